@@ -1,0 +1,72 @@
+"""Actuators that are a gain or a differential equation: limits, lag, rate limit."""
+
+from collections.abc import Iterator
+
+from diffabs.numerics import clamp
+from diffabs.protocols import Memory, no_flow, no_jump, no_memory
+from diffabs.pytree import Scalar, param, pytree
+
+
+@pytree
+class Limits:
+    """control = clamp(command, low, high)."""
+
+    low: Scalar = param(0.0, unit="N m")
+    high: Scalar = param(90.0, unit="N m")
+
+    start = no_memory
+    flow = no_flow
+    jump = no_jump
+
+    def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """Torque [N m]."""
+        del t, memory
+        return clamp(signal, self.low, self.high)
+
+    def problems(self) -> Iterator[str]:
+        """Limits that exclude each other."""
+        if not self.low <= self.high:
+            yield f"low = {self.low:g} N m exceeds high = {self.high:g} N m"
+
+
+@pytree
+class Lag:
+    """time_constant control' = command - control, control(0) = 0: a brake that has to build up pressure."""
+
+    time_constant: Scalar = param(0.01, unit="s", above=0.0)
+
+    jump = no_jump
+
+    def start(self, signal: Scalar) -> Memory:
+        """Brake released."""
+        return Memory(flow=0.0 * signal)
+
+    def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """control'."""
+        del t
+        return (signal - memory.flow) / self.time_constant
+
+    def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """Torque [N m]."""
+        del t, signal
+        return memory.flow
+
+
+@pytree
+class RateLimit:
+    """control' = clamp((command - control)/time_constant, -rate, rate), control(0) = 0.
+
+    A servo whose speed saturates; the ideal rate limiter is the limit of a small time constant.
+    """
+
+    rate: Scalar = param(1000.0, unit="N m/s", above=0.0)
+    time_constant: Scalar = param(0.002, unit="s", above=0.0)
+
+    start = Lag.start
+    output = Lag.output
+    jump = no_jump
+
+    def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """control'."""
+        del t
+        return clamp((signal - memory.flow) / self.time_constant, -self.rate, self.rate)

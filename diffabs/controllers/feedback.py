@@ -1,0 +1,54 @@
+"""State feedback with integral action and feed-forward.
+
+    u = clamp(ff + K x, u_min, u_max),   x = (integral of (slip - target), slip - target)
+
+Maeda and Sugiura, eqs. (18), (19), (23): tau1 = tau1* + K x. Note the sign: u = +K x, so a stabilising K is negative.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from diffabs.controllers.antiwindup import NoAntiWindup
+from diffabs.controllers.pid import limit_problems
+from diffabs.numerics import clamp
+from diffabs.protocols import Memory, Tracking, no_jump
+from diffabs.pytree import Scalar, Vector, param, part, pytree
+
+
+@pytree
+class StateFeedback:
+    """u = clamp(ff + k1 x1 + k2 x2, torque_min, torque_max); the default gain is the paper's, from its section 4."""
+
+    gain: Vector = param((-11753.0, -48.0), unit="N m/s, N m")
+    torque_min: Scalar = param(-np.inf, unit="N m", infinite=True)
+    torque_max: Scalar = param(np.inf, unit="N m", infinite=True)
+    antiwindup: Any = part(NoAntiWindup)
+
+    def start(self, signal: Tracking) -> Memory:
+        """x1(0) = 0."""
+        return Memory(flow=0.0 * signal.measured.slip)
+
+    def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
+        """x1' = slip - target, unless the anti-windup says otherwise."""
+        raw, limited = self._torque(memory, signal)
+        error = signal.measured.slip - signal.target
+        return self.antiwindup.rate(error, self.gain[0], raw, limited)
+
+    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
+        """Torque [N m]."""
+        return self._torque(memory, signal)[1]
+
+    jump = no_jump
+
+    def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
+        error = signal.measured.slip - signal.target
+        raw = signal.feedforward + self.gain[0] * memory.flow + self.gain[1] * error
+        return raw, clamp(raw, self.torque_min, self.torque_max)
+
+    def problems(self) -> Iterator[str]:
+        """A gain of the wrong length, limits that exclude each other."""
+        if np.shape(self.gain) != (2,):
+            yield f"gain has shape {np.shape(self.gain)}; it needs (2,): integral and proportional"
+        yield from limit_problems(self.torque_min, self.torque_max)

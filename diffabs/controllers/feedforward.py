@@ -1,0 +1,38 @@
+"""The input that feedback is added to."""
+
+from typing import Any
+
+from diffabs.protocols import BrakeOutput, Plant
+from diffabs.pytree import Scalar, param, pytree
+
+
+@pytree
+class NoFeedforward:
+    """0."""
+
+    def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
+        """Zero."""
+        del plant, output
+        return 0.0 * target
+
+
+@pytree
+class ConstantInput:
+    """A number: what a controller does that knows neither mass nor road."""
+
+    value: Scalar = param(0.0, unit="N m")
+
+    def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
+        """The number [N m]."""
+        del plant, output, target
+        return self.value
+
+
+@pytree
+class HoldingInput:
+    """The plant's own equilibrium input at the target: tau* of Maeda and Sugiura. It follows a swept mass or road, as a
+    controller does that knows them exactly."""
+
+    def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
+        """tau* [N m]."""
+        return plant.holding(output, target)

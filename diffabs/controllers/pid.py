@@ -1,0 +1,68 @@
+"""PID control of the slip, with filtered derivative and limits.
+
+    u = clamp(ff + kp e + kI I + kD wc (e - d), u_min, u_max),   I' = e,   d' = wc (e - d),   e = target - slip
+
+Aoki and Nakamura, eq. (13): C(s) = kp + kI/s + kD s wc/(s + wc). Their u is the negative of this one, which brakes when
+positive. P, PI and PD are this with gains of zero.
+"""
+
+from typing import Any, NamedTuple
+
+from diffabs.controllers.antiwindup import NoAntiWindup
+from diffabs.numerics import clamp
+from diffabs.protocols import Memory, Tracking, no_jump
+from diffabs.pytree import Scalar, param, part, pytree
+
+
+class PIDMemory(NamedTuple):
+    """Integral of the error [s], filtered error [1]."""
+
+    integral: Scalar
+    filtered: Scalar
+
+
+@pytree
+class PID:
+    """u = clamp(ff + kp e + kI I + kD wc (e - d), torque_min, torque_max)."""
+
+    kp: Scalar = param(3893.0, unit="N m", low=0.0)
+    ki: Scalar = param(0.0, unit="N m/s", low=0.0)
+    kd: Scalar = param(0.0, unit="N m s", low=0.0)
+    cutoff: Scalar = param(55.0, unit="rad/s", above=0.0)
+    torque_min: Scalar = param(0.0, unit="N m", infinite=True)
+    torque_max: Scalar = param(90.0, unit="N m", infinite=True)
+    antiwindup: Any = part(NoAntiWindup)
+
+    def start(self, signal: Tracking) -> Memory:
+        """Integral and filter at zero."""
+        zero = 0.0 * signal.measured.slip
+        return Memory(flow=PIDMemory(zero, zero))
+
+    def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> PIDMemory:
+        """I' and d'."""
+        raw, limited = self._torque(memory, signal)
+        error = signal.target - signal.measured.slip
+        integral = self.antiwindup.rate(error, self.ki, raw, limited)
+        return PIDMemory(integral, self.cutoff * (error - memory.flow.filtered))
+
+    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
+        """Torque [N m]."""
+        return self._torque(memory, signal)[1]
+
+    jump = no_jump
+
+    def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
+        error = signal.target - signal.measured.slip
+        derivative = self.cutoff * (error - memory.flow.filtered)
+        raw = signal.feedforward + self.kp * error + self.ki * memory.flow.integral + self.kd * derivative
+        return raw, clamp(raw, self.torque_min, self.torque_max)
+
+    def problems(self):
+        """Limits that exclude each other."""
+        return limit_problems(self.torque_min, self.torque_max)
+
+
+def limit_problems(low: Scalar, high: Scalar):
+    """Objects to a lower limit above the upper one."""
+    if not low <= high:
+        yield f"torque_min = {low:g} N m exceeds torque_max = {high:g} N m"

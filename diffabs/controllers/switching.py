@@ -1,0 +1,103 @@
+"""Controllers without memory of the plant: constant torque, relay with hysteresis, sliding mode."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from diffabs.numerics import clamp, ratio
+from diffabs.protocols import Clock, Jump, Memory, Tracking, no_flow, no_jump, no_memory
+from diffabs.pytree import Scalar, param, pytree
+
+
+@pytree
+class ConstantTorque:
+    """u = torque: a driver who stands on the brake, no anti-lock control."""
+
+    torque: Scalar = param(90.0, unit="N m")
+
+    start = no_memory
+    flow = no_flow
+    jump = no_jump
+
+    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
+        """Torque [N m]."""
+        del t, memory, signal
+        return self.torque
+
+
+class RelayMemory(NamedTuple):
+    """1 while the brake is applied, else 0; excess of the slip over the target at the last instant."""
+
+    applied: Scalar
+    excess: Scalar
+
+
+@pytree
+class Relay:
+    """torque_max until slip > target + band, then torque_min until slip < target - band.
+
+    Switches at the instants of the integration grid; the moment of the crossing inside the step is found by linear
+    interpolation, so that a run does not depend on the grid and is differentiable.
+    """
+
+    band: Scalar = param(0.02, unit="1", above=0.0, below=1.0)
+    torque_min: Scalar = param(0.0, unit="N m")
+    torque_max: Scalar = param(90.0, unit="N m")
+
+    flow = no_flow
+
+    def start(self, signal: Tracking) -> Memory:
+        """Applied if the slip is below the target."""
+        excess = signal.measured.slip - signal.target
+        return Memory(held=RelayMemory(jnp.where(excess < 0, 1.0, 0.0) + 0.0 * excess, excess))
+
+    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
+        """Torque [N m]."""
+        del t, signal
+        applied = memory.held.applied
+        return self.torque_min + applied * (self.torque_max - self.torque_min)
+
+    def jump(self, clock: Clock, memory: Memory, signal: Tracking) -> Jump:
+        """Switch at the far side of the band."""
+        applied, before = memory.held
+        excess = signal.measured.slip - signal.target
+        release = (applied > 0.5) & (excess > self.band)
+        apply = (applied < 0.5) & (excess < -self.band)
+        level = jnp.where(release, self.band, -self.band)
+        late = clamp(ratio(excess - level, excess - before), 0.0, 1.0)
+        elapsed = jnp.where(release | apply, late * clock.h, 0.0)
+        now = jnp.where(release, 0.0, jnp.where(apply, 1.0, applied))
+        return Jump(Memory(held=RelayMemory(now, excess)), elapsed)
+
+    def problems(self):
+        """A release torque above the applied one."""
+        if not self.torque_min < self.torque_max:
+            yield f"torque_min = {self.torque_min:g} N m is not below torque_max = {self.torque_max:g} N m"
+
+
+@pytree
+class SlidingMode:
+    """u = clamp(ff + gain sat((target - slip)/boundary), torque_min, torque_max), sat(z) = clamp(z, -1, 1).
+
+    First-order sliding mode with a boundary layer. Slotine and Li, Applied Nonlinear Control, sec. 7.2.
+    """
+
+    gain: Scalar = param(90.0, unit="N m", low=0.0)
+    boundary: Scalar = param(0.02, unit="1", above=0.0)
+    torque_min: Scalar = param(0.0, unit="N m")
+    torque_max: Scalar = param(90.0, unit="N m")
+
+    start = no_memory
+    flow = no_flow
+    jump = no_jump
+
+    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
+        """Torque [N m]."""
+        del t, memory
+        inside = clamp((signal.target - signal.measured.slip) / self.boundary, -1.0, 1.0)
+        return clamp(signal.feedforward + self.gain * inside, self.torque_min, self.torque_max)
+
+    def problems(self):
+        """Limits that exclude each other."""
+        if not self.torque_min < self.torque_max:
+            yield f"torque_min = {self.torque_min:g} N m is not below torque_max = {self.torque_max:g} N m"

@@ -1,0 +1,146 @@
+"""One hybrid closed loop: plant, sensor, reference, feed-forward, controller, actuator, and when it ends.
+
+    between instants   dz/dt = flow(t, z; held)      z: plant state and the blocks' continuous memories
+    at instants        (z, held) -> jump(z, held)    sensor, reference, controller, actuator, in this order
+
+A `Loop` is one pytree: every parameter of every part is a leaf with a dotted path, `loop.plant.road.scale`.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from diffabs.blocks import Direct
+from diffabs.controllers import PID, NoFeedforward
+from diffabs.plants import BrakeStart, QuarterCar
+from diffabs.protocols import (
+    Block,
+    BrakeOutput,
+    Clock,
+    Feedforward,
+    Memory,
+    Plant,
+    Reference,
+    Sample,
+    Stop,
+    Tracking,
+)
+from diffabs.pytree import Scalar, part, pytree
+from diffabs.references import FixedSlip
+from diffabs.stops import Standstill
+
+BLOCKS = ("sensor", "reference", "controller", "actuator")
+
+
+class LoopState(NamedTuple):
+    """Plant state and the memories of the blocks."""
+
+    plant: Any
+    sensor: Memory
+    reference: Memory
+    controller: Memory
+    actuator: Memory
+
+    def flow(self) -> tuple[Any, ...]:
+        """What is integrated."""
+        return (self.plant, *(m.flow for m in self[1:]))
+
+    def with_flow(self, flow: tuple[Any, ...]) -> "LoopState":
+        """The same held memories with other continuous ones."""
+        return LoopState(flow[0], *(m._replace(flow=f) for m, f in zip(self[1:], flow[1:], strict=True)))
+
+
+class Signals(NamedTuple):
+    """Every signal of the loop at an instant."""
+
+    sample: Sample
+    measured: BrakeOutput
+    tracking: Tracking
+
+
+class Event(NamedTuple):
+    """A jump whose cause lies `elapsed` seconds back: the state before and after it."""
+
+    before: LoopState
+    after: LoopState
+    elapsed: Scalar
+
+
+@pytree
+class Loop:
+    """Plant and controller with what is around them."""
+
+    plant: Plant = part(QuarterCar)
+    initial: Any = part(BrakeStart)
+    sensor: Block = part(Direct)
+    reference: Reference = part(FixedSlip)
+    feedforward: Feedforward = part(NoFeedforward)
+    controller: Block = part(PID)
+    actuator: Block = part(Direct)
+    stop: Stop = part(Standstill)
+
+    def start(self) -> LoopState:
+        """State at t = 0, before the first jump."""
+        x = self.plant.start(self.initial)
+        y = self.plant.output(x)
+        sensor = self.sensor.start(y)
+        measured = self.sensor.output(0.0, sensor, y)
+        reference = self.reference.start(measured)
+        tracking = self._tracking(0.0, reference, measured)
+        controller = self.controller.start(tracking)
+        actuator = self.actuator.start(self.controller.output(0.0, controller, tracking))
+        return LoopState(x, sensor, reference, controller, actuator)
+
+    def signals(self, t: Scalar, state: LoopState) -> Signals:
+        """Follow the signal once around the loop."""
+        y = self.plant.output(state.plant)
+        measured = self.sensor.output(t, state.sensor, y)
+        tracking = self._tracking(t, state.reference, measured)
+        command = self.controller.output(t, state.controller, tracking)
+        control = self.actuator.output(t, state.actuator, command)
+        setpoint = self.reference.setpoint(state.reference)
+        return Signals(
+            Sample(t, y, tracking.target, setpoint, tracking.feedforward, command, control), measured, tracking
+        )
+
+    def flow(self, t: Scalar, state: LoopState) -> tuple[Any, ...]:
+        """d(state.flow())/dt."""
+        sample, measured, tracking = self.signals(t, state)
+        return (
+            self.plant.derivative(t, state.plant, sample.control),
+            self.sensor.flow(t, state.sensor, sample.output),
+            self.reference.flow(t, state.reference, measured),
+            self.controller.flow(t, state.controller, tracking),
+            self.actuator.flow(t, state.actuator, sample.command),
+        )
+
+    def jump(self, clock: Clock, state: LoopState) -> tuple[LoopState, list[Event]]:
+        """The blocks' jumps in the order of the signal, and those that are localised events."""
+        events = []
+        for name in BLOCKS:
+            jumped = getattr(self, name).jump(clock, getattr(state, name), self._input(name, clock.t, state))
+            after = state._replace(**{name: jumped.memory})
+            if jumped.elapsed is not None:
+                events.append(Event(state, after, jumped.elapsed))
+            state = after
+        return state, events
+
+    def grid_problems(self, step: float) -> Iterator[str]:
+        """What the blocks object to in an integration step [s]."""
+        for name in BLOCKS:
+            block = getattr(self, name)
+            if hasattr(block, "grid_problems"):
+                yield from (f"{name}.{line}" for line in block.grid_problems(step))
+
+    def _input(self, name: str, t: Scalar, state: LoopState) -> Any:
+        signals = self.signals(t, state)
+        return {
+            "sensor": signals.sample.output,
+            "reference": signals.measured,
+            "controller": signals.tracking,
+            "actuator": signals.sample.command,
+        }[name]
+
+    def _tracking(self, t: Scalar, reference: Memory, measured: BrakeOutput) -> Tracking:
+        target = self.reference.output(t, reference, measured)
+        setpoint = self.reference.setpoint(reference)
+        return Tracking(target, measured, self.feedforward.input(self.plant, measured, setpoint))

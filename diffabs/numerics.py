@@ -1,0 +1,56 @@
+"""Elementary functions whose gradients stay finite where the textbook ones do not."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.pytree import Scalar
+
+
+def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
+    """x limited to [low, high]. At a limit the slope is 0 in x and 1 in the limit.
+
+    `lax.clamp` rather than `jnp.clip`: the tangent of the latter divides.
+    """
+    dtype = jnp.result_type(x, low, high)
+    return jax.lax.clamp(jnp.asarray(low, dtype), jnp.asarray(x, dtype), jnp.asarray(high, dtype))
+
+
+def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> Any:
+    """numerator/denominator, and `otherwise` where the denominator is zero (with zero slope there)."""
+    fine = jnp.not_equal(denominator, 0)
+    return jnp.where(fine, numerator / jnp.where(fine, denominator, 1.0), otherwise)
+
+
+def power(base: Scalar, exponent: Scalar) -> Any:
+    """base ** exponent for base >= 0 and exponent > 1, with slope 0 at base = 0 in both arguments.
+
+    exp(q log x): XLA's own power is three to four times slower on a CPU.
+    """
+    positive = jnp.greater(base, 0)
+    return jnp.where(positive, jnp.exp(exponent * jnp.log(jnp.where(positive, base, 1.0))), 0.0)
+
+
+def sign(x: Scalar) -> Any:
+    """+1 for x >= 0, else -1: the odd extension of a curve given for x >= 0 keeps the slope of its right side at 0."""
+    return jnp.where(jnp.greater_equal(x, 0), 1.0, -1.0)
+
+
+def parabola(left: Scalar, middle: Scalar, right: Scalar) -> tuple[Any, Any]:
+    """Place (in steps from the middle, within [-1, 1]) and value of the extremum of the parabola through three equally spaced
+    values; the middle where the three lie on a line."""
+    place = clamp(ratio(0.5 * (left - right), left - 2 * middle + right), -1.0, 1.0)
+    return place, interpolate(left, middle, right, place)
+
+
+def interpolate(left: Scalar, middle: Scalar, right: Scalar, place: Scalar) -> Any:
+    """The parabola through three equally spaced values at `place` steps from the middle one."""
+    return middle + 0.5 * place * (right - left) + 0.5 * place**2 * (left - 2 * middle + right)
+
+
+def odd(curve: Callable[[Any], Any], x: Scalar) -> Any:
+    """The odd extension of a curve given for x >= 0. At 0 the slope is that of the curve (|x| would make it 0)."""
+    s = sign(x)
+    return s * curve(s * x)

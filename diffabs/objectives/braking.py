@@ -1,0 +1,108 @@
+"""What a braking run costs: time, distance, locked wheel, effort of the brake."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from diffabs.numerics import ratio
+from diffabs.objectives.accuracy import FinalSlipError, from_zero, integral, nothing, unchanged
+from diffabs.protocols import Ending, Memory, Sample
+from diffabs.pytree import Scalar, param, pytree
+
+
+@pytree
+class StopTime:
+    """Time to the stop [s]. A run that did not stop gets t + v/a with its last deceleration."""
+
+    start, flow, update = FinalSlipError.start, nothing, unchanged
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Time of the last sample and what is left."""
+        del memory
+        return ending.sample.t + ending.time_left
+
+
+@pytree
+class StopDistance:
+    """Distance to the stop [m]. A run that did not stop gets x + v^2/(2 a), so that rolling on is never the best."""
+
+    start, flow, update = FinalSlipError.start, nothing, unchanged
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Distance of the last sample and what is left."""
+        del memory
+        return ending.sample.output.distance + ending.distance_left
+
+
+class Locked(NamedTuple):
+    """Locked time so far [s], and the last slip."""
+
+    time: Scalar
+    slip: Scalar
+
+
+@pytree
+class LockedTime:
+    """Time [s] during which the slip exceeds `threshold`. Crossings are interpolated linearly inside a step."""
+
+    threshold: Scalar = param(0.99, unit="1", above=0.0, below=1.0)
+
+    flow = nothing
+
+    def start(self, sample: Sample) -> Memory:
+        """Zero."""
+        return Memory(held=Locked(0.0 * sample.t, sample.output.slip))
+
+    def update(self, memory: Memory, sample: Sample, h: Scalar) -> Locked:
+        """Add the part of the step above the threshold."""
+        time, before = memory.held
+        a, b = before - self.threshold, sample.output.slip - self.threshold
+        crossing = ratio(jnp.maximum(a, b), jnp.abs(a - b))
+        part = jnp.where((a > 0) & (b > 0), 1.0, jnp.where((a > 0) | (b > 0), crossing, 0.0))
+        return Locked(time + part * h, sample.output.slip)
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Locked time."""
+        del ending
+        return memory.held.time
+
+
+@pytree
+class Effort:
+    """Integral of u^2 dt [N^2 m^2 s], u the torque that the actuator delivers."""
+
+    start, update, value = from_zero, unchanged, integral
+
+    def flow(self, memory: Memory, sample: Sample) -> Scalar:
+        """u^2."""
+        del memory
+        return sample.control**2
+
+
+class Varied(NamedTuple):
+    """Variation so far, and the last torque."""
+
+    total: Scalar
+    last: Scalar
+
+
+@pytree
+class Variation:
+    """Total variation of the torque, sum of |u_(k+1) - u_k| [N m]: what chattering costs."""
+
+    flow = nothing
+
+    def start(self, sample: Sample) -> Memory:
+        """From the first torque."""
+        return Memory(held=Varied(0.0 * sample.control, sample.control))
+
+    def update(self, memory: Memory, sample: Sample, h: Scalar) -> Varied:
+        """Add the change over the step."""
+        del h
+        total, last = memory.held
+        return Varied(total + jnp.abs(sample.control - last), sample.control)
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Variation."""
+        del ending
+        return memory.held.total

@@ -1,0 +1,120 @@
+"""The laboratory anti-lock brake rig of INTECO, as its manual models it.
+
+    Fn = (Mg + s1 (M1 + M10) + d1 omega1)/(L (sin phi - mu cos phi))
+    J1 omega1' = Fn r1 mu - d1 omega1 - s1 (M1 + M10)
+    J2 omega2' = -(Fn r2 mu + d2 omega2 + s2 M20)
+    M1' = c31 (b(u) - M1),   b(u) = b1 u + b2 for u >= u0, else 0
+
+The braked upper wheel hangs on a lever of length L and presses on the lower wheel, the "road", at the angle phi: its brake
+torque adds to the normal force. mu is odd in the slip, so the manual's sign s of the slip is inside it. Eq. (1) of Maeda and
+Sugiura with tau_b + tau_1 = Mg + M1 + M10 + d1 omega1. Radii, J1 and the friction curve are confirmed by that paper; the
+other constants are as commonly published and were not verified against the manual.
+
+A stopped wheel sticks: the brake then carries T = r1 mu Mg/(L (sin phi - mu cos phi) - r1 mu), what the road asks for, as
+long as that is below M1 + M10.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from diffabs.numerics import clamp
+from diffabs.plants.wheel import BrakeStart, forward, halted, slip_ratio
+from diffabs.protocols import BrakeOutput, Road
+from diffabs.pytree import Scalar, param, part, pytree
+from diffabs.roads import RIG
+
+
+class LabRigState(NamedTuple):
+    """Angular speeds of the braked and of the road wheel [rad/s], brake torque [N m], distance r2 * angle [m]."""
+
+    wheel: Scalar
+    drum: Scalar
+    brake: Scalar
+    distance: Scalar
+
+
+@pytree
+class LabRig:
+    """Two wheels, a lever, bearing friction, and a brake with a 49 ms lag. The control u in [0, 1] is the brake command."""
+
+    wheel_radius: Scalar = param(0.0995, unit="m", above=0.0)
+    drum_radius: Scalar = param(0.099, unit="m", above=0.0)
+    wheel_inertia: Scalar = param(7.53e-3, unit="kg m^2", above=0.0)
+    drum_inertia: Scalar = param(25.6e-3, unit="kg m^2", above=0.0)
+    wheel_friction: Scalar = param(1.1874e-4, unit="N m s", low=0.0)
+    drum_friction: Scalar = param(2.1468e-4, unit="N m s", low=0.0)
+    wheel_stiction: Scalar = param(0.003, unit="N m", low=0.0)
+    drum_stiction: Scalar = param(0.0925, unit="N m", low=0.0)
+    lever: Scalar = param(0.37, unit="m", above=0.0)
+    lever_angle: Scalar = param(math.radians(65.61), unit="rad", above=0.0, below=math.pi / 2)
+    weight_torque: Scalar = param(19.6181, unit="N m", above=0.0)
+    brake_rate: Scalar = param(20.37, unit="1/s", above=0.0)
+    brake_gain: Scalar = param(15.24, unit="N m", above=0.0)
+    brake_offset: Scalar = param(-6.21, unit="N m")
+    brake_threshold: Scalar = param(0.415, unit="1", low=0.0, high=1.0, tunable=False)
+    crawl_speed: Scalar = param(0.01, unit="m/s", above=0.0)
+    road: Road = part(RIG)
+
+    def start(self, initial: BrakeStart) -> LabRigState:
+        """State for a speed and a slip, brake released."""
+        zero = 0.0 * initial.speed
+        wheel = (1 - initial.slip) * initial.speed / self.wheel_radius
+        return LabRigState(wheel, initial.speed / self.drum_radius, zero, zero)
+
+    def derivative(self, t: Scalar, state: LabRigState, control: Scalar) -> LabRigState:
+        """dx/dt under the brake command `control` [1], limited to [0, 1]."""
+        del t
+        mu, normal, torque = self.contact(state)
+        wheel = (normal * self.wheel_radius * mu - torque) / self.wheel_inertia
+        drum = -self._drum_torque(state.drum, normal * mu) / self.drum_inertia
+        u = clamp(control, 0.0, 1.0)
+        target = jnp.where(u >= self.brake_threshold, self.brake_gain * u + self.brake_offset, 0.0)
+        return LabRigState(
+            halted(state.wheel, wheel),
+            halted(state.drum, drum),
+            self.brake_rate * (target - state.brake),
+            self.drum_radius * state.drum,
+        )
+
+    def contact(self, state: LabRigState) -> tuple[Any, Any, Any]:
+        """Friction coefficient [1], normal force [N], and the torque that brakes the wheel [N m], bearing included."""
+        slip = slip_ratio(self.drum_radius * state.drum, self.wheel_radius * state.wheel, self.crawl_speed)
+        mu = self.road.friction(slip, self.drum_radius * state.drum, state.distance)
+        arm = self.lever * (jnp.sin(self.lever_angle) - mu * jnp.cos(self.lever_angle))
+        capacity = state.brake + self.wheel_stiction
+        asked = self.wheel_radius * mu * self.weight_torque / (arm - self.wheel_radius * mu)
+        stuck = jnp.minimum(asked, capacity)
+        torque = jnp.where(state.wheel > 0, capacity + self.wheel_friction * state.wheel, stuck)
+        return mu, (self.weight_torque + torque) / arm, torque
+
+    def project(self, state: LabRigState) -> LabRigState:
+        """Neither wheel turns backwards."""
+        return LabRigState(forward(state.wheel), forward(state.drum), state.brake, state.distance)
+
+    def output(self, state: LabRigState) -> BrakeOutput:
+        """Slip, rim speeds, deceleration of the road wheel's rim, distance."""
+        v, w = self.drum_radius * state.drum, self.wheel_radius * state.wheel
+        mu, normal, _ = self.contact(state)
+        deceleration = self.drum_radius * self._drum_torque(state.drum, normal * mu) / self.drum_inertia
+        return BrakeOutput(slip_ratio(v, w, self.crawl_speed), v, w, deceleration, state.distance)
+
+    def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
+        """The brake command whose steady torque keeps the slip constant, from omega1' = (1 - slip) (r2/r1) omega2'."""
+        drum = output.speed / self.drum_radius
+        spin = (1 - target) * output.speed / self.wheel_radius
+        mu = self.road.friction(target, output.speed, output.distance)
+        arm = self.lever * (jnp.sin(self.lever_angle) - mu * jnp.cos(self.lever_angle))
+        k = self.wheel_inertia * (1 - target) * self.drum_radius / (self.wheel_radius * self.drum_inertia)
+        pull = mu * (self.wheel_radius + k * self.drum_radius) / arm
+        drag = k * (self.drum_friction * drum + self.drum_stiction)
+        brake = (pull * self.weight_torque + drag) / (1 - pull) - self.wheel_stiction - self.wheel_friction * spin
+        return (brake - self.brake_offset) / self.brake_gain
+
+    def energy(self, state: LabRigState) -> Scalar:
+        """Kinetic energy of both wheels [J]."""
+        return 0.5 * (self.wheel_inertia * state.wheel**2 + self.drum_inertia * state.drum**2)
+
+    def _drum_torque(self, drum: Scalar, push: Scalar) -> Any:
+        return push * self.drum_radius + self.drum_friction * drum + jnp.where(drum > 0, self.drum_stiction, 0.0)

@@ -1,0 +1,73 @@
+"""The laboratory rig turned upside down: the upper wheel is the car's body, of mass m, and presses on the lower, braked one.
+
+    J1 omega1' = Fn r1 mu(slip) - tau1,   J2 omega2' = -Fn r2 mu(slip),   Fn = m g,   J2 = c m r2^2
+    slip = (r2 omega2 - r1 omega1)/(r2 omega2)
+
+Maeda and Sugiura, eqs. (2)-(5), (12). Their eq. (3) takes the body for a disk, c = 1/2, and eq. (9) then decelerates it at
+2 mu g, twice their eq. (8) for a car: c = 1 is the inertia that gives the car's mu g. Their numbers use 1/2, so that is the
+default. Eq. (12) is for omega2 r2 >= omega1 r1 only; beyond it the slip is taken relative to the faster wheel.
+"""
+
+from typing import NamedTuple
+
+from diffabs.plants.wheel import GRAVITY, BrakeStart, forward, halted, slip_ratio
+from diffabs.protocols import BrakeOutput, Road
+from diffabs.pytree import Scalar, param, part, pytree
+from diffabs.roads import RIG
+
+
+class RigState(NamedTuple):
+    """Angular speeds of the braked wheel and of the body wheel [rad/s], distance r2 * angle [m]."""
+
+    wheel: Scalar
+    body: Scalar
+    distance: Scalar
+
+
+@pytree
+class MirroredRig:
+    """J1 omega1' = m g r1 mu - tau1, c m r2^2 omega2' = -m g r2 mu."""
+
+    mass: Scalar = param(5.3, unit="kg", above=0.0)
+    wheel_radius: Scalar = param(0.0995, unit="m", above=0.0)
+    body_radius: Scalar = param(0.099, unit="m", above=0.0)
+    wheel_inertia: Scalar = param(7.53e-3, unit="kg m^2", above=0.0)
+    inertia_factor: Scalar = param(0.5, unit="1", above=0.0, high=1.0)
+    crawl_speed: Scalar = param(0.01, unit="m/s", above=0.0)
+    road: Road = part(RIG)
+
+    def start(self, initial: BrakeStart) -> RigState:
+        """State for a speed and a slip."""
+        wheel = (1 - initial.slip) * initial.speed / self.wheel_radius
+        return RigState(wheel, initial.speed / self.body_radius, 0.0 * initial.speed)
+
+    def derivative(self, t: Scalar, state: RigState, control: Scalar) -> RigState:
+        """dx/dt under the brake torque tau1 = `control` [N m]."""
+        del t
+        y = self.output(state)
+        push = self.inertia_factor * self.mass * y.deceleration  # Fn mu [N]
+        wheel = (push * self.wheel_radius - control) / self.wheel_inertia
+        body = -y.deceleration / self.body_radius
+        return RigState(halted(state.wheel, wheel), halted(state.body, body), y.speed)
+
+    def project(self, state: RigState) -> RigState:
+        """Neither wheel turns backwards."""
+        return RigState(forward(state.wheel), forward(state.body), state.distance)
+
+    def output(self, state: RigState) -> BrakeOutput:
+        """Slip, rim speeds, deceleration mu g/c of the body's rim, distance."""
+        v, w = self.body_radius * state.body, self.wheel_radius * state.wheel
+        slip = slip_ratio(v, w, self.crawl_speed)
+        mu = self.road.friction(slip, v, state.distance)
+        return BrakeOutput(slip, v, w, mu * GRAVITY / self.inertia_factor, state.distance)
+
+    def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
+        """tau* = m g r1 mu + (1 - slip) J1 mu g/(c r1), the zero of eq. (14)."""
+        mu = self.road.friction(target, output.speed, output.distance)
+        wheel = (1 - target) * self.wheel_inertia / (self.inertia_factor * self.wheel_radius)
+        return mu * GRAVITY * (self.mass * self.wheel_radius + wheel)
+
+    def energy(self, state: RigState) -> Scalar:
+        """Kinetic energy [J]."""
+        body = self.inertia_factor * self.mass * self.body_radius**2
+        return 0.5 * (self.wheel_inertia * state.wheel**2 + body * state.body**2)

@@ -1,0 +1,68 @@
+"""Quarter car with one braked wheel.
+
+    m v' = -mu(slip) m g,   J omega' = r mu(slip) m g - u,   x' = v,   slip = (v - r omega)/v
+
+Aoki and Nakamura, eqs. (1) and (7)-(12), which is also eqs. (6)-(11) of Maeda and Sugiura. Their brake torque is negative;
+here u >= 0 brakes. Their eq. (9) drops the brake from a stopped wheel, so that it starts to turn again at once; here a
+stopped wheel stays stopped while the brake torque exceeds the road's. Rolling and air resistance are neglected.
+"""
+
+from typing import NamedTuple
+
+from diffabs.plants.wheel import GRAVITY, BrakeStart, forward, halted, slip_ratio
+from diffabs.protocols import BrakeOutput, Road
+from diffabs.pytree import Scalar, param, part, pytree
+from diffabs.roads import SPLINE_B
+
+
+class QuarterCarState(NamedTuple):
+    """Vehicle speed [m/s], wheel's angular speed [rad/s], distance [m]."""
+
+    speed: Scalar
+    spin: Scalar
+    distance: Scalar
+
+
+@pytree
+class QuarterCar:
+    """m v' = -mu m g, J omega' = r mu m g - u. The inertia was identified together with the spline road."""
+
+    mass: Scalar = param(15.0, unit="kg", above=0.0)
+    radius: Scalar = param(0.2, unit="m", above=0.0)
+    inertia: Scalar = param(1.04456, unit="kg m^2", above=0.0)
+    crawl_speed: Scalar = param(0.01, unit="m/s", above=0.0)
+    road: Road = part(SPLINE_B)
+
+    def start(self, initial: BrakeStart) -> QuarterCarState:
+        """State for a speed and a slip."""
+        spin = (1 - initial.slip) * initial.speed / self.radius
+        return QuarterCarState(initial.speed, spin, 0.0 * initial.speed)
+
+    def derivative(self, t: Scalar, state: QuarterCarState, control: Scalar) -> QuarterCarState:
+        """dx/dt under the brake torque `control` [N m]."""
+        del t
+        mu = self.output(state).deceleration / GRAVITY
+        net = self.radius * mu * self.mass * GRAVITY - control
+        return QuarterCarState(
+            halted(state.speed, -mu * GRAVITY), halted(state.spin, net / self.inertia), state.speed
+        )
+
+    def project(self, state: QuarterCarState) -> QuarterCarState:
+        """Neither car nor wheel moves backwards."""
+        return QuarterCarState(forward(state.speed), forward(state.spin), state.distance)
+
+    def output(self, state: QuarterCarState) -> BrakeOutput:
+        """Slip, speeds, deceleration mu g, distance."""
+        v, w = state.speed, self.radius * state.spin
+        slip = slip_ratio(v, w, self.crawl_speed)
+        mu = self.road.friction(slip, v, state.distance)
+        return BrakeOutput(slip, v, w, mu * GRAVITY, state.distance)
+
+    def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
+        """tau* = mu (m g r + (1 - slip) J g/r): brakes the car and the wheel together at a constant slip."""
+        mu = self.road.friction(target, output.speed, output.distance)
+        return mu * GRAVITY * (self.mass * self.radius + (1 - target) * self.inertia / self.radius)
+
+    def energy(self, state: QuarterCarState) -> Scalar:
+        """Kinetic energy [J]."""
+        return 0.5 * (self.mass * state.speed**2 + self.inertia * state.spin**2)

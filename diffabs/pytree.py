@@ -1,0 +1,202 @@
+"""How a part is made: a frozen, keyword-only dataclass that is a JAX pytree.
+
+A part's leaves are its parameters. So `jax.vmap` over a plant is a Monte-Carlo sweep, `jax.grad` with respect to a
+controller is tuning, and no second dictionary of parameters exists. A field is one of three kinds:
+
+    param(...)   a leaf: a float (or array), with unit and range; differentiable and batchable
+    part(...)    another part, or a tuple of parts
+    static(...)  a shape or a choice fixed at trace time
+
+Ranges are not checked when a part is built, because JAX rebuilds parts with tracers and placeholders; `check(part)`
+does it on the host, and names every offender at once.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar, dataclass_transform
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+Scalar = Any  # a float, a NumPy or JAX scalar, a tracer; a batch of them under vmap
+Vector = Any  # the same with one axis
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Spec:
+    """What a parameter may be: its unit and the interval it lives in. `tunable` is False where the run does not depend
+    on the value smoothly (a sampling period, say), so that its derivative is zero or not defined."""
+
+    unit: str
+    low: float = -math.inf
+    high: float = math.inf
+    open_low: bool = False
+    open_high: bool = False
+    infinite: bool = False
+    tunable: bool = True
+
+    def interval(self) -> str:
+        """The range as a person writes it: `(0, 1] kg`."""
+        left = "(" if self.open_low or self.low == -math.inf else "["
+        right = ")" if self.open_high or self.high == math.inf else "]"
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return f"{left}{self.low:g}, {self.high:g}{right}{unit}"
+
+    def holds(self, value: ArrayLike) -> bool:
+        """Whether every element lies in the range. Written so that NaN does not."""
+        array = np.asarray(value, float)
+        above = array > self.low if self.open_low else array >= self.low
+        below = array < self.high if self.open_high else array <= self.high
+        return bool(np.all(above & below & (np.isfinite(array) | (self.infinite & ~np.isnan(array)))))
+
+
+def param(
+    default: Any = dataclasses.MISSING,
+    *,
+    unit: str,
+    low: float = -math.inf,
+    high: float = math.inf,
+    above: float | None = None,
+    below: float | None = None,
+    infinite: bool = False,
+    tunable: bool = True,
+) -> Any:
+    """A parameter: one differentiable leaf. `low`/`high` belong to the range, `above`/`below` do not."""
+    spec = Spec(
+        unit,
+        low if above is None else above,
+        high if below is None else below,
+        above is not None,
+        below is not None,
+        infinite,
+        tunable,
+    )
+    if isinstance(default, tuple | list):
+        values = tuple(float(v) for v in default)
+        return dataclasses.field(default_factory=lambda: np.array(values), metadata={"spec": spec})
+    return dataclasses.field(default=default, metadata={"spec": spec})
+
+
+def part(default: Any = dataclasses.MISSING) -> Any:
+    """A field that holds another part, or a tuple of parts. `default` is a part or a class to call."""
+    if default is dataclasses.MISSING:
+        return dataclasses.field(metadata={"part": True})
+    make = default if isinstance(default, type) else lambda: default
+    return dataclasses.field(default_factory=make, metadata={"part": True})
+
+
+def static(default: Any = dataclasses.MISSING) -> Any:
+    """A field known at trace time: changing it compiles again."""
+    return dataclasses.field(default=default, metadata={"static": True})
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, eq_default=False, field_specifiers=(param, part, static))
+def pytree(cls: type[T]) -> type[T]:
+    """Make a class a part. Raises TypeError for `__post_init__`, which JAX would call with tracers and None."""
+    if "__post_init__" in cls.__dict__:
+        raise TypeError(f"{cls.__name__}: no __post_init__ on a part; write problems(self) for check() instead")
+    new = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
+    fields = dataclasses.fields(new)  # pyright: ignore[reportArgumentType]  # just made a dataclass
+    unknown = [f.name for f in fields if not {"spec", "part", "static"} & set(f.metadata)]
+    if unknown:
+        raise TypeError(f"{cls.__name__}: declare {', '.join(unknown)} with param, part or static")
+    meta = [f.name for f in fields if "static" in f.metadata]
+    data = [f.name for f in fields if f.name not in meta]
+    return jax.tree_util.register_dataclass(new, data_fields=data, meta_fields=meta)
+
+
+def parameters(part: Any, prefix: str = "") -> Iterator[tuple[str, Spec, Any]]:
+    """Every parameter below `part` as (dotted path, spec, value), in the order of declaration."""
+    for name, field, value in _children(part, prefix):
+        if field is not None and "spec" in field.metadata:
+            yield name, field.metadata["spec"], value
+        else:
+            yield from parameters(value, f"{name}.")
+
+
+def _children(part: Any, prefix: str) -> Iterator[tuple[str, dataclasses.Field[Any] | None, Any]]:
+    if isinstance(part, tuple):
+        for i, item in enumerate(part):
+            yield f"{prefix}{i}", None, item
+    elif dataclasses.is_dataclass(part):
+        for field in dataclasses.fields(part):
+            if "static" not in field.metadata:
+                yield prefix + field.name, field, getattr(part, field.name)
+
+
+def problems(part: Any, prefix: str = "") -> Iterator[str]:
+    """One line for each field that is out of range, and whatever the parts themselves object to."""
+    own = getattr(part, "problems", None)
+    found = False
+    for name, field, value in _children(part, prefix):
+        if field is not None and "spec" in field.metadata:
+            spec: Spec = field.metadata["spec"]
+            if not spec.holds(value):
+                found = True
+                yield f"{name} = {_show(value)} is outside {spec.interval()}"
+        else:
+            yield from problems(value, f"{name}.")
+    if own is not None and not found:
+        yield from (prefix + line for line in own())
+
+
+def check(part: T, prefix: str = "") -> T:
+    """Return `part` if every parameter is in its range.
+
+    Raises:
+        ValueError: names every offending field with its value, range and unit. NaN offends.
+    """
+    lines = list(problems(part, prefix))
+    if lines:
+        raise ValueError("; ".join(lines))
+    return part
+
+
+def _show(value: Any) -> str:
+    array = np.asarray(value, float)
+    return f"{float(array):g}" if array.ndim == 0 else np.array2string(array, threshold=8, precision=4)
+
+
+def get(part: Any, path: str) -> Any:
+    """The value at a dotted path: `get(loop, "plant.road.scale")`. Raises KeyError naming what is there instead."""
+    for name in path.split("."):
+        names = [child.rpartition(".")[2] for child, _, _ in _children(part, "")]
+        if name not in names:
+            raise KeyError(f"no '{name}' in {path}; there is {', '.join(names) or 'nothing'}")
+        part = part[int(name)] if isinstance(part, tuple) else getattr(part, name)
+    return part
+
+
+def replace(part: T, values: Mapping[str, Any]) -> T:
+    """A copy with the parameters at these dotted paths replaced: `replace(loop, {"plant.mass": 5.3})`.
+
+    Works under jit, grad and vmap. Raises KeyError for a path that does not exist.
+    """
+    for path, value in values.items():
+        get(part, path)
+        part = _replace(part, path.split("."), value)
+    return part
+
+
+def _replace(part: Any, names: list[str], value: Any) -> Any:
+    head, *rest = names
+    if isinstance(part, tuple):
+        i = int(head)
+        return (*part[:i], _replace(part[i], rest, value) if rest else value, *part[i + 1 :])
+    new = _replace(getattr(part, head), rest, value) if rest else value
+    return dataclasses.replace(part, **{head: new})
+
+
+def strong(tree: T) -> T:
+    """Every leaf as a float array of one dtype: that of the arrays among the leaves, else JAX's default float.
+
+    Python numbers are weakly typed: mixed with arrays they would cause a second compilation of the same function.
+    """
+    arrays = [x.dtype for x in jax.tree.leaves(tree) if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)]
+    dtype = jnp.result_type(*arrays) if arrays else jnp.result_type(float)
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)

@@ -1,0 +1,160 @@
+"""References that find the best slip: the slip at which the measured deceleration was greatest.
+
+Aoki and Nakamura, sec. 4, fig. 5: a running maximum of the deceleration |a|; when it is exceeded, the target becomes the
+present slip. Read literally this cannot brake: while friction rises the target equals the slip, the error is zero, and the
+car rolls on. `PeakLiteral` shows that. `PeakLatch` is the reading that reproduces the paper's table 2: brake with the first
+target until |a| first falls below its maximum, then take the slip at that maximum. `PeakRobust` is the latch for a noisy
+accelerometer.
+
+The maximum lies between samples. The latch takes the vertex of the parabola through the last three decelerations, for the
+slip and for the moment, and hands the time since that moment to the loop. Without this, values would depend on the step and
+derivatives would be wrong by O(1) at every step size.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from diffabs.numerics import clamp, interpolate, parabola, ratio
+from diffabs.protocols import BrakeOutput, Clock, Jump, Memory, no_flow
+from diffabs.pytree import Scalar, param, pytree
+
+
+class PeakMemory(NamedTuple):
+    """1 once latched; greatest deceleration [m/s^2] and the slip [1] there; target [1]; the last two samples."""
+
+    latched: Scalar
+    greatest: Scalar
+    slip: Scalar
+    target: Scalar
+    deceleration: tuple[Scalar, Scalar]
+    slips: tuple[Scalar, Scalar]
+
+
+def _fresh(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMemory:
+    zero = 0.0 * deceleration
+    return PeakMemory(zero, deceleration, slip, target + zero, (deceleration,) * 2, (slip,) * 2)
+
+
+@pytree
+class PeakLiteral:
+    """The estimator as printed: whenever |a| exceeds its maximum, target := slip. It does not brake; kept as evidence."""
+
+    slip: Scalar = param(0.2, unit="1", above=0.0, high=1.0)
+
+    flow = no_flow
+
+    def start(self, signal: BrakeOutput) -> Memory:
+        """Maximum so far: the first sample."""
+        return Memory(held=_fresh(self.slip, signal.deceleration, signal.slip))
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
+        """Target slip [1]."""
+        del t, signal
+        return memory.held.target
+
+    def setpoint(self, memory: Memory) -> Scalar:
+        """The target as known now."""
+        return memory.held.target
+
+    def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
+        """Follow the slip while the deceleration rises."""
+        del clock
+        m: PeakMemory = memory.held
+        exceeds = signal.deceleration > m.greatest
+        greatest = jnp.where(exceeds, signal.deceleration, m.greatest)
+        target = jnp.where(exceeds, signal.slip, m.target)
+        return Jump(Memory(held=m._replace(greatest=greatest, target=target)))
+
+
+@pytree
+class PeakLatch:
+    """target = slip until |a| first falls, then the slip at its maximum; a later greater |a| moves the target there.
+
+    For an exact accelerometer: noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip.
+    """
+
+    slip: Scalar = param(0.2, unit="1", above=0.0, high=1.0)
+
+    flow = no_flow
+    start = PeakLiteral.start
+    output = PeakLiteral.output
+    setpoint = PeakLiteral.setpoint
+
+    def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
+        """Latch at the first fall."""
+        m: PeakMemory = memory.held
+        a, s = signal.deceleration, signal.slip
+        latch = (m.latched < 0.5) & (a < m.deceleration[0])
+        exceeds = (m.latched > 0.5) & (a > m.greatest)
+        place, greatest, slip = _vertex(m, a, s)
+        new = PeakMemory(
+            latched=jnp.where(latch, 1.0, m.latched),
+            greatest=jnp.where(latch, greatest, jnp.where(exceeds, a, m.greatest)),
+            slip=m.slip,
+            target=jnp.where(latch, slip, jnp.where(exceeds, s, m.target)),
+            deceleration=(a, m.deceleration[0]),
+            slips=(s, m.slips[0]),
+        )
+        return Jump(Memory(held=new), jnp.where(latch, (1 - place) * clock.h, 0.0))
+
+
+class FilterMemory(NamedTuple):
+    """Low-passed deceleration [m/s^2] and slip [1]."""
+
+    deceleration: Scalar
+    slip: Scalar
+
+
+@pytree
+class PeakRobust:
+    """The latch for noisy sensors: deceleration and slip pass the same low-pass (so their delays cancel), nothing happens
+    below `arming`, and the fall must exceed the fraction `threshold` of the maximum."""
+
+    slip: Scalar = param(0.2, unit="1", above=0.0, high=1.0)
+    time_constant: Scalar = param(0.01, unit="s", above=0.0)
+    threshold: Scalar = param(0.03, unit="1", above=0.0, below=1.0)
+    arming: Scalar = param(3.0, unit="m/s^2", low=0.0, tunable=False)
+
+    output = PeakLiteral.output
+    setpoint = PeakLiteral.setpoint
+
+    def start(self, signal: BrakeOutput) -> Memory:
+        """Filters at the first sample."""
+        flow = FilterMemory(signal.deceleration, signal.slip)
+        return Memory(flow, _fresh(self.slip, *flow))
+
+    def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> FilterMemory:
+        """First-order low-pass of both signals."""
+        del t
+        a, s = memory.flow
+        return FilterMemory((signal.deceleration - a) / self.time_constant, (signal.slip - s) / self.time_constant)
+
+    def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
+        """Keep the maximum, latch at the threshold below it."""
+        m: PeakMemory = memory.held
+        a, s = memory.flow
+        _, top, slip_at_top = _vertex(m, a, s)
+        turned = (a < m.deceleration[0]) & (m.deceleration[0] >= m.deceleration[1]) & (top > m.greatest)
+        higher = a > m.greatest
+        greatest = jnp.where(turned, top, jnp.where(higher, a, m.greatest))
+        slip = jnp.where(turned, slip_at_top, jnp.where(higher, s, m.slip))
+        level = (1 - self.threshold) * greatest
+        latch = (m.latched < 0.5) & (greatest > self.arming) & (a < level)
+        late = clamp(ratio(level - a, m.deceleration[0] - a), 0.0, 1.0)
+        moved = latch | ((m.latched > 0.5) & (turned | higher))
+        new = PeakMemory(
+            latched=jnp.where(latch, 1.0, m.latched),
+            greatest=greatest,
+            slip=slip,
+            target=jnp.where(moved, slip, m.target),
+            deceleration=(a, m.deceleration[0]),
+            slips=(s, m.slips[0]),
+        )
+        return Jump(Memory(memory.flow, new), jnp.where(latch, late * clock.h, 0.0))
+
+
+def _vertex(m: PeakMemory, deceleration: Scalar, slip: Scalar) -> tuple[Any, Any, Any]:
+    """Place of the last maximum (steps from the middle one of the last three samples), deceleration and slip there."""
+    place, greatest = parabola(m.deceleration[1], m.deceleration[0], deceleration)
+    return place, greatest, interpolate(m.slips[1], m.slips[0], slip, place)

@@ -1,0 +1,57 @@
+"""Slip references that know their target: fixed, and first-order filtered."""
+
+from diffabs.protocols import BrakeOutput, Memory, no_flow, no_jump, no_memory
+from diffabs.pytree import Scalar, param, pytree
+
+
+@pytree
+class FixedSlip:
+    """target = slip."""
+
+    slip: Scalar = param(0.2, unit="1", above=0.0, high=1.0)
+
+    start = no_memory
+    flow = no_flow
+    jump = no_jump
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
+        """Target slip [1]."""
+        del t, memory, signal
+        return self.slip
+
+    def setpoint(self, memory: Memory) -> Scalar:
+        """The same."""
+        del memory
+        return self.slip
+
+
+@pytree
+class FilteredSlip:
+    """time_constant target' = slip - target, from the measured slip at the start.
+
+    From rest this is slip (1 - exp(-t/T)): a step that the loop can follow without overshoot.
+    """
+
+    slip: Scalar = param(0.2, unit="1", above=0.0, high=1.0)
+    time_constant: Scalar = param(0.035, unit="s", above=0.0)
+
+    jump = no_jump
+
+    def start(self, signal: BrakeOutput) -> Memory:
+        """The measured slip."""
+        return Memory(flow=signal.slip)
+
+    def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
+        """target'."""
+        del t, signal
+        return (self.slip - memory.flow) / self.time_constant
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
+        """Target slip [1]."""
+        del t, signal
+        return memory.flow
+
+    def setpoint(self, memory: Memory) -> Scalar:
+        """Where the filter settles."""
+        del memory
+        return self.slip

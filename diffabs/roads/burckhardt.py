@@ -1,0 +1,42 @@
+"""Burckhardt's friction curve.
+
+    mu(s, v) = (c1 (1 - exp(-c2 s)) - c3 s) exp(-c4 s v)        for s >= 0, odd in s
+
+M. Burckhardt, Fahrwerktechnik: Radschlupf-Regelsysteme, Vogel 1993; coefficients as tabulated by Kiencke and Nielsen,
+Automotive Control Systems, Springer 2005, ch. 8. They give c1..c3 for each surface and 0.02 to 0.04 s/m as the range of c4
+on all of them; the named roads carry c4 = 0.03 s/m, the middle of it. Set c4 = 0 for the curve at walking speed, which is
+the one usually plotted.
+"""
+
+import jax.numpy as jnp
+
+from diffabs.numerics import odd
+from diffabs.pytree import Scalar, param, pytree
+
+
+@pytree
+class Burckhardt:
+    """mu(s, v) = (c1 (1 - exp(-c2 s)) - c3 s) exp(-c4 s v); the defaults are dry asphalt."""
+
+    c1: Scalar = param(1.2801, unit="1", low=0.0)
+    c2: Scalar = param(23.99, unit="1", above=0.0)
+    c3: Scalar = param(0.52, unit="1", low=0.0)
+    c4: Scalar = param(0.03, unit="s/m", low=0.0)
+
+    def friction(self, slip: Scalar, speed: Scalar, distance: Scalar = 0.0) -> Scalar:
+        """mu [1] at a slip [1] and a vehicle speed [m/s]."""
+        del distance
+
+        def curve(s: Scalar) -> Scalar:
+            return (-self.c1 * jnp.expm1(-self.c2 * s) - self.c3 * s) * jnp.exp(-self.c4 * s * speed)
+
+        return odd(curve, slip)
+
+
+DRY_ASPHALT = Burckhardt()
+WET_ASPHALT = Burckhardt(c1=0.857, c2=33.822, c3=0.347)
+DRY_CONCRETE = Burckhardt(c1=1.1973, c2=25.168, c3=0.5373)
+DRY_COBBLESTONE = Burckhardt(c1=1.3713, c2=6.4565, c3=0.6691)
+WET_COBBLESTONE = Burckhardt(c1=0.4004, c2=33.7080, c3=0.1204)
+SNOW = Burckhardt(c1=0.1946, c2=94.129, c3=0.0646)
+ICE = Burckhardt(c1=0.05, c2=306.39, c3=0.0)

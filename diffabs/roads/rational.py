@@ -1,0 +1,45 @@
+"""Friction curve of the laboratory rig.
+
+    mu(s) = w4 s^q / (a + s^q) + w3 s^3 + w2 s^2 + w1 s        for s >= 0, odd in s
+
+Maeda and Sugiura, eq. (13), after INTECO, The Laboratory Anti-lock Braking System, user's manual. The paper's "0.2 is the
+slip of greatest friction" is not true of this curve: its local peak lies at slip 0.18754 and a locked wheel (slip 1) has
+more friction than either. The printed equation is undefined for s < 0; the odd extension is ours.
+"""
+
+from typing import Any
+
+from diffabs.numerics import odd, power
+from diffabs.pytree import Scalar, param, pytree
+
+
+@pytree
+class RationalCurve:
+    """mu(s) = w4 s^q/(a + s^q) + w3 s^3 + w2 s^2 + w1 s, with the coefficients rounded as in eq. (13)."""
+
+    w1: Scalar = param(-4.24e-2, unit="1")
+    w2: Scalar = param(2.94e-10, unit="1")
+    w3: Scalar = param(3.51e-2, unit="1")
+    w4: Scalar = param(0.407, unit="1", low=0.0)
+    a: Scalar = param(2.57e-4, unit="1", above=0.0)
+    q: Scalar = param(2.10, unit="1", above=1.0)
+
+    def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
+        """mu [1]; does not depend on speed or distance."""
+        del speed, distance
+        return odd(self._curve, slip)
+
+    def _curve(self, s: Any) -> Any:
+        p = power(s, self.q)
+        return self.w4 * p / (self.a + p) + s * (self.w1 + s * (self.w2 + s * self.w3))
+
+
+RIG = RationalCurve()
+RIG_UNROUNDED = RationalCurve(
+    w1=-0.04240011450454,
+    w2=2.9375e-10,
+    w3=0.03508217905067,
+    w4=0.40662691102315,
+    a=0.00025724985785,
+    q=2.09945271667129,
+)

@@ -1,0 +1,62 @@
+"""How slip is really measured: from the wheel's speed, and from a vehicle speed that nobody measures directly."""
+
+import jax.numpy as jnp
+
+from diffabs.protocols import BrakeOutput, Memory, no_jump
+from diffabs.pytree import Scalar, param, pytree
+
+
+@pytree
+class WheelSpeed:
+    """A wheel-speed sensor with a first-order filter, w' = (true - w)/T; the slip is computed from it as (v - w)/v."""
+
+    time_constant: Scalar = param(0.002, unit="s", above=0.0)
+    floor: Scalar = param(0.05, unit="m/s", above=0.0)
+
+    jump = no_jump
+
+    def start(self, signal: BrakeOutput) -> Memory:
+        """The filter at the true speed."""
+        return Memory(flow=signal.wheel_speed)
+
+    def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
+        """w'."""
+        del t
+        return (signal.wheel_speed - memory.flow) / self.time_constant
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
+        """Filtered wheel speed, and the slip computed with it."""
+        del t
+        slip = (signal.speed - memory.flow) / jnp.maximum(signal.speed, self.floor)
+        return signal._replace(slip=slip, wheel_speed=memory.flow)
+
+
+@pytree
+class IntegratedAccelerometer:
+    """Vehicle speed as the integral of an accelerometer, v' = -deceleration + bias, and the slip computed with it.
+
+    Aoki and Nakamura, sec. 4: "obtained by integrating the acceleration sensors". The bias is that of the signed forward
+    acceleration: a positive one makes the vehicle seem too fast, the slip too large, and releases the brake. The `floor` on
+    the speed in the slip's denominator limits what this does near standstill.
+    """
+
+    bias: Scalar = param(0.0, unit="m/s^2")
+    floor: Scalar = param(0.05, unit="m/s", above=0.0)
+
+    jump = no_jump
+
+    def start(self, signal: BrakeOutput) -> Memory:
+        """The speed at which braking starts is known: the wheel still rolls."""
+        return Memory(flow=signal.speed)
+
+    def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
+        """v'."""
+        del t, memory
+        return self.bias - signal.deceleration
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
+        """Estimated speed, biased deceleration, slip."""
+        del t
+        v = memory.flow
+        slip = (v - signal.wheel_speed) / jnp.maximum(v, self.floor)
+        return signal._replace(slip=slip, speed=v, deceleration=signal.deceleration - self.bias)

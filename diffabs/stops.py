@@ -1,0 +1,59 @@
+"""When a braking run ends, and what is left after its last sample."""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from diffabs.protocols import BrakeOutput
+from diffabs.pytree import Scalar, param, pytree
+
+LEAST_DECELERATION = 1e-3  # m/s^2, so that a car that only rolls gets a finite, very long, stopping distance
+
+
+@pytree
+class SpeedReached:
+    """The run ends at this speed. If it is not reached in time, the rest is braked at the last deceleration."""
+
+    speed: Scalar = param(5 / 3.6, unit="m/s", above=0.0)
+
+    def margin(self, output: BrakeOutput) -> Scalar:
+        """Speed above the end [m/s]."""
+        return output.speed - self.speed
+
+    def rate(self, output: BrakeOutput) -> Scalar:
+        """d(margin)/dt."""
+        return -output.deceleration
+
+    def remainder(self, output: BrakeOutput, stopped: Any) -> tuple[Scalar, Scalar]:
+        """Nothing after a stop; else (v - v_end)/a and (v^2 - v_end^2)/(2 a)."""
+        time, distance = _braked(output, self.speed)
+        return jnp.where(stopped, 0.0, time), jnp.where(stopped, 0.0, distance)
+
+
+@pytree
+class Standstill:
+    """The run is integrated to a small speed and braked from there to rest at the last deceleration: v/a, v^2/(2 a).
+
+    Slip is stiff near standstill (its rate goes with 1/v), so the last centimetres are not integrated. The result does not
+    depend on the speed between 0.01 and 1 m/s.
+    """
+
+    speed: Scalar = param(0.05, unit="m/s", above=0.0)
+
+    def margin(self, output: BrakeOutput) -> Scalar:
+        """Speed above the end of integration [m/s]."""
+        return output.speed - self.speed
+
+    def rate(self, output: BrakeOutput) -> Scalar:
+        """d(margin)/dt."""
+        return -output.deceleration
+
+    def remainder(self, output: BrakeOutput, stopped: Any) -> tuple[Scalar, Scalar]:
+        """v/a and v^2/(2 a)."""
+        del stopped
+        return _braked(output, 0.0)
+
+
+def _braked(output: BrakeOutput, end: Scalar) -> tuple[Any, Any]:
+    a = jnp.maximum(output.deceleration, LEAST_DECELERATION)
+    return (output.speed - end) / a, (output.speed**2 - end**2) / (2 * a)
