@@ -1,0 +1,12 @@
+"""Simulate, differentiate, tune and certify controllers for braking wheels."""
+
+from diffabs.loop import Loop as Loop
+from diffabs.plants import BrakeStart as BrakeStart
+from diffabs.pytree import check as check
+from diffabs.pytree import replace as replace
+from diffabs.rollout import FixedStep as FixedStep
+from diffabs.rollout import Run as Run
+from diffabs.rollout import measure as measure
+from diffabs.rollout import rollout as rollout
+
+__version__ = "0.1.0"

@@ -26,7 +26,7 @@ class Direct:
 class Series:
     """Blocks one after the other, the first nearest to the input. Events inside a series are not localised."""
 
-    blocks: tuple[Block, ...] = part((Direct(),))
+    blocks: tuple[Block, ...] = part(default=(Direct(),))
 
     def start(self, signal: Any) -> Memory:
         """The memories, each started on what the blocks before it put out."""

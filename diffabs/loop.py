@@ -69,14 +69,14 @@ class Event(NamedTuple):
 class Loop:
     """Plant and controller with what is around them."""
 
-    plant: Plant = part(QuarterCar)
-    initial: Any = part(BrakeStart)
-    sensor: Block = part(Direct)
-    reference: Reference = part(FixedSlip)
-    feedforward: Feedforward = part(NoFeedforward)
-    controller: Block = part(PID)
-    actuator: Block = part(Direct)
-    stop: Stop = part(Standstill)
+    plant: Plant = part(default=QuarterCar)
+    initial: Any = part(default=BrakeStart)
+    sensor: Block = part(default=Direct)
+    reference: Reference = part(default=FixedSlip)
+    feedforward: Feedforward = part(default=NoFeedforward)
+    controller: Block = part(default=PID)
+    actuator: Block = part(default=Direct)
+    stop: Stop = part(default=Standstill)
 
     def start(self) -> LoopState:
         """State at t = 0, before the first jump."""
@@ -102,9 +102,9 @@ class Loop:
             Sample(t, y, tracking.target, setpoint, tracking.feedforward, command, control), measured, tracking
         )
 
-    def flow(self, t: Scalar, state: LoopState) -> tuple[Any, ...]:
-        """d(state.flow())/dt."""
-        sample, measured, tracking = self.signals(t, state)
+    def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[Any, ...]:
+        """d(state.flow())/dt, from the signals at (t, state)."""
+        sample, measured, tracking = signals
         return (
             self.plant.derivative(t, state.plant, sample.control),
             self.sensor.flow(t, state.sensor, sample.output),
@@ -115,13 +115,22 @@ class Loop:
 
     def jump(self, clock: Clock, state: LoopState) -> tuple[LoopState, list[Event]]:
         """The blocks' jumps in the order of the signal, and those that are localised events."""
-        events = []
-        for name in BLOCKS:
-            jumped = getattr(self, name).jump(clock, getattr(state, name), self._input(name, clock.t, state))
-            after = state._replace(**{name: jumped.memory})
-            if jumped.elapsed is not None:
-                events.append(Event(state, after, jumped.elapsed))
+        t, events = clock.t, []
+
+        def jumped(name: str, signal: Any) -> Memory:
+            nonlocal state
+            memory, elapsed = getattr(self, name).jump(clock, getattr(state, name), signal)
+            after = state._replace(**{name: memory})
+            if elapsed is not None:
+                events.append(Event(state, after, elapsed))
             state = after
+            return memory
+
+        y = self.plant.output(state.plant)
+        measured = self.sensor.output(t, jumped("sensor", y), y)
+        tracking = self._tracking(t, jumped("reference", measured), measured)
+        command = self.controller.output(t, jumped("controller", tracking), tracking)
+        jumped("actuator", command)
         return state, events
 
     def grid_problems(self, step: float) -> Iterator[str]:
@@ -130,15 +139,6 @@ class Loop:
             block = getattr(self, name)
             if hasattr(block, "grid_problems"):
                 yield from (f"{name}.{line}" for line in block.grid_problems(step))
-
-    def _input(self, name: str, t: Scalar, state: LoopState) -> Any:
-        signals = self.signals(t, state)
-        return {
-            "sensor": signals.sample.output,
-            "reference": signals.measured,
-            "controller": signals.tracking,
-            "actuator": signals.sample.command,
-        }[name]
 
     def _tracking(self, t: Scalar, reference: Memory, measured: BrakeOutput) -> Tracking:
         target = self.reference.output(t, reference, measured)

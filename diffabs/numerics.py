@@ -39,8 +39,8 @@ def sign(x: Scalar) -> Any:
 
 
 def parabola(left: Scalar, middle: Scalar, right: Scalar) -> tuple[Any, Any]:
-    """Place (in steps from the middle, within [-1, 1]) and value of the extremum of the parabola through three equally spaced
-    values; the middle where the three lie on a line."""
+    """Place (in steps from the middle, within [-1, 1]) and value of the extremum of the parabola through three equally
+    spaced values; the middle where the three lie on a line."""
     place = clamp(ratio(0.5 * (left - right), left - 2 * middle + right), -1.0, 1.0)
     return place, interpolate(left, middle, right, place)
 

@@ -56,8 +56,8 @@ class Spec:
 
 
 def param(
-    default: Any = dataclasses.MISSING,
     *,
+    default: Any = dataclasses.MISSING,
     unit: str,
     low: float = -math.inf,
     high: float = math.inf,
@@ -82,7 +82,7 @@ def param(
     return dataclasses.field(default=default, metadata={"spec": spec})
 
 
-def part(default: Any = dataclasses.MISSING) -> Any:
+def part(*, default: Any = dataclasses.MISSING) -> Any:
     """A field that holds another part, or a tuple of parts. `default` is a part or a class to call."""
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata={"part": True})
@@ -90,12 +90,14 @@ def part(default: Any = dataclasses.MISSING) -> Any:
     return dataclasses.field(default_factory=make, metadata={"part": True})
 
 
-def static(default: Any = dataclasses.MISSING) -> Any:
+def static(*, default: Any = dataclasses.MISSING) -> Any:
     """A field known at trace time: changing it compiles again."""
     return dataclasses.field(default=default, metadata={"static": True})
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True, eq_default=False, field_specifiers=(param, part, static))
+@dataclass_transform(
+    frozen_default=True, kw_only_default=True, eq_default=False, field_specifiers=(param, part, static)
+)
 def pytree(cls: type[T]) -> type[T]:
     """Make a class a part. Raises TypeError for `__post_init__`, which JAX would call with tracers and None."""
     if "__post_init__" in cls.__dict__:
@@ -197,6 +199,20 @@ def strong(tree: T) -> T:
 
     Python numbers are weakly typed: mixed with arrays they would cause a second compilation of the same function.
     """
-    arrays = [x.dtype for x in jax.tree.leaves(tree) if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)]
+    arrays = [
+        x.dtype for x in jax.tree.leaves(tree) if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)
+    ]
     dtype = jnp.result_type(*arrays) if arrays else jnp.result_type(float)
     return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)
+
+
+def prepared(part: Any) -> Any:
+    """The same parts, with everything worked out that does not change during a run: a part that has a method
+    `prepared()` is replaced by what it returns. Differentiable; a run does it once, inside its compiled function."""
+    if isinstance(part, tuple):
+        return tuple(prepared(item) for item in part)
+    if not dataclasses.is_dataclass(part):
+        return part
+    inner = {f.name: prepared(getattr(part, f.name)) for f in dataclasses.fields(part) if "part" in f.metadata}
+    part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
+    return part.prepared() if hasattr(part, "prepared") else part

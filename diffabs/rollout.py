@@ -3,9 +3,9 @@
     each step:   jump at t_k;  z += elapsed (f_after - f_before) for each localised event;  RK4 over [t_k, t_k + h];
                  the plant's projection;  the objectives' update
 
-A run that crosses its stop is frozen at the instant before; after the scan, one last step lands on the crossing. Stopping
-time, distance and every objective are thus exact to the order of the method and differentiable, wherever the crossing falls.
-"""
+A run that crosses its stop is frozen at the instant before; after the scan, one last step lands on the crossing.
+Stopping time, distance and every objective are thus exact to the order of the method and differentiable, wherever the
+crossing falls."""
 
 import dataclasses
 import math
@@ -20,7 +20,7 @@ from diffabs.integrate import axpy, rk4_step
 from diffabs.loop import Loop, LoopState
 from diffabs.numerics import clamp
 from diffabs.protocols import BrakeOutput, Clock, Ending, Memory, Objective, Sample
-from diffabs.pytree import strong
+from diffabs.pytree import prepared, strong
 
 LANDINGS = 5  # Newton iterations for the last step; quadratic from an error below one step
 
@@ -101,6 +101,7 @@ class _Carry(NamedTuple):
 def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, steps: int, every: int) -> Run:
     keep = every > 0
     segment = every if keep else max(1, math.isqrt(steps))
+    loop = prepared(loop)
     start = loop.start()
     first = loop.signals(0.0 * h, start)
     tally = {name: objective.start(first.sample) for name, objective in objectives.items()}
@@ -114,7 +115,7 @@ def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, step
     def advance(carry: _Carry) -> _Carry:
         return jax.lax.scan(lambda c, _: (body(c), None), carry, length=segment)[0]
 
-    def block(carry: _Carry, _: None) -> tuple[_Carry, Any]:
+    def block(carry: _Carry, _: Any) -> tuple[_Carry, Any]:
         carry = jax.lax.cond(carry.running, advance, lambda c: c, carry)
         return carry, _seen(loop, carry.k * h, carry.state, carry.running) if keep else None
 
@@ -131,9 +132,7 @@ def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, step
     return Run(metrics, carry.stopped, carry.diverged, ending, trajectory)
 
 
-def _step(
-    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: int, carry: _Carry
-) -> _Carry:
+def _step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: int, carry: _Carry) -> _Carry:
     """One step, or nothing if the run has ended."""
     state, tally = _advance(loop, objectives, h, key, carry, h)
     y = loop.plant.output(state.plant)
@@ -160,9 +159,9 @@ def _advance(
     def flow(t: Any, z: Any, state: LoopState = state) -> Any:
         loop_flow, tally_flow = z
         state = state.with_flow(loop_flow)
-        sample = loop.signals(t, state).sample
-        rates = {name: o.flow(Memory(tally_flow[name], held[name]), sample) for name, o in objectives.items()}
-        return loop.flow(t, state), rates
+        signals = loop.signals(t, state)
+        rates = {name: o.flow(Memory(tally_flow[name], held[name]), signals.sample) for name, o in objectives.items()}
+        return loop.flow(t, state, signals), rates
 
     tally_flow = {name: memory.flow for name, memory in carry.tally.items()}
     z = (state.flow(), tally_flow)
@@ -187,18 +186,16 @@ def _land(
     """For a run that stopped, the partial step that ends on the crossing; the time of the end."""
     stop = loop.stop
 
-    def output(length: Any) -> BrakeOutput:
-        return loop.plant.output(_advance(loop, {}, h, key, carry._replace(tally={}), length)[0].plant)
-
-    def newton(length: Any, y: BrakeOutput) -> Any:
+    def newton(length: Any, _: Any) -> tuple[Any, None]:
+        """One iteration. Only the last one is differentiated: its slope is the implicit function theorem's."""
+        length = jax.lax.stop_gradient(length)
+        state, _ = _advance(loop, {}, h, key, carry._replace(tally={}), length)
+        y = loop.plant.output(state.plant)
         slope = jax.lax.stop_gradient(stop.rate(y))
         slope = jnp.where(slope < 0, slope, -jnp.inf)
-        return clamp(length - stop.margin(y) / slope, 0.0, h)
+        return clamp(length - stop.margin(y) / slope, 0.0, h), None
 
-    length = newton(0.0 * h, loop.plant.output(carry.state.plant))
-    length, _ = jax.lax.scan(lambda s, _: (newton(s, output(s)), None), length, length=LANDINGS - 1)
-    length = jax.lax.stop_gradient(length)
-    length = newton(length, output(length))  # the derivative of this one is the implicit function theorem's
+    length, _ = jax.lax.scan(newton, 0.0 * h, length=LANDINGS)
     length = jnp.where(carry.stopped, length, 0.5 * h)  # not used, but a point where all derivatives exist
     state, tally = _advance(loop, objectives, h, key, carry, length)
     chosen = jax.tree.map(lambda a, b: jnp.where(carry.stopped, a, b), (state, tally), (carry.state, carry.tally))
@@ -233,4 +230,3 @@ def _typed(tree: Any, dtype: Any) -> Any:
         return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(x.dtype)
 
     return jax.tree.map(typed, tree)
-

@@ -14,7 +14,7 @@ LEAST_DECELERATION = 1e-3  # m/s^2, so that a car that only rolls gets a finite,
 class SpeedReached:
     """The run ends at this speed. If it is not reached in time, the rest is braked at the last deceleration."""
 
-    speed: Scalar = param(5 / 3.6, unit="m/s", above=0.0)
+    speed: Scalar = param(default=5 / 3.6, unit="m/s", above=0.0)
 
     def margin(self, output: BrakeOutput) -> Scalar:
         """Speed above the end [m/s]."""
@@ -34,11 +34,10 @@ class SpeedReached:
 class Standstill:
     """The run is integrated to a small speed and braked from there to rest at the last deceleration: v/a, v^2/(2 a).
 
-    Slip is stiff near standstill (its rate goes with 1/v), so the last centimetres are not integrated. The result does not
-    depend on the speed between 0.01 and 1 m/s.
-    """
+    Slip is stiff near standstill (its rate goes with 1/v), so the last centimetres are not integrated. The result does
+    not depend on the speed between 0.01 and 1 m/s."""
 
-    speed: Scalar = param(0.05, unit="m/s", above=0.0)
+    speed: Scalar = param(default=0.05, unit="m/s", above=0.0)
 
     def margin(self, output: BrakeOutput) -> Scalar:
         """Speed above the end of integration [m/s]."""

@@ -11,8 +11,8 @@ from diffabs.pytree import Scalar, param, pytree
 class Limits:
     """control = clamp(command, low, high)."""
 
-    low: Scalar = param(0.0, unit="N m")
-    high: Scalar = param(90.0, unit="N m")
+    low: Scalar = param(default=0.0, unit="N m")
+    high: Scalar = param(default=90.0, unit="N m")
 
     start = no_memory
     flow = no_flow
@@ -33,7 +33,7 @@ class Limits:
 class Lag:
     """time_constant control' = command - control, control(0) = 0: a brake that has to build up pressure."""
 
-    time_constant: Scalar = param(0.01, unit="s", above=0.0)
+    time_constant: Scalar = param(default=0.01, unit="s", above=0.0)
 
     jump = no_jump
 
@@ -59,8 +59,8 @@ class RateLimit:
     A servo whose speed saturates; the ideal rate limiter is the limit of a small time constant.
     """
 
-    rate: Scalar = param(1000.0, unit="N m/s", above=0.0)
-    time_constant: Scalar = param(0.002, unit="s", above=0.0)
+    rate: Scalar = param(default=1000.0, unit="N m/s", above=0.0)
+    time_constant: Scalar = param(default=0.002, unit="s", above=0.0)
 
     start = Lag.start
     output = Lag.output

@@ -1,9 +1,8 @@
 """Pure delay: control(t) = command(t - time), and 0 before the first command has come through.
 
-The command is kept at the instants of the integration grid and joined by straight lines; each step uses the exact mean of
-the delayed command over the step. That is second order in the step, exact in the impulse of the first command, and
-differentiable in the delay.
-"""
+The command is kept at the instants of the integration grid and joined by straight lines; each step uses the exact mean
+of the delayed command over the step. That is second order in the step, exact in the impulse of the first command, and
+differentiable in the delay."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -24,11 +23,11 @@ class DelayMemory(NamedTuple):
 
 @pytree
 class Delay:
-    """control(t) = command(t - time). `capacity` is how many steps the ring holds; the delay is at least one step and at
-    most capacity - 2 of them."""
+    """control(t) = command(t - time). `capacity` is how many steps the ring holds; the delay is at least one step and
+    at most capacity - 2 of them."""
 
-    time: Scalar = param(0.01, unit="s", above=0.0)
-    capacity: int = static(1024)
+    time: Scalar = param(default=0.01, unit="s", above=0.0)
+    capacity: int = static(default=1024)
 
     flow = no_flow
 

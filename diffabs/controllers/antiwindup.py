@@ -36,7 +36,7 @@ class BackCalculation:
     Astrom and Hagglund, PID Controllers, 2nd ed., sec. 3.5.
     """
 
-    tracking_time: Scalar = param(0.05, unit="s", above=0.0)
+    tracking_time: Scalar = param(default=0.05, unit="s", above=0.0)
 
     def rate(self, error: Scalar, gain: Scalar, raw: Scalar, limited: Scalar) -> Scalar:
         """I'; with gain 0 there is nothing to drain."""

@@ -21,10 +21,10 @@ from diffabs.pytree import Scalar, Vector, param, part, pytree
 class StateFeedback:
     """u = clamp(ff + k1 x1 + k2 x2, torque_min, torque_max); the default gain is the paper's, from its section 4."""
 
-    gain: Vector = param((-11753.0, -48.0), unit="N m/s, N m")
-    torque_min: Scalar = param(-np.inf, unit="N m", infinite=True)
-    torque_max: Scalar = param(np.inf, unit="N m", infinite=True)
-    antiwindup: Any = part(NoAntiWindup)
+    gain: Vector = param(default=(-11753.0, -48.0), unit="N m/s, N m")
+    torque_min: Scalar = param(default=-np.inf, unit="N m", infinite=True)
+    torque_max: Scalar = param(default=np.inf, unit="N m", infinite=True)
+    antiwindup: Any = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:
         """x1(0) = 0."""

@@ -20,7 +20,7 @@ class NoFeedforward:
 class ConstantInput:
     """A number: what a controller does that knows neither mass nor road."""
 
-    value: Scalar = param(0.0, unit="N m")
+    value: Scalar = param(default=0.0, unit="N m")
 
     def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
         """The number [N m]."""

@@ -25,13 +25,13 @@ class PIDMemory(NamedTuple):
 class PID:
     """u = clamp(ff + kp e + kI I + kD wc (e - d), torque_min, torque_max)."""
 
-    kp: Scalar = param(3893.0, unit="N m", low=0.0)
-    ki: Scalar = param(0.0, unit="N m/s", low=0.0)
-    kd: Scalar = param(0.0, unit="N m s", low=0.0)
-    cutoff: Scalar = param(55.0, unit="rad/s", above=0.0)
-    torque_min: Scalar = param(0.0, unit="N m", infinite=True)
-    torque_max: Scalar = param(90.0, unit="N m", infinite=True)
-    antiwindup: Any = part(NoAntiWindup)
+    kp: Scalar = param(default=3893.0, unit="N m", low=0.0)
+    ki: Scalar = param(default=0.0, unit="N m/s", low=0.0)
+    kd: Scalar = param(default=0.0, unit="N m s", low=0.0)
+    cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
+    torque_min: Scalar = param(default=0.0, unit="N m", infinite=True)
+    torque_max: Scalar = param(default=90.0, unit="N m", infinite=True)
+    antiwindup: Any = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:
         """Integral and filter at zero."""

@@ -2,10 +2,9 @@
 
     u(t) = u_k for t_k + delay <= t < t_(k+1) + delay,   t_k = k period,   I_(k+1) = I_k + period I'(t_k)
 
-The continuous memory of the inner controller is advanced by forward Euler at the sampling period, as such code is usually
-written. When the output changes inside an integration step, the step uses its mean: the impulse is exact, and the run is
-differentiable in the delay.
-"""
+The continuous memory of the inner controller is advanced by forward Euler at the sampling period, as such code is
+usually written. When the output changes inside an integration step, the step uses its mean: the impulse is exact, and
+the run is differentiable in the delay."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -35,9 +34,9 @@ class SampledMemory(NamedTuple):
 class Sampled:
     """`controller` evaluated every `period`, its output applied `delay` later. The period is a multiple of the step."""
 
-    controller: Block = part(PID)
-    period: Scalar = param(1e-3, unit="s", above=0.0, tunable=False)
-    delay: Scalar = param(0.0, unit="s", low=0.0)
+    controller: Block = part(default=PID)
+    period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+    delay: Scalar = param(default=0.0, unit="s", low=0.0)
 
     flow = no_flow
 

@@ -13,7 +13,7 @@ from diffabs.pytree import Scalar, param, pytree
 class ConstantTorque:
     """u = torque: a driver who stands on the brake, no anti-lock control."""
 
-    torque: Scalar = param(90.0, unit="N m")
+    torque: Scalar = param(default=90.0, unit="N m")
 
     start = no_memory
     flow = no_flow
@@ -40,9 +40,9 @@ class Relay:
     interpolation, so that a run does not depend on the grid and is differentiable.
     """
 
-    band: Scalar = param(0.02, unit="1", above=0.0, below=1.0)
-    torque_min: Scalar = param(0.0, unit="N m")
-    torque_max: Scalar = param(90.0, unit="N m")
+    band: Scalar = param(default=0.02, unit="1", above=0.0, below=1.0)
+    torque_min: Scalar = param(default=0.0, unit="N m")
+    torque_max: Scalar = param(default=90.0, unit="N m")
 
     flow = no_flow
 
@@ -82,10 +82,10 @@ class SlidingMode:
     First-order sliding mode with a boundary layer. Slotine and Li, Applied Nonlinear Control, sec. 7.2.
     """
 
-    gain: Scalar = param(90.0, unit="N m", low=0.0)
-    boundary: Scalar = param(0.02, unit="1", above=0.0)
-    torque_min: Scalar = param(0.0, unit="N m")
-    torque_max: Scalar = param(90.0, unit="N m")
+    gain: Scalar = param(default=90.0, unit="N m", low=0.0)
+    boundary: Scalar = param(default=0.02, unit="1", above=0.0)
+    torque_min: Scalar = param(default=0.0, unit="N m")
+    torque_max: Scalar = param(default=90.0, unit="N m")
 
     start = no_memory
     flow = no_flow

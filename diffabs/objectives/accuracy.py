@@ -1,7 +1,7 @@
 """How well a run follows its slip: peak, overshoot, settling, integrals of the error.
 
-The error e = slip - setpoint is against where the reference will settle, not against a filtered target on its way there.
-"""
+The error e = slip - setpoint is against where the reference will settle, not against a filtered target on its way
+there."""
 
 from typing import Any, NamedTuple
 
@@ -126,7 +126,7 @@ class SettlingTime:
     The entry is interpolated linearly between samples.
     """
 
-    band: Scalar = param(0.01, unit="1", above=0.0)
+    band: Scalar = param(default=0.01, unit="1", above=0.0)
 
     flow = nothing
 
@@ -174,13 +174,14 @@ class Quadratic(NamedTuple):
 
 @pytree
 class QuadraticCost:
-    """Integral of q1 x1^2 + q2 x2^2 + r (u - ff)^2 dt, x1 = integral of e, x2 = e: eq. (24) of Maeda and Sugiura with eps = 0.
+    """Integral of q1 x1^2 + q2 x2^2 + r (u - ff)^2 dt, x1 = integral of e, x2 = e: eq. (24) of Maeda and Sugiura with
+    eps = 0.
 
     u is the torque that the actuator delivers.
     """
 
-    q: Vector = param((1.0, 1.0), unit="1", low=0.0)
-    r: Scalar = param(1.0, unit="1", above=0.0)
+    q: Vector = param(default=(1.0, 1.0), unit="1", low=0.0)
+    r: Scalar = param(default=1.0, unit="1", above=0.0)
 
     update = unchanged
 

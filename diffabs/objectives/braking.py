@@ -45,7 +45,7 @@ class Locked(NamedTuple):
 class LockedTime:
     """Time [s] during which the slip exceeds `threshold`. Crossings are interpolated linearly inside a step."""
 
-    threshold: Scalar = param(0.99, unit="1", above=0.0, below=1.0)
+    threshold: Scalar = param(default=0.99, unit="1", above=0.0, below=1.0)
 
     flow = nothing
 

@@ -5,14 +5,13 @@
     J2 omega2' = -(Fn r2 mu + d2 omega2 + s2 M20)
     M1' = c31 (b(u) - M1),   b(u) = b1 u + b2 for u >= u0, else 0
 
-The braked upper wheel hangs on a lever of length L and presses on the lower wheel, the "road", at the angle phi: its brake
-torque adds to the normal force. mu is odd in the slip, so the manual's sign s of the slip is inside it. Eq. (1) of Maeda and
-Sugiura with tau_b + tau_1 = Mg + M1 + M10 + d1 omega1. Radii, J1 and the friction curve are confirmed by that paper; the
-other constants are as commonly published and were not verified against the manual.
+The braked upper wheel hangs on a lever of length L and presses on the lower wheel, the "road", at the angle phi: its
+brake torque adds to the normal force. mu is odd in the slip, so the manual's sign s of the slip is inside it. Eq. (1)
+of Maeda and Sugiura with tau_b + tau_1 = Mg + M1 + M10 + d1 omega1. Radii, J1 and the friction curve are confirmed by
+that paper; the other constants are as commonly published and were not verified against the manual.
 
-A stopped wheel sticks: the brake then carries T = r1 mu Mg/(L (sin phi - mu cos phi) - r1 mu), what the road asks for, as
-long as that is below M1 + M10.
-"""
+A stopped wheel sticks: the brake then carries T = r1 mu Mg/(L (sin phi - mu cos phi) - r1 mu), what the road asks for,
+as long as that is below M1 + M10."""
 
 import math
 from typing import Any, NamedTuple
@@ -37,25 +36,26 @@ class LabRigState(NamedTuple):
 
 @pytree
 class LabRig:
-    """Two wheels, a lever, bearing friction, and a brake with a 49 ms lag. The control u in [0, 1] is the brake command."""
+    """Two wheels, a lever, bearing friction, and a brake with a 49 ms lag. The control u in [0, 1] is the brake
+    command."""
 
-    wheel_radius: Scalar = param(0.0995, unit="m", above=0.0)
-    drum_radius: Scalar = param(0.099, unit="m", above=0.0)
-    wheel_inertia: Scalar = param(7.53e-3, unit="kg m^2", above=0.0)
-    drum_inertia: Scalar = param(25.6e-3, unit="kg m^2", above=0.0)
-    wheel_friction: Scalar = param(1.1874e-4, unit="N m s", low=0.0)
-    drum_friction: Scalar = param(2.1468e-4, unit="N m s", low=0.0)
-    wheel_stiction: Scalar = param(0.003, unit="N m", low=0.0)
-    drum_stiction: Scalar = param(0.0925, unit="N m", low=0.0)
-    lever: Scalar = param(0.37, unit="m", above=0.0)
-    lever_angle: Scalar = param(math.radians(65.61), unit="rad", above=0.0, below=math.pi / 2)
-    weight_torque: Scalar = param(19.6181, unit="N m", above=0.0)
-    brake_rate: Scalar = param(20.37, unit="1/s", above=0.0)
-    brake_gain: Scalar = param(15.24, unit="N m", above=0.0)
-    brake_offset: Scalar = param(-6.21, unit="N m")
-    brake_threshold: Scalar = param(0.415, unit="1", low=0.0, high=1.0, tunable=False)
-    crawl_speed: Scalar = param(0.01, unit="m/s", above=0.0)
-    road: Road = part(RIG)
+    wheel_radius: Scalar = param(default=0.0995, unit="m", above=0.0)
+    drum_radius: Scalar = param(default=0.099, unit="m", above=0.0)
+    wheel_inertia: Scalar = param(default=7.53e-3, unit="kg m^2", above=0.0)
+    drum_inertia: Scalar = param(default=25.6e-3, unit="kg m^2", above=0.0)
+    wheel_friction: Scalar = param(default=1.1874e-4, unit="N m s", low=0.0)
+    drum_friction: Scalar = param(default=2.1468e-4, unit="N m s", low=0.0)
+    wheel_stiction: Scalar = param(default=0.003, unit="N m", low=0.0)
+    drum_stiction: Scalar = param(default=0.0925, unit="N m", low=0.0)
+    lever: Scalar = param(default=0.37, unit="m", above=0.0)
+    lever_angle: Scalar = param(default=math.radians(65.61), unit="rad", above=0.0, below=math.pi / 2)
+    weight_torque: Scalar = param(default=19.6181, unit="N m", above=0.0)
+    brake_rate: Scalar = param(default=20.37, unit="1/s", above=0.0)
+    brake_gain: Scalar = param(default=15.24, unit="N m", above=0.0)
+    brake_offset: Scalar = param(default=-6.21, unit="N m")
+    brake_threshold: Scalar = param(default=0.415, unit="1", low=0.0, high=1.0, tunable=False)
+    crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
+    road: Road = part(default=RIG)
 
     def start(self, initial: BrakeStart) -> LabRigState:
         """State for a speed and a slip, brake released."""

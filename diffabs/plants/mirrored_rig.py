@@ -1,11 +1,12 @@
-"""The laboratory rig turned upside down: the upper wheel is the car's body, of mass m, and presses on the lower, braked one.
+"""The laboratory rig turned upside down: the upper wheel is the car's body, of mass m, and presses on the lower, braked
+one.
 
     J1 omega1' = Fn r1 mu(slip) - tau1,   J2 omega2' = -Fn r2 mu(slip),   Fn = m g,   J2 = c m r2^2
     slip = (r2 omega2 - r1 omega1)/(r2 omega2)
 
-Maeda and Sugiura, eqs. (2)-(5), (12). Their eq. (3) takes the body for a disk, c = 1/2, and eq. (9) then decelerates it at
-2 mu g, twice their eq. (8) for a car: c = 1 is the inertia that gives the car's mu g. Their numbers use 1/2, so that is the
-default. Eq. (12) is for omega2 r2 >= omega1 r1 only; beyond it the slip is taken relative to the faster wheel.
+Maeda and Sugiura, eqs. (2)-(5), (12). Their eq. (3) takes the body for a disk, c = 1/2, and eq. (9) then decelerates it
+at 2 mu g, twice their eq. (8) for a car: c = 1 is the inertia that gives the car's mu g. Their numbers use 1/2, so that
+is the default. Eq. (12) is for omega2 r2 >= omega1 r1 only; beyond it the slip is taken relative to the faster wheel.
 """
 
 from typing import NamedTuple
@@ -28,13 +29,13 @@ class RigState(NamedTuple):
 class MirroredRig:
     """J1 omega1' = m g r1 mu - tau1, c m r2^2 omega2' = -m g r2 mu."""
 
-    mass: Scalar = param(5.3, unit="kg", above=0.0)
-    wheel_radius: Scalar = param(0.0995, unit="m", above=0.0)
-    body_radius: Scalar = param(0.099, unit="m", above=0.0)
-    wheel_inertia: Scalar = param(7.53e-3, unit="kg m^2", above=0.0)
-    inertia_factor: Scalar = param(0.5, unit="1", above=0.0, high=1.0)
-    crawl_speed: Scalar = param(0.01, unit="m/s", above=0.0)
-    road: Road = part(RIG)
+    mass: Scalar = param(default=5.3, unit="kg", above=0.0)
+    wheel_radius: Scalar = param(default=0.0995, unit="m", above=0.0)
+    body_radius: Scalar = param(default=0.099, unit="m", above=0.0)
+    wheel_inertia: Scalar = param(default=7.53e-3, unit="kg m^2", above=0.0)
+    inertia_factor: Scalar = param(default=0.5, unit="1", above=0.0, high=1.0)
+    crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
+    road: Road = part(default=RIG)
 
     def start(self, initial: BrakeStart) -> RigState:
         """State for a speed and a slip."""

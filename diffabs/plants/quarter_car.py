@@ -2,10 +2,10 @@
 
     m v' = -mu(slip) m g,   J omega' = r mu(slip) m g - u,   x' = v,   slip = (v - r omega)/v
 
-Aoki and Nakamura, eqs. (1) and (7)-(12), which is also eqs. (6)-(11) of Maeda and Sugiura. Their brake torque is negative;
-here u >= 0 brakes. Their eq. (9) drops the brake from a stopped wheel, so that it starts to turn again at once; here a
-stopped wheel stays stopped while the brake torque exceeds the road's. Rolling and air resistance are neglected.
-"""
+Aoki and Nakamura, eqs. (1) and (7)-(12), which is also eqs. (6)-(11) of Maeda and Sugiura. Their brake torque is
+negative; here u >= 0 brakes. Their eq. (9) drops the brake from a stopped wheel, so that it starts to turn again at
+once; here a stopped wheel stays stopped while the brake torque exceeds the road's. Rolling and air resistance are
+neglected."""
 
 from typing import NamedTuple
 
@@ -27,11 +27,11 @@ class QuarterCarState(NamedTuple):
 class QuarterCar:
     """m v' = -mu m g, J omega' = r mu m g - u. The inertia was identified together with the spline road."""
 
-    mass: Scalar = param(15.0, unit="kg", above=0.0)
-    radius: Scalar = param(0.2, unit="m", above=0.0)
-    inertia: Scalar = param(1.04456, unit="kg m^2", above=0.0)
-    crawl_speed: Scalar = param(0.01, unit="m/s", above=0.0)
-    road: Road = part(SPLINE_B)
+    mass: Scalar = param(default=15.0, unit="kg", above=0.0)
+    radius: Scalar = param(default=0.2, unit="m", above=0.0)
+    inertia: Scalar = param(default=1.04456, unit="kg m^2", above=0.0)
+    crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
+    road: Road = part(default=SPLINE_B)
 
     def start(self, initial: BrakeStart) -> QuarterCarState:
         """State for a speed and a slip."""
@@ -43,9 +43,7 @@ class QuarterCar:
         del t
         mu = self.output(state).deceleration / GRAVITY
         net = self.radius * mu * self.mass * GRAVITY - control
-        return QuarterCarState(
-            halted(state.speed, -mu * GRAVITY), halted(state.spin, net / self.inertia), state.speed
-        )
+        return QuarterCarState(halted(state.speed, -mu * GRAVITY), halted(state.spin, net / self.inertia), state.speed)
 
     def project(self, state: QuarterCarState) -> QuarterCarState:
         """Neither car nor wheel moves backwards."""

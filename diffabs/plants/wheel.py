@@ -13,8 +13,8 @@ GRAVITY = 9.81  # m/s^2, the value behind every number of the papers
 class BrakeStart:
     """A vehicle at `speed` whose wheel has `slip`, at distance 0."""
 
-    speed: Scalar = param(100 / 3.6, unit="m/s", above=0.0, high=200.0)
-    slip: Scalar = param(0.0, unit="1", low=0.0, high=1.0)
+    speed: Scalar = param(default=100 / 3.6, unit="m/s", above=0.0, high=200.0)
+    slip: Scalar = param(default=0.0, unit="1", low=0.0, high=1.0)
 
 
 def slip_ratio(speed: Scalar, wheel_speed: Scalar, crawl: Scalar) -> Any:

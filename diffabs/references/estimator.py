@@ -1,15 +1,14 @@
 """References that find the best slip: the slip at which the measured deceleration was greatest.
 
-Aoki and Nakamura, sec. 4, fig. 5: a running maximum of the deceleration |a|; when it is exceeded, the target becomes the
-present slip. Read literally this cannot brake: while friction rises the target equals the slip, the error is zero, and the
-car rolls on. `PeakLiteral` shows that. `PeakLatch` is the reading that reproduces the paper's table 2: brake with the first
-target until |a| first falls below its maximum, then take the slip at that maximum. `PeakRobust` is the latch for a noisy
-accelerometer.
+Aoki and Nakamura, sec. 4, fig. 5: a running maximum of the deceleration |a|; when it is exceeded, the target becomes
+the present slip. Read literally this cannot brake: while friction rises the target equals the slip, the error is zero,
+and the car rolls on. `PeakLiteral` shows that. `PeakLatch` is the reading that reproduces the paper's table 2: brake
+with the first target until |a| first falls below its maximum, then take the slip at that maximum. `PeakRobust` is the
+latch for a noisy accelerometer.
 
-The maximum lies between samples. The latch takes the vertex of the parabola through the last three decelerations, for the
-slip and for the moment, and hands the time since that moment to the loop. Without this, values would depend on the step and
-derivatives would be wrong by O(1) at every step size.
-"""
+The maximum lies between samples. The latch takes the vertex of the parabola through the last three decelerations, for
+the slip and for the moment, and hands the time since that moment to the loop. Without this, values would depend on the
+step and derivatives would be wrong by O(1) at every step size."""
 
 from typing import Any, NamedTuple
 
@@ -38,9 +37,10 @@ def _fresh(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMemory:
 
 @pytree
 class PeakLiteral:
-    """The estimator as printed: whenever |a| exceeds its maximum, target := slip. It does not brake; kept as evidence."""
+    """The estimator as printed: whenever |a| exceeds its maximum, target := slip. It does not brake; kept as
+    evidence."""
 
-    slip: Scalar = param(0.2, unit="1", above=0.0, high=1.0)
+    slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
 
     flow = no_flow
 
@@ -74,7 +74,7 @@ class PeakLatch:
     For an exact accelerometer: noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip.
     """
 
-    slip: Scalar = param(0.2, unit="1", above=0.0, high=1.0)
+    slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
 
     flow = no_flow
     start = PeakLiteral.start
@@ -108,13 +108,13 @@ class FilterMemory(NamedTuple):
 
 @pytree
 class PeakRobust:
-    """The latch for noisy sensors: deceleration and slip pass the same low-pass (so their delays cancel), nothing happens
-    below `arming`, and the fall must exceed the fraction `threshold` of the maximum."""
+    """The latch for noisy sensors: deceleration and slip pass the same low-pass (so their delays cancel), nothing
+    happens below `arming`, and the fall must exceed the fraction `threshold` of the maximum."""
 
-    slip: Scalar = param(0.2, unit="1", above=0.0, high=1.0)
-    time_constant: Scalar = param(0.01, unit="s", above=0.0)
-    threshold: Scalar = param(0.03, unit="1", above=0.0, below=1.0)
-    arming: Scalar = param(3.0, unit="m/s^2", low=0.0, tunable=False)
+    slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
+    time_constant: Scalar = param(default=0.01, unit="s", above=0.0)
+    threshold: Scalar = param(default=0.03, unit="1", above=0.0, below=1.0)
+    arming: Scalar = param(default=3.0, unit="m/s^2", low=0.0, tunable=False)
 
     output = PeakLiteral.output
     setpoint = PeakLiteral.setpoint

@@ -8,7 +8,7 @@ from diffabs.pytree import Scalar, param, pytree
 class FixedSlip:
     """target = slip."""
 
-    slip: Scalar = param(0.2, unit="1", above=0.0, high=1.0)
+    slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
 
     start = no_memory
     flow = no_flow
@@ -32,8 +32,8 @@ class FilteredSlip:
     From rest this is slip (1 - exp(-t/T)): a step that the loop can follow without overshoot.
     """
 
-    slip: Scalar = param(0.2, unit="1", above=0.0, high=1.0)
-    time_constant: Scalar = param(0.035, unit="s", above=0.0)
+    slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
+    time_constant: Scalar = param(default=0.035, unit="s", above=0.0)
 
     jump = no_jump
 

@@ -3,10 +3,9 @@
     mu(s, v) = (c1 (1 - exp(-c2 s)) - c3 s) exp(-c4 s v)        for s >= 0, odd in s
 
 M. Burckhardt, Fahrwerktechnik: Radschlupf-Regelsysteme, Vogel 1993; coefficients as tabulated by Kiencke and Nielsen,
-Automotive Control Systems, Springer 2005, ch. 8. They give c1..c3 for each surface and 0.02 to 0.04 s/m as the range of c4
-on all of them; the named roads carry c4 = 0.03 s/m, the middle of it. Set c4 = 0 for the curve at walking speed, which is
-the one usually plotted.
-"""
+Automotive Control Systems, Springer 2005, ch. 8. They give c1..c3 for each surface and 0.02 to 0.04 s/m as the range of
+c4 on all of them; the named roads carry c4 = 0.03 s/m, the middle of it. Set c4 = 0 for the curve at walking speed,
+which is the one usually plotted."""
 
 import jax.numpy as jnp
 
@@ -18,10 +17,10 @@ from diffabs.pytree import Scalar, param, pytree
 class Burckhardt:
     """mu(s, v) = (c1 (1 - exp(-c2 s)) - c3 s) exp(-c4 s v); the defaults are dry asphalt."""
 
-    c1: Scalar = param(1.2801, unit="1", low=0.0)
-    c2: Scalar = param(23.99, unit="1", above=0.0)
-    c3: Scalar = param(0.52, unit="1", low=0.0)
-    c4: Scalar = param(0.03, unit="s/m", low=0.0)
+    c1: Scalar = param(default=1.2801, unit="1", low=0.0)
+    c2: Scalar = param(default=23.99, unit="1", above=0.0)
+    c3: Scalar = param(default=0.52, unit="1", low=0.0)
+    c4: Scalar = param(default=0.03, unit="s/m", low=0.0)
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar = 0.0) -> Scalar:
         """mu [1] at a slip [1] and a vehicle speed [m/s]."""

@@ -1,6 +1,7 @@
 """Roads made of roads: a friction scale, and patches along the distance."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +16,8 @@ from diffabs.roads.burckhardt import DRY_ASPHALT, SNOW
 class Scaled:
     """scale * mu of another road: wear, temperature, wetness in one number."""
 
-    road: Road = part(DRY_ASPHALT)
-    scale: Scalar = param(1.0, unit="1", above=0.0, high=10.0)
+    road: Road = part(default=DRY_ASPHALT)
+    scale: Scalar = param(default=1.0, unit="1", above=0.0, high=10.0)
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
         """scale * mu [1]."""
@@ -29,13 +30,13 @@ class Patches:
 
         mu = mu_0 + sum_i S((x - edge_i)/width) (mu_(i+1) - mu_i),  S(z) = 3 y^2 - 2 y^3,  y = clamp(z + 1/2, 0, 1)
 
-    A width of about 0.1 m is the length of a tyre's contact patch. With width 0 the jump is sharp: values are right, but a
-    derivative through the run misses what moving the moment of the jump does. Differentiate with a width of a few steps.
-    """
+    A width of about 0.1 m is the length of a tyre's contact patch. With width 0 the jump is sharp: values are right,
+    but a derivative through the run misses what moving the moment of the jump does. Differentiate with a width of a few
+    steps."""
 
-    roads: tuple[Road, ...] = part((DRY_ASPHALT, SNOW))
-    edges: Vector = param((10.0,), unit="m", low=0.0)
-    width: Scalar = param(0.1, unit="m", low=0.0)
+    roads: tuple[Road, ...] = part(default=(DRY_ASPHALT, SNOW))
+    edges: Vector = param(default=(10.0,), unit="m", low=0.0)
+    width: Scalar = param(default=0.1, unit="m", low=0.0)
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
         """mu [1] of the surface at this distance [m]."""
@@ -43,7 +44,7 @@ class Patches:
         smooth = jnp.greater(self.width, 0)
         width = jnp.where(smooth, self.width, 1.0)
         total = mus[0]
-        for i, (before, after) in enumerate(zip(mus[:-1], mus[1:], strict=True)):
+        for i, (before, after) in enumerate(pairwise(mus)):
             beyond = distance - jnp.asarray(self.edges)[i]
             y = clamp(beyond / width + 0.5, 0.0, 1.0)
             weight = jnp.where(smooth, y * y * (3 - 2 * y), jnp.where(beyond >= 0, 1.0, 0.0))

@@ -18,10 +18,10 @@ class MagicFormula:
     tables (with J = 1.0539 kg m^2), since the paper does not give its curve.
     """
 
-    B: Scalar = param(13.00891, unit="1", above=0.0)
-    C: Scalar = param(1.47692, unit="1", low=1.0, high=2.0)
-    D: Scalar = param(0.98483, unit="1", low=0.0)
-    E: Scalar = param(-1.08841, unit="1", high=1.0)
+    B: Scalar = param(default=13.00891, unit="1", above=0.0)
+    C: Scalar = param(default=1.47692, unit="1", low=1.0, high=2.0)
+    D: Scalar = param(default=0.98483, unit="1", low=0.0)
+    E: Scalar = param(default=-1.08841, unit="1", high=1.0)
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
         """mu [1]; does not depend on speed or distance."""

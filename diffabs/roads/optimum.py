@@ -23,10 +23,9 @@ class Peak(NamedTuple):
 def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     """The first local maximum of mu over slip in (0, 1]; slip 1 where mu only rises (ice).
 
-    It is the first maximum that a braking wheel meets, not always the greatest: the rig's curve rises again towards lock.
-    Bracketed on a grid, bisected on the slope, and polished by one Newton step s - mu'/mu'' whose derivative is that of the
-    implicit function theorem, so slip and mu are differentiable in every parameter of the road.
-    """
+    It is the first maximum that a braking wheel meets, not always the greatest: the rig's curve rises again towards
+    lock. Bracketed on a grid, bisected on the slope, and polished by one Newton step s - mu'/mu'' whose derivative is
+    that of the implicit function theorem, so slip and mu are differentiable in every parameter of the road."""
 
     def mu(s: Any) -> Any:
         return road.friction(s, speed, distance)

@@ -2,10 +2,9 @@
 
     mu(s) = w4 s^q / (a + s^q) + w3 s^3 + w2 s^2 + w1 s        for s >= 0, odd in s
 
-Maeda and Sugiura, eq. (13), after INTECO, The Laboratory Anti-lock Braking System, user's manual. The paper's "0.2 is the
-slip of greatest friction" is not true of this curve: its local peak lies at slip 0.18754 and a locked wheel (slip 1) has
-more friction than either. The printed equation is undefined for s < 0; the odd extension is ours.
-"""
+Maeda and Sugiura, eq. (13), after INTECO, The Laboratory Anti-lock Braking System, user's manual. The paper's "0.2 is
+the slip of greatest friction" is not true of this curve: its local peak lies at slip 0.18754 and a locked wheel (slip
+1) has more friction than either. The printed equation is undefined for s < 0; the odd extension is ours."""
 
 from typing import Any
 
@@ -17,12 +16,12 @@ from diffabs.pytree import Scalar, param, pytree
 class RationalCurve:
     """mu(s) = w4 s^q/(a + s^q) + w3 s^3 + w2 s^2 + w1 s, with the coefficients rounded as in eq. (13)."""
 
-    w1: Scalar = param(-4.24e-2, unit="1")
-    w2: Scalar = param(2.94e-10, unit="1")
-    w3: Scalar = param(3.51e-2, unit="1")
-    w4: Scalar = param(0.407, unit="1", low=0.0)
-    a: Scalar = param(2.57e-4, unit="1", above=0.0)
-    q: Scalar = param(2.10, unit="1", above=1.0)
+    w1: Scalar = param(default=-4.24e-2, unit="1")
+    w2: Scalar = param(default=2.94e-10, unit="1")
+    w3: Scalar = param(default=3.51e-2, unit="1")
+    w4: Scalar = param(default=0.407, unit="1", low=0.0)
+    a: Scalar = param(default=2.57e-4, unit="1", above=0.0)
+    q: Scalar = param(default=2.10, unit="1", above=1.0)
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
         """mu [1]; does not depend on speed or distance."""

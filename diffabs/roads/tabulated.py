@@ -3,9 +3,8 @@
     mu(s) = cubic Hermite between knots, with the slopes of Fritsch and Butland        for s >= 0, odd in s
 
 F. N. Fritsch and J. Butland, A method for constructing local monotone piecewise cubic interpolants, SIAM J. Sci. Stat.
-Comput. 5 (1984), with the three-point end slopes of C. Moler, Numerical Computing with MATLAB, sec. 3.6: the interpolant
-that SciPy calls PchipInterpolator. It is exact at the knots, has no extrema but at knots, and is C1.
-"""
+Comput. 5 (1984), with the three-point end slopes of C. Moler, Numerical Computing with MATLAB, sec. 3.6: the
+interpolant that SciPy calls PchipInterpolator. It is exact at the knots, has no extrema but at knots, and is C1."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -22,18 +21,46 @@ class Tabulated:
     """Monotone cubic through (slip, mu); the knots start at (0, 0), increase, and end at slip 1.
 
     The defaults are the spline identified from Tables 1 and 2 of Aoki and Nakamura, with J = 1.04456 kg m^2, which
-    reproduces all twenty numbers to the printed digit. The paper does not give its curve, and the true one stays unknown.
-    """
+    reproduces all twenty numbers to the printed digit. The paper does not give its curve, and the true one stays
+    unknown."""
 
     slip: Vector = param(
-        (0, 0.02108, 0.04215, 0.06323, 0.08431, 0.09696, 0.10539, 0.12039, 0.14539, 0.17539, 0.19039, 0.20539, 0.23539)
+        default=(
+            0,
+            0.02108,
+            0.04215,
+            0.06323,
+            0.08431,
+            0.09696,
+            0.10539,
+            0.12039,
+            0.14539,
+            0.17539,
+            0.19039,
+            0.20539,
+            0.23539,
+        )
         + (0.28539, 0.40539, 0.60539, 1.0),
         unit="1",
         low=0.0,
         high=1.0,
     )
     mu: Vector = param(
-        (0, 0.51493, 0.72745, 0.86912, 0.96331, 0.98097, 0.99064, 0.98201, 0.95733, 0.92939, 0.91484, 0.90622, 0.88005)
+        default=(
+            0,
+            0.51493,
+            0.72745,
+            0.86912,
+            0.96331,
+            0.98097,
+            0.99064,
+            0.98201,
+            0.95733,
+            0.92939,
+            0.91484,
+            0.90622,
+            0.88005,
+        )
         + (0.85317, 0.81806, 0.79436, 0.75761),
         unit="1",
         low=0.0,
@@ -41,16 +68,16 @@ class Tabulated:
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
         """mu [1]; constant beyond the last knot; does not depend on speed or distance."""
-        del speed, distance
-        return odd(self._curve, slip)
+        return self.prepared().friction(slip, speed, distance)
 
-    def _curve(self, s: Any) -> Any:
-        x, y, d = jnp.asarray(self.slip), jnp.asarray(self.mu), slopes(self.slip, self.mu)
-        i = jnp.sum(s >= x[1:-1])
-        h = x[i + 1] - x[i]
-        t = jnp.minimum((s - x[i]) / h, 1.0)
-        m = (y[i + 1] - y[i]) / h
-        return y[i] + h * t * (d[i] + t * (3 * m - 2 * d[i] - d[i + 1] + t * (d[i] + d[i + 1] - 2 * m)))
+    def prepared(self) -> "PiecewiseCubic":
+        """The same curve with the coefficients worked out, once for a whole run."""
+        x, y = jnp.asarray(self.slip), jnp.asarray(self.mu)
+        d = slopes(x, y)
+        h, m = jnp.diff(x), jnp.diff(y) / jnp.diff(x)
+        c2 = (3 * m - 2 * d[:-1] - d[1:]) / h
+        c3 = (d[:-1] + d[1:] - 2 * m) / h**2
+        return PiecewiseCubic(knots=x, rows=jnp.stack([x[:-1], y[:-1], d[:-1], c2, c3], axis=1))
 
     def problems(self) -> Iterator[str]:
         """Objections that concern both columns."""
@@ -63,18 +90,36 @@ class Tabulated:
             yield f"the knots run from ({x[0]:g}, {y[0]:g}) to slip {x[-1]:g}; they must run from (0, 0) to slip 1"
 
 
-def slopes(x: Vector, y: Vector) -> Any:
+@pytree
+class PiecewiseCubic:
+    """mu(s) = c0 + z (c1 + z (c2 + z c3)), z = s - x_i, between knots; rows of (x_i, c0, c1, c2, c3)."""
+
+    knots: Vector = param(unit="1")
+    rows: Vector = param(unit="1")
+
+    def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
+        """mu [1]."""
+        del speed, distance
+        return odd(self._curve, slip)
+
+    def _curve(self, s: Any) -> Any:
+        i = jnp.sum(s >= self.knots[1:-1])
+        x, c0, c1, c2, c3 = self.rows[i]
+        z = jnp.minimum(s, self.knots[-1]) - x
+        return c0 + z * (c1 + z * (c2 + z * c3))
+
+
+def slopes(x: Any, y: Any) -> Any:
     """Slopes at the knots: the weighted harmonic mean of the neighbouring secants, 0 where they differ in sign.
 
-    Differentiable in x and y. At a local extremum the slope is held at 0, so the derivative in the knot's value is one-sided.
-    """
-    h = jnp.diff(jnp.asarray(x))
-    m = jnp.diff(jnp.asarray(y)) / h
-    w1, w2 = 2 * h[1:] + h[:-1], h[1:] + 2 * h[:-1]
+    Differentiable in x and y. At a local extremum the slope is held at 0, so the derivative in the knot's value is
+    one-sided."""
+    h = jnp.diff(x)
+    m = jnp.diff(y) / h
+    w0, w1 = 2 * h[1:] + h[:-1], h[1:] + 2 * h[:-1]
     product = m[:-1] * m[1:]
-    inner = jnp.where(product > 0, ratio((w1 + w2) * product, w1 * m[1:] + w2 * m[:-1]), 0.0)
-    first = _end_slope(h[0], h[1], m[0], m[1])
-    last = _end_slope(h[-1], h[-2], m[-1], m[-2])
+    inner = jnp.where(product > 0, ratio((w0 + w1) * product, w0 * m[1:] + w1 * m[:-1]), 0.0)
+    first, last = _end_slope(h[0], h[1], m[0], m[1]), _end_slope(h[-1], h[-2], m[-1], m[-2])
     return jnp.concatenate([first[None], inner, last[None]])
 
 

@@ -19,11 +19,11 @@ class Noise:
     The k-th draw is a function of (key, k), so a run is deterministic and differentiable in the deviations.
     """
 
-    slip: Scalar = param(0.0, unit="1", low=0.0)
-    speed: Scalar = param(0.0, unit="m/s", low=0.0)
-    wheel_speed: Scalar = param(0.0, unit="m/s", low=0.0)
-    deceleration: Scalar = param(0.0, unit="m/s^2", low=0.0)
-    period: Scalar = param(1e-3, unit="s", above=0.0, tunable=False)
+    slip: Scalar = param(default=0.0, unit="1", low=0.0)
+    speed: Scalar = param(default=0.0, unit="m/s", low=0.0)
+    wheel_speed: Scalar = param(default=0.0, unit="m/s", low=0.0)
+    deceleration: Scalar = param(default=0.0, unit="m/s^2", low=0.0)
+    period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
 
     flow = no_flow
 
@@ -43,7 +43,11 @@ class Noise:
         n = steps(self.period, clock.h)
         z = jax.random.normal(jax.random.fold_in(clock.key, clock.k // n), (4,), jnp.result_type(signal.slip))
         drawn = BrakeOutput(
-            self.slip * z[0], self.speed * z[1], self.wheel_speed * z[2], self.deceleration * z[3], 0.0 * signal.distance
+            self.slip * z[0],
+            self.speed * z[1],
+            self.wheel_speed * z[2],
+            self.deceleration * z[3],
+            0.0 * signal.distance,
         )
         return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(clock.k % n == 0, a, b), drawn, memory.held)))
 
@@ -56,10 +60,10 @@ class Noise:
 class Bias:
     """measured = true + bias."""
 
-    slip: Scalar = param(0.0, unit="1")
-    speed: Scalar = param(0.0, unit="m/s")
-    wheel_speed: Scalar = param(0.0, unit="m/s")
-    deceleration: Scalar = param(0.0, unit="m/s^2")
+    slip: Scalar = param(default=0.0, unit="1")
+    speed: Scalar = param(default=0.0, unit="m/s")
+    wheel_speed: Scalar = param(default=0.0, unit="m/s")
+    deceleration: Scalar = param(default=0.0, unit="m/s^2")
 
     start = no_memory
     flow = no_flow
@@ -84,10 +88,10 @@ class Quantisation:
     The derivative is the true one almost everywhere: 0 in the signal, round(true/q) in q. It says nothing of the jumps.
     """
 
-    slip: Scalar = param(0.0, unit="1", low=0.0, tunable=False)
-    speed: Scalar = param(0.0, unit="m/s", low=0.0, tunable=False)
-    wheel_speed: Scalar = param(0.0, unit="m/s", low=0.0, tunable=False)
-    deceleration: Scalar = param(0.0, unit="m/s^2", low=0.0, tunable=False)
+    slip: Scalar = param(default=0.0, unit="1", low=0.0, tunable=False)
+    speed: Scalar = param(default=0.0, unit="m/s", low=0.0, tunable=False)
+    wheel_speed: Scalar = param(default=0.0, unit="m/s", low=0.0, tunable=False)
+    deceleration: Scalar = param(default=0.0, unit="m/s^2", low=0.0, tunable=False)
 
     start = no_memory
     flow = no_flow

@@ -10,8 +10,8 @@ from diffabs.pytree import Scalar, param, pytree
 class WheelSpeed:
     """A wheel-speed sensor with a first-order filter, w' = (true - w)/T; the slip is computed from it as (v - w)/v."""
 
-    time_constant: Scalar = param(0.002, unit="s", above=0.0)
-    floor: Scalar = param(0.05, unit="m/s", above=0.0)
+    time_constant: Scalar = param(default=0.002, unit="s", above=0.0)
+    floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
 
     jump = no_jump
 
@@ -35,13 +35,12 @@ class WheelSpeed:
 class IntegratedAccelerometer:
     """Vehicle speed as the integral of an accelerometer, v' = -deceleration + bias, and the slip computed with it.
 
-    Aoki and Nakamura, sec. 4: "obtained by integrating the acceleration sensors". The bias is that of the signed forward
-    acceleration: a positive one makes the vehicle seem too fast, the slip too large, and releases the brake. The `floor` on
-    the speed in the slip's denominator limits what this does near standstill.
-    """
+    Aoki and Nakamura, sec. 4: "obtained by integrating the acceleration sensors". The bias is that of the signed
+    forward acceleration: a positive one makes the vehicle seem too fast, the slip too large, and releases the brake.
+    The `floor` on the speed in the slip's denominator limits what this does near standstill."""
 
-    bias: Scalar = param(0.0, unit="m/s^2")
-    floor: Scalar = param(0.05, unit="m/s", above=0.0)
+    bias: Scalar = param(default=0.0, unit="m/s^2")
+    floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
 
     jump = no_jump
 

@@ -1,0 +1,58 @@
+"""The largest integration step that is stable for a loop.
+
+RK4 is stable on a mode lambda while |R(h lambda)| <= 1, R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24. A braking loop stiffens
+as it slows down, its slip rate going with 1/v, so the loop is linearised at speeds down to the stop, at slips around
+the setpoint where the controller is not at a limit. Held memories do not move: a sampled controller is not judged here.
+"""
+
+from typing import Any
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.loop import Loop
+from diffabs.pytree import replace, strong
+
+SPEEDS = 6  # between start and stop, in geometric progression: the ends decide
+OFFSETS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)  # slip below and above the setpoint
+RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 3.5 of the origin
+
+
+def stable_step(loop: Loop) -> float:
+    """Largest step [s] at which RK4 damps every damped mode of the loop, between its initial speed and its stop."""
+    loop = strong(loop)
+    modes = _modes(loop)
+    damped = modes[(modes.real < 0) & np.isfinite(modes)]
+    return float(np.min(_radius(damped / np.abs(damped)) / np.abs(damped), initial=np.inf))
+
+
+def _radius(direction: Any) -> Any:
+    """How far along each direction of the complex plane RK4 stays stable."""
+    z = RADII * direction[:, None]
+    grows = np.abs(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))) > 1 + 1e-9
+    return np.where(grows.any(axis=1), RADII[np.argmax(grows, axis=1)], RADII[-1])
+
+
+def _modes(loop: Loop) -> Any:
+    """Eigenvalues of d(flow)/d(flow) over the grid of speeds and slips."""
+    state = loop.start()
+    setpoint = loop.reference.setpoint(state.reference)
+    slips = jnp.clip(jnp.concatenate([setpoint - jnp.array(OFFSETS), setpoint + jnp.array(OFFSETS)]), 1e-4, 1.0)
+    speeds = jnp.geomspace(loop.initial.speed, loop.stop.speed, SPEEDS)  # pyright: ignore[reportAttributeAccessIssue]
+    jacobian = jax.jit(jax.vmap(jax.vmap(lambda v, s: _jacobian(loop, v, s), (None, 0)), (0, None)))(speeds, slips)
+    matrices = np.asarray(jacobian).reshape(-1, *jacobian.shape[2:])
+    return np.linalg.eigvals(matrices[np.isfinite(matrices).all(axis=(1, 2))]).ravel()
+
+
+def _jacobian(loop: Loop, speed: jax.Array, slip: jax.Array) -> jax.Array:
+    loop = replace(loop, {"initial.speed": speed, "initial.slip": slip})
+    state = loop.start()
+    z, unravel = jax.flatten_util.ravel_pytree(state.flow())
+
+    def flow(z: jax.Array) -> jax.Array:
+        at = state.with_flow(unravel(z))
+        return jax.flatten_util.ravel_pytree(loop.flow(0.0, at, loop.signals(0.0, at)))[0]
+
+    return jax.jacfwd(flow)(z)
