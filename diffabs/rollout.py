@@ -22,7 +22,7 @@ from diffabs.numerics import clamp
 from diffabs.protocols import BrakeOutput, Clock, Ending, Memory, Objective, Sample
 from diffabs.pytree import prepared, strong
 
-LANDINGS = 5  # Newton iterations for the last step; quadratic from an error below one step
+LANDINGS = 4  # Newton iterations for the length of the last step; quadratic from an error below one step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,6 +92,9 @@ class _Carry(NamedTuple):
     state: LoopState
     tally: dict[str, Memory]  # accumulators of the objectives
     k: Any  # number of the last instant
+    t: Any  # its time; after a stop, the time of the crossing
+    length: Any  # of the step to try: h, or shorter when landing
+    landing: Any  # how many times the last step was tried
     running: Any
     stopped: Any
     diverged: Any
@@ -99,125 +102,113 @@ class _Carry(NamedTuple):
 
 @partial(jax.jit, static_argnames=("steps", "every"))
 def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, steps: int, every: int) -> Run:
-    keep = every > 0
-    segment = every if keep else max(1, math.isqrt(steps))
     loop = prepared(loop)
     start = loop.start()
-    first = loop.signals(0.0 * h, start)
-    tally = {name: objective.start(first.sample) for name, objective in objectives.items()}
-    no = jnp.asarray(False)
-    carry = _Carry(start, tally, jnp.asarray(0), loop.stop.margin(first.sample.output) > 0, no, no)
+    first = loop.signals(0.0 * h, start).sample
+    tally = {name: objective.start(first) for name, objective in objectives.items()}
+    no, zero = jnp.asarray(False), jnp.asarray(0)
+    carry = _Carry(start, tally, zero, 0.0 * h, h, zero, loop.stop.margin(first.output) > 0, no, no)
     carry = _typed(carry, h.dtype)
-
-    step = partial(_step, loop, objectives, h, key, steps)
-    body = jax.checkpoint(step, policy=jax.checkpoint_policies.nothing_saveable, prevent_cse=False)
+    segment = every or max(1, math.isqrt(steps))
 
     def advance(carry: _Carry) -> _Carry:
-        return jax.lax.scan(lambda c, _: (body(c), None), carry, length=segment)[0]
+        return jax.lax.scan(lambda c, _: (_step(loop, objectives, h, key, steps, c), None), carry, length=segment)[0]
 
     def block(carry: _Carry, _: Any) -> tuple[_Carry, Any]:
         carry = jax.lax.cond(carry.running, advance, lambda c: c, carry)
-        return carry, _seen(loop, carry.k * h, carry.state, carry.running) if keep else None
+        return carry, _seen(loop, carry) if every else None
 
+    first = _seen(loop, carry)
     block = jax.checkpoint(block, policy=jax.checkpoint_policies.nothing_saveable, prevent_cse=False)
-    carry, seen = jax.lax.scan(block, carry, length=-(-steps // segment))
-    final, tally, t = _land(loop, objectives, h, key, carry)
-    ending = _ending(loop, t, final, carry.stopped)
-    trajectory = None
-    if keep:
-        last = _seen(loop, t, final, no)
-        trajectory = _assembled(_seen(loop, 0.0 * h, start, first.sample.t >= 0), seen, last)
-    metrics = {name: o.value(tally[name], ending) for name, o in objectives.items()}
+    carry, seen = jax.lax.scan(block, carry, length=-(-(steps + LANDINGS) // segment))
+    last = _seen(loop, carry)
+    trajectory = _assembled(first, seen, last, -(-steps // segment)) if every else None
+    ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample.output, carry.stopped))
+    metrics = {name: o.value(carry.tally[name], ending) for name, o in objectives.items()}
     metrics = {name: jnp.where(carry.diverged, jnp.nan, value) for name, value in metrics.items()}
     return Run(metrics, carry.stopped, carry.diverged, ending, trajectory)
 
 
 def _step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: int, carry: _Carry) -> _Carry:
-    """One step, or nothing if the run has ended."""
-    state, tally = _advance(loop, objectives, h, key, carry, h)
-    y = loop.plant.output(state.plant)
+    """One step; or one try of the last step; or nothing if the run has ended."""
+    state, tally, late = _advance(loop, objectives, h, key, carry)
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state.flow())]))
-    crossed = finite & (loop.stop.margin(y) <= 0)
-    on = carry.running & finite & ~crossed
-    new = _Carry(state, tally, carry.k + 1, carry.running, carry.stopped, carry.diverged)
-    new = jax.tree.map(lambda a, b: jnp.where(on, a, b), new, carry)
-    return new._replace(
-        running=on & (new.k < steps),
-        stopped=carry.stopped | (carry.running & crossed),
+    trying = carry.landing > 0
+    crossed = finite & (loop.stop.margin(loop.plant.output(state.plant)) <= 0)
+    landed = carry.running & trying & (carry.landing == LANDINGS)
+    ahead = carry.running & finite & ~trying & ~crossed
+    search = carry.running & finite & ~landed & ~ahead
+    state, tally = jax.tree.map(
+        lambda a, b: jnp.where(ahead | landed, a, b), (state, tally), (carry.state, carry.tally)
+    )
+    k = carry.k + jnp.where(ahead, 1, 0)
+    shorter = clamp(jax.lax.stop_gradient(carry.length + late), 0.0, h)
+    return _Carry(
+        state=state,
+        tally=tally,
+        k=k,
+        t=jnp.where(landed, carry.t + carry.length + late, k * h),
+        length=jnp.where(search, shorter, carry.length),
+        landing=carry.landing + jnp.where(search, 1, 0),
+        running=(ahead & (k < steps)) | search,
+        stopped=carry.stopped | landed,
         diverged=carry.diverged | (carry.running & ~finite),
     )
 
 
 def _advance(
-    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, carry: _Carry, length: Any
-) -> tuple[LoopState, dict[str, Memory]]:
-    """Jump at the present instant, then integrate over `length` <= h."""
-    t = carry.k * h
-    state, events = loop.jump(Clock(t, h, carry.k, key), carry.state)
+    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, carry: _Carry
+) -> tuple[LoopState, dict[str, Memory], Any]:
+    """Jump at the present instant and integrate over carry.length; how much later [s] the margin crosses zero.
+
+    On the last try of the last step that time is zero to rounding, but not its derivative, which is the implicit
+    function theorem's: the state is moved by it, and so carries the derivative of the moment of the crossing.
+    """
+    state, events = loop.jump(Clock(carry.t, h, carry.k, key), carry.state)
     held = {name: memory.held for name, memory in carry.tally.items()}
 
     def flow(t: Any, z: Any, state: LoopState = state) -> Any:
-        loop_flow, tally_flow = z
-        state = state.with_flow(loop_flow)
+        state = state.with_flow(z[0])
         signals = loop.signals(t, state)
-        rates = {name: o.flow(Memory(tally_flow[name], held[name]), signals.sample) for name, o in objectives.items()}
+        rates = {name: o.flow(Memory(z[1][name], held[name]), signals.sample) for name, o in objectives.items()}
         return loop.flow(t, state, signals), rates
 
     tally_flow = {name: memory.flow for name, memory in carry.tally.items()}
     z = (state.flow(), tally_flow)
     for event in events:
-        before = flow(t, (event.before.flow(), tally_flow), event.before)
-        after = flow(t, (event.after.flow(), tally_flow), event.after)
+        before = flow(carry.t, (event.before.flow(), tally_flow), event.before)
+        after = flow(carry.t, (event.after.flow(), tally_flow), event.after)
         z = axpy(event.elapsed, axpy(-1.0, before, after), z)
-    loop_flow, tally_flow = rk4_step(flow, t, z, length)
+    z = rk4_step(flow, carry.t, z, carry.length)
+
+    t = carry.t + carry.length
+    y = loop.plant.output(z[0][0])
+    slope = jax.lax.stop_gradient(loop.stop.rate(y))
+    late = -loop.stop.margin(y) / jnp.where(slope < 0, slope, -jnp.inf)
+    moved = jnp.where(carry.landing == LANDINGS, late, 0.0)
+    loop_flow, tally_flow = axpy(moved, flow(t, z), z)
     state = state.with_flow(loop_flow)
     state = state._replace(plant=loop.plant.project(state.plant))
-    sample = loop.signals(t + length, state).sample
+    sample = loop.signals(t + moved, state).sample
+    memories = {name: Memory(tally_flow[name], held[name]) for name in objectives}
     tally = {
-        name: Memory(tally_flow[name], o.update(Memory(tally_flow[name], held[name]), sample, length))
+        name: memories[name]._replace(held=o.update(memories[name], sample, carry.length + moved))
         for name, o in objectives.items()
     }
-    return state, tally
+    return state, tally, late
 
 
-def _land(
-    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, carry: _Carry
-) -> tuple[LoopState, dict[str, Memory], Any]:
-    """For a run that stopped, the partial step that ends on the crossing; the time of the end."""
-    stop = loop.stop
-
-    def newton(length: Any, _: Any) -> tuple[Any, None]:
-        """One iteration. Only the last one is differentiated: its slope is the implicit function theorem's."""
-        length = jax.lax.stop_gradient(length)
-        state, _ = _advance(loop, {}, h, key, carry._replace(tally={}), length)
-        y = loop.plant.output(state.plant)
-        slope = jax.lax.stop_gradient(stop.rate(y))
-        slope = jnp.where(slope < 0, slope, -jnp.inf)
-        return clamp(length - stop.margin(y) / slope, 0.0, h), None
-
-    length, _ = jax.lax.scan(newton, 0.0 * h, length=LANDINGS)
-    length = jnp.where(carry.stopped, length, 0.5 * h)  # not used, but a point where all derivatives exist
-    state, tally = _advance(loop, objectives, h, key, carry, length)
-    chosen = jax.tree.map(lambda a, b: jnp.where(carry.stopped, a, b), (state, tally), (carry.state, carry.tally))
-    return *chosen, carry.k * h + jnp.where(carry.stopped, length, 0.0)
+def _seen(loop: Loop, carry: _Carry) -> Trajectory:
+    signals = loop.signals(carry.t, carry.state)
+    return Trajectory(signals.sample, signals.measured, carry.state.plant, carry.running & (carry.landing == 0))
 
 
-def _ending(loop: Loop, t: Any, state: LoopState, stopped: Any) -> Ending:
-    sample = loop.signals(t, state).sample
-    return Ending(sample, stopped, *loop.stop.remainder(sample.output, stopped))
-
-
-def _seen(loop: Loop, t: Any, state: LoopState, running: Any) -> Trajectory:
-    signals = loop.signals(t, state)
-    return Trajectory(signals.sample, signals.measured, state.plant, running)
-
-
-def _assembled(first: Trajectory, seen: Trajectory, last: Trajectory) -> Trajectory:
-    """First instant, the instants of the scan, and the last one in place of everything after the end."""
+def _assembled(first: Trajectory, seen: Trajectory, last: Trajectory, count: int) -> Trajectory:
+    """First instant, `count` instants of the scan, and the last one in place of everything after the end."""
 
     def join(a: Any, b: Any, c: Any) -> Any:
         b = jnp.where(jnp.expand_dims(seen.running, range(1, b.ndim)), b, c)
-        return jnp.concatenate([jnp.asarray(a)[None], b])
+        return jnp.concatenate([jnp.asarray(a)[None], b[:count]])
 
     return jax.tree.map(join, first, seen, last)
 
