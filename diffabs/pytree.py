@@ -13,7 +13,7 @@ does it on the host, and names every offender at once.
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -108,8 +108,28 @@ def pytree(cls: type[T]) -> type[T]:
     if unknown:
         raise TypeError(f"{cls.__name__}: declare {', '.join(unknown)} with param, part or static")
     meta = [f.name for f in fields if "static" in f.metadata]
-    data = [f.name for f in fields if f.name not in meta]
-    return jax.tree_util.register_dataclass(new, data_fields=data, meta_fields=meta)
+    _register(new, [f.name for f in fields if f.name not in meta], meta)
+    return new
+
+
+def _register(cls: type, data: list[str], meta: list[str]) -> None:
+    """Tell JAX how to take a part apart and put it together.
+
+    Not `jax.tree_util.register_dataclass`: with that, in JAX 0.10, the tree structures of two different classes compare
+    equal if they have as many leaves and the same static values, and so jit, when their hashes meet, now and then runs
+    what it compiled for the other class."""
+
+    def flatten(part: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        return tuple(getattr(part, name) for name in data), tuple(getattr(part, name) for name in meta)
+
+    def flatten_with_keys(part: Any) -> tuple[tuple[tuple[Any, Any], ...], tuple[Any, ...]]:
+        leaves, statics = flatten(part)
+        return tuple(zip(map(jax.tree_util.GetAttrKey, data), leaves, strict=True)), statics
+
+    def unflatten(statics: tuple[Any, ...], leaves: Iterable[Any]) -> Any:
+        return cls(**dict(zip(data, leaves, strict=True)), **dict(zip(meta, statics, strict=True)))
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
 
 
 def parameters(part: Any, prefix: str = "") -> Iterator[tuple[str, Spec, Any]]:

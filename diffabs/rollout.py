@@ -147,7 +147,7 @@ def _step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps:
         state=state,
         tally=tally,
         k=k,
-        t=jnp.where(landed, carry.t + carry.length + late, k * h),
+        t=jnp.where(landed, carry.t + carry.length + late, jnp.where(ahead, k * h, carry.t)),
         length=jnp.where(search, shorter, carry.length),
         landing=carry.landing + jnp.where(search, 1, 0),
         running=(ahead & (k < steps)) | search,

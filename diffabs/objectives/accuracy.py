@@ -3,9 +3,11 @@
 The error e = slip - setpoint is against where the reference will settle, not against a filtered target on its way
 there."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.numerics import clamp, parabola, ratio
 from diffabs.protocols import Ending, Memory, Sample
@@ -88,7 +90,7 @@ class MaxSlip:
         del h
         greatest, last, before = memory.held
         slip = sample.output.slip
-        turned = (last >= before) & (last > slip)
+        turned = (last > before) & (last > slip)
         vertex = jnp.where(turned, parabola(before, last, slip)[1], slip)
         return Peak(jnp.maximum(greatest, jnp.maximum(vertex, slip)), slip, last)
 
@@ -198,3 +200,8 @@ class QuadraticCost:
         """Cost."""
         del ending
         return memory.flow.cost
+
+    def problems(self) -> Iterator[str]:
+        """Weights of the wrong length."""
+        if np.shape(self.q) != (2,):
+            yield f"q has shape {np.shape(self.q)}; it needs (2,): integral and error"

@@ -57,6 +57,8 @@ class LabRig:
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
     road: Road = part(default=RIG)
 
+    control_unit = "1"  # a command, where other plants take a torque in N m
+
     def start(self, initial: BrakeStart) -> LabRigState:
         """State for a speed and a slip, brake released."""
         zero = 0.0 * initial.speed
