@@ -3,19 +3,17 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from diffabs.pytree import Scalar
 
 
 def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
-    """x limited to [low, high]. At a limit the slope is 0 in x and 1 in the limit.
+    """x limited to [low, high]. The slope in x is 1 at a limit and 0 beyond it, where that in the limit is 1.
 
-    `lax.clamp` rather than `jnp.clip`: the tangent of the latter divides.
+    Selections, since the tangent of `jnp.clip` divides, and `lax.clamp` refuses a batched limit of an unbatched x.
     """
-    dtype = jnp.result_type(x, low, high)
-    return jax.lax.clamp(jnp.asarray(low, dtype), jnp.asarray(x, dtype), jnp.asarray(high, dtype))
+    return jnp.where(jnp.less(x, low), low, jnp.where(jnp.greater(x, high), high, x))
 
 
 def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> Any:

@@ -17,6 +17,7 @@ from diffabs.pytree import replace, strong
 
 SPEEDS = 6  # between start and stop, in geometric progression: the ends decide
 OFFSETS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)  # slip below and above the setpoint
+SLIPS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # where a run may pass
 RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 3.5 of the origin
 
 
@@ -39,7 +40,8 @@ def _modes(loop: Loop) -> Any:
     """Eigenvalues of d(flow)/d(flow) over the grid of speeds and slips."""
     state = loop.start()
     setpoint = loop.reference.setpoint(state.reference)
-    slips = jnp.clip(jnp.concatenate([setpoint - jnp.array(OFFSETS), setpoint + jnp.array(OFFSETS)]), 1e-4, 1.0)
+    near = jnp.concatenate([setpoint - jnp.array(OFFSETS), setpoint + jnp.array(OFFSETS)])
+    slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(SLIPS)])
     speeds = jnp.geomspace(loop.initial.speed, loop.stop.speed, SPEEDS)  # pyright: ignore[reportAttributeAccessIssue]
     jacobian = jax.jit(jax.vmap(jax.vmap(lambda v, s: _jacobian(loop, v, s), (None, 0)), (0, None)))(speeds, slips)
     matrices = np.asarray(jacobian).reshape(-1, *jacobian.shape[2:])

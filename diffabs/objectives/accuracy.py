@@ -77,7 +77,7 @@ class Peak(NamedTuple):
 
 @pytree
 class MaxSlip:
-    """Greatest slip of the run [1]: the vertex of the parabola through the three samples around it."""
+    """Greatest slip of the run [1]: the vertex of the parabola through the three samples around it, at most 1."""
 
     flow = nothing
 
@@ -91,7 +91,7 @@ class MaxSlip:
         greatest, last, before = memory.held
         slip = sample.output.slip
         turned = (last > before) & (last > slip)
-        vertex = jnp.where(turned, parabola(before, last, slip)[1], slip)
+        vertex = jnp.where(turned, jnp.minimum(parabola(before, last, slip)[1], 1.0), slip)
         return Peak(jnp.maximum(greatest, jnp.maximum(vertex, slip)), slip, last)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:

@@ -155,6 +155,9 @@ class PeakRobust:
 
 
 def _vertex(m: PeakMemory, deceleration: Scalar, slip: Scalar) -> tuple[Any, Any, Any]:
-    """Place of the last maximum (steps from the middle one of the last three samples), deceleration and slip there."""
-    place, greatest = parabola(m.deceleration[1], m.deceleration[0], deceleration)
+    """Place of the last maximum (steps from the middle one of the last three samples), deceleration and slip there. Where the
+    deceleration did not rise before it fell, as at the start of a run, that is the middle sample."""
+    place, _ = parabola(m.deceleration[1], m.deceleration[0], deceleration)
+    place = jnp.where(m.deceleration[1] < m.deceleration[0], place, 0.0)
+    greatest = interpolate(m.deceleration[1], m.deceleration[0], deceleration, place)
     return place, greatest, interpolate(m.slips[1], m.slips[0], slip, place)

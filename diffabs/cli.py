@@ -1,0 +1,206 @@
+"""The command `diffabs`. Exit status: 0 done, 1 could not be done (the run diverged), 2 bad input.
+
+Results go to stdout, as tables or with --json as one JSON document; everything else goes to stderr."""
+
+import contextlib
+import dataclasses
+import importlib.util
+import math
+import os
+import pathlib
+import platform
+from typing import Annotated, Any, NoReturn
+
+import jax
+import typer
+
+from diffabs import __version__, catalogue, console, show
+from diffabs.rollout import Run, measure, rollout
+from diffabs.scenario import Scenario, header, load, names
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,  # plain usage errors: one line that scripts and people can read
+    pretty_exceptions_enable=False,
+    help="Simulate, differentiate, tune and certify controllers for braking wheels.",
+)
+
+MOST_ROWS = 20_000  # of a trajectory
+PICTURES = (".png", ".pdf", ".svg")
+PLURALS = {f"{name}s": name for name in ("plant", "road", "controller", "reference", "actuator", "sensor")}
+PLURALS |= {"feedforward": "feedforward", "antiwindup": "antiwindup", "initial": "initial"}
+PLURALS |= {"stops": "stop", "objectives": "objective"}
+
+Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout, nothing else there.")]
+
+
+def main() -> NoReturn:
+    """The executable: run the command line, and leave."""
+    try:
+        app()
+        status: Any = 0
+    except SystemExit as left:
+        status = left.code
+    except KeyboardInterrupt:
+        console.say("interrupted")
+        status = console.INTERRUPTED
+    console.leave(status)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"diffabs {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def setup(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Simulate, differentiate, tune and certify controllers for braking wheels."""
+    del version
+    jax.config.update("jax_enable_x64", True)
+
+
+@app.command()
+def simulate(
+    scenario: Annotated[str, typer.Argument(help="A TOML file, or the name of a packaged scenario.")],
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Override a field; may be repeated."),
+    ] = None,
+    as_json: Json = False,
+    csv: Annotated[pathlib.Path | None, typer.Option(help="Write the trajectory to this file.")] = None,
+    plot: Annotated[pathlib.Path | None, typer.Option(help="Draw the run to this file (.png, .pdf, .svg).")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of noisy sensors; the same as --set solver.seed=N.")] = None,
+) -> None:
+    """Run a scenario once and show its metrics."""
+    with console.guarded():
+        _check_targets(csv, plot)
+        changes = [*(changes or ()), *([] if seed is None else [f"solver.seed={seed}"])]
+        with contextlib.ExitStack() as files:
+            csv_file = files.enter_context(console.new_file(csv, "--csv")) if csv else None
+            picture = files.enter_context(console.new_file(plot, "--plot")) if plot else None
+            chosen = console.waited(lambda: load(scenario, changes), "checking the scenario")
+            run = console.waited(lambda: _run(chosen, keep=bool(csv or plot)), f"simulating {chosen.name}")
+            if csv_file and run.trajectory:
+                show.write_csv(run.trajectory, getattr(chosen.loop.plant, "control_unit", "N m"), csv_file)
+            if picture:
+                from diffabs.plot import braking
+
+                braking(run, title=chosen.title or chosen.name).savefig(picture)
+        result = _result(chosen, run, {"csv": csv, "plot": plot})
+        show.as_json(result) if as_json else show.run(result, chosen)
+        if result["diverged"]:
+            console.fail(f"{chosen.name} diverged: a number became infinite or NaN, so there are no metrics", 1)
+        if not result["stopped"]:
+            console.say(
+                f"warning: NOT STOPPED within solver.duration = {chosen.solver.duration:g} s; stop_time and"
+                " stop_distance are extrapolated with the last deceleration"
+            )
+
+
+def _check_targets(csv: pathlib.Path | None, plot: pathlib.Path | None) -> None:
+    if plot:
+        if plot.suffix.lower() not in PICTURES:
+            console.fail(f"--plot {plot}: the name must end in {', '.join(PICTURES)}")
+        _need_matplotlib()
+    if csv and plot and csv.resolve() == plot.resolve():
+        console.fail(f"--csv and --plot are the same file, {csv}")
+
+
+def _need_matplotlib() -> None:
+    os.environ.setdefault("MPLBACKEND", "agg")
+    if importlib.util.find_spec("matplotlib") is None:
+        console.fail('figures need matplotlib: pip install "diffabs[plot]"')
+
+
+def _run(chosen: Scenario, keep: bool) -> Run:
+    """The run, on the host."""
+    if not keep:
+        return jax.device_get(measure(chosen.loop, chosen.solver, chosen.objectives, key=chosen.key()))
+    steps = chosen.solver.steps
+    every = min(max(chosen.solver.every, math.ceil(steps / MOST_ROWS)), steps)
+    solver = dataclasses.replace(chosen.solver, every=every)
+    return jax.device_get(rollout(chosen.loop, solver, chosen.objectives, key=chosen.key()))
+
+
+def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -> dict[str, Any]:
+    return {
+        "scenario": chosen.name,
+        "metrics": {name: float(run.metrics[name]) for name in chosen.objectives},
+        "stopped": bool(run.stopped),
+        "diverged": bool(run.diverged),
+        "solver": {"step": chosen.solver.step, "duration": chosen.solver.duration, "seed": chosen.seed},
+        "versions": _versions(),
+        "files": {name: str(path) for name, path in files.items() if path},
+    }
+
+
+def _versions() -> dict[str, str]:
+    return {"diffabs": __version__, "jax": jax.__version__, "python": platform.python_version()}
+
+
+@app.command("list")
+def list_parts(
+    family: Annotated[
+        str | None, typer.Argument(metavar="[FAMILY]", help=f"{', '.join(PLURALS)} or scenarios.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Every part with its parameters, defaults, units and ranges; every packaged scenario."""
+    with console.guarded():
+        there = (*PLURALS, "scenarios")
+        if family is not None and family not in there:
+            raise catalogue.unknown(f"there is no family {catalogue.shown(family)}", family, there)
+        result = {name: _listed(name) for name in there if family in (None, name)}
+        if as_json:
+            return show.as_json(result)
+        for name, members in result.items():
+            show.family(name, members)
+    return None
+
+
+def _listed(plural: str) -> dict[str, Any]:
+    """The members of a family as plain values."""
+    if plural == "scenarios":
+        return {name: header(name) for name in names()}
+    family = PLURALS[plural]
+    return {
+        name: {
+            "summary": catalogue.summary(part),
+            **({"unit": catalogue.unit_of(part)} if family == "objective" else {}),
+            "parameters": catalogue.described(family, part),
+        }
+        for name, part in catalogue.types(family).items()
+    }
+
+
+@app.command()
+def reproduce(
+    name: Annotated[str, typer.Argument(help="slip-lmi, slip-estimator, or all.")] = "all",
+    out: Annotated[pathlib.Path, typer.Option(help="Folder for the results, one folder per paper.")] = pathlib.Path(
+        "out"
+    ),
+    as_json: Json = False,
+) -> None:
+    """A paper's whole result: figures, summary.json, and a table of ours against the published numbers."""
+    with console.guarded():
+        _need_matplotlib()
+        from diffabs.papers import PAPERS
+
+        if name != "all" and name not in PAPERS:
+            raise catalogue.unknown(f"there is no paper {catalogue.shown(name)}", name, (*PAPERS, "all"))
+        results = {}
+        for paper in PAPERS if name == "all" else (name,):
+            with console.new_folder(out / paper) as folder:
+                results[paper] = console.waited(
+                    lambda paper=paper, folder=folder: PAPERS[paper](folder, console.say), f"reproducing {paper}"
+                )
+            if not as_json:
+                show.paper(results[paper], out / paper)
+        if as_json:
+            show.as_json({"out": str(out), "papers": results, "versions": _versions()})

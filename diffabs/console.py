@@ -1,0 +1,152 @@
+"""What every command does: report errors in one line, wait with a sign of life, replace files whole."""
+
+import contextlib
+import os
+import pathlib
+import shutil
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NoReturn, TypeVar
+
+import typer
+from rich.console import Console
+
+from diffabs.catalogue import ScenarioError
+
+T = TypeVar("T")
+
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+PATIENCE = 2.0  # s without a sign of life
+WORKER = "diffabs worker"
+
+
+def say(line: str) -> None:
+    """A line for a person: on stderr, never wrapped."""
+    typer.echo(line, err=True)
+
+
+def fail(line: str, status: int = BAD_INPUT) -> NoReturn:
+    """Leave with one line. Raises typer.Exit."""
+    say(f"error: {line}")
+    raise typer.Exit(status)
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[None]:
+    """Bad input, a full disk, and Ctrl-C end a command with one line and their exit status."""
+    try:
+        yield
+    except ScenarioError as error:
+        fail(str(error))
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        fail(" ".join(str(error).split()), FAILED)
+    except MemoryError:
+        fail("out of memory", FAILED)
+    except KeyboardInterrupt:
+        say("interrupted")
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def waited(work: Callable[[], T], message: str) -> T:
+    """The result of `work`, with a spinner on a terminal, or a line if it takes long elsewhere.
+
+    The work has a thread of its own, because Ctrl-C cannot interrupt compiled code in the main one. Raises what it
+    raises.
+    """
+    result: list[T] = []
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            result.append(work())
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run, name=WORKER, daemon=True)
+    console = Console(stderr=True)
+    begun, told = time.monotonic(), console.is_terminal
+    with console.status(f"{message} ...") if console.is_terminal else contextlib.nullcontext():
+        thread.start()
+        while thread.is_alive():
+            thread.join(0.1)
+            if not told and time.monotonic() - begun > PATIENCE:
+                say(f"{message} ...")
+                told = True
+    if errors:
+        raise errors[0]
+    return result[0]
+
+
+def leave(status: Any) -> NoReturn:
+    """Exit at once where interrupted work still runs: the interpreter would wait for it. Raises SystemExit else."""
+    if any(thread.name == WORKER for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status if isinstance(status, int) else FAILED)
+    raise SystemExit(status)
+
+
+@contextlib.contextmanager
+def new_file(target: pathlib.Path, option: str) -> Iterator[pathlib.Path]:
+    """A temporary file beside `target` that takes its place at the end, or vanishes if anything goes wrong.
+
+    Raises typer.Exit where no file can be written.
+    """
+    target = target.resolve()
+    if target.exists() and not target.is_file():
+        fail(f"{option} {target}: is not a regular file")
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
+    except OSError as error:
+        fail(f"{option} {target}: cannot be written, {error.strerror}")
+    os.close(handle)
+    temporary = pathlib.Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A temporary folder beside `target` that takes its place at the end, or vanishes if anything goes wrong.
+
+    An older result (it has a summary.json) is replaced; any other content is left alone. Raises typer.Exit where the
+    folder cannot be made or replaced.
+    """
+    target = target.resolve()
+    if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "summary.json").exists())):
+        fail(f"--out {target}: exists and is no earlier result; move it away")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        room = pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    except OSError as error:
+        fail(f"--out {target}: cannot be written, {error.strerror}")
+    new, old = room / "new", room / "old"
+    try:
+        new.mkdir()
+        yield new
+        if target.exists():
+            target.rename(old)
+        try:
+            new.rename(target)
+        except OSError:
+            if old.exists():
+                old.rename(target)
+            raise
+    finally:
+        shutil.rmtree(room, ignore_errors=True)
+
+
+def _umask() -> int:
+    """What new files may not have; it can only be read by setting it."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

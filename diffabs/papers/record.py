@@ -1,0 +1,113 @@
+"""What a published result consists of: rows, figures, honest notes, and where the numbers come from."""
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import pathlib
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import diffabs
+from diffabs import plot
+from diffabs.rollout import FixedStep, Run
+
+
+def stacked(loops: Sequence[Any]) -> Any:
+    """Loops of one structure as one batch, for `jax.vmap`."""
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, float) for x in leaves]), *loops)
+
+
+def lane(run: Run, i: int) -> Run:
+    """One run out of a batch, as NumPy arrays."""
+    return jax.tree.map(lambda x: np.asarray(x[i]), run)
+
+
+def row(
+    name: str, quantity: str, unit: str, ours: Any, *, published: float | None = None, reference: float | None = None
+) -> dict[str, Any]:
+    """A line of a table, with the paper's number, or one that was computed independently, or neither."""
+    ours, expected = float(ours), reference if published is None else published
+    difference = None if expected is None else ours - expected
+    line = {"name": name, "quantity": quantity, "unit": unit, "ours": ours}
+    return {**line, "published": published, "reference": reference, "difference": difference}
+
+
+def printed(name: str, quantity: str, unit: str, ours: Any, published: float, digits: int = 2) -> dict[str, Any]:
+    """A line of a table whose published number has so many decimals; `matches` if ours rounds to it."""
+    line = row(name, quantity, unit, ours, published=published)
+    return {**line, "matches": round(line["ours"], digits) == round(published, digits)}
+
+
+def solver(step: FixedStep, **more: Any) -> dict[str, Any]:
+    """How it was integrated."""
+    dtype = str(jnp.result_type(float))
+    return {"method": "RK4, fixed step", "step": step.step, "duration": step.duration, "dtype": dtype, **more}
+
+
+def versions() -> dict[str, str]:
+    """Of everything that can change a number, and the commit where there is one."""
+    found = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy", "matplotlib")}
+    platforms = {"python": platform.python_version(), "backend": jax.default_backend(), "machine": platform.machine()}
+    return {"diffabs": diffabs.__version__, **found, **platforms, **_commit()}
+
+
+def _commit() -> dict[str, str]:
+    """The commit of a working copy, marked where files differ from it; nothing for an installed package."""
+    root = pathlib.Path(diffabs.__file__).parent.parent
+    if not (root / ".git").exists():
+        return {}
+    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return {}
+    return {"commit": answer.stdout.strip()} if answer.returncode == 0 else {}
+
+
+def write(folder: pathlib.Path, summary: dict[str, Any], name: str = "summary.json") -> dict[str, Any]:
+    """Write a summary, whole or not at all, and return it as a reader would get it. Raises ValueError for a number
+    that is not finite."""
+    text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False)
+    path = folder / name
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text(text + "\n", encoding="utf-8")
+    os.replace(temporary, path)
+    return json.loads(text)
+
+
+def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print rows of equal keys as a table; floats with five significant digits or four decimals."""
+    table = Table(title=title, title_justify="left")
+    for name in rows[0]:
+        table.add_column(name, justify="left" if isinstance(rows[0][name], str) else "right")
+    for line in rows:
+        table.add_row(*(_short(value) for value in line.values()))
+    console = Console(markup=False, emoji=False, highlight=False)
+    if not console.is_terminal:
+        console.width = 160
+    console.print(table)
+
+
+def _short(value: Any) -> str:
+    if not isinstance(value, float):
+        return "" if value is None else str(value)
+    return f"{value:.5g}" if abs(value) < 1 or abs(value) >= 1000 else f"{value:.4f}"
+
+
+def experiment(config: Any, results: Mapping[str, Any], figures: Mapping[str, Any]) -> dict[str, Any]:
+    """Write an experiment's figures and `results.json` into its folder `config.out`, with config and versions; returns
+    what was written."""
+    folder = pathlib.Path(config.out)
+    folder.mkdir(parents=True, exist_ok=True)
+    names = [plot.save(figure, folder / f"{name}.png").name for name, figure in figures.items()]
+    whole = {"config": dataclasses.asdict(config), **results, "figures": names, "versions": versions()}
+    return write(folder, whole, "results.json")

@@ -1,0 +1,193 @@
+"""Figures of runs. The only module that needs matplotlib (`pip install "diffabs[plot]"`); it keeps no global state.
+
+Speeds are drawn in km/h, everything else in SI units. Colours are those of M. Okabe and K. Ito, Color Universal Design
+(2008), which colour-blind readers can tell apart; curves that lie close differ in their dashes as well.
+"""
+
+import os
+import pathlib
+import tempfile
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffabs.protocols import Road
+from diffabs.rollout import Run, Trajectory
+
+try:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError('figures need matplotlib: pip install "diffabs[plot]"', name=error.name) from error
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+DASHES = ("-", "--", "-.", ":", "-", "--", "-.")
+GREY = "#767676"
+KMH = 3.6  # km/h per m/s
+DPI = 150
+
+
+def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float, float] = (5.4, 3.4), **kwargs: Any):
+    """An empty figure in the house's look, and its axes, a list in reading order. `size` [inch] is that of one axes."""
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), dpi=DPI, layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False, **kwargs).flat)
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.spines[["left", "bottom"]].set_color(GREY)
+        ax.tick_params(labelsize=10, colors="#333333")
+        ax.grid(color="#DDDDDD", linewidth=0.7)
+        ax.set_axisbelow(True)
+    if title:
+        figure.suptitle(title, fontsize=12.5, fontweight="bold")
+    return figure, axes
+
+
+def label(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> None:
+    """Name the axes, with units, and show the legend if there is something in it."""
+    ax.set_xlabel(x, fontsize=11)
+    ax.set_ylabel(y, fontsize=11)
+    if title:
+        ax.set_title(title, fontsize=11)
+    if legend and ax.get_legend_handles_labels()[1]:
+        ax.legend(fontsize=9.5, framealpha=0.9, edgecolor="none")
+
+
+def save(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
+    """Write a figure in the format of the path's suffix, atomically: readers see the old file or the whole new one."""
+    path = pathlib.Path(path)
+    handle, name = tempfile.mkstemp(suffix=path.suffix, prefix=f".{path.stem}-", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            figure.savefig(file, format=path.suffix.lstrip(".") or "png", dpi=DPI)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        os.unlink(name)
+        raise
+    return path
+
+
+def braking(run: Run, *, title: str = "") -> Figure:
+    """A run at a glance: slip with target and setpoint, speeds, torque, deceleration. Raises ValueError for a run
+    without a trajectory, as `measure` returns it."""
+    seen = _trajectory(run)
+    figure, (top, speed, torque, brake) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
+    t, sample = np.asarray(seen.sample.t), seen.sample
+    top.plot(t, sample.output.slip, color=COLOURS[0], label="slip")
+    top.plot(t, sample.target, "--", color=COLOURS[1], label="target")
+    top.plot(t, sample.setpoint, ":", color="black", label="setpoint")
+    label(top, "", "slip [1]")
+    _speeds(speed, seen)
+    label(speed, "", "speed [km/h]")
+    torque.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
+    torque.plot(t, sample.control, color=COLOURS[0], label="control")
+    label(torque, "time [s]", "brake torque [N m]")
+    brake.plot(t, sample.output.deceleration, color=COLOURS[0])
+    label(brake, "time [s]", "deceleration [m/s²]")
+    return figure
+
+
+def slips(runs: Mapping[str, Trajectory], *, title: str = "", until: float | None = None) -> Figure:
+    """Slip over time, one curve per run, and the setpoint of the first."""
+    figure, (ax,) = sheet(title=title, size=(6.4, 3.8))
+    slip_lines(ax, runs)
+    label(ax, "time [s]", "slip [1]")
+    ax.set_xlim(0, until)
+    return figure
+
+
+def slip_lines(ax: Axes, runs: Mapping[str, Trajectory]) -> None:
+    """Draw slips and the setpoint of the first run into an axes."""
+    for i, (name, seen) in enumerate(runs.items()):
+        ax.plot(np.asarray(seen.sample.t), seen.sample.output.slip, DASHES[i], color=COLOURS[i], label=name)
+    first = next(iter(runs.values())).sample
+    ax.plot(np.asarray(first.t), first.setpoint, color="black", linewidth=0.9, linestyle=":", label="setpoint")
+
+
+def speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
+    """Vehicle and wheel speed over time, one panel per run, side by side."""
+    figure, axes = sheet(1, len(runs), title=title, size=(5.2 if len(runs) > 1 else 6.4, 3.6), sharex=True, sharey=True)
+    for i, (ax, (name, seen)) in enumerate(zip(axes, runs.items(), strict=True)):
+        _speeds(ax, seen)
+        label(ax, "time [s]", "" if i else "speed [km/h]", name)
+        ax.set_xlim(0, None)
+    return figure
+
+
+def _speeds(ax: Axes, seen: Trajectory) -> None:
+    t, y = np.asarray(seen.sample.t), seen.sample.output
+    ax.plot(t, KMH * np.asarray(y.wheel_speed), color=COLOURS[1], linestyle="--", linewidth=1.3, label="wheel")
+    ax.plot(t, KMH * np.asarray(y.speed), color=COLOURS[0], linewidth=1.6, label="vehicle")
+
+
+def positions(
+    panels: Sequence[Mapping[str, Trajectory]], *, title: str = "", zoom: tuple[float, float] | None = None
+) -> Figure:
+    """Position over time, one panel per group of runs; with `zoom`, one more panel that shows the last group over these
+    times [s]."""
+    groups = list(panels) + ([panels[-1]] if zoom else [])
+    figure, axes = sheet(1, len(groups), title=title, size=(5.2, 3.6), sharey=zoom is None)
+    for i, (ax, runs) in enumerate(zip(axes, groups, strict=True)):
+        single = len(runs) == 1
+        for j, (name, seen) in enumerate(runs.items()):
+            t, x = np.asarray(seen.sample.t), np.asarray(seen.sample.output.distance)
+            ax.plot(t, x, DASHES[j], color=COLOURS[j], label=None if single else f"{name}: {x[-1]:.2f} m")
+            ax.plot(t[-1:], x[-1:], "o", color=COLOURS[j], markersize=4.5)
+        label(ax, "time [s]", "" if i else "position [m]", next(iter(runs)) if single else "")
+        ax.set_xlim(0, None)
+    if zoom:
+        ends = [np.interp(zoom, seen.sample.t, seen.sample.output.distance) for seen in panels[-1].values()]
+        low, high = float(np.min(ends)), float(np.max(ends))
+        axes[-1].set_xlim(*zoom)
+        axes[-1].set_ylim(low, high + 0.08 * (high - low))
+    return figure
+
+
+def friction(
+    roads: Mapping[str, Road],
+    *,
+    marks: Mapping[str, tuple[float, float]] | None = None,
+    zoom: tuple[float, float, float, float] | None = None,
+    speed: float = 0.0,
+    title: str = "",
+) -> Figure:
+    """Friction over slip, with points marked by name; `zoom` = (slip, slip, mu, mu) adds a panel with that window."""
+    figure, axes = sheet(1, 2 if zoom else 1, title=title, size=(5.6, 3.8))
+    for ax in axes:
+        limits = zoom[:2] if zoom and ax is axes[-1] else (0.0, 1.0)
+        s = np.linspace(*limits, 1001)
+        for i, (name, road) in enumerate(roads.items()):
+            mu = jax.vmap(lambda x, road=road: road.friction(x, speed, 0.0))(s)
+            ax.plot(s, np.asarray(mu), DASHES[i], color=COLOURS[i], label=name)
+        for i, (name, (x, y)) in enumerate((marks or {}).items()):
+            if limits[0] <= x <= limits[1]:
+                ax.plot([x], [y], "osD^v"[i % 5], color=COLOURS[(i + len(roads)) % 7], markersize=7, label=name)
+        label(ax, "slip [1]", "friction coefficient [1]")
+    if zoom:
+        axes[-1].set_xlim(*zoom[:2])
+        axes[-1].set_ylim(*zoom[2:])
+    return figure
+
+
+def convergence(
+    panels: Mapping[str, Mapping[str, Any]], steps: Sequence[float], *, orders: Sequence[int], title: str = ""
+) -> Figure:
+    """Error over step length in logarithmic axes, one panel per case, with a guide line for each order."""
+    figure, axes = sheet(1, len(panels), title=title, size=(5.2, 3.8), sharey=True)
+    h = np.asarray(steps)
+    for i, (ax, order, (name, curves)) in enumerate(zip(axes, orders, panels.items(), strict=True)):
+        for j, (quantity, errors) in enumerate(curves.items()):
+            ax.loglog(h, errors, "o" + DASHES[j], color=COLOURS[j], markersize=4.5, label=quantity.replace("_", " "))
+        top = 3.0 * np.max([np.max(e) for e in curves.values()])
+        ax.loglog(h, top * (h / h.max()) ** order, color=GREY, linewidth=0.9, label=f"slope {order}")
+        label(ax, "step [s]", "" if i else "relative error [1]", name, legend=False)
+        ax.legend(fontsize=9, loc="lower right", framealpha=0.9, edgecolor="none")
+    return figure
+
+
+def _trajectory(run: Run) -> Trajectory:
+    if run.trajectory is None:
+        raise ValueError("the run has no trajectory: use rollout, not measure")
+    return run.trajectory

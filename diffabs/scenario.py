@@ -1,0 +1,254 @@
+"""A scenario: a TOML file, or the name of a packaged one, that says what is run.
+
+    [plant] [road] [initial] [sensor] [reference] [feedforward] [controller] [actuator] [stop]    a part each: `type`
+    [solver]       step [s], duration [s], every (trajectories keep every so many steps), seed (of noisy sensors)
+    [objective]    name = a part; adds to, or changes, those of every braking report
+
+What is left out has its default. Speeds may be given in km/h: `speed_kmh`. A value is never evaluated as code."""
+
+import dataclasses
+import importlib.resources
+import math
+import pathlib
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffabs import toml
+from diffabs.catalogue import OTHERS, build, filled, joined, number, shown, unknown, whole, wrong
+from diffabs.catalogue import ScenarioError as ScenarioError
+from diffabs.loop import Loop
+from diffabs.objectives import BRAKING
+from diffabs.protocols import Objective
+from diffabs.pytree import Spec, problems
+from diffabs.rollout import FixedStep
+from diffabs.stability import stable_step
+
+LARGEST_FILE = 1_000_000  # bytes
+LONGEST_PATH = 4096  # characters of it in a message
+MOST_STEPS = 1e8
+TEXTS = ("title", "description")
+TIME = Spec("s", low=0.0, open_low=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario:
+    """What is run: a loop, how it is integrated [s], what is measured, and the seed of its noise."""
+
+    name: str
+    title: str = ""
+    description: str = ""
+    loop: Loop = dataclasses.field(default_factory=lambda: Loop())
+    solver: FixedStep = dataclasses.field(default_factory=FixedStep)
+    objectives: Mapping[str, Objective] = dataclasses.field(default_factory=lambda: dict(BRAKING))
+    seed: int = 0
+
+    def key(self) -> jax.Array:
+        """The random key of a run."""
+        return jax.random.key(self.seed)
+
+
+def names() -> list[str]:
+    """The packaged scenarios."""
+    folder = importlib.resources.files("diffabs") / "scenarios"
+    return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
+
+
+def header(name_or_path: str | pathlib.Path) -> dict[str, str]:
+    """Title and description of a scenario, without building it. Raises ScenarioError."""
+    table = _parsed(_read(name_or_path)[1], str(name_or_path))
+    return {key: _text(table.get(key, ""), key) for key in TEXTS}
+
+
+def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = ()) -> Scenario:
+    """The scenario in a TOML file, or a packaged one, with overrides such as `controller.kp=4000`.
+
+    An override's value is a TOML value; a bare word is text, and `1,2` a list. `controller=relay` replaces the part.
+    Raises ScenarioError, one line, for a file that cannot be read, unknown names, wrong types, values out of range, and
+    a step that is not stable for the loop.
+    """
+    name, raw = _read(name_or_path)
+    table = _parsed(raw, str(name_or_path))
+    for override in overrides:
+        _override(table, override)
+    scenario = _assembled(name, table)
+    for lines in (_wrong_values(scenario), _wrong_together(scenario)):
+        found = [re.sub(r"^plant\.road\b", "road", line) for line in lines]
+        if found:
+            raise ScenarioError("; ".join(found))
+    return scenario
+
+
+def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
+    path, quoted = pathlib.Path(name_or_path), shown(str(name_or_path), LONGEST_PATH)
+    if str(name_or_path) in names():
+        file = importlib.resources.files("diffabs") / "scenarios" / f"{name_or_path}.toml"
+        return str(name_or_path), file.read_bytes()
+    try:
+        if len(path.parts) == 1 and not path.suffix and not path.exists():
+            raise unknown(f"no scenario and no file is called {quoted}", str(path), names())
+        with path.open("rb") as file:
+            raw = file.read(LARGEST_FILE + 1)
+    except (OSError, ValueError) as error:
+        if isinstance(error, ScenarioError):
+            raise
+        why = getattr(error, "strerror", None) or str(error)
+        raise ScenarioError(f"cannot read scenario {quoted}: {why}") from None
+    if len(raw) > LARGEST_FILE:
+        raise ScenarioError(f"{quoted} is larger than {LARGEST_FILE} bytes; it is no scenario")
+    return path.stem, raw
+
+
+def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
+    quoted = shown(origin, LONGEST_PATH)
+    try:
+        return _lifted(tomllib.loads(raw.decode()))
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise ScenarioError(f"{quoted} is not UTF-8 text (at line {line})") from None
+    except ScenarioError:
+        raise
+    except RecursionError:
+        raise ScenarioError(f"{quoted} is not a scenario: its values are nested too deeply") from None
+    except ValueError as error:
+        raise ScenarioError(f"{quoted} is not TOML: {error}") from None
+
+
+def _lifted(table: dict[str, Any]) -> dict[str, Any]:
+    """The road of the plant in its own section, wherever it was written."""
+    plant = table.get("plant")
+    if isinstance(plant, dict) and "road" in plant:
+        if "road" in table:
+            raise ScenarioError("road is given twice, as a section and in plant")
+        table["road"] = plant.pop("road")
+    return table
+
+
+def _override(table: dict[str, Any], override: str) -> None:
+    path, equals, text = override.partition("=")
+    keys = path.strip().split(".")
+    if not equals or not all(keys):
+        raise ScenarioError(f"override {shown(override)} is not of the form section.field=value")
+    if keys[:2] == ["plant", "road"]:
+        keys = keys[1:]
+    node: Any = table
+    for i, key in enumerate(keys[:-1]):
+        place = _place(node, key, ".".join(keys[:i]))
+        child = node[place] if isinstance(node, list) else node.get(place, {})
+        child = {"type": child} if isinstance(child, str) else child
+        if not isinstance(child, dict | list):
+            raise ScenarioError(f"{'.'.join(keys[: i + 1])} = {shown(child)} has no field {shown(keys[i + 1])}")
+        node[place] = child
+        node = child
+    place = _place(node, keys[-1], ".".join(keys[:-1]))
+    if isinstance(place, str):
+        other = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
+        node.pop(other, None)
+    node[place] = toml.value(text.strip())
+    _lifted(table)
+
+
+def _place(node: Any, key: str, path: str) -> Any:
+    if isinstance(node, dict):
+        return key
+    there = [str(i) for i in range(len(node))]
+    if key not in there:
+        raise unknown(f"{path}.{key} is not there", key, there)
+    return int(key)
+
+
+def _assembled(name: str, table: dict[str, Any]) -> Scenario:
+    text = {key: _text(table.get(key, ""), key) for key in TEXTS}
+    sections = {key: value for key, value in table.items() if key not in OTHERS}
+    if "road" in table:
+        plant = sections.get("plant", {})
+        plant = {"type": plant} if isinstance(plant, str) else plant
+        sections["plant"] = {**plant, "road": table["road"]} if isinstance(plant, dict) else plant
+    solver, seed = _solver(table.get("solver", {}))
+    given = table.get("objective", {})
+    if not isinstance(given, dict):
+        raise wrong("objective", given, "a table of objectives")
+    measured = {
+        key: build("objective", value, BRAKING.get(key), joined("objective", key)) for key, value in given.items()
+    }
+    return Scenario(
+        name=name,
+        **text,
+        loop=filled(Loop(), sections, "", ""),
+        solver=solver,
+        objectives={**BRAKING, **measured},
+        seed=seed,
+    )
+
+
+def _text(value: Any, path: str) -> str:
+    if not isinstance(value, str):
+        raise wrong(path, value, "text")
+    return value
+
+
+def _solver(table: Any) -> tuple[FixedStep, int]:
+    fields = ("step", "duration", "every", "seed")
+    if not isinstance(table, dict):
+        raise wrong("solver", table, f"a table of {', '.join(fields)}")
+    for key in table:
+        if key not in fields:
+            raise unknown(f"{joined('solver', key)} is not a field of solver", key, fields)
+    times = {key: number(table[key], TIME, f"solver.{key}") for key in ("step", "duration") if key in table}
+    for key, value in times.items():
+        if not TIME.holds(value):
+            raise ScenarioError(f"solver.{key} = {shown(value)} is outside {TIME.interval()}")
+    every = whole(table.get("every", 1), 1, int(MOST_STEPS), "solver.every")
+    return FixedStep(**times, every=every), whole(table.get("seed", 0), 0, 2**32 - 1, "solver.seed")
+
+
+def _wrong_values(scenario: Scenario) -> Iterator[str]:
+    """What the parts object to."""
+    yield from problems(scenario.loop)
+    for name, objective in scenario.objectives.items():
+        yield from problems(objective, f"{joined('objective', name)}.")
+
+
+def _wrong_together(scenario: Scenario) -> Iterator[str]:
+    """What does not go together: parts and step. The dearest question, stability, comes last."""
+    loop, solver = scenario.loop, scenario.solver
+    start, end = getattr(loop.initial, "speed", np.inf), getattr(loop.stop, "speed", 0.0)
+    if not start > end:
+        yield f"initial.speed = {start:g} m/s is not above stop.speed = {end:g} m/s: the run would end before it starts"
+        return
+    if solver.step > solver.duration:
+        yield f"solver.step = {solver.step:g} s is outside (0, {solver.duration:g}] s: longer than solver.duration"
+        return
+    if solver.duration / solver.step > MOST_STEPS:
+        least = solver.duration / MOST_STEPS
+        yield f"solver.step = {solver.step:g} s is outside [{least:g}, {solver.duration:g}] s: too many steps"
+        return
+    lines = list(loop.grid_problems(solver.step))
+    yield from lines
+    if lines:
+        return
+    largest = stable_step(loop)
+    if solver.step > largest:
+        digit = 10.0 ** (math.floor(math.log10(largest)) - 2)
+        largest = math.floor(largest / digit) * digit  # what is printed must be stable too
+        yield (
+            f"solver.step = {solver.step:g} s is not stable: RK4 follows the fastest mode of this loop, between the "
+            f"initial speed and {end:g} m/s, only with steps in (0, {largest:.3g}] s"
+        )
+
+
+def dump(scenario: Scenario) -> str:
+    """TOML that loads back to the same scenario; every field is written, numbers at full precision."""
+    sections = {
+        field.name: toml.table(field.name, getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)
+    }
+    if "road" in sections["plant"]:
+        sections["road"] = sections["plant"].pop("road")
+    solver = {name: getattr(scenario.solver, name) for name in ("step", "duration", "every")}
+    sections["solver"] = {**solver, "seed": scenario.seed}
+    sections["objective"] = {name: toml.table("objective", part) for name, part in scenario.objectives.items()}
+    return toml.document({key: getattr(scenario, key) for key in TEXTS}, sections)

@@ -1,0 +1,111 @@
+"""What the commands show: tables for a person, JSON and CSV for a script."""
+
+import json
+import math
+import pathlib
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from diffabs.catalogue import unit_of
+from diffabs.console import say
+from diffabs.rollout import Trajectory
+from diffabs.scenario import Scenario
+
+PIPE_WIDTH = 140  # columns of a table that goes to a file
+
+
+def as_json(value: Any) -> None:
+    """One JSON document on stdout; numbers that JSON does not have are null."""
+    typer.echo(json.dumps(_finite(value), indent=2, allow_nan=False))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_csv(trajectory: Trajectory, control_unit: str, path: pathlib.Path) -> None:
+    """The instants up to the end of the run, with units in the header."""
+    sample, y = trajectory.sample, trajectory.sample.output
+    columns = {
+        "t [s]": sample.t,
+        "slip [1]": y.slip,
+        "speed [m/s]": y.speed,
+        "wheel_speed [m/s]": y.wheel_speed,
+        "deceleration [m/s^2]": y.deceleration,
+        "distance [m]": y.distance,
+        "target [1]": sample.target,
+        f"command [{control_unit}]": sample.command,
+        f"control [{control_unit}]": sample.control,
+    }
+    rows = int(trajectory.running.sum()) + 1  # after the end the last sample is repeated
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(",".join(columns) + "\n")
+        for row in zip(*(values[:rows].tolist() for values in columns.values()), strict=True):
+            file.write(",".join(f"{value:.12g}" for value in row) + "\n")
+
+
+def run(result: dict[str, Any], chosen: Scenario) -> None:
+    """Metrics with their units, and what was written."""
+    table = Table("metric", "value", "unit")
+    for name, value in result["metrics"].items():
+        table.add_row(name, f"{value:.6g}", unit_of(chosen.objectives[name]))
+    _print(chosen.title or chosen.name, table)
+    for name, path in result["files"].items():
+        say(f"{name}: {path}")
+
+
+def family(name: str, members: dict[str, Any]) -> None:
+    """The members of a family, field by field; or the scenarios."""
+    if name == "scenarios":
+        table = Table("name", "title", "description")
+        for member, header in members.items():
+            table.add_row(member, header["title"], header["description"])
+    else:
+        table = Table("type", "field", "default", "unit", "range")
+        for member, about in members.items():
+            member = f"{member} [{about['unit']}]" if about.get("unit") else member
+            fields = about["parameters"] or {"": {"default": "", "unit": "", "range": ""}}
+            for field, row in fields.items():
+                table.add_row(
+                    member, field, _brief(row["default"]), row["unit"], row["range"].removesuffix(row["unit"])
+                )
+                member = ""
+            table.add_section()
+    _print(name, table)
+
+
+def paper(summary: dict[str, Any], folder: pathlib.Path) -> None:
+    """Our numbers against the published ones, and where the figures are."""
+    independent = any(row.get("reference") is not None for row in summary["rows"])
+    numbers = ("ours", "published", *(("reference",) if independent else ()), "difference")
+    table = Table("", "quantity", *numbers, "unit")
+    for row in summary["rows"]:
+        texts = (row.get("name"), row.get("quantity"), *(row.get(key) for key in numbers), row.get("unit"))
+        table.add_row(*("" if value is None else _brief(value) for value in texts))
+    _print(summary["title"], table)
+    notes = summary.get("notes") or []
+    for note in [notes] if isinstance(notes, str) else notes:
+        say(f"note: {note}")
+    say(f"figures and summary.json: {folder} ({', '.join(summary['figures'])})")
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _print(title: str, table: Table) -> None:
+    for column in table.columns:
+        column.overflow = "fold"  # a pipe has no width: nothing may be cut off
+    console = Console(markup=False, emoji=False, highlight=False)  # `[N m]` is a unit here, not a style
+    if not console.is_terminal:
+        console.width = PIPE_WIDTH
+    console.print(title, table, sep="\n")

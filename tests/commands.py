@@ -1,0 +1,25 @@
+"""Running the command line in this process, for the tests of every command."""
+
+import pathlib
+
+from typer.testing import CliRunner
+
+from diffabs import cli
+
+
+def run(*args: object, status: int = 0):
+    result = CliRunner().invoke(cli.app, [str(a) for a in args])
+    if result.exception and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    assert result.exit_code == status, result.output
+    return result
+
+
+def assert_one_error_line(result):
+    assert result.stdout == ""
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+
+
+def left_in(folder: pathlib.Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}

@@ -1,0 +1,279 @@
+"""Does every test that should fail, fail? Breaks a copy of the package in one place at a time and runs the tests named.
+
+    python tests/mutations.py [part of a name ...]
+
+Exit status 1 if a mutation survives, if its text is no longer in the file, or if a named test fails without it. Not
+collected by pytest; run it weekly, and when a test is added: add a line to MUTATIONS.
+"""
+
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import tempfile
+from typing import NamedTuple
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+
+
+class Mutation(NamedTuple):
+    """In diffabs/`file`, `old` becomes `new`; `test` (file::name, or file::name[case]) must then fail."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    test: str
+
+
+MUTATIONS = [
+    Mutation(
+        "RK4 with a wrong weight", "integrate.py", "2 * (b + c)", "(b + 3 * c)", "test_integrate.py::test_fourth_order"
+    ),
+    Mutation(
+        "RK4 stage at the wrong time",
+        "integrate.py",
+        "derivative(t + h, axpy(h, k3, x))",
+        "derivative(t, axpy(h, k3, x))",
+        "test_integrate.py::test_fourth_order",
+    ),
+    Mutation(
+        "structures that forget their class",
+        "pytree.py",
+        "    _register(new, [f.name for f in fields if f.name not in meta], meta)\n",
+        "    jax.tree_util.register_dataclass(new, [f.name for f in fields if f.name not in meta], meta)\n",
+        "test_pytree.py::test_structures_of_different_classes_differ",
+    ),
+    Mutation(
+        "infinity inside every range",
+        "pytree.py",
+        " & (np.isfinite(array) | (self.infinite & ~np.isnan(array)))",
+        "",
+        "test_pytree.py::test_check_returns_the_part_and_allows_declared_infinities",
+    ),
+    Mutation(
+        "weak types stay weak",
+        "pytree.py",
+        "return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)",
+        "return tree",
+        "test_conformance.py::test_new_values_do_not_compile_again[plant: quarter car]",
+    ),
+    Mutation(
+        "an odd curve that is even",
+        "numerics.py",
+        "return s * curve(s * x)",
+        "return curve(s * x)",
+        "test_conformance.py::test_road[SNOW]",
+    ),
+    Mutation(
+        "a power with an infinite gradient at 0",
+        "numerics.py",
+        "jnp.exp(exponent * jnp.log(jnp.where(positive, base, 1.0)))",
+        "jnp.exp(exponent * jnp.log(base))",
+        "test_conformance.py::test_road[RIG]",
+    ),
+    Mutation(
+        "pchip with secants weighted the wrong way round",
+        "roads/tabulated.py",
+        "w0 * m[1:] + w1 * m[:-1]",
+        "w1 * m[1:] + w0 * m[:-1]",
+        "test_roads.py::test_tabulated_is_pchip",
+    ),
+    Mutation(
+        "pchip with a steep end",
+        "roads/tabulated.py",
+        "jnp.where(steep, 3 * m0, d)",
+        "d",
+        "test_roads.py::test_tabulated_is_pchip",
+    ),
+    Mutation(
+        "a peak without its derivative",
+        "roads/optimum.py",
+        "s0 - ratio(slope(s0), curvature)",
+        "s0",
+        "test_roads.py::test_gradient_of_burckhardt_peak",
+    ),
+    Mutation(
+        "a ramp between patches that is a line",
+        "roads/compound.py",
+        "y * y * (3 - 2 * y)",
+        "y",
+        "test_roads.py::test_patches_are_c1",
+    ),
+    Mutation(
+        "slip of the wrong sign",
+        "plants/wheel.py",
+        "return (speed - wheel_speed) /",
+        "return (wheel_speed - speed) /",
+        "test_plants.py::test_energy_only_goes_into_friction[quarter car]",
+    ),
+    Mutation(
+        "a brake that turns a stopped wheel backwards",
+        "plants/wheel.py",
+        "return jnp.where(jnp.greater(speed, 0), rate, jnp.maximum(rate, 0.0))",
+        "return rate",
+        "test_plants.py::test_a_stopped_wheel_stays_stopped_until_released[mirrored rig]",
+    ),
+    Mutation(
+        "a plant that stops gradients",
+        "plants/mirrored_rig.py",
+        "wheel = (push * self.wheel_radius - control) / self.wheel_inertia",
+        'wheel = (__import__("jax").lax.stop_gradient(push) * self.wheel_radius - control) / self.wheel_inertia',
+        "test_conformance.py::test_plant_jacobian[mirrored rig]",
+    ),
+    Mutation(
+        "a lever without the brake's reaction",
+        "plants/lab_rig.py",
+        "return mu, (self.weight_torque + torque) / arm, torque",
+        "return mu, self.weight_torque / arm, torque",
+        "test_plants.py::test_lab_rig_derivative",
+    ),
+    Mutation(
+        "holding torque of a wheel without inertia",
+        "plants/quarter_car.py",
+        "self.mass * self.radius + (1 - target) * self.inertia / self.radius",
+        "self.mass * self.radius",
+        "test_plants.py::test_holding_holds_the_slip[25.0-0.2-quarter car]",
+    ),
+    Mutation(
+        "anti-windup that winds up",
+        "controllers/antiwindup.py",
+        "ratio(limited - raw, gain * self.tracking_time)",
+        "ratio(raw - limited, gain * self.tracking_time)",
+        "test_blocks.py::test_antiwindup",
+    ),
+    Mutation(
+        "a derivative without its filter",
+        "controllers/pid.py",
+        "return PIDMemory(integral, self.cutoff * (error - memory.flow.filtered))",
+        "return PIDMemory(integral, 0.0 * error)",
+        "test_blocks.py::test_pi_and_filtered_derivative_to_a_step",
+    ),
+    Mutation(
+        "a relay without hysteresis",
+        "controllers/switching.py",
+        "(excess > self.band)",
+        "(excess > 0)",
+        "test_blocks.py::test_relay_switches_on_the_far_side_of_its_band",
+    ),
+    Mutation(
+        "a computer without delay",
+        "controllers/sampled.py",
+        "clock.t + self.delay",
+        "clock.t",
+        "test_blocks.py::test_sampled_is_a_zero_order_hold",
+    ),
+    Mutation(
+        "a latch that is never late",
+        "references/estimator.py",
+        "jnp.where(latch, (1 - place) * clock.h, 0.0)",
+        "0.0 * place",
+        "test_blocks.py::test_latch_finds_the_vertex",
+    ),
+    Mutation(
+        "a robust latch that is always armed",
+        "references/estimator.py",
+        "(greatest > self.arming) & ",
+        "",
+        "test_blocks.py::test_robust_latch",
+    ),
+    Mutation(
+        "a delay that forgets the running segment",
+        "actuators/delay.py",
+        "line(first, part, 1.0) + line(second, 0.0, part)",
+        "line(first, 0.0, 1.0)",
+        "test_blocks.py::test_delay_shifts_a_ramp",
+    ),
+    Mutation(
+        "noise drawn off its period",
+        "sensors/disturbance.py",
+        "jnp.where(clock.k % n == 0, a, b), drawn",
+        "jnp.where(clock.k % n == 1, a, b), drawn",
+        "test_blocks.py::test_noise",
+    ),
+    Mutation(
+        "a biased accelerometer that reads true",
+        "sensors/speed.py",
+        "return self.bias - signal.deceleration",
+        "return -signal.deceleration",
+        "test_blocks.py::test_integrated_accelerometer",
+    ),
+    Mutation(
+        "IAE without abs",
+        "objectives/accuracy.py",
+        "return jnp.abs(error(sample))",
+        "return error(sample)",
+        "test_conformance.py::test_errors_count_on_either_side[iae]",
+    ),
+    Mutation(
+        "a peak before the first sample",
+        "objectives/accuracy.py",
+        "(last > before) & (last > slip)",
+        "(last >= before) & (last > slip)",
+        "test_conformance.py::test_objective[max_slip]",
+    ),
+    Mutation(
+        "a road that nobody lists",
+        "roads/__init__.py",
+        "from diffabs.roads.tabulated import Tabulated as Tabulated\n",
+        "from diffabs.roads.tabulated import PiecewiseCubic as PiecewiseCubic\n"
+        "from diffabs.roads.tabulated import Tabulated as Tabulated\n",
+        "test_conformance.py::test_every_exported_part_has_an_instance",
+    ),
+]
+
+
+def passes(tests: list[str], folder: pathlib.Path) -> bool:
+    """Whether the tests pass against the package in `folder`. Stops at the first failure."""
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(folder),
+        "DIFFABS_JAX_CACHE": str(ROOT / ".jax_cache"),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    command = [sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *(f"tests/{test}" for test in tests)]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode > 1:  # neither passed nor failed: the test does not exist, or nothing could be imported
+        raise SystemExit(done.stdout + done.stderr)
+    return done.returncode == 0
+
+
+def copied(folder: pathlib.Path) -> None:
+    """The package and its tests, and a proof that it is this copy that Python finds."""
+    for name in ("diffabs", "tests"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    command = [sys.executable, "-c", "import diffabs; print(diffabs.__file__)"]
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    found = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True).stdout
+    if not pathlib.Path(found.strip()).is_relative_to(folder):
+        raise SystemExit(f"the tests would import {found.strip()}, not the copy in {folder}")
+
+
+def main(wanted: list[str]) -> int:
+    """Run the mutations whose names contain one of the words."""
+    chosen = [m for m in MUTATIONS if not wanted or any(word in m.name for word in wanted)]
+    bad = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = pathlib.Path(name).resolve()
+        copied(folder)
+        if not passes(sorted({m.test for m in chosen}), folder):
+            raise SystemExit("a named test fails without any mutation")
+        for mutation in chosen:
+            path = folder / "diffabs" / mutation.file
+            source = path.read_text()
+            if source.count(mutation.old) == 0:
+                verdict = "IS OUT OF DATE: its text is not in the file"
+            else:
+                path.write_text(source.replace(mutation.old, mutation.new))
+                verdict = "SURVIVES" if passes([mutation.test], folder) else "dies"
+                path.write_text(source)
+            bad += [mutation.name] if verdict != "dies" else []
+            print(f"{mutation.name}: {verdict}", flush=True)
+    print(f"{len(chosen) - len(bad)} of {len(chosen)} mutations die")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,259 @@
+"""One instance, at least, of every part. A new part needs one line here; tests/test_conformance.py does the rest.
+
+Values differ from the defaults where a default would hide something: a gain of zero, a limit never reached, a delay at
+the end of its range. Below them: the signals that blocks and objectives are fed, and derivatives by differences.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from diffabs import actuators, blocks, controllers, objectives, plants, references, roads, sensors, stops
+from diffabs.integrate import axpy, rk4_step
+from diffabs.protocols import BrakeOutput, Clock, Ending, Memory, Sample, Tracking
+from diffabs.pytree import strong
+
+FAMILIES = (roads, plants, controllers, references, actuators, sensors, objectives, stops, blocks)
+
+ROADS: dict[str, Any] = {
+    **{name: road for name, road in vars(roads).items() if name.isupper()},
+    "walking speed": roads.Burckhardt(c4=0.0),
+    "magic": roads.MagicFormula(),
+    "scaled": roads.Scaled(road=roads.RIG, scale=0.8),
+    "patches": roads.Patches(),
+    "patches, three": roads.Patches(
+        roads=(roads.Scaled(road=roads.DRY_ASPHALT, scale=0.9), roads.MagicFormula(), roads.WET_ASPHALT),
+        edges=np.array([10.0, 10.2]),
+        width=0.5,
+    ),
+    "patches, sharp": roads.Patches(width=0.0),
+    "tabulated": roads.Tabulated(slip=np.array([0.0, 0.1, 0.3, 0.6, 1.0]), mu=np.array([0.0, 0.8, 0.6, 0.65, 0.5])),
+}
+
+PLANTS: dict[str, Any] = {
+    "quarter car": plants.QuarterCar(),
+    "quarter car, asphalt": plants.QuarterCar(road=roads.DRY_ASPHALT),
+    "quarter car, snow": plants.QuarterCar(mass=300.0, radius=0.3, road=roads.SNOW),
+    "quarter car, magic": plants.QuarterCar(road=roads.MagicFormula()),
+    "quarter car, patches": plants.QuarterCar(road=roads.Patches()),
+    "mirrored rig": plants.MirroredRig(),
+    "mirrored rig, a body": plants.MirroredRig(mass=6.2, inertia_factor=1.0),
+    "lab rig": plants.LabRig(),
+    "lab rig, unrounded": plants.LabRig(road=roads.RIG_UNROUNDED),
+}
+
+_PID = controllers.PID(kp=150.0, ki=800.0, kd=1.5, torque_min=-5.0)
+
+CONTROLLERS: dict[str, Any] = {
+    "pid": _PID,
+    "pid, default": controllers.PID(),
+    "pid, clamping": controllers.PID(kp=900.0, ki=5000.0, kd=5.67, antiwindup=controllers.Clamping()),
+    "pid, back-calculation": controllers.PID(kp=900.0, ki=5000.0, antiwindup=controllers.BackCalculation()),
+    "state feedback": controllers.StateFeedback(),
+    "state feedback, limited": controllers.StateFeedback(
+        gain=np.array([-900.0, -150.0]),
+        torque_min=0.0,
+        torque_max=30.0,
+        antiwindup=controllers.BackCalculation(tracking_time=0.02),
+    ),
+    "constant torque": controllers.ConstantTorque(),
+    "relay": controllers.Relay(torque_min=2.0),
+    "sliding mode": controllers.SlidingMode(gain=60.0, boundary=0.1, torque_max=70.0),
+    "sampled pid": controllers.Sampled(controller=_PID, period=2e-3, delay=5e-4),
+    "sampled relay": controllers.Sampled(controller=controllers.Relay(), delay=3e-4),
+}
+
+REFERENCES: dict[str, Any] = {
+    "fixed": references.FixedSlip(),
+    "filtered": references.FilteredSlip(),
+    "literal": references.PeakLiteral(),
+    "latch": references.PeakLatch(),
+    "robust": references.PeakRobust(time_constant=0.002, threshold=0.01),
+}
+
+ACTUATORS: dict[str, Any] = {
+    "direct": blocks.Direct(),
+    "limits": actuators.Limits(low=5.0, high=60.0),
+    "lag": actuators.Lag(),
+    "rate limit": actuators.RateLimit(),
+    "delay": actuators.Delay(time=2.3e-3, capacity=8),
+    "series": blocks.Series(
+        blocks=(actuators.Delay(time=1.6e-3, capacity=8), actuators.Lag(), actuators.Limits(low=-5.0))
+    ),
+}
+
+SENSORS: dict[str, Any] = {
+    "direct": blocks.Direct(),
+    "noise": sensors.Noise(slip=0.01, speed=0.1, wheel_speed=0.2, deceleration=0.3, period=2e-3),
+    "bias": sensors.Bias(slip=0.01, deceleration=-0.2),
+    "quantisation": sensors.Quantisation(slip=0.013, wheel_speed=0.1),
+    "wheel speed": sensors.WheelSpeed(),
+    "accelerometer": sensors.IntegratedAccelerometer(bias=0.05),
+    "series": blocks.Series(blocks=(sensors.Noise(deceleration=0.05), sensors.WheelSpeed())),
+}
+
+PARTS: dict[str, dict[str, Any]] = {
+    "road": ROADS,
+    "plant": PLANTS,
+    "initial": {"default": plants.BrakeStart(), "slipping": plants.BrakeStart(speed=20.0, slip=0.1)},
+    "controller": CONTROLLERS,
+    "reference": REFERENCES,
+    "actuator": ACTUATORS,
+    "sensor": SENSORS,
+    "antiwindup": {
+        "none": controllers.NoAntiWindup(),
+        "clamping": controllers.Clamping(),
+        "back-calculation": controllers.BackCalculation(),
+    },
+    "feedforward": {
+        "none": controllers.NoFeedforward(),
+        "constant": controllers.ConstantInput(value=2.5),
+        "holding": controllers.HoldingInput(),
+    },
+    "stop": {"speed reached": stops.SpeedReached(), "standstill": stops.Standstill()},
+    "objective": {
+        **objectives.BRAKING,
+        "itae": objectives.ITAE(),
+        "quadratic": objectives.QuadraticCost(q=np.array([3.0, 2.0]), r=0.5),
+        "effort": objectives.Effort(),
+        "variation": objectives.Variation(),
+    },
+}
+
+BLOCKS = {(family, name): PARTS[family][name] for family in ("controller", "reference", "actuator", "sensor")
+          for name in PARTS[family]}  # fmt: skip
+
+
+def inside(part: Any) -> Iterator[Any]:
+    """A part and every part in it."""
+    yield part
+    for field in dataclasses.fields(part):
+        if "part" in field.metadata:
+            inner = getattr(part, field.name)
+            for item in inner if isinstance(inner, tuple) else (inner,):
+                yield from inside(item)
+
+
+def leaves(tree: Any) -> list[np.ndarray]:
+    """The leaves as NumPy arrays."""
+    return [np.asarray(x) for x in jax.tree.leaves(tree)]
+
+
+def struct(tree: Any, dtype: Any = None) -> Any:
+    """Structure, shapes and dtypes; with `dtype`, a stand-in that `eval_shape` accepts."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), dtype or jnp.result_type(x)), tree)
+
+
+H = 1e-3  # s, the step at which blocks are fed
+
+
+def output_at(t: Any) -> BrakeOutput:
+    """A wheel that slips ever more while the deceleration passes its maximum at 4.3 ms."""
+    slip, speed = 0.1 + 17.0 * t, 20.0 - 8.0 * t
+    return BrakeOutput(slip, speed, (1 - slip) * speed, 8.0 - 3e5 * (t - 4.3e-3) ** 2, 20.0 * t)
+
+
+def signal_at(family: str, t: Any) -> Any:
+    """What a block of this family is given at time t."""
+    if family == "controller":
+        return Tracking(0.2 + 0.0 * t, output_at(t), 20.0 + 300.0 * t)
+    return 20.0 + 50.0 * jnp.sin(200.0 * t + 0.5) if family == "actuator" else output_at(t)
+
+
+def sample_at(t: Any) -> Sample:
+    """A locked wheel whose slip falls from 1 to the setpoint 0.2 with the time constant 0.1 s; torque 10 + 5 e."""
+    excess = 0.8 * jnp.exp(-t / 0.1)
+    y = BrakeOutput(0.2 + excess, 20.0 - 8.0 * t, 16.0 - 8.0 * t, 8.0 + 0.0 * t, 20.0 * t - 4.0 * t**2)
+    return Sample(t, y, 0.2 + 0.0 * t, 0.2 + 0.0 * t, 10.0 + 0.0 * t, 10.0 + 5.0 * excess, 10.0 + 5.0 * excess)
+
+
+def block_run(family: str, block: Any, steps: int = 8) -> Any:
+    """Outputs, continuous memories and moments of events over some steps, by Euler: what a loop asks of a block."""
+    t = H * jnp.arange(steps)
+    signals = signal_at(family, t)
+
+    def step(memory: Memory, inputs: Any) -> Any:
+        t, k, signal = inputs
+        memory, elapsed = block.jump(Clock(t, H, k, jax.random.key(7)), memory, signal)
+        flow = axpy(H, block.flow(t, memory, signal), memory.flow)
+        return Memory(flow, memory.held), (block.output(t, memory, signal), memory.flow, elapsed)
+
+    start = block.start(jax.tree.map(lambda x: x[0], signals))
+    return jax.lax.scan(step, start, (t, jnp.arange(steps), signals))[1]
+
+
+RUNS = {family: partial(block_run, family) for family, _ in BLOCKS}
+
+
+def mirrored_at(t: Any) -> Sample:
+    """The same run with the error of the other sign: slip below the setpoint."""
+    sample = sample_at(t)
+    return sample._replace(output=sample.output._replace(slip=2 * sample.setpoint - sample.output.slip))
+
+
+def objective_run(objective: Any, sample_at: Any = sample_at, end: float = 0.5, steps: int = 500) -> Any:
+    """The value of an objective on the run of `sample_at`, streamed as the rollout does."""
+    h = end / steps
+
+    def step(memory: Memory, k: Any) -> Any:
+        t = k * h
+        flow = rk4_step(lambda t, z: objective.flow(Memory(z, memory.held), sample_at(t)), t, memory.flow, h)
+        return Memory(flow, objective.update(Memory(flow, memory.held), sample_at(t + h), h)), None
+
+    memory, _ = jax.lax.scan(step, objective.start(sample_at(0.0 * h)), jnp.arange(steps))
+    return objective.value(memory, Ending(sample_at(jnp.asarray(end)), True, 0.25, 0.7))
+
+
+E, T = np.exp(-5.0), 0.1  # the error is 0.8 exp(-t/T), 0.8 E at the end; x1 = 0.8 T (1 - exp(-t/T)), u - ff = 5 e
+VALUES = {  # of the objectives on that run, by hand
+    "stop_time": 0.5 + 0.25,
+    "stop_distance": 20 * 0.5 - 4 * 0.25 + 0.7,
+    "max_slip": 1.0,
+    "overshoot": 4.0,
+    "settling_time": T * np.log(0.8 / 0.01),
+    "iae": 0.8 * T * (1 - E),
+    "itae": 0.8 * (T**2 - (T**2 + T * 0.5) * E),
+    "final_slip_error": 0.8 * E,
+    "locked_time": T * np.log(0.8 / 0.79),
+    "quadratic": 3 * (0.8 * T) ** 2 * (0.5 - 2 * T * (1 - E) + T / 2 * (1 - E**2))
+    + (2 + 0.5 * 25) * 0.64 * T / 2 * (1 - E**2),
+    "effort": 100 * 0.5 + 100 * 0.8 * T * (1 - E) + 25 * 0.64 * T / 2 * (1 - E**2),
+    "variation": 4.0 * (1 - E),
+}
+
+
+@partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})  # compiles twice as fast
+def _linearised(function: Any, tree: Any) -> Any:
+    x, unravel = ravel_pytree(tree)
+
+    def flat(x: Any) -> Any:
+        y = ravel_pytree(function(unravel(x)))[0]
+        return y, y
+
+    return jax.jacfwd(flat, has_aux=True)(x)
+
+
+def value(function: Any, tree: Any) -> np.ndarray:
+    """function(tree), its leaves in one vector."""
+    return np.asarray(_linearised(function, strong(tree))[1])
+
+
+def jacobian(function: Any, tree: Any) -> np.ndarray:
+    """d(function)/d(every element of every leaf), one row for each element, by forward-mode differentiation.
+
+    Compiled once for each function and structure of the tree: give it functions that outlive the test."""
+    return np.asarray(_linearised(function, strong(tree))[0]).T
+
+
+def differences(function: Any, tree: Any, step: float = 1e-5) -> np.ndarray:
+    """The same by central differences, with a step relative to the element (absolute for a zero)."""
+    x, unravel = ravel_pytree(strong(tree))
+    h = step * np.where(np.isfinite(x) & (np.abs(x) > 1e-6), np.abs(x), 1.0)
+    left, right = (np.array([value(function, unravel(x + sign * d)) for d in np.diag(h)]) for sign in (-1, 1))
+    return (right - left) / (2 * h[:, None]) if len(x) else jacobian(function, tree)

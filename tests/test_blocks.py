@@ -1,0 +1,300 @@
+"""Sensors, references, controllers and actuators against values by hand, closed forms and loops in NumPy."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from diffabs.actuators import Delay, Lag, Limits, RateLimit
+from diffabs.blocks import Series
+from diffabs.controllers import PID, BackCalculation, Clamping, NoAntiWindup, Relay, Sampled, SlidingMode, StateFeedback
+from diffabs.controllers.pid import PIDMemory
+from diffabs.integrate import rk4_step
+from diffabs.protocols import BrakeOutput, Clock, Memory, Tracking
+from diffabs.references import FilteredSlip, PeakLatch, PeakLiteral, PeakRobust
+from diffabs.sensors import Bias, IntegratedAccelerometer, Noise, Quantisation, WheelSpeed
+from diffabs.stops import SpeedReached, Standstill
+
+H = 1e-3
+
+
+def seen(slip=0.0, speed=20.0, deceleration=0.0, wheel_speed=None):
+    return BrakeOutput(slip, speed, (1 - slip) * speed if wheel_speed is None else wheel_speed, deceleration, 0.0)
+
+
+def tracking(error, feedforward=0.0, target=0.2):
+    return Tracking(target, seen(target - error), feedforward)
+
+
+def run(block, signal, steps, h=H, key=None):
+    """Jump, output, then RK4 over the step: outputs and elapsed times at the instants, as a loop would see them."""
+
+    def step(memory, k):
+        t = k * h
+        memory, elapsed = block.jump(Clock(t, h, k, key), memory, signal(t))
+        flow = rk4_step(lambda t, z: block.flow(t, Memory(z, memory.held), signal(t)), t, memory.flow, h)
+        return Memory(flow, memory.held), (block.output(t, memory, signal(t)), elapsed)
+
+    start = jax.tree.map(jnp.asarray, block.start(jax.tree.map(jnp.asarray, signal(0.0))))
+    return jax.jit(lambda start: jax.lax.scan(step, start, jnp.arange(steps))[1])(start)
+
+
+def close(actual, desired, rtol=1e-12, atol=1e-14):
+    np.testing.assert_allclose(actual, desired, rtol=rtol, atol=atol)
+
+
+# Controllers
+
+
+def test_pid_by_hand():
+    """10 + 100 * 0.05 + 2000 * 0.01 + 3 * 55 * (0.05 - 0.02) = 39.95."""
+    pid = PID(kp=100.0, ki=2000.0, kd=3.0, cutoff=55.0)
+    memory = Memory(PIDMemory(0.01, 0.02))
+    close(pid.output(0.0, memory, tracking(0.05, 10.0)), 39.95)
+    close(pid.flow(0.0, memory, tracking(0.05)), (0.05, 55.0 * 0.03))
+    close([pid.output(0.0, memory, tracking(error)) for error in (1.0, -1.0)], [90.0, 0.0])
+
+
+def test_pi_and_filtered_derivative_to_a_step():
+    """u = kp e + ki e t + kd wc e exp(-wc t)."""
+    pid = PID(kp=10.0, ki=40.0, kd=0.5, cutoff=30.0)
+    t = H * np.arange(50)
+    u, _ = run(pid, lambda t: tracking(0.1 + 0.0 * t), 50)
+    close(u, 1.0 + 4.0 * t + 0.5 * 30.0 * 0.1 * np.exp(-30.0 * t), rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "rates"),
+    [
+        # error, gain and excess raw - limited: outward, inward, not limited, outward below, gain zero
+        (NoAntiWindup(), (0.1, -0.1, 0.1, -0.1, 0.1)),
+        (Clamping(), (0.0, -0.1, 0.1, 0.0, 0.1)),
+        (BackCalculation(tracking_time=0.5), (0.1 - 3.0, -0.1 - 3.0, 0.1, -0.1 + 3.0, 0.1)),
+    ],
+)
+def test_antiwindup(strategy, rates):
+    cases = ((0.1, 20.0, 120.0, 90.0), (-0.1, 20.0, 120.0, 90.0), (0.1, 20.0, 50.0, 50.0), (-0.1, 20.0, -30.0, 0.0),
+             (0.1, 0.0, 120.0, 90.0))  # fmt: skip
+    close([strategy.rate(*case) for case in cases], rates)
+
+
+def test_antiwindup_of_state_feedback():
+    """Its gain is negative and its error slip - target: the signs cancel, and the excess drains all the same."""
+    k = StateFeedback(gain=np.array([-20.0, -100.0]), torque_max=5.0, antiwindup=Clamping())
+    assert k.flow(0.0, Memory(-1.0), tracking(0.1)) == 0  # raw = 20 + 10, the error asks for more
+    close(k.flow(0.0, Memory(-1.0), tracking(-0.05)), 0.05)
+    back = StateFeedback(gain=np.array([-20.0, -100.0]), torque_max=5.0, antiwindup=BackCalculation(tracking_time=0.1))
+    close(back.flow(0.0, Memory(-1.0), tracking(0.1)), -0.1 + (5.0 - 30.0) / (-20.0 * 0.1))
+
+
+def test_state_feedback_by_hand():
+    k = StateFeedback()
+    close(k.output(0.0, Memory(2e-4), tracking(-0.05, 2.5)), 2.5 - 11753.0 * 2e-4 - 48.0 * 0.05)
+    close(k.flow(0.0, Memory(2e-4), tracking(-0.05)), 0.05)
+
+
+def test_relay_switches_on_the_far_side_of_its_band():
+    """Excess by hand, band 0.02. Linear interpolation puts the crossing of 0.02 at 2/3 and of -0.02 at 1/2."""
+    relay = Relay(band=0.02, torque_min=1.0, torque_max=9.0)
+    excess = jnp.array([-0.05, 0.01, 0.025, 0.03, -0.01, -0.015, -0.025, 0.01])
+    torque, elapsed = run(relay, lambda t: tracking(-excess[jnp.round(t / H).astype(int)]), 8)
+    close(torque, [9.0, 9.0, 1.0, 1.0, 1.0, 1.0, 9.0, 9.0])
+    close(elapsed, H * np.array([0, 0, 1 / 3, 0, 0, 0, 1 / 2, 0]))
+
+
+def test_sliding_mode():
+    mode = SlidingMode(gain=40.0, boundary=0.1, torque_min=-100.0)
+    close([mode.output(0.0, Memory(), tracking(e, 5.0)) for e in (0.05, -0.02, 0.3, -0.3)], [25.0, -3.0, 45.0, -35.0])
+
+
+@pytest.mark.parametrize("delay", [0.0, 1.5, 2.0, 4.0])
+def test_sampled_is_a_zero_order_hold(delay):
+    """Against the textbook loop: u_k held from t_k + delay on, integral by forward Euler, mean over each step."""
+    period, steps, fine = 4, 23, 100  # in steps; `fine` resolves the mean
+    pid = PID(kp=30.0, ki=500.0, torque_min=-200.0, torque_max=200.0)
+
+    def error(t):
+        return 0.1 * jnp.cos(300.0 * t)
+
+    integral, changes = 0.0, []
+    for k in range(0, steps, period):
+        e = 0.1 * np.cos(300.0 * k * H)
+        changes.append((k + delay, 30.0 * e + 500.0 * integral))
+        integral += period * H * e
+    expected = []
+    for k in range(steps):
+        moments = k + (np.arange(fine) + 0.5) / fine
+        expected.append(np.mean([([0.0] + [u for t, u in changes if t <= m])[-1] for m in moments]))
+    u, _ = run(Sampled(controller=pid, period=period * H, delay=delay * H), lambda t: tracking(error(t)), steps)
+    close(u, expected)
+
+
+# References
+
+
+def test_filtered_slip():
+    target, _ = run(FilteredSlip(slip=0.2, time_constant=0.035), lambda t: seen(0.05), 60)
+    close(target, 0.2 - 0.15 * np.exp(-H * np.arange(60) / 0.035), rtol=1e-8)  # RK4 leaves 35 (1/35)^5/120
+
+
+def parabola(t, top=5.3e-3, a=9.0, bend=4e4):
+    """A deceleration with its maximum `a` at `top`; the slip there is 0.15."""
+    return seen(0.15 + 20.0 * (t - top) + 300.0 * (t - top) ** 2, deceleration=a - bend * (t - top) ** 2)
+
+
+@pytest.mark.parametrize("top", [5.3e-3, 5.7e-3])
+def test_latch_finds_the_vertex(top):
+    """Exact on parabolas. The fall shows at the first sample after the vertex that lies below its predecessor."""
+    target, elapsed = run(PeakLatch(slip=0.2), partial(parabola, top=top), 12)
+    fall = 6 if top < 5.5e-3 else 7
+    close(target, np.where(np.arange(12) < fall, 0.2, 0.15), rtol=1e-10)
+    close(elapsed, np.where(np.arange(12) == fall, fall * H - top, 0.0), rtol=1e-9, atol=1e-13)
+
+
+def test_latch_follows_later_maxima():
+    """Slip 0.1 + t; two maxima, the second one higher: the target moves while the first maximum is exceeded."""
+    a = jnp.array([1.0, 2.0, 3.0, 2.5, 2.0, 2.9, 3.5, 4.0, 3.0, 2.0])
+    target, _ = run(PeakLatch(), lambda t: seen(0.1 + t, deceleration=a[jnp.round(t / H).astype(int)]), 10)
+    vertex = 0.1 + H * (2 + 1 / 6)  # (2, 3, 2.5): half of (2 - 2.5) over (2 - 6 + 2.5)
+    close(target, [0.2] * 3 + [vertex] * 3 + [0.106, 0.107, 0.107, 0.107])
+
+
+def test_literal_follows_the_slip_while_friction_rises():
+    """So that the error is zero: what keeps it from braking."""
+    target, elapsed = run(PeakLiteral(slip=0.2), parabola, 12)
+    slip = np.asarray(jax.vmap(parabola)(H * jnp.arange(12)).slip)
+    assert elapsed is None
+    close(target, [0.2, *slip[1:6], *[slip[5]] * 6])
+
+
+@pytest.mark.parametrize(("threshold", "arming", "latches"), [(0.05, 3.0, True), (0.05, 9.1, False), (0.5, 3.0, False)])
+def test_robust_latch(threshold, arming, latches):
+    """A low-pass turns A - B t^2 into A - B T^2 - B (t - T)^2, slip likewise. With top 9.3 ms, T = 0.2 ms, the level
+    0.95 (9 - 0.0016) is met at 9.5 + sqrt(0.44992/4e4) 1e3 = 12.8538 ms. Not armed, or falling less: nothing."""
+    reference = PeakRobust(time_constant=2e-4, threshold=threshold, arming=arming)
+    target, elapsed = run(reference, partial(parabola, top=9.3e-3), 160, h=1e-4)
+    late = 129 if latches else 160
+    close(target, np.where(np.arange(160) < late, 0.2, 0.15 + 300.0 * 4e-8), rtol=0, atol=1e-7)
+    close(elapsed, np.where(np.arange(160) == late, 12.9e-3 - 12.8538e-3, 0.0), rtol=0, atol=5e-7)
+
+
+# Actuators
+
+
+def test_limits_and_lag():
+    limits = Limits(low=-1.0, high=5.0)
+    close([limits.output(0.0, Memory(), u) for u in (-3.0, 2.0, 7.0)], [-1.0, 2.0, 5.0])
+    u, _ = run(Lag(time_constant=0.01), lambda t: 50.0 + 0.0 * t, 40)
+    close(u, 50.0 * (1 - np.exp(-0.1 * np.arange(40))), rtol=1e-6)
+
+
+def test_rate_limit():
+    """A ramp until (command - u)/T meets the rate, an exponential from there."""
+    u, _ = run(RateLimit(rate=1000.0, time_constant=0.004), lambda t: 10.0 + 0.0 * t, 2000, h=1e-5)
+    t = 1e-5 * np.arange(2000)
+    close(u, np.where(t < 0.006, 1000.0 * t, 10.0 - 4.0 * np.exp(-(t - 0.006) / 0.004)), rtol=1e-6, atol=1e-6)
+
+
+def test_two_lags_in_series():
+    """1 - (T1 exp(-t/T1) - T2 exp(-t/T2))/(T1 - T2)."""
+    t1, t2, t = 0.02, 0.005, H * np.arange(60)
+    series = Series(blocks=(Lag(time_constant=t1), Lag(time_constant=t2)))
+    u, _ = run(series, lambda t: 1.0 + 0.0 * t, 60)
+    close(u, 1 - (t1 * np.exp(-t / t1) - t2 * np.exp(-t / t2)) / (t1 - t2), rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("back", [1.0, 2.0, 2.7, 5.5])
+def test_delay_shifts_a_ramp(back):
+    """The mean over a step of a ramp is its value in the middle; the impulse of the first step is exact."""
+    u, _ = run(Delay(time=back * H, capacity=9), lambda t: 3.0 + 1000.0 * t, 25)
+    middle = (np.arange(25) + 0.5 - back) * H
+    whole = middle > 0.5 * H
+    close(np.asarray(u)[whole], 3.0 + 1000.0 * middle[whole], rtol=1e-11)
+    come = 24 * H - back * H + H  # of the command, by the end of the last step
+    close(H * np.sum(u), 3.0 * come + 500.0 * come**2, rtol=1e-11)
+
+
+def test_delay_of_a_sine_is_second_order():
+    def error(n):
+        h = 0.05 / n
+        u, _ = run(Delay(time=0.0123, capacity=n + 4), lambda t: jnp.sin(200.0 * t), n, h=h)
+        t = h * np.arange(n) - 0.0123
+        exact = (np.cos(200.0 * t) - np.cos(200.0 * (t + h))) / (200.0 * h)
+        return np.max(np.abs((u - exact)[t > 0]))
+
+    counts = np.array([100, 200, 400])
+    order = -np.polyfit(np.log(counts), np.log([error(int(n)) for n in counts]), 1)[0]
+    assert 1.9 < order < 2.1
+
+
+def test_delay_is_differentiable_in_its_time():
+    """-1000 per second of delay on a ramp, at a whole number of steps and between."""
+
+    def late(time):
+        return run(Delay(time=time, capacity=9), lambda t: 3.0 + 1000.0 * t, 12)[0][-1]
+
+    close(jax.vmap(jax.grad(late))(jnp.array([2e-3, 2.7e-3])), -1000.0, rtol=1e-9)
+
+
+# Sensors
+
+
+def test_noise():
+    """10^4 draws: their mean within 4/sqrt(10^4) and their deviation within 4/sqrt(2 10^4) of the deviation."""
+    noise = Noise(slip=0.1, speed=2.0, wheel_speed=0.5, deceleration=3.0, period=2 * H)
+    key = jax.random.key(11)
+    y, _ = run(noise, lambda t: seen(0.5 + 0.0 * t), 20000, key=key)
+    for values, mean, deviation in zip(y[:4], (0.5, 20.0, 10.0, 0.0), (0.1, 2.0, 0.5, 3.0), strict=True):
+        draws = np.asarray(values).reshape(-1, 2)
+        close(draws[:, 0], draws[:, 1], rtol=0, atol=0)  # held over the period
+        close((np.mean(draws) - mean) / deviation, 0.0, rtol=0, atol=0.04)
+        close(np.std(draws[:, 0]) / deviation, 1.0, rtol=0, atol=4 / np.sqrt(2e4))
+    close(np.corrcoef(np.asarray(y[:4])[:, ::2]), np.eye(4), rtol=0, atol=0.04)
+    close(run(noise, lambda t: seen(0.5 + 0.0 * t), 100, key=key)[0].slip, y.slip[:100], rtol=0, atol=0)
+    other, _ = run(noise, lambda t: seen(0.5 + 0.0 * t), 100, key=jax.random.key(12))
+    assert np.all(other.slip != y.slip[:100])
+    with pytest.raises(ValueError, match="needs a random key"):
+        run(noise, lambda t: seen(0.5 + 0.0 * t), 2)
+
+
+def test_bias_and_quantisation():
+    y = BrakeOutput(0.234, 20.3, 15.9, 8.76, 5.0)
+    bias = Bias(slip=0.01, speed=-1.0, wheel_speed=0.5, deceleration=0.2)
+    close(bias.output(0.0, Memory(), y), (0.244, 19.3, 16.4, 8.96, 5.0))
+    quantised = Quantisation(slip=0.05, speed=0.5, deceleration=0.1).output(0.0, Memory(), y)
+    close(quantised, (0.25, 20.5, 15.9, 8.8, 5.0))
+
+
+def test_wheel_speed_lags_a_ramp():
+    """After a step of rate a, w - true = -a T (1 - exp(-t/T)); the slip is computed with it and the floor."""
+    sensor, t = WheelSpeed(time_constant=0.004, floor=30.0), H * np.arange(20)
+    y, _ = run(sensor, lambda t: seen(0.0, 20.0, wheel_speed=18.0 - 100.0 * t), 20)
+    close(y.wheel_speed, 18.0 - 100.0 * t + 0.4 * (1 - np.exp(-t / 0.004)), rtol=1e-6)
+    close(y.slip, (20.0 - y.wheel_speed) / 30.0)
+
+
+def test_integrated_accelerometer():
+    """v = v0 - a t + bias t; slip (v - w)/v."""
+    t = H * np.arange(30)
+    sensor = IntegratedAccelerometer(bias=0.5)
+    y, _ = run(sensor, lambda t: seen(0.0, 20.0 - 8.0 * t, deceleration=8.0, wheel_speed=15.0), 30)
+    close(y.speed, 20.0 - 7.5 * t)
+    close(y.slip, 1 - 15.0 / (20.0 - 7.5 * t))
+    close(y.deceleration, 7.5)
+
+
+# Stops
+
+
+def test_remainders():
+    """v/a and v^2/(2 a) from the stop speed, or from wherever a run was cut off, down to the end."""
+    y = seen(speed=3.0, deceleration=2.0)
+    for stopped in (True, False):
+        close(Standstill(speed=0.05).remainder(y, stopped), (1.5, 2.25))
+    close(SpeedReached(speed=1.0).remainder(y, False), (1.0, 2.0))
+    close(SpeedReached(speed=1.0).remainder(y, True), (0.0, 0.0))
+    close(Standstill().remainder(seen(speed=3.0, deceleration=-1.0), False), (3000.0, 4500.0))  # at least 1e-3 m/s^2
+    for stop in (Standstill(speed=1.0), SpeedReached(speed=1.0)):
+        close((stop.margin(y), stop.rate(y)), (2.0, -2.0))

@@ -1,0 +1,288 @@
+"""The command line as a script sees it: exit status, stdout, stderr, and the files it leaves."""
+
+import json
+import math
+import os
+import pathlib
+import signal
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+from commands import assert_one_error_line, left_in, run
+
+import diffabs
+from diffabs import catalogue, cli, scenario
+from diffabs.objectives import BRAKING
+from diffabs.stability import stable_step
+
+SHORT = ("--set", "solver.duration=0.02", "--set", "solver.step=1e-3", "--set", "solver.every=1")
+
+
+class Figure:
+    """Stands for a figure: what it writes shows what was drawn, and in what format."""
+
+    def __init__(self, text: str):
+        self.text = text
+
+    def savefig(self, path: pathlib.Path):
+        pathlib.Path(path).write_text(f"{self.text} {pathlib.Path(path).suffix}")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def stable():
+    """Seconds saved in every run (the step has a test of its own), and no lines that depend on the machine's load."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli.console, "PATIENCE", math.inf)
+        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        yield
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """The runs of `whole`, for tests that need any run."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, runs):
+    """One whole run of slip-lmi with everything written."""
+    folder = tmp_path_factory.mktemp("whole")
+    simulated = cli._run
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "_run", lambda *args, **more: runs.append(simulated(*args, **more)) or runs[-1])
+        plot = types.SimpleNamespace(braking=lambda run, *, title="": Figure(f"{title}: {bool(run.stopped)}"))
+        patch.setitem(sys.modules, "diffabs.plot", plot)
+        result = run("simulate", "slip-lmi", "--json", "--csv", folder / "a.csv", "--plot", folder / "a.png")
+    return folder, json.loads(result.stdout)
+
+
+# simulate
+
+
+def test_json_has_what_scripts_rely_on(whole):
+    folder, document = whole
+    assert set(document) == {"scenario", "metrics", "stopped", "diverged", "solver", "versions", "files"}
+    assert document["scenario"] == "slip-lmi"
+    assert list(document["metrics"]) == list(BRAKING)
+    assert document["stopped"] is True
+    assert document["diverged"] is False
+    assert document["solver"] == {"step": 1e-4, "duration": 2.5, "seed": 0}
+    assert set(document["versions"]) == {"diffabs", "jax", "python"}
+    assert document["versions"]["diffabs"] == diffabs.__version__
+    assert document["files"] == {"csv": str(folder / "a.csv"), "plot": str(folder / "a.png")}
+
+
+def test_metrics_are_the_reference_numbers(whole):
+    """An independent, converged integration gave these (unlimited torque); float64 or they would not come out."""
+    metrics = whole[1]["metrics"]
+    assert metrics["max_slip"] == pytest.approx(0.308331266209, abs=2e-8)
+    assert metrics["settling_time"] == pytest.approx(0.122693, abs=1e-6)
+    assert metrics["stop_time"] == pytest.approx(1.611940500246, abs=1e-9)
+    assert metrics["stop_distance"] == pytest.approx(12.326404879818, abs=1e-8)
+    assert metrics["iae"] == pytest.approx(0.005443262785, abs=2e-8)
+    assert metrics["overshoot"] == pytest.approx(0.308331266209 / 0.2 - 1, abs=1e-7)
+    assert metrics["locked_time"] == 0.0
+
+
+def test_csv_is_the_run(whole):
+    folder, document = whole
+    header, *rows = (folder / "a.csv").read_text().splitlines()
+    assert header == (
+        "t [s],slip [1],speed [m/s],wheel_speed [m/s],deceleration [m/s^2],distance [m],target [1],command [N m],"
+        "control [N m]"
+    )
+    t, slip, speed, wheel, _, distance, target, command, control = np.array([r.split(",") for r in rows], float).T
+    np.testing.assert_allclose(t[:-1], 1e-3 * np.arange(len(t) - 1), rtol=1e-11, atol=0)
+    assert t[-1] == pytest.approx(document["metrics"]["stop_time"], rel=1e-11)
+    assert distance[-1] == pytest.approx(document["metrics"]["stop_distance"], rel=1e-11)
+    assert t[-1] > t[-2]
+    assert (speed[0], speed[-1]) == (pytest.approx(50 / 3.6, rel=1e-11), pytest.approx(5 / 3.6, rel=1e-11))
+    np.testing.assert_allclose(slip, (speed - wheel) / speed, atol=1e-9)
+    assert set(target) == {0.2}
+    np.testing.assert_array_equal(command, control)
+
+
+def test_figure_and_nothing_else_is_left(whole):
+    folder, _ = whole
+    assert (folder / "a.png").read_text() == "State feedback on the mirrored rig, published gain: True .png"
+    assert left_in(folder) == {"a.csv", "a.png"}
+    assert (folder / "a.csv").stat().st_mode & 0o777 == 0o666 & ~cli.console._umask()
+
+
+def test_a_long_trajectory_is_thinned(tmp_path, monkeypatch):
+    monkeypatch.setattr(cli, "MOST_ROWS", 5)
+    (tmp_path / "a.csv").write_text("old")
+    os.link(tmp_path / "a.csv", tmp_path / "reader.csv")  # stands for someone who has the old file open
+    run("simulate", "slip-lmi", *SHORT, "--csv", tmp_path / "a.csv")
+    rows = (tmp_path / "a.csv").read_text().splitlines()[1:]
+    assert [row.split(",")[0] for row in rows] == ["0", "0.004", "0.008", "0.012", "0.016", "0.02"]
+    assert (tmp_path / "reader.csv").read_text() == "old"
+
+
+def test_not_stopped_is_done_but_said_loudly():
+    result = run("simulate", "slip-lmi", *SHORT)
+    assert "NOT STOPPED within solver.duration = 0.02 s" in result.stderr
+    assert "stop_distance" in result.stdout
+    document = json.loads(run("simulate", "slip-lmi", *SHORT, "--json").stdout)
+    assert document["stopped"] is False
+
+
+def test_table_shows_units():
+    lines = run("simulate", "slip-lmi", *SHORT).stdout.splitlines()
+    units = {line.split("│")[1].strip(): line.split("│")[3].strip() for line in lines if line.startswith("│")}
+    assert units == {name: catalogue.unit_of(part) for name, part in BRAKING.items()}
+
+
+def test_diverged_could_not_be_done():
+    blow_up = ("--set", "controller=constant-torque", "--set", "controller.torque=-1e308")
+    result = run("simulate", "slip-lmi", *SHORT, *blow_up, "--json", status=1)
+    document = json.loads(result.stdout)
+    assert document["diverged"] is True
+    assert set(document["metrics"].values()) == {None}
+    assert "error: slip-lmi diverged" in result.stderr
+
+
+def test_seed_decides_the_noise():
+    def iae(*more: str) -> float:
+        noise = ("--set", "sensor=noise", "--set", "sensor.slip=0.01")
+        return json.loads(run("simulate", "slip-lmi", *SHORT, *noise, "--json", *more).stdout)["metrics"]["iae"]
+
+    first = iae("--seed", "1")
+    assert first == iae("--set", "solver.seed=1")
+    assert first != iae("--seed", "2")
+
+
+@pytest.fixture
+def simulated(whole, runs, monkeypatch):
+    """Every simulation gives the run of slip-lmi."""
+    monkeypatch.setattr(cli, "_run", lambda chosen, keep: runs[0])
+
+
+def test_lab_rig_commands_have_no_torque_unit(tmp_path, simulated):
+    run("simulate", "lab-rig", "--csv", tmp_path / "a.csv")
+    header = (tmp_path / "a.csv").read_text().splitlines()[0]
+    assert header.endswith("command [1],control [1]")
+
+
+BAD = [
+    (("slip-lim",), "did you mean slip-lmi?"),
+    (("none.toml",), "No such file"),
+    (("slip-lmi", "--set", "plant.mass=-1"), "plant.mass = -1 is outside (0, inf) kg"),
+    (("slip-lmi", "--set", "road.w4=nan"), "road.w4 = nan is outside [0, inf)"),
+    (("slip-lmi", "--set", "contrller.gain=1,2"), "did you mean controller?"),
+    (("slip-lmi", "--set", "controller.gain=hello"), 'controller.gain = "hello" is text; a list of numbers'),
+    (("slip-lmi", "--set", "plant.mass"), "section.field=value"),
+    (("slip-lmi", "--seed", "-1"), "solver.seed = -1 is outside [0, 4294967295]"),
+]
+
+
+@pytest.mark.parametrize(("args", "needed"), BAD, ids=[" ".join(args) for args, _ in BAD])
+def test_bad_scenario_is_one_line_and_leaves_nothing(tmp_path, args, needed):
+    result = run("simulate", *args, "--json", "--csv", tmp_path / "a.csv", status=2)
+    assert_one_error_line(result)
+    assert needed in result.stderr
+    assert left_in(tmp_path) == set()
+
+
+def test_step_that_is_not_stable(monkeypatch):
+    monkeypatch.setattr(scenario, "stable_step", stable_step)
+    result = run("simulate", "slip-lmi", "--set", "solver.step=0.01", status=2)
+    assert_one_error_line(result)
+    assert "solver.step = 0.01 s is not stable" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("args", "needed"),
+    [
+        (("--csv", "none/a.csv"), "No such file or directory"),
+        (("--csv", "."), "is not a regular file"),
+        (("--csv", "/dev/null"), "/dev/null: is not a regular file"),
+        (("--csv", "file/a.csv"), "Not a directory"),
+        (("--plot", "none/a.png"), "No such file or directory"),
+        (("--plot", "a.xyz"), ".png"),
+        (("--csv", "a.png", "--plot", "./a.png"), "the same file"),
+    ],
+)
+def test_target_that_cannot_be_written(tmp_path, monkeypatch, args, needed):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(cli, "load", lambda *_: pytest.fail("looked at the scenario first"))
+    (tmp_path / "file").write_text("")
+    result = run("simulate", "slip-lmi", *args, status=2)
+    assert_one_error_line(result)
+    assert needed in result.stderr
+    assert left_in(tmp_path) == {"file"}
+    assert not pathlib.Path("/dev/null").is_file()
+
+
+def test_plot_without_matplotlib(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    result = run("simulate", "slip-lmi", "--plot", tmp_path / "a.png", status=2)
+    assert_one_error_line(result)
+    assert 'pip install "diffabs[plot]"' in result.stderr
+
+
+def test_real_figure(tmp_path, simulated):
+    pytest.importorskip("matplotlib")
+    run("simulate", "slip-lmi", "--plot", tmp_path / "a.png")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert left_in(tmp_path) == {"a.png"}
+
+
+def test_failure_at_the_end_leaves_old_files_as_they_were(tmp_path, monkeypatch, simulated):
+    def full(run, *, title=""):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(braking=full))
+    (tmp_path / "a.csv").write_text("old")
+    files = ("--csv", tmp_path / "a.csv", "--plot", tmp_path / "a.png")
+    result = run("simulate", "slip-lmi", *files, status=1)
+    assert result.stderr.splitlines()[-1] == "error: [Errno 28] No space left on device"
+    assert (tmp_path / "a.csv").read_text() == "old"
+    assert left_in(tmp_path) == {"a.csv"}
+
+
+# The program
+
+
+def test_version_and_usage():
+    assert run("--version").stdout == f"diffabs {diffabs.__version__}\n"
+    assert run("simulate", "--nonsense", status=2).stdout == ""
+    assert run("simulate", status=2).stdout == ""
+    assert run("simulat", status=2).stdout == ""
+
+
+def test_as_a_module_with_double_precision():
+    done = subprocess.run(
+        [sys.executable, "-m", "diffabs", "simulate", "slip-lmi", *SHORT, "--json"],
+        capture_output=True,
+        text=True,
+        env={k: v for k, v in os.environ.items() if k != "JAX_ENABLE_X64"},
+        check=True,
+    )
+    value = json.loads(done.stdout)["metrics"]["iae"]
+    assert math.isfinite(value)
+    assert value != float(np.float32(value))
+
+
+def test_help_imports_no_matplotlib():
+    code = "import sys, diffabs.cli; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_control_c_ends_a_long_run_with_one_line(tmp_path):
+    endless = ["controller={type='constant-torque',torque=0.0}", "solver.step=1e-5", "solver.duration=1000"]
+    command = [sys.executable, "-m", "diffabs", "simulate", "slip-lmi", "--csv", str(tmp_path / "a.csv")]
+    command += [word for change in endless for word in ("--set", change)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr
+        for line in process.stderr:
+            if line.startswith("simulating"):
+                break
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert (out, err) == ("", "interrupted\n")
+    assert left_in(tmp_path) == set()

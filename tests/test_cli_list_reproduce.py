@@ -1,0 +1,143 @@
+"""`diffabs list` and `diffabs reproduce`: what they show, and that no folder is half written or lost."""
+
+import json
+import os
+import pathlib
+import sys
+import types
+
+import pytest
+from commands import assert_one_error_line, left_in, run
+
+from diffabs import catalogue, cli
+
+# list
+
+
+def test_list_knows_every_part():
+    document = json.loads(run("list", "--json").stdout)
+    assert set(document) == {*cli.PLURALS, "scenarios"}
+    for plural, family in cli.PLURALS.items():
+        assert set(document[plural]) == set(catalogue.types(family))
+    mass = document["plants"]["quarter-car"]["parameters"]["mass"]
+    assert mass == {"default": 15.0, "unit": "kg", "range": "(0, inf) kg", "low": 0.0, "high": None}
+    assert document["plants"]["quarter-car"]["parameters"]["road"]["default"] == "spline-b"
+    assert document["roads"]["patches"]["parameters"]["roads"]["default"] == ["dry-asphalt", "snow"]
+    assert document["roads"]["snow"]["parameters"]["c1"]["default"] == 0.1946
+    assert document["controllers"]["state-feedback"]["parameters"]["torque_max"]["default"] is None
+    assert document["actuators"]["delay"]["parameters"]["capacity"]["default"] == 1024
+    assert document["objectives"]["variation"]["unit"] == "N m"
+    assert document["scenarios"]["slip-lmi"]["title"]
+    assert all(member["summary"] for family in cli.PLURALS for member in document[family].values())
+
+
+def test_list_table_shows_units_and_ranges():
+    text = run("list", "plants").stdout
+    row = next(line for line in text.splitlines() if " mass " in line)
+    assert [cell.strip() for cell in row.split("│")[2:-1]] == ["mass", "5.3", "kg", "(0, inf)"]
+    assert "[0, 1]" in text
+    assert "snow" not in text
+    assert "[dry-asphalt, snow]" in run("list", "roads").stdout
+
+
+def test_list_of_an_unknown_family():
+    result = run("list", "plant", status=2)
+    assert_one_error_line(result)
+    assert "did you mean plants?" in result.stderr
+
+
+# reproduce
+
+
+@pytest.fixture
+def papers(monkeypatch):
+    def good(folder: pathlib.Path, progress) -> dict:
+        progress("drawing")
+        (folder / "figure1.png").write_text("picture")
+        (folder / "summary.json").write_text("{}")
+        row = {
+            "name": "proposed PI",
+            "quantity": "T",
+            "unit": "s",
+            "ours": 2.9915,
+            "published": 2.99,
+            "difference": 0.0015,
+        }
+        more = {"name": "J", "unit": "kg m^2", "ours": 1.04, "published": None, "reference": 1.05}
+        return {"title": "A paper", "rows": [row, more], "figures": ["figure1.png"], "notes": ["unknown road"]}
+
+    def interrupted(folder: pathlib.Path, progress) -> dict:
+        good(folder, progress)
+        raise KeyboardInterrupt
+
+    found = {"slip-lmi": good, "slip-estimator": good}
+    monkeypatch.setitem(sys.modules, "diffabs.papers", types.SimpleNamespace(PAPERS=found))
+    return found, interrupted
+
+
+def test_reproduce_everything(papers, tmp_path):
+    result = run("reproduce", "--out", tmp_path / "new" / "out")
+    out = tmp_path / "new" / "out"
+    assert left_in(out) == {"slip-lmi", "slip-estimator"}
+    assert left_in(out / "slip-lmi") == {"figure1.png", "summary.json"}
+    row = next(line for line in result.stdout.splitlines() if "proposed PI" in line)
+    assert [cell.strip() for cell in row.split("│")[1:-1]] == ["proposed PI", "T", "2.9915", "2.99", "", "0.0015", "s"]
+    row = next(line for line in result.stdout.splitlines() if "kg m^2" in line)
+    assert [cell.strip() for cell in row.split("│")[1:-1]] == ["J", "", "1.04", "", "1.05", "", "kg m^2"]
+    assert "drawing" in result.stderr
+    assert "note: unknown road" in result.stderr
+    assert str(out / "slip-lmi") in result.stderr
+    assert os.stat(out / "slip-lmi").st_mode & 0o777 == 0o777 & ~cli.console._umask()
+
+
+def test_reproduce_as_json_replaces_an_older_result(papers, tmp_path):
+    old = tmp_path / "slip-lmi"
+    old.mkdir()
+    (old / "summary.json").write_text("old")
+    (old / "stale.png").write_text("old")
+    document = json.loads(run("reproduce", "slip-lmi", "--out", tmp_path, "--json").stdout)
+    assert set(document["papers"]) == {"slip-lmi"}
+    assert document["papers"]["slip-lmi"]["rows"][0]["ours"] == 2.9915
+    assert left_in(old) == {"figure1.png", "summary.json"}
+    assert left_in(tmp_path) == {"slip-lmi"}
+
+
+def test_reproduce_keeps_the_old_result_when_interrupted(papers, tmp_path):
+    run("reproduce", "slip-lmi", "--out", tmp_path)
+    papers[0]["slip-lmi"] = papers[1]
+    (tmp_path / "slip-lmi" / "summary.json").write_text("old")
+    result = run("reproduce", "slip-lmi", "--out", tmp_path, status=130)
+    assert result.stderr.splitlines()[-1] == "interrupted"
+    assert (tmp_path / "slip-lmi" / "summary.json").read_text() == "old"
+    assert left_in(tmp_path) == {"slip-lmi"}
+
+
+def test_reproduce_puts_the_old_result_back_when_the_new_one_cannot_take_its_place(papers, tmp_path, monkeypatch):
+    run("reproduce", "slip-lmi", "--out", tmp_path)
+    (tmp_path / "slip-lmi" / "summary.json").write_text("old")
+    rename = pathlib.Path.rename
+
+    def failing(self: pathlib.Path, target: pathlib.Path):
+        if self.name == "new":
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(pathlib.Path, "rename", failing)
+    assert "Input/output error" in run("reproduce", "slip-lmi", "--out", tmp_path, status=1).stderr
+    assert (tmp_path / "slip-lmi" / "summary.json").read_text() == "old"
+    assert left_in(tmp_path) == {"slip-lmi"}
+
+
+def test_reproduce_leaves_other_peoples_folders_alone(papers, tmp_path):
+    (tmp_path / "slip-lmi").mkdir()
+    (tmp_path / "slip-lmi" / "thesis.tex").write_text("years of work")
+    assert_one_error_line(run("reproduce", "slip-lmi", "--out", tmp_path, status=2))
+    assert left_in(tmp_path / "slip-lmi") == {"thesis.tex"}
+    assert_one_error_line(run("reproduce", "slip-lmi", "--out", tmp_path / "slip-lmi" / "thesis.tex", status=2))
+
+
+def test_reproduce_an_unknown_paper(papers, tmp_path):
+    result = run("reproduce", "slip-lim", "--out", tmp_path / "out", status=2)
+    assert_one_error_line(result)
+    assert "did you mean slip-lmi?" in result.stderr
+    assert left_in(tmp_path) == set()

@@ -1,0 +1,202 @@
+"""Every objective differentiated in every parameter of every part: forward, reverse, and against differences."""
+
+import dataclasses
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffabs as d
+from diffabs import actuators, blocks, controllers, objectives, plants, references, roads, sensors
+from diffabs.pytree import get, parameters, replace, strong
+from diffabs.stops import SpeedReached, Standstill
+
+OBJECTIVES = {
+    **objectives.BRAKING,
+    "itae": objectives.ITAE(),
+    "effort": objectives.Effort(),
+    "variation": objectives.Variation(),
+    "cost": objectives.QuadraticCost(),
+}
+KEY = jax.random.key(3)
+
+RIG = {"plant": plants.MirroredRig(), "initial": d.BrakeStart(speed=8.0, slip=0.05), "stop": SpeedReached(speed=6.8)}
+CAR = {
+    "plant": plants.QuarterCar(road=roads.MagicFormula()),
+    "initial": d.BrakeStart(speed=8.0, slip=0.02),
+    "stop": SpeedReached(speed=6.0),
+}
+PATCHES = roads.Patches(
+    roads=(roads.DRY_CONCRETE, roads.Scaled(road=roads.SPLINE_B, scale=0.7)), edges=np.array([0.8]), width=0.3
+)
+# Together these hold every part that a loop can be made of; the last test of this file sees to it.
+LOOPS = {
+    "feedback": d.Loop(**RIG, controller=controllers.StateFeedback(), feedforward=controllers.HoldingInput()),
+    "filtered reference": d.Loop(
+        **RIG,
+        controller=controllers.StateFeedback(
+            torque_min=0.0, torque_max=9.03, antiwindup=controllers.BackCalculation(tracking_time=0.02)
+        ),
+        feedforward=controllers.ConstantInput(value=2.7),
+        reference=references.FilteredSlip(time_constant=0.02),
+        actuator=actuators.Lag(time_constant=0.002),
+    ),
+    "latch": d.Loop(
+        **CAR | {"stop": Standstill(speed=5.5)},
+        controller=controllers.PID(ki=5000.0, kd=5.67, torque_max=200.0),
+        reference=references.PeakLatch(),
+    ),
+    "lock": d.Loop(
+        plant=plants.LabRig(),
+        initial=d.BrakeStart(speed=8.0, slip=0.1),
+        stop=SpeedReached(speed=6.5),
+        controller=controllers.ConstantTorque(torque=0.95),
+    ),
+    "relay": d.Loop(
+        **CAR, controller=controllers.Relay(torque_max=250.0), actuator=actuators.Limits(low=5.0, high=190.0)
+    ),
+    "computer": d.Loop(
+        **CAR | {"plant": plants.QuarterCar(road=PATCHES)},
+        controller=controllers.Sampled(
+            controller=controllers.PID(kp=900.0, ki=2000.0, torque_max=120.0, antiwindup=controllers.Clamping()),
+            period=5e-3,
+            delay=1.3e-3,
+        ),
+        actuator=blocks.Series(blocks=(actuators.RateLimit(rate=4000.0), actuators.Lag(time_constant=0.003))),
+    ),
+    "noisy": d.Loop(
+        **CAR,
+        controller=controllers.SlidingMode(gain=150.0, boundary=0.05, torque_max=150.0),
+        reference=references.PeakRobust(time_constant=0.004, threshold=0.02),
+        sensor=blocks.Series(
+            blocks=(
+                sensors.Noise(slip=1e-4, deceleration=0.02, wheel_speed=1e-3, speed=1e-3),
+                sensors.Bias(slip=1e-3, deceleration=0.02, speed=0.01, wheel_speed=0.01),
+                sensors.Quantisation(),
+                sensors.WheelSpeed(),
+                sensors.IntegratedAccelerometer(bias=0.05),
+            )
+        ),
+    ),
+    "delay": d.Loop(
+        **CAR,
+        controller=controllers.PID(kp=300.0, torque_max=250.0),
+        reference=references.PeakLiteral(slip=0.15),
+        actuator=actuators.Delay(time=0.0123, capacity=64),
+    ),
+}
+SOLVERS = dict.fromkeys(LOOPS, d.FixedStep(5e-4, 0.8)) | {"feedback": d.FixedStep(2.5e-4, 0.4)}
+# Step of the differences and what they may miss. Smooth runs: 1e-6. A kink inside an integration step makes the
+# derivative of the numerical run jump by O(h); noise that triggers the robust latch makes it jump more, so its difference
+# is wider.
+ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {"computer": (1e-5, 2e-4), "delay": (1e-5, 2e-5), "noisy": (1e-3, 5e-3)}
+
+
+def flat(name):
+    """(names, values, objectives as a function of the values) of the tunable parameters of a loop."""
+    loop = strong(LOOPS[name])
+    paths = [p for p, spec, v in parameters(loop) if spec.tunable and np.all(np.isfinite(v))]
+    values, unravel = jax.flatten_util.ravel_pytree([get(loop, p) for p in paths])
+    names = [f"{p}[{i}]" for p in paths for i in range(np.size(get(loop, p)))]
+
+    @jax.jit
+    def measured(x):
+        run = d.measure(replace(loop, dict(zip(paths, unravel(x), strict=True))), SOLVERS[name], OBJECTIVES, key=KEY)
+        return jnp.stack([run.metrics[name] for name in OBJECTIVES])
+
+    return names, values, measured
+
+
+def differences(measured, x, step):
+    """Central differences, relative to the size of each parameter: (log-scale gradient, scale)."""
+    scale = np.maximum(np.abs(x), 1e-2)
+    moves = np.diag(scale * step)
+    many = jax.jit(jax.vmap(measured))
+    return np.asarray((many(x + moves) - many(x - moves)) / (2 * step)).T, scale
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_gradient_of_every_objective_in_every_parameter(name):
+    names, x, measured = flat(name)
+    jacobian = np.asarray(jax.jit(jax.jacfwd(measured))(x))
+    assert np.all(np.isfinite(jacobian)), [names[j] for j in np.argwhere(~np.isfinite(jacobian))[:, 1]]
+    step, tolerance = ACCURACY[name]
+    expected, scale = differences(measured, x, step)
+    for i, objective in enumerate(OBJECTIVES):
+        largest = np.max(np.abs(expected[i]))
+        error = np.abs(jacobian[i] * scale - expected[i])
+        worst = int(np.argmax(error))
+        assert error[worst] <= tolerance * largest + 1e-10, (objective, names[worst], error[worst] / largest)
+
+
+@pytest.mark.parametrize("name", ["feedback", "latch", "computer"])
+def test_reverse_mode_equals_forward_mode(name):
+    _, x, measured = flat(name)
+    weights = jnp.array(np.random.default_rng(0).normal(size=len(OBJECTIVES)))
+    value, pull = jax.vjp(measured, x)
+    reverse = jax.jit(pull)(weights / (1 + jnp.abs(value)))[0]
+    forward = (weights / (1 + jnp.abs(value))) @ jax.jit(jax.jacfwd(measured))(x)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-10 * np.max(np.abs(forward)))
+
+
+def _sensitivity(loop, paths, objective="stop_distance", step=1e-4, difference=None):
+    """d(objective)/d ln(parameter) for each path, by forward mode or a central difference of that relative size."""
+    loop = strong(loop)
+    solver = d.FixedStep(step, 4.0)
+
+    def distance(logs):
+        values = {p: get(loop, p) * jnp.exp(v) for p, v in zip(paths, logs, strict=True)}
+        return d.measure(replace(loop, values), solver, {objective: OBJECTIVES[objective]}).metrics[objective]
+
+    zero = jnp.zeros(len(paths))
+    if difference is None:
+        return np.asarray(jax.jit(jax.jacfwd(distance))(zero))
+    many = jax.jit(jax.vmap(distance))
+    moves = difference * jnp.eye(len(paths))
+    return np.asarray((many(moves) - many(-moves)) / (2 * difference))
+
+
+FULL = d.Loop(plant=plants.QuarterCar(road=roads.MagicFormula(), inertia=1.0539))
+
+
+def test_sensitivity_of_the_conventional_brake():
+    """d(distance)/d ln p of [est]'s P loop; expected: differences (1e-3) of SciPy runs of oracles.py."""
+    expected = {
+        "controller.kp": 0.33163,
+        "reference.slip": 3.873,
+        "plant.inertia": 0.98866,
+        "controller.torque_max": -0.93409,
+        "plant.road.D": -43.27,
+    }
+    np.testing.assert_allclose(_sensitivity(FULL, list(expected)), list(expected.values()), rtol=5e-4, atol=0)
+
+
+def test_gradient_through_the_latch_agrees_with_a_wide_difference():
+    """A narrow difference would agree with a wrong derivative: both miss how the latched slip moves between samples."""
+    loop = dataclasses.replace(FULL, reference=references.PeakLatch())
+    paths = ["plant.inertia", "controller.torque_max"]
+    ours = _sensitivity(loop, paths)
+    wide = _sensitivity(loop, paths, difference=1e-2)
+    np.testing.assert_allclose(ours, wide, rtol=1.5e-3, atol=0)
+    np.testing.assert_allclose(ours, [4.305, -4.646], rtol=1e-3, atol=0)  # independent program, same correction
+
+
+def test_every_part_is_differentiated_in_some_loop():
+    def classes(part):
+        yield type(part).__name__
+        for field in dataclasses.fields(part):
+            value = getattr(part, field.name)
+            for item in value if isinstance(value, tuple) else (value,):
+                if dataclasses.is_dataclass(item):
+                    yield from classes(item)
+
+    used = {name for loop in LOOPS.values() for name in classes(loop)}
+    offered = {
+        name
+        for family in (plants, roads, controllers, references, actuators, sensors)
+        for name, part in vars(family).items()
+        if dataclasses.is_dataclass(part) and isinstance(part, type)
+    }
+    assert offered - used == set()

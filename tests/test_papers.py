@@ -1,0 +1,184 @@
+"""The papers' numbers: to the printed digit where they print any, to 1e-6 of an independent solution where not."""
+
+import json
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("matplotlib")
+
+from diffabs import FixedStep, Loop, measure, plot, rollout
+from diffabs.objectives import BRAKING
+from diffabs.papers import PAPERS, record, slip_lmi
+from diffabs.references import FixedSlip
+
+SMALLEST_FIGURE = 10_000  # bytes: an empty sheet takes less than 6,000
+
+
+class Reproduced(dict):
+    """A summary, with the folder it was written into and what was said meanwhile."""
+
+    folder: Any
+    said: list[str]
+
+
+def _reproduced(name: str, folder: Any) -> Reproduced:
+    said: list[str] = []
+    summary = Reproduced(PAPERS[name](folder, said.append))
+    summary.folder, summary.said = folder, said
+    return summary
+
+
+@pytest.fixture(scope="module")
+def lmi(tmp_path_factory):
+    return _reproduced("slip-lmi", tmp_path_factory.mktemp("slip-lmi"))
+
+
+@pytest.fixture(scope="module")
+def estimator(tmp_path_factory):
+    return _reproduced("slip-estimator", tmp_path_factory.mktemp("slip-estimator"))
+
+
+@pytest.fixture(params=sorted(PAPERS))
+def paper(request, lmi, estimator):
+    return {"slip-lmi": lmi, "slip-estimator": estimator}[request.param]
+
+
+def _rows(summary: dict[str, Any], start: str) -> list[dict[str, Any]]:
+    found = [row for row in summary["rows"] if row["name"].startswith(start)]
+    assert found, start
+    return found
+
+
+@pytest.mark.parametrize("case", slip_lmi.REFERENCE)
+def test_the_braking_table_is_the_independent_solution(lmi, case):
+    rows = {row["quantity"]: row for row in lmi["rows"] if row["name"] == case}
+    assert set(rows) == set(slip_lmi.QUANTITIES)
+    for row in rows.values():
+        # At the torque limits 2e-5 s leaves 5e-8 of the greatest slip; the rest is closer.
+        assert row["ours"] == pytest.approx(row["reference"], rel=1e-6), row
+
+
+def test_a_car_of_the_same_mass_brakes_twice_as_long(lmi):
+    for row in _rows(lmi, "5.3 kg, J2") + _rows(lmi, "6.2 kg, J2"):
+        assert row["ours"] == pytest.approx(row["reference"], rel=1e-9), row
+
+
+def test_the_friction_curve_peaks_before_the_target(lmi):
+    for row in _rows(lmi, "friction curve"):
+        assert row["ours"] == pytest.approx(row["reference"], rel=1e-10), row
+
+
+def test_filtering_the_reference_cures_the_overshoot(lmi):
+    (row,) = _rows(lmi, "reference filter")
+    assert row["ours"] == 0.0
+
+
+def test_the_order_of_the_step(lmi):
+    """Four where all is smooth; slip^2.1 at slip 0 leaves 3.1. Both slopes are of few points, hence the width."""
+    for row in _rows(lmi, "order of the step: 5.3 kg, from slip 0.1"):
+        assert row["ours"] == pytest.approx(4.0, abs=0.3), row
+    for row in _rows(lmi, "order of the step: 5.3 kg, torque unlimited"):
+        assert row["ours"] == pytest.approx(3.1, abs=0.1), row
+
+
+def test_all_twenty_numbers_round_to_the_printed_ones(estimator):
+    rows = [row for row in _rows(estimator, "Table") if "Magic" not in row["name"]]
+    assert len(rows) == 20
+    assert [f"{row['ours']:.2f}" for row in rows] == [f"{row['published']:.2f}" for row in rows]
+    assert estimator["matches"] == {"of": 20, "to the printed digit": 20}
+
+
+@pytest.mark.parametrize(
+    ("quantity", "bound"), [("stopping time", 0.0094 + 0.001), ("stopping distance", 0.056 + 0.005)]
+)
+def test_five_parameters_come_close_to_all_twenty(estimator, quantity, bound):
+    rows = [row for row in estimator["rows"] if "(Magic" in row["name"] and row["quantity"] == quantity]
+    assert len(rows) == 10
+    assert max(abs(row["difference"]) for row in rows) <= bound
+
+
+def test_the_estimator_as_printed_does_not_brake(estimator):
+    fine, coarse = (
+        next(row["ours"] for row in _rows(estimator, f"estimator as printed, step {step}") if row["unit"] == "m")
+        for step in ("0.0001", "0.001")
+    )
+    rolling = 10 * 100 / 3.6
+    assert rolling - 1 < fine < rolling
+    # What it brakes is the delay of one sample, so ten times the step brakes ten times as much, to first order.
+    assert (rolling - coarse) / (rolling - fine) == pytest.approx(10, rel=0.02)
+
+
+def test_physical_bounds_of_the_distance(estimator):
+    for row in _rows(estimator, "bound"):
+        assert row["ours"] == pytest.approx(row["reference"], abs=1e-3), row
+    best = min(row["ours"] for row in _rows(estimator, "Table 2") if row["unit"] == "m" and "Magic" not in row["name"])
+    assert best > max(row["ours"] for row in _rows(estimator, "bound"))
+
+
+def test_what_does_not_agree_is_said(estimator):
+    (row,) = _rows(estimator, "no ABS, from lock to stop")
+    assert row["ours"] == pytest.approx(1.224, abs=1e-3)
+    assert any("1.4 s" in note for note in estimator["notes"])
+    assert any("true curve stays unknown" in note for note in estimator["notes"])
+
+
+def test_summary_is_finite_json_with_provenance(paper):
+    text = (paper.folder / "summary.json").read_text(encoding="utf-8")
+    assert json.loads(text, parse_constant=pytest.fail) == paper
+    assert all(math.isfinite(row["ours"]) for row in paper["rows"])
+    assert {"paper", "title", "rows", "figures", "notes", "solver", "versions"} <= set(paper)
+    assert {"diffabs", "jax", "numpy", "python"} <= set(paper["versions"])
+    assert len(paper.said) >= 3
+
+
+def test_figures_are_pictures(paper):
+    assert sorted(path.name for path in paper.folder.iterdir()) == sorted([*paper["figures"], "summary.json"])
+    for name in paper["figures"]:
+        data = (paper.folder / name).read_bytes()
+        assert data[:8] == b"\x89PNG\r\n\x1a\n"
+        width, height = struct.unpack(">II", data[16:24])
+        assert min(width, height) >= 400
+        assert len(data) > SMALLEST_FIGURE, name
+
+
+def test_rows_say_how_far_they_are():
+    assert record.row("a", "q", "m", 3.0, published=2.0)["difference"] == 1.0
+    assert record.row("a", "q", "m", 3.0, reference=4.0)["difference"] == -1.0
+    assert record.row("a", "q", "m", 3.0)["difference"] is None
+    assert record.printed("a", "q", "m", 2.994, 2.99)["matches"]
+    assert not record.printed("a", "q", "m", 2.996, 2.99)["matches"]
+
+
+def test_a_number_that_is_not_finite_is_not_written(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        record.write(tmp_path, {"rows": [math.nan]})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_braking_draws_the_run(tmp_path):
+    solver = FixedStep(step=1e-2, duration=0.1)
+    figure = plot.braking(rollout(Loop(reference=FixedSlip()), solver, BRAKING), title="a run")
+    slip, speed, torque, deceleration = figure.axes
+    assert [line.get_label() for line in slip.lines] == ["slip", "target", "setpoint"]
+    assert speed.get_ylabel() == "speed [km/h]"
+    np.testing.assert_allclose(speed.lines[1].get_ydata()[0], 100.0, rtol=1e-12)
+    np.testing.assert_allclose(torque.lines[1].get_ydata()[0], 90.0, rtol=1e-12)
+    assert deceleration.get_ylabel() == "deceleration [m/s²]"
+    assert plot.save(figure, tmp_path / "run.png").stat().st_size > SMALLEST_FIGURE
+    assert [path.name for path in tmp_path.iterdir()] == ["run.png"]
+
+
+def test_a_run_without_a_trajectory_cannot_be_drawn():
+    with pytest.raises(ValueError, match="rollout"):
+        plot.braking(measure(Loop(), FixedStep(step=1e-2, duration=0.1), BRAKING))
+
+
+def test_a_figure_that_fails_leaves_nothing_behind(tmp_path):
+    figure, _ = plot.sheet()
+    with pytest.raises(ValueError, match="nonsense"):
+        plot.save(figure, tmp_path / "x.nonsense")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,210 @@
+"""How parts are made, checked, read and replaced."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffabs
+from diffabs.pytree import check, get, param, parameters, part, prepared, problems, pytree, replace, static, strong
+from diffabs.roads import DRY_ASPHALT, SPLINE_B, MagicFormula, Patches, Scaled
+
+
+@pytree
+class Spring:
+    stiffness: float = param(default=2.0, unit="N/m", above=0.0)
+    damping: float = param(default=0.5, unit="1", low=0.0, below=1.0)
+    rest: float = param(default=(0.0, 1.0), unit="m")
+    turns: int = static(default=3)
+
+    def problems(self):
+        if self.rest[0] == self.rest[1]:
+            yield "rest has two equal lengths"
+
+
+@pytree
+class Pair:
+    springs: tuple = part(default=(Spring(), Spring(stiffness=5.0)))
+    limit: float = param(default=np.inf, unit="N", infinite=True)
+
+
+def test_refuses_post_init():
+    with pytest.raises(TypeError, match=r"Bad: no __post_init__.*problems\(self\)"):
+
+        @pytree
+        class Bad:
+            x: float = param(default=1.0, unit="1")
+
+            def __post_init__(self):
+                raise AssertionError
+
+
+def test_refuses_undeclared_fields():
+    with pytest.raises(TypeError, match=r"Bad: declare y, z with param, part or static"):
+
+        @pytree
+        class Bad:
+            x: float = param(default=1.0, unit="1")
+            y: float = 2.0
+            z: float = dataclasses.field(default=3.0)
+
+
+def test_parts_are_frozen_and_keyword_only():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Spring().stiffness = 3.0  # pyright: ignore
+    with pytest.raises(TypeError, match="positional"):
+        Spring(3.0)  # pyright: ignore
+
+
+def test_static_fields_are_no_leaves():
+    assert jax.tree.leaves(Spring())[:2] == [2.0, 0.5]
+    assert len(jax.tree.leaves(Spring())) == 3
+
+
+def test_static_field_compiles_again_and_a_value_does_not():
+    traces = []
+
+    @jax.jit
+    def double(spring):
+        traces.append(spring.turns)
+        return 2 * spring.stiffness
+
+    assert double(strong(Spring())) == 4.0
+    assert double(strong(Spring(stiffness=3.0))) == 6.0
+    assert double(strong(Spring(turns=4))) == 4.0
+    assert traces == [3, 4]
+
+
+def test_check_names_every_offender_with_value_range_and_unit():
+    bad = Pair(springs=(Spring(stiffness=0.0), Spring(damping=1.0)), limit=np.nan)
+    with pytest.raises(ValueError, match="outside") as error:
+        check(bad, "pair.")
+    assert str(error.value).split("; ") == [
+        "pair.springs.0.stiffness = 0 is outside (0, inf) N/m",
+        "pair.springs.1.damping = 1 is outside [0, 1)",
+        "pair.limit = nan is outside (-inf, inf) N",
+    ]
+
+
+def test_check_returns_the_part_and_allows_declared_infinities():
+    pair = Pair()
+    assert check(pair) is pair
+    assert list(problems(Pair(limit=-np.inf))) == []
+    assert list(problems(Spring(stiffness=np.inf))) == ["stiffness = inf is outside (0, inf) N/m"]
+
+
+def test_check_sees_one_bad_element_of_an_array():
+    with pytest.raises(ValueError, match=r"rest = \[ ?0\. nan\] is outside \(-inf, inf\) m"):
+        check(Spring(rest=np.array([0.0, np.nan])))
+
+
+def test_own_problems_have_the_path_and_wait_for_the_ranges():
+    same = np.array([1.0, 1.0])
+    assert list(problems(Pair(springs=(Spring(rest=same),)))) == ["springs.0.rest has two equal lengths"]
+    assert list(problems(Spring(rest=same, damping=2.0))) == ["damping = 2 is outside [0, 1)"]
+
+
+def test_parameters_in_order_of_declaration():
+    paths = [path for path, _, _ in parameters(Pair())]
+    names = ("stiffness", "damping", "rest")
+    assert paths == [f"springs.{i}.{name}" for i in range(2) for name in names] + ["limit"]
+    assert [spec.unit for _, spec, _ in parameters(Spring())] == ["N/m", "1", "m"]
+
+
+def test_get_and_replace_by_dotted_path():
+    pair = replace(Pair(), {"springs.1.stiffness": 7.0, "limit": 4.0})
+    assert get(pair, "springs.1.stiffness") == 7.0
+    assert (get(pair, "springs.0.stiffness"), get(pair, "limit")) == (2.0, 4.0)
+    assert get(Pair(), "springs.1.stiffness") == 5.0  # the original is untouched
+    assert diffabs.replace(pair, {"springs.0": Spring(turns=9)}).springs[0].turns == 9
+    assert get(replace(diffabs.Loop(), {"plant.road": MagicFormula(D=0.5)}), "plant.road.D") == 0.5
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("spring.0.damping", "no 'spring' in spring.0.damping; there is springs, limit"),
+        ("springs.2.damping", "no '2' in springs.2.damping; there is 0, 1"),
+        ("springs.0.dampin", "no 'dampin' in springs.0.dampin; there is stiffness, damping, rest"),
+        ("limit.x", "no 'x' in limit.x; there is nothing"),
+    ],
+)
+def test_wrong_path_says_what_is_there(path, message):
+    for use in (lambda: get(Pair(), path), lambda: replace(Pair(), {path: 1.0})):
+        with pytest.raises(KeyError) as error:
+            use()
+        assert error.value.args[0] == message
+
+
+def test_replace_under_grad_and_vmap():
+    def force(k):
+        spring = replace(Pair(), {"springs.1.stiffness": k}).springs[1]
+        return spring.stiffness**2 * spring.damping
+
+    np.testing.assert_allclose(jax.grad(force)(3.0), 3.0, rtol=1e-15, atol=0)
+    np.testing.assert_allclose(jax.vmap(force)(jnp.array([1.0, 2.0])), [0.5, 2.0], rtol=1e-15, atol=0)
+
+
+def test_strong_makes_one_dtype():
+    """That of the JAX arrays among the leaves; JAX's default for Python numbers and NumPy arrays alone."""
+    for tree, dtype in (
+        ({"a": 1.0, "b": np.float32(2.0), "c": 3}, jnp.float64),
+        ({"a": 1.0, "b": jnp.float32(2.0)}, jnp.float32),
+        ({"a": jnp.ones(2, jnp.float32), "b": jnp.float64(2.0)}, jnp.float64),
+        ({"a": 1.0, "k": jnp.arange(3)}, jnp.float64),
+    ):
+        leaves = jax.tree.leaves(strong(tree))
+        assert [x.dtype for x in leaves] == [dtype] * len(leaves)
+        assert not any(x.weak_type for x in leaves)
+
+
+def test_strong_saves_a_compilation():
+    """A Python float and an array are two types to jit. With `strong` they are one."""
+    for prepare, count in ((lambda tree: tree, 2), (strong, 1)):
+        double = jax.jit(lambda spring: 2 * spring.stiffness)
+        double(prepare(Spring()))
+        double(prepare(Spring(stiffness=jnp.asarray(3.0))))
+        assert double._cache_size() == count
+
+
+def test_prepared_reaches_nested_parts_and_keeps_the_rest():
+    loop = diffabs.Loop(plant=diffabs.Loop().plant)
+    road = prepared(replace(loop, {"plant.road": Patches(roads=(Scaled(road=SPLINE_B, scale=0.7), DRY_ASPHALT))}))
+    inner = road.plant.road.roads[0]
+    assert type(inner.road).__name__ == "PiecewiseCubic"
+    assert inner.scale == 0.7
+    assert road.plant.road.roads[1].c1 == DRY_ASPHALT.c1
+    assert prepared(()) == ()
+
+
+def test_prepared_is_differentiable():
+    """mu at a knot is the knot's value, so the derivative with respect to it is one."""
+
+    def mu(value):
+        road = dataclasses.replace(SPLINE_B, mu=jnp.asarray(SPLINE_B.mu).at[4].set(value))
+        return prepared(road).friction(SPLINE_B.slip[4])
+
+    np.testing.assert_allclose(jax.jit(jax.grad(mu))(0.96331), 1.0, rtol=1e-12, atol=0)
+
+
+def test_structures_of_different_classes_differ():
+    """Else jit may run for one class what it compiled for another: `jax.tree_util.register_dataclass` of JAX 0.10
+    compares neither classes nor names of fields."""
+
+    @pytree
+    class Twin:
+        stiffness: float = param(default=2.0, unit="N/m", above=0.0)
+        damping: float = param(default=0.5, unit="1", low=0.0, below=1.0)
+        rest: float = param(default=(0.0, 1.0), unit="m")
+        turns: int = static(default=3)
+
+    assert jax.tree.structure(Twin()) != jax.tree.structure(Spring())
+    assert jax.tree.structure(Spring(turns=4)) != jax.tree.structure(Spring())
+    assert jax.tree.structure(Spring(damping=0.1)) == jax.tree.structure(Spring())
+
+
+def test_leaves_have_the_names_of_the_fields():
+    keys = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(Pair())]
+    assert keys[:2] == [".springs[0].stiffness", ".springs[0].damping"]

@@ -1,0 +1,272 @@
+"""Friction curves against published numbers, closed forms, NumPy and SciPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from parts import ROADS, differences, jacobian
+from scipy.interpolate import PchipInterpolator
+from scipy.optimize import brentq
+
+from diffabs.pytree import check, problems, replace, strong
+from diffabs.roads import (
+    DRY_ASPHALT,
+    ICE,
+    RIG,
+    RIG_UNROUNDED,
+    SNOW,
+    SPLINE_B,
+    Burckhardt,
+    MagicFormula,
+    Patches,
+    Scaled,
+    Tabulated,
+    peak,
+)
+
+GRID = np.linspace(-1.0, 1.0, 401)
+
+
+@jax.jit
+def curve(road, slips, speed=0.0, distance=0.0):
+    return jax.vmap(lambda s: road.friction(s, speed, distance))(slips)
+
+
+best = jax.jit(peak)
+
+
+def found(road):
+    """At 12 m/s, in the ramp of the roads that have patches."""
+    return peak(road, 12.0, 10.01)
+
+
+# The rig's curve, eq. (13)
+
+
+def test_rig_numbers():
+    mu, slope = jax.jit(jax.value_and_grad(RIG.friction))(0.2)
+    np.testing.assert_allclose(mu, 0.39575220833898, rtol=1e-13, atol=0)
+    np.testing.assert_allclose(slope, -0.00641755652574, rtol=1e-10, atol=0)  # twelve printed digits
+    np.testing.assert_allclose(RIG.friction(1.0), 0.399595428169, rtol=1e-11, atol=0)
+
+
+def test_rig_peaks_before_its_target():
+    """Not at 0.2, and lower than a locked wheel's friction: two errors of the paper."""
+    slip, mu = best(strong(RIG))
+    np.testing.assert_allclose((slip, mu), (0.187542005875, 0.395794085737), rtol=1e-10, atol=0)
+    assert mu < RIG.friction(1.0)
+
+
+@pytest.mark.parametrize("road", [RIG, RIG_UNROUNDED], ids=["rounded", "unrounded"])
+def test_rational_formula(road):
+    s = np.abs(GRID)
+    mu = road.w4 * s**road.q / (road.a + s**road.q) + np.polyval([road.w3, road.w2, road.w1, 0.0], s)
+    np.testing.assert_allclose(curve(road, GRID), np.sign(GRID) * mu, rtol=1e-12, atol=1e-15)
+
+
+# Burckhardt
+
+TABLE = {  # Kiencke and Nielsen, ch. 8
+    "DRY_ASPHALT": (1.2801, 23.99, 0.52),
+    "WET_ASPHALT": (0.857, 33.822, 0.347),
+    "DRY_CONCRETE": (1.1973, 25.168, 0.5373),
+    "DRY_COBBLESTONE": (1.3713, 6.4565, 0.6691),
+    "WET_COBBLESTONE": (0.4004, 33.7080, 0.1204),
+    "SNOW": (0.1946, 94.129, 0.0646),
+    "ICE": (0.05, 306.39, 0.0),
+}
+
+
+@pytest.mark.parametrize("name", TABLE)
+@pytest.mark.parametrize("speed", [0.0, 30.0])
+def test_burckhardt_formula(name, speed):
+    c1, c2, c3 = TABLE[name]
+    s = np.abs(GRID)
+    mu = np.sign(GRID) * (c1 * (1 - np.exp(-c2 * s)) - c3 * s) * np.exp(-0.03 * s * speed)
+    np.testing.assert_allclose(curve(ROADS[name], GRID, speed), mu, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", [n for n in TABLE if n != "ICE"])
+def test_burckhardt_peak(name):
+    """Without c4 the slope c1 c2 exp(-c2 s) - c3 vanishes at s = ln(c1 c2/c3)/c2."""
+    road = replace(ROADS[name], {"c4": 0.0})
+    c1, c2, c3 = TABLE[name]
+    s = np.log(c1 * c2 / c3) / c2
+    slip, mu = best(strong(road), 12.0)
+    np.testing.assert_allclose(slip, s, rtol=1e-12, atol=0)
+    np.testing.assert_allclose(mu, c1 - c3 / c2 - c3 * s, rtol=1e-12, atol=0)
+
+
+def test_gradient_of_burckhardt_peak():
+    """d/dc1 = 1/(c1 c2), d/dc2 = (1/c2 - s)/c2, d/dc3 = -1/(c2 c3); of mu at its peak: the partial derivatives."""
+    c1, c2, c3 = TABLE["WET_ASPHALT"]
+    s = np.log(c1 * c2 / c3) / c2
+    g = jacobian(found, Burckhardt(c1=c1, c2=c2, c3=c3, c4=0.0))[:3]
+    np.testing.assert_allclose(g[:, 0], [1 / (c1 * c2), (1 / c2 - s) / c2, -1 / (c2 * c3)], rtol=1e-9, atol=0)
+    np.testing.assert_allclose(g[:, 1], [1 - c3 / (c1 * c2), c1 * s * c3 / (c1 * c2), -s], rtol=1e-9, atol=0)
+
+
+def test_peak_falls_with_speed():
+    slips, mus = jax.jit(jax.vmap(lambda v: peak(DRY_ASPHALT, v)))(jnp.array([0.0, 15.0, 30.0]))
+    assert np.all(np.diff(slips) < 0)
+    assert np.all(np.diff(mus) < 0)
+
+
+# Magic formula
+
+
+def test_magic_formula():
+    b, c, d, e = 10.0, 1.65, 0.9, 0.97
+    x = b * GRID
+    mu = d * np.sin(c * np.arctan((1 - e) * x + e * np.arctan(x)))
+    np.testing.assert_allclose(curve(MagicFormula(B=b, C=c, D=d, E=e), GRID), mu, rtol=1e-13, atol=1e-15)
+
+
+def test_magic_peak():
+    """The greatest mu is D, where C arctan(...) = pi/2."""
+    road = MagicFormula()
+    slip, mu = best(strong(road))
+    place = brentq(
+        lambda s: road.B * s * (1 - road.E) + road.E * np.arctan(road.B * s) - np.tan(np.pi / 2 / road.C),
+        0,
+        1,
+        xtol=1e-15,
+    )
+    np.testing.assert_allclose(slip, place, rtol=1e-10, atol=0)
+    np.testing.assert_allclose(mu, road.D, rtol=1e-14, atol=0)
+
+
+# Tabulated
+
+
+def knots(seed, monotone):
+    rng = np.random.default_rng(seed)
+    slip = np.concatenate([[0.0], (np.arange(1, 10) + rng.uniform(-0.4, 0.4, 9)) / 10, [1.0]])
+    mu = rng.uniform(0.1, 1.0, 10)
+    return slip, np.concatenate([[0.0], np.sort(mu) if monotone else mu])
+
+
+FLAT = (np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0]), np.array([0.0, 0.5, 0.5, 0.8, 0.8, 0.8]))
+STEEP_ENDS = (np.array([0.0, 0.3, 0.35, 0.4, 0.45, 1.0]), np.array([0.0, 0.05, 0.01, 0.8, 0.2, 0.3]))
+
+
+@pytest.mark.parametrize(
+    ("slip", "mu"),
+    [knots(seed, monotone) for seed in range(8) for monotone in (True, False)]
+    + [FLAT, STEEP_ENDS, (SPLINE_B.slip, SPLINE_B.mu)],
+)
+def test_tabulated_is_pchip(slip, mu):
+    road = check(Tabulated(slip=slip, mu=mu))
+    s = np.linspace(0.0, 1.0, 401)
+    oracle = PchipInterpolator(slip, mu)
+    np.testing.assert_allclose(curve(road, s), oracle(s), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(curve(road, -s), -oracle(s), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(curve(road, slip), mu, rtol=1e-15, atol=1e-15)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_tabulated_gradient(seed):
+    """In every knot, slip and mu, against differences of SciPy's interpolant."""
+    slip, mu = knots(seed, monotone=False)
+    s = np.random.default_rng(9).uniform(0.0, 1.0, 40)
+    rows = []
+    for column in (0, 1):
+        for i in range(len(slip)):
+            values = []
+            for step in (1e-6, -1e-6):
+                table = [slip.copy(), mu.copy()]
+                table[column][i] += step
+                values.append(PchipInterpolator(*table, extrapolate=True)(s))
+            rows.append((values[0] - values[1]) / 2e-6)
+    exact = jacobian(lambda road: curve(road, s), Tabulated(slip=slip, mu=mu))
+    np.testing.assert_allclose(exact, rows, rtol=1e-6, atol=1e-8)
+
+
+def test_spline_b_knots():
+    """The published identification, knot by knot, and its peak: a knot, where the slope of the cubic is zero."""
+    text = """
+    0 .02108 .04215 .06323 .08431 .09696 .10539 .12039 .14539 .17539 .19039 .20539 .23539 .28539 .40539 .60539 1
+    0 .51493 .72745 .86912 .96331 .98097 .99064 .98201 .95733 .92939 .91484 .90622 .88005 .85317 .81806 .79436 .75761"""
+    slip, mu = (np.array(line.split(), float) for line in text.strip().splitlines())
+    np.testing.assert_allclose(SPLINE_B.slip, slip, rtol=0, atol=0)
+    np.testing.assert_allclose(SPLINE_B.mu, mu, rtol=0, atol=0)
+    np.testing.assert_allclose(best(strong(SPLINE_B)), (0.10539, 0.99064), rtol=1e-9, atol=0)
+
+
+def test_tabulated_objects_to_bad_tables():
+    x, y = np.array([0.0, 0.5, 1.0]), np.array([0.0, 0.8, 0.7])
+    for slip, mu, message in (
+        (x, y[:2], "same length of at least 3"),
+        (x[[0, 2, 1]], y, "not increasing"),
+        (x * 0.9, y, r"slip 0.9; they must run"),
+        (x, y + 0.1, r"from \(0, 0.1\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            check(Tabulated(slip=slip, mu=mu))
+
+
+# Compound roads
+
+
+def test_scaled():
+    np.testing.assert_allclose(curve(Scaled(road=RIG, scale=0.3), GRID), 0.3 * curve(RIG, GRID), rtol=1e-15, atol=0)
+
+
+def along(road, distance):
+    return jax.jit(jax.vmap(lambda x: road.friction(0.1, 10.0, x)))(jnp.asarray(distance))
+
+
+def test_patches_on_either_side_and_between():
+    a, b, c = (float(r.friction(0.1, 10.0, 0.0)) for r in (DRY_ASPHALT, SNOW, ICE))
+    road = Patches(roads=(DRY_ASPHALT, SNOW, ICE), edges=np.array([10.0, 20.0]), width=2.0)
+    mu = along(road, [0.0, 9.0, 9.5, 10.0, 11.0, 15.0, 20.0, 21.0, 99.0])
+    quarter = a + (3 / 16 - 2 / 64) * (b - a)  # y = 1/4 of 3 y^2 - 2 y^3
+    np.testing.assert_allclose(mu, [a, a, quarter, (a + b) / 2, b, b, (b + c) / 2, c, c], rtol=1e-14, atol=0)
+
+
+def test_patches_are_c1():
+    """Slope zero at both ends of the ramp, 3/2 (after - before)/width in its middle."""
+    road = Patches(width=2.0)
+    jump = float(SNOW.friction(0.1, 10.0) - DRY_ASPHALT.friction(0.1, 10.0))
+    slope = jax.jit(jax.vmap(jax.grad(lambda x: road.friction(0.1, 10.0, x))))
+    np.testing.assert_allclose(
+        slope(jnp.array([9 + 1e-9, 10.0, 11 - 1e-9])), [0, 0.75 * jump, 0], rtol=1e-12, atol=1e-8
+    )
+
+
+def test_sharp_patches():
+    a, b = (float(r.friction(0.1, 10.0, 0.0)) for r in (DRY_ASPHALT, SNOW))
+    mu = along(Patches(width=0.0), [10 - 1e-9, 10.0, 10 + 1e-9])
+    np.testing.assert_allclose(mu, [a, b, b], rtol=1e-14, atol=0)
+
+
+def test_patches_object_to_bad_edges():
+    assert list(problems(Patches(edges=np.array([1.0, 2.0])))) == ["edges has shape (2,); 2 roads need (1,)"]
+    road = Patches(roads=(ICE, SNOW, ICE), edges=np.array([2.0, 1.0]))
+    assert list(problems(road)) == ["edges = [2. 1.] m is not increasing"]
+
+
+# The best slip
+
+
+def test_monotone_curve_is_best_locked():
+    ice = replace(ICE, {"c4": 0.0})
+    np.testing.assert_allclose(best(strong(ice)), (1.0, 0.05), rtol=1e-12, atol=0)
+    slope = jacobian(found, ice)
+    assert np.all(np.isfinite(slope))
+    np.testing.assert_allclose(slope[:, 0], 0.0, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", ["DRY_ASPHALT", "SNOW", "RIG", "RIG_UNROUNDED", "magic", "patches, three"])
+def test_peak_is_differentiable_in_every_parameter(name):
+    """Where patches meet. A root is found to 1e-16 of mu' over mu'', here 1 to 200, and differences divide it by
+    1e-5."""
+    road = ROADS[name]
+    np.testing.assert_allclose(jacobian(found, road), differences(found, road), rtol=1e-6, atol=1e-8)
+
+
+def test_peak_of_a_table_moves_with_its_knot():
+    """Spline B peaks at its seventh knot and stays there: slip and mu are those of the knot."""
+    expected = np.zeros((34, 2))
+    expected[6, 0] = expected[17 + 6, 1] = 1.0
+    np.testing.assert_allclose(jacobian(found, SPLINE_B), expected, rtol=1e-9, atol=1e-9)

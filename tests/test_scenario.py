@@ -1,0 +1,226 @@
+"""Scenarios: packaged ones, the round trip, overrides, defaults, the catalogue."""
+
+import dataclasses
+import pathlib
+
+import jax
+import numpy as np
+import pytest
+
+from diffabs import catalogue, controllers, roads, scenario
+from diffabs.loop import Loop
+from diffabs.objectives import BRAKING
+from diffabs.rollout import FixedStep
+from diffabs.scenario import dump, load, names
+
+
+@pytest.fixture(autouse=True, scope="module")
+def stable():
+    """Loading without the seconds of the stability check, which has tests of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        yield
+
+
+@pytest.fixture
+def file(tmp_path: pathlib.Path):
+    def write(text: str, name: str = "mine.toml") -> pathlib.Path:
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def assert_same(a: scenario.Scenario, b: scenario.Scenario):
+    assert jax.tree.structure((a.loop, dict(a.objectives))) == jax.tree.structure((b.loop, dict(b.objectives)))
+    for x, y in zip(jax.tree.leaves((a.loop, a.objectives)), jax.tree.leaves((b.loop, b.objectives)), strict=True):
+        np.testing.assert_array_equal(np.asarray(x, float), np.asarray(y, float))
+    assert (a.name, a.title, a.description, a.solver, a.seed) == (b.name, b.title, b.description, b.solver, b.seed)
+
+
+# What is packaged
+
+
+def test_packaged_names():
+    assert {"slip-lmi", "slip-estimator", "lab-rig"} <= set(names())
+
+
+def test_slip_lmi_is_the_papers_example():
+    s = load("slip-lmi")
+    assert type(s.loop.plant).__name__ == "MirroredRig"
+    assert s.loop.plant.mass == 5.3
+    assert s.loop.plant.road.q == 2.10
+    np.testing.assert_array_equal(s.loop.controller.gain, [-11753, -48])
+    assert (s.loop.controller.torque_min, s.loop.controller.torque_max) == (-np.inf, np.inf)
+    assert isinstance(s.loop.feedforward, controllers.HoldingInput)
+    assert s.loop.initial.speed == pytest.approx(50 / 3.6, rel=1e-15)
+    assert s.loop.stop.speed == pytest.approx(5 / 3.6, rel=1e-15)
+    assert s.loop.reference.slip == 0.2
+    assert s.title
+    assert s.description
+
+
+def test_slip_estimator_is_the_papers_example():
+    s = load("slip-estimator")
+    c = s.loop.controller
+    assert (c.kp, c.ki, c.kd, c.cutoff, c.torque_min, c.torque_max) == (3893, 5000, 5.67, 55, 0, 90)
+    assert type(s.loop.reference).__name__ == "PeakLatch"
+    assert (s.loop.plant.mass, s.loop.plant.radius, s.loop.plant.inertia) == (15, 0.2, 1.04456)
+    np.testing.assert_array_equal(s.loop.plant.road.mu, roads.SPLINE_B.mu)
+    assert s.loop.initial.speed == pytest.approx(100 / 3.6, rel=1e-15)
+
+
+@pytest.mark.parametrize("name", names())
+def test_packaged_scenario_survives_dump_and_load(name, file):
+    first = load(name)
+    assert_same(first, load(file(dump(first), f"{name}.toml")))
+
+
+def test_everything_nested_survives_dump_and_load(file):
+    text = """
+    title = 'quotes " and \\ and ü'
+    description = "two\\nlines, \\u007f"
+    [plant]
+    mass = 0.1
+    [road]
+    type = "patches"
+    roads = ["snow", {type = "scaled", scale = 0.7, road = "ice"}, {type = "magic-formula", B = 9.0}]
+    edges = [5.0, 7.123456789012345]
+    [controller]
+    type = "sampled"
+    period = 0.002
+    [controller.controller]
+    kp = 0.1
+    torque_max = inf
+    antiwindup = {type = "back-calculation", tracking_time = 0.3}
+    [sensor]
+    type = "series"
+    blocks = [{type = "noise", slip = 0.01}, "wheel-speed", {type = "bias", slip = 1e-300}]
+    [actuator]
+    type = "series"
+    blocks = ["lag", {type = "delay", time = 0.02, capacity = 99}]
+    [solver]
+    step = 1e-3
+    duration = 1.25
+    every = 7
+    seed = 42
+    [objective]
+    effort = "effort"
+    "odd name" = {type = "quadratic-cost", q = [2.0, 3.0]}
+    settling_time = {band = 0.02}
+    """
+    first = load(file(text))
+    assert first.description == "two\nlines, \x7f"
+    assert_same(first, load(file(dump(first))))
+    assert first.loop.plant.road.roads[1].road is roads.ICE
+    assert first.loop.controller.controller.antiwindup.tracking_time == 0.3
+    assert first.loop.actuator.blocks[1].capacity == 99
+    assert first.objectives["settling_time"].band == 0.02
+    assert list(first.objectives) == [*BRAKING, "effort", "odd name"]
+    assert first.solver == FixedStep(step=1e-3, duration=1.25, every=7)
+    assert jax.numpy.array_equal(jax.random.key_data(first.key()), jax.random.key_data(jax.random.key(42)))
+
+
+def test_what_is_left_out_has_its_default(file):
+    s = load(file(""))
+    assert_same(s, scenario.Scenario(name="mine", loop=Loop(), solver=FixedStep()))
+
+
+# The catalogue
+
+
+def test_members_are_told_by_shape():
+    assert set(catalogue.types("plant")) == {"quarter-car", "mirrored-rig", "lab-rig"}
+    assert set(catalogue.types("initial")) == {"brake-start"}
+    assert {"burckhardt", "snow", "rig-unrounded", "spline-b"} <= set(catalogue.types("road"))
+    assert not {"peak", "piecewise-cubic"} & set(catalogue.types("road"))
+    assert "pid" in catalogue.types("controller")
+    assert set(catalogue.types("antiwindup")) == {"no-anti-windup", "clamping", "back-calculation"}
+    assert set(catalogue.types("feedforward")) == {"no-feedforward", "constant-input", "holding-input"}
+    assert not set(catalogue.types("controller")) & {*catalogue.types("antiwindup"), *catalogue.types("feedforward")}
+    assert {"direct", "series", "lag"} <= set(catalogue.types("actuator"))
+    assert {"direct", "series", "noise"} <= set(catalogue.types("sensor"))
+    assert set(catalogue.types("stop")) == {"standstill", "speed-reached"}
+    assert catalogue.types("road")["snow"] is roads.SNOW
+
+
+@pytest.mark.parametrize("family", catalogue.FAMILIES)
+def test_every_exported_part_is_in_one_family_or_another(family):
+    """An exported part class that no family recognises could not be used in a scenario."""
+    modules, _ = catalogue.FAMILIES[family]
+    known = {type(part) for name in catalogue.FAMILIES for part in catalogue.types(name).values()}
+    helpers = {"Peak"}
+    for module in modules:
+        classes = {x for x in vars(module).values() if isinstance(x, type) and dataclasses.is_dataclass(x)}
+        assert {c.__name__ for c in classes - known} <= helpers
+
+
+def test_every_objective_says_its_unit():
+    units = {name: catalogue.unit_of(part) for name, part in BRAKING.items()}
+    assert units == {
+        "stop_time": "s",
+        "stop_distance": "m",
+        "max_slip": "1",
+        "overshoot": "1",
+        "settling_time": "s",
+        "iae": "s",
+        "final_slip_error": "1",
+        "locked_time": "s",
+    }
+
+
+# Overrides
+
+
+def test_overrides_reach_every_kind_of_field(file):
+    path = file(
+        '[road]\ntype="patches"\nroads=["snow","ice"]\n[controller]\ntype="sampled"\n[initial]\nspeed_kmh=50.0\n'
+        "[solver]\nstep=1e-3"
+    )
+    changes = (
+        "title=two words",
+        "controller.controller.kp=12",
+        "controller.controller.antiwindup=clamping",
+        "road.roads.0.c1=0.5",
+        "road.edges=[3]",
+        "initial.speed=10",
+        "stop.speed_kmh=3.6",
+        "solver.seed=3",
+        "plant.road.width = 0.5",
+        "objective.settling_time.band=0.05",
+        "actuator={type='lag', time_constant=0.1}",
+        "feedforward=holding-input",
+    )
+    s = load(path, changes)
+    assert s.title == "two words"
+    assert s.loop.controller.controller.kp == 12.0
+    assert isinstance(s.loop.controller.controller.kp, float)
+    assert isinstance(s.loop.controller.controller.antiwindup, controllers.Clamping)
+    assert s.loop.plant.road.roads[0].c1 == 0.5
+    assert s.loop.plant.road.roads[0].c2 == roads.SNOW.c2
+    assert s.loop.plant.road.roads[1] is roads.ICE
+    np.testing.assert_array_equal(s.loop.plant.road.edges, [3.0])
+    assert s.loop.plant.road.width == 0.5
+    assert s.loop.initial.speed == 10.0
+    assert s.loop.stop.speed == pytest.approx(1.0, rel=1e-15)
+    assert s.seed == 3
+    assert s.objectives["settling_time"].band == 0.05
+    assert s.loop.actuator.time_constant == 0.1
+    assert isinstance(s.loop.feedforward, controllers.HoldingInput)
+
+
+def test_a_list_needs_no_brackets():
+    np.testing.assert_array_equal(load("slip-lmi", ["controller.gain=-1000,-50"]).loop.controller.gain, [-1000, -50])
+
+
+def test_a_bare_type_replaces_the_part():
+    s = load("slip-estimator", ["controller=relay", "controller.band=0.03"])
+    assert type(s.loop.controller).__name__ == "Relay"
+    assert s.loop.controller.band == 0.03
+
+
+def test_default_members_of_a_tuple_can_be_changed(file):
+    s = load(file(""), ["road=patches", "road.roads.1.c1=0.3"])
+    assert s.loop.plant.road.roads[0] is roads.DRY_ASPHALT
+    assert s.loop.plant.road.roads[1].c1 == 0.3

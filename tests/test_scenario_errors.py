@@ -1,0 +1,202 @@
+"""A scenario that is wrong: one clear line that names field, value, range and unit."""
+
+import pathlib
+
+import numpy as np
+import pytest
+
+from diffabs import scenario
+from diffabs.scenario import ScenarioError, load, names
+
+
+@pytest.fixture(autouse=True, scope="module")
+def stable():
+    """Loading without the seconds of the stability check, which has tests of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        yield
+
+
+@pytest.fixture
+def file(tmp_path: pathlib.Path):
+    def write(text: str, name: str = "mine.toml") -> pathlib.Path:
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def message(path, *overrides: str) -> str:
+    with pytest.raises(ScenarioError) as caught:
+        load(path, overrides)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# Bad input: the parts of the message that a person needs
+
+
+BAD = [
+    ("plnt.mass=1", "plnt is not a section", "did you mean plant?"),
+    ("plant.mas=1", "plant.mas is not a field of quarter-car", "did you mean mass?"),
+    ("plant.type=quarter-cart", 'plant.type = "quarter-cart" is unknown', "did you mean quarter-car?", "lab-rig"),
+    ("road=snw", "road.type", '"snw"', "did you mean snow?"),
+    ("road.c9=1", "road.c9 is not a field", "there is slip, mu"),
+    ("controller.antiwindup=clamp", "controller.antiwindup.type", "did you mean clamping?"),
+    ("controller.type=clamping", "controller.type", "unknown", "pid"),
+    ("controller.type=3", "controller.type = 3 is a number", "pid"),
+    ("plant.mass=-1", "plant.mass = -1 is outside (0, inf) kg"),
+    ("plant.mass=0", "plant.mass = 0 is outside (0, inf) kg"),
+    ("plant.mass=nan", "plant.mass = nan is outside (0, inf) kg"),
+    ("plant.mass=inf", "plant.mass = inf is outside (0, inf) kg"),
+    ("plant.mass=1" + "0" * 400, "plant.mass = ", "too large", "(0, inf) kg"),
+    ("plant.mass=heavy", 'plant.mass = "heavy" is text', "a number in (0, inf) kg is needed"),
+    ("plant.mass=true", "plant.mass = true is a boolean", "a number in (0, inf) kg is needed"),
+    ("plant.mass=1,2", "plant.mass = [1, 2] is a list", "a number in (0, inf) kg is needed"),
+    ("plant.mass={a=1}", "plant.mass = {'a': 1} is a table", "(0, inf) kg"),
+    ("plant.mass=1979-05-27", "plant.mass", "a date or time", "(0, inf) kg"),
+    ("plant.mass=", 'plant.mass = "" is text'),
+    ("plant.mass.x=1", "plant.mass", "number"),
+    ("plant=3", "plant = 3 is a number", "quarter-car"),
+    ("reference.slip=1.5", "reference.slip = 1.5 is outside (0, 1]"),
+    ("road.mu=0.5", "road.mu = 0.5 is a number", "a list of numbers in [0, inf) is needed"),
+    ("road.mu=['a','b']", 'road.mu.0 = "a" is text', "a number in [0, inf)"),
+    ("road.mu=[0,[1]]", "road.mu.1 = [1] is a list"),
+    ("road.mu=" + ",".join(["-1.23456789e-10"] * 8), "road.mu = [-1.2346e-10", "is outside [0, inf)"),
+    ("road.mu=0,0.5,0.9", "road.slip and mu have shapes (17,) and (3,)"),
+    ("road={type='burckhardt',c1=-2}", "road.c1 = -2 is outside [0, inf)"),
+    ("road={type='patches',roads=['snow','ice'],edges=[1,2]}", "road.edges has shape (2,); 2 roads need (1,)"),
+    ("road={type='patches',roads='snow'}", 'road.roads = "snow" is text', "a list of parts"),
+    ("road={type='patches',roads=[{c1=2}]}", "road.roads.0.type is missing", "snow"),
+    ("road={type='patches',roads={5={c1=2}}}", "road.roads.5 is not there", "0, 1"),
+    ("road={type='scaled',road={type='scaled',scale=11}}", "road.road.scale = 11 is outside (0, 10]"),
+    ("initial.speed_kmh=-5", "initial.speed_kmh = -5 is outside (0, 720] km/h"),
+    ("initial.speed_kmh=fast", 'initial.speed_kmh = "fast" is text', "(0, 720] km/h"),
+    ("initial.slip_kmh=5", "initial.slip_kmh is not a field of brake-start"),
+    ("initial.speed=0.01", "initial.speed = 0.01 m/s is not above stop.speed = 0.05 m/s"),
+    ("initial={speed=9.0,speed_kmh=9.0}", "initial.speed is given twice", "m/s", "km/h"),
+    ("stop.speed=-1", "stop.speed = -1 is outside (0, inf) m/s"),
+    ("solver.stp=1", "solver.stp is not a field of solver", "did you mean step?"),
+    ("solver=rk4", 'solver = "rk4" is text', "a table of step, duration, every, seed"),
+    ("solver.step=0", "solver.step = 0 is outside (0, inf) s"),
+    ("solver.step=nan", "solver.step = nan is outside (0, inf) s"),
+    ("solver.duration=inf", "solver.duration = inf is outside (0, inf) s"),
+    ("solver.step=small", 'solver.step = "small" is text', "(0, inf) s"),
+    ("solver.every=0", "solver.every = 0 is outside [1, 100000000]"),
+    ("solver.every=1.5", "solver.every = 1.5 is a number", "a whole number in [1, 100000000]"),
+    ("solver.seed=-1", "solver.seed = -1 is outside [0, 4294967295]"),
+    ("solver.step=20", "solver.step = 20 s is outside (0, 10] s"),
+    ("solver.step=1e-9", "solver.step = 1e-09 s is outside [1e-07, 10] s"),
+    (
+        "controller={type='sampled',period=0.0015}",
+        "controller.period = 0.0015 s is not a multiple",
+        "solver.step = 0.001 s",
+    ),
+    ("actuator={type='delay',time=5.0}", "actuator.time = 5 s is outside [0.001, 1.022] s"),
+    ("actuator={type='delay',capacity=0}", "actuator.capacity = 0 is outside [1, 10000000]"),
+    ("actuator={type='delay',capacity=100000000000}", "actuator.capacity", "outside [1, 10000000]"),
+    ("actuator={type='delay',capacity=9.5}", "actuator.capacity = 9.5 is a number", "a whole number"),
+    ("sensor={type='series',blocks=[{type='noise',slip=-1}]}", "sensor.blocks.0.slip = -1 is outside [0, inf)"),
+    ("sensor={type='series',blocks=['lag']}", "sensor.blocks.0.type", '"lag" is unknown'),
+    ("controller={type='state-feedback',gain=[1]}", "controller.gain has shape (1,); it needs (2,)"),
+    ("controller={type='pid',torque_min=100}", "controller.torque_min = 100 N m exceeds torque_max = 90 N m"),
+    ("objective.settling_time.band=0", "objective.settling_time.band = 0 is outside (0, inf)"),
+    ("objective.settling_tim.band=1", "objective.settling_tim.type is missing", "did you mean settling-time?"),
+    ("objective.cost={type='quadratic-cost',q=[1]}", "objective.cost.q has shape (1,); it needs (2,)"),
+    ("objective=iae", 'objective = "iae" is text', "a table"),
+    ("title=3", "title = 3 is a number", "text"),
+    ("nonsense", '"nonsense" is not of the form section.field=value'),
+    ("a..b=1", "is not of the form section.field=value"),
+    ("=1", "is not of the form section.field=value"),
+    ("plant.mass=1\nname=2", "plant.mass", "is text"),
+    ("plant.'\x1b[31m\n'=1", "is not a field of quarter-car"),
+    ("plant.mass=" + "x" * 500, "..."),
+]
+
+
+@pytest.mark.parametrize("case", BAD, ids=lambda case: case[0][:40].encode("unicode_escape").decode())
+def test_bad_value_is_one_line_that_says_where_what_and_what_is_needed(file, case):
+    override, *needed = case
+    line = message(file(""), override)
+    for text in needed:
+        assert text in line
+    assert "plant.road" not in line
+    assert len(line) < 600
+    assert line.isprintable()
+
+
+def test_every_value_out_of_range_is_named():
+    line = message("slip-lmi", "plant.mass=-1", "reference.slip=2")
+    assert "plant.mass = -1 is outside (0, inf) kg" in line
+    assert "reference.slip = 2 is outside (0, 1]" in line
+
+
+def test_road_given_twice(file):
+    assert "road is given twice" in message(file('road = "snow"\n[plant]\nroad = "ice"'))
+
+
+def test_nesting_without_end(file):
+    nested = "road" + ".road" * 30 + '.type="scaled"'
+    types = [f'road{".road" * i}.type="scaled"' for i in range(30)]
+    assert "nested more than 16 deep" in message(file("\n".join([*types, nested])))
+    assert "nested too deeply" in message(file("a = " + "[" * 5000))
+
+
+# Bad files
+
+
+def test_missing_file_and_unknown_name(tmp_path):
+    assert "No such file" in message(tmp_path / "none.toml")
+    line = message("slip-lim")
+    assert "did you mean slip-lmi?" in line
+    assert "lab-rig" in line
+
+
+def test_directory(tmp_path):
+    assert "Is a directory" in message(tmp_path)
+
+
+def test_not_text(tmp_path):
+    path = tmp_path / "binary.toml"
+    path.write_bytes(b"title = 'x'\nname = '\xff\xfe'\n")
+    assert "is not UTF-8 text (at line 2)" in message(path)
+
+
+@pytest.mark.parametrize("text", ["title = 'x'\n[plant\n", "title = 'x'\nmass = 1 kg\n", "a = 1\na = 2\n"])
+def test_not_toml_gives_the_line(file, text):
+    line = message(file(text))
+    assert "mine.toml" in line
+    assert "is not TOML" in line
+    assert "line 2" in line
+
+
+def test_endless_file():
+    assert "larger than 1000000 bytes" in message("/dev/zero")
+
+
+def test_nothing_is_evaluated(file):
+    assert '"__import__(' in message(file("plant.mass = \"__import__('os').abort()\""))
+
+
+# The step
+
+
+@pytest.fixture
+def checked_step(monkeypatch):
+    from diffabs.stability import stable_step
+
+    monkeypatch.setattr(scenario, "stable_step", stable_step)
+
+
+def test_unstable_step(checked_step):
+    line = message("slip-estimator", "controller.kp=10000")
+    assert "solver.step = 0.0001 s is not stable" in line
+    largest = float(line.partition("(0, ")[2].partition("]")[0])
+    load("slip-estimator", ["controller.kp=10000", f"solver.step={largest}"])
+    assert "is not stable" in message("slip-estimator", "controller.kp=10000", f"solver.step={1.02 * largest}")
+
+
+@pytest.mark.parametrize("name", names())
+def test_packaged_step_is_stable(checked_step, name):
+    load(name)
