@@ -168,7 +168,7 @@ class Stop(Protocol):
         """d(margin)/dt, negative near the end: the slope for landing on the crossing."""
         ...
 
-    def remainder(self, output: BrakeOutput, stopped: Any) -> tuple[Scalar, Scalar]:
+    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """Time [s] and distance [m] that are left after the last sample."""
         ...
 
@@ -184,8 +184,8 @@ class Objective(Protocol):
         """d(memory.flow)/dt, integrated with the plant at the order of the method."""
         ...
 
-    def update(self, memory: Memory, sample: Sample, h: Scalar) -> Any:
-        """`memory.held` after a step of length h that ended at `sample`."""
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Any:
+        """`memory.held` after a step of length h from `before` (after the jump there) to `sample`."""
         ...
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:

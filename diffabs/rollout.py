@@ -123,7 +123,7 @@ def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, step
     carry, seen = jax.lax.scan(block, carry, length=-(-(steps + LANDINGS) // segment))
     last = _seen(loop, carry)
     trajectory = _assembled(first, seen, last, -(-steps // segment)) if every else None
-    ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample.output, carry.stopped))
+    ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample, carry.stopped))
     metrics = {name: o.value(carry.tally[name], ending) for name, o in objectives.items()}
     metrics = {name: jnp.where(carry.diverged, jnp.nan, value) for name, value in metrics.items()}
     return Run(metrics, carry.stopped, carry.diverged, ending, trajectory)
@@ -176,9 +176,10 @@ def _advance(
     tally_flow = {name: memory.flow for name, memory in carry.tally.items()}
     z = (state.flow(), tally_flow)
     for event in events:
-        before = flow(carry.t, (event.before.flow(), tally_flow), event.before)
-        after = flow(carry.t, (event.after.flow(), tally_flow), event.after)
-        z = axpy(event.elapsed, axpy(-1.0, before, after), z)
+        old = flow(carry.t, (event.before.flow(), tally_flow), event.before)
+        new = flow(carry.t, (event.after.flow(), tally_flow), event.after)
+        z = axpy(event.elapsed, axpy(-1.0, old, new), z)
+    before = loop.signals(carry.t, state.with_flow(z[0])).sample
     z = rk4_step(flow, carry.t, z, carry.length)
 
     t = carry.t + carry.length
@@ -192,7 +193,7 @@ def _advance(
     sample = loop.signals(t + moved, state).sample
     memories = {name: Memory(tally_flow[name], held[name]) for name in objectives}
     tally = {
-        name: memories[name]._replace(held=o.update(memories[name], sample, carry.length + moved))
+        name: memories[name]._replace(held=o.update(memories[name], before, sample, carry.length + moved))
         for name, o in objectives.items()
     }
     return state, tally, late

@@ -4,7 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from diffabs.protocols import BrakeOutput
+from diffabs.protocols import BrakeOutput, Sample
 from diffabs.pytree import Scalar, param, pytree
 
 LEAST_DECELERATION = 1e-3  # m/s^2, so that a car that only rolls gets a finite, very long, stopping distance
@@ -24,9 +24,9 @@ class SpeedReached:
         """d(margin)/dt."""
         return -output.deceleration
 
-    def remainder(self, output: BrakeOutput, stopped: Any) -> tuple[Scalar, Scalar]:
+    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """Nothing after a stop; else (v - v_end)/a and (v^2 - v_end^2)/(2 a)."""
-        time, distance = _braked(output, self.speed)
+        time, distance = _braked(sample, self.speed, False)
         return jnp.where(stopped, 0.0, time), jnp.where(stopped, 0.0, distance)
 
 
@@ -47,12 +47,16 @@ class Standstill:
         """d(margin)/dt."""
         return -output.deceleration
 
-    def remainder(self, output: BrakeOutput, stopped: Any) -> tuple[Scalar, Scalar]:
+    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """v/a and v^2/(2 a)."""
-        del stopped
-        return _braked(output, 0.0)
+        return _braked(sample, 0.0, stopped)
 
 
-def _braked(output: BrakeOutput, end: Scalar) -> tuple[Any, Any]:
-    a = jnp.maximum(output.deceleration, LEAST_DECELERATION)
+def _braked(sample: Sample, end: Scalar, stopped: Any) -> tuple[Any, Any]:
+    """Braked to `end` at the last deceleration. For a run that stopped, at no less than half its mean deceleration:
+    slip may chatter at the very end, and the last instant then says little."""
+    output, t = sample.output, jnp.maximum(sample.t, 1e-9)
+    mean = 2 * (output.distance / t - output.speed) / t
+    a = jnp.where(stopped, jnp.maximum(output.deceleration, 0.5 * mean), output.deceleration)
+    a = jnp.maximum(a, LEAST_DECELERATION)
     return (output.speed - end) / a, (output.speed**2 - end**2) / (2 * a)

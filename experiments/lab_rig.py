@@ -8,8 +8,8 @@ Then the mirrored rig of Maeda and Sugiura under their gain, with the brake's la
 which Routh and Hurwitz find stable for T below T* = (beta |k2| - alpha)/(beta |k1| + alpha (beta |k2| - alpha)/omega).
 
 That is 4.02 ms at 50 km/h and 3.94 ms at 5 km/h; above 4.03 ms no speed is stable. With 49 ms the wheel locks at
-0.078 s where the brake can only brake, at 0.16 s where negative torque is allowed, and at the rig's 0..9.03 N m it swings
-between rolling freely and a slip of 0.8, and locks near the end.
+0.078 s where the brake can only brake, at 0.16 s where negative torque is allowed, and at the rig's 0..9.03 N m it
+swings between rolling freely and a slip of 0.8, and locks near the end.
 
     python experiments/lab_rig.py
 """

@@ -202,15 +202,15 @@ MUTATIONS = [
     Mutation(
         "IAE without abs",
         "objectives/accuracy.py",
-        "return jnp.abs(error(sample))",
-        "return error(sample)",
+        "jnp.abs(whole))",
+        "whole)",
         "test_conformance.py::test_errors_count_on_either_side[iae]",
     ),
     Mutation(
         "a peak before the first sample",
         "objectives/accuracy.py",
-        "(last > before) & (last > slip)",
-        "(last >= before) & (last > slip)",
+        "(last > earlier) & (last > slip)",
+        "(last >= earlier) & (last > slip)",
         "test_conformance.py::test_objective[max_slip]",
     ),
     Mutation(

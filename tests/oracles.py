@@ -1,7 +1,7 @@
 """Slow, obvious second versions: the closed loops as plain NumPy right-hand sides, integrated by SciPy.
 
-Nothing here calls diffabs for physics or control: only the parameters are read from its parts. Equations as printed in the
-papers (quarter car in (v, omega), rig in (omega1, omega2)), limits by `np.clip`, stop by an event.
+Nothing here calls diffabs for physics or control: only the parameters are read from its parts. Equations as printed in
+the papers, in the speeds of vehicle and rim; limits by `np.clip`, stop and lock by events.
 """
 
 import numpy as np
@@ -45,7 +45,7 @@ def slip_of(v, w):
 
 
 def plant_rates(plant):
-    """f(v, w, x, extra, u) -> (v', w', extra') in vehicle speed and rim speed of the wheel; extra is the rig's brake."""
+    """f(v, w, x, extra, u) -> (v', w', extra'): vehicle speed, rim speed of the wheel, the lab rig's brake torque."""
     mu = friction(plant.road)
     if isinstance(plant, QuarterCar):
 

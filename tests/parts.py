@@ -204,7 +204,7 @@ def objective_run(objective: Any, sample_at: Any = sample_at, end: float = 0.5, 
     def step(memory: Memory, k: Any) -> Any:
         t = k * h
         flow = rk4_step(lambda t, z: objective.flow(Memory(z, memory.held), sample_at(t)), t, memory.flow, h)
-        return Memory(flow, objective.update(Memory(flow, memory.held), sample_at(t + h), h)), None
+        return Memory(flow, objective.update(Memory(flow, memory.held), sample_at(t), sample_at(t + h), h)), None
 
     memory, _ = jax.lax.scan(step, objective.start(sample_at(0.0 * h)), jnp.arange(steps))
     return objective.value(memory, Ending(sample_at(jnp.asarray(end)), True, 0.25, 0.7))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.numerics import clamp, parabola, ratio
+from diffabs.numerics import clamp, parabola, ratio, sign
 from diffabs.protocols import Ending, Memory, Sample
 from diffabs.pytree import Scalar, Vector, param, pytree
 
@@ -20,9 +20,9 @@ def nothing(self: Any, memory: Memory, sample: Sample) -> Any:
     return ()
 
 
-def unchanged(self: Any, memory: Memory, sample: Sample, h: Scalar) -> Any:
+def unchanged(self: Any, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Any:
     """`update` of an objective that is only an integral."""
-    del self, sample, h
+    del self, before, sample, h
     return memory.held
 
 
@@ -43,28 +43,72 @@ def error(sample: Sample) -> Scalar:
     return sample.output.slip - sample.setpoint
 
 
+class Area(NamedTuple):
+    """Integral of the absolute value so far, and of the value itself."""
+
+    total: Scalar
+    signed: Scalar
+
+
+def _area(memory: Memory, a: Scalar, b: Scalar, left: Scalar, right: Scalar, crossing: Scalar) -> Area:
+    """Add a step. Where the value changes sign, from a to b, `left` and `right` are its integrals on either side of
+    the `crossing` (a fraction of the step) if it were linear; the whole is exact to the order of the method."""
+    total, signed = memory.held
+    whole = memory.flow - signed
+    rest = (whole - left - right) * (crossing * sign(a) + (1 - crossing) * sign(b))
+    part = jnp.where(a * b < 0, jnp.abs(left) + jnp.abs(right) + rest, jnp.abs(whole))
+    return Area(total + part, memory.flow)
+
+
 @pytree
 class IAE:
-    """Integral of |e| dt [s]. At e = 0 the derivative is taken as 0."""
+    """Integral of |e| dt [s], e = slip - setpoint.
 
-    start, update, value = from_zero, unchanged, integral
+    e is integrated with the plant; |e|, whose kink would cost the method its order and the derivative its smoothness,
+    is put together step by step, with the crossings of zero interpolated linearly.
+    """
+
+    def start(self, sample: Sample) -> Memory:
+        """Zero."""
+        zero = 0.0 * sample.output.slip
+        return Memory(zero, Area(zero, zero))
 
     def flow(self, memory: Memory, sample: Sample) -> Scalar:
-        """|e|."""
+        """e."""
         del memory
-        return jnp.abs(error(sample))
+        return error(sample)
+
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Area:
+        """Add |e| over the step."""
+        a, b = error(before), error(sample)
+        part = clamp(ratio(a, a - b), 0.0, 1.0)
+        return _area(memory, a, b, 0.5 * h * part * a, 0.5 * h * (1 - part) * b, part)
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Integral."""
+        del ending
+        return memory.held.total
 
 
 @pytree
 class ITAE:
-    """Integral of t |e| dt [s^2]."""
+    """Integral of t |e| dt [s^2], by the method of IAE."""
 
-    start, update, value = from_zero, unchanged, integral
+    start, value = IAE.start, IAE.value
 
     def flow(self, memory: Memory, sample: Sample) -> Scalar:
-        """t |e|."""
+        """t e."""
         del memory
-        return sample.t * jnp.abs(error(sample))
+        return sample.t * error(sample)
+
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Area:
+        """Add t |e| over the step."""
+        a, b = error(before), error(sample)
+        part = clamp(ratio(a, a - b), 0.0, 1.0)
+        head, tail = part * h, (1 - part) * h
+        left = a * head * (before.t / 2 + head / 6)
+        right = b * tail * ((before.t + head) / 2 + tail / 3)
+        return _area(memory, a, b, left, right, part)
 
 
 class Peak(NamedTuple):
@@ -72,7 +116,7 @@ class Peak(NamedTuple):
 
     greatest: Scalar
     last: Scalar
-    before: Scalar
+    earlier: Scalar
 
 
 @pytree
@@ -85,13 +129,13 @@ class MaxSlip:
         """The first slip."""
         return Memory(held=Peak(*(sample.output.slip,) * 3))
 
-    def update(self, memory: Memory, sample: Sample, h: Scalar) -> Peak:
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Peak:
         """Look for a vertex at the last sample but one."""
-        del h
-        greatest, last, before = memory.held
+        del before, h
+        greatest, last, earlier = memory.held
         slip = sample.output.slip
-        turned = (last > before) & (last > slip)
-        vertex = jnp.where(turned, jnp.minimum(parabola(before, last, slip)[1], 1.0), slip)
+        turned = (last > earlier) & (last > slip)
+        vertex = jnp.where(turned, jnp.minimum(parabola(earlier, last, slip)[1], 1.0), slip)
         return Peak(jnp.maximum(greatest, jnp.maximum(vertex, slip)), slip, last)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
@@ -114,13 +158,6 @@ class Overshoot:
         return jnp.where(excess > 0, excess, 0.0)
 
 
-class Entry(NamedTuple):
-    """When |e| last came inside the band [s], and the last |e|."""
-
-    t: Scalar
-    distance: Scalar
-
-
 @pytree
 class SettlingTime:
     """Time [s] after which |slip - setpoint| stays within `band`; the end of the run if it never does.
@@ -133,21 +170,19 @@ class SettlingTime:
     flow = nothing
 
     def start(self, sample: Sample) -> Memory:
-        """Settled from the start if inside."""
-        return Memory(held=Entry(0.0 * sample.t, jnp.abs(error(sample))))
+        """Settled from the start."""
+        return Memory(held=0.0 * sample.t)
 
-    def update(self, memory: Memory, sample: Sample, h: Scalar) -> Entry:
-        """Note the last entry."""
-        entered, before = memory.held
-        now = jnp.abs(error(sample))
-        late = clamp(ratio(self.band - now, before - now), 0.0, 1.0)
-        t = jnp.where(now > self.band, sample.t, jnp.where(before > self.band, sample.t - late * h, entered))
-        return Entry(t, now)
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Scalar:
+        """Note the last entry; while outside, the present time."""
+        a, b = jnp.abs(error(before)), jnp.abs(error(sample))
+        late = clamp(ratio(self.band - b, a - b), 0.0, 1.0)
+        return jnp.where(b > self.band, sample.t, jnp.where(a > self.band, sample.t - late * h, memory.held))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Settling time."""
         del ending
-        return memory.held.t
+        return memory.held
 
 
 @pytree

@@ -34,13 +34,6 @@ class StopDistance:
         return ending.sample.output.distance + ending.distance_left
 
 
-class Locked(NamedTuple):
-    """Locked time so far [s], and the last slip."""
-
-    time: Scalar
-    slip: Scalar
-
-
 @pytree
 class LockedTime:
     """Time [s] during which the slip exceeds `threshold`. Crossings are interpolated linearly inside a step."""
@@ -51,20 +44,19 @@ class LockedTime:
 
     def start(self, sample: Sample) -> Memory:
         """Zero."""
-        return Memory(held=Locked(0.0 * sample.t, sample.output.slip))
+        return Memory(held=0.0 * sample.t)
 
-    def update(self, memory: Memory, sample: Sample, h: Scalar) -> Locked:
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Scalar:
         """Add the part of the step above the threshold."""
-        time, before = memory.held
-        a, b = before - self.threshold, sample.output.slip - self.threshold
+        a, b = before.output.slip - self.threshold, sample.output.slip - self.threshold
         crossing = ratio(jnp.maximum(a, b), jnp.abs(a - b))
         part = jnp.where((a > 0) & (b > 0), 1.0, jnp.where((a > 0) | (b > 0), crossing, 0.0))
-        return Locked(time + part * h, sample.output.slip)
+        return memory.held + part * h
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Locked time."""
         del ending
-        return memory.held.time
+        return memory.held
 
 
 @pytree
@@ -96,9 +88,9 @@ class Variation:
         """From the first torque."""
         return Memory(held=Varied(0.0 * sample.control, sample.control))
 
-    def update(self, memory: Memory, sample: Sample, h: Scalar) -> Varied:
-        """Add the change over the step."""
-        del h
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Varied:
+        """Add the change since the last sample, jumps between steps included."""
+        del before, h
         total, last = memory.held
         return Varied(total + jnp.abs(sample.control - last), sample.control)
 

@@ -112,7 +112,7 @@ class PeakRobust:
     happens below `arming`, and the fall must exceed the fraction `threshold` of the maximum."""
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
-    time_constant: Scalar = param(default=0.01, unit="s", above=0.0)
+    time_constant: Scalar = param(default=0.02, unit="s", above=0.0)
     threshold: Scalar = param(default=0.03, unit="1", above=0.0, below=1.0)
     arming: Scalar = param(default=3.0, unit="m/s^2", low=0.0, tunable=False)
 
@@ -155,8 +155,10 @@ class PeakRobust:
 
 
 def _vertex(m: PeakMemory, deceleration: Scalar, slip: Scalar) -> tuple[Any, Any, Any]:
-    """Place of the last maximum (steps from the middle one of the last three samples), deceleration and slip there. Where the
-    deceleration did not rise before it fell, as at the start of a run, that is the middle sample."""
+    """Place of the last maximum (steps from the middle one of the last three samples), deceleration and slip there.
+
+    Where the deceleration did not rise before it fell, as at the start of a run, that is the middle sample.
+    """
     place, _ = parabola(m.deceleration[1], m.deceleration[0], deceleration)
     place = jnp.where(m.deceleration[1] < m.deceleration[0], place, 0.0)
     greatest = interpolate(m.deceleration[1], m.deceleration[0], deceleration, place)

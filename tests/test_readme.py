@@ -1,0 +1,45 @@
+"""The README's code runs and says what the README says of it; its commands exist."""
+
+import pathlib
+import re
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from diffabs.cli import app
+
+TEXT = (pathlib.Path(__file__).parent.parent / "README.md").read_text()
+CODE = re.search(r"```python\n(.*?)```", TEXT, re.DOTALL)[1]
+
+
+def test_the_twelve_lines_run():
+    code = CODE.replace("64)", "3)")  # 9 lanes instead of 4,096: the same call
+    names = {}
+    exec(compile(code, "README.md", "exec"), names)
+    assert names["many"]["overshoot"].shape == (9,)
+    assert np.all(np.isfinite(names["slope"]))
+    assert np.all(names["slope"] != 0)
+    assert len([line for line in CODE.splitlines() if line.strip()]) <= 16
+
+
+def test_4096_masses_and_roads_in_one_call():
+    code = CODE.replace("FixedStep(1e-3, 4.0)", "FixedStep(1e-3, 0.05)").rsplit("slope", 1)[0]
+    names = {}
+    exec(compile(code, "README.md", "exec"), names)
+    overshoot = np.asarray(names["many"]["overshoot"])
+    assert overshoot.shape == (4096,)
+    assert len(np.unique(overshoot)) > 4000
+    one = names["brake"]({"plant.mass": names["masses"][1234], "plant.road.w4": names["grips"][1234]})
+    np.testing.assert_allclose(overshoot[1234], one["overshoot"], rtol=1e-10)
+
+
+@pytest.mark.parametrize("command", re.findall(r"^    diffabs (list .*)$", TEXT, re.MULTILINE))
+def test_commands_exist(command):
+    assert CliRunner().invoke(app, command.split()).exit_code == 0
+
+
+def test_the_promised_message():
+    result = CliRunner().invoke(app, ["simulate", "slip-lmi", "--set", "plant.mass=-1"])
+    assert result.exit_code == 2
+    assert re.search(r"^    (error: .*)$", TEXT, re.MULTILINE)[1] in result.stderr
