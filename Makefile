@@ -11,7 +11,7 @@ demo: $(VENV)/.installed
 	@echo "The figures and summary.json of both papers are in out/slip-lmi and out/slip-estimator."
 
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 lint: $(VENV)/.lint
 	$(BIN)/ruff check .

@@ -1,7 +1,7 @@
 """Closed loops per second: diffabs, diffrax and SciPy on the same loop, in one run, at equal accuracy.
 
 The loop: the rig of [lmi] from 50 to 5 km/h under its published gain, torque >= 0, masses 5.3 to 6.2 kg. Each program
-gets the largest step or tolerance of its ladder whose worst error over ALL lanes, in stopping time, distance and IAE, is
+gets the largest step or tolerance of its ladder whose worst error over ALL lanes (stopping time, distance, IAE) is
 below `--accuracy` against a converged reference. Medians; compile time apart. Prints a table, writes JSON with machine
 and versions to out/benchmarks/rollout.json.
 

@@ -18,6 +18,8 @@ from diffabs import catalogue, cli, scenario
 from diffabs.objectives import BRAKING
 from diffabs.stability import stable_step
 
+pytestmark = pytest.mark.xdist_group("cli")  # one worker makes what these share
+
 SHORT = ("--set", "solver.duration=0.02", "--set", "solver.step=1e-3", "--set", "solver.every=1")
 
 

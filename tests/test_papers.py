@@ -15,6 +15,8 @@ from diffabs.objectives import BRAKING
 from diffabs.papers import PAPERS, record, slip_lmi
 from diffabs.references import FixedSlip
 
+pytestmark = pytest.mark.xdist_group("papers")  # one worker makes what these share
+
 SMALLEST_FIGURE = 10_000  # bytes: an empty sheet takes less than 6,000
 
 
