@@ -4,6 +4,7 @@ import os
 import pathlib
 
 import jax
+import numpy as np
 import pytest
 
 jax.config.update("jax_enable_x64", True)
@@ -17,3 +18,25 @@ def _float64():
     """A test that leaves another precision behind is an error."""
     yield
     assert jax.config.jax_enable_x64
+
+
+@pytest.fixture(scope="module")
+def any_step_is_stable():
+    """Loading a scenario without the seconds of the stability check, which has tests of its own."""
+    from diffabs import scenario
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        yield
+
+
+@pytest.fixture
+def file(tmp_path: pathlib.Path):
+    """Write a scenario file."""
+
+    def write(text: str, name: str = "mine.toml") -> pathlib.Path:
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write

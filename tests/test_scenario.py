@@ -1,7 +1,6 @@
 """Scenarios: packaged ones, the round trip, overrides, defaults, the catalogue."""
 
 import dataclasses
-import pathlib
 
 import jax
 import numpy as np
@@ -13,23 +12,7 @@ from diffabs.objectives import BRAKING
 from diffabs.rollout import FixedStep
 from diffabs.scenario import dump, load, names
 
-
-@pytest.fixture(autouse=True, scope="module")
-def stable():
-    """Loading without the seconds of the stability check, which has tests of its own."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
-        yield
-
-
-@pytest.fixture
-def file(tmp_path: pathlib.Path):
-    def write(text: str, name: str = "mine.toml") -> pathlib.Path:
-        path = tmp_path / name
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return write
+pytestmark = pytest.mark.usefixtures("any_step_is_stable")
 
 
 def assert_same(a: scenario.Scenario, b: scenario.Scenario):

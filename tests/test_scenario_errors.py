@@ -1,30 +1,11 @@
 """A scenario that is wrong: one clear line that names field, value, range and unit."""
 
-import pathlib
-
-import numpy as np
 import pytest
 
 from diffabs import scenario
 from diffabs.scenario import ScenarioError, load, names
 
-
-@pytest.fixture(autouse=True, scope="module")
-def stable():
-    """Loading without the seconds of the stability check, which has tests of its own."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
-        yield
-
-
-@pytest.fixture
-def file(tmp_path: pathlib.Path):
-    def write(text: str, name: str = "mine.toml") -> pathlib.Path:
-        path = tmp_path / name
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return write
+pytestmark = pytest.mark.usefixtures("any_step_is_stable")
 
 
 def message(path, *overrides: str) -> str:
