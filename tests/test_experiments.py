@@ -1,0 +1,56 @@
+"""The experiments run, small, and find what their docstrings say."""
+
+import importlib.util
+import pathlib
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("matplotlib")
+pytestmark = pytest.mark.xdist_group("experiments")
+FOLDER = pathlib.Path(__file__).parent.parent / "experiments"
+
+
+def experiment(name):
+    spec = importlib.util.spec_from_file_location(f"experiments_{name}", FOLDER / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_sampled_control_agrees_with_an_independent_solution(tmp_path):
+    module = experiment("sampled_control")
+    config = module.Config(periods=(1e-3,), delays=(0.0,), drawn_periods=(1e-3,), out=str(tmp_path), stop=0.05)
+    result = module.main(config)
+    for row, (_, time, distance) in zip(result["sweep"], config.reference, strict=True):
+        np.testing.assert_allclose(row["time [s]"], time, rtol=0, atol=7e-4)  # three digits given
+        np.testing.assert_allclose(row["distance [m]"], distance, rtol=0, atol=7e-4)
+    assert list(tmp_path.glob("*.json"))
+    assert list(tmp_path.glob("*.png"))
+
+
+def test_noise_blinds_the_bare_latch_and_not_the_robust_one():
+    module = experiment("sensor_noise")
+    config = module.Config(seeds=8)
+    references = {"bare": module.PeakLatch(), "robust": module.PeakRobust()}
+    car = module.CARS["Magic Formula"]
+    loops = [module.noisy_loop(config, car, 0.1, reference) for reference in references.values()]
+    means = {}
+    for name, loop in zip(references, loops, strict=True):
+        distance, stopped = module.noisy(config, [loop], 6.0)
+        means[name] = np.mean(distance)
+        assert np.all(stopped) == (name == "robust")
+    assert means["bare"] > 100
+    np.testing.assert_allclose(means["robust"], 42.9, rtol=0, atol=0.3)  # 42.87 +- .11 elsewhere
+
+
+def test_the_laboratory_rig_locks_and_its_brake_is_too_slow_for_the_published_gain():
+    module = experiment("lab_rig")
+    config = module.Config()
+    for row in module.checks(config):
+        if row["reference"] is not None:
+            np.testing.assert_allclose(row["ours"], row["reference"], rtol=1e-7, atol=0)
+    critical = [value for row in module.critical_lags(config) for value in row.values() if isinstance(value, float)]
+    assert any(abs(value - 4.02e-3) < 2e-5 or abs(value - 4.02) < 2e-2 for value in critical), critical
