@@ -158,11 +158,23 @@ def test_latch_finds_the_vertex(top):
 
 
 def test_latch_follows_later_maxima():
-    """Slip 0.1 + t; two maxima, the second one higher: the target moves while the first maximum is exceeded."""
+    """Slip 0.1 + t; two maxima, the second one higher: the target moves there once the second is past."""
     a = jnp.array([1.0, 2.0, 3.0, 2.5, 2.0, 2.9, 3.5, 4.0, 3.0, 2.0])
     target, _ = run(PeakLatch(), lambda t: seen(0.1 + t, deceleration=a[jnp.round(t / H).astype(int)]), 10)
-    vertex = 0.1 + H * (2 + 1 / 6)  # (2, 3, 2.5): half of (2 - 2.5) over (2 - 6 + 2.5)
-    close(target, [0.2] * 3 + [vertex] * 3 + [0.106, 0.107, 0.107, 0.107])
+    first = 0.1 + H * (2 + 1 / 6)  # (2, 3, 2.5): half of (2 - 2.5) over (2 - 6 + 2.5)
+    second = 0.1 + H * (7 - 1 / 6)  # (3.5, 4, 3): half of (3.5 - 3) over (3.5 - 8 + 3)
+    close(target, [0.2] * 3 + [first] * 5 + [second] * 2)
+    falling, _ = run(PeakLatch(), lambda t: seen(0.5 - 10 * t, deceleration=8 - 100 * t), 3)
+    close(falling, [0.2, 0.5, 0.5])  # past the peak from the start: the best slip was the first one
+
+
+def test_latch_does_not_move_for_rounding():
+    """A controller that holds the best slip keeps the deceleration at its maximum, to rounding."""
+    a = jnp.array([1.0, 3.0, 2.0, 3.0 * (1 + 1e-7), 2.0])
+    target, elapsed = run(PeakLatch(), lambda t: seen(0.1 + t, deceleration=a[jnp.round(t / H).astype(int)]), 5)
+    assert target[2] != target[1]
+    close(target[3:], target[2])
+    assert np.count_nonzero(elapsed) == 1
 
 
 def test_literal_follows_the_slip_while_friction_rises():

@@ -9,7 +9,7 @@ import pytest
 
 import diffabs as d
 from diffabs import controllers, plants, references, roads
-from diffabs.objectives import BRAKING, Effort, Variation
+from diffabs.objectives import BRAKING, Effort, MaxSlip, Variation
 from diffabs.rollout import _run
 from diffabs.stability import stable_step
 from diffabs.stops import SpeedReached, Standstill
@@ -54,8 +54,16 @@ def test_speed_reached_lands_between_samples():
     run = d.rollout(loop, d.FixedStep(0.01, 2.0), {"effort": Effort(), "variation": Variation()})
     np.testing.assert_allclose(run.ending.sample.t, 7 / DECELERATION, rtol=1e-12)
     np.testing.assert_allclose(run.ending.sample.output.speed, 3.0, rtol=1e-12)
+    np.testing.assert_allclose(run.ending.sample.output.distance, (100 - 9) / (2 * DECELERATION), rtol=1e-12)
     np.testing.assert_allclose(run.metrics["effort"], 500.0**2 * 7 / DECELERATION, rtol=1e-12)
     assert run.metrics["variation"] == 0
+
+
+def test_the_peak_of_a_falling_slip_is_its_first_value():
+    loop = dataclasses.replace(RIG, initial=d.BrakeStart(speed=10.0, slip=0.6))
+    run = d.rollout(loop, d.FixedStep(1e-3, 0.01), {"max_slip": MaxSlip()})
+    assert np.all(np.diff(run.trajectory.sample.output.slip) < 0)
+    assert run.metrics["max_slip"] == 0.6
 
 
 def test_a_run_that_does_not_stop_is_charged_the_rest():

@@ -18,6 +18,10 @@ from diffabs.numerics import clamp, interpolate, parabola, ratio
 from diffabs.protocols import BrakeOutput, Clock, Jump, Memory, no_flow
 from diffabs.pytree import Scalar, param, pytree
 
+# A later maximum counts only if it exceeds the greatest by this fraction: a controller that holds the best slip keeps
+# the deceleration at its maximum to rounding, and comparisons of equal numbers would then decide on derivatives.
+MARGIN = 1e-6
+
 
 class PeakMemory(NamedTuple):
     """1 once latched; greatest deceleration [m/s^2] and the slip [1] there; target [1]; the last two samples."""
@@ -32,7 +36,7 @@ class PeakMemory(NamedTuple):
 
 def _fresh(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMemory:
     zero = 0.0 * deceleration
-    return PeakMemory(zero, deceleration, slip, target + zero, (deceleration,) * 2, (slip,) * 2)
+    return PeakMemory(zero, zero, slip, target + zero, (deceleration,) * 2, (slip,) * 2)
 
 
 @pytree
@@ -46,7 +50,8 @@ class PeakLiteral:
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Maximum so far: the first sample."""
-        return Memory(held=_fresh(self.slip, signal.deceleration, signal.slip))
+        fresh = _fresh(self.slip, signal.deceleration, signal.slip)
+        return Memory(held=fresh._replace(greatest=signal.deceleration))
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
         """Target slip [1]."""
@@ -69,7 +74,7 @@ class PeakLiteral:
 
 @pytree
 class PeakLatch:
-    """target = slip until |a| first falls, then the slip at its maximum; a later greater |a| moves the target there.
+    """target = slip until |a| first falls, then the slip at its maximum; a later, greater one moves the target there.
 
     For an exact accelerometer: noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip.
     """
@@ -77,26 +82,22 @@ class PeakLatch:
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
 
     flow = no_flow
-    start = PeakLiteral.start
     output = PeakLiteral.output
     setpoint = PeakLiteral.setpoint
 
+    def start(self, signal: BrakeOutput) -> Memory:
+        """No maximum yet."""
+        return Memory(held=_fresh(self.slip, signal.deceleration, signal.slip))
+
     def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
-        """Latch at the first fall."""
+        """Latch at a maximum greater than all before."""
         m: PeakMemory = memory.held
-        a, s = signal.deceleration, signal.slip
-        latch = (m.latched < 0.5) & (a < m.deceleration[0])
-        exceeds = (m.latched > 0.5) & (a > m.greatest)
-        place, greatest, slip = _vertex(m, a, s)
-        new = PeakMemory(
-            latched=jnp.where(latch, 1.0, m.latched),
-            greatest=jnp.where(latch, greatest, jnp.where(exceeds, a, m.greatest)),
-            slip=m.slip,
-            target=jnp.where(latch, slip, jnp.where(exceeds, s, m.target)),
-            deceleration=(a, m.deceleration[0]),
-            slips=(s, m.slips[0]),
+        place, higher, new = _tracked(m, signal.deceleration, signal.slip)
+        new = new._replace(
+            latched=jnp.where(higher, 1.0, m.latched),
+            target=jnp.where(higher, new.slip, m.target),
         )
-        return Jump(Memory(held=new), jnp.where(latch, (1 - place) * clock.h, 0.0))
+        return Jump(Memory(held=new), jnp.where(higher, (1 - place) * clock.h, 0.0))
 
 
 class FilterMemory(NamedTuple):
@@ -134,32 +135,32 @@ class PeakRobust:
         """Keep the maximum, latch at the threshold below it."""
         m: PeakMemory = memory.held
         a, s = memory.flow
-        _, top, slip_at_top = _vertex(m, a, s)
-        turned = (a < m.deceleration[0]) & (m.deceleration[0] >= m.deceleration[1]) & (top > m.greatest)
-        higher = a > m.greatest
-        greatest = jnp.where(turned, top, jnp.where(higher, a, m.greatest))
-        slip = jnp.where(turned, slip_at_top, jnp.where(higher, s, m.slip))
-        level = (1 - self.threshold) * greatest
-        latch = (m.latched < 0.5) & (greatest > self.arming) & (a < level)
+        _, higher, new = _tracked(m, a, s)
+        level = (1 - self.threshold) * new.greatest
+        latch = (m.latched < 0.5) & (new.greatest > self.arming) & (a < level)
         late = clamp(ratio(level - a, m.deceleration[0] - a), 0.0, 1.0)
-        moved = latch | ((m.latched > 0.5) & (turned | higher))
-        new = PeakMemory(
+        moved = latch | ((m.latched > 0.5) & higher)
+        new = new._replace(
             latched=jnp.where(latch, 1.0, m.latched),
-            greatest=greatest,
-            slip=slip,
-            target=jnp.where(moved, slip, m.target),
-            deceleration=(a, m.deceleration[0]),
-            slips=(s, m.slips[0]),
+            target=jnp.where(moved, new.slip, m.target),
         )
         return Jump(Memory(memory.flow, new), jnp.where(latch, late * clock.h, 0.0))
 
 
-def _vertex(m: PeakMemory, deceleration: Scalar, slip: Scalar) -> tuple[Any, Any, Any]:
-    """Place of the last maximum (steps from the middle one of the last three samples), deceleration and slip there.
+def _tracked(m: PeakMemory, deceleration: Scalar, slip: Scalar) -> tuple[Any, Any, PeakMemory]:
+    """Look for a maximum among the last three samples, greater than all before: its place (in steps from the middle
+    one), whether there is one, and the memory with it.
 
-    Where the deceleration did not rise before it fell, as at the start of a run, that is the middle sample.
+    Where the deceleration did not rise before it fell, as at the start of a run, the maximum is the middle sample.
     """
-    place, _ = parabola(m.deceleration[1], m.deceleration[0], deceleration)
-    place = jnp.where(m.deceleration[1] < m.deceleration[0], place, 0.0)
-    greatest = interpolate(m.deceleration[1], m.deceleration[0], deceleration, place)
-    return place, greatest, interpolate(m.slips[1], m.slips[0], slip, place)
+    before, last = m.deceleration[1], m.deceleration[0]
+    place = jnp.where(before < last, parabola(before, last, deceleration)[0], 0.0)
+    top = interpolate(before, last, deceleration, place)
+    higher = (deceleration < last) & (last >= before) & (top > (1 + MARGIN) * m.greatest)
+    new = m._replace(
+        greatest=jnp.where(higher, top, m.greatest),
+        slip=jnp.where(higher, interpolate(m.slips[1], m.slips[0], slip, place), m.slip),
+        deceleration=(deceleration, last),
+        slips=(slip, m.slips[0]),
+    )
+    return place, higher, new
