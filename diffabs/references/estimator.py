@@ -92,7 +92,7 @@ class PeakLatch:
     def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
         """Latch at a maximum greater than all before."""
         m: PeakMemory = memory.held
-        place, higher, new = _tracked(m, signal.deceleration, signal.slip)
+        place, higher, new = _tracked(m, signal.deceleration, signal.slip, clock.k == 0)
         new = new._replace(
             latched=jnp.where(higher, 1.0, m.latched),
             target=jnp.where(higher, new.slip, m.target),
@@ -135,7 +135,7 @@ class PeakRobust:
         """Keep the maximum, latch at the threshold below it."""
         m: PeakMemory = memory.held
         a, s = memory.flow
-        _, higher, new = _tracked(m, a, s)
+        _, higher, new = _tracked(m, a, s, clock.k == 0)
         level = (1 - self.threshold) * new.greatest
         latch = (m.latched < 0.5) & (new.greatest > self.arming) & (a < level)
         late = clamp(ratio(level - a, m.deceleration[0] - a), 0.0, 1.0)
@@ -147,20 +147,22 @@ class PeakRobust:
         return Jump(Memory(memory.flow, new), jnp.where(latch, late * clock.h, 0.0))
 
 
-def _tracked(m: PeakMemory, deceleration: Scalar, slip: Scalar) -> tuple[Any, Any, PeakMemory]:
+def _tracked(m: PeakMemory, deceleration: Scalar, slip: Scalar, first: Any) -> tuple[Any, Any, PeakMemory]:
     """Look for a maximum among the last three samples, greater than all before: its place (in steps from the middle
     one), whether there is one, and the memory with it.
 
-    Where the deceleration did not rise before it fell, as at the start of a run, the maximum is the middle sample.
+    Where the deceleration did not rise before it fell, as at the start of a run, the maximum is the middle sample. The
+    first sample decides nothing: it would be compared with itself, and compiled code may compute it twice and round it
+    differently, in the forward and in the backward pass of a gradient for instance.
     """
     before, last = m.deceleration[1], m.deceleration[0]
     place = jnp.where(before < last, parabola(before, last, deceleration)[0], 0.0)
     top = interpolate(before, last, deceleration, place)
-    higher = (deceleration < last) & (last >= before) & (top > (1 + MARGIN) * m.greatest)
+    higher = ~first & (deceleration < last) & (last >= before) & (top > (1 + MARGIN) * m.greatest)
     new = m._replace(
         greatest=jnp.where(higher, top, m.greatest),
         slip=jnp.where(higher, interpolate(m.slips[1], m.slips[0], slip, place), m.slip),
-        deceleration=(deceleration, last),
-        slips=(slip, m.slips[0]),
+        deceleration=(deceleration, jnp.where(first, deceleration, last)),
+        slips=(slip, jnp.where(first, slip, m.slips[0])),
     )
     return place, higher, new
