@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench mutations clean
+.PHONY: demo test test-slow lint bench mutations clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -11,7 +11,10 @@ demo: $(VENV)/.installed
 	@echo "The figures and summary.json of both papers are in out/slip-lmi and out/slip-estimator."
 
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
+
+test-slow: $(VENV)/.test
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m slow
 
 lint: $(VENV)/.lint
 	$(BIN)/ruff check .

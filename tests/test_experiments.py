@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("matplotlib")
-pytestmark = pytest.mark.xdist_group("experiments")
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("experiments")]
 FOLDER = pathlib.Path(__file__).parent.parent / "experiments"
 
 

@@ -93,6 +93,9 @@ SOLVERS = dict.fromkeys(LOOPS, d.FixedStep(5e-4, 0.8)) | {"feedback": d.FixedSte
 ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {"feedback": (3e-6, 1e-6), "computer": (1e-5, 5e-5)}
 
 
+SLOW = ("computer", "noisy", "relay", "delay")  # the largest programs to compile
+
+
 def flat(name):
     """(names, values, objectives as a function of the values) of the tunable parameters of a loop."""
     loop = strong(LOOPS[name])
@@ -116,7 +119,7 @@ def differences(measured, x, step):
     return np.asarray((many(x + moves) - many(x - moves)) / (2 * step)).T, scale
 
 
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in LOOPS])
 def test_gradient_of_every_objective_in_every_parameter(name):
     names, x, measured = flat(name)
     jacobian = np.asarray(jax.jit(jax.jacfwd(measured))(x))
@@ -130,7 +133,7 @@ def test_gradient_of_every_objective_in_every_parameter(name):
         assert error[worst] <= tolerance * largest + 1e-10, (objective, names[worst], error[worst] / largest)
 
 
-@pytest.mark.parametrize("name", ["feedback", "latch"])
+@pytest.mark.parametrize("name", ["feedback", pytest.param("latch", marks=pytest.mark.slow)])
 def test_reverse_mode_equals_forward_mode(name):
     _, x, measured = flat(name)
     weights = jnp.array(np.random.default_rng(0).normal(size=len(OBJECTIVES)))

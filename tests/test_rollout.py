@@ -188,7 +188,7 @@ PASSIVE = {
 }
 
 
-@pytest.mark.parametrize("plant", PASSIVE)
+@pytest.mark.parametrize("plant", ["car", "rig", pytest.param("lab", marks=pytest.mark.slow)])
 def test_energy_never_increases_down_to_standstill(plant):
     """Brakes and friction only take energy, on every road, while the wheel rolls, locks, sticks and stands."""
     part, torque = PASSIVE[plant]
