@@ -1,8 +1,9 @@
 """The largest integration step that is stable for a loop.
 
 RK4 is stable on a mode lambda while |R(h lambda)| <= 1, R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24. A braking loop stiffens
-as it slows down, its slip rate going with 1/v, so the loop is linearised at speeds down to the stop, at slips around
-the setpoint where the controller is not at a limit. Held memories do not move: a sampled controller is not judged here.
+as it slows down, its slip rate going with 1/v, so the loop is linearised at speeds down to the stop: at slips close to
+the setpoint, where the controller is not at a limit, and at slips all over the friction curve, which is steepest near
+0. Held memories do not move: a sampled controller is not judged here.
 """
 
 from typing import Any
