@@ -1,0 +1,1 @@
+"""Robust design and its proofs."""

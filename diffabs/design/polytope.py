@@ -1,0 +1,99 @@
+"""Sets of linear systems: what a robust design is robust against.
+
+    Polytope    x' = A x + B u (or x+ = A x + B u),  (A, B) anywhere, at any time, in the convex hull of the vertices
+    Schedule    a chain of polytopes along one parameter that is measured, such as speed
+
+Maeda and Sugiura, section 3. Their eq. (22) pairs A of one speed with B of another; here a vertex is a pair.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+LARGEST = 2**12  # vertices; an LMI for each
+
+
+@dataclasses.dataclass(frozen=True)
+class Coverage:
+    """What was checked about a hull: how many systems of a dense grid over the box lie in it, how far the furthest
+    reaches (1 = on the boundary, relative to the centre), and by what factor the corners were spread to cover all."""
+
+    checked: int
+    furthest: float
+    spread: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Polytope:
+    """Vertices A (V, n, n) and B (V, n, m); `period` [s] of a discrete-time system, None for continuous time.
+
+    `states` and `corners` (the parameters at each vertex) are for people. Raises ValueError for shapes that do not fit,
+    numbers that are not finite, no vertex or more than 2^12.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    period: float | None = None
+    states: tuple[str, ...] = ()
+    corners: tuple[Mapping[str, float], ...] = ()
+    coverage: Coverage | None = None
+
+    def __post_init__(self) -> None:
+        """Arrays of float64, of matching shapes."""
+        for name in ("A", "B"):
+            object.__setattr__(self, name, np.array(getattr(self, name), float))
+        a, b = self.A.shape, self.B.shape
+        if len(a) != 3 or len(b) != 3 or a[1] != a[2] or b[:2] != a[:2] or not a[1] or not b[2]:
+            raise ValueError(f"a polytope needs A of shape (V, n, n) and B of shape (V, n, m); got {a} and {b}")
+        if not 1 <= a[0] <= LARGEST:
+            raise ValueError(f"a polytope of {a[0]} vertices is outside [1, {LARGEST}]: an LMI for each")
+        if not (np.isfinite(self.A).all() and np.isfinite(self.B).all()):
+            raise ValueError("a vertex of the polytope has an entry that is not finite")
+
+    @property
+    def vertices(self) -> int:
+        """V."""
+        return self.A.shape[0]
+
+    @property
+    def order(self) -> int:
+        """n, the number of states."""
+        return self.A.shape[1]
+
+    @property
+    def inputs(self) -> int:
+        """m."""
+        return self.B.shape[2]
+
+    def closed(self, gain: Any) -> np.ndarray:
+        """A + B K at each vertex (V, n, n). Raises ValueError for a gain of the wrong shape or not finite."""
+        return self.A + self.B @ checked_gain(gain, (self.inputs, self.order))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Schedule:
+    """Polytopes `cells[i]` for values of `parameter` between `nodes[i]` and `nodes[i + 1]` (increasing)."""
+
+    parameter: str
+    nodes: np.ndarray
+    cells: tuple[Polytope, ...]
+
+    def __post_init__(self) -> None:
+        """Nodes increase; one cell between two."""
+        object.__setattr__(self, "nodes", np.array(self.nodes, float))
+        if len(self.nodes) != len(self.cells) + 1 or not self.cells or not (np.diff(self.nodes) > 0).all():
+            raise ValueError(f"a schedule of {len(self.cells)} cells needs one node more, increasing: {self.nodes}")
+        if len({(cell.order, cell.inputs, cell.period) for cell in self.cells}) != 1:
+            raise ValueError("the cells of a schedule differ in order, inputs or period")
+
+
+def checked_gain(gain: Any, shape: tuple[int, int]) -> np.ndarray:
+    """A gain (m, n); (n,) is one row. Raises ValueError for another shape, or numbers that are not finite."""
+    k = np.atleast_2d(np.array(gain, float))
+    if k.shape != shape:
+        raise ValueError(f"the gain has shape {k.shape}; inputs and states of the system need {shape}")
+    if not np.isfinite(k).all():
+        raise ValueError(f"the gain {k.tolist()} has an entry that is not finite")
+    return k
