@@ -1,1 +1,17 @@
-"""Robust design and its proofs."""
+"""Robust design and its proofs: `design`, `certify`, and what they are about.
+
+Needs the extra `diffabs[design]` (cvxpy, Clarabel, SciPy), which is loaded when the first programme is solved. Riccati
+and Lyapunov equations are pure JAX and need nothing.
+"""
+
+from diffabs.design.analysis import certify as certify
+from diffabs.design.certificate import Certificate as Certificate
+from diffabs.design.certificate import Claim as Claim
+from diffabs.design.polytope import Polytope as Polytope
+from diffabs.design.polytope import Schedule as Schedule
+from diffabs.design.spec import InputLimit as InputLimit
+from diffabs.design.spec import L2Gain as L2Gain
+from diffabs.design.spec import Spec as Spec
+from diffabs.design.synthesis import Design as Design
+from diffabs.design.synthesis import DesignError as DesignError
+from diffabs.design.synthesis import design as design

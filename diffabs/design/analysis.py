@@ -1,0 +1,316 @@
+"""Proofs about a gain, from wherever it comes.
+
+    V = x'P x,  C = A + B K at every vertex,  P > 0
+    decay      He[P C] + 2 rate P < 0
+    cost       He[P C] + Q + K'RK < 0, minimise trace P
+    ...        see `certificate` for the others, for discrete time, and for schedules
+
+P is found by a solver in floating point and then proved in exact arithmetic (`certificate`). Where no common P exists
+the multipliers of the same programme are the proof of that: W_i >= 0 with sum He[C_i W_i] > 0.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from diffabs.design import exact, lmi
+from diffabs.design.certificate import Certificate, Claim
+from diffabs.design.frame import Frame, analysis_frame, frame
+from diffabs.design.lmi import Answer, Unknowns, grouped, he, symmetric
+from diffabs.design.polytope import Polytope, Schedule, checked_gain
+from diffabs.design.spec import Spec
+
+TRIES = 4  # frames, each better than the one before
+ROOM = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)  # relative: by how much a bound is loosened until its proof succeeds
+RAISED = 1e-3  # relative: where the search for the fastest decay stops
+SEARCH = 20  # programmes of that search, at most
+
+
+def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *, fastest: bool = False) -> Certificate:
+    """What can be proved about u = K x, K = `gain` (m, n) or (n,): quadratic stability or its impossibility, and every
+    property that the specification asks for. A schedule takes a gain for each node, too, (N + 1, m, n).
+
+    `fastest` looks for the largest decay rate that a common P proves (a few more programmes); else the claimed rate is
+    that of the specification, or what the first P happens to prove.
+
+    Raises ValueError for shapes that do not fit, ModuleNotFoundError without cvxpy. That something cannot be proved is
+    no error: the certificate says so.
+    """
+    spec = Spec() if spec is None else spec
+    if isinstance(system, Schedule):
+        from diffabs.design.scheduled import certify_schedule
+
+        return certify_schedule(gain, system, spec)
+    spec = spec.checked(system.order, system.inputs)
+    k = checked_gain(gain, (system.inputs, system.order))
+    return Certificate(system, k, tuple(_Analysis(system, k, spec).claims(fastest)))
+
+
+class _Analysis:
+    """The claims about one gain on one polytope."""
+
+    def __init__(self, system: Polytope, k: np.ndarray, spec: Spec):
+        self.system, self.k, self.spec = system, k, spec
+        self.closed = system.closed(k)
+        self.discrete = system.period is not None
+        self.frame = analysis_frame(self.closed, discrete=self.discrete)
+
+    def claims(self, fastest: bool) -> Iterator[Claim]:
+        """Each is proved already; what could not be proved is absent."""
+        spec = self.spec
+        cost = self._cost() if spec.Q is not None and self._slowest_mode() > 0 else None
+        stable = None if cost is None or fastest else self._decaying(np.asarray(cost.data["P"]), spec.decay)
+        stable = stable or self._stability(fastest)
+        yield from (claim for claim in (stable, cost) if claim is not None)
+        if stable is None or stable.kind == "infeasible":
+            return
+        for wanted, find in ((spec.damping, self._damping), (spec.l2, self._l2), (spec.input, self._input)):
+            claim = find() if wanted else None
+            if claim is not None:
+                yield claim
+
+    # quadratic stability, decay, and their impossibility
+
+    def _stability(self, fastest: bool) -> Claim | None:
+        asked = self.spec.decay
+        for _ in range(TRIES):
+            p, margin, w = self._common(asked)
+            if p is None:
+                return None
+            if margin > 0:
+                found = self._decaying(p, asked)
+                if found is not None:
+                    return self._fastest(found) if fastest else found
+            claim = self._claim("infeasible", W=w, **self._rate(asked))
+            if margin <= 0 and self._proved(claim):
+                return claim
+            if np.linalg.eigvalsh(p)[0] <= 0:
+                return None
+            self.frame = frame(p, self.closed, np.eye(1), discrete=self.discrete)
+        return None
+
+    def _common(self, rate: float) -> tuple[np.ndarray | None, float, np.ndarray]:
+        """The P, trace 1 in the frame, whose least margin over the vertices is largest; that margin; the multipliers.
+        Original coordinates."""
+        n = self.system.order
+        unknowns, scaled = Unknowns(P=n, t=(1, 1)), self.frame.states(self.closed)
+        step = self.system.period or 1 / self.frame.tau
+        sizes = np.linalg.norm(scaled, axis=(1, 2)) + 1.0 if self.discrete else np.linalg.norm(scaled, axis=(1, 2))
+        one = np.eye(n)
+        decreases = [
+            unknowns.affine(lambda v, c=c, s=s: self._decrease(v["P"], c, rate * step) / s - v["t"] * one)
+            for c, s in zip(scaled, sizes, strict=True)
+        ]
+        positive = unknowns.affine(lambda v: v["P"] - v["t"] * one)
+        total = unknowns.affine(lambda v: (1 - np.trace(v["P"], axis1=-2, axis2=-1) / n)[:, None, None])
+        answer = lmi.solve(unknowns.row(lambda v: -v["t"]), [lmi.joined([*decreases, positive]), total])
+        if not np.isfinite(answer.y).all():
+            return None, math.nan, np.zeros((0, n, n))
+        values = unknowns.values(answer.y)
+        return self.frame.form(values["P"]), float(values["t"][0, 0]), self._witness(answer, sizes)
+
+    def _witness(self, answer: Answer, sizes: np.ndarray) -> np.ndarray:
+        """W_i in the original coordinates, lifted off the boundary of the cone so that rounding cannot leave it."""
+        w = answer.multipliers[0][:-1]
+        w = (w + np.swapaxes(w, 1, 2)) / 2
+        w = w / np.trace(w.sum(axis=0)) + 1e-9 * np.eye(self.system.order)
+        t = self.frame.T
+        w = t @ w @ t.T / sizes[:, None, None]
+        return he(w) / np.abs(w).max()
+
+    def _decrease(self, p: Any, c: np.ndarray, rate: float) -> np.ndarray:
+        """-dV/dt - 2 rate V, or exp(-2 rate) V - V+."""
+        if self.discrete:
+            return math.exp(-2 * rate) * p - c.T @ p @ c
+        return -he(p @ c) - 2 * rate * p
+
+    def _decaying(self, p: np.ndarray, asked: float) -> Claim | None:
+        """The largest rate that this P proves; at least the rate asked for, or nothing."""
+        best = self._rate_of(p)
+        if best == -math.inf:
+            return None
+        for room in ROOM:
+            rate = best - room * (abs(best) + asked)
+            claim = self._claim("decay", P=p, **self._rate(max(rate, asked)))
+            if self._proved(claim):
+                return claim
+            if rate <= asked:
+                return None
+        return None
+
+    def _fastest(self, claim: Claim) -> Claim:
+        """Close in on the fastest rate that a common P proves: each programme between the bounds gives a P, whose own
+        rate is a lower bound, and multipliers, which are a witness against every rate above an upper bound."""
+        p = np.asarray(claim.data["P"])
+        low, high = self._rate_of(p), self._slowest_mode()
+        for _ in range(SEARCH):
+            if high - low <= RAISED * high:
+                break
+            self.frame = frame(p, self.closed, np.eye(1), discrete=self.discrete)
+            better, _, w = self._common((low + high) / 2)
+            if better is None:
+                break
+            high = min(high, self._ruled_out(w))
+            if self._rate_of(better) > low:
+                p, low = better, self._rate_of(better)
+        return self._decaying(p, self.spec.decay) or claim
+
+    def _slowest_mode(self) -> float:
+        """The decay rate [1/s] of the slowest mode of any vertex."""
+        modes = np.linalg.eigvals(self.closed)
+        if self.discrete:
+            return -math.log(np.abs(modes).max()) / (self.system.period or 1.0)
+        return -float(modes.real.max())
+
+    def _ruled_out(self, w: np.ndarray) -> float:
+        """The least rate that the multipliers W are a witness against: sum He[C W] + 2 rate sum W >= 0."""
+        root = np.linalg.inv(np.linalg.cholesky(w.sum(axis=0)))
+        if self.discrete:
+            spread = (self.closed @ w @ np.swapaxes(self.closed, 1, 2)).sum(axis=0)
+            least = np.linalg.eigvalsh(root @ spread @ root.T)[0]
+            return -math.log(max(least, 1e-300)) / 2 / (self.system.period or 1.0)
+        return -float(np.linalg.eigvalsh(root @ he(self.closed @ w).sum(axis=0) @ root.T)[0]) / 2
+
+    def _rate_of(self, p: np.ndarray) -> float:
+        """The decay rate [1/s] that V = x'Px has at the slowest vertex; -inf where V is not positive definite."""
+        try:
+            root = np.linalg.cholesky(p).T
+        except np.linalg.LinAlgError:
+            return -math.inf
+        c = root @ self.closed @ np.linalg.inv(root)
+        if self.discrete:
+            return -math.log(np.linalg.norm(c, ord=2, axis=(1, 2)).max()) / (self.system.period or 1.0)
+        return -float(np.linalg.eigvalsh(he(c)).max()) / 2
+
+    def _rate(self, rate: float) -> dict[str, float]:
+        """As a claim has it: a rate [1/s], or the factor for one step, rounded to the safe side."""
+        if self.discrete:
+            return {"factor": min(1.0, math.exp(-rate * (self.system.period or 1.0)) * (1 + 1e-15))}
+        return {"rate": rate}
+
+    # what else may be asked
+
+    def _cost(self) -> Claim | None:
+        q, r = self.spec.Q, self.spec.R
+        weight = q + self.k.T @ r @ self.k
+        at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
+        scaled = at.weight(weight) + 1e-12 * np.eye(len(q))
+        trace = at.trace_weight() / np.trace(at.trace_weight())
+        return self._found(
+            at,
+            {"P": self.system.order},
+            lambda v: np.einsum("ij,dji->d", trace, v["P"]),
+            lambda v, c, b: [self._decrease(v["P"], c, 0.0) - scaled],
+            lambda p, v, more: {"kind": "cost", "P": more * p, "Q": q, "R": r},
+        )
+
+    def _damping(self) -> Claim | None:
+        zeta = self.spec.damping
+        cot = zeta / math.sqrt(1 - zeta**2) * (1 + 1e-12)
+
+        def cone(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+            flow = v["P"] @ c / np.linalg.norm(c)
+            skew = cot * (flow - np.swapaxes(flow, -1, -2))
+            return [-symmetric([[he(flow)], [-skew, he(flow)]]) - v["t"] * np.eye(2 * len(c))]
+
+        return self._found(
+            self.frame,
+            {"P": self.system.order, "t": (1, 1)},
+            lambda v: -v["t"],
+            cone,
+            lambda p, v, more: {"kind": "damping", "P": p, "zeta": zeta, "cot": cot},
+            lambda v: [1 - np.trace(v["P"], axis1=-2, axis2=-1)[..., None, None]],
+        )
+
+    def _l2(self) -> Claim | None:
+        l2 = self.spec.l2
+        assert l2 is not None
+        z = l2.output + l2.feedthrough @ self.k
+        weight = z.T @ z
+        weight = weight + 1e-9 * np.trace(weight) * np.eye(len(weight))
+        at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
+        given = None if l2.disturbance is None else at.inverse @ l2.disturbance / math.sqrt(at.tau)
+
+        def bounded(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+            e = at.inverse @ b / math.sqrt(at.tau) if given is None else given
+            limit = v["g"] * np.eye(e.shape[1])
+            top = self._decrease(v["P"], c, 0.0) - at.weight(z.T @ z) - 1e-10 * np.eye(len(c))
+            if self.discrete:
+                return [symmetric([[top], [-e.T @ v["P"] @ c, limit - e.T @ v["P"] @ e]])]
+            return [symmetric([[top], [-e.T @ v["P"], limit]])]
+
+        disturbance = self.system.B if l2.disturbance is None else l2.disturbance
+        return self._found(
+            at,
+            {"P": self.system.order, "g": (1, 1)},
+            lambda v: v["g"],
+            bounded,
+            lambda p, v, more: {
+                "kind": "l2",
+                "P": more * p,
+                "gamma": math.sqrt(more * float(v["g"][0, 0])),
+                "Bw": disturbance,
+                "C": l2.output,
+                "D": l2.feedthrough,
+            },
+        )
+
+    def _input(self) -> Claim | None:
+        """The least fraction g^(1/2) of the limits that an invariant ellipsoid around the starts can prove."""
+        limit, at = self.spec.input, self.frame
+        assert limit is not None
+        rows = self.k @ at.T / limit.limit[:, None]
+        starts = at.inverse @ limit.points.T
+        starts_size = float(np.linalg.norm(starts, axis=0).max())  # P is of the order of 1/size^2
+
+        def held(v: Any) -> list[np.ndarray]:
+            p = v["P"]
+            inside = [1 - starts_size**-2 * (x @ p @ x)[..., None, None] for x in starts.T]
+            return inside + [symmetric([[p], [row[None] * starts_size, v["g"]]]) for row in rows]
+
+        return self._found(
+            at,
+            {"P": self.system.order, "g": (1, 1)},
+            lambda v: v["g"],
+            lambda v, c, b: [self._decrease(v["P"], c, 1e-9) / np.linalg.norm(c)],
+            lambda p, v, more: {
+                "kind": "input",
+                "P": p / starts_size**2 / more,
+                "limit": limit.limit * math.sqrt(float(v["g"][0, 0])) * more,
+                "points": limit.points,
+            },
+            held,
+        )
+
+    def _found(
+        self,
+        at: Frame,
+        shapes: dict[str, Any],
+        objective: Callable[[Any], Any],
+        everywhere: Callable[[Any, np.ndarray, np.ndarray], list[np.ndarray]],
+        claim: Callable[[np.ndarray, Any, float], dict[str, Any]],
+        once: Callable[[Any], list[np.ndarray]] | None = None,
+    ) -> Claim | None:
+        """Solve for P and more in a frame, and loosen the answer until its proof succeeds; None if it does not."""
+        unknowns = Unknowns(**shapes)
+        blocks = unknowns.blocks(lambda v: [v["P"], *(once(v) if once else [])])
+        for c, b in zip(at.states(self.closed), self.system.B, strict=True):
+            blocks += unknowns.blocks(lambda v, c=c, b=b: everywhere(v, c, b))
+        answer = lmi.solve(unknowns.row(objective), grouped(blocks))
+        if not np.isfinite(answer.y).all():
+            return None
+        values = unknowns.values(answer.y)
+        for room in ROOM if "g" not in values or values["g"] > 0 else ():
+            found = claim(at.form(values["P"]), values, 1 + room)
+            made = Claim(found.pop("kind"), found)
+            if self._proved(made):
+                return made
+        return None
+
+    def _claim(self, kind: str, **data: Any) -> Claim:
+        return Claim(kind, data)
+
+    def _proved(self, claim: Claim) -> bool:
+        return exact.verify(claim.kind, self.system, self.k, claim.data)

@@ -1,0 +1,200 @@
+"""Linear matrix inequalities: the only place that knows cvxpy.
+
+    minimise c'y   subject to   h_b + sum_d y_d G_bd >= 0   for every block b
+
+A formula such as eq. (30) of Maeda and Sugiura is written once, in NumPy, for unknown matrices X, F; `affine` reads off
+h and G by putting in unit matrices. The program is parametrised by c, h and G, so that cvxpy compiles one for each
+pattern of sizes and a new weight, vertex or gain costs only the solution.
+
+A solver's status is not believed: `Answer` carries the multipliers, and `gap` and `violation` are worked out here.
+"""
+
+import functools
+import threading
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+SOLVERS = ("CLARABEL", "MOSEK", "CVXOPT")  # in this order, of those installed; SCS is wrong by 1e-3 and never asked
+OPTIONS = {"CLARABEL": {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}}
+HINT = 'pip install "diffabs[design]"'
+LOCK = threading.Lock()  # a compiled program is shared, and holds its parameters
+
+
+class Block(NamedTuple):
+    """Inequalities of one size: h (b, k, k), G (b, d, k, k)."""
+
+    h: np.ndarray
+    G: np.ndarray
+
+
+class Answer(NamedTuple):
+    """Unknowns y, multipliers of each group of blocks (b, k, k), and what the solver says of itself."""
+
+    y: np.ndarray
+    multipliers: list[np.ndarray]
+    status: str
+
+    def violation(self, blocks: list[Block]) -> float:
+        """How far the least eigenvalue of any block is below 0; 0 if none is."""
+        values = (b.h + np.einsum("d,bdij->bij", self.y, b.G) for b in blocks)
+        return max(0.0, *(-float(np.linalg.eigvalsh(value).min()) for value in values))
+
+    def gap(self, c: np.ndarray, blocks: list[Block]) -> float:
+        """Bound on how far c'y is above the optimum: duality gap, and the multipliers' residual times the unknowns."""
+        bound = -sum(float(np.sum(b.h * w)) for b, w in zip(blocks, self.multipliers, strict=True))
+        found = sum(np.einsum("bdij,bij->d", b.G, w) for b, w in zip(blocks, self.multipliers, strict=True))
+        return float(c @ self.y) - bound + float(np.abs(c - found) @ np.abs(self.y))
+
+
+class Unknowns:
+    """Unknown matrices by name: a shape (r, c), or a number n for a symmetric (n, n); packed into one vector y."""
+
+    def __init__(self, **shapes: tuple[int, int] | int):
+        """Lay the matrices out one after the other."""
+        self.basis: dict[str, np.ndarray] = {}
+        units = {name: _units(shape) for name, shape in shapes.items()}
+        self.size, at = sum(map(len, units.values())), 0
+        for name, unit in units.items():
+            whole = np.zeros((self.size, *unit.shape[1:]))
+            whole[at : at + len(unit)] = unit
+            self.basis[name], at = whole, at + len(unit)
+        self.stacked = {name: np.concatenate([np.zeros((1, *b.shape[1:])), b]) for name, b in self.basis.items()}
+
+    def values(self, y: np.ndarray) -> dict[str, np.ndarray]:
+        """The matrices in a vector."""
+        return {name: np.tensordot(y, unit, 1) for name, unit in self.basis.items()}
+
+    def blocks(self, formulas: Callable[[Mapping[str, np.ndarray]], list[Any]]) -> list[Block]:
+        """The blocks h + sum y_d G_d of formulas that are affine in the unknowns and work on stacks of them."""
+        values = formulas(self.stacked)
+        wholes = [np.broadcast_to(value, (self.size + 1, *value.shape[-2:])) for value in values]
+        return [Block(whole[:1], (whole[1:] - whole[0])[None]) for whole in wholes]
+
+    def affine(self, formula: Callable[[Mapping[str, np.ndarray]], Any]) -> Block:
+        """The block of one formula."""
+        return self.blocks(lambda v: [formula(v)])[0]
+
+    def row(self, formula: Callable[[Mapping[str, np.ndarray]], Any]) -> np.ndarray:
+        """The coefficients c of a formula that is linear in the unknowns."""
+        return np.asarray(formula(self.basis), float).reshape(self.size)
+
+
+def _units(shape: tuple[int, int] | int) -> np.ndarray:
+    """The unit matrices that span all matrices of a shape."""
+    if isinstance(shape, tuple):
+        return np.eye(shape[0] * shape[1]).reshape(-1, *shape)
+    pairs = [(i, j) for i in range(shape) for j in range(i + 1)]
+    units = np.zeros((len(pairs), shape, shape))
+    for unit, (i, j) in zip(units, pairs, strict=True):
+        unit[i, j] = unit[j, i] = 1.0
+    return units
+
+
+def he(m: np.ndarray) -> np.ndarray:
+    """He[M] = M + M'."""
+    return m + np.swapaxes(m, -1, -2)
+
+
+def symmetric(rows: list[list[Any]]) -> np.ndarray:
+    """A symmetric matrix, or a stack of them, from the blocks on and below its diagonal; None is zero."""
+    stack = np.broadcast_shapes(*(np.shape(x)[:-2] for row in rows for x in row if x is not None))
+    sizes = [np.shape(row[-1])[-1] for row in rows]
+    ends = np.cumsum([0, *sizes])
+    whole = np.zeros((*stack, ends[-1], ends[-1]))
+    for i, row in enumerate(rows):
+        for j, x in enumerate(row):
+            if x is not None:
+                whole[..., ends[i] : ends[i + 1], ends[j] : ends[j + 1]] = x
+                if i != j:
+                    whole[..., ends[j] : ends[j + 1], ends[i] : ends[i + 1]] = np.swapaxes(x, -1, -2)
+    return whole
+
+
+def grouped(blocks: Iterable[Block]) -> list[Block]:
+    """Blocks of equal size in one group, each scaled so that its largest coefficient is 1."""
+    groups: dict[int, list[Block]] = {}
+    for block in blocks:
+        size = max(float(np.abs(block.G).max()), float(np.abs(block.h).max()))
+        groups.setdefault(block.h.shape[-1], []).append(Block(block.h / size, block.G / size))
+    return [joined(group) for group in groups.values()]
+
+
+def joined(blocks: list[Block]) -> Block:
+    """Blocks of one size as one group."""
+    return Block(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
+
+
+@functools.cache
+def solvers() -> tuple[str, ...]:
+    """Those of `SOLVERS` that are installed. Raises ModuleNotFoundError where there is none."""
+    try:
+        import cvxpy
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"robust design needs {error.name}: {HINT}", name=error.name) from error
+    installed = cvxpy.installed_solvers()
+    found = tuple(name for name in SOLVERS if name in installed)
+    if not found:
+        raise ModuleNotFoundError(f"robust design needs one of {', '.join(SOLVERS)}: {HINT}", name="clarabel")
+    return found
+
+
+def solve(c: np.ndarray, blocks: list[Block], solver: str = "CLARABEL") -> Answer:
+    """Minimise c'y under grouped blocks. An answer that a solver fails to give has NaN in y."""
+    shapes = tuple(b.h.shape[:2] for b in blocks)
+    with LOCK:
+        program = _program(len(c), shapes)
+        program.cost.value = c
+        for block, h, g in zip(blocks, program.h, program.g, strict=True):
+            h.value = block.h.ravel()
+            g.value = np.swapaxes(block.G.reshape(*block.G.shape[:2], -1), 1, 2).reshape(-1, len(c))
+        status = _run(program.problem, solver)
+        known = program.y.value is not None
+        y = np.array(program.y.value) if known else np.full(len(c), np.nan)
+        duals = [[w.dual_value for w in group] for group in program.constraints]
+    multipliers = [
+        np.array([np.full((k, k), np.nan) if w is None else w for w in group])
+        for group, (_, k) in zip(duals, shapes, strict=True)
+    ]
+    return Answer(y, multipliers, status)
+
+
+class _Program(NamedTuple):
+    problem: Any
+    y: Any
+    cost: Any
+    h: list[Any]
+    g: list[Any]
+    constraints: list[list[Any]]
+
+
+@functools.lru_cache(maxsize=64)
+def _program(unknowns: int, shapes: tuple[tuple[int, int], ...]) -> _Program:
+    """The parametrised program (disciplined, so that cvxpy compiles it once) for groups of (count, size) blocks."""
+    import cvxpy as cp
+
+    y, cost = cp.Variable(unknowns), cp.Parameter(unknowns)
+    h = [cp.Parameter(count * k * k) for count, k in shapes]
+    g = [cp.Parameter((count * k * k, unknowns)) for count, k in shapes]
+    constraints = []
+    for (count, k), h_all, g_all in zip(shapes, h, g, strict=True):
+        flat = g_all @ y + h_all
+        parts = [flat[i * k * k : (i + 1) * k * k] for i in range(count)]
+        constraints.append([cp.reshape(part, (k, k), order="C") >> 0 for part in parts])
+    problem = cp.Problem(cp.Minimize(cost @ y), [one for group in constraints for one in group])
+    return _Program(problem, y, cost, h, g, constraints)
+
+
+def _run(problem: Any, solver: str) -> str:
+    """Solve; what goes wrong inside a solver becomes a status."""
+    import cvxpy as cp
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a doubtful answer is judged by its numbers
+        try:
+            problem.solve(solver=solver, **OPTIONS.get(solver, {}))
+        except (cp.SolverError, ArithmeticError, ValueError) as error:
+            return f"failed: {' '.join(str(error).split())}"
+    return str(problem.status)

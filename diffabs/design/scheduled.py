@@ -1,0 +1,121 @@
+"""Parameter-dependent Lyapunov functions, for a gain that no common one can prove.
+
+    V = x'P(p) x,  P piecewise linear in a measured parameter p (speed, say) that moves within r_lo <= p' <= r_hi
+
+In a cell between the nodes a, b, with D = (P_b - P_a)/(p_b - p_a), for every vertex of the cell and r = r_lo, r_hi,
+
+    He[P (A + B K)] + r D + 2 rate P + Q + K'R K < 0
+
+is asked of the three Bernstein coefficients of its left side, quadratic along the cell: P and K at a, at b, and mixed.
+A car that brakes has a speed that falls no faster than friction allows; a common P pretends that it may jump.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from diffabs.design import exact, lmi
+from diffabs.design.certificate import Certificate, Claim
+from diffabs.design.frame import Frame, analysis_frame
+from diffabs.design.lmi import Unknowns, grouped, he
+from diffabs.design.polytope import Schedule, checked_gain
+from diffabs.design.spec import Spec
+
+ROOM = (1e-9, 1e-7, 1e-6, 1e-5, 1e-4)  # relative: by how much the answer is loosened until its proof succeeds
+
+
+def certify_schedule(gain: Any, system: Schedule, spec: Spec) -> Certificate:
+    """What can be proved about a gain, constant (m, n) or linear between nodes (N + 1, m, n), with P(p).
+
+    Raises ValueError for shapes that do not fit, without rates, in discrete time, and for specifications other than
+    decay and cost.
+    """
+    first = system.cells[0]
+    spec = spec.checked(first.order, first.inputs)
+    if spec.rates is None or first.period is not None:
+        raise ValueError("a schedule needs rates, the bounds of its parameter's derivative, and continuous time")
+    if spec.damping or spec.l2 or spec.input:
+        raise ValueError("over a schedule, decay and cost can be proved; damping, L2 gain, input limit need a polytope")
+    gains = scheduled_gain(gain, system)
+    claim = _proof(gains, system, spec)
+    return Certificate(system, gains, () if claim is None else (claim,))
+
+
+def scheduled_gain(gain: Any, system: Schedule) -> np.ndarray:
+    """Gains at the nodes (N + 1, m, n) from those or from a constant one. Raises ValueError for other shapes."""
+    first, k = system.cells[0], np.array(gain, float)
+    shape = (first.inputs, first.order)
+    if k.ndim < 3:
+        return np.repeat(checked_gain(k, shape)[None], len(system.nodes), axis=0)
+    if len(k) != len(system.nodes):
+        raise ValueError(f"the gain has {len(k)} rows of a table; the schedule has {len(system.nodes)} nodes")
+    return np.array([checked_gain(one, shape) for one in k])
+
+
+def _proof(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
+    """The claim with the least mean trace P (with Q, R), or with the largest margin; None where no proof succeeds."""
+    n, nodes = system.cells[0].order, range(len(system.nodes))
+    middle = [(cell.A + cell.B @ gains[i])[:1] for i, cell in enumerate(system.cells)]
+    frame = analysis_frame(np.concatenate(middle), discrete=False)
+    unknowns = Unknowns(**{f"P{i}": n for i in nodes}, **({} if spec.Q is not None else {"t": (1, 1)}))
+    blocks = [unknowns.affine(lambda v, i=i: v[f"P{i}"]) for i in nodes]
+    for formulas in _everywhere(gains, system, spec, frame):
+        blocks += unknowns.blocks(formulas)
+    if spec.Q is None:
+        total = len(nodes) * n
+        blocks += unknowns.blocks(
+            lambda v: [total - sum(np.trace(v[f"P{i}"], axis1=-2, axis2=-1)[..., None, None] for i in nodes)]
+        )
+        objective = unknowns.row(lambda v: -v["t"])
+    else:
+        weight = frame.trace_weight() / np.trace(frame.trace_weight())
+        objective = unknowns.row(lambda v: sum(np.einsum("ij,dji->d", weight, v[f"P{i}"]) for i in nodes))
+    answer = lmi.solve(objective, grouped(blocks))
+    if not np.isfinite(answer.y).all():
+        return None
+    values = unknowns.values(answer.y)
+    forms = np.array([frame.form(values[f"P{i}"]) for i in nodes])
+    cost = {} if spec.Q is None else {"Q": spec.Q, "R": spec.R}
+    for room in ROOM if cost else (0.0,):
+        data = {"P": forms * (1 + room), "rates": np.array(spec.rates), "rate": spec.decay, **cost}
+        claim = Claim("scheduled", data)
+        if exact.verify(claim.kind, system, gains, claim.data):
+            return claim
+    return None
+
+
+def _everywhere(gains: np.ndarray, system: Schedule, spec: Spec, frame: Frame) -> Iterator[Any]:
+    """For each cell, vertex and end of the rates, the Bernstein coefficients as formulas of the P at the nodes."""
+    assert spec.rates is not None
+    n = system.cells[0].order
+    weight = np.zeros((n, n)) if spec.Q is None else spec.Q
+    effort = np.zeros((system.cells[0].inputs,) * 2) if spec.R is None else spec.R
+    for i, cell in enumerate(system.cells):
+        width = float(system.nodes[i + 1] - system.nodes[i])
+        low, high = gains[i], gains[i + 1]
+        price = [
+            frame.weight(weight + part) + 1e-12 * np.eye(n)
+            for part in (low.T @ effort @ low, he(low.T @ effort @ high) / 2, high.T @ effort @ high)
+        ]
+        for a, b in zip(cell.A, cell.B, strict=True):
+            closed = frame.states(a + b @ low), frame.states(a + b @ high)
+            size = float(max(np.linalg.norm(c) for c in closed))
+            for rate in sorted(set(spec.rates)):
+
+                def coefficients(
+                    v: Mapping[str, np.ndarray], i: int = i, c: Any = closed, q: Any = price, s: float = size,
+                    drift: float = rate / width / frame.tau,
+                ) -> list[np.ndarray]:  # fmt: skip
+                    start, end = v[f"P{i}"], v[f"P{i + 1}"]
+                    common = drift * (end - start)
+                    spare = v["t"] * np.eye(n) if spec.Q is None else 0.0
+                    flows = (he(start @ c[0]), (he(start @ c[1]) + he(end @ c[0])) / 2, he(end @ c[1]))
+                    forms = (start, (start + end) / 2, end)
+                    speed = 2 * spec.decay / frame.tau
+                    return [
+                        -(f + common + speed * p + (0.0 if spec.Q is None else w)) / s - spare
+                        for f, p, w in zip(flows, forms, q, strict=True)
+                    ]
+
+                yield coefficients

@@ -1,0 +1,108 @@
+"""What a design has to achieve, or a certificate to prove. Specifications combine freely; all are optional."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class InputLimit:
+    """|u_j(t)| <= limit_j at all times, from every start in the hull of `points` (k, n)."""
+
+    limit: Any
+    points: Any
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class L2Gain:
+    """|z|_2 <= bound |w|_2 from rest, z = C x + D u, x' = A x + B u + E w: an H-infinity bound for every frozen system,
+    and for every varying one. `bound` None asks for the smallest; `disturbance` E (n, w) None acts where u does."""
+
+    output: Any
+    feedthrough: Any = None
+    disturbance: Any = None
+    bound: float | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Spec:
+    """Specifications for x' = A x + B u, u = K x.
+
+    Q (n, n) or its diagonal, R (m, m), its diagonal, or a number: cost integral of x'Qx + u'Ru (a sum in discrete time)
+    decay [1/s]: |x| <= c exp(-decay t)
+    damping [1]: at least this, for the poles of every frozen system
+    input, l2: see `InputLimit` and `L2Gain`
+    rates: lowest and highest d(parameter)/dt of a `Schedule`
+    """
+
+    Q: Any = None
+    R: Any = None
+    decay: float = 0.0
+    damping: float = 0.0
+    input: InputLimit | None = None
+    l2: L2Gain | None = None
+    rates: tuple[float, float] | None = None
+
+    def checked(self, order: int, inputs: int) -> "Spec":
+        """The same with full matrices. Raises ValueError naming what does not fit, its value and the allowed range."""
+        if (self.Q is None) != (self.R is None):
+            raise ValueError("a quadratic cost needs both Q and R")
+        weights = {}
+        if self.Q is not None:
+            weights = {"Q": weight("Q", self.Q, order, definite=False), "R": weight("R", self.R, inputs, definite=True)}
+        if not (math.isfinite(self.decay) and self.decay >= 0):
+            raise ValueError(f"decay = {self.decay:g} is outside [0, inf) 1/s")
+        if not 0 <= self.damping < 1:
+            raise ValueError(f"damping = {self.damping:g} is outside [0, 1)")
+        if self.rates is not None and not (np.isfinite(self.rates).all() and self.rates[0] <= self.rates[1]):
+            raise ValueError(f"rates = {self.rates} are not a lower and an upper bound")
+        limit, gain = self.input and _input(self.input, order, inputs), self.l2 and _l2(self.l2, order, inputs)
+        return dataclasses.replace(self, **weights, input=limit, l2=gain)
+
+
+def weight(name: str, value: Any, size: int, *, definite: bool) -> np.ndarray:
+    """A weight as a symmetric matrix (size, size), from a matrix, a diagonal, or a number for size 1. Raises ValueError
+    for another shape, numbers that are not finite, asymmetry, or eigenvalues below 0 (at 0 where `definite`)."""
+    array = np.array(value, float)
+    if array.ndim < 2:
+        array = np.diag(np.atleast_1d(array))
+    if array.shape != (size, size):
+        raise ValueError(f"{name} has shape {np.shape(value)}; it needs ({size}, {size}), or its diagonal ({size},)")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} = {array.tolist()} has an entry that is not finite")
+    if not np.allclose(array, array.T, rtol=1e-12, atol=0):
+        raise ValueError(f"{name} = {array.tolist()} is not symmetric")
+    lowest, largest = np.linalg.eigvalsh(array)[[0, -1]]
+    if lowest < -1e-13 * max(largest, 0.0) or largest < 0 or (definite and lowest <= 0):
+        kind, allowed = ("definite", "(0, inf)") if definite else ("semidefinite", "[0, inf)")
+        raise ValueError(f"{name} is not positive {kind}: an eigenvalue is {lowest:g}, outside {allowed}")
+    return (array + array.T) / 2
+
+
+def _input(limit: InputLimit, order: int, inputs: int) -> InputLimit:
+    values, points = np.atleast_1d(np.array(limit.limit, float)), np.atleast_2d(np.array(limit.points, float))
+    if values.shape != (inputs,) or not (np.isfinite(values) & (values > 0)).all():
+        raise ValueError(f"input limit = {values.tolist()}: {inputs} numbers in (0, inf) are needed")
+    if points.shape[1:] != (order,) or not np.isfinite(points).all() or not points.any():
+        raise ValueError(f"input points have shape {points.shape}; finite ones of shape (k, {order}), not all zero")
+    return InputLimit(values, points)
+
+
+def _l2(gain: L2Gain, order: int, inputs: int) -> L2Gain:
+    c = np.atleast_2d(np.array(gain.output, float))
+    d = (
+        np.zeros((len(c), inputs))
+        if gain.feedthrough is None
+        else np.array(gain.feedthrough, float).reshape(len(c), -1)
+    )
+    e = None if gain.disturbance is None else np.array(gain.disturbance, float).reshape(order, -1)
+    if c.shape[1:] != (order,) or d.shape != (len(c), inputs) or not (np.isfinite(c).all() and np.isfinite(d).all()):
+        fitting = f"({len(c)}, {order}) and ({len(c)}, {inputs})"
+        raise ValueError(f"L2 output C {c.shape} and feedthrough D {d.shape}: finite ones of {fitting} are needed")
+    if e is not None and not np.isfinite(e).all():
+        raise ValueError("the L2 disturbance matrix has an entry that is not finite")
+    if gain.bound is not None and not (math.isfinite(gain.bound) and gain.bound > 0):
+        raise ValueError(f"L2 bound = {gain.bound:g} is outside (0, inf)")
+    return L2Gain(c, d, e, gain.bound)

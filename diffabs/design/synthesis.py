@@ -1,0 +1,176 @@
+"""Robust state feedback by linear matrix inequalities.
+
+    u = K x,  K = F X^-1,  V = x'X^-1 x,  one X and F for all vertices (or for each node of a schedule)
+
+    [ -He[A X + B F]  X Qh'  F' Rh' ]
+    [  Qh X           I      0      ] >= 0 at every vertex (A, B),   [ Z  I ] >= 0,   minimise trace Z
+    [  Rh F           0      I      ]                                [ I  X ]
+
+Maeda and Sugiura, eqs. (29)-(32), with Q = Qh'Qh, R = Rh'Rh, and with vertices that are pairs: their eq. (31) pairs A
+of one speed with B of another in two blocks of four, and leaves two systems uncovered. trace Z is the cost summed over
+starts at the unit vectors, guaranteed for every system of the polytope, also while it varies. Decay, damping, L2 gain
+and input limits join it with the same X and F (`inequalities`).
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+
+from diffabs.design import lmi
+from diffabs.design.analysis import certify
+from diffabs.design.certificate import Certificate
+from diffabs.design.frame import Frame, design_frames
+from diffabs.design.lmi import he
+from diffabs.design.polytope import Polytope, Schedule
+from diffabs.design.programme import Programme
+from diffabs.design.spec import Spec
+
+GAP = 1e-6  # relative: how far from the optimum an answer may be
+ROUGH = 1e-4  # the same for a schedule, and for an L2 gain
+FRAMES = 3  # tried for each solver
+LEVELS = np.geomspace(1.0, 1e4, 25)  # of the invariant set for an input limit, relative to the least conceivable
+KINDS = {"Q": "cost", "decay": "decay", "damping": "damping", "l2": "l2", "input": "input"}  # claim of a specification
+
+
+class DesignError(RuntimeError):
+    """No gain was found that passes its checks; the message has the numbers."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Design:
+    """A gain (m, n), or (N + 1, m, n) at the nodes of a schedule, and its proof.
+
+    trace_cost: trace Z, the least guaranteed cost (None without Q, R); of a schedule the mean over its nodes
+    lower_bound: the largest trace of the vertices' own Riccati solutions, which no common gain can beat
+    gap: bound on (objective - optimum)/objective
+    residual: largest eigenvalue over the vertices of He[P(A + BK)] + K'RK + Q relative to Q + K'RK; at the vertices
+        that decide it is 0 but for rounding
+    """
+
+    gain: np.ndarray
+    certificate: Certificate
+    trace_cost: float | None
+    lower_bound: float | None
+    gap: float
+    residual: float | None
+    attempts: tuple[str, ...] = ()
+
+
+def design(system: Polytope | Schedule, spec: Spec) -> Design:
+    """The gain that minimises the guaranteed cost (with Q, R), or else the L2 gain, under all specifications.
+
+    Every answer is checked: exact proof of every specification (`certify`), duality gap, lower bound. A failed check
+    tries other coordinates, then other solvers.
+
+    Raises:
+        ValueError: a specification that does not fit, nothing to minimise, a vertex that is not stabilisable.
+        DesignError: no gain passes; says for each attempt why.
+        ModuleNotFoundError: cvxpy or a solver is missing.
+    """
+    whole = pooled(system)
+    spec = _complete(system, whole, spec)
+    attempts: list[str] = []
+    for solver in lmi.solvers():
+        for frame, bound in itertools.islice(_frames(whole, spec), FRAMES):
+            lower = bound if spec.Q is not None and isinstance(system, Polytope) else None
+            found, trouble = _attempt(system, whole, spec, frame, solver, lower)
+            attempts.append(f"{solver}: {trouble or 'passed'}")
+            if found is not None and not trouble:
+                return dataclasses.replace(found, attempts=tuple(attempts))
+    raise DesignError("no gain passes its checks. " + "; ".join(dict.fromkeys(attempts)))
+
+
+def pooled(system: Polytope | Schedule) -> Polytope:
+    """All vertices of a schedule as one polytope; a polytope as it is."""
+    if isinstance(system, Polytope):
+        return system
+    a, b = (np.concatenate([getattr(cell, name) for cell in system.cells]) for name in "AB")
+    corners = tuple(itertools.chain.from_iterable(cell.corners for cell in system.cells))
+    return Polytope(A=a, B=b, period=system.cells[0].period, states=system.cells[0].states, corners=corners)
+
+
+def _complete(system: Polytope | Schedule, whole: Polytope, spec: Spec) -> Spec:
+    spec = spec.checked(whole.order, whole.inputs)
+    if spec.Q is None and (spec.l2 is None or spec.l2.bound is not None):
+        raise ValueError("nothing to minimise: give the weights Q and R, or an L2 gain without a bound")
+    if spec.Q is not None and spec.l2 is not None and spec.l2.bound is None:
+        raise ValueError("two things to minimise: with Q and R, the L2 gain needs a bound")
+    if isinstance(system, Schedule) and (spec.rates is None or whole.period is not None):
+        raise ValueError("a schedule needs rates, the bounds of its parameter's derivative, and continuous time")
+    if isinstance(system, Schedule) and (spec.Q is None or spec.input or spec.l2 or spec.damping):
+        raise ValueError("a scheduled design takes a cost and a decay; damping, L2 gain, input limit need a polytope")
+    if spec.damping and whole.period is not None:
+        raise ValueError("damping is a specification for continuous time")
+    return spec
+
+
+def _frames(whole: Polytope, spec: Spec) -> Iterator[tuple[Frame, float]]:
+    if spec.Q is not None:
+        yield from design_frames(whole, spec.Q, spec.R)
+    elif spec.l2 is not None:
+        c, d = spec.l2.output, spec.l2.feedthrough
+        effort = d.T @ d
+        definite = np.linalg.eigvalsh(effort)[0] > 1e-12 * np.trace(effort)
+        weight = c.T @ c + 1e-8 * np.trace(c.T @ c) * np.eye(whole.order)
+        yield from design_frames(whole, weight, effort if definite else np.eye(whole.inputs))
+
+
+def _attempt(
+    system: Polytope | Schedule, whole: Polytope, spec: Spec, frame: Frame, solver: str, lower: float | None
+) -> tuple[Design | None, str]:
+    """A design in one frame by one solver, and what is wrong with it, if anything."""
+    programme = Programme(system, whole, spec, frame)
+    c, best, status = programme.objective(), None, "no answer"
+    for level in LEVELS * programme.least_level() if spec.input else (1.0,):
+        blocks = programme.blocks(level)
+        answer = lmi.solve(c, blocks, solver)
+        status = answer.status
+        if np.isfinite(answer.y).all() and answer.violation(blocks) < 1e-6:
+            value = float(c @ answer.y)
+            if best is None or value < best[0]:
+                best = value, answer.y, answer.gap(c, blocks) / abs(value)
+    if best is None:
+        return None, f"the solver says {status}"
+    value, y, gap = best
+    try:
+        gains, forms = programme.read(y)
+        residual = _residual(whole, gains[0], forms[0], spec) if lower is not None else None
+    except np.linalg.LinAlgError:
+        return None, f"the solver says {status}, with a singular X"
+    gain = gains[0] if isinstance(system, Polytope) else gains
+    proof = certify(gain, system, spec, fastest=False)
+    cost = None if spec.Q is None else value * programme.scale
+    found = Design(gain, proof, cost, lower, gap, residual)
+    return found, _trouble(found, spec, isinstance(system, Schedule))
+
+
+def _residual(system: Polytope, k: np.ndarray, p: np.ndarray, spec: Spec) -> float:
+    """Largest eigenvalue of the Riccati inequality (29) over the vertices, relative to Q + K'RK."""
+    closed, weight = system.closed(k), spec.Q + k.T @ spec.R @ k
+    discrete = system.period is not None
+    left = weight + (np.swapaxes(closed, 1, 2) @ p @ closed - p if discrete else he(p @ closed))
+    root = np.linalg.inv(np.linalg.cholesky(p)).T  # judged where P is the unit matrix, as the solver saw it
+    return float(np.linalg.eigvalsh(root.T @ left @ root).max() / np.linalg.eigvalsh(root.T @ weight @ root).max())
+
+
+def _trouble(found: Design, spec: Spec, scheduled: bool) -> str:
+    """What is wrong with a design; nothing, if it may leave this module."""
+    proof = found.certificate
+    wanted = {"scheduled"} if scheduled else {kind for name, kind in KINDS.items() if _asks(getattr(spec, name))}
+    missing = wanted - {claim.kind for claim in proof.claims}
+    if missing or not proof.verified_exactly:
+        return f"gain {found.gain.tolist()}: not proved: {', '.join(sorted(missing)) or 'its claims'}"
+    cost, lower, guaranteed = found.trace_cost, found.lower_bound, proof.guaranteed_cost
+    if cost is not None and lower is not None and cost < lower * (1 - GAP):
+        return f"cost {cost:.10g} is below its lower bound {lower:.10g}"
+    if cost is not None and guaranteed is not None and not scheduled and guaranteed > cost * (1 + 10 * GAP):
+        return f"the gain guarantees {guaranteed:.10g}, not the cost {cost:.10g}"
+    if not found.gap <= (ROUGH if scheduled or spec.Q is None else GAP):
+        return f"the answer may be {found.gap:.2g} (relative) above the optimum"
+    return ""
+
+
+def _asks(value: object) -> bool:
+    return value is not None and (not isinstance(value, float | int) or value > 0)
