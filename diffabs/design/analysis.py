@@ -17,7 +17,7 @@ import numpy as np
 
 from diffabs.design import exact, lmi
 from diffabs.design.certificate import Certificate, Claim
-from diffabs.design.frame import Frame, analysis_frame, frame
+from diffabs.design.frame import Frame, analysis_frame, frame, whitening
 from diffabs.design.lmi import Answer, Unknowns, grouped, he, symmetric
 from diffabs.design.polytope import Polytope, Schedule, checked_gain
 from diffabs.design.spec import Spec
@@ -196,13 +196,14 @@ class _Analysis:
         q, r = self.spec.Q, self.spec.R
         weight = q + self.k.T @ r @ self.k
         at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
-        scaled = at.weight(weight) + 1e-12 * np.eye(len(q))
+        scaled = at.weight(weight)
+        even = whitening(scaled)
         trace = at.trace_weight() / np.trace(at.trace_weight())
         return self._found(
             at,
             {"P": self.system.order},
             lambda v: np.einsum("ij,dji->d", trace, v["P"]),
-            lambda v, c, b: [self._decrease(v["P"], c, 0.0) - scaled],
+            lambda v, c, b: [even.T @ (self._decrease(v["P"], c, 0.0) - scaled) @ even],
             lambda p, v, more: {"kind": "cost", "P": more * p, "Q": q, "R": r},
         )
 

@@ -382,13 +382,15 @@ def true(condition: Condition) -> bool:
         return False
     if total.error is None:
         return all(positive(matrix, condition.strict) for matrix in matrices.tolist())
-    return all(map(robust, matrices, total.error.reshape(-1, k, k), [total.bits] * len(matrices)))
+    errors = np.broadcast_to(total.error, total.shape).reshape(-1, k, k)
+    return all(robust(matrix, error, total.bits) for matrix, error in zip(matrices, errors, strict=True))
 
 
 def robust(matrix: np.ndarray, error: np.ndarray, bits: int) -> bool:
     """Whether integers 2^-bits `matrix` - diag_i(sum_j error_ij s_i / s_j) > 0, s_i a power of 2 near sqrt(M_ii).
 
-    Multiplied from both sides by 1 / s, times a power of 2 that leaves integers: rows of unlike size lose alike.
+    Multiplied from both sides by 1 / s, times a power of 2 that leaves integers: rows of unlike size lose alike. The
+    bound carried for C' P C is not symmetric; the error is, so that either of error_ij and error_ji bounds it.
     """
     diagonal = np.diagonal(matrix)
     if (diagonal <= 0).any():

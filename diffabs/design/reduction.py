@@ -1,0 +1,125 @@
+"""A loop's controller as static state feedback u = K x on a linear slip model: what a certificate is about.
+
+    StateFeedback   K = (k1, k2)
+    PID             K = (-ki, -(kp + kd wc), ..., kd wc), the last state being the slip error behind the filter wc
+
+since e = target - slip = -x2, and d = -x_f in Aoki and Nakamura's eq. (13). `Sampled` makes the model a discrete one;
+gains of zero leave out the integral and the filter.
+"""
+
+import re
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from diffabs.actuators import Delay, Lag, Limits, RateLimit
+from diffabs.blocks import Direct, Series
+from diffabs.controllers import PID, HoldingInput, NoAntiWindup, Sampled, StateFeedback
+from diffabs.linearize import Continuous, LowPass, Sampling, SlipModel
+from diffabs.loop import Loop
+from diffabs.pytree import check
+from diffabs.references import FixedSlip
+from diffabs.sensors import Bias, Noise
+
+
+class Reduced(NamedTuple):
+    """u = gain x on `model`, gain of shape (n,). `exact`: near the target, inside all limits and at a frozen speed,
+    this is the loop's own linearisation. `neglected` says what it leaves out, in sentences."""
+
+    model: SlipModel
+    gain: np.ndarray
+    exact: bool
+    neglected: tuple[str, ...]
+
+
+def state_feedback(loop: Loop) -> Reduced:
+    """The loop at its initial speed and its setpoint as state feedback.
+
+    Raises:
+        ValueError: a controller or an actuator that is not linear, a parameter out of its range, a setpoint of 1.
+    """
+    check(loop)
+    sampled = loop.controller if isinstance(loop.controller, Sampled) else None
+    controller = sampled.controller if sampled else loop.controller
+    integral, proportional, derivative, cutoff = _gains(controller)
+    actuator, by_actuator, exact = _actuator(loop.actuator)
+    state = loop.start()
+    model = SlipModel(
+        plant=loop.plant,
+        slip=float(loop.reference.setpoint(state.reference)),
+        speed=float(loop.initial.speed),
+        actuator=actuator,
+        sampling=Sampling(period=float(sampled.period), delay=float(sampled.delay)) if sampled else Continuous(),
+        filter=LowPass(cutoff=cutoff) if derivative else Direct(),
+        integral=integral != 0,
+    )
+    gain = np.zeros(len(check(model).states))
+    gain[int(model.integral)] = proportional + derivative
+    if model.integral:
+        gain[0] = integral
+    if derivative:
+        gain[-1] = -derivative
+    neglected = (*_of_controller(controller), *by_actuator, *_around(loop))
+    return Reduced(model, gain, exact and isinstance(loop.sensor, Direct | Noise | Bias), neglected)
+
+
+def _gains(controller: Any) -> tuple[float, float, float, float]:
+    """On the integral, the slip error, and slip error minus filtered slip error; the filter's cutoff."""
+    if isinstance(controller, StateFeedback):
+        return float(controller.gain[0]), float(controller.gain[1]), 0.0, 0.0
+    if isinstance(controller, PID):
+        wc = float(controller.cutoff)
+        return -float(controller.ki), -float(controller.kp), -float(controller.kd) * wc, wc
+    raise ValueError(f"controller {_words(controller)} is not linear: it cannot be brought to state feedback")
+
+
+def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
+    """The linear actuator, what it leaves out, and whether that is nothing near the target."""
+    blocks = actuator.blocks if isinstance(actuator, Series) else (actuator,)
+    lags, neglected, exact = [], [], True
+    for block in blocks:
+        match block:
+            case Direct():
+                pass
+            case Lag():
+                lags.append(block)
+            case RateLimit():
+                lags.append(Lag(time_constant=block.time_constant))
+                neglected.append(f"The actuator's rate limit of {float(block.rate):g} N m/s.")
+            case Limits():
+                neglected.append(f"The actuator's limits of {float(block.low):g} and {float(block.high):g} N m.")
+            case Delay():
+                exact = False
+                neglected.append(f"The actuator's delay of {float(block.time):g} s, which can destabilise.")
+            case _:
+                raise ValueError(f"actuator {_words(block)} is not known to be linear: it cannot be brought to state feedback")
+    if len(lags) > 1:
+        raise ValueError("actuator: a linear slip model has room for one lag, not for several in series")
+    return (lags[0] if lags else Direct()), tuple(neglected), exact
+
+
+def _of_controller(controller: Any) -> Iterator[str]:
+    low, high = float(controller.torque_min), float(controller.torque_max)
+    if np.isfinite([low, high]).any():
+        yield f"The controller's torque limits of {low:g} and {high:g} N m."
+        if not isinstance(controller.antiwindup, NoAntiWindup):
+            yield "Anti-windup, which acts at the torque limits only."
+
+
+def _around(loop: Loop) -> Iterator[str]:
+    """What is left out of the rest of the loop."""
+    yield "The fall of the speed: it is frozen."
+    if isinstance(loop.sensor, Noise | Bias):
+        yield f"The sensor's {_words(loop.sensor)}, a disturbance."
+    elif not isinstance(loop.sensor, Direct):
+        yield f"The sensor, {_words(loop.sensor)}: its dynamics, rounding or error."
+    if not isinstance(loop.reference, FixedSlip):
+        yield f"The motion of the target ({_words(loop.reference)}), a disturbance; the model is taken at its setpoint."
+    if not isinstance(loop.feedforward, HoldingInput):
+        yield f"The error of the feed-forward ({_words(loop.feedforward)}), a disturbance."
+
+
+def _words(part: Any) -> str:
+    """SlidingMode as `sliding mode`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower()

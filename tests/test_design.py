@@ -1,0 +1,503 @@
+"""Robust design against closed forms, a programme written out by hand, and simulated switching."""
+
+import builtins
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are, solve_discrete_lyapunov
+
+from diffabs.design import (
+    DesignError,
+    InputLimit,
+    L2Gain,
+    Polytope,
+    Schedule,
+    Spec,
+    certify,
+    design,
+    lmi,
+    synthesis,
+)
+
+BETA, ALPHAS = 133.472842636189, (83.8796606703, 84.6321445666)  # at 5.3 and 6.2 kg
+FAST, SLOW = 140.291806958, 14.0291806958  # rad/s at 50 and 5 km/h
+K1 = 11753.0
+START = np.array([0.0, -0.2])
+
+
+def rig(speeds=(FAST, SLOW), alphas=ALPHAS):
+    pairs = [(alpha, speed) for alpha in alphas for speed in speeds]
+    a = [[[0, 1], [0, alpha / speed]] for alpha, speed in pairs]
+    return Polytope(A=a, B=[[[0], [BETA / speed]] for _, speed in pairs])
+
+
+RIG = rig()
+ONE = rig((FAST,), ALPHAS[:1])
+
+
+def has_common_lyapunov(k1, k2, alphas=ALPHAS):
+    """Closed form, sharp for the rig's chain of two integrators: the worst mass is the heaviest."""
+    return bool(BETA * abs(k2) - max(alphas) > np.sqrt(BETA * abs(k1)) * (np.sqrt(FAST) - np.sqrt(SLOW)))
+
+
+def single(q1, q2, r, alpha=ALPHAS[0], speed=FAST):
+    """Gain and trace of the Riccati solution of one vertex."""
+    k1, a = -np.sqrt(q1 / r), alpha / BETA
+    k2 = -(a + np.sqrt(a**2 + q2 / r + 2 * np.sqrt(q1 / r) * speed / BETA))
+    return np.array([k1, k2]), r * (abs(k1) * abs(k2) - a * abs(k1) + abs(k2) * speed / BETA)
+
+
+def by_hand(system, q1, q2, r):
+    """Eqs. (30)-(32) in cvxpy as the paper writes them, time and states scaled by hand."""
+    speed = SLOW
+    t = np.sqrt(FAST / (BETA * np.sqrt(q1 / r)))
+    k2 = single(q1, q2, r)[0][1]
+    scale = np.diag([t, 1.0])  # x = scale z, time in t, u in |k2|
+    q = scale @ np.diag([q1, q2]) @ scale
+    cost = max(q.max(), r * k2**2)
+    x, z, f = cp.Variable((2, 2), symmetric=True), cp.Variable((2, 2), symmetric=True), cp.Variable((1, 2))
+    root, effort = np.sqrt(q / cost), np.sqrt(r * k2**2 / cost)
+    constraints = [cp.bmat([[z, np.eye(2)], [np.eye(2), x]]) >> 0]
+    for a, b in zip(system.A, system.B, strict=True):
+        flow = t * (np.linalg.inv(scale) @ a @ scale @ x + np.linalg.inv(scale) @ b * abs(k2) @ f)
+        rows = [[-(flow + flow.T), x @ root, effort * f.T], [root @ x, np.eye(2), np.zeros((2, 1))]]
+        constraints.append(cp.bmat([*rows, [effort * f, np.zeros((1, 2)), np.eye(1)]]) >> 0)
+    weights = cost * t / np.diag(scale) ** 2
+    problem = cp.Problem(cp.Minimize(weights[0] / weights.max() * z[0, 0] + weights[1] / weights.max() * z[1, 1]))
+    problem = cp.Problem(problem.objective, constraints)
+    problem.solve(solver="CLARABEL", tol_gap_rel=1e-9, tol_gap_abs=1e-9, tol_feas=1e-9)
+    assert speed and problem.status == "optimal"
+    gain = abs(k2) * f.value @ np.linalg.inv(x.value) @ np.linalg.inv(scale)
+    return gain[0], problem.value * weights.max()
+
+
+# the paper's design
+
+
+@pytest.mark.parametrize(
+    ("q", "gain", "trace"),
+    [
+        ((K1**2, 1.0), (-11752.95, -158.170), 1847633.09),
+        ((1e6, 1e4), (-999.73, -111.072), 110129.870),
+        ((1.0, 1.0), (-0.833855, -2.599026), 4.58876617),
+    ],
+)
+def test_published_weights(q, gain, trace):
+    found = design(RIG, Spec(Q=q, R=1.0))
+    np.testing.assert_allclose(found.trace_cost, trace, rtol=1e-6)
+    np.testing.assert_allclose(found.gain[0], gain, rtol=1e-3)
+    assert found.certificate.verified_exactly
+    assert found.certificate.quadratically_stable
+    assert found.lower_bound <= found.trace_cost <= found.certificate.guaranteed_cost * (1 + 1e-6)
+    np.testing.assert_allclose(found.certificate.guaranteed_cost, found.trace_cost, rtol=1e-5)
+    assert abs(found.residual) < 1e-6
+
+
+def test_where_unscaled_solvers_return_a_destabilising_gain():
+    found = design(RIG, Spec(Q=(1.38e8, 1e4), R=1.0))
+    np.testing.assert_allclose(found.gain[0], [-11747.5, -187.25], rtol=1e-3)
+
+
+def test_one_vertex_is_the_closed_form_over_ten_decades():
+    random = np.random.default_rng(1)
+    for q1, q2, r in 10.0 ** random.uniform(-5, 5, (24, 3)):
+        gain, trace = single(q1, q2, r)
+        found = design(ONE, Spec(Q=(q1, q2), R=r))
+        np.testing.assert_allclose(found.trace_cost, trace, rtol=1e-6)
+        np.testing.assert_allclose(found.gain[0], gain, rtol=2e-3)
+        np.testing.assert_allclose(found.lower_bound, trace, rtol=1e-9)
+
+
+def test_four_vertices_agree_with_the_programme_by_hand():
+    random = np.random.default_rng(2)
+    for q1, q2, r in 10.0 ** np.stack([random.uniform(0, 6, 8), random.uniform(0, 4, 8), random.uniform(-1, 1, 8)], 1):
+        gain, trace = by_hand(RIG, q1, q2, r)
+        found = design(RIG, Spec(Q=(q1, q2), R=r))
+        np.testing.assert_allclose(found.trace_cost, trace, rtol=2e-6)
+        np.testing.assert_allclose(found.gain[0], gain, rtol=3e-3)
+
+
+def unfailing(count, seed):
+    random, reported = np.random.default_rng(seed), []
+    for q1, q2, r in 10.0 ** random.uniform(-5, 5, (count, 3)):
+        try:
+            found = design(RIG, Spec(Q=(q1, q2), R=r))
+        except DesignError as error:
+            reported.append((q1, q2, r, str(error)))
+            continue
+        proof = found.certificate
+        assert proof.verified_exactly
+        assert proof.quadratically_stable
+        bound = max(single(q1, q2, r, alpha, speed)[1] for alpha in ALPHAS for speed in (FAST, SLOW))
+        assert bound * (1 - 1e-6) <= found.trace_cost
+        assert proof.guaranteed_cost <= found.trace_cost * (1 + 1e-5)
+        assert np.linalg.eigvals(RIG.closed(found.gain)).real.max() < 0
+    return reported
+
+
+def test_no_silent_failure():
+    assert len(unfailing(60, 3)) <= 1
+
+
+@pytest.mark.slow
+def test_no_silent_failure_among_a_thousand():
+    assert len(unfailing(1000, 4)) <= 20
+
+
+def test_printed_pairing_leaves_vertices_uncovered():
+    """Eq. (31) as printed: A at the low speed with B at the high one, and the other way round."""
+    b = RIG.B[[0, 0, 1, 1]]
+    printed = Polytope(A=RIG.A[[0, 3, 2, 1]], B=b)
+    wrong = design(printed, Spec(Q=(1e6, 1e4), R=1.0))
+    assert abs(wrong.trace_cost / 110129.870 - 1) > 1e-4
+
+
+# proofs about a gain
+
+
+def test_published_gain_has_no_common_lyapunov_matrix():
+    proof = certify((-11753.0, -48.0), RIG)
+    assert proof.quadratically_stable is False
+    assert proof.verified_exactly
+    np.testing.assert_allclose(
+        sorted(np.linalg.eigvals(RIG.closed(proof.gain)[0]).imag), [-103.3147, 103.3147], rtol=1e-6
+    )
+    assert np.linalg.eigvals(RIG.closed(proof.gain)).real.max() < 0
+
+
+@pytest.mark.parametrize(("k2", "stable"), [(-76.6, False), (-76.7, True), (-158.17, True), (48.0, False)])
+def test_verdicts(k2, stable):
+    proof = certify((-11753.0, k2), RIG)
+    assert proof.quadratically_stable is stable
+    assert proof.verified_exactly
+
+
+def test_verdicts_agree_with_the_closed_form():
+    random = np.random.default_rng(5)
+    for k1, nearness in zip(10.0 ** random.uniform(0, 6, 40), random.uniform(-0.5, 0.5, 40), strict=True):
+        least = (np.sqrt(BETA * k1) * (np.sqrt(FAST) - np.sqrt(SLOW)) + max(ALPHAS)) / BETA
+        k2 = least * (1 + nearness) + np.sign(nearness) * 1e-3 * least
+        proof = certify((-k1, -k2), RIG)
+        assert proof.verified_exactly
+        assert proof.quadratically_stable is has_common_lyapunov(k1, k2), (k1, k2)
+
+
+def test_fastest_decay_of_one_system_is_that_of_its_poles():
+    gain = (-1000.0, -30.0)
+    slowest = -np.linalg.eigvals(ONE.closed(gain)).real.max()
+    proof = certify(gain, ONE, fastest=True)
+    assert slowest * (1 - 2e-3) < proof.decay_rate <= slowest
+    assert certify(gain, ONE, Spec(decay=0.99 * slowest)).decay_rate >= 0.99 * slowest
+    assert certify(gain, ONE, Spec(decay=1.01 * slowest)).decay_rate is None
+
+
+def test_cost_of_one_system_is_that_of_its_lyapunov_equation():
+    gain, q, r = np.array([[-1000.0, -30.0]]), np.diag([3.0, 2.0]), 0.5
+    closed = ONE.closed(gain)[0]
+    exact = np.trace(solve_continuous_lyapunov(closed.T, -(q + r * gain.T @ gain)))
+    found = certify(gain, ONE, Spec(Q=q, R=r)).guaranteed_cost
+    assert exact < found < exact * (1 + 1e-6)
+
+
+def frequency_response(closed, b, c, d, gain, count=20001):
+    grid = 1j * np.concatenate([[0.0], np.geomspace(1e-3, 1e5, count)])
+    resolvent = np.linalg.inv(grid[:, None, None] * np.eye(len(closed)) - closed)
+    return np.linalg.norm((c + d @ gain) @ resolvent @ b, ord=2, axis=(1, 2)).max()
+
+
+def test_l2_gain_of_one_system_is_the_peak_of_its_frequency_response():
+    gain, c, d = np.array([[-1000.0, -30.0]]), np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [0.003]])
+    peak = frequency_response(ONE.closed(gain)[0], ONE.B[0], c, d, gain)
+    found = certify(gain, ONE, Spec(l2=L2Gain(output=c, feedthrough=d))).l2_gain
+    assert peak * (1 - 1e-6) < found < peak * (1 + 1e-4)
+
+
+def test_damping_of_one_system_is_that_of_its_poles():
+    gain = (-1000.0, -30.0)
+    pole = np.linalg.eigvals(ONE.closed(gain)[0])[0]
+    zeta = -pole.real / abs(pole)
+    assert 0.3 < zeta < 0.9
+    assert certify(gain, ONE, Spec(damping=zeta * 0.999)).damping == zeta * 0.999
+    assert certify(gain, ONE, Spec(damping=zeta * 1.001)).damping is None
+
+
+def switched(system, gain, count=40, seed=0, steps=400, h=5e-4):
+    """States (count, steps + 1, n) from START where the vertex changes at random, exact within each step."""
+    random = np.random.default_rng(seed)
+    maps = np.array([expm(h * closed) for closed in system.closed(gain)])
+    x = np.repeat(START[None], count, 0)
+    states = [x]
+    for _ in range(steps):
+        x = np.einsum("cij,cj->ci", maps[random.integers(len(maps), size=count)], x)
+        states.append(x)
+    return np.stack(states, 1)
+
+
+def test_guarantees_hold_while_the_system_switches():
+    limit, q, r = 9.03 - 2.8, np.diag([1e6, 1e4]), 1.0
+    spec = Spec(Q=q, R=r, decay=3.0, input=InputLimit(limit, [START]))
+    found = design(RIG, spec)
+    proof = found.certificate
+    assert proof.verified_exactly
+    assert proof.decay_rate >= 3.0
+    assert proof.input_limit[0] <= limit
+    x = switched(RIG, found.gain)
+    u = x @ found.gain[0]
+    assert np.abs(u).max() <= proof.input_limit[0]
+    assert np.abs(u).max() > 0.5 * limit  # the limit matters
+    p = {claim.kind: claim.data["P"] for claim in proof.claims}
+    v = np.einsum("cti,ij,ctj->ct", x, p["decay"], x)
+    assert (v[:, 1:] <= v[:, :-1] * np.exp(-2 * 3.0 * 5e-4) * (1 + 1e-9)).all()
+    rate = np.einsum("cti,ij,ctj->ct", x, q, x) + r * u**2
+    spent = 5e-4 * (rate[:, :-1] + rate[:, 1:]).sum(1) / 2
+    assert (spent <= START @ p["cost"] @ START * 1.001).all()
+
+
+def test_pole_regions():
+    found = design(RIG, Spec(Q=(1e6, 1e4), R=1.0, decay=20.0, damping=0.95))
+    poles = np.linalg.eigvals(RIG.closed(found.gain))
+    assert poles.real.max() <= -20.0
+    assert (-poles.real / np.abs(poles)).min() >= 0.95
+    assert found.certificate.decay_rate >= 20.0
+    assert found.certificate.damping == 0.95
+    free = design(RIG, Spec(Q=(1e6, 1e4), R=1.0))
+    assert np.linalg.eigvals(RIG.closed(free.gain)).real.max() > -20.0
+    assert found.trace_cost > free.trace_cost
+
+
+def test_l2_bound_and_smallest_l2_gain():
+    bounded = design(RIG, Spec(Q=(1e6, 1e4), R=1.0, l2=L2Gain(output=[[0.0, 1.0]], bound=0.005)))
+    assert bounded.certificate.l2_gain <= 0.005
+    for closed, b in zip(RIG.closed(bounded.gain), RIG.B, strict=True):
+        peak = frequency_response(closed, b, np.array([[0.0, 1.0]]), np.zeros((1, 1)), bounded.gain)
+        assert peak <= bounded.certificate.l2_gain
+    c, d, e = [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], [[0.0], [0.0], [0.01]], [[0.0], [1.0]]
+    smallest = design(RIG, Spec(l2=L2Gain(output=c, feedthrough=d, disturbance=e)))
+    other = certify((-100.0, -100.0), RIG, Spec(l2=L2Gain(output=c, feedthrough=d, disturbance=e)))
+    assert smallest.certificate.l2_gain < other.l2_gain
+    impossible = Spec(Q=(1e6, 1e4), R=1.0, l2=L2Gain(output=c, feedthrough=d, disturbance=e, bound=1e-7))
+    with pytest.raises(DesignError, match="no gain passes its checks"):
+        design(RIG, impossible)
+
+
+# discrete time
+
+PERIOD = 1e-3
+
+
+def sampled(system, period=PERIOD):
+    """Slip held over a period; the integral by Euler's rule, as a computer adds it up."""
+    a, b = system.A[:, 1, 1], system.B[:, 1, 0]
+    factor = np.exp(a * period)
+    zero, one = np.zeros_like(a), np.ones_like(a)
+    matrices = np.stack([np.stack([one, period * one], -1), np.stack([zero, factor], -1)], -2)
+    return Polytope(A=matrices, B=np.stack([zero, (factor - 1) / a * b], -1)[..., None], period=period)
+
+
+def test_one_discrete_vertex_is_the_riccati_solution():
+    system, q, r = sampled(ONE), np.diag([1e3, 10.0]), 1e-3
+    p = solve_discrete_are(system.A[0], system.B[0], q, np.array([[r]]))
+    b = system.B[0]
+    found = design(system, Spec(Q=q, R=r))
+    np.testing.assert_allclose(found.trace_cost, np.trace(p), rtol=1e-6)
+    np.testing.assert_allclose(found.gain, -np.linalg.solve(r + b.T @ p @ b, b.T @ p @ system.A[0]), rtol=2e-3)
+    np.testing.assert_allclose(found.lower_bound, np.trace(p), rtol=1e-9)
+
+
+def test_discrete_design_and_proofs():
+    system = sampled(RIG)
+    found = design(system, Spec(Q=(1e3, 10.0), R=1e-3, decay=8.0))
+    proof = found.certificate
+    assert proof.verified_exactly
+    assert proof.decay_rate >= 8.0
+    assert np.abs(np.linalg.eigvals(system.closed(found.gain))).max() <= np.exp(-8.0 * PERIOD)
+    too_fast = certify((-1e6, -3000.0), system)  # stable in continuous time, not at 1 kHz
+    assert certify((-1e6, -3000.0), RIG).quadratically_stable
+    assert too_fast.quadratically_stable is False
+    assert too_fast.verified_exactly
+
+
+def test_discrete_analysis_of_one_system():
+    system, gain = sampled(ONE), np.array([[-1000.0, -30.0]])
+    closed = system.closed(gain)[0]
+    slowest = -np.log(np.abs(np.linalg.eigvals(closed)).max()) / PERIOD
+    fastest = certify(gain, system, fastest=True).decay_rate
+    assert slowest * (1 - 2e-3) < fastest <= slowest
+    q, r = np.diag([3.0, 2.0]), 0.5
+    exact = np.trace(solve_discrete_lyapunov(closed.T, q + r * gain.T @ gain))
+    found = certify(gain, system, Spec(Q=q, R=r, l2=L2Gain(output=[[0.0, 1.0]])))
+    assert exact < found.guaranteed_cost < exact * (1 + 1e-6)
+    circle = np.exp(1j * np.linspace(0, np.pi, 20001))
+    resolvent = np.linalg.inv(circle[:, None, None] * np.eye(2) - closed)
+    peak = np.abs(resolvent @ system.B[0])[:, 1, 0].max()
+    assert peak * (1 - 1e-6) < found.l2_gain < peak * (1 + 1e-4)
+
+
+# a parameter that moves at a bounded rate
+
+RATES = (-7.9, 0.0)  # m/s^2
+
+
+def chain(count=8):
+    nodes = np.geomspace(5 / 3.6, 50 / 3.6, count + 1)
+    cells = tuple(rig((low / 0.099, high / 0.099)) for low, high in zip(nodes[:-1], nodes[1:], strict=True))
+    return Schedule("speed", nodes, cells)
+
+
+def form(proof, speed):
+    """P at a speed, linear between nodes."""
+    (claim,) = proof.claims
+    nodes, p = proof.system.nodes, claim.data["P"]
+    return np.array([[np.interp(speed, nodes, p[:, i, j]) for j in range(2)] for i in range(2)])
+
+
+def test_published_gain_is_proved_for_a_speed_that_cannot_jump():
+    proof = certify((-11753.0, -48.0), chain(), Spec(rates=RATES, decay=5.0))
+    assert proof.verified_exactly
+    assert proof.stable
+    assert proof.decay_rate == 5.0
+    assert certify((-11753.0, -48.0), chain(), Spec(rates=(-1e6, 1e6))).claims == ()
+    x, speed, h = START, 50 / 3.6, 1e-4
+    before = x @ form(proof, speed) @ x
+    while speed - 7.8 * h > 5 / 3.6:
+        alpha = ALPHAS[int(speed * 100) % 2]
+        closed = rig((speed / 0.099,), (alpha,)).closed((-11753.0, -48.0))[0]
+        x, speed = expm(h * closed) @ x, speed - 7.8 * h
+        after = x @ form(proof, speed) @ x
+        assert after <= before * np.exp(-2 * 5.0 * h) * (1 + 1e-3)
+        before = after
+
+
+def test_scheduled_gain():
+    system = chain(6)
+    found = design(system, Spec(Q=(K1**2, 1.0), R=1.0, rates=RATES))
+    assert found.gain.shape == (7, 1, 2)
+    assert found.certificate.verified_exactly
+    fixed = design(RIG, Spec(Q=(K1**2, 1.0), R=1.0))
+    assert found.trace_cost < 0.9 * fixed.trace_cost  # knowing the speed pays
+    assert abs(found.gain[0, 0, 1]) < abs(found.gain[-1, 0, 1])
+
+
+# what is refused
+
+
+def test_unstabilisable_vertex():
+    system = Polytope(A=[[[1.0, 0.0], [0.0, -1.0]]], B=[[[0.0], [1.0]]], corners=({"plant.mass": 5.3},))
+    with pytest.raises(ValueError, match=r"vertex 0 .*plant.mass.* not stabilisable"):
+        design(system, Spec(Q=(1.0, 1.0), R=1.0))
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        (Spec(Q=(1.0, -1.0), R=1.0), r"Q is not positive semidefinite: an eigenvalue is -1, outside \[0, inf\)"),
+        (Spec(Q=(1.0, 1.0), R=0.0), r"R is not positive definite: an eigenvalue is 0, outside \(0, inf\)"),
+        (Spec(Q=(1.0, 1.0, 1.0), R=1.0), r"Q has shape \(3,\); it needs \(2, 2\), or its diagonal \(2,\)"),
+        (Spec(Q=[[1.0, 2.0], [0.0, 5.0]], R=1.0), "not symmetric"),
+        (Spec(Q=(1.0, np.nan), R=1.0), "not finite"),
+        (Spec(Q=(1.0, 1.0)), "needs both Q and R"),
+        (Spec(), "nothing to minimise"),
+        (Spec(Q=(1.0, 1.0), R=1.0, l2=L2Gain(output=[[0.0, 1.0]])), "two things to minimise"),
+        (Spec(Q=(1.0, 1.0), R=1.0, decay=-1.0), r"decay = -1 is outside \[0, inf\) 1/s"),
+        (Spec(Q=(1.0, 1.0), R=1.0, damping=1.0), r"damping = 1 is outside \[0, 1\)"),
+        (Spec(Q=(1.0, 1.0), R=1.0, input=InputLimit(0.0, [START])), r"input limit = \[0.0\]: 1 numbers in \(0, inf\)"),
+        (Spec(Q=(1.0, 1.0), R=1.0, input=InputLimit(1.0, [[1.0]])), r"input points have shape \(1, 1\)"),
+        (Spec(l2=L2Gain(output=[[1.0]])), r"L2 output C \(1, 1\)"),
+        (Spec(Q=(1.0, 1.0), R=1.0, l2=L2Gain(output=[[0.0, 1.0]], bound=0.0)), r"L2 bound = 0 is outside \(0, inf\)"),
+    ],
+)
+def test_bad_specification(spec, message):
+    with pytest.raises(ValueError, match=message):
+        design(RIG, spec)
+
+
+def test_bad_systems_and_gains():
+    with pytest.raises(ValueError, match=r"4097 vertices is outside \[1, 4096\]"):
+        Polytope(A=np.zeros((4097, 2, 2)), B=np.zeros((4097, 2, 1)))
+    with pytest.raises(ValueError, match=r"A of shape \(V, n, n\)"):
+        Polytope(A=np.zeros((2, 2)), B=np.zeros((2, 1)))
+    with pytest.raises(ValueError, match=r"the gain has shape \(1, 3\); inputs and states of the system need \(1, 2\)"):
+        certify((1.0, 2.0, 3.0), RIG)
+    with pytest.raises(ValueError, match="not finite"):
+        certify((1.0, np.inf), RIG)
+    with pytest.raises(ValueError, match="needs rates"):
+        certify((-11753.0, -48.0), chain(2))
+    with pytest.raises(ValueError, match="needs rates"):
+        design(chain(2), Spec(Q=(1.0, 1.0), R=1.0))
+    with pytest.raises(ValueError, match="the schedule has 3 nodes"):
+        certify(np.zeros((5, 1, 2)), chain(2), Spec(rates=RATES))
+    with pytest.raises(ValueError, match="need a polytope"):
+        certify((-11753.0, -48.0), chain(2), Spec(rates=RATES, damping=0.5))
+    with pytest.raises(ValueError, match="continuous time"):
+        design(sampled(RIG), Spec(Q=(1.0, 1.0), R=1.0, damping=0.5))
+
+
+def test_missing_cvxpy(monkeypatch):
+    def refuse(name, *args, _import=builtins.__import__, **kwargs):
+        if name == "cvxpy":
+            raise ModuleNotFoundError("No module named 'cvxpy'", name="cvxpy")
+        return _import(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    lmi.solvers.cache_clear()
+    with pytest.raises(ModuleNotFoundError, match=r'needs cvxpy: pip install "diffabs\[design\]"'):
+        design(RIG, Spec(Q=(1.0, 1.0), R=1.0))
+    lmi.solvers.cache_clear()
+
+
+def test_missing_solver(monkeypatch):
+    monkeypatch.setattr(cp, "installed_solvers", lambda: ["SCS", "OSQP"])
+    lmi.solvers.cache_clear()
+    with pytest.raises(ModuleNotFoundError, match="needs one of CLARABEL"):
+        design(RIG, Spec(Q=(1.0, 1.0), R=1.0))
+    lmi.solvers.cache_clear()
+
+
+# answers that lie
+
+
+def tampered(change):
+    """A solver whose status is optimal and whose answer is `change`d."""
+    honest = lmi.solve
+
+    def solve(c, blocks, solver="CLARABEL"):
+        answer = honest(c, blocks, solver)
+        return answer._replace(y=change(answer.y), status="optimal")
+
+    return solve
+
+
+@pytest.mark.parametrize("factor", [0.9, 1.1, -1.0])
+def test_a_wrong_answer_called_optimal_is_not_believed(monkeypatch, factor):
+    monkeypatch.setattr(synthesis.lmi, "solve", tampered(lambda y: factor * y))
+    with pytest.raises(DesignError, match="CLARABEL"):
+        design(RIG, Spec(Q=(1e6, 1e4), R=1.0))
+
+
+def test_gap_and_violation():
+    """min y subject to [[y, 1], [1, 2]] >= 0: y = 1/2."""
+    unknowns = lmi.Unknowns(y=(1, 1))
+    blocks = lmi.grouped([unknowns.affine(lambda v: lmi.symmetric([[v["y"]], [np.ones((1, 1)), 2 * np.ones((1, 1))]]))])
+    c = unknowns.row(lambda v: v["y"])
+    answer = lmi.solve(c, blocks)
+    np.testing.assert_allclose(answer.y, [0.5], rtol=1e-7)
+    assert answer.violation(blocks) < 1e-8
+    assert 0 <= answer.gap(c, blocks) < 1e-7
+    worse = answer._replace(y=np.array([0.6]))
+    np.testing.assert_allclose(worse.gap(c, blocks), 0.1, rtol=1e-5)
+    assert answer._replace(y=np.array([0.4])).violation(blocks) > 0.02
+
+
+def test_unknowns_pack_and_unpack():
+    unknowns = lmi.Unknowns(X=3, F=(2, 3))
+    y = np.random.default_rng(0).normal(size=unknowns.size)
+    v = unknowns.values(y)
+    np.testing.assert_array_equal(v["X"], v["X"].T)
+    a = np.arange(9.0).reshape(3, 3)
+    block = unknowns.affine(lambda v: lmi.he(a @ v["X"]) - 1)
+    np.testing.assert_allclose(block.h[0] + np.einsum("d,dij->ij", y, block.G[0]), a @ v["X"] + v["X"] @ a.T - 1)
+
+
+def test_never_scs():
+    assert "SCS" not in lmi.SOLVERS
