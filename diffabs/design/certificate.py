@@ -14,7 +14,6 @@ does `experiments/check_certificate.py`, which shares no code with this package.
 
 import dataclasses
 import functools
-import json
 import math
 import os
 import pathlib
@@ -25,11 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.design import exact
+from diffabs.design import document, exact
 from diffabs.design.polytope import Polytope, Schedule
 
-FORMAT, VERSION = "diffabs certificate", 1
-LARGEST_FILE, LARGEST_ORDER = 2**24, 64  # bytes; states and inputs together
 QUADRATIC = ("decay", "cost", "damping", "l2", "input")  # each has one P > 0 that decreases at every vertex
 
 
@@ -232,19 +229,11 @@ class Certificate:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file whole or not at all. Raises OSError."""
-        data = {
-            "format": FORMAT,
-            "version": VERSION,
-            "system": described(self.system),
-            "gain": self.gain.tolist(),
-            "claims": [
-                {"kind": claim.kind, "data": {k: listed(v) for k, v in claim.data.items()}} for claim in self.claims
-            ],
-        }
         target = pathlib.Path(path)
         part = target.with_name(f".{target.name}.{os.getpid()}.part")
         try:
-            part.write_text(json.dumps(data, allow_nan=False, indent=1) + "\n", encoding="utf-8")
+            claims = ((claim.kind, claim.data) for claim in self.claims)
+            part.write_text(document.text(self.system, self.gain, claims), encoding="utf-8")
             os.replace(part, target)
         finally:
             part.unlink(missing_ok=True)
@@ -253,10 +242,8 @@ class Certificate:
     def load(path: str | os.PathLike[str]) -> "Certificate":
         """What `save` wrote, nothing proved yet. Raises OSError, or ValueError in one line that names the field."""
         try:
-            if os.path.getsize(path) > LARGEST_FILE:
-                raise ValueError(f"the file is larger than {LARGEST_FILE} bytes")
-            text = pathlib.Path(path).read_text(encoding="utf-8")
-            return read(json.loads(text, parse_int=float, parse_constant=number, object_pairs_hook=members))
+            system, gain, claims = document.read(path)
+            return Certificate(system, gain, tuple(Claim(kind, data) for kind, data in claims))
         except (ValueError, RecursionError) as error:
             raise ValueError(f"{os.fspath(path)}: {' '.join(str(error).split())}") from None
 
@@ -284,91 +271,3 @@ def rounded_up(value: Any) -> float:
     """The least float that is not below a rational number."""
     near = float(value)
     return near if Fraction(near) >= value else math.nextafter(near, math.inf)
-
-
-def listed(value: float | np.ndarray) -> Any:
-    """For JSON."""
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-def described(system: Polytope | Schedule) -> dict[str, Any]:
-    """For JSON; `coverage`, which no claim rests on, is left out."""
-    if isinstance(system, Schedule):
-        cells = [described(cell) for cell in system.cells]
-        return {"parameter": system.parameter, "nodes": system.nodes.tolist(), "cells": cells}
-    corners = [{name: float(value) for name, value in corner.items()} for corner in system.corners]
-    names = {"period": system.period, "states": list(system.states), "corners": corners}
-    return {"A": system.A.tolist(), "B": system.B.tolist(), **names}
-
-
-def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object. Raises ValueError for a name that comes twice: two readers may take different ones."""
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        raise ValueError(f"a name comes twice among {', '.join(name for name, _ in pairs)}")
-    return found
-
-
-def fields(value: Any, where: str, *names: str) -> list[Any]:
-    """The values of an object with exactly these members. Raises ValueError."""
-    if not isinstance(value, dict) or set(value) != set(names):
-        has = ", ".join(value) if isinstance(value, dict) else type(value).__name__
-        raise ValueError(f"{where} must have the members {', '.join(names)} and no other; has {has}")
-    return [value[name] for name in names]
-
-
-def items(value: Any, where: str, kind: type = dict) -> list[Any]:
-    """A list of JSON values of one type. Raises ValueError."""
-    if not isinstance(value, list) or not all(type(each) is kind for each in value):
-        raise ValueError(f"{where} must be a list of {kind.__name__}")
-    return value
-
-
-def number(value: Any, where: str = "a number") -> Any:
-    """A finite number or lists of them of equal lengths, as an array. Raises ValueError."""
-    array = np.array(value, object)
-    if not all(type(each) is float and math.isfinite(each) for each in array.flat):
-        raise ValueError(f"{where} must be finite numbers, in lists of equal lengths")
-    return array.astype(float)
-
-
-def read(value: Any) -> Certificate:
-    """A certificate from JSON. Raises ValueError that names the field."""
-    kind, version, system, gain, claims = fields(value, "the file", "format", "version", "system", "gain", "claims")
-    if kind != FORMAT or version != VERSION:
-        raise ValueError(f"format and version must be {FORMAT!r} and {VERSION}; are {kind!r} and {version!r}")
-    found = []
-    for i, claim in enumerate(items(claims, "claims")):
-        name, data = fields(claim, f"claims[{i}]", "kind", "data")
-        if not isinstance(name, str) or not isinstance(data, dict):
-            raise ValueError(f"claims[{i}] needs a kind that is a string and data that is an object")
-        found.append(Claim(name, {key: number(each, f"claims[{i}].data.{key}") for key, each in data.items()}))
-    return Certificate(read_system(system), number(gain, "gain"), tuple(found))
-
-
-def read_system(value: Any) -> Polytope | Schedule:
-    """A polytope or a schedule from JSON. Raises ValueError that names the field."""
-    if isinstance(value, dict) and "cells" in value:
-        parameter, nodes, cells = fields(value, "system", "parameter", "nodes", "cells")
-        if not isinstance(parameter, str):
-            raise ValueError("system.parameter must be a string")
-        found = tuple(read_polytope(each, f"system.cells[{i}]") for i, each in enumerate(items(cells, "system.cells")))
-        return Schedule(parameter, np.atleast_1d(number(nodes, "system.nodes")), found)
-    return read_polytope(value, "system")
-
-
-def read_polytope(value: Any, where: str) -> Polytope:
-    """A polytope from JSON. Raises ValueError that names the field."""
-    A, B, period, states, corners = fields(value, where, "A", "B", "period", "states", "corners")
-    if period is not None and not (isinstance(period, float) and 0 < period < math.inf):
-        raise ValueError(f"{where}.period must be null or positive [s]")
-    for corner in items(corners, f"{where}.corners"):
-        items(list(corner.values()), f"values of {where}.corners", float)
-        number(list(corner.values()), f"{where}.corners")
-    states = tuple(items(states, f"{where}.states", str))
-    system = Polytope(number(A, f"{where}.A"), number(B, f"{where}.B"), period, states, tuple(corners))
-    if len(corners) not in (0, system.vertices) or len(states) not in (0, system.order):
-        raise ValueError(f"{where}.corners and {where}.states must be empty or one for each vertex and each state")
-    if system.order + system.inputs > LARGEST_ORDER:
-        raise ValueError(f"{where} has more than {LARGEST_ORDER} states and inputs")
-    return system
