@@ -342,7 +342,7 @@ MUTATIONS = [
     ),
     Mutation(
         "certify: discrete time taken for continuous",
-        "design/analysis.py",
+        "design/bounds.py",
         "return math.exp(-2 * rate) * p - c.T @ p @ c",
         "return math.exp(-2 * rate) * p - c @ p @ c.T",
         "test_design.py::test_discrete_analysis_of_one_system",
@@ -370,7 +370,7 @@ MUTATIONS = [
     ),
     Mutation(
         "certify: L2 gain without the input",
-        "design/analysis.py",
+        "design/bounds.py",
         "z = l2.output + l2.feedthrough @ self.k",
         "z = l2.output",
         "test_design.py::test_l2_gain_of_one_system_is_the_peak_of_its_frequency_response",

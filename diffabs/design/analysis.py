@@ -10,20 +10,20 @@ the multipliers of the same programme are the proof of that: W_i >= 0 with sum H
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from diffabs.design import exact, lmi
+from diffabs.design.bounds import ROOM, Bounds, decrease
 from diffabs.design.certificate import Certificate, Claim
-from diffabs.design.frame import Frame, analysis_frame, frame, whitening
-from diffabs.design.lmi import Answer, Unknowns, grouped, he, symmetric
+from diffabs.design.frame import analysis_frame, frame
+from diffabs.design.lmi import Answer, Unknowns, he
 from diffabs.design.polytope import Polytope, Schedule, checked_gain
 from diffabs.design.spec import Spec
 
 TRIES = 4  # frames, each better than the one before
-ROOM = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)  # relative: by how much a bound is loosened until its proof succeeds
 RAISED = 1e-3  # relative: where the search for the fastest decay stops
 SEARCH = 20  # programmes of that search, at most
 
@@ -59,14 +59,14 @@ class _Analysis:
 
     def claims(self, fastest: bool) -> Iterator[Claim]:
         """Each is proved already; what could not be proved is absent."""
-        spec = self.spec
-        cost = self._cost() if spec.Q is not None and self._slowest_mode() > 0 else None
+        spec, bounds = self.spec, Bounds(self.system, self.k, self.spec, self.frame)
+        cost = bounds.cost() if spec.Q is not None and self._slowest_mode() > 0 else None
         stable = None if cost is None or fastest else self._decaying(np.asarray(cost.data["P"]), spec.decay)
         stable = stable or self._stability(fastest)
         yield from (claim for claim in (stable, cost) if claim is not None)
         if stable is None or stable.kind == "infeasible":
             return
-        for wanted, find in ((spec.damping, self._damping), (spec.l2, self._l2), (spec.input, self._input)):
+        for wanted, find in ((spec.damping, bounds.damping), (spec.l2, bounds.l2), (spec.input, bounds.input)):
             claim = find() if wanted else None
             if claim is not None:
                 yield claim
@@ -100,7 +100,9 @@ class _Analysis:
         sizes = np.linalg.norm(scaled, axis=(1, 2)) + 1.0 if self.discrete else np.linalg.norm(scaled, axis=(1, 2))
         one = np.eye(n)
         decreases = [
-            unknowns.affine(lambda v, c=c, s=s: self._decrease(v["P"], c, rate * step) / s - v["t"] * one)
+            unknowns.affine(
+                lambda v, c=c, s=s: decrease(v["P"], c, rate * step, discrete=self.discrete) / s - v["t"] * one
+            )
             for c, s in zip(scaled, sizes, strict=True)
         ]
         positive = unknowns.affine(lambda v: v["P"] - v["t"] * one)
@@ -119,12 +121,6 @@ class _Analysis:
         t = self.frame.T
         w = t @ w @ t.T / sizes[:, None, None]
         return he(w) / np.abs(w).max()
-
-    def _decrease(self, p: Any, c: np.ndarray, rate: float) -> np.ndarray:
-        """-dV/dt - 2 rate V, or exp(-2 rate) V - V+."""
-        if self.discrete:
-            return math.exp(-2 * rate) * p - c.T @ p @ c
-        return -he(p @ c) - 2 * rate * p
 
     def _decaying(self, p: np.ndarray, asked: float) -> Claim | None:
         """The largest rate that this P proves; at least the rate asked for, or nothing."""
@@ -189,126 +185,6 @@ class _Analysis:
         if self.discrete:
             return {"factor": min(1.0, math.exp(-rate * (self.system.period or 1.0)) * (1 + 1e-15))}
         return {"rate": rate}
-
-    # what else may be asked
-
-    def _cost(self) -> Claim | None:
-        q, r = self.spec.Q, self.spec.R
-        weight = q + self.k.T @ r @ self.k
-        at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
-        scaled = at.weight(weight)
-        even = whitening(scaled)
-        trace = at.trace_weight() / np.trace(at.trace_weight())
-        return self._found(
-            at,
-            {"P": self.system.order},
-            lambda v: np.einsum("ij,dji->d", trace, v["P"]),
-            lambda v, c, b: [even.T @ (self._decrease(v["P"], c, 0.0) - scaled) @ even],
-            lambda p, v, more: {"kind": "cost", "P": more * p, "Q": q, "R": r},
-        )
-
-    def _damping(self) -> Claim | None:
-        zeta = self.spec.damping
-        cot = zeta / math.sqrt(1 - zeta**2) * (1 + 1e-12)
-
-        def cone(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
-            flow = v["P"] @ c / np.linalg.norm(c)
-            skew = cot * (flow - np.swapaxes(flow, -1, -2))
-            return [-symmetric([[he(flow)], [-skew, he(flow)]]) - v["t"] * np.eye(2 * len(c))]
-
-        return self._found(
-            self.frame,
-            {"P": self.system.order, "t": (1, 1)},
-            lambda v: -v["t"],
-            cone,
-            lambda p, v, more: {"kind": "damping", "P": p, "zeta": zeta, "cot": cot},
-            lambda v: [1 - np.trace(v["P"], axis1=-2, axis2=-1)[..., None, None]],
-        )
-
-    def _l2(self) -> Claim | None:
-        l2 = self.spec.l2
-        assert l2 is not None
-        z = l2.output + l2.feedthrough @ self.k
-        weight = z.T @ z
-        weight = weight + 1e-9 * np.trace(weight) * np.eye(len(weight))
-        at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
-        given = None if l2.disturbance is None else at.inverse @ l2.disturbance / math.sqrt(at.tau)
-
-        def bounded(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
-            e = at.inverse @ b / math.sqrt(at.tau) if given is None else given
-            limit = v["g"] * np.eye(e.shape[1])
-            top = self._decrease(v["P"], c, 0.0) - at.weight(z.T @ z) - 1e-10 * np.eye(len(c))
-            if self.discrete:
-                return [symmetric([[top], [-e.T @ v["P"] @ c, limit - e.T @ v["P"] @ e]])]
-            return [symmetric([[top], [-e.T @ v["P"], limit]])]
-
-        disturbance = self.system.B if l2.disturbance is None else l2.disturbance
-        return self._found(
-            at,
-            {"P": self.system.order, "g": (1, 1)},
-            lambda v: v["g"],
-            bounded,
-            lambda p, v, more: {
-                "kind": "l2",
-                "P": more * p,
-                "gamma": math.sqrt(more * float(v["g"][0, 0])),
-                "Bw": disturbance,
-                "C": l2.output,
-                "D": l2.feedthrough,
-            },
-        )
-
-    def _input(self) -> Claim | None:
-        """The least fraction g^(1/2) of the limits that an invariant ellipsoid around the starts can prove."""
-        limit, at = self.spec.input, self.frame
-        assert limit is not None
-        rows = self.k @ at.T / limit.limit[:, None]
-        starts = at.inverse @ limit.points.T
-        starts_size = float(np.linalg.norm(starts, axis=0).max())  # P is of the order of 1/size^2
-
-        def held(v: Any) -> list[np.ndarray]:
-            p = v["P"]
-            inside = [1 - starts_size**-2 * (x @ p @ x)[..., None, None] for x in starts.T]
-            return inside + [symmetric([[p], [row[None] * starts_size, v["g"]]]) for row in rows]
-
-        return self._found(
-            at,
-            {"P": self.system.order, "g": (1, 1)},
-            lambda v: v["g"],
-            lambda v, c, b: [self._decrease(v["P"], c, 1e-9) / np.linalg.norm(c)],
-            lambda p, v, more: {
-                "kind": "input",
-                "P": p / starts_size**2 / more,
-                "limit": limit.limit * math.sqrt(float(v["g"][0, 0])) * more,
-                "points": limit.points,
-            },
-            held,
-        )
-
-    def _found(
-        self,
-        at: Frame,
-        shapes: dict[str, Any],
-        objective: Callable[[Any], Any],
-        everywhere: Callable[[Any, np.ndarray, np.ndarray], list[np.ndarray]],
-        claim: Callable[[np.ndarray, Any, float], dict[str, Any]],
-        once: Callable[[Any], list[np.ndarray]] | None = None,
-    ) -> Claim | None:
-        """Solve for P and more in a frame, and loosen the answer until its proof succeeds; None if it does not."""
-        unknowns = Unknowns(**shapes)
-        blocks = unknowns.blocks(lambda v: [v["P"], *(once(v) if once else [])])
-        for c, b in zip(at.states(self.closed), self.system.B, strict=True):
-            blocks += unknowns.blocks(lambda v, c=c, b=b: everywhere(v, c, b))
-        answer = lmi.solve(unknowns.row(objective), grouped(blocks))
-        if not np.isfinite(answer.y).all():
-            return None
-        values = unknowns.values(answer.y)
-        for room in ROOM if "g" not in values or values["g"] > 0 else ():
-            found = claim(at.form(values["P"]), values, 1 + room)
-            made = Claim(found.pop("kind"), found)
-            if self._proved(made):
-                return made
-        return None
 
     def _claim(self, kind: str, **data: Any) -> Claim:
         return Claim(kind, data)

@@ -122,7 +122,7 @@ def _hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> 
     p = (p + p.T) / 2
     terms = (a.T @ p + p @ a, p @ push @ p, q)
     residual = np.abs(terms[0] - terms[1] + terms[2]) / np.maximum(sum(np.abs(t) for t in terms), 1e-300)
-    settled = np.linalg.eigvals(a - push @ p).real.max() < 0
+    settled = np.real(np.linalg.eigvals(a - push @ p)).max() < 0
     return p if settled and residual.max() < 1e-10 else None
 
 

@@ -1,0 +1,153 @@
+"""Bounds that a gain keeps: cost, damping, L2 gain, inputs. Each is the least that a common P proves."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from diffabs.design import exact, lmi
+from diffabs.design.certificate import Claim
+from diffabs.design.frame import Frame, analysis_frame, whitening
+from diffabs.design.lmi import Unknowns, grouped, he, symmetric
+from diffabs.design.polytope import Polytope
+from diffabs.design.spec import Spec
+
+ROOM = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)  # relative: by how much a bound is loosened until its proof succeeds
+
+
+def decrease(p: Any, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
+    """-dV/dt - 2 rate V for V = x'Px and x' = C x, or exp(-2 rate) V - V+ for x+ = C x; P may be a stack."""
+    if discrete:
+        return math.exp(-2 * rate) * p - c.T @ p @ c
+    return -he(p @ c) - 2 * rate * p
+
+
+class Bounds:
+    """Each method gives a claim that is proved already, or None where no proof succeeds."""
+
+    def __init__(self, system: Polytope, k: np.ndarray, spec: Spec, frame: Frame):
+        """For gain K (m, n) and a checked specification; `frame` is one for quadratic stability."""
+        self.system, self.k, self.spec, self.frame = system, k, spec, frame
+        self.closed, self.discrete = system.closed(k), system.period is not None
+
+    def cost(self) -> Claim | None:
+        """The least trace P."""
+        q, r = self.spec.Q, self.spec.R
+        weight = q + self.k.T @ r @ self.k
+        at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
+        scaled = at.weight(weight)
+        even = whitening(scaled)
+        trace = at.trace_weight() / np.trace(at.trace_weight())
+        return self._found(
+            at,
+            {"P": self.system.order},
+            lambda v: np.einsum("ij,dji->d", trace, v["P"]),
+            lambda v, c, b: [even.T @ (decrease(v["P"], c, 0.0, discrete=self.discrete) - scaled) @ even],
+            lambda p, v, more: {"kind": "cost", "P": more * p, "Q": q, "R": r},
+        )
+
+    def damping(self) -> Claim | None:
+        """All poles of every frozen system in the cone asked for."""
+        zeta = self.spec.damping
+        cot = zeta / math.sqrt(1 - zeta**2) * (1 + 1e-12)
+
+        def cone(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+            flow = v["P"] @ c / np.linalg.norm(c)
+            skew = cot * (flow - np.swapaxes(flow, -1, -2))
+            return [-symmetric([[he(flow)], [-skew, he(flow)]]) - v["t"] * np.eye(2 * len(c))]
+
+        return self._found(
+            self.frame,
+            {"P": self.system.order, "t": (1, 1)},
+            lambda v: -v["t"],
+            cone,
+            lambda p, v, more: {"kind": "damping", "P": p, "zeta": zeta, "cot": cot},
+            lambda v: [1 - np.trace(v["P"], axis1=-2, axis2=-1)[..., None, None]],
+        )
+
+    def l2(self) -> Claim | None:
+        """The least gain."""
+        l2 = self.spec.l2
+        assert l2 is not None
+        z = l2.output + l2.feedthrough @ self.k
+        weight = z.T @ z
+        weight = weight + 1e-9 * np.trace(weight) * np.eye(len(weight))
+        at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
+        given = None if l2.disturbance is None else at.inverse @ l2.disturbance / math.sqrt(at.tau)
+
+        def bounded(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+            e = at.inverse @ b / math.sqrt(at.tau) if given is None else given
+            limit = v["g"] * np.eye(e.shape[1])
+            top = decrease(v["P"], c, 0.0, discrete=self.discrete) - at.weight(z.T @ z) - 1e-10 * np.eye(len(c))
+            if self.discrete:
+                return [symmetric([[top], [-e.T @ v["P"] @ c, limit - e.T @ v["P"] @ e]])]
+            return [symmetric([[top], [-e.T @ v["P"], limit]])]
+
+        disturbance = self.system.B if l2.disturbance is None else l2.disturbance
+        return self._found(
+            at,
+            {"P": self.system.order, "g": (1, 1)},
+            lambda v: v["g"],
+            bounded,
+            lambda p, v, more: {
+                "kind": "l2",
+                "P": more * p,
+                "gamma": math.sqrt(more * float(v["g"][0, 0])),
+                "Bw": disturbance,
+                "C": l2.output,
+                "D": l2.feedthrough,
+            },
+        )
+
+    def input(self) -> Claim | None:
+        """The least fraction g^(1/2) of the limits that an invariant ellipsoid around the starts can prove."""
+        limit, at = self.spec.input, self.frame
+        assert limit is not None
+        rows = self.k @ at.T / limit.limit[:, None]
+        starts = at.inverse @ limit.points.T
+        starts_size = float(np.linalg.norm(starts, axis=0).max())  # P is of the order of 1/size^2
+
+        def held(v: Any) -> list[np.ndarray]:
+            p = v["P"]
+            inside = [1 - starts_size**-2 * (x @ p @ x)[..., None, None] for x in starts.T]
+            return inside + [symmetric([[p], [row[None] * starts_size, v["g"]]]) for row in rows]
+
+        return self._found(
+            at,
+            {"P": self.system.order, "g": (1, 1)},
+            lambda v: v["g"],
+            lambda v, c, b: [decrease(v["P"], c, 1e-9, discrete=self.discrete) / np.linalg.norm(c)],
+            lambda p, v, more: {
+                "kind": "input",
+                "P": p / starts_size**2 / more,
+                "limit": limit.limit * math.sqrt(float(v["g"][0, 0])) * more,
+                "points": limit.points,
+            },
+            held,
+        )
+
+    def _found(
+        self,
+        at: Frame,
+        shapes: dict[str, Any],
+        objective: Callable[[Any], Any],
+        everywhere: Callable[[Any, np.ndarray, np.ndarray], list[np.ndarray]],
+        claim: Callable[[np.ndarray, Any, float], dict[str, Any]],
+        once: Callable[[Any], list[np.ndarray]] | None = None,
+    ) -> Claim | None:
+        """Solve for P and more in a frame, and loosen the answer until its proof succeeds; None if it does not."""
+        unknowns = Unknowns(**shapes)
+        blocks = unknowns.blocks(lambda v: [v["P"], *(once(v) if once else [])])
+        for c, b in zip(at.states(self.closed), self.system.B, strict=True):
+            blocks += unknowns.blocks(lambda v, c=c, b=b: everywhere(v, c, b))
+        answer = lmi.solve(unknowns.row(objective), grouped(blocks))
+        if not np.isfinite(answer.y).all():
+            return None
+        values = unknowns.values(answer.y)
+        for room in ROOM if "g" not in values or values["g"] > 0 else ():
+            found = claim(at.form(values["P"]), values, 1 + room)
+            made = Claim(found.pop("kind"), found)
+            if exact.verify(made.kind, self.system, self.k, made.data):
+                return made
+        return None
