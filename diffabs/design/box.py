@@ -186,9 +186,10 @@ class _Frame(NamedTuple):
     @classmethod
     def of(cls, rows: np.ndarray) -> "_Frame":
         size, extent = np.abs(rows).max(axis=0), np.ptp(rows, axis=0)
-        scale = np.where(extent > SAME * size, extent, np.where(size > 0, size, 1.0))
+        varies = extent > SAME * size
+        scale = np.where(varies, extent, np.where(size > 0, size, 1.0))
         z = (rows - rows[0]) / scale
-        basis = np.linalg.svd(z - z.mean(axis=0), full_matrices=False)[2]
+        basis = np.linalg.svd(z - z.mean(axis=0), full_matrices=False)[2] * varies
         half = np.ptp(z @ basis.T, axis=0) / 2
         return cls(rows[0], scale, basis[half > SPAN], half[half > SPAN])
 

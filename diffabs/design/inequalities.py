@@ -24,7 +24,9 @@ def cost(
     if discrete:
         rows = [[even.T @ x @ even], [flow @ even, x], [q_root @ x @ even, None, np.eye(n)]]
         return symmetric([*rows, [f @ even, None, None, np.eye(m)]])
-    return symmetric([[even.T @ (drift - he(flow)) @ even], [q_root @ x @ even, np.eye(n)], [f @ even, None, np.eye(m)]])
+    return symmetric(
+        [[even.T @ (drift - he(flow)) @ even], [q_root @ x @ even, np.eye(n)], [f @ even, None, np.eye(m)]]
+    )
 
 
 def trace(x: Matrix, z: Matrix) -> np.ndarray:

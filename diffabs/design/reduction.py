@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from diffabs.actuators import Delay, Lag, Limits, RateLimit
@@ -44,10 +45,10 @@ def state_feedback(loop: Loop) -> Reduced:
     controller = sampled.controller if sampled else loop.controller
     integral, proportional, derivative, cutoff = _gains(controller)
     actuator, by_actuator, exact = _actuator(loop.actuator)
-    state = loop.start()
+    setpoint = jax.jit(lambda loop: loop.reference.setpoint(loop.start().reference))(loop)
     model = SlipModel(
         plant=loop.plant,
-        slip=float(loop.reference.setpoint(state.reference)),
+        slip=float(setpoint),
         speed=float(loop.initial.speed),
         actuator=actuator,
         sampling=Sampling(period=float(sampled.period), delay=float(sampled.delay)) if sampled else Continuous(),
@@ -93,7 +94,9 @@ def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
                 exact = False
                 neglected.append(f"The actuator's delay of {float(block.time):g} s, which can destabilise.")
             case _:
-                raise ValueError(f"actuator {_words(block)} is not known to be linear: it cannot be brought to state feedback")
+                raise ValueError(
+                    f"actuator {_words(block)} is not known to be linear: it cannot be brought to state feedback"
+                )
     if len(lags) > 1:
         raise ValueError("actuator: a linear slip model has room for one lag, not for several in series")
     return (lags[0] if lags else Direct()), tuple(neglected), exact

@@ -1,0 +1,415 @@
+"""Linear slip models against the paper's formulas, SciPy, finite differences, and the real loops."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+from scipy.signal import cont2discrete
+
+from diffabs.actuators import Delay, Lag, Limits, RateLimit
+from diffabs.blocks import Direct, Series
+from diffabs.controllers import (
+    PID,
+    BackCalculation,
+    ConstantTorque,
+    HoldingInput,
+    Relay,
+    Sampled,
+    SlidingMode,
+    StateFeedback,
+)
+from diffabs.design.reduction import state_feedback
+from diffabs.integrate import rk4_step
+from diffabs.linearize import LowPass, Sampling, SlipModel, linearize, tracking
+from diffabs.loop import Loop
+from diffabs.plants import BrakeStart, LabRig, MirroredRig, QuarterCar
+from diffabs.protocols import BrakeOutput, Clock
+from diffabs.pytree import check, replace, strong
+from diffabs.references import FilteredSlip, FixedSlip
+from diffabs.roads import WET_ASPHALT, Burckhardt
+from diffabs.sensors import Bias, WheelSpeed
+
+K = 1 / 3.6
+R1, R2, J1, G = 0.0995, 0.099, 7.53e-3, 9.81
+BETA = 133.472842636189
+ALPHA = {5.3: 83.8796606703, 6.2: 84.6321445666}
+
+
+def alpha_beta(mass, slip, road):
+    """Eq. (17), with mu' of eq. (13) by hand."""
+    a, q, w = road.a, road.q, (road.w1, road.w2, road.w3, road.w4)
+    mu = w[3] * slip**q / (a + slip**q) + w[2] * slip**3 + w[1] * slip**2 + w[0] * slip
+    steep = w[3] * a * q * slip ** (q - 1) / (a + slip**q) ** 2 + 3 * w[2] * slip**2 + 2 * w[1] * slip + w[0]
+    load, j2 = mass * G, 0.5 * mass * R2**2
+    return (
+        -(R1**2 / (J1 * R2) * load * steep + ((1 - slip) * steep - mu) * load * R2 / j2),
+        R1 / (J1 * R2),
+    )
+
+
+quick = partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})  # compiles twice as fast
+
+
+@pytest.mark.parametrize(("mass", "slip", "speed"), [(5.3, 0.2, 50 * K), (6.2, 0.2, 5 * K), (6.0, 0.35, 3.0)])
+def test_rig_is_equation_21(mass, slip, speed):
+    model = SlipModel(plant=MirroredRig(mass=mass), slip=slip, speed=speed)
+    alpha, beta = alpha_beta(mass, slip, model.plant.road)
+    omega = speed / R2
+    a, b = model.matrices()
+    np.testing.assert_allclose(a, [[0, 1], [0, alpha / omega]], rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(b, [[0], [beta / omega]], rtol=1e-12, atol=0)
+    if slip == 0.2:
+        np.testing.assert_allclose([alpha, beta], [ALPHA[mass], BETA], rtol=1e-11)
+    assert model.states == ("integral of slip error", "slip error")
+    assert model.period is None
+    assert a.dtype == b.dtype == jnp.float64
+
+
+def test_quarter_car_by_hand():
+    """slip' = ((1 - s) v' - r omega')/v at a frozen v, and mu' of Burckhardt's curve, by hand."""
+    r, m, j, s, v, road = 0.2, 15.0, 1.04456, 0.1, 12.0, WET_ASPHALT
+    fade, low = np.exp(-road.c4 * s * v), np.exp(-road.c2 * s)
+    mu = (road.c1 * (1 - low) - road.c3 * s) * fade
+    steep = (road.c1 * road.c2 * low - road.c3) * fade - road.c4 * v * mu
+    expected = (-r * r * steep * m * G / j - (1 - s) * steep * G + mu * G) / v
+    car = QuarterCar(mass=m, radius=r, inertia=j, road=road)
+    a, b = SlipModel(plant=car, slip=s, speed=v, integral=False).matrices()
+    np.testing.assert_allclose(a, [[expected]], rtol=1e-12)
+    np.testing.assert_allclose(b, [[r / j / v]], rtol=1e-12)
+
+
+def differences(function, z, h):
+    return np.stack([(function(z + d) - function(z - d)) / (2 * h) for d in h * np.eye(len(z))], axis=1)
+
+
+@pytest.mark.parametrize("plant", [QuarterCar(road=WET_ASPHALT), LabRig()], ids=["car", "lab rig"])
+def test_linearize_against_differences(plant):
+    state = plant.start(BrakeStart(speed=11.0, slip=0.15))
+    x, unravel = ravel_pytree(jax.tree.map(float, state))
+    control = {QuarterCar: 20.0, LabRig: 0.7}[type(plant)]
+    flow = quick(lambda x, u: ravel_pytree(plant.derivative(0.0, unravel(x), u[0]))[0])
+    a, b = quick(linearize)(plant, state, control)
+    u = jnp.array([control])
+    np.testing.assert_allclose(a, differences(lambda x: flow(x, u), x, 1e-5), rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(b, differences(lambda u: flow(x, u), u, 1e-5), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("brake", [1.0, 4.0])
+def test_tracking_away_from_equilibrium(brake):
+    """The lab rig, its brake anywhere: rates of slip and brake by finite differences in those coordinates, at a fixed
+    drum speed, from the derivative of slip = 1 - r1 w1/(r2 w2) by the quotient rule."""
+    rig, drum, control = LabRig(), 100.0, 0.7
+
+    @jax.jit
+    def rates(z, u):
+        s, m = z
+        wheel = (1 - s) * rig.drum_radius * drum / rig.wheel_radius
+        state = type(rig.start(BrakeStart()))(wheel, drum, m, 0.0)
+        rate = rig.derivative(0.0, state, u[0])
+        ratio = rig.wheel_radius / rig.drum_radius
+        return jnp.stack([-ratio * (rate.wheel * drum - wheel * rate.drum) / drum**2, rate.brake])
+
+    z, u = jnp.array([0.15, brake]), jnp.array([control])
+    state = rig.start(BrakeStart(speed=rig.drum_radius * drum, slip=0.15))._replace(brake=brake)
+    a, b = quick(tracking)(rig, state, control)
+    np.testing.assert_allclose(a, differences(lambda z: rates(z, u), z, 1e-6), rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(b, differences(lambda u: rates(z, u), u, 1e-6), rtol=1e-6, atol=1e-8)
+
+
+def test_tracking_needs_coordinates():
+    car = QuarterCar()
+    state = car.start(BrakeStart(speed=10.0, slip=0.1))
+    for outputs, count in ((("speed", "wheel_speed", "distance"), 4), ((), 2)):
+        with pytest.raises(ValueError, match=f"do not depend on are {count} coordinates of 3 states"):
+            jax.eval_shape(lambda x, outputs=outputs: tracking(car, x, 20.0, ("slip",), outputs), state)
+    with pytest.raises(ValueError, match="slip, deceleration, distance are no coordinates here: they depend on each"):
+        tracking(QuarterCar(road=SlipOnly()), state, 20.0, ("slip",), ("deceleration", "distance"))
+
+
+class SlipOnly:
+    """A road whose friction the slip alone decides: then so is the deceleration."""
+
+    def friction(self, slip, speed, distance):
+        return 3.0 * slip
+
+
+jax.tree_util.register_pytree_node(SlipOnly, lambda r: ((), ()), lambda s, c: SlipOnly())
+
+
+def test_lab_rig_rests_where_it_is_held():
+    """The remaining state, the brake, where its own rate is zero; then the slip's is, too."""
+    model = SlipModel(plant=LabRig(), speed=8.0)
+    state, control = quick(SlipModel.point)(strong(model))
+    rate = model.plant.derivative(0.0, state, control)
+    assert abs(rate.brake) < 1e-12
+    slip_rate = jax.jvp(lambda x: model.plant.output(x).slip, (state,), (rate,))[1]
+    assert abs(slip_rate) < 1e-12
+    assert rate.drum < -1
+    assert model.states == ("integral of slip error", "slip error", "brake")
+    a, b = model.matrices()
+    assert a[0].tolist() == [0, 1, 0]
+    np.testing.assert_allclose(a[2], [0, 0, -20.37], atol=1e-12)
+    np.testing.assert_allclose(b[:, 0], [0, 0, 20.37 * 15.24], atol=1e-11)
+
+
+def test_lag_is_a_state():
+    a, b = SlipModel(actuator=Lag(time_constant=0.02)).matrices()
+    plain = SlipModel().matrices()
+    np.testing.assert_allclose(a[:2, :2], plain.A, rtol=1e-14)
+    np.testing.assert_allclose(a[:, 2], [0, plain.B[1, 0], -50.0], rtol=1e-13)
+    assert b[:, 0].tolist() == [0, 0, 50.0]
+
+
+@pytest.mark.parametrize("delay", [0.0, 1.3e-3, 4e-3])
+def test_sampling_against_scipy(delay):
+    """SciPy's zero-order hold over the two parts of a period."""
+    period, lag = 4e-3, 0.01
+    model = SlipModel(speed=2.0, actuator=Lag(time_constant=lag), sampling=Sampling(period=period, delay=delay))
+    a, b = model.matrices()
+    c = SlipModel(speed=2.0, actuator=Lag(time_constant=lag), integral=False).matrices()
+    c = [np.asarray(x) for x in c]
+    (first, old), (second, new) = (
+        cont2discrete((*c, np.eye(2), np.zeros((2, 1))), s)[:2] if s else (np.eye(2), np.zeros((2, 1)))
+        for s in (delay, period - delay)
+    )
+    expected = np.zeros((4, 4))
+    expected[0, :2] = 1, period
+    expected[1:3, 1:3], expected[1:3, 3:] = second @ first, second @ old
+    np.testing.assert_allclose(a, expected, rtol=1e-11, atol=1e-15)
+    np.testing.assert_allclose(b[:, 0], [0, *new[:, 0], 1], rtol=1e-11, atol=1e-16)
+    assert model.period == period
+    assert model.states[2:] == ("actuator torque", "torque of the last sample")
+
+
+class FrozenRig:
+    """Eq. (14) for the default rig at a frozen omega2; the state is the slip."""
+
+    def __init__(self, speed):
+        self.speed = speed
+
+    def start(self, initial):
+        return jnp.asarray(initial.slip)
+
+    def derivative(self, t, state, control):
+        road, load, omega = MirroredRig().road, 5.3 * G, self.speed / R2
+        mu = road.friction(state, self.speed, 0.0)
+        j2 = 0.5 * 5.3 * R2**2
+        friction = R1**2 / (J1 * R2) * load * mu + (1 - state) * load * R2 * mu / j2
+        return -friction / omega + R1 / (J1 * R2 * omega) * control
+
+    def output(self, state):
+        return BrakeOutput(state, self.speed, (1 - state) * self.speed, 0.0, 0.0)
+
+    def holding(self, output, target):
+        return MirroredRig().holding(output._replace(deceleration=0.0), target)
+
+
+jax.tree_util.register_pytree_node(FrozenRig, lambda r: ((), r.speed), lambda s, c: FrozenRig(s))
+STEPS = 40
+
+
+def one_period(loop, z, period):
+    """(integral, slip, lag's torque, last sample's torque, [PID's filter]) a period later, in the real loop."""
+    h = period / STEPS
+    state = loop.start()
+    flow = state.controller.held.inner.flow
+    flow = flow._replace(integral=z[0], filtered=z[4]) if len(z) == 5 else z[0]
+    held = state.controller.held
+    held = held._replace(inner=held.inner._replace(flow=flow), after=z[3])
+    state = state._replace(
+        plant=z[1],
+        controller=state.controller._replace(held=held),
+        actuator=state.actuator._replace(flow=z[2]),
+    )
+
+    def step(state, k):
+        state, _ = loop.jump(Clock(k * h, h, k, None), state)
+
+        def rate(t, flow):
+            at = state.with_flow(flow)
+            return loop.flow(t, at, loop.signals(t, at))
+
+        return state.with_flow(rk4_step(rate, k * h, state.flow(), h)), None
+
+    state, _ = jax.lax.scan(step, strong(state), jnp.arange(STEPS))
+    held = state.controller.held
+    inner = held.inner.flow
+    own = [inner.integral, inner.filtered] if len(z) == 5 else [inner]
+    return jnp.stack([own[0], state.plant, state.actuator.flow, held.after, *own[1:]])
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.002])
+@pytest.mark.parametrize(
+    "controller",
+    [
+        StateFeedback(gain=np.array([-400.0, -30.0])),
+        PID(kp=30.0, ki=400.0, kd=0.3, torque_min=-np.inf, torque_max=np.inf),
+    ],
+    ids=["state feedback", "pid"],
+)
+def test_sampled_loop_is_the_model(controller, delay):
+    """The Jacobian of a period of the real sampled loop, eq. (14) at a frozen speed behind a lag, is A + B K."""
+    period, speed = 0.004, 2.0
+    sampled = Sampled(controller=controller, period=period, delay=delay)
+    parts = {
+        "feedforward": HoldingInput(),
+        "controller": sampled,
+        "actuator": Lag(),
+        "initial": BrakeStart(speed=speed, slip=0.2),
+    }
+    reduced = state_feedback(Loop(plant=MirroredRig(), reference=FixedSlip(slip=0.2), **parts))
+    loop = Loop(plant=FrozenRig(speed), reference=FixedSlip(slip=0.2), **parts)
+    tau = float(MirroredRig().holding(BrakeOutput(0.2, speed, 0.0, 0.0, 0.0), 0.2))
+    pid = isinstance(controller, PID)
+    z = jnp.array([0.0, 0.2, tau, tau] + [0.0] * pid)
+    true = quick(jax.jacfwd(lambda z: one_period(loop, z, period)))(z)
+    a, b = reduced.model.matrices()
+    sign = np.diag([-1.0, 1, 1, 1, -1]) if pid else np.eye(4)  # a PID's integral and filter are of target - slip
+    np.testing.assert_allclose(a + b @ reduced.gain[None], sign @ true @ sign, rtol=1e-8, atol=1e-12)
+    assert reduced.exact
+
+
+def modes(matrix):
+    return np.linalg.eigvals(np.asarray(matrix))
+
+
+CONTROLLERS = {
+    "state feedback": (StateFeedback(), ["integral of slip error", "slip error"]),
+    "p": (PID(kp=300.0, torque_max=np.inf), ["slip error"]),
+    "pi": (PID(kp=300.0, ki=900.0), ["integral of slip error", "slip error"]),
+    "pd": (PID(kp=300.0, kd=4.0), ["slip error", "filtered slip error"]),
+    "pid": (PID(kp=300.0, ki=900.0, kd=4.0), ["integral of slip error", "slip error", "filtered slip error"]),
+}
+
+
+CASES = [("rig", name, Direct()) for name in CONTROLLERS] + [("rig", "pid", RateLimit()), ("car", "pid", Lag())]
+
+
+@pytest.mark.parametrize(("plant", "name", "actuator"), CASES)
+def test_reduction_has_the_modes_of_the_loop(plant, name, actuator):
+    """The real loop's flow in the coordinates (slip, speed, distance): held exactly, the slip's rate is zero at any
+    speed, the Jacobian is block triangular, and the modes of A + B K are among its own."""
+    controller, states = CONTROLLERS[name]
+    plant = {"rig": MirroredRig(), "car": QuarterCar(road=Burckhardt(c4=0.0))}[plant]
+    if isinstance(plant, QuarterCar):
+        controller = replace(controller, {"torque_max": np.inf})
+    parts = {"reference": FixedSlip(slip=0.2), "feedforward": HoldingInput(), "controller": controller}
+    loop = Loop(plant=plant, initial=BrakeStart(speed=9.0, slip=0.2), actuator=actuator, **parts)
+    reduced = state_feedback(loop)
+    a, b = reduced.model.matrices()
+    state = loop.start()
+    if not isinstance(actuator, Direct):
+        tau = plant.holding(plant.output(state.plant), 0.2)
+        state = state._replace(actuator=state.actuator._replace(flow=tau))
+    z, unravel = ravel_pytree(state.flow())
+
+    def chart(z):
+        y = plant.output(unravel(z)[0])
+        return jnp.concatenate([jnp.stack([y.slip, y.speed, y.distance]), z[3:]])
+
+    def rate(z):
+        at = state.with_flow(unravel(z))
+        return jax.jvp(chart, (z,), (ravel_pytree(loop.flow(0.0, at, loop.signals(0.0, at)))[0],))[1]
+
+    by_chart, by_state = quick(lambda z: (jax.jacfwd(chart)(z), jax.jacfwd(rate)(z)))(z)
+    true = modes(by_state @ np.linalg.inv(by_chart))
+    assert [s for s in reduced.model.states if "torque" not in s] == states
+    assert reduced.exact
+    for mode in modes(a + b @ reduced.gain[None]):
+        assert np.min(np.abs(true - mode)) < 1e-9 * max(1, abs(mode))
+
+
+def test_what_is_neglected():
+    lag = Lag(time_constant=0.02)
+    loop = Loop(
+        plant=MirroredRig(),
+        controller=PID(kp=30.0, ki=9.0, antiwindup=BackCalculation()),
+        actuator=Series(blocks=(Delay(time=0.004), lag, Limits(), Direct())),
+        sensor=WheelSpeed(),
+        reference=FilteredSlip(),
+    )
+    reduced = state_feedback(loop)
+    assert not reduced.exact
+    assert reduced.neglected == (
+        "The controller's torque limits of 0 and 90 N m.",
+        "Anti-windup, which acts at the torque limits only.",
+        "The actuator's delay of 0.004 s, which can destabilise.",
+        "The actuator's limits of 0 and 90 N m.",
+        "The fall of the speed: it is frozen.",
+        "The sensor, wheel speed: its dynamics, rounding or error.",
+        "The motion of the target (filtered slip), a disturbance; the model is taken at its setpoint.",
+        "The error of the feed-forward (no feedforward), a disturbance.",
+    )
+    np.testing.assert_array_equal(reduced.gain, [-9.0, -30.0, 0.0])
+    assert reduced.model.actuator.time_constant == 0.02
+    assert reduced.model.speed == loop.initial.speed
+    plain = state_feedback(replace(loop, {"actuator": RateLimit(rate=70.0), "sensor": Bias(slip=0.01)}))
+    assert plain.exact
+    assert "The actuator's rate limit of 70 N m/s." in plain.neglected
+    assert "The sensor's bias, a disturbance." in plain.neglected
+    assert state_feedback(Loop(controller=StateFeedback(), feedforward=HoldingInput())).neglected == (
+        "The fall of the speed: it is frozen.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"controller": Relay()}, "controller relay is not linear: it cannot be brought to state feedback"),
+        ({"controller": SlidingMode()}, "controller sliding mode is not linear"),
+        ({"controller": Sampled(controller=ConstantTorque())}, "controller constant torque is not linear"),
+        ({"controller": Sampled(controller=Sampled())}, "controller sampled is not linear"),
+        ({"actuator": Series(blocks=(Lag(), Lag()))}, "room for one lag, not for several"),
+        ({"actuator": Sampled()}, "actuator sampled is not known to be linear"),
+        ({"plant.mass": np.nan}, r"plant.mass = nan is outside \(0, inf\) kg"),
+        ({"reference.slip": 1.0}, r"slip = 1 is outside \(0, 1\)"),
+    ],
+)
+def test_what_cannot_be_reduced(change, message):
+    with pytest.raises(ValueError, match=message):
+        state_feedback(replace(Loop(), change))
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"actuator": Delay()}, "actuator: a linear slip model knows Direct and Lag, not Delay"),
+        ({"sampling": Lag()}, "sampling: a linear slip model knows Continuous and Sampling, not Lag"),
+        ({"filter": Lag()}, "filter: a linear slip model knows Direct and LowPass, not Lag"),
+    ],
+)
+def test_unknown_parts(parts, message):
+    model = SlipModel(**parts)
+    with pytest.raises(ValueError, match=message):
+        model.matrices()
+    with pytest.raises(ValueError, match=message):
+        _ = model.states
+
+
+def test_ranges():
+    with pytest.raises(ValueError, match=r"delay = 0.002 s exceeds the period of 0.001 s"):
+        check(SlipModel(sampling=Sampling(delay=0.002)))
+    with pytest.raises(ValueError, match=r"slip = 0 is outside \(0, 1\); speed = 0 is outside \(0, 200\] m/s"):
+        check(SlipModel(slip=0.0, speed=0.0))
+
+
+def test_batches_and_derivatives():
+    """A full model, batched; and its derivatives in every parameter that is varied, by differences."""
+    model = SlipModel(actuator=Lag(), sampling=Sampling(period=2e-3, delay=5e-4), filter=LowPass())
+    paths = ("plant.mass", "speed", "actuator.time_constant", "sampling.delay", "filter.cutoff", "slip")
+
+    @jax.vmap
+    def entries(values):
+        return ravel_pytree(replace(model, dict(zip(paths, values, strict=True))).matrices())[0]
+
+    at = jnp.array([5.5, 6.0, 0.012, 7e-4, 50.0, 0.25])
+    h = 1e-5 * at
+    left, right = (quick(entries)(at + sign * jnp.diag(h)) for sign in (-1, 1))
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        slopes = quick(jacobian(lambda v: entries(v[None])[0]))(at).T
+        np.testing.assert_allclose(slopes, (right - left) / (2 * h[:, None]), rtol=1e-5, atol=1e-6)
+    one = replace(model, dict(zip(paths, at.tolist(), strict=True)))
+    np.testing.assert_allclose(quick(entries)(at[None])[0], ravel_pytree(one.matrices())[0], rtol=1e-13, atol=1e-16)
