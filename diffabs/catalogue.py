@@ -177,7 +177,8 @@ def filled(template: Any, table: dict[str, Any], family: str, path: str) -> Any:
     return dataclasses.replace(template, **values) if values else template
 
 
-OTHERS = ("road", "solver", "objective", "title", "description")  # what a scenario has besides the fields of a loop
+# What a scenario has besides the fields of a loop.
+OTHERS = ("road", "solver", "objective", "design", "title", "description")
 
 
 def joined(path: str, key: str) -> str:

@@ -1,4 +1,4 @@
-"""The command `diffabs`. Exit status: 0 done, 1 could not be done (the run diverged), 2 bad input.
+"""The command `diffabs`. Exit status: 0 done, 1 not possible (diverged, no gain, not proved), 2 bad input.
 
 Results go to stdout, as tables or with --json as one JSON document; everything else goes to stderr."""
 
@@ -8,13 +8,12 @@ import importlib.util
 import math
 import os
 import pathlib
-import platform
 from typing import Annotated, Any, NoReturn
 
 import jax
 import typer
 
-from diffabs import __version__, catalogue, console, show
+from diffabs import __version__, catalogue, commands_design, console, show
 from diffabs.rollout import Run, measure, rollout
 from diffabs.scenario import Scenario, header, load, names
 
@@ -31,8 +30,6 @@ PICTURES = (".png", ".pdf", ".svg")
 PLURALS = {f"{name}s": name for name in ("plant", "road", "controller", "reference", "actuator", "sensor")}
 PLURALS |= {"feedforward": "feedforward", "antiwindup": "antiwindup", "initial": "initial"}
 PLURALS |= {"stops": "stop", "objectives": "objective"}
-
-Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout, nothing else there.")]
 
 
 def main() -> NoReturn:
@@ -67,12 +64,9 @@ def setup(
 
 @app.command()
 def simulate(
-    scenario: Annotated[str, typer.Argument(help="A TOML file, or the name of a packaged scenario.")],
-    changes: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Override a field; may be repeated."),
-    ] = None,
-    as_json: Json = False,
+    scenario: console.ScenarioName,
+    changes: console.Changes = None,
+    as_json: console.Json = False,
     csv: Annotated[pathlib.Path | None, typer.Option(help="Write the trajectory to this file.")] = None,
     plot: Annotated[pathlib.Path | None, typer.Option(help="Draw the run to this file (.png, .pdf, .svg).")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of noisy sensors; the same as --set solver.seed=N.")] = None,
@@ -135,13 +129,13 @@ def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -
         "stopped": bool(run.stopped),
         "diverged": bool(run.diverged),
         "solver": {"step": chosen.solver.step, "duration": chosen.solver.duration, "seed": chosen.seed},
-        "versions": _versions(),
+        "versions": show.versions(),
         "files": {name: str(path) for name, path in files.items() if path},
     }
 
 
-def _versions() -> dict[str, str]:
-    return {"diffabs": __version__, "jax": jax.__version__, "python": platform.python_version()}
+app.command()(commands_design.design)
+app.command()(commands_design.certify)
 
 
 @app.command("list")
@@ -149,7 +143,7 @@ def list_parts(
     family: Annotated[
         str | None, typer.Argument(metavar="[FAMILY]", help=f"{', '.join(PLURALS)} or scenarios.")
     ] = None,
-    as_json: Json = False,
+    as_json: console.Json = False,
 ) -> None:
     """Every part with its parameters, defaults, units and ranges; every packaged scenario."""
     with console.guarded():
@@ -185,7 +179,7 @@ def reproduce(
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the results, one folder per paper.")] = pathlib.Path(
         "out"
     ),
-    as_json: Json = False,
+    as_json: console.Json = False,
 ) -> None:
     """A paper's whole result: figures, summary.json, and a table of ours against the published numbers."""
     with console.guarded():
@@ -203,4 +197,4 @@ def reproduce(
             if not as_json:
                 show.paper(results[paper], out / paper)
         if as_json:
-            show.as_json({"out": str(out), "papers": results, "versions": _versions()})
+            show.as_json({"out": str(out), "papers": results, "versions": show.versions()})

@@ -3,6 +3,7 @@
     [plant] [road] [initial] [sensor] [reference] [feedforward] [controller] [actuator] [stop]    a part each: `type`
     [solver]       step [s], duration [s], every (trajectories keep every so many steps), seed (of noisy sensors)
     [objective]    name = a part; adds to, or changes, those of every braking report
+    [design]       what a robust gain is asked for, and over which ranges: see `robust`
 
 What is left out has its default. Speeds may be given in km/h: `speed_kmh`. A value is never evaluated as code."""
 
@@ -18,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import toml
+from diffabs import robust, toml
 from diffabs.catalogue import OTHERS, build, filled, joined, number, shown, unknown, whole, wrong
 from diffabs.catalogue import ScenarioError as ScenarioError
 from diffabs.loop import Loop
@@ -37,7 +38,7 @@ TIME = Spec("s", low=0.0, open_low=True)
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """What is run: a loop, how it is integrated [s], what is measured, and the seed of its noise."""
+    """What is run: a loop, how it is integrated [s], what is measured, the seed of its noise; what a design must do."""
 
     name: str
     title: str = ""
@@ -46,6 +47,7 @@ class Scenario:
     solver: FixedStep = dataclasses.field(default_factory=FixedStep)
     objectives: Mapping[str, Objective] = dataclasses.field(default_factory=lambda: dict(BRAKING))
     seed: int = 0
+    design: robust.Task = dataclasses.field(default_factory=robust.Task)
 
     def key(self) -> jax.Array:
         """The random key of a run."""
@@ -64,19 +66,19 @@ def header(name_or_path: str | pathlib.Path) -> dict[str, str]:
     return {key: _text(table.get(key, ""), key) for key in TEXTS}
 
 
-def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = ()) -> Scenario:
+def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = (), *, integrated: bool = True) -> Scenario:
     """The scenario in a TOML file, or a packaged one, with overrides such as `controller.kp=4000`.
 
     An override's value is a TOML value; a bare word is text, and `1,2` a list. `controller=relay` replaces the part.
     Raises ScenarioError, one line, for a file that cannot be read, unknown names, wrong types, values out of range, and
-    a step that is not stable for the loop.
+    a step that is not stable for the loop (not asked for a scenario that will not be integrated).
     """
     name, raw = _read(name_or_path)
     table = _parsed(raw, str(name_or_path))
     for override in overrides:
         _override(table, override)
     scenario = _assembled(name, table)
-    for lines in (_wrong_values(scenario), _wrong_together(scenario)):
+    for lines in (_wrong_values(scenario), _wrong_together(scenario), _unstable(scenario) if integrated else ()):
         found = [re.sub(r"^plant\.road\b", "road", line) for line in lines]
         if found:
             raise ScenarioError("; ".join(found))
@@ -119,12 +121,15 @@ def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
 
 
 def _lifted(table: dict[str, Any]) -> dict[str, Any]:
-    """The road of the plant in its own section, wherever it was written."""
+    """The road of the plant in its own section, and the ranges of the design by path, however they were written."""
     plant = table.get("plant")
     if isinstance(plant, dict) and "road" in plant:
         if "road" in table:
             raise ScenarioError("road is given twice, as a section and in plant")
         table["road"] = plant.pop("road")
+    design = table.get("design")
+    if isinstance(design, dict) and isinstance(design.get("over"), dict):
+        design["over"] = robust.flat(design["over"])
     return table
 
 
@@ -135,6 +140,8 @@ def _override(table: dict[str, Any], override: str) -> None:
         raise ScenarioError(f"override {shown(override)} is not of the form section.field=value")
     if keys[:2] == ["plant", "road"]:
         keys = keys[1:]
+    if keys[:2] == ["design", "over"] and len(keys) > 2:
+        keys[2:] = [robust.canonical(".".join(keys[2:]))]
     node: Any = table
     for i, key in enumerate(keys[:-1]):
         place = _place(node, key, ".".join(keys[:i]))
@@ -175,13 +182,15 @@ def _assembled(name: str, table: dict[str, Any]) -> Scenario:
     measured = {
         key: build("objective", value, BRAKING.get(key), joined("objective", key)) for key, value in given.items()
     }
+    loop = filled(Loop(), sections, "", "")
     return Scenario(
         name=name,
         **text,
-        loop=filled(Loop(), sections, "", ""),
+        loop=loop,
         solver=solver,
         objectives={**BRAKING, **measured},
         seed=seed,
+        design=robust.read(table.get("design", {}), loop),
     )
 
 
@@ -214,7 +223,7 @@ def _wrong_values(scenario: Scenario) -> Iterator[str]:
 
 
 def _wrong_together(scenario: Scenario) -> Iterator[str]:
-    """What does not go together: parts and step. The dearest question, stability, comes last."""
+    """What does not go together: parts and step."""
     loop, solver = scenario.loop, scenario.solver
     start, end = getattr(loop.initial, "speed", np.inf), getattr(loop.stop, "speed", 0.0)
     if not start > end:
@@ -227,11 +236,13 @@ def _wrong_together(scenario: Scenario) -> Iterator[str]:
         least = solver.duration / MOST_STEPS
         yield f"solver.step = {solver.step:g} s is outside [{least:g}, {solver.duration:g}] s: too many steps"
         return
-    lines = list(loop.grid_problems(solver.step))
-    yield from lines
-    if lines:
-        return
-    largest = stable_step(loop)
+    yield from loop.grid_problems(solver.step)
+
+
+def _unstable(scenario: Scenario) -> Iterator[str]:
+    """A step too long for the loop. The dearest question, so it comes last."""
+    loop, solver = scenario.loop, scenario.solver
+    largest, end = stable_step(loop), getattr(loop.stop, "speed", 0.0)
     if solver.step > largest:
         digit = 10.0 ** (math.floor(math.log10(largest)) - 2)
         largest = math.floor(largest / digit) * digit  # what is printed must be stable too
@@ -251,4 +262,5 @@ def dump(scenario: Scenario) -> str:
     solver = {name: getattr(scenario.solver, name) for name in ("step", "duration", "every")}
     sections["solver"] = {**solver, "seed": scenario.seed}
     sections["objective"] = {name: toml.table("objective", part) for name, part in scenario.objectives.items()}
+    sections["design"] = scenario.design.table()
     return toml.document({key: getattr(scenario, key) for key in TEXTS}, sections)

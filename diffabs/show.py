@@ -1,20 +1,26 @@
 """What the commands show: tables for a person, JSON and CSV for a script."""
 
+import importlib.metadata
 import json
 import math
 import pathlib
+import platform
+from collections.abc import Mapping
 from typing import Any
 
+import jax
 import typer
 from rich.console import Console
 from rich.table import Table
 
+from diffabs import __version__
 from diffabs.catalogue import unit_of
 from diffabs.console import say
 from diffabs.rollout import Trajectory
 from diffabs.scenario import Scenario
 
 PIPE_WIDTH = 140  # columns of a table that goes to a file
+PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
 
 
 def as_json(value: Any) -> None:
@@ -28,6 +34,12 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def versions(*others: str) -> dict[str, str]:
+    """What a result was computed with."""
+    always = {"diffabs": __version__, "jax": jax.__version__, "python": platform.python_version()}
+    return always | {name: importlib.metadata.version(name) for name in others}
 
 
 def write_csv(trajectory: Trajectory, control_unit: str, path: pathlib.Path) -> None:
@@ -94,6 +106,29 @@ def paper(summary: dict[str, Any], folder: pathlib.Path) -> None:
     for note in [notes] if isinstance(notes, str) else notes:
         say(f"note: {note}")
     say(f"figures and summary.json: {folder} ({', '.join(summary['figures'])})")
+
+
+def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict: str) -> None:
+    """A gain, what is proved about it, and the vertices for which it is."""
+    gains = Table("state", "gain")
+    for state, value in zip(result["states"], result["gain"], strict=True):
+        gains.add_row(state, f"{value:.8g}")
+    _print(title, gains)
+    numbers = Table("quantity", "value", "unit")
+    numbers.add_row("quadratically stable", verdict, "")
+    numbers.add_row("verified exactly", "yes" if result["verified_exactly"] else "no", "")
+    for name, unit in PROOF.items():
+        if result[name] is not None:
+            numbers.add_row(name.replace("_", " "), f"{result[name]:.8g}", unit)
+    _print("proof", numbers)
+    corners = result["corners"] or [{} for _ in result["poles"]]
+    discrete = result["period"] is not None
+    names = [f"{name} [{units[name]}]" for name in corners[0]]
+    vertices = Table("vertex", *names, "largest |pole| [1]" if discrete else "slowest pole, real part [1/s]")
+    for i, (corner, pole) in enumerate(zip(corners, result["poles"], strict=True)):
+        vertices.add_row(str(i), *(f"{value:.6g}" for value in corner.values()), f"{pole:.6g}")
+    checked = result["coverage"]["checked"] if result["coverage"] else 0
+    _print(f"{result['vertices']} vertices; their hull covers {checked} systems checked within the ranges", vertices)
 
 
 def _brief(value: Any) -> str:

@@ -9,6 +9,7 @@ import pytest
 from diffabs import catalogue, controllers, roads, scenario
 from diffabs.loop import Loop
 from diffabs.objectives import BRAKING
+from diffabs.robust import Task
 from diffabs.rollout import FixedStep
 from diffabs.scenario import dump, load, names
 
@@ -20,6 +21,7 @@ def assert_same(a: scenario.Scenario, b: scenario.Scenario):
     for x, y in zip(jax.tree.leaves((a.loop, a.objectives)), jax.tree.leaves((b.loop, b.objectives)), strict=True):
         np.testing.assert_array_equal(np.asarray(x, float), np.asarray(y, float))
     assert (a.name, a.title, a.description, a.solver, a.seed) == (b.name, b.title, b.description, b.solver, b.seed)
+    assert a.design == b.design
 
 
 # What is packaged
@@ -42,6 +44,10 @@ def test_slip_lmi_is_the_papers_example():
     assert s.loop.reference.slip == 0.2
     assert s.title
     assert s.description
+    speeds = (s.loop.stop.speed, s.loop.initial.speed)
+    over = {"plant.mass": (5.3, 6.2), "initial.speed": speeds}
+    assert s.design == Task(Q=(11753.0**2, 1.0), R=1.0, over=over)
+    assert s.design.box(s.loop) == {"plant.mass": (5.3, 6.2), "speed": speeds}
 
 
 def test_slip_estimator_is_the_papers_example():
@@ -207,3 +213,85 @@ def test_default_members_of_a_tuple_can_be_changed(file):
     s = load(file(""), ["road=patches", "road.roads.1.c1=0.3"])
     assert s.loop.plant.road.roads[0] is roads.DRY_ASPHALT
     assert s.loop.plant.road.roads[1].c1 == 0.3
+
+
+# What a design is for
+
+RANGES = """
+[design]
+Q = [[4, 1], [1, 3.0]]
+R = [2]
+decay = 1
+damping = 0.25
+"""
+
+
+def test_ranges_are_the_same_however_they_are_written(file):
+    dotted = load(
+        file(
+            RANGES
+            + """[design.over]
+            "plant.mass" = [5, 6.5]
+            "road.scale" = [0.5, 1.0]
+            "initial.speed_kmh" = [3.6, 36.0]
+            [road]
+            type = "scaled"
+            """
+        )
+    )
+    nested = load(
+        file(
+            RANGES
+            + """[design.over]
+            initial = {speed = [1.0, 10.0]}
+            [design.over.plant]
+            mass = [5.0, 6.5]
+            [design.over.plant.road]
+            scale = [0.5, 1]
+            [road]
+            type = "scaled"
+            """
+        )
+    )
+    over = {"plant.mass": (5.0, 6.5), "plant.road.scale": (0.5, 1.0), "initial.speed": (1.0, 10.0)}
+    assert dotted.design == Task(Q=((4.0, 1.0), (1.0, 3.0)), R=(2.0,), decay=1.0, damping=0.25, over=over)
+    assert nested.design == dotted.design
+    assert nested.design.box(nested.loop) == {"plant.mass": (5.0, 6.5), "plant.road.scale": (0.5, 1), "speed": (1, 10)}
+    assert_same(dotted, load(file(dump(dotted))))
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["design.over.plant.road.w4=0.38,0.42", "design.over.road.w4=0.38,0.42", 'design.over."road.w4"=0.38,0.42'],
+)
+def test_overrides_reach_ranges(change):
+    first = "design.over.plant.road.w4=0,1"
+    s = load("slip-lmi", [first, change, "design.Q=1,2", "design.over.initial.speed=2,3", "design.over.plant.mass=5,6"])
+    assert s.design.Q == (1.0, 2.0)
+    assert s.design.over == {"plant.mass": (5, 6), "initial.speed": (2, 3), "plant.road.w4": (0.38, 0.42)}
+
+
+def test_ranges_by_the_names_of_the_linear_model(file):
+    text = """
+    reference = "peak-latch"
+    [controller]
+    type = "sampled"
+    [actuator]
+    type = "series"
+    blocks = ["limits", "lag"]
+    [design.over]
+    "reference.slip" = [0.1, 0.2]
+    "controller.delay" = [0.0, 1e-3]
+    "actuator.blocks.1.time_constant" = [0.01, 0.02]
+    """
+    s = load(file(text))
+    default = (s.loop.stop.speed, s.loop.initial.speed)
+    ranges = {"slip": (0.1, 0.2), "sampling.delay": (0, 1e-3), "actuator.time_constant": (0.01, 0.02)}
+    assert s.design.box(s.loop) == {**ranges, "speed": default}
+    lag = load(file('actuator = "lag"\n[design.over]\nactuator.time_constant = [0.01, 0.02]'))
+    assert lag.design.box(lag.loop) == {"actuator.time_constant": (0.01, 0.02), "speed": default}
+
+
+def test_no_stable_step_is_needed_for_what_is_not_integrated(monkeypatch):
+    monkeypatch.setattr(scenario, "stable_step", lambda loop: pytest.fail("asked"))
+    load("slip-lmi", integrated=False)

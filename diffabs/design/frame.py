@@ -111,7 +111,7 @@ def _hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> 
     n, push = len(a), b @ np.linalg.solve(r, b.T)
     size = np.sqrt(np.linalg.norm(q) / np.linalg.norm(push)) if push.any() else 1.0
     modes, vectors = np.linalg.eig(np.block([[a, -push * size], [-q / size, -a.T]]))
-    stable = vectors[:, np.argsort(modes.real)[:n]]
+    stable = vectors[:, np.argsort(np.real(modes))[:n]]
     try:
         p = size * np.real(stable[n:] @ np.linalg.inv(stable[:n]))
         closed = a - push @ p
