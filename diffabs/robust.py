@@ -1,0 +1,201 @@
+"""The section [design] of a scenario: what a gain is asked for, and the ranges over which it is robust.
+
+    Q, R       weights of the integral of x'Qx + u'Ru: a diagonal or a full matrix
+    decay      1/s
+    damping    of the poles, in [0, 1)
+    [design.over]
+    "plant.mass" = [5.3, 6.2]              # a path of the loop, as elsewhere in scenarios; low and high, in SI
+    "initial.speed_kmh" = [5.0, 50.0]      # or in km/h
+
+A path may be one key with dots or nested tables. Only what the linear model of a loop depends on can have a range."""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from diffabs.actuators import Lag, RateLimit
+from diffabs.blocks import Series
+from diffabs.catalogue import DEEPEST, KMH, ScenarioError, joined, number, shown, unknown, wrong
+from diffabs.controllers import Sampled
+from diffabs.linearize import SlipModel
+from diffabs.loop import Loop
+from diffabs.pytree import Spec, parameters
+
+FIELDS = ("Q", "R", "decay", "damping", "over")
+ENTRY = Spec("1")
+DECAY = Spec("1/s", low=0.0)
+DAMPING = Spec("1", low=0.0, high=1.0, open_high=True)
+
+Range = tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """What a gain is asked for: weights (tuples of their rows, or of a diagonal) or None, decay [1/s], damping, and the
+    ranges given, in SI, by path of the loop."""
+
+    Q: Any = None
+    R: Any = None
+    decay: float = 0.0
+    damping: float = 0.0
+    over: Mapping[str, Range] = dataclasses.field(default_factory=dict)
+
+    def box(self, loop: Loop) -> dict[str, Range]:
+        """The ranges by path of the loop's linear model, that of the speed between the loop's start and its stop if
+        none was given."""
+        start, end = getattr(loop.initial, "speed", None), getattr(loop.stop, "speed", None)
+        over, known = dict(self.over), _known(loop)
+        if start is not None and end is not None:
+            over.setdefault("initial.speed", (float(end), float(start)))
+        return {known[path].model: ends for path, ends in over.items()}
+
+    def table(self) -> dict[str, Any]:
+        """As values of TOML."""
+        weights = {name: _listed(getattr(self, name)) for name in ("Q", "R") if getattr(self, name) is not None}
+        over = {path: list(ends) for path, ends in self.over.items()}
+        return {**weights, "decay": self.decay, "damping": self.damping, "over": over}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Parameter:
+    """What can have a range: its path in the linear model, its values, and whether it is more than one number."""
+
+    model: str
+    spec: Spec
+    shape: tuple[int, ...] = ()
+
+
+def read(table: Any, loop: Loop) -> Task:
+    """The task of a section. Raises ScenarioError, one line, for whatever is wrong with it."""
+    if not isinstance(table, dict):
+        raise wrong("design", table, f"a table of {', '.join(FIELDS)}")
+    for key in table:
+        if key not in FIELDS:
+            raise unknown(f"{joined('design', key)} is not a field of design", key, FIELDS)
+    weights = {name: _weight(table[name], f"design.{name}") for name in ("Q", "R") if name in table}
+    if len(weights) == 1:
+        (there,), (missing,) = weights, {"Q", "R"} - set(weights)
+        raise ScenarioError(f"design.{missing} is missing: with design.{there}, a cost needs both")
+    numbers = {}
+    for name, spec in (("decay", DECAY), ("damping", DAMPING)):
+        numbers[name] = number(table.get(name, 0.0), spec, f"design.{name}")
+        if not spec.holds(numbers[name]):
+            raise ScenarioError(f"design.{name} = {shown(numbers[name])} is outside {spec.interval()}")
+    return Task(**weights, **numbers, over=_over(table.get("over", {}), loop))
+
+
+def flat(over: Mapping[str, Any]) -> dict[str, Any]:
+    """The ranges by dotted path, whether they were written as nested tables or with dotted keys. Raises ScenarioError
+    for a path that comes twice."""
+    found: dict[str, Any] = {}
+    pending = list(over.items())
+    while pending:
+        path, value = pending.pop(0)
+        if path.count(".") > DEEPEST:
+            raise ScenarioError(f"design.over: {shown(path)} is nested more than {DEEPEST} deep")
+        if isinstance(value, dict):
+            pending[:0] = [(f"{path}.{key}", item) for key, item in value.items()]
+            continue
+        path = canonical(path)
+        if path in found:
+            raise ScenarioError(f"{_where(path)} is given twice")
+        found[path] = value
+    return found
+
+
+def canonical(path: str) -> str:
+    """A path as messages have it: without the quotes of a key, the road in a section of its own."""
+    path = path.replace('"', "").replace("'", "")
+    return path.removeprefix("plant.") if path.startswith("plant.road.") else path
+
+
+def _where(path: str) -> str:
+    return f"design.over.{path if re.fullmatch(r'[a-zA-Z0-9_.-]{1,60}', path) else shown(path)}"
+
+
+def _weight(given: Any, path: str) -> Any:
+    """A weight as a number or nested tuples, which compare; its order is for the model to say."""
+    from diffabs.design.spec import weight
+
+    if not isinstance(given, list):
+        if isinstance(given, bool) or not isinstance(given, int | float):
+            raise wrong(path, given, "a number, a diagonal or a matrix")
+        value = number(given, ENTRY, path)
+    elif any(isinstance(row, list) for row in given):
+        if not all(isinstance(row, list) and len(row) == len(given) for row in given):
+            raise ScenarioError(f"{path} = {shown(given)} is not square: {len(given)} rows need as many numbers each")
+        value = tuple(
+            tuple(number(x, ENTRY, f"{path}.{i}.{j}") for j, x in enumerate(row)) for i, row in enumerate(given)
+        )
+    else:
+        value = tuple(number(item, ENTRY, f"{path}.{i}") for i, item in enumerate(given))
+    if given == []:
+        raise ScenarioError(f"{path} = [] is empty")
+    try:
+        weight(path, value, len(np.atleast_1d(value)), definite=path == "design.R")
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
+    return value
+
+
+def _over(table: Any, loop: Loop) -> dict[str, Range]:
+    if not isinstance(table, dict):
+        raise wrong("design.over", table, "a table of ranges")
+    known = {canonical(path): (path, parameter, 1.0) for path, parameter in _known(loop).items()}
+    known |= {f"{key}_kmh": (path, of, KMH) for key, (path, of, _) in known.items() if of.spec.unit == "m/s"}
+    found: dict[str, Range] = {}
+    for key, given in flat(table).items():
+        if key not in known:
+            raise unknown(f"{_where(key)} is nothing that the linear model of this loop depends on", key, known)
+        path, parameter, scale = known[key]
+        if path in found:
+            raise ScenarioError(f"{_where(canonical(path))} is given twice, in m/s and in km/h")
+        found[path] = _range(given, parameter, _where(key), scale)
+    return found
+
+
+def _range(given: Any, parameter: _Parameter, path: str, scale: float) -> Range:
+    """Low and high end in SI, checked in the unit in which they were given."""
+    spec = parameter.spec
+    if scale != 1:
+        spec = dataclasses.replace(spec, unit="km/h", low=spec.low * scale, high=spec.high * scale)
+    if parameter.shape:
+        raise ScenarioError(f"{path} is a list of {parameter.shape[0]} numbers; only single numbers can have a range")
+    if not isinstance(given, list):
+        raise wrong(path, given, f"a range [low, high] in {spec.interval()}")
+    if len(given) != 2:
+        raise ScenarioError(f"{path} = {shown(given)} is no range [low, high] in {spec.interval()}")
+    low, high = (number(item, spec, f"{path}.{i}") for i, item in enumerate(given))
+    if not spec.holds(np.array([low, high])):
+        raise ScenarioError(f"{path} = {shown([low, high])} is outside {spec.interval()}")
+    if low > high:
+        raise ScenarioError(f"{path} = {shown([low, high])} is inverted: a range [low, high] in {spec.interval()}")
+    return low / scale, high / scale
+
+
+def _known(loop: Loop) -> dict[str, _Parameter]:
+    """What can have a range, by path of the loop. The model's names for the rest of the loop are `reduction`'s."""
+    model = {field.name: field.metadata["spec"] for field in dataclasses.fields(SlipModel) if "spec" in field.metadata}
+    found = {"initial.speed": _Parameter("speed", model["speed"]), "reference.slip": _Parameter("slip", model["slip"])}
+    for path, spec, value in parameters(loop.plant, "plant."):
+        found[path] = _Parameter(path, spec, np.shape(value))
+    actuators = {"actuator.": loop.actuator}
+    if isinstance(loop.actuator, Series):
+        actuators = {f"actuator.blocks.{i}.": block for i, block in enumerate(loop.actuator.blocks)}
+    for prefix, block in actuators.items():
+        if isinstance(block, Lag | RateLimit):
+            found |= _one(block, prefix, "time_constant", "actuator.time_constant")
+    if isinstance(loop.controller, Sampled):
+        found |= _one(loop.controller, "controller.", "delay", "sampling.delay")
+    return found
+
+
+def _one(part: Any, prefix: str, name: str, model: str) -> dict[str, _Parameter]:
+    return {path: _Parameter(model, spec) for path, spec, _ in parameters(part, prefix) if path == prefix + name}
+
+
+def _listed(value: Any) -> Any:
+    return [_listed(item) for item in value] if isinstance(value, tuple) else value
