@@ -12,7 +12,7 @@ pytest.importorskip("matplotlib")
 
 from diffabs import FixedStep, Loop, measure, plot, rollout
 from diffabs.objectives import BRAKING
-from diffabs.papers import PAPERS, record, slip_lmi
+from diffabs.papers import PAPERS, lmi_design, record, slip_lmi
 from diffabs.references import FixedSlip
 
 pytestmark = pytest.mark.xdist_group("papers")  # one worker makes what these share
@@ -85,6 +85,41 @@ def test_the_order_of_the_step(lmi):
         assert row["ours"] == pytest.approx(4.0, abs=0.3), row
     for row in _rows(lmi, "order of the step: 5.3 kg, torque unlimited"):
         assert row["ours"] == pytest.approx(3.1, abs=0.1), row
+
+
+def test_the_design_is_that_of_other_solvers(lmi):
+    for weights in lmi_design.REFERENCE:
+        rows = {
+            r["quantity"]: r for r in lmi["rows"] if r["name"] == f"LMI, Q = diag({weights[0]:.6g}, {weights[1]:g})"
+        }
+        assert rows["trace Z"]["ours"] == pytest.approx(rows["trace Z"]["reference"], rel=1e-6)
+        for name in ("k1", "k2"):
+            assert rows[name]["ours"] == pytest.approx(rows[name]["reference"], rel=1e-3)
+    for answer in lmi["design"]["designs"]:
+        assert answer["certificate"]["verified_exactly"]
+        assert answer["lower_bound"] <= answer["trace_cost"]
+
+
+def test_the_verdicts_on_the_published_gain(lmi):
+    rows = [row for row in lmi["rows"] if row["quantity"] in ("common Lyapunov matrix", "proved stable")]
+    assert [row["ours"] for row in rows] == [0.0, 0.0, 1.0, 1.0, 1.0]
+    assert all(verdict["verified_exactly"] for verdict in lmi["design"]["verdicts"])
+    (row,) = _rows(lmi, "k1 = -11753")
+    assert row["ours"] == pytest.approx(76.63, abs=5e-3)
+    for row in _rows(lmi, "published gain at 50 km/h"):
+        assert row["ours"] == pytest.approx(row["reference"], rel=1e-3)
+
+
+def test_printed_inequalities_cost_more(lmi):
+    """Eq. (31) as printed covers systems that do not exist, so its cost is higher."""
+    costs = [[answer["trace_cost"] for answer in lmi["design"][name]] for name in ("designs", "as_printed")]
+    assert all(printed > right * 1.005 for right, printed in zip(*costs, strict=True))
+
+
+def test_overshoot_under_other_gains(lmi):
+    (same,), (gentle,) = _rows(lmi, "LMI, same k1"), _rows(lmi, "K = [-121.8, -158.2]")
+    assert round(same["ours"], 3) == 0.205
+    assert round(gentle["ours"], 4) == 0.0049
 
 
 def test_all_twenty_numbers_round_to_the_printed_ones(estimator):
@@ -184,3 +219,13 @@ def test_a_figure_that_fails_leaves_nothing_behind(tmp_path):
     with pytest.raises(ValueError, match="nonsense"):
         plot.save(figure, tmp_path / "x.nonsense")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_solver_the_design_is_left_out(monkeypatch):
+    def missing():
+        raise ModuleNotFoundError('robust design needs cvxpy: pip install "diffabs[design]"', name="cvxpy")
+
+    monkeypatch.setattr(lmi_design, "Designed", missing)
+    rows, figures, more = slip_lmi._designed({}, None)
+    assert (rows, figures, more["design"]) == ([], {}, None)
+    assert 'pip install "diffabs[design]"' in more["notes"][0]
