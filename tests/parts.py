@@ -62,6 +62,12 @@ CONTROLLERS: dict[str, Any] = {
         torque_max=30.0,
         antiwindup=controllers.BackCalculation(tracking_time=0.02),
     ),
+    "scheduled feedback": controllers.ScheduledFeedback(
+        speeds=np.array([2.0, 11.0, 24.0]),
+        integral_gains=np.array([-900.0, -1100.0, -1000.0]),
+        gains=np.array([-60.0, -110.0, -150.0]),
+        torque_max=40.0,
+    ),
     "constant torque": controllers.ConstantTorque(),
     "relay": controllers.Relay(torque_min=2.0),
     "sliding mode": controllers.SlidingMode(gain=60.0, boundary=0.1, torque_max=70.0),

@@ -9,7 +9,17 @@ import pytest
 
 from diffabs.actuators import Delay, Lag, Limits, RateLimit
 from diffabs.blocks import Series
-from diffabs.controllers import PID, BackCalculation, Clamping, NoAntiWindup, Relay, Sampled, SlidingMode, StateFeedback
+from diffabs.controllers import (
+    PID,
+    BackCalculation,
+    Clamping,
+    NoAntiWindup,
+    Relay,
+    Sampled,
+    ScheduledFeedback,
+    SlidingMode,
+    StateFeedback,
+)
 from diffabs.controllers.pid import PIDMemory
 from diffabs.integrate import rk4_step
 from diffabs.protocols import BrakeOutput, Clock, Memory, Sample, Tracking
@@ -97,6 +107,32 @@ def test_state_feedback_by_hand():
     k = StateFeedback()
     close(k.output(0.0, Memory(2e-4), tracking(-0.05, 2.5)), 2.5 - 11753.0 * 2e-4 - 48.0 * 0.05)
     close(k.flow(0.0, Memory(2e-4), tracking(-0.05)), 0.05)
+
+
+def test_scheduled_feedback_interpolates_its_gains():
+    """At a node, between nodes, and beyond the last: against StateFeedback with the gain by hand."""
+    k = ScheduledFeedback(
+        speeds=np.array([2.0, 4.0]), integral_gains=np.array([-10.0, -30.0]), gains=np.array([-1.0, -5.0])
+    )
+    for speed, gain in ((2.0, (-10.0, -1.0)), (3.5, (-25.0, -4.0)), (9.0, (-30.0, -5.0))):
+        signal = tracking(0.1, 2.5)
+        signal = signal._replace(measured=signal.measured._replace(speed=speed))
+        fixed = StateFeedback(gain=np.array(gain))
+        close(k.output(0.0, Memory(0.3), signal), fixed.output(0.0, Memory(0.3), signal))
+        close(k.flow(0.0, Memory(0.3), signal), fixed.flow(0.0, Memory(0.3), signal))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"gains": np.array([-1.0])}, "they need one"),
+        ({"speeds": np.array([3.0, 2.0])}, "do not increase"),
+        ({"torque_min": 3.0, "torque_max": 2.0}, "exceeds torque_max"),
+    ],
+)
+def test_scheduled_feedback_refuses(change, message):
+    with pytest.raises(ValueError, match=message):
+        check(ScheduledFeedback(**change))
 
 
 def test_relay_switches_on_the_far_side_of_its_band():

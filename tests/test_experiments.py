@@ -54,3 +54,27 @@ def test_the_laboratory_rig_locks_and_its_brake_is_too_slow_for_the_published_ga
             np.testing.assert_allclose(row["ours"], row["reference"], rtol=1e-7, atol=0)
     critical = [value for row in module.critical_lags(config) for value in row.values() if isinstance(value, float)]
     assert any(abs(value - 4.02e-3) < 2e-5 or abs(value - 4.02) < 2e-2 for value in critical), critical
+
+
+def test_nothing_drawn_from_three_uncertainties_is_slower_than_proved(tmp_path):
+    module = experiment("three_uncertainties")
+    result = module.main(module.Config(samples=10_000, out=str(tmp_path)))
+    found = {row["quantity"]: row["value"] for row in result["table"]}
+    assert found["proved exactly"]
+    assert found["slower than proved"] == 0
+    assert found["loops drawn"] == 10_000
+    assert found["decay rate proved [1/s]"] >= 6.0
+    assert found["slowest of them [1/s]"] < 1.01 * found["decay rate proved [1/s]"]  # the proof is not idle
+    assert list(tmp_path.glob("*.png"))
+
+
+def test_each_specification_of_a_robust_gain_is_kept(tmp_path):
+    module = experiment("robust_design")
+    config = module.Config(out=str(tmp_path), cells=4)
+    result = module.main(config)
+    rows = {row["specification"]: row for row in result["table"]}
+    assert all(row["proved exactly"] for row in rows.values())
+    assert rows["decay"]["decay proved [1/s]"] >= config.decay
+    assert all(row["guaranteed cost"] >= rows["cost alone"]["guaranteed cost"] * 0.999 for row in rows.values())
+    assert rows["damping"]["overshoot [%]"] < rows["cost alone"]["overshoot [%]"] / 2
+    assert rows["scheduled"]["decay proved [1/s]"] > rows["cost alone"]["decay proved [1/s]"]

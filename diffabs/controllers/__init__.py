@@ -9,6 +9,7 @@ from diffabs.controllers.feedforward import HoldingInput as HoldingInput
 from diffabs.controllers.feedforward import NoFeedforward as NoFeedforward
 from diffabs.controllers.pid import PID as PID
 from diffabs.controllers.sampled import Sampled as Sampled
+from diffabs.controllers.scheduled import ScheduledFeedback as ScheduledFeedback
 from diffabs.controllers.switching import ConstantTorque as ConstantTorque
 from diffabs.controllers.switching import Relay as Relay
 from diffabs.controllers.switching import SlidingMode as SlidingMode

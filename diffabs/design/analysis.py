@@ -42,7 +42,7 @@ def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *,
     if isinstance(system, Schedule):
         from diffabs.design.scheduled import certify_schedule
 
-        return certify_schedule(gain, system, spec)
+        return certify_schedule(gain, system, spec, fastest=fastest)
     spec = spec.checked(system.order, system.inputs)
     k = checked_gain(gain, (system.inputs, system.order))
     return Certificate(system, k, tuple(_Analysis(system, k, spec).claims(fastest)))

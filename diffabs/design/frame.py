@@ -140,9 +140,10 @@ def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | N
             a = a / max(1.0, 1.02 * np.abs(modes).max())
         else:
             a = a - (max(0.0, 1.02 * modes.real.max()) + 1e-6 * np.abs(modes).max() + 1e-300) * np.eye(n)
-        q = np.diag(units**-2.0) if weight is None else weight
+        a = a * units / units[:, None]
+        q = np.eye(n) if weight is None else weight * units * units[:, None]
         p = solve_discrete_lyapunov(a.T, q) if discrete else solve_continuous_lyapunov(a.T, -q)
-        mean += p / (np.trace(units[:, None] * p * units) if weight is None else len(closed))
+        mean += p / units / units[:, None] / (np.trace(p) if weight is None else len(closed))
     try:
         return frame(mean, closed, np.eye(1), discrete=discrete)
     except np.linalg.LinAlgError:  # a mode on the edge of stability, or a weight that is blind to a state
