@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from diffabs import check
 from diffabs.actuators import Delay, Lag, Limits, RateLimit
 from diffabs.blocks import Series
 from diffabs.controllers import (
