@@ -24,6 +24,8 @@ lint: $(VENV)/.lint
 
 bench: $(VENV)/.bench
 	$(BIN)/python benchmarks/bench_rollout.py
+	$(BIN)/python benchmarks/bench_riccati.py
+	$(BIN)/python benchmarks/bench_design.py
 
 mutations: $(VENV)/.test
 	$(BIN)/python tests/mutations.py

@@ -1,0 +1,253 @@
+"""Riccati and Lyapunov equations against SciPy, closed forms, published gains, and two control libraries."""
+
+import contrax
+import control
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg as sl
+
+from diffabs.design.lyapunov import discrete_lyapunov, lyapunov
+from diffabs.design.regulator import dlqr, lqr, unstabilisable
+from diffabs.design.riccati import care, dare
+
+ALPHA, BETA, FAST, SLOW = 83.8796606703, 133.472842636189, 140.291806958, 14.0291806958
+CARE, DARE = jax.jit(care), jax.jit(dare)
+
+
+def rig(speed=FAST):
+    return np.array([[0.0, 1.0], [0.0, ALPHA / speed]]), np.array([[0.0], [BETA / speed]])
+
+
+def random_problem(n, seed, m=None):
+    random = np.random.default_rng([n, seed])
+    m = m or 1 + n // 4
+    a, b, s = random.normal(size=(n, n)), random.normal(size=(n, m)), 0.1 * random.normal(size=(n, m))
+    q, r = (x @ x.T + 0.5 * np.eye(len(x)) for x in (random.normal(size=(n, n)), random.normal(size=(m, m))))
+    return a, b, q, r, s
+
+
+def polished(a, b, q, r, s, p):
+    """SciPy's P after two Newton-Kleinman steps: its own residual is often the larger one."""
+    for _ in range(2):
+        k = np.linalg.solve(r, b.T @ p + s.T)
+        p = sl.solve_continuous_lyapunov((a - b @ k).T, -(q + k.T @ r @ k - s @ k - k.T @ s.T))
+    return p
+
+
+def relative(a, b):
+    return np.linalg.norm(a - b) / np.linalg.norm(b)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 5, 7, 8, 9, 10))])
+def test_care_is_scipys(n):
+    for seed in range(6):
+        a, b, q, r, s = random_problem(n, seed, m=1 + n // 4)
+        found = CARE(a, b, q, r, s)
+        assert found.stabilising
+        assert found.residual < 1e-13
+        exact = polished(a, b, q, r, s, sl.solve_continuous_are(a, b, q, r, s=s))
+        assert relative(found.P, exact) < 1e-11
+
+
+@pytest.mark.parametrize("n", [1, 3, *(pytest.param(n, marks=pytest.mark.slow) for n in (6, 10))])
+def test_dare_is_scipys(n):
+    for seed in range(6):
+        a, b, q, r, s = random_problem(n, seed, m=1 + n // 4)
+        found = DARE(a, b, q, r, s)
+        assert found.stabilising
+        assert relative(found.P, sl.solve_discrete_are(a, b, q, r, s=s)) < 1e-10
+
+
+@pytest.mark.parametrize("speed", [FAST, SLOW])
+@pytest.mark.parametrize("q", [(11753.0**2, 1.0), (1.38e8, 1.0), (1e6, 1e4), (1.0, 1.0), (1e-5, 1e5)])
+def test_the_rig_is_its_closed_form(speed, q):
+    a, b = rig(speed)
+    found = lqr(a, b, np.diag(q), np.eye(1))
+    k1, c = -np.sqrt(q[0]), ALPHA / BETA
+    k2 = -(c + np.sqrt(c**2 + q[1] - 2 * k1 * speed / BETA))
+    np.testing.assert_allclose(found.gain[0], [k1, k2], rtol=1e-11)
+    np.testing.assert_allclose(np.trace(found.P), k1 * k2 + k1 * c - k2 * speed / BETA, rtol=1e-11)
+
+
+def test_published_gain_of_the_arm():
+    """A two-wheeler balanced by an arm, linearised; Q = I, R = 1 (F = -K there)."""
+    rows = [
+        (12.9180668385, -4.45395728949, 70.2901931216, 0, 26.6593633961, 8.14807608114),
+        (-11.7727635355, 23.7491365472, -143.727708323, 0, -99.2915341084, -16.6609913898),
+        (-11.9588753223, 8.35116991779, -161.19827877, 0, -49.9863063677, -19.4443093188),
+    ]
+    a = np.vstack([np.hstack([np.zeros((3, 3)), np.eye(3)]), rows])
+    b = np.array([[0, 0, 0, -0.888586207456, 3.30949717047, 1.66609913898]]).T
+    found = lqr(a, b, np.eye(6), np.eye(1))
+    f = (-24208.064, -2293.1921, -7667.1, -8683.2995, -889.36867, -2860.7285)
+    np.testing.assert_allclose(found.gain[0], -np.array(f), rtol=2e-6)  # as precise as the entries of A
+    assert found.residual < 1e-12
+
+
+def test_two_control_libraries_agree():
+    a, b, q, r, _ = random_problem(3, 0)
+    found = lqr(a, b, q, r)
+    np.testing.assert_allclose(-found.gain, control.lqr(a, b, q, r)[0], rtol=1e-9)
+    np.testing.assert_allclose(-found.gain, contrax.care(*map(jnp.asarray, (a, b, q, r))).K, rtol=1e-9)
+    found = dlqr(a, b, q, r)
+    np.testing.assert_allclose(-found.gain, contrax.dare(*map(jnp.asarray, (a, b, q, r))).K, rtol=1e-9)
+    np.testing.assert_allclose(-found.gain, control.dlqr(a, b, q, r)[0], rtol=1e-9)
+
+
+def test_lyapunov_equations_are_scipys():
+    for n in (1, 3, 6):
+        a, _, q, *_ = random_problem(n, 1)
+        np.testing.assert_allclose(lyapunov(a, q).P, sl.solve_continuous_lyapunov(a.T, -q), rtol=1e-9, atol=1e-9)
+        a = a / (1.1 * np.abs(np.linalg.eigvals(a)).max())
+        found = discrete_lyapunov(a, q)
+        np.testing.assert_allclose(found.P, sl.solve_discrete_lyapunov(a.T, q), rtol=1e-9, atol=1e-9)
+        assert found.residual < 1e-13
+
+
+# derivatives
+
+
+def scalar(solver, weights):
+    return lambda *data: jnp.sum(weights * solver(*data).P)
+
+
+@pytest.mark.parametrize("solver", [care, pytest.param(dare, marks=pytest.mark.slow)])
+def test_gradients_are_differences(solver):
+    data = random_problem(3, 3)
+    function = scalar(solver, np.random.default_rng(0).normal(size=(3, 3)))
+    reverse = jax.jit(jax.grad(function, (0, 1, 2, 3, 4)))(*data)
+    forward = jax.jit(jax.jacfwd(function, (0, 1, 2, 3, 4)))(*data)
+    value = jax.jit(function)
+    for i, (back, ahead) in enumerate(zip(reverse, forward, strict=True)):
+        np.testing.assert_allclose(back, ahead, rtol=1e-9, atol=1e-9 * np.abs(ahead).max())
+        direction = np.random.default_rng(i).normal(size=data[i].shape)
+        direction = direction + direction.T if i in (2, 3) else direction
+        h = 1e-4
+
+        def at(step, i=i, direction=direction):
+            moved = [x + step * direction if j == i else x for j, x in enumerate(data)]
+            return value(*moved)
+
+        difference = (8 * (at(h) - at(-h)) - (at(2 * h) - at(-2 * h))) / (12 * h)
+        np.testing.assert_allclose(np.sum(np.asarray(back) * direction), difference, rtol=1e-6)
+
+
+def test_gradient_of_the_rigs_gain_in_its_weights():
+    """k1 = -sqrt(q1/R): its derivative in log q1 is k1/2."""
+    a, b = rig()
+
+    def k1(log_q1):
+        return lqr(a, b, jnp.diag(jnp.array([jnp.exp(log_q1), 1.0])), jnp.eye(1)).gain[0, 0]
+
+    value, slope = jax.value_and_grad(k1)(np.log(1.38e8))
+    np.testing.assert_allclose(slope, value / 2, rtol=1e-9)
+
+
+def test_batched_is_single():
+    problems = [random_problem(3, seed) for seed in range(5)]
+    batch = [np.stack(x) for x in zip(*problems, strict=True)]
+    many = jax.jit(jax.vmap(care))(*batch)
+    for i, problem in enumerate(problems):
+        one = care(*problem)
+        np.testing.assert_allclose(many.P[i], one.P, rtol=1e-12, atol=1e-12 * np.abs(one.P).max())
+    shared = jax.vmap(care, (0, None, None, None))(batch[0], *problems[0][1:4])
+    np.testing.assert_allclose(shared.P[0], care(*problems[0][:4]).P, rtol=1e-12, atol=1e-13)
+
+
+# what has no answer
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "q"),
+    [
+        (np.diag([1.0, -1.0]), [[0.0], [1.0]], np.eye(2)),  # an unstable mode that the input does not move
+        (np.zeros((2, 2)), [[0.0], [0.0]], np.eye(2)),
+        ([[0.0, 1.0], [-1.0, 0.0]], [[0.0], [1.0]], np.zeros((2, 2))),  # undamped, and unseen by the cost
+        ([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], np.diag([0.0, 1.0])),  # an integrator that the cost does not see
+        (np.diag([1.0, -1.0]), [[1.0], [1.0]], -100 * np.eye(2)),
+        (np.diag([np.nan, -1.0]), [[1.0], [1.0]], np.eye(2)),
+    ],
+)
+def test_what_has_no_solution_is_reported(a, b, q):
+    found = CARE(np.array(a), np.array(b), q, np.eye(1))
+    assert not found.stabilising
+    assert np.isnan(found.P).all()
+
+
+def test_a_weight_that_is_not_definite_is_reported():
+    a, b = rig()
+    assert not CARE(a, b, np.eye(2), -np.eye(1)).stabilising
+    assert not DARE(a, b, np.eye(2), -np.eye(1)).stabilising
+
+
+def test_repeated_poles_and_unseen_unstable_modes():
+    jordan = np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]])
+    b = np.array([[0.0], [0.0], [1.0]])
+    for q in (np.eye(3), np.zeros((3, 3))):  # without a cost the poles are mirrored, to -1 three times
+        found = CARE(jordan, b, q, np.eye(1))
+        assert found.stabilising
+        closed = jordan - b @ b.T @ found.P
+        assert np.linalg.eigvals(closed).real.max() < -0.9
+
+
+def test_nearly_unstabilisable_is_right_or_reported():
+    reported = 0
+    for coupling in 10.0 ** -np.arange(0.0, 15.0):
+        a, b = np.diag([1.0, -2.0]), np.array([[coupling], [1.0]])
+        found = CARE(a, b, np.eye(2), np.eye(1))
+        if not found.stabilising:
+            reported += 1
+            continue
+        # scaled by the coupling the first state is moved by 1, and the problem is a good one but for its weight
+        unit = np.diag([coupling, 1.0])
+        exact = polished(a, np.ones((2, 1)), unit @ unit, np.eye(1), np.zeros((2, 1)),
+                         sl.solve_continuous_are(a, np.ones((2, 1)), unit @ unit, np.eye(1)))  # fmt: skip
+        p = unit @ np.asarray(found.P) @ unit
+        assert relative(p, exact) < 1e-6, coupling
+    assert reported <= 8  # from a coupling of 1e-7 on
+
+
+def test_no_silent_failure_among_a_thousand():
+    random = np.random.default_rng(7)
+    a, b = (np.stack([rig(speed)[i] for speed in np.geomspace(SLOW, FAST, 1000)]) for i in (0, 1))
+    q = np.stack([np.diag(x) for x in 10.0 ** random.uniform(-5, 5, (1000, 2))])
+    r = 10.0 ** random.uniform(-5, 5, (1000, 1, 1))
+    found = jax.jit(jax.vmap(care))(a, b, q, r)
+    fine = np.asarray(found.stabilising)
+    assert fine.sum() > 990
+    q1, q2, r, speed = q[:, 0, 0], q[:, 1, 1], r[:, 0, 0], np.geomspace(SLOW, FAST, 1000)
+    k1, c = -np.sqrt(q1 / r), ALPHA / BETA
+    k2 = -(c + np.sqrt(c**2 + q2 / r - 2 * k1 * speed / BETA))
+    trace = r * (k1 * k2 + k1 * c - k2 * speed / BETA)
+    np.testing.assert_allclose(np.trace(found.P, axis1=1, axis2=2)[fine], trace[fine], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"A": np.zeros((2, 3))}, r"A has shape \(2, 3\) and B \(2, 1\)"),
+        ({"B": np.zeros((3, 1))}, r"B \(3, 1\); \(n, n\) and \(n, m\) are needed"),
+        ({"Q": np.eye(3)}, r"Q has shape \(3, 3\); \(2, 2\) is needed"),
+        ({"Q": np.array([[1.0, 1.0], [0.0, 1.0]])}, "Q = .* is not symmetric"),
+        ({"R": np.zeros((1, 1))}, r"R is not positive definite: an eigenvalue is 0, outside \(0, inf\)"),
+        ({"A": np.full((2, 2), np.inf)}, "not finite"),
+        ({"B": np.zeros((2, 1))}, "not stabilisable: the input does not move the mode at"),
+    ],
+)
+def test_bad_matrices(change, message):
+    a, b = rig()
+    given = {"A": a, "B": b, "Q": np.eye(2), "R": np.eye(1)} | change
+    for regulator in (lqr, dlqr):
+        if "mode" in message and regulator is dlqr:
+            given["A"] = np.diag([1.5, 0.5])
+        with pytest.raises(ValueError, match=message):
+            regulator(**given)
+
+
+def test_the_mode_that_is_not_moved():
+    assert unstabilisable(np.diag([0.6, -1.0]), [[0.0], [1.0]]) == 0.6
+    assert unstabilisable(np.diag([-0.6, 1.0]), [[0.0], [1.0]]) is None
+    assert unstabilisable(np.diag([-0.6, 1.0]), [[0.0], [1.0]], discrete=True) is None
+    assert unstabilisable(np.diag([-1.6, 0.1]), [[0.0], [1.0]], discrete=True) == -1.6
