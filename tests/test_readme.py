@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from diffabs.cli import app
 
 TEXT = (pathlib.Path(__file__).parent.parent / "README.md").read_text()
-CODE = re.search(r"```python\n(.*?)```", TEXT, re.DOTALL)[1]
+CODE, DESIGN = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 
 def test_the_twelve_lines_run():
@@ -34,7 +34,15 @@ def test_4096_masses_and_roads_in_one_call():
     np.testing.assert_allclose(overshoot[1234], one["overshoot"], rtol=1e-10)
 
 
-@pytest.mark.parametrize("command", re.findall(r"^    diffabs (list .*)$", TEXT, re.MULTILINE))
+def test_the_robust_design_runs():
+    names = {}
+    exec(compile(DESIGN, "README.md", "exec"), names)
+    assert names["found"].certificate.verified_exactly
+    assert names["found"].certificate.decay_rate >= 20.0
+    assert names["published"].quadratically_stable is False
+
+
+@pytest.mark.parametrize("command", re.findall(r"^    diffabs ((?:list|certify) .*)$", TEXT, re.MULTILINE))
 def test_commands_exist(command):
     assert CliRunner().invoke(app, command.split()).exit_code == 0
 
