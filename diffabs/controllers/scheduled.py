@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.controllers.antiwindup import NoAntiWindup
+from diffabs.controllers.feedback import StateFeedback
 from diffabs.controllers.pid import limit_problems
-from diffabs.numerics import clamp
 from diffabs.protocols import Memory, Tracking, no_jump
 from diffabs.pytree import Scalar, Vector, param, part, pytree
 
@@ -30,30 +30,22 @@ class ScheduledFeedback:
     torque_max: Scalar = param(default=np.inf, unit="N m", infinite=True)
     antiwindup: Any = part(default=NoAntiWindup)
 
-    def start(self, signal: Tracking) -> Memory:
-        """x1(0) = 0."""
-        return Memory(flow=0.0 * signal.measured.slip)
-
-    def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """x1' = slip - target, unless the anti-windup says otherwise."""
-        raw, limited = self._torque(memory, signal)
-        error = signal.measured.slip - signal.target
-        return self.antiwindup.rate(error, self._gain(signal, self.integral_gains), raw, limited)
-
-    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Torque [N m]."""
-        return self._torque(memory, signal)[1]
-
+    start = StateFeedback.start
     jump = no_jump
 
-    def _gain(self, signal: Tracking, gains: Vector) -> Any:
-        return jnp.interp(signal.measured.speed, self.speeds, gains)
+    def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Any:
+        """x1' = slip - target, unless the anti-windup says otherwise."""
+        return self._here(signal).flow(t, memory, signal)
 
-    def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
-        error = signal.measured.slip - signal.target
-        integral, proportional = self._gain(signal, self.integral_gains), self._gain(signal, self.gains)
-        raw = signal.feedforward + integral * memory.flow + proportional * error
-        return raw, clamp(raw, self.torque_min, self.torque_max)
+    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Any:
+        """Torque [N m]."""
+        return self._here(signal).output(t, memory, signal)
+
+    def _here(self, signal: Tracking) -> StateFeedback:
+        """The feedback at the measured speed."""
+        rows = (jnp.interp(signal.measured.speed, self.speeds, gains) for gains in (self.integral_gains, self.gains))
+        limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
+        return StateFeedback(gain=jnp.stack(list(rows)), **limits, antiwindup=self.antiwindup)
 
     def problems(self) -> Iterator[str]:
         """Lists of different lengths, speeds that do not increase, limits that exclude each other."""

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.design import document, exact
+from diffabs.design import document, exact, shapes
 from diffabs.design.polytope import Polytope, Schedule
 
 QUADRATIC = ("decay", "cost", "damping", "l2", "input")  # each has one P > 0 that decreases at every vertex
@@ -61,9 +61,9 @@ class Certificate:
         object.__setattr__(self, "gain", read_only(gain[None]) if gain.ndim == 1 else gain)
         object.__setattr__(self, "system", frozen(self.system))
         object.__setattr__(self, "claims", tuple(self.claims))
-        exact.check_gain(self.system, self.gain)
+        shapes.check_gain(self.system, self.gain)
         for claim in self.claims:
-            exact.check(claim.kind, self.system, self.gain, claim.data)
+            shapes.check(claim.kind, self.system, self.gain, claim.data)
 
     def verify(self) -> tuple[bool, ...]:
         """For each claim whether it is proved: exactly, and with every vertex off by up to 2^-40 of each entry."""
