@@ -7,9 +7,9 @@ from diffabs.controllers.feedback import StateFeedback as StateFeedback
 from diffabs.controllers.feedforward import ConstantInput as ConstantInput
 from diffabs.controllers.feedforward import HoldingInput as HoldingInput
 from diffabs.controllers.feedforward import NoFeedforward as NoFeedforward
+from diffabs.controllers.lookup import ScheduledFeedback as ScheduledFeedback
 from diffabs.controllers.pid import PID as PID
 from diffabs.controllers.sampled import Sampled as Sampled
-from diffabs.controllers.scheduled import ScheduledFeedback as ScheduledFeedback
 from diffabs.controllers.switching import ConstantTorque as ConstantTorque
 from diffabs.controllers.switching import Relay as Relay
 from diffabs.controllers.switching import SlidingMode as SlidingMode
