@@ -36,8 +36,13 @@ LOOPS = {
     "feedback": d.Loop(**RIG, controller=controllers.StateFeedback(), feedforward=controllers.HoldingInput()),
     "filtered reference": d.Loop(
         **RIG,
-        controller=controllers.StateFeedback(
-            torque_min=0.0, torque_max=9.03, antiwindup=controllers.BackCalculation(tracking_time=0.02)
+        controller=controllers.ScheduledFeedback(
+            speeds=np.array([2.0, 20.0]),
+            integral_gains=np.array([-11000.0, -13000.0]),
+            gains=np.array([-40.0, -64.0]),
+            torque_min=0.0,
+            torque_max=9.03,
+            antiwindup=controllers.BackCalculation(tracking_time=0.02),
         ),
         feedforward=controllers.ConstantInput(value=2.7),
         reference=references.FilteredSlip(time_constant=0.02),
