@@ -387,7 +387,7 @@ MUTATIONS = [
         "design/lanes.py",
         "a, q = A - times(B, transpose(S)), Q - times(S, transpose(S))",
         "a, q = A, Q",
-        "test_riccati.py::test_care_is_scipys[3]",
+        "test_riccati.py::test_care_is_scipys[2]",
     ),
     Mutation(
         "riccati: never refused",

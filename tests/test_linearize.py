@@ -396,6 +396,7 @@ def test_ranges():
         check(SlipModel(slip=0.0, speed=0.0))
 
 
+@pytest.mark.slow
 def test_batches_and_derivatives():
     """A full model, batched; and its derivatives in every parameter that is varied, by differences."""
     model = SlipModel(actuator=Lag(), sampling=Sampling(period=2e-3, delay=5e-4), filter=LowPass())
