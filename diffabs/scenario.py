@@ -157,6 +157,15 @@ def _override(table: dict[str, Any], override: str) -> None:
         node.pop(other, None)
     node[place] = toml.value(text.strip())
     _lifted(table)
+    if len(keys) == 1 and isinstance(node[place], str):
+        _forget_ranges(table, keys[0])
+
+
+def _forget_ranges(table: dict[str, Any], section: str) -> None:
+    """Another part has other parameters: the ranges of the one it replaces go with it."""
+    design = table.get("design")
+    if isinstance(design, dict) and isinstance(design.get("over"), dict):
+        design["over"] = {path: ends for path, ends in design["over"].items() if not path.startswith(f"{section}.")}
 
 
 def _place(node: Any, key: str, path: str) -> Any:

@@ -2,6 +2,8 @@
 
 import builtins
 import itertools
+import subprocess
+import sys
 
 import cvxpy as cp
 import numpy as np
@@ -524,6 +526,12 @@ def test_unknowns_pack_and_unpack():
     a = np.arange(9.0).reshape(3, 3)
     block = unknowns.affine(lambda v: lmi.he(a @ v["X"]) - 1)
     np.testing.assert_allclose(block.h[0] + np.einsum("d,dij->ij", y, block.G[0]), a @ v["X"] + v["X"] @ a.T - 1)
+
+
+def test_importing_loads_no_solver():
+    heavy = "{'cvxpy', 'clarabel', 'scipy.optimize', 'matplotlib'}"
+    program = f"import sys, diffabs, diffabs.design; sys.exit(bool({heavy} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", program]).returncode == 0
 
 
 def test_never_scs():

@@ -295,3 +295,11 @@ def test_ranges_by_the_names_of_the_linear_model(file):
 def test_no_stable_step_is_needed_for_what_is_not_integrated(monkeypatch):
     monkeypatch.setattr(scenario, "stable_step", lambda loop: pytest.fail("asked"))
     load("slip-lmi", integrated=False)
+
+
+@pytest.mark.usefixtures("any_step_is_stable")
+def test_another_part_takes_the_ranges_of_the_one_it_replaces_with_it():
+    assert set(load("slip-lmi").design.over) == {"plant.mass", "initial.speed"}
+    assert set(load("slip-lmi", ["plant=lab-rig"]).design.over) == {"initial.speed"}
+    again = load("slip-lmi", ["plant=quarter-car", "design.over.plant.mass=12,20"])
+    assert again.design.over["plant.mass"] == (12.0, 20.0)
