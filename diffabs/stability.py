@@ -6,8 +6,6 @@ the setpoint, where the controller is not at a limit, and at slips all over the 
 0. Held memories do not move: a sampled controller is not judged here.
 """
 
-from typing import Any
-
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -24,29 +22,46 @@ RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 
 
 def stable_step(loop: Loop) -> float:
     """Largest step [s] at which RK4 damps every damped mode of the loop, between its initial speed and its stop."""
-    loop = strong(loop)
-    modes = _modes(loop)
-    damped = modes[(modes.real < 0) & np.isfinite(modes)]
-    return float(np.min(_radius(damped / np.abs(damped)) / np.abs(damped), initial=np.inf))
+    return float(stable_steps(jax.tree.map(lambda x: x[None], strong(loop)))[0])
 
 
-def _radius(direction: Any) -> Any:
+def stable_steps(loops: Loop) -> np.ndarray:
+    """The same for a batch of loops, whose leaves have a leading axis (n,); returns (n,)."""
+    matrices = np.asarray(_jacobians(loops))
+    known = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
+    modes = np.linalg.eigvals(np.where(known[..., None, None], matrices, 0.0))
+    damped = (modes.real < 0) & known[..., None]
+    size = np.where(damped, np.abs(modes), 1.0)
+    limits = np.where(damped, _radius(np.where(damped, modes, -1.0) / size) / size, np.inf)
+    return limits.min(axis=tuple(range(1, limits.ndim)), initial=np.inf)
+
+
+def _radius(direction: np.ndarray) -> np.ndarray:
     """How far along each direction of the complex plane RK4 stays stable."""
-    z = RADII * direction[:, None]
+    angles = np.abs(np.angle(direction))  # the region is symmetric
+    return np.interp(angles, ANGLES, REACH)
+
+
+def _reach(angle: np.ndarray) -> np.ndarray:
+    z = RADII * np.exp(1j * angle[:, None])
     grows = np.abs(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))) > 1 + 1e-9
     return np.where(grows.any(axis=1), RADII[np.argmax(grows, axis=1)], RADII[-1])
 
 
-def _modes(loop: Loop) -> Any:
-    """Eigenvalues of d(flow)/d(flow) over the grid of speeds and slips."""
+ANGLES = np.linspace(np.pi / 2, np.pi, 2001)
+REACH = _reach(ANGLES)
+
+
+@jax.jit
+@jax.vmap
+def _jacobians(loop: Loop) -> jax.Array:
+    """d(flow)/d(flow) over the grid of speeds and slips (SPEEDS, slips, n, n)."""
     state = loop.start()
     setpoint = loop.reference.setpoint(state.reference)
     near = jnp.concatenate([setpoint - jnp.array(OFFSETS), setpoint + jnp.array(OFFSETS)])
     slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(SLIPS)])
     speeds = jnp.geomspace(loop.initial.speed, loop.stop.speed, SPEEDS)  # pyright: ignore[reportAttributeAccessIssue]
-    jacobian = jax.jit(jax.vmap(jax.vmap(lambda v, s: _jacobian(loop, v, s), (None, 0)), (0, None)))(speeds, slips)
-    matrices = np.asarray(jacobian).reshape(-1, *jacobian.shape[2:])
-    return np.linalg.eigvals(matrices[np.isfinite(matrices).all(axis=(1, 2))]).ravel()
+    return jax.vmap(jax.vmap(lambda v, s: _jacobian(loop, v, s), (None, 0)), (0, None))(speeds, slips)
 
 
 def _jacobian(loop: Loop, speed: jax.Array, slip: jax.Array) -> jax.Array:

@@ -68,6 +68,7 @@ CONTROLLERS: dict[str, Any] = {
         gains=np.array([-60.0, -110.0, -150.0]),
         torque_max=40.0,
     ),
+    "proportional feedback": controllers.ProportionalFeedback(gain=np.array([-900.0, -150.0]), torque_max=40.0),
     "constant torque": controllers.ConstantTorque(),
     "relay": controllers.Relay(torque_min=2.0),
     "sliding mode": controllers.SlidingMode(gain=60.0, boundary=0.1, torque_max=70.0),
@@ -128,6 +129,7 @@ PARTS: dict[str, dict[str, Any]] = {
         "itae": objectives.ITAE(),
         "quadratic": objectives.QuadraticCost(q=np.array([3.0, 2.0]), r=0.5),
         "effort": objectives.Effort(),
+        "torque rate": objectives.TorqueRate(),
         "variation": objectives.Variation(),
     },
 }

@@ -15,6 +15,7 @@ from diffabs.controllers import (
     BackCalculation,
     Clamping,
     NoAntiWindup,
+    ProportionalFeedback,
     Relay,
     Sampled,
     ScheduledFeedback,
@@ -121,6 +122,16 @@ def test_scheduled_feedback_interpolates_its_gains():
         fixed = StateFeedback(gain=np.array(gain))
         close(k.output(0.0, Memory(0.3), signal), fixed.output(0.0, Memory(0.3), signal))
         close(k.flow(0.0, Memory(0.3), signal), fixed.flow(0.0, Memory(0.3), signal))
+
+
+def test_proportional_feedback_is_state_feedback_with_a_gain_that_goes_with_the_speed():
+    k = ProportionalFeedback(gain=np.array([-30.0, -5.0]), reference_speed=4.0, torque_max=9.0)
+    for speed, part in ((4.0, 1.0), (1.0, 0.25), (8.0, 2.0)):  # all beyond 9 N m with an integral of -3
+        signal = tracking(0.1, 2.5)
+        signal = signal._replace(measured=signal.measured._replace(speed=speed))
+        close(k.output(0.0, Memory(-0.03), signal), 2.5 + part * (30.0 * 0.03 + 5.0 * 0.1))
+        close(k.output(0.0, Memory(-3.0), signal), 9.0)
+        close(k.flow(0.0, Memory(-0.03), signal), -0.1)
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,11 @@ LOOPS = {
         reference=references.FilteredSlip(time_constant=0.02),
         actuator=actuators.Lag(time_constant=0.002),
     ),
+    "proportional": d.Loop(
+        **RIG,
+        controller=controllers.ProportionalFeedback(gain=np.array([-8000.0, -200.0])),
+        feedforward=controllers.HoldingInput(),
+    ),
     "latch": d.Loop(
         **CAR | {"stop": Standstill(speed=5.5)},
         controller=controllers.PID(ki=5000.0, kd=5.67, torque_max=200.0),
@@ -98,7 +103,7 @@ SOLVERS = dict.fromkeys(LOOPS, d.FixedStep(5e-4, 0.8)) | {"feedback": d.FixedSte
 ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {"feedback": (3e-6, 1e-6), "computer": (1e-5, 5e-5)}
 
 
-SLOW = ("computer", "noisy", "relay", "delay")  # the largest programs to compile
+SLOW = ("proportional", "computer", "noisy", "relay", "delay")  # the largest programs to compile
 
 
 def flat(name):

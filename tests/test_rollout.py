@@ -9,7 +9,8 @@ import pytest
 
 import diffabs as d
 from diffabs import controllers, plants, references, roads
-from diffabs.objectives import BRAKING, Effort, MaxSlip, Variation
+from diffabs.actuators import Lag
+from diffabs.objectives import BRAKING, Effort, MaxSlip, TorqueRate, Variation
 from diffabs.rollout import _run
 from diffabs.stability import stable_step
 from diffabs.stops import SpeedReached, Standstill
@@ -57,6 +58,14 @@ def test_speed_reached_lands_between_samples():
     np.testing.assert_allclose(run.ending.sample.output.distance, (100 - 9) / (2 * DECELERATION), rtol=1e-12)
     np.testing.assert_allclose(run.metrics["effort"], 500.0**2 * 7 / DECELERATION, rtol=1e-12)
     assert run.metrics["variation"] == 0
+
+
+def test_the_torque_rate_of_a_lag_is_that_of_its_exponential():
+    """u = U (1 - exp(-t/T)) from rest: the first step is the steepest, and the short landing step does not count."""
+    lag, h = 0.05, 1e-3
+    loop = dataclasses.replace(SLIDING, stop=SpeedReached(speed=3.0), actuator=Lag(time_constant=lag))
+    run = d.measure(loop, d.FixedStep(h, 2.0), {"rate": TorqueRate()})
+    np.testing.assert_allclose(run.metrics["rate"], 500.0 * -np.expm1(-h / lag) / h, rtol=1e-7)
 
 
 def test_the_peak_of_a_falling_slip_is_its_first_value():

@@ -7,6 +7,7 @@ from diffabs.controllers.feedback import StateFeedback as StateFeedback
 from diffabs.controllers.feedforward import ConstantInput as ConstantInput
 from diffabs.controllers.feedforward import HoldingInput as HoldingInput
 from diffabs.controllers.feedforward import NoFeedforward as NoFeedforward
+from diffabs.controllers.lookup import ProportionalFeedback as ProportionalFeedback
 from diffabs.controllers.lookup import ScheduledFeedback as ScheduledFeedback
 from diffabs.controllers.pid import PID as PID
 from diffabs.controllers.sampled import Sampled as Sampled

@@ -55,3 +55,28 @@ class ScheduledFeedback:
         elif not (np.diff(self.speeds) > 0).all():
             yield f"speeds = {np.asarray(self.speeds).tolist()} m/s do not increase"
         yield from limit_problems(self.torque_min, self.torque_max)
+
+
+@pytree
+class ProportionalFeedback:
+    """u = clamp(ff + (v/v0) (k1 x1 + k2 x2), torque_min, torque_max): gains in proportion to the measured speed.
+
+    At a frozen speed the slip of a braked wheel answers to torque with a gain that goes with 1/v, eq. (16) of Maeda and
+    Sugiura; this cancels it, and the loop is equally fast at every speed. `gain` is that at `reference_speed` v0.
+    """
+
+    gain: Vector = param(default=(-11753.0, -158.0), unit="N m/s, N m")
+    reference_speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0)
+    torque_min: Scalar = param(default=-np.inf, unit="N m", infinite=True)
+    torque_max: Scalar = param(default=np.inf, unit="N m", infinite=True)
+    antiwindup: Any = part(default=NoAntiWindup)
+
+    start, problems = StateFeedback.start, StateFeedback.problems
+    flow, output = ScheduledFeedback.flow, ScheduledFeedback.output
+    jump = no_jump
+
+    def _here(self, signal: Tracking) -> StateFeedback:
+        """The feedback at the measured speed."""
+        gain = jnp.asarray(self.gain) * (signal.measured.speed / self.reference_speed)
+        limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
+        return StateFeedback(gain=gain, **limits, antiwindup=self.antiwindup)

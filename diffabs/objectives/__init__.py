@@ -11,6 +11,7 @@ from diffabs.objectives.braking import Effort as Effort
 from diffabs.objectives.braking import LockedTime as LockedTime
 from diffabs.objectives.braking import StopDistance as StopDistance
 from diffabs.objectives.braking import StopTime as StopTime
+from diffabs.objectives.braking import TorqueRate as TorqueRate
 from diffabs.objectives.braking import Variation as Variation
 
 BRAKING = {

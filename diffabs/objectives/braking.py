@@ -98,3 +98,40 @@ class Variation:
         """Variation."""
         del ending
         return memory.held.total
+
+
+class Rate(NamedTuple):
+    """Greatest rate so far, the last torque, and the length of the longest step."""
+
+    greatest: Scalar
+    last: Scalar
+    step: Scalar
+
+
+@pytree
+class TorqueRate:
+    """Greatest |du/dt| [N m/s] of the torque that the actuator delivers, as a difference quotient over a step.
+
+    A shorter last step, which lands on the end of the run, does not count. Behind a lag the rate is finite; of a
+    controller's own jumps the quotient says no more than jump/step.
+    """
+
+    flow = nothing
+
+    def start(self, sample: Sample) -> Memory:
+        """From the first torque."""
+        zero = 0.0 * sample.control
+        return Memory(held=Rate(zero, sample.control, zero))
+
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Rate:
+        """Look at the step."""
+        del before
+        greatest, last, step = memory.held
+        whole = jnp.greater(h, 0.5 * step)
+        rate = jnp.where(whole, jnp.abs(sample.control - last) / jnp.where(whole, h, 1.0), 0.0)
+        return Rate(jnp.maximum(greatest, rate), sample.control, jnp.maximum(step, h))
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Greatest rate."""
+        del ending
+        return memory.held.greatest
