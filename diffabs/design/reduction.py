@@ -8,15 +8,16 @@ gains of zero leave out the integral and the filter.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from diffabs.actuators import Delay, Lag, Limits, RateLimit
 from diffabs.blocks import Direct, Series
-from diffabs.controllers import PID, HoldingInput, NoAntiWindup, Sampled, StateFeedback
+from diffabs.controllers import PID, HoldingInput, NoAntiWindup, ProportionalFeedback, Sampled, StateFeedback
 from diffabs.linearize import Continuous, LowPass, Sampling, SlipModel
 from diffabs.loop import Loop
 from diffabs.pytree import check
@@ -43,7 +44,7 @@ def state_feedback(loop: Loop) -> Reduced:
     check(loop)
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     controller = sampled.controller if sampled else loop.controller
-    integral, proportional, derivative, cutoff = _gains(controller)
+    integral, _, derivative, cutoff = map(float, _gains(controller))
     actuator, by_actuator, exact = _actuator(loop.actuator)
     setpoint = jax.jit(lambda loop: loop.reference.setpoint(loop.start().reference))(loop)
     model = SlipModel(
@@ -55,23 +56,35 @@ def state_feedback(loop: Loop) -> Reduced:
         filter=LowPass(cutoff=cutoff) if derivative else Direct(),
         integral=integral != 0,
     )
-    gain = np.zeros(len(check(model).states))
-    gain[int(model.integral)] = proportional + derivative
-    if model.integral:
-        gain[0] = integral
-    if derivative:
-        gain[-1] = -derivative
+    gain = np.asarray(feedback(loop, check(model).states), float)
     neglected = (*_of_controller(controller), *by_actuator, *_around(loop))
     return Reduced(model, gain, exact and isinstance(loop.sensor, Direct | Noise | Bias), neglected)
 
 
-def _gains(controller: Any) -> tuple[float, float, float, float]:
+def feedback(loop: Loop, states: Sequence[str]) -> Any:
+    """K (n,) of a loop's controller on the states of a `SlipModel`, by their names; 0 on those it does not use.
+    Differentiable in the controller's parameters. That of a `ProportionalFeedback` is at its reference speed.
+
+    Raises:
+        ValueError: a controller that is not linear.
+    """
+    controller = loop.controller.controller if isinstance(loop.controller, Sampled) else loop.controller
+    integral, proportional, derivative, _ = _gains(controller)
+    gains = {
+        "integral of slip error": integral,
+        "slip error": proportional + derivative,
+        "filtered slip error": -derivative,
+    }
+    return jnp.stack([jnp.asarray(gains.get(name, 0.0), float) for name in states])
+
+
+def _gains(controller: Any) -> tuple[Any, Any, Any, Any]:
     """On the integral, the slip error, and slip error minus filtered slip error; the filter's cutoff."""
-    if isinstance(controller, StateFeedback):
-        return float(controller.gain[0]), float(controller.gain[1]), 0.0, 0.0
+    if isinstance(controller, StateFeedback | ProportionalFeedback):
+        return controller.gain[0], controller.gain[1], 0.0, 0.0
     if isinstance(controller, PID):
-        wc = float(controller.cutoff)
-        return -float(controller.ki), -float(controller.kp), -float(controller.kd) * wc, wc
+        wc = controller.cutoff
+        return -controller.ki, -controller.kp, -controller.kd * wc, wc
     raise ValueError(f"controller {_words(controller)} is not linear: it cannot be brought to state feedback")
 
 
