@@ -24,6 +24,7 @@ lint: $(VENV)/.lint
 
 bench: $(VENV)/.bench
 	$(BIN)/python benchmarks/bench_rollout.py
+	$(BIN)/python benchmarks/bench_gradient.py
 	$(BIN)/python benchmarks/bench_riccati.py
 	$(BIN)/python benchmarks/bench_design.py
 
@@ -40,7 +41,7 @@ $(VENV)/.python:
 	touch $@
 
 $(VENV)/.installed: $(VENV)/.python pyproject.toml
-	$(BIN)/python -m pip install --quiet --editable ".[plot,design]"
+	$(BIN)/python -m pip install --quiet --editable ".[plot,design,tune]"
 	touch $@
 
 $(VENV)/.test $(VENV)/.lint $(VENV)/.bench: $(VENV)/.%: $(VENV)/.installed

@@ -1,0 +1,34 @@
+"""Tuning by gradients, worst cases, identification: what a differentiable model is for."""
+
+from diffabs.tune.aggregate import CVaR as CVaR
+from diffabs.tune.aggregate import Mean as Mean
+from diffabs.tune.aggregate import Quantile as Quantile
+from diffabs.tune.aggregate import SmoothWorst as SmoothWorst
+from diffabs.tune.batch import Batch as Batch
+from diffabs.tune.batch import grid as grid
+from diffabs.tune.batch import latin as latin
+from diffabs.tune.batch import run as run
+from diffabs.tune.constraints import AtMost as AtMost
+from diffabs.tune.constraints import CertifiedDecay as CertifiedDecay
+from diffabs.tune.constraints import Poles as Poles
+from diffabs.tune.descent import Point as Point
+from diffabs.tune.descent import Reason as Reason
+from diffabs.tune.descent import Stopping as Stopping
+from diffabs.tune.fit import Identified as Identified
+from diffabs.tune.fit import Tolerances as Tolerances
+from diffabs.tune.fit import fit as fit
+from diffabs.tune.identify import identify as identify
+from diffabs.tune.problem import Mode as Mode
+from diffabs.tune.result import Method as Method
+from diffabs.tune.result import Progress as Progress
+from diffabs.tune.result import StartError as StartError
+from diffabs.tune.result import Tuned as Tuned
+from diffabs.tune.squares import gaussian as gaussian
+from diffabs.tune.table import Table as Table
+from diffabs.tune.traces import Traces as Traces
+from diffabs.tune.tuning import posed as posed
+from diffabs.tune.tuning import tune as tune
+from diffabs.tune.uncertainty import Direction as Direction
+from diffabs.tune.uncertainty import Uncertainty as Uncertainty
+from diffabs.tune.worst import WorstCase as WorstCase
+from diffabs.tune.worst import worst_case as worst_case

@@ -1,0 +1,150 @@
+"""What is tuned, as a function of the unbounded vector z: loss, gradient, and what is needed to judge a step.
+
+    J(z) = aggregate over the lanes of (sum of weight * metric)
+    L(z) = J/s + sum over the constraints of [max(0, m + c g)^2 - m^2]/(2 c)
+
+L is the augmented Lagrangian of Powell, Hestenes and Rockafellar for g <= 0 with multipliers m and penalty c; s is the
+objective's size at the start, so that L is of the order of one.
+"""
+
+import dataclasses
+import enum
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.loop import Loop
+from diffabs.protocols import Objective
+from diffabs.pytree import replace, strong
+from diffabs.rollout import FixedStep, Run
+from diffabs.stability import stable_steps
+from diffabs.tune.aggregate import Aggregate
+from diffabs.tune.batch import Batch, run
+from diffabs.tune.constraints import Constraint
+from diffabs.tune.space import Space
+
+FEW = 6  # parameters up to which forward mode is the cheaper one (benchmarks/bench_gradient.py)
+STIFFEST = 6  # lanes that are asked about the stability of the step at every trial
+
+
+class Mode(enum.Enum):
+    """How a gradient is computed: one rollout with a tangent per parameter, or a checkpointed backward pass."""
+
+    FORWARD = "forward"
+    REVERSE = "reverse"
+
+
+class Seen(NamedTuple):
+    """What is known at one z: objective J, excesses (k,), how many lanes diverged, the metrics of every lane."""
+
+    objective: Any
+    excess: Any
+    diverged: Any
+    metrics: dict[str, Any]
+
+
+class Evaluation(NamedTuple):
+    """Loss, its gradient (p,), and what was seen; with a leading axis of starts where there are several."""
+
+    loss: Any
+    gradient: Any
+    seen: Seen
+
+
+class Multipliers(NamedTuple):
+    """Multipliers (k,) and penalty of the augmented Lagrangian."""
+
+    values: Any
+    penalty: Any
+
+
+def built(subject: Any) -> Loop:
+    """The loop that a part stands for: itself, or what its method `closed()` makes of its parameters."""
+    return subject if isinstance(subject, Loop) else subject.closed()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """A part, its free parameters, and how a choice of them is judged. `subject` is a Loop, or a part with a method
+    `loop()`, whose parameters may then be anything that a loop can be computed from (LQ weights, say)."""
+
+    subject: Any
+    space: Space
+    solver: FixedStep
+    measured: Mapping[str, Objective]
+    weights: Mapping[str, float]
+    batch: Batch
+    aggregate: Aggregate
+    constraints: Sequence[Constraint]
+    mode: Mode
+
+    def runs(self, z: Any) -> Run:
+        """All lanes at z, without trajectories."""
+        return run(built(self.space.at(self.subject, z)), self.batch, self.solver, self.measured)
+
+    def seen(self, z: Any) -> Seen:
+        """Objective and excesses at z."""
+        runs = self.runs(z)
+        each = sum(weight * runs.metrics[name] for name, weight in self.weights.items())
+        each = each if self.batch.weights is None else each * jnp.asarray(self.batch.weights)
+        loop = built(self.space.at(self.subject, z))
+        excess = [jnp.ravel(c.excess(loop, runs.metrics)) for c in self.constraints]
+        excess = jnp.concatenate(excess) if excess else jnp.zeros(0)
+        return Seen(self.aggregate(jnp.asarray(each)), excess, jnp.sum(runs.diverged), runs.metrics)
+
+    def loss(self, scale: float) -> Callable[[Any, Multipliers], tuple[Any, tuple[Any, Seen]]]:
+        """(z, multipliers) -> L, and (L, what was seen)."""
+
+        def loss(z: Any, m: Multipliers) -> tuple[Any, tuple[Any, Seen]]:
+            seen = self.seen(z)
+            value = seen.objective / scale + _penalty(seen.excess, m)
+            return value, (value, seen)
+
+        return loss
+
+    def evaluator(self, scale: float) -> Callable[[Any, Multipliers], Evaluation]:
+        """(starts, p) and multipliers with a leading axis of starts -> Evaluation; compiled, one call for all."""
+        derivative = jax.jacfwd if self.mode is Mode.FORWARD else jax.grad
+
+        def evaluate(z: Any, m: Multipliers) -> Evaluation:
+            gradient, (value, seen) = derivative(self.loss(scale), has_aux=True)(z, m)
+            return Evaluation(value, gradient, seen)
+
+        return jax.jit(jax.vmap(evaluate))
+
+    def valuer(self) -> Callable[[Any], Seen]:
+        """(starts, p) -> Seen: without a gradient."""
+        return jax.jit(jax.vmap(self.seen))
+
+    def steady(self) -> Callable[[np.ndarray], np.ndarray]:
+        """(starts, p) -> whether the step is stable for the loop there (starts,). Asked of the lanes that are the
+        stiffest at the start."""
+        values = self.batch.arrays()[0]
+
+        def loops(z: Any, values: Any) -> Loop:
+            return strong(replace(built(self.space.at(self.subject, z)), values))
+
+        def limits(z: Any, values: Any) -> np.ndarray:
+            lanes = 0 if values else None
+            batch = jax.jit(jax.vmap(jax.vmap(loops, (None, lanes), axis_size=count), (0, None)))(z, values)
+            flat = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), batch)
+            return stable_steps(flat).reshape(len(z), -1)
+
+        count = self.batch.size if values else 1
+        if count > STIFFEST:
+            stiffest = np.argsort(limits(self.space.place(self.subject)[None], values)[0])[:STIFFEST]
+            values, count = {path: column[stiffest] for path, column in values.items()}, STIFFEST
+        return lambda z: limits(jnp.asarray(z), values).min(axis=1) >= self.solver.step
+
+
+def automatic(space: Space) -> Mode:
+    """Forward for few parameters, reverse for many."""
+    return Mode.FORWARD if space.size <= FEW else Mode.REVERSE
+
+
+def _penalty(excess: Any, m: Multipliers) -> Any:
+    """[max(0, m + c g)^2 - m^2]/(2 c), summed."""
+    return jnp.sum(jnp.maximum(0.0, m.values + m.penalty * excess) ** 2 - m.values**2) / (2 * m.penalty)

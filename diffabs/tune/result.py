@@ -1,0 +1,92 @@
+"""How a minimum is looked for, and what was found."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import optax
+
+from diffabs.tune.descent import Point, Reason, Stopping
+from diffabs.tune.problem import Mode, built
+
+
+class StartError(ValueError):
+    """No start could be left: the runs diverge there, or the integration step is not stable."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """How a minimum is looked for.
+
+    optimiser: any of optax; None is L-BFGS with a line search that rejects what diverges
+    starts: the first is the part itself, the others are drawn from the ranges with `seed`
+    mode: forward or reverse; None decides by the number of parameters
+    stopping: of each descent; with constraints there is one per round
+    rounds, tolerance: of the augmented Lagrangian; the greatest excess that counts as met, in units of its scale
+    """
+
+    optimiser: optax.GradientTransformation | None = None
+    starts: int = 1
+    seed: int = 0
+    mode: Mode | None = None
+    stopping: Stopping = dataclasses.field(default_factory=Stopping)
+    rounds: int = 12
+    tolerance: float = 1e-3
+
+
+class Progress(NamedTuple):
+    """What is told on the way: of the best start so far."""
+
+    round: int
+    starts: int  # that are still on their way
+    point: Point
+
+
+class Start(NamedTuple):
+    """How a descent went: parameters by path, objective J, greatest excess, why it ended, and its history."""
+
+    values: dict[str, Any]
+    objective: float
+    violation: float
+    reason: Reason
+    history: list[Point]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Tuned:
+    """The best part found.
+
+    part: the given one with its free parameters changed; `loop` is what it stands for
+    values: the free parameters by path
+    objective: J before and after; violation: the greatest excess before and after; metrics (lanes,) before and after
+    met: whether every constraint holds within the tolerance
+    reason: why the descent of the best start ended, in its last round
+    history: of the best start; `starts` has all of them
+    evaluations: gradients that were computed for the best start, rejected trials included
+    """
+
+    part: Any
+    values: dict[str, Any]
+    objective: tuple[float, float]
+    violation: tuple[float, float]
+    metrics: tuple[dict[str, Any], dict[str, Any]]
+    met: bool
+    reason: Reason
+    history: list[Point]
+    starts: list[Start]
+    mode: Mode
+    diverged: tuple[int, int]
+
+    @property
+    def loop(self) -> Any:
+        """The tuned loop."""
+        return built(self.part)
+
+    @property
+    def gradient(self) -> float:
+        """The greatest component of the gradient where it ended."""
+        return self.history[-1].gradient
+
+    @property
+    def evaluations(self) -> int:
+        """Gradients computed for the best start."""
+        return self.history[-1].evaluations

@@ -1,0 +1,99 @@
+"""Tune any parameters of any part by gradients, under constraints, over a batch of runs."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from diffabs.objectives import BRAKING
+from diffabs.protocols import Objective
+from diffabs.pytree import check
+from diffabs.rollout import FixedStep
+from diffabs.tune.aggregate import Aggregate, Mean
+from diffabs.tune.batch import Batch
+from diffabs.tune.constraints import Constraint
+from diffabs.tune.lagrangian import Search
+from diffabs.tune.problem import Mode, Problem, automatic, built
+from diffabs.tune.result import Method, Progress, Tuned
+from diffabs.tune.space import Range, space
+
+
+def tune(
+    subject: Any,
+    *,
+    free: Sequence[str] | Mapping[str, Range | None],
+    objective: Mapping[str, float],
+    over: Batch | None = None,
+    solver: FixedStep,
+    measured: Mapping[str, Objective] = BRAKING,
+    aggregate: Aggregate | None = None,
+    constraints: Sequence[Constraint] = (),
+    method: Method | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> Tuned:
+    """Minimise an aggregate, over a batch of runs, of a weighted sum of metrics.
+
+    subject: a Loop, or a part with a method `closed()`
+    free: dotted paths of its parameters, with ranges in which they stay (declared ones where None)
+    objective: weight of each metric of `measured`, `{"stop_distance": 1.0, "effort": 1e-4}`
+    over: the runs, parameters of the loop by path; none is the loop itself
+
+    Raises:
+        ValueError: a path, range, metric or batch that does not fit.
+        StartError: a start that diverges, or at which the integration step is not stable, if there is no other.
+    """
+    method = method or Method()
+    problem = posed(
+        subject,
+        free=free,
+        objective=objective,
+        over=over,
+        solver=solver,
+        measured=measured,
+        aggregate=aggregate,
+        constraints=constraints,
+        mode=method.mode,
+    )
+    return Search(problem, method, progress).result()
+
+
+def posed(
+    subject: Any,
+    *,
+    free: Sequence[str] | Mapping[str, Range | None],
+    objective: Mapping[str, float],
+    over: Batch | None = None,
+    solver: FixedStep,
+    measured: Mapping[str, Objective] = BRAKING,
+    aggregate: Aggregate | None = None,
+    constraints: Sequence[Constraint] = (),
+    mode: Mode | None = None,
+) -> Problem:
+    """The problem that `tune` solves, for those who bring their own search. Raises ValueError as `tune` does."""
+    check(subject)
+    batch = (over or Batch()).check(built(subject))
+    _check_metrics(objective, measured, constraints)
+    free_space = space(subject, free)
+    return Problem(
+        subject=subject,
+        space=free_space,
+        solver=solver,
+        measured=measured,
+        weights=objective,
+        batch=batch,
+        aggregate=aggregate or Mean(),
+        constraints=constraints,
+        mode=mode or automatic(free_space),
+    )
+
+
+def _check_metrics(objective: Mapping[str, float], measured: Mapping[str, Objective], constraints: Any) -> None:
+    wanted = [*objective, *(c.metric for c in constraints if hasattr(c, "metric"))]
+    if not objective:
+        raise ValueError("the objective has no metric")
+    for name in wanted:
+        if name not in measured:
+            raise ValueError(f"{name} is not measured; there is {', '.join(measured)}")
+    for name, weight in objective.items():
+        if not np.isfinite(weight):
+            raise ValueError(f"objective: the weight of {name} is {weight}, not a finite number")

@@ -1,0 +1,198 @@
+"""The worst case of a given controller inside a box of plant, road and initial parameters.
+
+    maximise metric(p),  p in [low, high]
+
+by gradient ascent from the worst of the box's corners and of random points, screened in one batch. A local method: what
+it finds is a counterexample for sure, and the worst with no more certainty than its starts give. Where a certificate
+covers the box the two belong together: `report` says which of them speaks.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import qmc
+
+from diffabs.objectives import BRAKING
+from diffabs.protocols import Objective
+from diffabs.pytree import check, replace
+from diffabs.rollout import FixedStep, Run, measure
+from diffabs.tune.aggregate import Mean
+from diffabs.tune.batch import Batch
+from diffabs.tune.descent import Descent, Lane, Reason, Stopping, lbfgs
+from diffabs.tune.problem import Mode, Multipliers, Problem, automatic
+from diffabs.tune.space import Range, Space, space
+
+MOST_CORNERS = 64
+EDGE = 0.01  # of a range: as near to its ends as an ascent starts; it may end nearer
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WorstCase:
+    """The greatest value found of a metric.
+
+    values: the parameters by path; loop: the loop there; metrics: all that were measured there
+    value: the metric there; screened: the greatest among the points that were run first
+    rollouts: what it cost, a gradient counted as `price` rollouts
+    met: whether `bound` holds even there (None without a bound); diverged: a screened point at which the run diverges
+    """
+
+    metric: str
+    values: dict[str, Any]
+    value: float
+    screened: float
+    metrics: dict[str, float]
+    loop: Any
+    rollouts: float
+    bound: float | None
+    diverged: dict[str, Any] | None
+    reasons: list[Reason]
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the bound holds."""
+        return None if self.bound is None else self.diverged is None and self.value <= self.bound
+
+    def report(self, proved: bool | None = None) -> str:
+        """What is known, in a sentence or two: a counterexample, or how hard one was looked for. `proved`: whether a
+        certificate covers the box."""
+        at = ", ".join(f"{path} = {np.asarray(v).tolist()}" for path, v in self.values.items())
+        if self.diverged is not None:
+            at = ", ".join(f"{path} = {np.asarray(v).tolist()}" for path, v in self.diverged.items())
+            return f"COUNTEREXAMPLE: the run diverges at {at}."
+        found = f"{self.metric} = {self.value:.6g} at {at}"
+        if self.met is False:
+            return f"COUNTEREXAMPLE: {found}, beyond {self.bound:g}."
+        proof = {
+            True: "The linear loop is proved stable over the box by a certificate.",
+            False: "No certificate covers the box.",
+            None: "Nothing was asked of a certificate.",
+        }[proved]
+        within = f", within {self.bound:g}" if self.bound is not None else ""
+        return f"No counterexample in {self.rollouts:.0f} rollouts: the worst is {found}{within}. {proof}"
+
+
+def worst_case(
+    loop: Any,
+    *,
+    over: Mapping[str, Range],
+    metric: str,
+    solver: FixedStep,
+    measured: Mapping[str, Objective] = BRAKING,
+    bound: float | None = None,
+    screen: int = 64,
+    starts: int = 6,
+    iterations: int = 10,
+    seed: int = 0,
+    seed_of_noise: int | None = None,
+    price: float | None = None,
+) -> WorstCase:
+    """Look for the greatest value of a metric over a box {path: (low, high)}.
+
+    screen: points of a scrambled Sobol sequence that are run first, besides the corners (up to 64)
+    starts: how many of the worst of them are ascended from, together
+    price: rollouts that a gradient counts as; None is 1 + 1.5 p in forward mode and 6 in reverse
+
+    Raises:
+        ValueError: a path or range that does not fit, an unknown metric.
+    """
+    check(loop)
+    if metric not in measured:
+        raise ValueError(f"{metric} is not measured; there is {', '.join(measured)}")
+    middle = replace(loop, {path: 0.5 * (np.asarray(a, float) + np.asarray(b, float)) for path, (a, b) in over.items()})
+    free, key = space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
+    points = _points(np.array(free.ranges), screen, seed)
+    screened = _screened(loop, free, points, solver, measured, seed_of_noise)
+    values = screened.metrics[metric]
+    mode = automatic(free)
+    problem = Problem(middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), mode)
+    lanes = _ascent(problem, points[np.argsort(-np.nan_to_num(values, nan=-np.inf))[:starts]], iterations)
+    each = price or (1 + 1.5 * free.size if mode is Mode.FORWARD else 6.0)
+    gradients = sum(lane.evaluations for lane in lanes)
+    return _found(loop, free, metric, bound, points, screened, lanes, len(points) + each * gradients)
+
+
+def _points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
+    """Corners, and random points (k, p)."""
+    low, high = ranges.T
+    corners = list(itertools.islice(itertools.product(*ranges), MOST_CORNERS))
+    drawn = qmc.Sobol(len(low), rng=np.random.default_rng(seed)).random(screen)
+    return np.concatenate([np.array(corners), low + (high - low) * drawn])
+
+
+def _at(free: Space, point: Any) -> dict[str, Any]:
+    """Parameters by path from their numbers in a row."""
+    found, first = {}, 0
+    for entry in free.entries:
+        n = len(entry.maps)
+        found[entry.path] = point[first : first + n].reshape(entry.shape)
+        first += n
+    return found
+
+
+def _screened(loop: Any, free: Space, points: np.ndarray, solver: FixedStep, measured: Any, seed: int | None) -> Run:
+    """All points in one call."""
+    key = None if seed is None else jax.random.key(seed)
+
+    @jax.jit
+    @jax.vmap
+    def run(point: Any) -> Run:
+        return measure(replace(loop, _at(free, point)), solver, measured, key=key)
+
+    return jax.device_get(run(jnp.asarray(points)))
+
+
+def _ascent(problem: Problem, points: np.ndarray, iterations: int) -> list[Lane]:
+    """From these points, a little inside of the box, where they can be left."""
+    low, high = np.array(problem.space.ranges).T
+    points = np.clip(points, low + EDGE * (high - low), high - EDGE * (high - low))
+    z = np.stack([problem.space.place(replace(problem.subject, _at(problem.space, point))) for point in points])
+    first = jax.device_get(problem.valuer()(jnp.asarray(z[:1])))
+    scale = max(abs(float(first.objective[0])), 1e-12)
+    loss = problem.loss(scale)
+    descent = Descent(
+        problem.evaluator(scale),
+        lambda z, m: loss(z, m)[0],
+        lambda z: np.ones(len(z), bool),
+        lbfgs(),
+        Stopping(iterations=iterations),
+        lambda lanes: None,
+    )
+    return descent.run(z, Multipliers(np.zeros((len(z), 0)), np.ones(len(z))))
+
+
+def _found(
+    loop: Any,
+    free: Space,
+    metric: str,
+    bound: float | None,
+    points: np.ndarray,
+    screened: Run,
+    lanes: list[Lane],
+    rollouts: float,
+) -> WorstCase:
+    values = np.nan_to_num(screened.metrics[metric], nan=-np.inf)
+    i = int(np.argmax(values))
+    place, value, metrics = _at(free, points[i]), float(values[i]), {n: x[i] for n, x in screened.metrics.items()}
+    for lane in lanes:
+        if -float(lane.seen.objective) > value:
+            place, value = free.values(jnp.asarray(lane.z)), -float(lane.seen.objective)
+            metrics = {name: x[0] for name, x in lane.seen.metrics.items()}
+    bad = np.flatnonzero(screened.diverged)
+    place = {path: np.asarray(x) for path, x in place.items()}
+    return WorstCase(
+        metric=metric,
+        values=place,
+        value=value,
+        screened=float(values[i]),
+        metrics={name: float(x) for name, x in metrics.items()},
+        loop=replace(loop, place),
+        rollouts=rollouts,
+        bound=bound,
+        diverged=_at(free, points[bad[0]]) if len(bad) else None,
+        reasons=[lane.reason or Reason.LIMIT for lane in lanes],
+    )

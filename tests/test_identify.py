@@ -1,0 +1,358 @@
+"""Least squares and covariance on problems with known answers; traces and tables against runs of known parameters."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import curve_fit
+
+import diffabs as d
+from diffabs import controllers, objectives, plants, references, roads, stops
+from diffabs.pytree import Scalar, param, pytree, replace
+from diffabs.tune.descent import Reason
+from diffabs.tune.fit import Tolerances, fit
+from diffabs.tune.identify import identify
+from diffabs.tune.squares import gaussian
+from diffabs.tune.table import Table
+from diffabs.tune.traces import Traces
+
+X = np.linspace(0.0, 3.0, 13)
+NOISE = np.random.default_rng(3).standard_normal(13)
+SIGMA = 0.1 + 0.05 * X
+
+
+@pytree
+class Decay:
+    """a exp(-k x) + c."""
+
+    a: Scalar = param(default=1.0, unit="1")
+    k: Scalar = param(default=0.5, unit="1", above=0.0)
+    c: Scalar = param(default=0.1, unit="1", low=-1.0, high=1.0)
+
+
+def decay(x, a, k, c):
+    return a * np.exp(-k * x) + c
+
+
+def decay_residuals(part, x, y):
+    return part.a * jnp.exp(-part.k * x) + part.c - y
+
+
+def line_residuals(part, x, y):
+    return part.a + part.c * x - y
+
+
+DATA = (X, decay(X, 2.0, 1.3, 0.3) + SIGMA * NOISE)
+LINE = (X, 0.7 + 0.4 * X + SIGMA * NOISE)
+
+
+class TestFit:
+    @pytest.mark.parametrize("absolute", [True, False])
+    def test_a_line_has_the_closed_form_and_its_covariance(self, absolute):
+        found = fit(Decay(), ["a", "c"], line_residuals, data=LINE, sigma=SIGMA, absolute=absolute)
+        A, b = np.stack([1 / SIGMA, X / SIGMA], axis=1), LINE[1] / SIGMA
+        best = np.linalg.solve(A.T @ A, A.T @ b)
+        chi2 = np.sum((A @ best - b) ** 2)
+        covariance = np.linalg.inv(A.T @ A) * (1.0 if absolute else chi2 / (13 - 2))
+        np.testing.assert_allclose([found.values["a"], found.values["c"]], best, rtol=1e-7, atol=0)
+        np.testing.assert_allclose(found.uncertainty.covariance, covariance, rtol=1e-6, atol=0)
+        np.testing.assert_allclose(found.chi2, chi2, rtol=1e-9, atol=0)
+        np.testing.assert_allclose(found.uncertainty.deviations["c"], np.sqrt(covariance[1, 1]), rtol=1e-6, atol=0)
+        np.testing.assert_allclose(np.diag(found.uncertainty.correlation), 1.0, rtol=1e-12, atol=0)
+
+    @pytest.mark.parametrize("sigma", [SIGMA, None])
+    def test_a_curve_and_its_covariance_are_those_of_scipy(self, sigma):
+        found = fit(Decay(), ["a", "k", "c"], decay_residuals, data=DATA, sigma=sigma)
+        best, covariance = curve_fit(
+            decay, *DATA, [1, 0.5, 0.1], sigma, sigma is not None, ftol=1e-13, xtol=1e-13, gtol=1e-13
+        )
+        np.testing.assert_allclose(list(found.values.values()), best, rtol=1e-6, atol=0)
+        np.testing.assert_allclose(found.uncertainty.covariance, covariance, rtol=1e-4, atol=0)  # theirs: differences
+        assert found.part.k == found.values["k"]
+        assert found.uncertainty.names == ["a", "k", "c"]
+        assert found.history[-1] == pytest.approx(found.cost, rel=1e-9)
+        assert all(np.diff(found.history) <= 0)
+        assert found.reason in (Reason.GRADIENT, Reason.CHANGE)
+        assert found.start == {"a": 1.0, "k": 0.5, "c": pytest.approx(0.1)}
+
+    def test_a_gaussian_prior_has_the_closed_form(self):
+        prior = gaussian({"c": (0.2, 0.05)})
+        found = fit(Decay(), ["a", "c"], line_residuals, data=LINE, sigma=SIGMA, prior=prior)
+        A, b = np.stack([1 / SIGMA, X / SIGMA], axis=1), LINE[1] / SIGMA
+        A, b = np.concatenate([A, [[0, 20.0]]]), np.concatenate([b, [20 * 0.2]])
+        np.testing.assert_allclose(list(found.values.values()), np.linalg.solve(A.T @ A, A.T @ b), rtol=1e-6, atol=0)
+        np.testing.assert_allclose(found.uncertainty.covariance, np.linalg.inv(A.T @ A), rtol=1e-6, atol=0)
+        assert len(found.residuals) == 13
+
+    def test_a_prior_makes_up_for_too_few_data_but_not_for_what_they_say(self):
+        prior = gaussian({"a": (1.0, 0.1), "k": (0.5, 0.1), "c": (0.1, 0.1)})
+        few = tuple(x[:2] for x in DATA)
+        found = fit(Decay(), ["a", "k", "c"], decay_residuals, data=few, sigma=0.1, prior=prior)
+        assert np.isinf(found.uncertainty.directions[-1].spread)
+        assert max(found.uncertainty.deviations.values()) < 0.1001
+
+    def test_a_redundant_pair_is_named(self):
+        def product(part, x, y):
+            return part.a * part.k * jnp.exp(-x) + part.c - y
+
+        found = fit(Decay(a=2.0), ["a", "k", "c"], product, data=DATA, sigma=SIGMA)
+        (open_,) = found.uncertainty.undetermined()
+        assert np.isinf(open_.spread)
+        a, k = abs(float(found.values["a"])), float(found.values["k"])
+        expected = np.array([1.0, -1.0, 0.0]) / np.array([max(a, 2.0) / a, 1.0, 1.0])  # sizes: |a| or its scale; k
+        expected /= np.linalg.norm(expected)
+        components = np.array(list(open_.components.values()))
+        np.testing.assert_allclose(np.abs(components @ expected), 1.0, rtol=0, atol=1e-6)
+        assert components[0] * components[1] < 0
+        assert "a" in open_.shown()
+        assert k > 0
+        assert found.uncertainty.correlation[0, 1] == pytest.approx(-1.0, abs=1e-6)
+        assert found.uncertainty.singular[-1] < 1e-9 * found.uncertainty.singular[0]
+
+    def test_a_step_into_nowhere_is_shortened(self):
+        tried = []
+
+        def logarithm(part):
+            return jnp.log(jnp.where(part.a > 0.05, part.a, jnp.nan))[None] - jnp.log(0.1)
+
+        def seen(part):
+            tried.append(float(part.a))
+            return True
+
+        found = fit(Decay(a=5.0), ["a"], logarithm, sigma=1.0, usable=seen)
+        assert min(tried) <= 0.05
+        np.testing.assert_allclose(found.values["a"], 0.1, rtol=1e-8, atol=0)
+        assert found.evaluations == len(tried)
+
+    def test_a_part_that_is_not_usable_is_not_taken(self):
+        found = fit(
+            Decay(), ["a"], lambda part: jnp.stack([part.a - 5.0]), sigma=1.0, usable=lambda part: part.a <= 3.0
+        )
+        assert 1.5 < found.values["a"] <= 3.0
+
+    def test_the_best_start_wins_and_the_others_are_kept(self):
+        def well(part):
+            return jnp.where(part.a > 10, jnp.nan, (part.a**2 - 4) * (part.a + 3))[None]
+
+        starts = [{"a": -8.0}, {"a": 1.0}, {"a": 20.0}]
+        found = fit(Decay(), ["a"], well, sigma=1.0, starts=starts)
+        assert [float(one.start["a"]) for one in found.starts] == [-8.0, 1.0]
+        assert [float(one["a"]) for one in found.diverged] == [20.0]
+        assert found.cost == min(one.cost for one in found.starts)
+
+    def test_a_high_norm_comes_near_to_the_least_greatest_residual(self):
+        y = np.array([0.0, 0.0, 0.0, 1.0])
+        two, many = (fit(Decay(), ["a"], lambda p, y: p.a - y, data=(y,), sigma=1.0, norm=n) for n in (2.0, 40.0))
+        np.testing.assert_allclose(two.values["a"], 0.25, rtol=1e-8, atol=0)
+        np.testing.assert_allclose(many.values["a"], 0.5, rtol=0, atol=0.02)
+
+    def test_other_data_do_not_compile_again(self):
+        calls = []
+
+        def counted(part, x, y):
+            calls.append(1)
+            return decay_residuals(part, x, y)
+
+        for shift in (0.0, 0.1):
+            fit(
+                Decay(),
+                ["a", "k"],
+                counted,
+                data=(DATA[0], DATA[1] + shift),
+                sigma=SIGMA,
+                prior=gaussian({"a": (shift, 1)}),
+            )
+        assert len(calls) <= 3  # traced once, and once per fit for its shape
+
+    @pytest.mark.parametrize(
+        ("changed", "message"),
+        [
+            ({"sigma": 0.0}, "sigma = 0 is not positive and finite"),
+            ({"sigma": np.ones(3)}, r"sigma has shape \(3,\); 13 residuals need a number or \(13,\)"),
+            ({"norm": 1.0}, r"norm = 1 is outside \[2, inf\)"),
+            ({"sigma": None, "prior": gaussian({"a": (0.0, 1.0)})}, "a prior needs sigma"),
+            (
+                {"data": tuple(x[:2] for x in DATA)},
+                "2 data do not determine 3 parameters: free fewer, or state a prior",
+            ),
+            (
+                {"data": tuple(x[:3] for x in DATA), "absolute": False},
+                "3 data do not determine 3 parameters and one more",
+            ),
+            (
+                {"data": (X, np.full(13, np.nan))},
+                "the run diverges, or its step is not stable, at each of the 1 starts",
+            ),
+            ({"free": ["q"]}, "q is not a parameter; there is a, k, c"),
+            ({"starts": [{"k": -1.0}]}, r"k = -1 is outside \(0, inf\)"),
+        ],
+    )
+    def test_what_does_not_fit_is_named(self, changed, message):
+        arguments = {"free": ["a", "k", "c"], "data": DATA, "sigma": 0.1, **changed}
+        with pytest.raises(ValueError, match=message):
+            fit(Decay(), residuals=decay_residuals, **arguments)
+
+    def test_a_prior_without_width_is_an_error(self):
+        with pytest.raises(ValueError, match="a: the prior's standard deviation is 0; it must be positive"):
+            gaussian({"a": (1.0, 0.0)})
+
+
+ROAD = roads.Scaled(road=roads.MagicFormula(), scale=1.0)
+LOOP = d.Loop(
+    plant=plants.QuarterCar(road=ROAD),
+    reference=references.FixedSlip(),
+    controller=controllers.ConstantTorque(torque=90.0),
+    stop=stops.SpeedReached(speed=24.0),
+)
+SOLVER = d.FixedStep(step=1e-3, duration=0.6)
+T = np.arange(0.0, 0.5, 1.3e-3)
+HOLE = np.where(np.arange(len(T)) == 3, np.nan, T)
+FREE = {"plant.inertia": (0.2, 5.0), "plant.road.scale": (0.3, 2.0)}
+
+
+def noisy(loop, fields, sigmas, seed, **more):
+    """Data of known parameters: a trace on a finer grid, and noise."""
+    seen = d.rollout(loop, dataclasses.replace(SOLVER, step=5e-4)).trajectory
+    draw = np.random.default_rng(seed)
+    clean = {name: np.interp(T, seen.sample.t, getattr(seen.sample.output, name)) for name in fields}
+    columns = {name: x + sigmas[name] * draw.standard_normal(len(T)) for name, x in clean.items()}
+    return Traces(t=T, columns=columns, sigma=sigmas, **more)
+
+
+class TestTraces:
+    def test_known_parameters_are_recovered_within_three_deviations(self):
+        truth = replace(LOOP, {"plant.inertia": 1.3, "plant.road.scale": 0.8})
+        data = noisy(truth, ("wheel_speed", "speed"), {"wheel_speed": 0.05, "speed": 0.1}, seed=1)
+        found = identify(LOOP, data, FREE, solver=SOLVER, tolerances=Tolerances(cost=1e-8))
+        for path, value in {"plant.inertia": 1.3, "plant.road.scale": 0.8}.items():
+            deviation = found.uncertainty.deviations[path]
+            assert abs(found.values[path] - value) < 3 * deviation
+            assert deviation < 0.02
+        assert 0.85 < found.chi2 / found.uncertainty.degrees < 1.15  # sqrt(2/768) = .05
+        left = data.residuals(found)
+        assert left["speed"].shape == (1, len(T))
+        np.testing.assert_allclose(np.std(left["speed"]), 0.1, rtol=0.15, atol=0)
+        np.testing.assert_allclose(np.std(left["wheel_speed"]), 0.05, rtol=0.15, atol=0)
+
+    def test_the_loop_is_compared_between_its_instants_and_stays_where_it_ended(self):
+        t = np.array([0.0, 0.0103, 0.1999, 0.3, 0.41, 0.59])
+        over = {"initial.speed": np.array([26.0, 30.0]), "plant.inertia": np.array([1.0, 1.2])}
+        data = Traces(
+            t=t, columns={"speed": np.zeros((2, 6)), "slip": np.ones((2, 6))}, sigma={"speed": 1, "slip": 1},
+            over=over, until=[np.inf, 0.4],
+        )  # fmt: skip
+        solver = dataclasses.replace(SOLVER, every=4)
+        against = data.against(LOOP, ["plant.road.scale"], solver)
+        seen = against.residuals(LOOP, *against.data)
+        expected = []
+        for name, shift in (("speed", 0.0), ("slip", 1.0)):
+            for i, kept in enumerate((t <= np.inf, t <= 0.4)):
+                run = d.rollout(replace(LOOP, {path: x[i] for path, x in over.items()}), solver)
+                y = getattr(run.trajectory.sample.output, name)
+                expected.append((np.interp(t, run.trajectory.sample.t, y) - shift)[kept])
+        assert expected[0][-1] == pytest.approx(24.0, abs=1e-6)  # it has ended there
+        np.testing.assert_allclose(seen, np.concatenate(expected), rtol=1e-12, atol=1e-12)
+
+    @pytest.mark.slow
+    def test_a_scale_and_the_peak_that_it_scales_are_not_told_apart(self):
+        data = noisy(LOOP, ("wheel_speed",), {"wheel_speed": 0.05}, seed=2)
+        free = ["plant.road.scale", "plant.road.road.D", "plant.inertia"]
+        found = identify(LOOP, data, free, solver=SOLVER, tolerances=Tolerances(cost=1e-6))
+        (open_,) = found.uncertainty.undetermined()
+        scale, peak, inertia = open_.components.values()
+        assert open_.spread > 1e3
+        assert scale * peak < 0
+        assert abs(inertia) < 1e-6
+
+    @pytest.mark.parametrize(
+        ("changed", "message"),
+        [
+            ({"columns": {"pressure": T}}, "columns: pressure; there is slip, speed, wheel_speed"),
+            ({"columns": {}}, "columns: none; there is"),
+            ({"columns": {"speed": T[1:]}}, r"speed has shape \(384,\); t and the runs \(over\) need \(1, 385\) or"),
+            ({"columns": {"speed": HOLE}}, "speed: 1 values are not finite, the first at t = 0.0039"),
+            ({"t": T[::-1]}, "must be finite numbers in increasing order"),
+            ({"t": T + 0.3}, r"t = 0.3 ... 0.7992 s leaves \[0, 0.6\] s, the solver's duration"),
+            ({"sigma": {"speed": -0.1}}, r"sigma.speed = -0.1 is outside \(0, inf\) m/s"),
+            ({"sigma": {"slip": 0.1}}, "sigma is that of slip; the columns are speed"),
+            ({"columns": {"speed": T, "slip": T}, "sigma": None}, "sigma: needed to weigh speed, slip"),
+            ({"over": {"plant.mess": np.ones(2)}}, "plant.mess is not a parameter of the loop"),
+            ({"over": {"plant.inertia": np.ones(1)}}, "plant.inertia: both free and given for each run"),
+            ({"until": [1.0, 2.0]}, r"until has shape \(2,\)"),
+        ],
+    )  # fmt: skip
+    def test_data_that_do_not_fit_are_named(self, changed, message):
+        data = Traces(**{"t": T, "columns": {"speed": T}, "sigma": {"speed": 0.1}, **changed})
+        with pytest.raises(ValueError, match=message):
+            identify(LOOP, data, FREE, solver=SOLVER)
+
+    def test_a_step_that_is_not_stable_is_named(self):
+        data = Traces(t=T, columns={"speed": T})
+        loop = dataclasses.replace(LOOP, controller=controllers.PID(kp=3893.0), stop=stops.Standstill(speed=0.05))
+        with pytest.raises(ValueError, match=r"solver.step = 0.001 s is not stable at the start; at most 0.00019 s is"):
+            identify(loop, data, FREE, solver=SOLVER)
+
+
+ROWS = {
+    "locked": LOOP,
+    "weak": replace(LOOP, {"controller.torque": 60.0}),
+    "sliding": dataclasses.replace(LOOP, controller=controllers.PID(kp=500.0)),
+}
+
+
+class TestTable:
+    @pytest.mark.slow
+    def test_rows_of_several_structures_are_measured_as_they_are(self):
+        values = {
+            "sliding": {"stop_time": 0.4},
+            "locked": {"stop_distance": 10.0, "stop_time": 0.5},
+            "weak": {"stop_time": 0.0},
+        }
+        table = Table(loops=ROWS, values=values, sigma={"stop_time": 0.01, "stop_distance": 0.1})
+        against = table.against(LOOP, ["plant.inertia"], SOLVER)
+        changed = replace(LOOP, {"plant.inertia": 1.4})
+        seen = against.residuals(changed, *against.data)
+        assert table.labels == [
+            ("sliding", "stop_time"),
+            ("locked", "stop_distance"),
+            ("locked", "stop_time"),
+            ("weak", "stop_time"),
+        ]
+        for (row, metric), ours in zip(table.labels, seen, strict=True):
+            run = d.measure(replace(ROWS[row], {"plant.inertia": 1.4}), SOLVER, objectives.BRAKING)
+            np.testing.assert_allclose(ours, run.metrics[metric] - values[row][metric], rtol=0, atol=1e-10)
+        np.testing.assert_array_equal(against.sigma, [0.01, 0.1, 0.01, 0.01])
+
+    @pytest.mark.parametrize(
+        ("changed", "message"),
+        [
+            ({"values": {"wet": {"stop_time": 1.0}}}, "row wet: no loop; there is locked, weak, sliding"),
+            ({"values": {"locked": {"grip": 1.0}}}, "row locked: grip is not measured; there is stop_time"),
+            ({"values": {"locked": {"stop_time": np.nan}}}, "row locked: stop_time = nan is not finite"),
+            ({"sigma": {"stop_time": 0.0}}, r"sigma.stop_time = 0 is outside \(0, inf\)"),
+            ({"sigma": {"iae": 1.0}}, "sigma: none for stop_time"),
+            ({"loops": {"locked": d.Loop()}}, "row locked: plant.road.scale is not a parameter of its loop"),
+        ],
+    )  # fmt: skip
+    def test_tables_that_do_not_fit_are_named(self, changed, message):
+        table = Table(
+            **{"loops": ROWS, "values": {"locked": {"stop_time": 1.0}}, "sigma": {"stop_time": 0.1}, **changed}
+        )
+        with pytest.raises(ValueError, match=message):
+            identify(LOOP, table, FREE, solver=SOLVER)
+
+
+@pytest.mark.slow
+def test_the_derivative_through_interpolation_and_the_end_is_right():
+    data = Traces(
+        t=np.array([0.1037, 0.55]), columns={"distance": np.zeros(2)}, over={"initial.speed": np.array([26.0])}
+    )
+    against = data.against(LOOP, [], SOLVER)
+
+    def seen(scale):
+        return against.residuals(replace(LOOP, {"plant.road.scale": scale}), *against.data)
+
+    slope, h = jax.jacfwd(seen)(0.9), 1e-5
+    np.testing.assert_allclose(slope, (seen(0.9 + h) - seen(0.9 - h)) / (2 * h), rtol=1e-6, atol=1e-8)

@@ -1,0 +1,315 @@
+"""Free parameters, aggregates, batches, descent and constraints, on problems with known answers and no rollouts."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+import diffabs as d
+from diffabs import controllers, plants, references
+from diffabs.tune import CVaR, Mean, Method, Mode, Quantile, Reason, SmoothWorst, Stopping, grid, latin
+from diffabs.tune.batch import Batch
+from diffabs.tune.descent import Descent, Optimiser, lbfgs
+from diffabs.tune.lagrangian import Search
+from diffabs.tune.problem import Evaluation, Multipliers, Seen, _penalty
+from diffabs.tune.space import Decades, HalfLine, Interval, Line, bijection, space
+
+LOOP = d.Loop(
+    plant=plants.MirroredRig(),
+    reference=references.FilteredSlip(),
+    controller=controllers.StateFeedback(gain=np.array([-1000.0, -40.0])),
+)
+
+
+class TestSpace:
+    @given(st.floats(-30, 30))
+    @settings(max_examples=50, deadline=None)
+    def test_every_map_stays_in_its_range_and_comes_back(self, z):
+        ranges = ((0.5, 0.9, 0.6), (1e-3, 1e2, 1.0), (-2e4, -80.0, -500.0), (0.0, np.inf, 3.0), (-np.inf, 1.0, 0.2))
+        for low, high, start in ranges:
+            m = bijection(low, high, start)
+            value = float(m.value(jnp.asarray(z)))
+            assert low <= value <= high
+            np.testing.assert_allclose(m.place(float(m.value(m.place(start)))), m.place(start), rtol=1e-12, atol=1e-12)
+
+    def test_a_range_of_decades_is_searched_in_its_logarithm(self):
+        assert isinstance(bijection(1e-3, 1e-1, 1e-2), Decades)
+        assert isinstance(bijection(-1e4, -10.0, -100.0), Decades)
+        assert isinstance(bijection(0.2, 0.9, 0.5), Interval)
+        assert isinstance(bijection(-5.0, 100.0, 1.0), Interval)
+        assert isinstance(bijection(0.0, np.inf, 1.0), HalfLine)
+        assert isinstance(bijection(-np.inf, np.inf, 1.0), Line)
+        np.testing.assert_allclose(bijection(1e-4, 1.0, 0.1).value(0.0), 1e-2, rtol=1e-12)  # the geometric mean
+
+    def test_the_start_is_where_the_loop_is(self):
+        free = space(LOOP, {"controller.gain": ((-1e5, -1e3), (-10.0, -1.0)), "reference.time_constant": None})
+        assert free.names == ["controller.gain.0", "controller.gain.1", "reference.time_constant"]
+        back = free.at(LOOP, free.place(LOOP))
+        np.testing.assert_allclose(back.controller.gain, LOOP.controller.gain, rtol=1e-12)
+        np.testing.assert_allclose(back.reference.time_constant, 0.035, rtol=1e-12)
+
+    def test_values_are_differentiable(self):
+        free = space(LOOP, {"controller.gain": ((-1e5, -1e3), (-10.0, -1.0))})
+        z = jnp.asarray(free.place(LOOP))
+        slope = jax.jacfwd(lambda z: free.values(z)["controller.gain"])(z)
+        h = 1e-5
+        for i in range(2):
+            e = np.eye(2)[i] * h
+            away = (free.values(z + e)["controller.gain"] - free.values(z - e)["controller.gain"]) / (2 * h)
+            np.testing.assert_allclose(slope[:, i], away, rtol=1e-8, atol=1e-8)
+
+    def test_random_starts_fill_the_range_and_repeat(self):
+        free = space(LOOP, {"reference.slip": (0.1, 0.3)})
+        z = free.spread(jax.random.key(1), 200)
+        values = np.array([float(free.values(x)["reference.slip"]) for x in z])
+        assert values.min() > 0.1
+        assert values.max() < 0.3
+        assert 0.19 < values.mean() < 0.21
+        np.testing.assert_array_equal(z, free.spread(jax.random.key(1), 200))
+
+    @pytest.mark.parametrize(
+        ("free", "message"),
+        [
+            ({}, "no parameter is free"),
+            (["controller.kq"], "controller.kq is not a parameter; there is"),
+            ({"plant.mass": (2.0, 1.0)}, r"plant.mass: the range \[2, 1\] is empty"),
+            ({"plant.mass": (-1.0, 9.0)}, r"plant.mass: the range \[-1, 9\] leaves the declared one, \(0, inf\) kg"),
+            ({"plant.mass": (6.0, 9.0)}, r"plant.mass = 5.3 is not inside \(6, 9\)"),
+            ({"plant.mass": (5.3, 9.0)}, r"plant.mass = 5.3 is not inside \(5.3, 9\): it cannot be moved from there"),
+            (["sensor.period"], "sensor.period cannot be tuned"),
+        ],
+    )
+    def test_says_what_does_not_fit(self, free, message):
+        from diffabs import sensors
+
+        with pytest.raises(ValueError, match=message):
+            space(dataclasses.replace(LOOP, sensor=sensors.Noise()), free)
+
+
+class TestAggregates:
+    VALUES = np.array(jax.random.normal(jax.random.key(3), (37,))) + 4.0
+
+    @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 0.95, 0.99])
+    def test_cvar_is_rockafellar_and_uryasevs_minimum(self, level):
+        def formula(t):
+            return t + np.mean(np.maximum(self.VALUES - t, 0)) / (1 - level)
+
+        best = min(formula(t) for t in self.VALUES)  # piecewise linear: a vertex is a value
+        np.testing.assert_allclose(CVaR(level=level)(jnp.asarray(self.VALUES)), best, rtol=1e-12)
+
+    def test_quantile_and_mean(self):
+        x = jnp.asarray(self.VALUES)
+        np.testing.assert_allclose(Quantile(level=0.8)(x), np.quantile(self.VALUES, 0.8), rtol=1e-12)
+        np.testing.assert_allclose(Mean()(x), self.VALUES.mean(), rtol=1e-12)
+
+    def test_the_smooth_worst_lies_between_mean_and_worst(self):
+        x = jnp.asarray(self.VALUES)
+        sharp, soft = SmoothWorst(softness=1e-4)(x), SmoothWorst(softness=1e4)(x)
+        np.testing.assert_allclose(sharp, self.VALUES.max(), rtol=1e-3)
+        np.testing.assert_allclose(soft, self.VALUES.mean(), rtol=1e-3)
+        assert soft < SmoothWorst(softness=0.1)(x) < sharp
+
+    @pytest.mark.parametrize("aggregate", [Mean(), CVaR(level=0.8), Quantile(level=0.8), SmoothWorst(softness=0.05)])
+    def test_gradients(self, aggregate):
+        x, h = jnp.asarray(self.VALUES), 1e-6
+        slope = jax.grad(aggregate)(x)
+        for i in range(0, 37, 5):
+            e = np.zeros(37)
+            e[i] = h
+            away = (aggregate(x + e) - aggregate(x - e)) / (2 * h)
+            np.testing.assert_allclose(slope[i], away, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(slope @ x, aggregate(x), rtol=1e-9)  # homogeneous of the first degree
+
+
+class TestBatch:
+    def test_a_grid_has_every_combination(self):
+        batch = grid({"plant.mass": [5.0, 6.0], "initial.speed": [10.0, 12.0, 14.0]}).check(LOOP)
+        assert batch.size == 6
+        pairs = set(zip(batch.values["plant.mass"].tolist(), batch.values["initial.speed"].tolist(), strict=True))
+        assert pairs == {(m, v) for m in (5.0, 6.0) for v in (10.0, 12.0, 14.0)}
+        assert float(batch.lane(LOOP, 5).plant.mass) == 6.0
+
+    def test_a_latin_hypercube_has_one_lane_in_each_strip(self):
+        batch = latin({"plant.mass": (5.0, 6.0), "initial.speed": (10.0, 20.0)}, 50, seed=4)
+        for path, (low, width) in {"plant.mass": (5.0, 1.0), "initial.speed": (10.0, 10.0)}.items():
+            strips = np.floor((batch.values[path] - low) / width * 50).astype(int)
+            assert sorted(strips) == list(range(50))
+
+    def test_lanes_of_similar_length_run_together(self):
+        times = np.array([1.0, 9.0, 3.0, 10.0, 1.2])
+        batch = Batch({"plant.mass": np.full(5, 5.0)}, durations=times)
+        groups = batch.groups(8.0)
+        assert sorted(np.concatenate([lanes for lanes, _ in groups])) == [0, 1, 2, 3, 4]
+        for lanes, duration in groups:
+            wanted = np.minimum(times[lanes], 8.0)
+            assert duration == wanted.max() < 2 * wanted.min() * (1 + 1e-9)
+
+    @pytest.mark.parametrize(
+        ("batch", "message"),
+        [
+            (Batch({"plant.mas": [5.0]}), "plant.mas is not a parameter of the loop"),
+            (Batch({"plant.mass": [5.0], "initial.speed": [9.0, 8.0]}), "different lengths, or none: plant.mass 1"),
+            (Batch({"plant.mass": []}), "different lengths, or none"),
+            (Batch({"plant.mass": [5.0, -1.0]}), r"plant.mass = -1 ... 5 leaves \(0, inf\) kg"),
+            (Batch({"controller.gain": [1.0, 2.0]}), r"a lane has shape \(\), not \(2,\)"),
+            (Batch({"plant.mass": [5.0]}, weights=[0.0]), "weights = 0 ... 0 are not all positive"),
+            (Batch({"plant.mass": [5.0]}, durations=[np.nan]), "durations = nan"),
+        ],
+    )
+    def test_says_what_does_not_fit(self, batch, message):
+        with pytest.raises(ValueError, match=message):
+            batch.check(LOOP)
+
+
+def evaluation(function, excess=lambda z: jnp.zeros(0)):
+    """The evaluation of a plain function of z with constraints."""
+
+    def loss(z, m):
+        seen = Seen(function(z), excess(z), jnp.asarray(0), {})
+        value = seen.objective + _penalty(seen.excess, m)
+        return value, (value, seen)
+
+    def evaluate(z, m):
+        gradient, (value, seen) = jax.grad(loss, has_aux=True)(z, m)
+        return Evaluation(value, gradient, seen)
+
+    return jax.jit(jax.vmap(evaluate)), lambda z, m: loss(z, m)[0]
+
+
+def descend(function, starts, optimiser=None, steady=None, **stopping):
+    evaluate, loss = evaluation(function)
+    descent = Descent(
+        evaluate,
+        loss,
+        steady or (lambda z: np.ones(len(z), bool)),
+        optimiser or lbfgs(),
+        Stopping(**stopping),
+        lambda lanes: None,
+    )
+    starts = np.atleast_2d(np.asarray(starts, float))
+    return descent.run(starts, Multipliers(np.zeros((len(starts), 0)), np.ones(len(starts))))
+
+
+def rosenbrock(z):
+    return jnp.sum(100 * (z[1:] - z[:-1] ** 2) ** 2 + (1 - z[:-1]) ** 2)
+
+
+class TestDescent:
+    def test_reaches_the_minimum_as_scipy_does(self):
+        start = np.full(6, -1.0)
+        (lane,) = descend(rosenbrock, start, iterations=200)
+        assert lane.reason is Reason.GRADIENT
+        np.testing.assert_allclose(lane.z, np.ones(6), rtol=0, atol=1e-6)
+        theirs = minimize(jax.value_and_grad(rosenbrock), start, jac=True, method="L-BFGS-B")
+        assert lane.evaluations < 2 * theirs.nfev
+
+    def test_a_kink_does_not_stop_it(self):
+        (lane,) = descend(lambda z: jnp.abs(z[0] - 1) + 10 * jnp.abs(z[1] + 2 * z[0]) + 0.1 * z[0] ** 2, [3.0, 1.0])
+        np.testing.assert_allclose(lane.z, [1.0, -2.0], rtol=0, atol=1e-4)
+
+    def test_it_backs_away_from_where_nothing_is_defined(self):
+        """sqrt is NaN beyond 1, right where the first long steps go."""
+        (lane,) = descend(lambda z: jnp.sum((z - 0.99) ** 2) - 1e-3 * jnp.sum(jnp.sqrt(1 - z)), [-3.0, -0.5])
+        assert np.isfinite(lane.loss)
+        slope = jax.grad(lambda x: (x - 0.99) ** 2 - 1e-3 * jnp.sqrt(1 - x))
+        assert float(jnp.max(jnp.abs(jax.vmap(slope)(jnp.asarray(lane.z))))) < 1e-5
+
+    def test_what_is_not_stable_is_not_entered(self):
+        steady = lambda z: z[:, 0] > 0.5  # noqa: E731
+        (lane,) = descend(lambda z: jnp.sum(z**2), [2.0, 1.0], steady=steady)
+        assert lane.z[0] > 0.5
+        assert lane.loss < 0.5
+
+    def test_every_start_goes_its_own_way(self):
+        lanes = descend(lambda z: (z[0] ** 2 - 1) ** 2 + 0.1 * z[0], [[2.0], [-2.0], [0.3], [np.nan]])
+        ends = [lane.z[0] for lane in lanes]
+        roots = np.sort(np.roots([4.0, 0.0, -4.0, 0.1]).real)[[2, 0]]
+        np.testing.assert_allclose(ends[:2], roots, rtol=0, atol=1e-6)
+        assert min(abs(ends[2] - e) for e in ends[:2]) < 1e-4
+        assert lanes[3].reason is Reason.START
+
+    def test_it_is_deterministic(self):
+        a, b = (descend(rosenbrock, np.full(4, -1.2), iterations=60)[0] for _ in range(2))
+        assert a.history == b.history
+
+    @pytest.mark.parametrize(
+        "optimiser", [optax.adam(0.05), optax.sgd(0.02, momentum=0.9), optax.lbfgs(), optax.adan(0.1)]
+    )
+    def test_any_optimiser_of_optax(self, optimiser):
+        given = Optimiser(optax.with_extra_args_support(optimiser), False)
+        (lane,) = descend(lambda z: jnp.sum((z - 1) ** 2 * jnp.array([1.0, 10.0])), [4.0, -3.0], given, iterations=800)
+        np.testing.assert_allclose(lane.z, [1.0, 1.0], rtol=0, atol=1e-3)
+
+    def test_it_says_why_it_ended(self):
+        (limited,) = descend(rosenbrock, np.full(6, -1.0), iterations=3)
+        assert limited.reason is Reason.LIMIT
+        assert limited.iterations == 3
+        assert [p.iteration for p in limited.history] == [0, 1, 2, 3]
+        (flat,) = descend(lambda z: 1.0 + 1e-12 * z[0], [0.0], gradient=1e-20, change=1e-6)
+        assert flat.reason is Reason.CHANGE
+
+
+class Constrained:
+    """A problem without rollouts: minimise x^2 + 2 y^2 with 1 - x - y <= 0; the minimum is at (2/3, 1/3)."""
+
+    mode = Mode.REVERSE
+    subject = None
+
+    def __init__(self, start, excess):
+        self.space, self.start, self._excess = self, np.asarray(start, float), excess
+        self._evaluate, self._loss = evaluation(lambda z: z[0] ** 2 + 2 * z[1] ** 2, excess)
+
+    def place(self, subject):
+        return self.start
+
+    def spread(self, key, count):
+        return np.asarray(jax.random.normal(key, (count, 2)))
+
+    def values(self, z):
+        return {"x": z[0], "y": z[1]}
+
+    def at(self, subject, z):
+        return {"x": z[0], "y": z[1]}
+
+    def valuer(self):
+        return jax.vmap(lambda z: Seen(z[0] ** 2 + 2 * z[1] ** 2, self._excess(z), jnp.asarray(0), {}))
+
+    def loss(self, scale):
+        return lambda z, m: (self._loss(z, m), None)
+
+    def evaluator(self, scale):
+        return self._evaluate
+
+    def steady(self):
+        return lambda z: np.ones(len(z), bool)
+
+
+class TestConstraints:
+    def test_the_multipliers_find_the_constrained_minimum(self):
+        problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1], z[0] - 5.0]))
+        found = Search(problem, Method(tolerance=1e-7, rounds=20), None).result()
+        np.testing.assert_allclose([found.values["x"], found.values["y"]], [2 / 3, 1 / 3], rtol=0, atol=1e-5)
+        np.testing.assert_allclose(found.objective[1], 2 / 3, rtol=0, atol=1e-5)
+        assert found.met
+        assert found.violation[1] <= 1e-7
+
+    def test_it_says_when_they_cannot_be_met(self):
+        problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0], z[0] + 1.0]))
+        found = Search(problem, Method(rounds=5), None).result()
+        assert not found.met
+        assert found.violation[1] > 0.9
+
+    def test_the_best_of_many_starts_meets_them(self):
+        problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))
+        told = []
+        found = Search(problem, Method(starts=4, seed=3, tolerance=1e-6, rounds=20), told.append).result()
+        assert len(found.starts) == 4
+        np.testing.assert_allclose(found.objective[1], 2 / 3, rtol=0, atol=1e-4)
+        assert told[-1].starts == 0
+        assert found.history[-1].evaluations == max(p.evaluations for p in found.history)

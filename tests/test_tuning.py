@@ -1,0 +1,284 @@
+"""Tuning with rollouts: gradients, optima against another search, stability, worst cases, LQ weights, pole regions."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import solve_continuous_are
+from scipy.optimize import minimize
+
+import diffabs as d
+from diffabs import actuators, controllers, plants, references
+from diffabs.design.polytope import Polytope
+from diffabs.design.scaled import SpeedScaled, fall
+from diffabs.linearize import Sampling, SlipModel
+from diffabs.objectives import BRAKING
+from diffabs.pytree import strong
+from diffabs.stability import stable_step, stable_steps
+from diffabs.stops import SpeedReached
+from diffabs.tune import AtMost, Batch, Method, Mode, Poles, Stopping, grid, tune, worst_case
+from diffabs.tune.problem import Multipliers
+from diffabs.tune.tuning import posed
+from diffabs.tune.weights import lq_weights, regulator
+
+RIG = d.Loop(
+    plant=plants.MirroredRig(),
+    initial=d.BrakeStart(speed=8.0, slip=0.02),
+    stop=SpeedReached(speed=6.5),
+    controller=controllers.StateFeedback(gain=np.array([-3000.0, -60.0]), torque_min=0.0, torque_max=9.03),
+    feedforward=controllers.HoldingInput(),
+    actuator=actuators.Lag(time_constant=1e-3),
+)
+GAINS = {"controller.gain": ((-1e5, -1e3), (-30.0, -5.0))}
+SOLVER = d.FixedStep(5e-4, 0.25)
+TWO = grid({"plant.mass": [5.3, 6.2]})
+
+
+def value_and_gradient(problem):
+    """Loss and gradient as functions of one z."""
+    m = Multipliers(jnp.full((1, 2), 0.3), jnp.full(1, 7.0))
+    evaluate = problem.evaluator(0.01)
+    return lambda z: jax.tree.map(lambda x: np.asarray(x[0]), evaluate(jnp.asarray(z)[None], m))
+
+
+@pytest.mark.slow
+def test_the_gradient_is_that_of_differences_forward_and_reverse():
+    """Objective and both terms of the augmented Lagrangian."""
+    ask = {"objective": {"iae": 1.0}, "over": TWO, "solver": SOLVER, "constraints": [AtMost("overshoot", 0.01)]}
+    forward, reverse = (value_and_gradient(posed(RIG, free=GAINS, mode=mode, **ask)) for mode in Mode)
+    z = posed(RIG, free=GAINS, **ask).space.place(RIG)
+    found = forward(z)
+    assert (found.seen.excess > 0).all()
+    np.testing.assert_allclose(found.gradient, reverse(z).gradient, rtol=1e-8)
+    np.testing.assert_allclose(found.seen.metrics["overshoot"] / 0.01 - 1, found.seen.excess, rtol=1e-9)
+    h = 1e-5
+    for i in range(2):
+        e = h * np.eye(2)[i]
+        away = (forward(z + e).loss - forward(z - e).loss) / (2 * h)
+        np.testing.assert_allclose(found.gradient[i], away, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_it_finds_what_nelder_mead_finds_and_stays_where_the_step_is_stable():
+    ask = {"objective": {"iae": 1.0, "final_slip_error": 0.1}, "over": TWO, "solver": SOLVER}
+    found = tune(RIG, free=GAINS, method=Method(starts=2, stopping=Stopping(iterations=40)), **ask)
+    problem = posed(RIG, free=GAINS, **ask)
+    value, steady = problem.valuer(), problem.steady()
+
+    def objective(z):
+        return float(value(jnp.asarray(z)[None]).objective[0]) if steady(z[None])[0] else 1.0
+
+    theirs = minimize(objective, problem.space.place(RIG), method="Nelder-Mead", options={"maxfev": 300})
+    assert found.objective[1] <= theirs.fun * (1 + 1e-3)
+    assert found.objective[1] < 0.8 * found.objective[0]
+    assert stable_step(found.loop) >= SOLVER.step
+    assert found.mode is Mode.FORWARD
+    assert found.history[-1].objective == found.objective[1]
+    again = tune(RIG, free=GAINS, method=Method(starts=2, stopping=Stopping(iterations=40)), **ask)
+    assert again.history == found.history
+
+
+@pytest.mark.slow
+def test_a_gain_that_the_step_cannot_follow_is_not_entered():
+    """Speed is everything here, so kp goes up until RK4 with this step would no longer follow."""
+    car = d.Loop(
+        plant=plants.QuarterCar(),
+        initial=d.BrakeStart(speed=8.0, slip=0.02),
+        stop=SpeedReached(speed=6.0),
+        controller=controllers.PID(kp=2000.0, torque_max=1e6),
+        reference=references.FixedSlip(slip=0.1),
+    )
+    step = 2e-3
+    found = tune(
+        car, free={"controller.kp": (500.0, 1e6)}, objective={"iae": 1.0}, solver=d.FixedStep(step, 0.4),
+        method=Method(stopping=Stopping(iterations=25)),
+    )  # fmt: skip
+    assert stable_step(found.loop) >= step
+    assert stable_step(found.loop) < 4 * step
+    assert found.loop.controller.kp > 2000
+
+
+def test_a_start_that_is_not_stable_is_refused():
+    with pytest.raises(ValueError, match=r"the integration step is not stable there: solver.step = 0.1 s"):
+        tune(RIG, free=GAINS, objective={"iae": 1.0}, solver=d.FixedStep(0.1, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"objective": {}}, "the objective has no metric"),
+        ({"objective": {"iea": 1.0}}, "iea is not measured; there is stop_time"),
+        ({"objective": {"iae": np.nan}}, "the weight of iae is nan"),
+        ({"constraints": [AtMost("overshot", 0.1)]}, "overshot is not measured"),
+        ({"over": Batch({"plant.mass": [-1.0]})}, "plant.mass = -1"),
+        ({"free": {"plant.mass": (9.0, 10.0)}}, "plant.mass = 5.3 is not inside"),
+    ],
+)
+def test_says_what_does_not_fit(change, message):
+    given = {"free": GAINS, "objective": {"iae": 1.0}, "solver": SOLVER}
+    with pytest.raises(ValueError, match=message):
+        tune(RIG, **(given | change))
+
+
+@pytest.mark.slow
+def test_lanes_in_groups_are_the_lanes_together():
+    speeds = np.array([8.0, 12.0, 7.0, 11.0])
+    values = {"initial.speed": speeds}
+    ask = {"free": GAINS, "objective": {"stop_distance": 1.0}, "solver": d.FixedStep(5e-4, 0.8)}
+    together, apart = (
+        jax.jit(posed(RIG, over=Batch(values, durations=t), **ask).seen)(jnp.zeros(2))
+        for t in (None, np.array([0.3, 0.8, 0.25, 0.75]))
+    )
+    np.testing.assert_allclose(apart.metrics["stop_distance"], together.metrics["stop_distance"], rtol=1e-12)
+    weighed = posed(RIG, over=Batch(values, weights=1 / speeds), **ask).seen(jnp.zeros(2))
+    np.testing.assert_allclose(weighed.objective, np.mean(together.metrics["stop_distance"] / speeds), rtol=1e-12)
+
+
+class TestStability:
+    def test_many_loops_at_once(self):
+        masses = np.array([5.3, 6.2, 9.0])
+        batch = jax.vmap(lambda m: d.replace(strong(RIG), {"plant.mass": m}))(masses)
+        each = [stable_step(d.replace(RIG, {"plant.mass": m})) for m in masses]
+        np.testing.assert_allclose(stable_steps(batch), each, rtol=1e-12)
+
+    def test_the_limit_of_a_real_and_of_an_imaginary_mode(self):
+        from diffabs.stability import _radius
+
+        np.testing.assert_allclose(_radius(np.array([-1.0 + 0j])), 2.785, atol=1.5e-3)  # the roots of |R(z)| = 1
+        np.testing.assert_allclose(_radius(np.array([1j])), np.sqrt(8.0), atol=1.5e-3)
+
+
+class TestPoles:
+    CLOSED = np.array([[[-2.0, 3.0], [-3.0, -2.0]], [[-5.0, 1.0], [0.0, -1.0]]])
+
+    def loop_for(self, gain):
+        return dataclasses.replace(RIG, controller=controllers.StateFeedback(gain=gain))
+
+    def test_continuous(self):
+        system = Polytope(self.CLOSED, np.zeros((2, 2, 1)), states=("integral of slip error", "slip error"))
+        excess = Poles(system, decay=1.5, damping=0.6).excess(self.loop_for(np.array([-1.0, -2.0])), {})
+        rates, damping = np.split(np.asarray(excess), 2)
+        np.testing.assert_allclose(np.sort(rates), np.sort(1 + np.array([-2, -2, -5, -1]) / 1.5), rtol=1e-12)
+        np.testing.assert_allclose(np.sort(damping), np.sort([0.6 - 2 / 13**0.5] * 2 + [-0.4] * 2), rtol=1e-9)
+
+    def test_discrete_poles_are_those_of_continuous_time(self):
+        from scipy.linalg import expm
+
+        period = 0.05
+        sampled = np.array([expm(a * period) for a in self.CLOSED])
+        names = ("integral of slip error", "slip error")
+        both = [
+            Poles(Polytope(a, np.zeros((2, 2, 1)), period=p, states=names), decay=1.5, damping=0.6)
+            for a, p in ((self.CLOSED, None), (sampled, period))
+        ]
+        loop = self.loop_for(np.array([-1.0, -2.0]))
+        np.testing.assert_allclose(*(np.sort(np.asarray(one.excess(loop, {}))) for one in both), rtol=1e-9)
+
+    def test_the_derivative_in_the_gain(self):
+        a, b = SlipModel().matrices()
+        system = Polytope(a[None], b[None], states=SlipModel().states)
+
+        def excess(k):
+            return Poles(system, decay=50.0, damping=0.8).excess(self.loop_for(k), {})
+
+        k, h = jnp.array([-11753.0, -48.0]), 1e-3
+        slope = jax.jacfwd(excess)(k)
+        for i in range(2):
+            e = h * np.eye(2)[i]
+            np.testing.assert_allclose(slope[:, i], (excess(k + e) - excess(k - e)) / (2 * h), rtol=1e-6, atol=1e-10)
+
+
+class TestWeights:
+    def test_the_gain_is_that_of_the_riccati_equation(self):
+        model = SlipModel(speed=20 / 3.6)
+        q = np.array([[1e6, 2e3], [2e3, 1e4]])
+        loop = lq_weights(RIG, q, 2.0, regulator(model))
+        np.testing.assert_allclose(loop.weights()[0], q, rtol=1e-12)
+        a, b = (np.asarray(x) for x in model.matrices())
+        k = -b.T @ solve_continuous_are(a, b, q, np.array([[2.0]])) / 2.0
+        np.testing.assert_allclose(loop.closed().controller.gain, k[0], rtol=1e-8)
+
+    def test_its_derivative(self):
+        loop = lq_weights(RIG, (1e6, 1e4), 1.0, regulator(SlipModel(speed=20 / 3.6)))
+
+        def gain(x):
+            values = {"log_diagonal": x[:2], "lower": x[2:3], "log_effort": x[3]}
+            return d.replace(loop, values).closed().controller.gain
+
+        x, h = jnp.concatenate([loop.log_diagonal, loop.lower + 30.0, jnp.zeros(1)]), 1e-5
+        slope = jax.jacfwd(gain)(x)
+        np.testing.assert_allclose(slope, jax.jacrev(gain)(x), rtol=1e-9)
+        for i in range(4):
+            e = h * np.eye(4)[i]
+            np.testing.assert_allclose(slope[:, i], (gain(x + e) - gain(x - e)) / (2 * h), rtol=1e-6)
+
+    @pytest.mark.parametrize(("q", "r"), [((1.0, 0.0), 1.0), ((1.0, 1.0), 0.0), ([[1.0, 2.0], [2.0, 1.0]], 1.0)])
+    def test_refuses_what_has_no_logarithm(self, q, r):
+        with pytest.raises(ValueError, match="is not positive definite"):
+            lq_weights(RIG, q, r, regulator(SlipModel()))
+
+
+class TestSpeedScaled:
+    MODEL = SlipModel(actuator=actuators.Lag(time_constant=1e-3), sampling=Sampling(period=1e-3))
+
+    def test_at_a_frozen_speed_it_is_the_same_loop(self):
+        """w = K z is u = (v/v0) K x, so closed loops are similar: the same poles."""
+        gain, v = np.array([[-8000.0, -200.0, 0.1, -0.2]]), 4.0
+        scaled = SpeedScaled(model=dataclasses.replace(self.MODEL, speed=v), reference_speed=10.0)
+        (a, b), (az, bz) = scaled.model.matrices(), scaled.matrices()
+        turned = gain * np.array([0.4, 0.4, 1.0, 1.0])  # the torques among the states are themselves in units of v/v0
+        poles = [np.sort_complex(np.linalg.eigvals(m)) for m in (az + bz @ gain, a + b @ turned)]
+        np.testing.assert_allclose(*poles, atol=1e-12)
+
+    def test_a_falling_speed_is_followed_step_by_step(self):
+        """Two periods, from v to v+: the physical states, brought to z with the speed of their own instant."""
+        v0, speeds = 10.0, (6.0, 5.9, 5.75)
+        gain = np.array([-8000.0, -200.0])
+        x = np.array([1e-3, 0.05, 1.0, 1.2])
+        z = x / np.array([1, 1, speeds[0] / v0, speeds[0] / v0])
+        for v, after in itertools.pairwise(speeds):
+            model = dataclasses.replace(self.MODEL, speed=v)
+            a, b = (np.asarray(m) for m in model.matrices())
+            x = a @ x + b[:, 0] * (v / v0) * (gain @ x[:2])
+            scaled = SpeedScaled(model=model, reference_speed=v0, fall=v / after - 1)
+            az, bz = (np.asarray(m) for m in scaled.matrices())
+            z = az @ z + bz[:, 0] * (gain @ z[:2])
+            np.testing.assert_allclose(z * np.array([1, 1, after / v0, after / v0]), x, rtol=1e-12)
+
+    def test_the_greatest_fall(self):
+        v, a, period = 1.4, 7.9, 1e-3
+        np.testing.assert_allclose(fall(a, v, period), v / (v - a * period) - 1, rtol=1e-12)
+
+    def test_refuses_continuous_time(self):
+        with pytest.raises(ValueError, match=r"model.sampling is continuous"):
+            SpeedScaled().matrices()
+
+
+BOX = {"plant.mass": (4.0, 8.0), "plant.road.w4": (0.3, 0.5), "actuator.time_constant": (5e-4, 4e-3)}
+
+
+@pytest.mark.slow
+class TestWorstCase:
+    def test_it_is_at_least_as_bad_as_thousands_of_samples(self):
+        found = worst_case(RIG, over=BOX, metric="max_slip", solver=SOLVER, bound=0.25, screen=16, starts=3)
+        low, high = np.array(list(BOX.values())).T
+        points = low + (high - low) * np.random.default_rng(0).random((3000, 3))
+        run = jax.jit(
+            jax.vmap(lambda p: d.measure(d.replace(RIG, dict(zip(BOX, p, strict=True))), SOLVER, BRAKING).metrics)
+        )
+        assert found.value >= float(jnp.max(run(points)["max_slip"]))
+        assert found.rollouts < 300
+        np.testing.assert_allclose(d.measure(found.loop, SOLVER, BRAKING).metrics["max_slip"], found.value, rtol=1e-9)
+        assert found.met is (found.value <= 0.25)
+        assert found.report().startswith("COUNTEREXAMPLE: max_slip" if not found.met else "No counterexample in")
+
+    def test_the_report_says_what_is_known(self):
+        found = worst_case(RIG, over=BOX, metric="iae", solver=SOLVER, bound=1.0, screen=8, starts=1, iterations=1)
+        assert found.met
+        assert "proved stable over the box" in found.report(True)
+        assert "No certificate covers the box" in found.report(False)
+        with pytest.raises(ValueError, match="iea is not measured"):
+            worst_case(RIG, over=BOX, metric="iea", solver=SOLVER)
