@@ -4,16 +4,14 @@ Results go to stdout, as tables or with --json as one JSON document; everything 
 
 import contextlib
 import dataclasses
-import importlib.util
 import math
-import os
 import pathlib
 from typing import Annotated, Any, NoReturn
 
 import jax
 import typer
 
-from diffabs import __version__, catalogue, commands_design, console, show
+from diffabs import __version__, catalogue, commands_design, commands_identify, commands_tune, console, show
 from diffabs.rollout import Run, measure, rollout
 from diffabs.scenario import Scenario, header, load, names
 
@@ -26,7 +24,6 @@ app = typer.Typer(
 )
 
 MOST_ROWS = 20_000  # of a trajectory
-PICTURES = (".png", ".pdf", ".svg")
 PLURALS = {f"{name}s": name for name in ("plant", "road", "controller", "reference", "actuator", "sensor")}
 PLURALS |= {"feedforward": "feedforward", "antiwindup": "antiwindup", "initial": "initial"}
 PLURALS |= {"stops": "stop", "objectives": "objective"}
@@ -98,18 +95,9 @@ def simulate(
 
 
 def _check_targets(csv: pathlib.Path | None, plot: pathlib.Path | None) -> None:
-    if plot:
-        if plot.suffix.lower() not in PICTURES:
-            console.fail(f"--plot {plot}: the name must end in {', '.join(PICTURES)}")
-        _need_matplotlib()
+    console.check_picture(plot)
     if csv and plot and csv.resolve() == plot.resolve():
         console.fail(f"--csv and --plot are the same file, {csv}")
-
-
-def _need_matplotlib() -> None:
-    os.environ.setdefault("MPLBACKEND", "agg")
-    if importlib.util.find_spec("matplotlib") is None:
-        console.fail('figures need matplotlib: pip install "diffabs[plot]"')
 
 
 def _run(chosen: Scenario, keep: bool) -> Run:
@@ -136,6 +124,8 @@ def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -
 
 app.command()(commands_design.design)
 app.command()(commands_design.certify)
+app.command()(commands_tune.tune)
+app.command()(commands_identify.identify)
 
 
 @app.command("list")
@@ -183,7 +173,7 @@ def reproduce(
 ) -> None:
     """A paper's whole result: figures, summary.json, and a table of ours against the published numbers."""
     with console.guarded():
-        _need_matplotlib()
+        console.need_matplotlib()
         from diffabs.papers import PAPERS
 
         if name != "all" and name not in PAPERS:

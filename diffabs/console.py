@@ -1,6 +1,8 @@
 """What every command does: report errors in one line, wait with a sign of life, replace files whole."""
 
 import contextlib
+import importlib.util
+import math
 import os
 import pathlib
 import shutil
@@ -20,7 +22,9 @@ T = TypeVar("T")
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 PATIENCE = 2.0  # s without a sign of life
+AGAIN = 5.0  # s between lines about how far work is
 WORKER = "diffabs worker"
+PICTURES = (".png", ".pdf", ".svg")
 
 # What commands take.
 ScenarioName = Annotated[str, typer.Argument(help="A TOML file, or the name of a packaged scenario.")]
@@ -59,8 +63,9 @@ def guarded() -> Iterator[None]:
         raise typer.Exit(INTERRUPTED) from None
 
 
-def waited(work: Callable[[], T], message: str) -> T:
-    """The result of `work`, with a spinner on a terminal, or a line if it takes long elsewhere.
+def waited(work: Callable[[], T], message: str, detail: Callable[[], str] | None = None) -> T:
+    """The result of `work`, with a spinner on a terminal, or a line if it takes long elsewhere. `detail` says how far
+    the work is: beside the spinner, or in a line every few seconds.
 
     The work has a thread of its own, because Ctrl-C cannot interrupt compiled code in the main one. Raises what it
     raises.
@@ -76,14 +81,21 @@ def waited(work: Callable[[], T], message: str) -> T:
 
     thread = threading.Thread(target=run, name=WORKER, daemon=True)
     console = Console(stderr=True)
-    begun, told = time.monotonic(), console.is_terminal
-    with console.status(f"{message} ...") if console.is_terminal else contextlib.nullcontext():
+
+    def line() -> str:
+        return f"{message} ... {detail() if detail else ''}".strip()
+
+    tell, due, told = say, time.monotonic() + PATIENCE, ""
+    with console.status(line()) if console.is_terminal else contextlib.nullcontext() as status:
+        if status:
+            tell, due = status.update, 0.0
         thread.start()
         while thread.is_alive():
             thread.join(0.1)
-            if not told and time.monotonic() - begun > PATIENCE:
-                say(f"{message} ...")
-                told = True
+            if time.monotonic() > due:
+                if told != (told := line()):
+                    tell(told)
+                due = (0.0 if status else time.monotonic() + AGAIN) if detail else math.inf
     if errors:
         raise errors[0]
     return result[0]
@@ -96,6 +108,34 @@ def leave(status: Any) -> NoReturn:
         sys.stderr.flush()
         os._exit(status if isinstance(status, int) else FAILED)
     raise SystemExit(status)
+
+
+def need_extra(extra: str, *modules: str) -> None:
+    """Raises typer.Exit if a module of an optional extra is not installed."""
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    if missing:
+        fail(f'{" and ".join(missing)} needed: pip install "diffabs[{extra}]"')
+
+
+def need_matplotlib() -> None:
+    """Raises typer.Exit where no figure can be drawn."""
+    os.environ.setdefault("MPLBACKEND", "agg")
+    if importlib.util.find_spec("matplotlib") is None:
+        fail('figures need matplotlib: pip install "diffabs[plot]"')
+
+
+def check_picture(plot: pathlib.Path | None) -> None:
+    """Raises typer.Exit for a name that no figure can have, or without matplotlib."""
+    if plot:
+        if plot.suffix.lower() not in PICTURES:
+            fail(f"--plot {plot}: the name must end in {', '.join(PICTURES)}")
+        need_matplotlib()
+
+
+def check_scenario_file(out: pathlib.Path | None) -> None:
+    """Raises typer.Exit for a name under which no scenario would be found."""
+    if out and out.suffix != ".toml":
+        fail(f"--out {out}: the name must end in .toml")
 
 
 @contextlib.contextmanager

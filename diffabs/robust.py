@@ -10,7 +10,6 @@
 A path may be one key with dots or nested tables. Only what the linear model of a loop depends on can have a range."""
 
 import dataclasses
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,11 +17,12 @@ import numpy as np
 
 from diffabs.actuators import Lag, RateLimit
 from diffabs.blocks import Series
-from diffabs.catalogue import DEEPEST, KMH, ScenarioError, joined, number, shown, unknown, wrong
+from diffabs.catalogue import ScenarioError, joined, number, shown, unknown, wrong
 from diffabs.controllers import Sampled
 from diffabs.linearize import SlipModel
 from diffabs.loop import Loop
 from diffabs.pytree import Spec, parameters
+from diffabs.ranges import Entry, entries
 
 FIELDS = ("Q", "R", "decay", "damping", "over")
 ENTRY = Spec("1")
@@ -87,35 +87,6 @@ def read(table: Any, loop: Loop) -> Task:
     return Task(**weights, **numbers, over=_over(table.get("over", {}), loop))
 
 
-def flat(over: Mapping[str, Any]) -> dict[str, Any]:
-    """The ranges by dotted path, whether they were written as nested tables or with dotted keys. Raises ScenarioError
-    for a path that comes twice."""
-    found: dict[str, Any] = {}
-    pending = list(over.items())
-    while pending:
-        path, value = pending.pop(0)
-        if path.count(".") > DEEPEST:
-            raise ScenarioError(f"design.over: {shown(path)} is nested more than {DEEPEST} deep")
-        if isinstance(value, dict):
-            pending[:0] = [(f"{path}.{key}", item) for key, item in value.items()]
-            continue
-        path = canonical(path)
-        if path in found:
-            raise ScenarioError(f"{_where(path)} is given twice")
-        found[path] = value
-    return found
-
-
-def canonical(path: str) -> str:
-    """A path as messages have it: without the quotes of a key, the road in a section of its own."""
-    path = path.replace('"', "").replace("'", "")
-    return path.removeprefix("plant.") if path.startswith("plant.road.") else path
-
-
-def _where(path: str) -> str:
-    return f"design.over.{path if re.fullmatch(r'[a-zA-Z0-9_.-]{1,60}', path) else shown(path)}"
-
-
 def _weight(given: Any, path: str) -> Any:
     """A weight as a number or nested tuples, which compare; its order is for the model to say."""
     from diffabs.design.spec import weight
@@ -144,26 +115,17 @@ def _weight(given: Any, path: str) -> Any:
 def _over(table: Any, loop: Loop) -> dict[str, Range]:
     if not isinstance(table, dict):
         raise wrong("design.over", table, "a table of ranges")
-    known = {canonical(path): (path, parameter, 1.0) for path, parameter in _known(loop).items()}
-    known |= {f"{key}_kmh": (path, of, KMH) for key, (path, of, _) in known.items() if of.spec.unit == "m/s"}
-    found: dict[str, Range] = {}
-    for key, given in flat(table).items():
-        if key not in known:
-            raise unknown(f"{_where(key)} is nothing that the linear model of this loop depends on", key, known)
-        path, parameter, scale = known[key]
-        if path in found:
-            raise ScenarioError(f"{_where(canonical(path))} is given twice, in m/s and in km/h")
-        found[path] = _range(given, parameter, _where(key), scale)
-    return found
+    known = _known(loop)
+    specs = {path: parameter.spec for path, parameter in known.items()}
+    given = entries(table, "design.over", specs, "nothing that the linear model of this loop depends on")
+    return {entry.path: _range(entry, known[entry.path].shape) for entry in given}
 
 
-def _range(given: Any, parameter: _Parameter, path: str, scale: float) -> Range:
+def _range(entry: Entry, shape: tuple[int, ...]) -> Range:
     """Low and high end in SI, checked in the unit in which they were given."""
-    spec = parameter.spec
-    if scale != 1:
-        spec = dataclasses.replace(spec, unit="km/h", low=spec.low * scale, high=spec.high * scale)
-    if parameter.shape:
-        raise ScenarioError(f"{path} is a list of {parameter.shape[0]} numbers; only single numbers can have a range")
+    path, given, spec = entry.where, entry.given, entry.spec
+    if shape:
+        raise ScenarioError(f"{path} is a list of {shape[0]} numbers; only single numbers can have a range")
     if not isinstance(given, list):
         raise wrong(path, given, f"a range [low, high] in {spec.interval()}")
     if len(given) != 2:
@@ -173,7 +135,7 @@ def _range(given: Any, parameter: _Parameter, path: str, scale: float) -> Range:
         raise ScenarioError(f"{path} = {shown([low, high])} is outside {spec.interval()}")
     if low > high:
         raise ScenarioError(f"{path} = {shown([low, high])} is inverted: a range [low, high] in {spec.interval()}")
-    return low / scale, high / scale
+    return low / entry.scale, high / entry.scale
 
 
 def _known(loop: Loop) -> dict[str, _Parameter]:

@@ -4,6 +4,7 @@
     [solver]       step [s], duration [s], every (trajectories keep every so many steps), seed (of noisy sensors)
     [objective]    name = a part; adds to, or changes, those of every braking report
     [design]       what a robust gain is asked for, and over which ranges: see `robust`
+    [tune]         which parameters are free, what is made small, and over which runs: see `goal`
 
 What is left out has its default. Speeds may be given in km/h: `speed_kmh`. A value is never evaluated as code."""
 
@@ -19,7 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import robust, toml
+from diffabs import goal, ranges, robust, toml
 from diffabs.catalogue import OTHERS, build, filled, joined, number, shown, unknown, whole, wrong
 from diffabs.catalogue import ScenarioError as ScenarioError
 from diffabs.loop import Loop
@@ -38,7 +39,8 @@ TIME = Spec("s", low=0.0, open_low=True)
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """What is run: a loop, how it is integrated [s], what is measured, the seed of its noise; what a design must do."""
+    """What is run: a loop, how it is integrated [s], what is measured, the seed of its noise; what a design must do,
+    and what is tuned."""
 
     name: str
     title: str = ""
@@ -48,6 +50,7 @@ class Scenario:
     objectives: Mapping[str, Objective] = dataclasses.field(default_factory=lambda: dict(BRAKING))
     seed: int = 0
     design: robust.Task = dataclasses.field(default_factory=robust.Task)
+    tune: goal.Goal = dataclasses.field(default_factory=goal.Goal)
 
     def key(self) -> jax.Array:
         """The random key of a run."""
@@ -121,15 +124,13 @@ def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
 
 
 def _lifted(table: dict[str, Any]) -> dict[str, Any]:
-    """The road of the plant in its own section, and the ranges of the design by path, however they were written."""
+    """The road of the plant in its own section, and ranges by path, however they were written."""
     plant = table.get("plant")
     if isinstance(plant, dict) and "road" in plant:
         if "road" in table:
             raise ScenarioError("road is given twice, as a section and in plant")
         table["road"] = plant.pop("road")
-    design = table.get("design")
-    if isinstance(design, dict) and isinstance(design.get("over"), dict):
-        design["over"] = robust.flat(design["over"])
+    ranges.lifted(table)
     return table
 
 
@@ -140,8 +141,7 @@ def _override(table: dict[str, Any], override: str) -> None:
         raise ScenarioError(f"override {shown(override)} is not of the form section.field=value")
     if keys[:2] == ["plant", "road"]:
         keys = keys[1:]
-    if keys[:2] == ["design", "over"] and len(keys) > 2:
-        keys[2:] = [robust.canonical(".".join(keys[2:]))]
+    keys = ranges.joined_keys(keys)
     node: Any = table
     for i, key in enumerate(keys[:-1]):
         place = _place(node, key, ".".join(keys[:i]))
@@ -157,15 +157,9 @@ def _override(table: dict[str, Any], override: str) -> None:
         node.pop(other, None)
     node[place] = toml.value(text.strip())
     _lifted(table)
-    if len(keys) == 1 and isinstance(node[place], str):
-        _forget_ranges(table, keys[0])
-
-
-def _forget_ranges(table: dict[str, Any], section: str) -> None:
-    """Another part has other parameters: the ranges of the one it replaces go with it."""
-    design = table.get("design")
-    if isinstance(design, dict) and isinstance(design.get("over"), dict):
-        design["over"] = {path: ends for path, ends in design["over"].items() if not path.startswith(f"{section}.")}
+    new = node[place]
+    if isinstance(new, str) or (isinstance(new, dict) and "type" in new):
+        ranges.forget(table, ".".join(keys))
 
 
 def _place(node: Any, key: str, path: str) -> Any:
@@ -192,14 +186,16 @@ def _assembled(name: str, table: dict[str, Any]) -> Scenario:
         key: build("objective", value, BRAKING.get(key), joined("objective", key)) for key, value in given.items()
     }
     loop = filled(Loop(), sections, "", "")
+    objectives = {**BRAKING, **measured}
     return Scenario(
         name=name,
         **text,
         loop=loop,
         solver=solver,
-        objectives={**BRAKING, **measured},
+        objectives=objectives,
         seed=seed,
         design=robust.read(table.get("design", {}), loop),
+        tune=goal.read(table.get("tune", {}), loop, objectives),
     )
 
 
@@ -271,5 +267,5 @@ def dump(scenario: Scenario) -> str:
     solver = {name: getattr(scenario.solver, name) for name in ("step", "duration", "every")}
     sections["solver"] = {**solver, "seed": scenario.seed}
     sections["objective"] = {name: toml.table("objective", part) for name, part in scenario.objectives.items()}
-    sections["design"] = scenario.design.table()
+    sections["design"], sections["tune"] = scenario.design.table(), scenario.tune.table()
     return toml.document({key: getattr(scenario, key) for key in TEXTS}, sections)

@@ -131,6 +131,52 @@ def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict:
     _print(f"{result['vertices']} vertices; their hull covers {checked} systems checked within the ranges", vertices)
 
 
+def tuned(result: dict[str, Any], chosen: Scenario) -> None:
+    """Parameters, metrics and constraints before and after, and how it went."""
+    free = Table("parameter", "before", "after", "low", "high", "unit")
+    for path, row in result["free"].items():
+        free.add_row(path, *(_brief(row[key]) for key in ("before", "after", "low", "high")), row["unit"])
+    _print(f"{chosen.title or chosen.name}: free parameters", free)
+    metrics = Table("metric", "mean before", "mean after", "worst before", "worst after", "unit")
+    for name in result["metrics"]["before"]["mean"]:
+        numbers = (result["metrics"][when][of][name] for of in ("mean", "worst") for when in ("before", "after"))
+        metrics.add_row(name, *map(_brief, numbers), unit_of(chosen.objectives[name]))
+    _print(f"over {result['lanes']} lane{'s' if result['lanes'] > 1 else ''}", metrics)
+    if result["constraints"]:
+        limits = Table("constraint", "bound", "before", "after", "met")
+        for row in result["constraints"]:
+            numbers = ("" if row[key] is None else _brief(row[key]) for key in ("bound", "before", "after"))
+            limits.add_row(row["name"], *numbers, "yes" if row["met"] else "NO")
+        _print("constraints, worst lane or vertex", limits)
+    how = Table("tuning", "")
+    for name in ("before", "after"):
+        how.add_row(f"objective {name}", _brief(result["objective"][name]))
+    how.add_row("gradients computed", str(result["evaluations"]))
+    how.add_row("gradient mode", result["mode"])
+    how.add_row("greatest component of the last gradient", f"{result['gradient_norm']:.2g}")
+    how.add_row("it ended because", result["reason"])
+    _print("", how)
+    for name, path in result["files"].items():
+        say(f"{name}: {path}")
+
+
+def identified(result: dict[str, Any]) -> None:
+    """Values with standard deviations, what hangs together, what the data leave open, and what is left over."""
+    values = Table("parameter", "before", "identified", "standard deviation", "unit")
+    for name, row in result["values"].items():
+        values.add_row(name, _brief(row["before"]), _brief(row["value"]), f"{row['deviation']:.3g}", row["unit"])
+    _print(f"{result['scenario']}: identified from {result['data']['samples']} instants", values)
+    left = Table("column", "sigma", "rms", "mean", "largest", "unit")
+    for name, row in result["residuals"].items():
+        left.add_row(name, *(f"{row[key]:.3g}" for key in ("sigma", "rms", "mean", "largest")), row["unit"])
+    _print("simulated minus measured", left)
+    for row in result["correlations"]:
+        say(f"note: {row['between'][0]} and {row['between'][1]} are correlated by {row['correlation']:.4f}")
+    say(f"it ended because {result['reason']}, after {result['evaluations']} evaluations")
+    for name, path in result["files"].items():
+        say(f"{name}: {path}")
+
+
 def _brief(value: Any) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
@@ -143,4 +189,4 @@ def _print(title: str, table: Table) -> None:
     console = Console(markup=False, emoji=False, highlight=False)  # `[N m]` is a unit here, not a style
     if not console.is_terminal:
         console.width = PIPE_WIDTH
-    console.print(title, table, sep="\n")
+    console.print(*([title] if title else []), table, sep="\n")

@@ -233,6 +233,20 @@ def test_sampled_loop_behind_a_delay():
     assert "note: the linear model is not the loop's own linearisation" in result.stderr
 
 
+@pytest.mark.slow
+def test_a_gain_that_follows_the_speed_is_proved_as_one():
+    """Fixed at its value for 50 km/h, the same gain is not stable at 5 km/h under 1 kHz; in proportion it is."""
+    document = json.loads(run("certify", "slip-cured", "--json", "--gain=-17481,-349,0,0").stdout)
+    assert document["over"]["model.plant.mass"] == [5.3, 6.2]
+    # friction of 0.3996 decelerates the body by 7.840 m/s^2; with 1 % more, 7.918e-3/(5/3.6 - 7.918e-3) in a period
+    assert document["over"]["fall"] == [0.0, pytest.approx(0.005734, rel=1e-3)]
+    assert document["decay_rate"] == pytest.approx(62.35, abs=0.1)
+    assert "The fall of the speed: it is frozen." not in document["neglected"]
+    fixed = ("controller.controller=state-feedback", "controller.controller.gain=-17481,-349")
+    result = run("certify", "slip-cured", *(word for change in fixed for word in ("--set", change)), status=1)
+    assert "is unstable even if it is fixed" in result.stderr
+
+
 # bad input
 
 
@@ -289,7 +303,8 @@ def test_without_the_extra(command, monkeypatch, no_polytope):
 
 def test_other_commands_do_without_the_extra():
     code = (
-        "import sys; sys.modules.update(dict.fromkeys(['cvxpy', 'scipy', 'clarabel'])); import diffabs.cli as c; "
+        "import sys; sys.modules.update(dict.fromkeys(['cvxpy', 'scipy', 'clarabel', 'optax'])); "
+        "import diffabs.cli as c, diffabs.scenario as s; s.load('slip-lmi', integrated=False); "
         "c.app(['list', 'scenarios'])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from diffabs import catalogue, controllers, roads, scenario
+from diffabs.goal import AGGREGATES, Goal
 from diffabs.loop import Loop
 from diffabs.objectives import BRAKING
 from diffabs.robust import Task
@@ -22,13 +23,14 @@ def assert_same(a: scenario.Scenario, b: scenario.Scenario):
         np.testing.assert_array_equal(np.asarray(x, float), np.asarray(y, float))
     assert (a.name, a.title, a.description, a.solver, a.seed) == (b.name, b.title, b.description, b.solver, b.seed)
     assert a.design == b.design
+    assert a.tune == b.tune
 
 
 # What is packaged
 
 
 def test_packaged_names():
-    assert {"slip-lmi", "slip-estimator", "lab-rig"} <= set(names())
+    assert {"slip-lmi", "slip-estimator", "slip-cured", "lab-rig"} <= set(names())
 
 
 def test_slip_lmi_is_the_papers_example():
@@ -297,9 +299,153 @@ def test_no_stable_step_is_needed_for_what_is_not_integrated(monkeypatch):
     load("slip-lmi", integrated=False)
 
 
+# What tuning is for
+
+TUNED = """
+reference = "filtered-slip"
+[controller]
+type = "state-feedback"
+[road]
+type = "scaled"
+road = "snow"
+[objective]
+effort = "effort"
+[tune]
+starts = 3
+seed = 11
+iterations = 7
+samples = 20
+decay = 12
+damping = 0.5
+aggregate = "quantile"
+[tune.objective]
+effort = 1e-4
+stop_time = 2
+[tune.limits]
+locked_time = 0
+"""
+WHAT = Goal(
+    starts=3,
+    seed=11,
+    iterations=7,
+    samples=20,
+    decay=12.0,
+    damping=0.5,
+    free={
+        "controller.gain": ((-2e4, -300.0), (-100.0, -15.0)),
+        "reference.time_constant": None,
+        "plant.road.scale": (0.5, 1.5),
+        "initial.speed": (5.0, 30.0),
+    },
+    objective={"effort": 1e-4, "stop_time": 2.0},
+    over={"plant.mass": (12.0, 15.5), "stop.speed": (0.5, 1.0), "plant.road.road.c1": (1.0,)},
+    aggregate={"type": "quantile", "level": 0.9},
+    limits={"locked_time": 0.0},
+)
+
+
+def test_what_is_tuned_is_the_same_however_it_is_written(file):
+    dotted = load(
+        file(
+            TUNED
+            + """[tune.free]
+            "controller.gain" = [[-2e4, -300], [-100, -15.0]]
+            "reference.time_constant" = "declared"
+            "plant.road.scale" = [0.5, 1.5]
+            "initial.speed_kmh" = [18, 108]
+            [tune.over]
+            "plant.mass" = [12, 15.5]
+            "stop.speed" = [0.5, 1.0]
+            "road.road.c1" = 1
+            """
+        )
+    )
+    nested = load(
+        file(
+            TUNED
+            + """[tune.free.controller]
+            gain = [[-2e4, -300], [-100.0, -15]]
+            [tune.free]
+            reference = {time_constant = "declared"}
+            road.scale = [0.5, 1.5]
+            initial.speed = [5, 30]
+            [tune.over]
+            plant = {mass = [12.0, 15.5], road = {road = {c1 = [1.0]}}}
+            stop.speed_kmh = [1.8, 3.6]
+            """
+        )
+    )
+    assert dotted.tune == WHAT
+    assert nested.tune == WHAT
+    assert_same(dotted, load(file(dump(dotted))))
+
+
+def test_overrides_reach_what_is_tuned():
+    changes = (
+        "tune.free.controller.gain=[[-2e4,-200],-20]",
+        'tune.free."reference.slip"=0.1,0.3',
+        "tune.over.plant.mass=5.3,6.2",
+        "tune.over.initial.speed_kmh=36",
+        "tune.over.plant.road.w4=0.3,0.4",
+        "tune.aggregate=smooth-worst",
+        "tune.aggregate.softness=0.1",
+        "tune.limits.overshoot=0.2",
+        "tune.objective={stop_time=1}",
+        "tune.starts=4",
+    )
+    goal = load("slip-lmi", changes).tune
+    assert goal.free == {"controller.gain": ((-2e4, -200.0), -20.0), "reference.slip": (0.1, 0.3)}
+    assert goal.over == {"plant.mass": (5.3, 6.2), "initial.speed": (10.0,), "plant.road.w4": (0.3, 0.4)}
+    assert goal.aggregate == {"type": "smooth-worst", "softness": 0.1}
+    assert (goal.limits, goal.objective, goal.starts) == ({"overshoot": 0.2}, {"stop_time": 1.0}, 4)
+
+
+def test_lanes_in_the_other_unit_replace_those_in_one():
+    goal = load("slip-cured", ["tune.over.initial.speed=9,10"]).tune
+    assert goal.over == {"plant.mass": (5.3, 5.75, 6.2), "initial.speed": (9.0, 10.0)}
+
+
+def test_lanes_are_every_combination_with_one_noise():
+    batch = load("slip-cured", ["solver.seed=4"]).tune.batch(4)
+    pairs = {(m, round(3.6 * v)) for m, v in zip(*(batch.values[path].tolist() for path in batch.values), strict=True)}
+    assert pairs == {(m, v) for m in (5.3, 5.75, 6.2) for v in (20, 35, 50)}
+    assert tuple(batch.seeds) == (4,) * 9
+
+
+@pytest.mark.parametrize("kind", AGGREGATES)
+def test_aggregates_are_those_of_the_library(kind):
+    """The section is read without the extra; here the two are compared."""
+    part = Goal(aggregate={"type": kind, **{name: value for name, (value, _) in AGGREGATES[kind].items()}}).aggregated()
+    assert catalogue.kebab(type(part).__name__).replace("cva-r", "cvar") == kind
+    fields = {field.name: field.metadata["spec"] for field in dataclasses.fields(part)}
+    assert fields == {name: spec for name, (_, spec) in AGGREGATES[kind].items()}
+    assert {name: getattr(type(part)(), name) for name in fields} == {n: v for n, (v, _) in AGGREGATES[kind].items()}
+
+
+def test_slip_cured_is_the_rig_with_what_the_paper_leaves_out():
+    s = load("slip-cured")
+    assert type(s.loop.controller.controller) is controllers.ProportionalFeedback
+    assert (s.loop.controller.controller.torque_min, s.loop.controller.controller.torque_max) == (0.0, 9.03)
+    assert (s.loop.controller.period, s.loop.actuator.time_constant) == (1e-3, 1e-3)
+    here = s.loop.plant.output(s.loop.plant.start(s.loop.initial))
+    assert s.loop.plant.mass == 5.75
+    assert s.loop.feedforward.value == pytest.approx(float(s.loop.plant.holding(here, 0.2)), rel=1e-12)
+
+
 @pytest.mark.usefixtures("any_step_is_stable")
 def test_another_part_takes_the_ranges_of_the_one_it_replaces_with_it():
     assert set(load("slip-lmi").design.over) == {"plant.mass", "initial.speed"}
     assert set(load("slip-lmi", ["plant=lab-rig"]).design.over) == {"initial.speed"}
     again = load("slip-lmi", ["plant=quarter-car", "design.over.plant.mass=12,20"])
     assert again.design.over["plant.mass"] == (12.0, 20.0)
+
+
+@pytest.mark.parametrize("change", ["controller=pid", "controller={type='pid'}"])
+def test_another_part_takes_what_is_tuned_with_it(change):
+    first = ("tune.over.controller.torque_min=0,1", "tune.free.reference.slip=0.1,0.3")
+    goal = load("slip-lmi", [*first, change]).tune
+    assert set(goal.free) == {"reference.slip"}
+    assert set(goal.over) == {"plant.mass"}
+    assert set(load("slip-cured", ["controller.controller=pid"]).tune.free) == {"reference.time_constant"}
+    again = load("slip-lmi", [change, "tune.free.controller.kp=1000,5000"]).tune
+    assert again.free == {"controller.kp": (1000.0, 5000.0)}

@@ -116,6 +116,49 @@ BAD = [
     ("design.over={'plant.mass'=[5,6],plant={mass=[5,6]}}", "design.over.plant.mass is given twice"),
     ("design.over={'initial.speed'=[1,2],'initial.speed_kmh'=[1,2]}", "is given twice, in m/s and in km/h"),
     ("design.over=" + "{a=" * 20 + "1" + "}" * 20, "design.over", "nested more than 16 deep"),
+    ("tune=3", "tune = 3 is a number", "a table of starts, seed, iterations, samples, decay, damping, free"),
+    ("tune.start=2", "tune.start is not a field of tune", "did you mean starts?"),
+    ("tune.starts=0", "tune.starts = 0 is outside [1, 1000]"),
+    ("tune.starts=1.5", "tune.starts = 1.5 is a number", "a whole number in [1, 1000]"),
+    ("tune.iterations=0", "tune.iterations = 0 is outside [1, 100000]"),
+    ("tune.samples=-1", "tune.samples = -1 is outside [0, 100000]"),
+    ("tune.decay=-1", "tune.decay = -1 is outside [0, inf) 1/s"),
+    ("tune.decay=nan", "tune.decay = nan is outside [0, inf) 1/s"),
+    ("tune.damping=1", "tune.damping = 1 is outside [0, 1)"),
+    ("tune.free=kp", 'tune.free = "kp" is text', "a table of ranges"),
+    ("tune.free.controller.kq=1,2", "tune.free.controller.kq is not a parameter of this loop", "mean controller.kp?"),
+    (
+        "tune.free.controller.kp=5",
+        "tune.free.controller.kp = 5 is a number",
+        'a range [low, high] in [0, inf) N m, or "d',
+    ),
+    ("tune.free.controller.kp=decl", 'tune.free.controller.kp = "decl" is text', '"declared"'),
+    ("tune.free.controller.kp=1,2,3", "tune.free.controller.kp = [1, 2, 3] is no range [low, high] in [0, inf) N m"),
+    ("tune.free.controller.kp=['a',1]", 'tune.free.controller.kp.0 = "a" is text', "[0, inf) N m"),
+    ("tune.free.controller.kp=6,5", "tune.free.controller.kp = [6.0, 5.0] is empty", "[0, inf) N m"),
+    ("tune.free.controller.kp=-1,5", "tune.free.controller.kp = [-1.0, 5.0] is outside [0, inf) N m"),
+    ("tune.free.controller.kp=nan,5", "tune.free.controller.kp = [nan, 5.0] is outside [0, inf) N m"),
+    ("tune.free.road.mu=[[0,1],2]", "tune.free.road.mu.0 = [0, 1] has 2 numbers; the parameter has 17"),
+    ("tune.free.initial.speed_kmh=5,900", "tune.free.initial.speed_kmh = [5.0, 900.0] is outside (0, 720] km/h"),
+    ("tune.free={'plant.mass'=[5,6],plant={mass=[5,6]}}", "tune.free.plant.mass is given twice"),
+    ("tune.over={'initial.speed'=[1],'initial.speed_kmh'=[2]}", "tune.over.initial.speed is given twice, in m/s and"),
+    ("tune.over.plant.mass=heavy", 'tune.over.plant.mass.0 = "heavy" is text', "(0, inf) kg"),
+    ("tune.over.plant.mass=5,-1", "tune.over.plant.mass.1 = -1 is outside (0, inf) kg"),
+    ("tune.over.plant.mass=[]", "tune.over.plant.mass = [] is empty", "(0, inf) kg"),
+    ("tune.over.road.mu=0,1", "tune.over.road.mu is a list of 17 numbers; only single numbers can differ"),
+    ("tune.over.plant.mas=1,2", "tune.over.plant.mas is not a parameter of this loop", "did you mean plant.mass?"),
+    ("tune.over.initial.speed_kmh=5,900", "tune.over.initial.speed_kmh.1 = 900 is outside (0, 720] km/h"),
+    ("tune.objective=iae", 'tune.objective = "iae" is text', "a table of weights"),
+    ("tune.objective.ia=1", "tune.objective.ia is not measured; did you mean iae?"),
+    ("tune.objective.iae=inf", "tune.objective.iae = inf is outside (-inf, inf)"),
+    ("tune.objective.iae=much", 'tune.objective.iae = "much" is text'),
+    ("tune.limits.stop_time=nan", "tune.limits.stop_time = nan is outside (-inf, inf) s"),
+    ("tune.limits.max_slp=1", "tune.limits.max_slp is not measured; did you mean max_slip?"),
+    ("tune.aggregate=3", "tune.aggregate = 3 is a number", "mean, smooth-worst, cvar, quantile"),
+    ("tune.aggregate=cvr", 'tune.aggregate.type = "cvr" is unknown', "did you mean cvar?"),
+    ("tune.aggregate={type=3}", "tune.aggregate.type = 3 is a number", "one of mean"),
+    ("tune.aggregate={type='cvar',softness=1}", "tune.aggregate.softness is not a field of cvar", "there is level"),
+    ("tune.aggregate={type='cvar',level=1}", "tune.aggregate.level = 1 is outside [0, 1)"),
     ("title=3", "title = 3 is a number", "text"),
     ("nonsense", '"nonsense" is not of the form section.field=value'),
     ("a..b=1", "is not of the form section.field=value"),
@@ -211,3 +254,16 @@ def test_unstable_step(checked_step):
 @pytest.mark.parametrize("name", names())
 def test_packaged_step_is_stable(checked_step, name):
     load(name)
+
+
+def test_a_sampling_period_cannot_be_tuned():
+    """The command line can say so before anything is compiled."""
+    line = message("slip-cured", "tune.free.controller.period=1e-3,2e-3")
+    assert line == "tune.free.controller.period cannot be tuned: a run does not depend smoothly on it"
+
+
+def test_too_many_combinations(file):
+    values = ",".join(map(str, range(1, 401)))
+    changes = (f"tune.over.plant.mass={values}", f"tune.over.plant.inertia={values}")
+    assert "tune.over has 160000 combinations, outside [1, 100000]; set tune.samples" in message(file(""), *changes)
+    load(file(""), [*changes, "tune.samples=5"])

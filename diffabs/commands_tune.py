@@ -1,0 +1,255 @@
+"""The command `tune`: the free parameters of [tune] by gradients, and what can be proved of the result.
+
+It needs the extra `diffabs[tune]`, and for a proof `diffabs[design]`; what needs them is imported when it runs."""
+
+import contextlib
+import dataclasses
+import pathlib
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import jax
+import numpy as np
+import typer
+
+from diffabs import console, proof, show
+from diffabs.pytree import get, parameters
+from diffabs.rollout import Trajectory, rollout
+from diffabs.scenario import Scenario, dump, load
+
+if TYPE_CHECKING:
+    from diffabs.tune import Batch, Progress, Tuned
+
+WHEN = ("before", "after")
+
+
+class _Work(NamedTuple):
+    """What is tuned: the scenario, its lanes, its constraints by name, and the linear systems a decay is asked of."""
+
+    chosen: Scenario
+    batch: "Batch"
+    constraints: dict[str, Any]
+    task: proof.Task | None
+
+
+class _Proved(NamedTuple):
+    """The JSON of a certificate, whose numbers are null where there is none, and why not in a sentence."""
+
+    document: dict[str, Any]
+    sentence: str
+    certified: bool = False
+
+
+def tune(
+    scenario: console.ScenarioName,
+    changes: console.Changes = None,
+    starts: Annotated[int | None, typer.Option(help="Descents; the same as --set tune.starts=N.")] = None,
+    as_json: console.Json = False,
+    out: Annotated[
+        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write the tuned scenario to this file.")
+    ] = None,
+    plot: Annotated[
+        pathlib.Path | None, typer.Option(metavar="FILE.png", help="Draw how the tuning went, and its worst lane.")
+    ] = None,
+) -> None:
+    """Tune the free parameters of [tune] by gradients, over all its runs at once."""
+    with console.guarded(), proof.reported():
+        console.need_extra("tune", "optax", "scipy")
+        console.check_picture(plot)
+        console.check_scenario_file(out)
+        changes = [*(changes or ()), *([] if starts is None else [f"tune.starts={starts}"])]
+        with contextlib.ExitStack() as files:
+            out_file = files.enter_context(console.new_file(out, "--out")) if out else None
+            picture = files.enter_context(console.new_file(plot, "--plot")) if plot else None
+            chosen = console.waited(lambda: load(scenario, changes), "checking the scenario")
+            result, told = _tuned(chosen, out_file, picture)
+            if not result["met"]:  # inside, so that no file is written
+                _show(result, told, chosen, as_json)
+                unmet = ", ".join(row["name"] for row in result["constraints"] if not row["met"])
+                console.fail(f"{chosen.name}: not met: {unmet}; {result['reason']}", console.FAILED)
+        result["files"] = {name: str(path) for name, path in (("out", out), ("plot", plot)) if path}
+        _show(result, told, chosen, as_json)
+
+
+def _show(result: dict[str, Any], told: str, chosen: Scenario, as_json: bool) -> None:
+    show.as_json(result) if as_json else show.tuned(result, chosen)
+    console.say(told)
+
+
+def _tuned(chosen: Scenario, out: pathlib.Path | None, picture: pathlib.Path | None) -> tuple[dict[str, Any], str]:
+    """The JSON document and a sentence about the certificate. The files are written if all constraints are met."""
+    work = console.waited(lambda: _work(chosen), "computing the lanes")
+    found = _watched(work)
+    after = dataclasses.replace(chosen, loop=found.loop)
+    proved = console.waited(lambda: _proved(after), "certifying the result")
+    result = _result(work, found, proved)
+    if out and result["met"]:
+        out.write_text(dump(after), encoding="utf-8")
+    if picture and result["met"]:
+        _drawn(work, found, picture)
+    return result, proved.sentence
+
+
+def _work(chosen: Scenario) -> _Work:
+    """Raises ScenarioError for what does not fit together."""
+    from diffabs.tune import AtMost, CertifiedDecay, Poles
+
+    goal = chosen.tune.check(chosen.loop)
+    batch = goal.batch(chosen.seed).check(chosen.loop)
+    constraints: dict[str, Any] = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
+    task = proof.task(chosen) if goal.decay or goal.damping else None
+    if task and goal.decay:
+        constraints["certified decay"] = CertifiedDecay(task.polytope, goal.decay)
+    if task and goal.damping:
+        constraints["damping"] = Poles(task.polytope, damping=goal.damping)
+    return _Work(chosen, batch, constraints, task)
+
+
+def _watched(work: _Work) -> "Tuned":
+    """Tune, and say how far it is. Raises typer.Exit where no start can be used."""
+    from diffabs import tune
+    from diffabs.tune import Method, StartError, Stopping
+
+    goal, told = work.chosen.tune, list["Progress"]()
+    method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
+
+    def tuned() -> "Tuned":
+        return tune.tune(
+            work.chosen.loop,
+            free=goal.free,
+            objective=goal.objective,
+            over=work.batch,
+            solver=work.chosen.solver,
+            measured=work.chosen.objectives,
+            aggregate=goal.aggregated(),
+            constraints=list(work.constraints.values()),
+            method=method,
+            progress=told.append,
+        )
+
+    try:
+        return console.waited(tuned, f"tuning {work.chosen.name}", lambda: _said(told))
+    except StartError as error:
+        console.fail(f"{work.chosen.name}: no start can be used: {error}", console.FAILED)
+
+
+def _said(told: "list[Progress]") -> str:
+    """How far it is, in one line."""
+    if not told:
+        return "compiling"
+    last, total = told[-1], len(told)
+    return (
+        f"loss {last.point.loss:.6g}, gradient {last.point.gradient:.2g}, violation {last.point.violation:.2g},"
+        f" {total} evaluations, {last.starts} under way"
+    )
+
+
+def _proved(after: Scenario) -> _Proved:
+    """A certificate over the ranges of [design], if there can be one."""
+    empty = dict.fromkeys(proof.FROM_PROOF)
+    try:
+        task = proof.task(after)
+        found = proof.certified(task)
+    except (ModuleNotFoundError, ValueError, np.linalg.LinAlgError) as error:
+        why = " ".join(str(error).split())
+        return _Proved({**empty, "reason": why}, f"no certificate: {why}")
+    reason = proof.unproved(found, task.spec) or None
+    document = proof.document(task, found, reason=reason)
+    document = {key: value for key, value in document.items() if key not in ("scenario", "versions", "files")}
+    rate = document["decay_rate"]
+    over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
+    said = reason or f"quadratically stable over {over}, decay rate {rate:.4g} 1/s"
+    return _Proved(document, f"certificate: {said}", certified=True)
+
+
+def _result(work: _Work, found: "Tuned", proved: _Proved) -> dict[str, Any]:
+    """The JSON document."""
+    chosen, goal = work.chosen, work.chosen.tune
+    return {
+        "scenario": chosen.name,
+        "lanes": work.batch.size,
+        "free": {path: _free(chosen, found, path) for path in goal.free},
+        "objective": dict(zip(WHEN, map(float, found.objective), strict=True)),
+        "metrics": {when: _over_lanes(m, chosen) for when, m in zip(WHEN, found.metrics, strict=True)},
+        "constraints": (rows := _constraints(work, found, proved)),
+        "met": all(row["met"] for row in rows),
+        "reason": found.reason.value,
+        "gradient_norm": float(found.gradient),
+        "evaluations": found.evaluations,
+        "mode": found.mode.value,
+        "history": [point._asdict() for point in found.history],
+        "starts": [
+            {"objective": float(s.objective), "violation": float(s.violation), "reason": s.reason.value}
+            for s in found.starts
+        ],
+        "parameters": {path: _plain(value) for path, _, value in parameters(found.loop)},
+        "certificate": proved.document,
+        "versions": show.versions("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ())),
+        "files": {},
+    }
+
+
+def _free(chosen: Scenario, found: "Tuned", path: str) -> dict[str, Any]:
+    spec = next(spec for name, spec, _ in parameters(chosen.loop) if name == path)
+    low, high = chosen.tune.free[path] or (spec.low, spec.high)
+    before, after = (_plain(get(loop, path)) for loop in (chosen.loop, found.loop))
+    return {"before": before, "after": after, "low": _plain(low), "high": _plain(high), "unit": spec.unit}
+
+
+def _over_lanes(metrics: dict[str, Any], chosen: Scenario) -> dict[str, dict[str, float]]:
+    """NaN where a lane diverged: a mean over the others would hide it."""
+    each = {name: np.asarray(metrics[name], float) for name in chosen.objectives}
+    return {
+        "mean": {name: float(values.mean()) for name, values in each.items()},
+        "worst": {name: float(values.max()) for name, values in each.items()},
+    }
+
+
+def _constraints(work: _Work, found: "Tuned", proved: _Proved) -> list[dict[str, Any]]:
+    """What was asked for, its worst value before and after, and whether it is met to the method's tolerance."""
+    from diffabs.tune import Method
+
+    goal, tolerance, rows = work.chosen.tune, Method().tolerance, []
+    for name, bound in goal.limits.items():
+        before, after = (float(np.max(metrics[name])) for metrics in found.metrics)
+        met = after <= bound + tolerance * (abs(bound) or 1.0)
+        rows.append({"name": name, "bound": bound, "before": before, "after": after, "met": met})
+    if work.task and goal.decay:
+        before, after = proof.certified(work.task).summary().get("decay_rate"), proved.document["decay_rate"]
+        met = after is not None and after >= (1 - tolerance) * goal.decay
+        rows.append({"name": "certified decay", "bound": goal.decay, "before": before, "after": after, "met": met})
+    if work.task and goal.damping:
+        before, after = (_damping(work.task, loop) for loop in (work.chosen.loop, found.loop))
+        met = after >= goal.damping - tolerance
+        rows.append({"name": "damping", "bound": goal.damping, "before": before, "after": after, "met": met})
+    return rows
+
+
+def _damping(task: proof.Task, loop: Any) -> float:
+    """The least of the poles at the vertices."""
+    from diffabs.tune import Poles
+
+    damping_and_rates = np.asarray(Poles(task.polytope, 0.0, 1.0).excess(loop, {}))
+    return float(1.0 - np.max(np.split(damping_and_rates, 2)[1]))
+
+
+def _drawn(work: _Work, found: "Tuned", path: pathlib.Path) -> None:
+    """The history, and the lane that is the worst afterwards, before and after."""
+    from diffabs.plot_tuning import tuning
+
+    chosen, metrics = work.chosen, found.metrics[1]
+    worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in chosen.tune.objective.items())))
+    solver = dataclasses.replace(chosen.solver, every=min(chosen.solver.every, chosen.solver.steps))
+
+    def seen(loop: Any) -> Trajectory:
+        run = jax.device_get(rollout(work.batch.lane(loop, worst), solver, key=chosen.key()))
+        assert run.trajectory is not None
+        return run.trajectory
+
+    runs = {"before": seen(chosen.loop), "after": seen(found.loop)}
+    where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
+    title = chosen.title or chosen.name
+    tuning(found.history, runs, title=title, lane=where).savefig(path)
+
+
+def _plain(value: Any) -> Any:
+    return np.asarray(value, float).tolist()

@@ -1,0 +1,325 @@
+"""`diffabs identify`: measured runs as files, what is found in them, and how it fails."""
+
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+from commands import assert_one_error_line, left_in, run
+
+import diffabs.tune.identify as library
+from diffabs import commands_identify, console, scenario
+from diffabs.readings import read
+from diffabs.scenario import ScenarioError, load
+from diffabs.tune import Reason
+from diffabs.tune.fit import Identified
+from diffabs.tune.uncertainty import uncertainty
+
+pytestmark = pytest.mark.xdist_group("cli-identify")  # one worker compiles what these share
+
+KEYS = [
+    *("scenario", "data", "values", "correlations", "undetermined", "residuals", "chi2", "degrees", "scale", "reason"),
+    *("evaluations", "parameters", "versions", "files"),
+]
+HEADER = "t [s],wheel_speed [m/s],slip [1],command [N m]"
+ROWS = ["0,13.8,0.0,1", "0.1,12.9,0.05,1", "0.3,11.0,0.1,2"]
+SMALL = """
+plant = "mirrored-rig"
+[initial]
+speed_kmh = 50.0
+[stop]
+type = "speed-reached"
+speed_kmh = 48.0
+[controller]
+type = "state-feedback"
+gain = [-4000.0, -40.0]
+[solver]
+step = 1e-3
+duration = 0.5
+"""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick():
+    """No lines that depend on the machine's load, and no seconds for what has tests of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(console, "PATIENCE", math.inf)
+        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        yield
+
+
+@pytest.fixture
+def csv(tmp_path):
+    """Write a table."""
+
+    def write(*lines: str):
+        (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
+        return tmp_path / "run.csv"
+
+    return write
+
+
+@pytest.fixture
+def small(file):
+    return file(SMALL, "small.toml")
+
+
+# Readings
+
+
+def test_readings_are_what_is_in_the_file(csv):
+    t, columns = read(csv("\ufeff" + HEADER, *ROWS, ""))
+    assert t.tolist() == [0, 0.1, 0.3]
+    assert list(columns) == ["wheel_speed", "slip"]
+    assert columns["wheel_speed"].tolist() == [13.8, 12.9, 11.0]
+    assert columns["slip"].tolist() == [0, 0.05, 0.1]
+
+
+def test_readings_are_what_simulate_writes(small, tmp_path):
+    run("simulate", small, "--csv", tmp_path / "run.csv", "--set", "solver.duration=0.02")
+    t, columns = read(tmp_path / "run.csv")
+    np.testing.assert_allclose(t, 1e-3 * np.arange(21), rtol=1e-11, atol=1e-15)
+    assert list(columns) == ["slip", "speed", "wheel_speed", "deceleration", "distance"]
+    np.testing.assert_allclose(columns["slip"], 1 - columns["wheel_speed"] / columns["speed"], rtol=0, atol=1e-10)
+
+
+BAD_FILES = [
+    ((), "is empty; there is t [s], slip [1], speed [m/s]"),
+    (("1,2,3",), "line 1 is no header with t [s]"),
+    (("slip [1]", "0"), "line 1 is no header with t [s]"),
+    ((HEADER,), "has a header and no numbers"),
+    (("t [s]", "0"), "no column was measured; there is slip [1]"),
+    (("t [s],wheel_spede [m/s]", "0,1"), 'column "wheel_spede [m/s]" is unknown; did you mean wheel_speed [m/s]?'),
+    (("t [s],speed [km/h]", "0,1"), 'column "speed [km/h]" is unknown; did you mean speed [m/s]?'),
+    (("t [s],slip [1],slip [1]", "0,1,1"), 'column "slip [1]" is there twice'),
+    ((HEADER, ROWS[0], "0.1,fast,0,0"), 'line 3: wheel_speed [m/s] = "fast" is text; a number is needed'),
+    ((HEADER, ROWS[0], "", "0.1,,0,0"), 'line 4: wheel_speed [m/s] = "" is text; a number is needed'),
+    ((HEADER, "0,nan,0,0"), "line 2: wheel_speed [m/s] = nan is outside (-inf, inf)"),
+    ((HEADER, ROWS[0], "0.1,2"), "line 3: has 2 cells; the header has 4"),
+    ((HEADER, ROWS[0], ROWS[2], ROWS[1]), "line 4: t = 0.1 s does not come after 0.3 s"),
+    ((HEADER, ROWS[0], ROWS[0]), "line 3: t = 0 s does not come after 0 s"),
+    ((HEADER, "-1,1,1,1"), "line 2: t = -1 s does not come after 0 s"),
+]
+
+
+@pytest.mark.parametrize(("lines", "needed"), BAD_FILES, ids=[needed[:40] for _, needed in BAD_FILES])
+def test_a_bad_file_is_one_line(csv, lines, needed):
+    path = csv(*lines) if lines else csv("")
+    path.write_text(path.read_text() if lines else "")
+    with pytest.raises(ScenarioError) as caught:
+        read(path)
+    assert needed in str(caught.value)
+    assert str(caught.value).startswith(f"--data {path}")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_text(tmp_path):
+    (tmp_path / "run.csv").write_bytes(b"t [s],slip [1]\n\xff\xfe\n")
+    with pytest.raises(ScenarioError, match="is not a CSV file of UTF-8 text"):
+        read(tmp_path / "run.csv")
+
+
+def test_a_file_that_is_not_there(small, tmp_path):
+    result = run("identify", small, "--data", tmp_path / "none.csv", "--free", "plant.mass", status=2)
+    assert_one_error_line(result)
+    assert "none.csv: cannot be read, No such file or directory" in result.stderr
+
+
+# What is asked, and shown
+
+
+@pytest.fixture
+def invented(monkeypatch):
+    """A fit that has found something, at once; returns what it was asked."""
+    asked = []
+
+    def identify(loop, data, free, **what):
+        asked.append({"data": data, "free": free, **what})
+        n = np.size(data.t) * len(data.columns)
+        residuals = np.repeat([0.2, 0.001], (n + 1) // 2)[:n]
+        slopes = 1e3 * np.array([[1.0, 1.0], [1.0, 1.1], [1.0, 0.9], *[[1.0, 1.0]] * (n - 3)])
+        known = uncertainty(list(free), np.array([6.0, 0.4]), slopes, np.zeros((0, 2)), 1.0)
+        found = {"plant.mass": np.array(6.0), "plant.road.w4": np.array(0.4)}
+        part = library.replace(loop, found)
+        one = np.ones(n)
+        return Identified(part, found, residuals, one, 5.0, 5.0, known, [9.0, 5.0], 4, Reason.CHANGE, {})
+
+    monkeypatch.setattr(library, "identify", identify)
+    return asked
+
+
+FREE = ("--free", "plant.mass=4:8", "--free", "road.w4")
+
+
+def test_the_arguments_reach_the_fit(small, csv, invented):
+    path = csv(HEADER, *ROWS)
+    run("identify", small, "--data", path, *FREE, "--sigma", "wheel_speed=0.05", "--sigma", "slip=1e-3")
+    (asked,) = invented
+    assert asked["free"] == {"plant.mass": (4.0, 8.0), "plant.road.w4": None}
+    assert asked["absolute"] is True
+    assert asked["data"].sigma == {"wheel_speed": 0.05, "slip": 1e-3}
+    assert asked["data"].t.tolist() == [0, 0.1, 0.3]
+    assert asked["solver"].duration == pytest.approx(0.302)
+
+
+def test_noise_that_is_not_known_is_taken_from_the_residuals(small, csv, invented):
+    document = json.loads(run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, "--json").stdout)
+    first, *others = (asked["data"].sigma for asked in invented)
+    assert first == {"wheel_speed": np.std([13.8, 12.9, 11.0]), "slip": np.std([0, 0.05, 0.1])}
+    assert len(others) == 2
+    for sigma in others:
+        assert sigma == {"wheel_speed": pytest.approx(0.2), "slip": pytest.approx(1e-3)}
+    assert not any(asked["absolute"] for asked in invented)
+    assert document["evaluations"] == 12
+    assert {name: row["sigma"] for name, row in document["residuals"].items()} == others[-1]
+
+
+def test_columns_that_follow_from_each_other_are_said_to(small, csv, invented):
+    path = csv("t [s],wheel_speed [m/s],slip [1],speed [m/s]", *ROWS)
+    assert commands_identify.REDUNDANT in run("identify", small, "--data", path, *FREE).stderr
+    assert commands_identify.REDUNDANT not in run("identify", small, "--data", path, *FREE, "--column", "slip").stderr
+
+
+def test_one_column_only(small, csv, invented):
+    run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, "--column", "slip")
+    assert list(invented[0]["data"].columns) == ["slip"]
+
+
+def test_json_has_what_scripts_rely_on(small, csv, invented, tmp_path):
+    out = tmp_path / "found.toml"
+    result = run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, "--json", "--out", out)
+    document = json.loads(result.stdout)
+    assert list(document) == KEYS
+    assert document["data"] == {"samples": 3, "columns": ["wheel_speed", "slip"], "until": 0.3}
+    mass = document["values"]["plant.mass"]
+    assert (mass["before"], mass["value"], mass["low"], mass["high"], mass["unit"]) == (5.3, 6.0, 4.0, 8.0, "kg")
+    assert mass["deviation"] > 0
+    (pair,) = document["correlations"]
+    assert set(pair["between"]) == {"plant.mass", "plant.road.w4"}
+    assert pair["correlation"] < -0.95
+    assert document["residuals"]["slip"]["rms"] == pytest.approx(1e-3)
+    assert document["files"] == {"out": str(out)}
+    assert load(out).loop.plant.mass == 6.0
+    assert load(out).loop.plant.road.w4 == 0.4
+
+
+def test_table_for_people(small, csv, invented):
+    result = run("identify", small, "--data", csv(HEADER, *ROWS), *FREE)
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in result.stdout.splitlines() if "│" in line]
+    found = {row[0]: row[1:] for row in rows}
+    assert found["plant.mass"][:2] == ["5.3", "6"]
+    assert found["slip"][:2] == ["0.001", "0.001"]
+    assert "plant.road.w4 and plant.mass are correlated by -0.9" in result.stderr
+
+
+# Whole ones
+
+
+@pytest.mark.slow
+def test_what_simulate_wrote_is_found_again(small, tmp_path):
+    truth = ("--set", "plant.mass=6.0", "--set", "road.w4=0.38")
+    run("simulate", small, "--csv", tmp_path / "run.csv", *truth)
+    t, columns = read(tmp_path / "run.csv")
+    noisy = columns["wheel_speed"] + np.random.default_rng(5).normal(0.0, 0.02, len(t))
+    lines = (f"{x},{w}" for x, w in zip(t, noisy, strict=True))
+    (tmp_path / "noisy.csv").write_text("\n".join(["t [s],wheel_speed [m/s]", *lines]))
+    out = tmp_path / "found.toml"
+    exact = json.loads(run("identify", small, "--data", tmp_path / "run.csv", *FREE, "--json", "--out", out).stdout)
+    assert exact["values"]["plant.mass"]["value"] == pytest.approx(6.0, rel=1e-8)
+    assert exact["values"]["plant.road.w4"]["value"] == pytest.approx(0.38, rel=1e-8)
+    assert load(out).loop.plant.mass == exact["values"]["plant.mass"]["value"]
+    noisy = json.loads(run("identify", small, "--data", tmp_path / "noisy.csv", *FREE, "--json").stdout)
+    for name, value in (("plant.mass", 6.0), ("plant.road.w4", 0.38)):
+        row = noisy["values"][name]
+        assert 1e-6 < row["deviation"] < 0.5
+        assert abs(row["value"] - value) < 4 * row["deviation"]  # 1 in 16,000 would be further off by chance
+    assert noisy["residuals"]["wheel_speed"]["sigma"] == pytest.approx(0.02, rel=0.25)  # 60 instants: 9 %
+
+
+@pytest.mark.slow
+def test_what_the_data_do_not_show_is_said(small, tmp_path):
+    run("simulate", small, "--csv", tmp_path / "run.csv")
+    args = (
+        "--data",
+        tmp_path / "run.csv",
+        "--column",
+        "slip",
+        "--free",
+        "plant.mass=4:8",
+        "--free",
+        "plant.crawl_speed",
+    )
+    result = run("identify", small, *args, "--json", "--out", tmp_path / "found.toml", status=1)
+    document = json.loads(result.stdout)
+    (row,) = document["undetermined"]
+    assert row["components"]["plant.crawl_speed"] == pytest.approx(1.0)
+    assert document["files"] == {}
+    assert result.stderr == "error: small: not identifiable from these data: 1.00 plant.crawl_speed\n"
+    assert left_in(tmp_path) == {"small.toml", "run.csv"}
+
+
+# What could not be done, and bad input
+
+
+def test_interrupted_it_leaves_nothing_half_written(small, csv, tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(library, "identify", interrupted)
+    args = ("--data", csv(HEADER, *ROWS), *FREE, "--out", tmp_path / "out.toml")
+    assert run("identify", small, *args, status=130).stderr == "interrupted\n"
+    assert left_in(tmp_path) == {"small.toml", "run.csv"}
+
+
+BAD = [
+    (("--free", "plant.mas"), "--free plant.mas is not a parameter of this loop; did you mean plant.mass?"),
+    (("--free", "plant.mass=5"), '--free "plant.mass=5" is not of the form path or path=low:high'),
+    (("--free", "=1:2"), '--free "=1:2" is not of the form'),
+    (("--free", "plant.mass=a:8"), '--free plant.mass.0 = "a" is text; a number in (0, inf) kg is needed'),
+    (("--free", "plant.mass=8:4"), "--free plant.mass = [8.0, 4.0] is empty: a range [low, high] in (0, inf) kg"),
+    (("--free", "plant.mass=-1:4"), "--free plant.mass = [-1.0, 4.0] is outside (0, inf) kg"),
+    (("--free", "plant.mass=6:8"), "plant.mass = 5.3 is outside (6, 8) kg, its range in --free"),
+    (("--free", "road.w4", "--free", "plant.road.w4"), "--free road.w4 is given twice"),
+    ((*FREE, "--sigma", "slip"), '--sigma "slip" is not of the form column=number'),
+    ((*FREE, "--sigma", "slp=1"), '--sigma "slp" is not a column of the data; did you mean slip?'),
+    ((*FREE, "--sigma", "slip=0"), "--sigma slip = 0 is outside (0, inf)"),
+    ((*FREE, "--sigma", "wheel_speed=much"), '--sigma wheel_speed = "much" is no number in (0, inf) m/s'),
+    ((*FREE, "--column", "speed"), '--column "speed" is not in the data; did you mean wheel_speed?'),
+    ((*FREE, "--out", "found"), "--out found: the name must end in .toml"),
+    ((*FREE, "--set", "plant.mass=0"), "plant.mass = 0 is outside (0, inf) kg"),
+    ((*FREE, "--set", "solver.duration=0.1"), "t = 0 ... 0.3 s leaves [0, 0.1] s, the solver's duration"),
+]
+
+
+@pytest.mark.parametrize(("args", "needed"), BAD, ids=[" ".join(args) for args, _ in BAD])
+def test_bad_input_is_one_line_and_leaves_nothing(small, csv, tmp_path, monkeypatch, args, needed):
+    monkeypatch.chdir(tmp_path)
+    path = csv(HEADER, *ROWS)
+    out = () if "--out" in args else ("--out", "c.toml")
+    result = run("identify", small, "--data", path, *args, *out, "--json", status=2)
+    assert_one_error_line(result)
+    assert needed in result.stderr
+    assert left_in(tmp_path) == {"small.toml", "run.csv"}
+
+
+def test_too_few_data_are_bad_input(small, csv):
+    result = run("identify", small, "--data", csv("t [s],slip [1]", "0.1,0.1"), *FREE, status=2)
+    assert_one_error_line(result)
+    assert "1 data do not determine 2 parameters" in result.stderr
+
+
+def test_without_the_extra(small, csv, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optax", None)
+    result = run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, status=2)
+    assert_one_error_line(result)
+    assert 'pip install "diffabs[tune]"' in result.stderr
+
+
+def test_a_trajectory_is_as_long_as_the_data_and_fits_into_memory(small, csv):
+    solver, readings = load(small).solver, read(csv(HEADER, *ROWS))
+    assert commands_identify._solver(solver, readings).steps == 302
+    long = commands_identify._solver(commands_identify.FixedStep(1e-6, 1.0), readings)
+    assert long.steps == 300_002
+    assert long.every == 16
+    assert commands_identify._solver(commands_identify.FixedStep(0.1, 0.3), readings).duration == pytest.approx(0.3)

@@ -1,0 +1,408 @@
+"""`diffabs tune`: what scripts read, what is written, and how it fails."""
+
+import json
+import math
+import pathlib
+import sys
+import types
+
+import jax
+import numpy as np
+import pytest
+from commands import assert_one_error_line, left_in, run
+
+import diffabs.tune as library
+from diffabs import commands_tune, console, proof, scenario
+from diffabs.design import lmi
+from diffabs.pytree import parameters, replace
+from diffabs.rollout import measure
+from diffabs.scenario import load
+from diffabs.tune import Mode, Point, Reason, StartError, Tuned
+from diffabs.tune.result import Start
+
+pytestmark = pytest.mark.xdist_group("cli-tune")  # one worker compiles what these share
+
+SMALL = """
+title = "small"
+plant = "mirrored-rig"
+[initial]
+speed_kmh = 50.0
+[stop]
+type = "speed-reached"
+speed_kmh = 48.0
+[controller]
+type = "state-feedback"
+gain = [-4000.0, -40.0]
+[solver]
+step = 1e-3
+duration = 0.15
+seed = 3
+[tune]
+iterations = 2
+[tune.free]
+"controller.gain" = [[-1e4, -60.0], [-100.0, -20.0]]
+[tune.objective]
+iae = 1.0
+[tune.over]
+"plant.mass" = [5.3, 6.2]
+[tune.limits]
+overshoot = 0.5
+"""
+KEYS = [
+    *("scenario", "lanes", "free", "objective", "metrics", "constraints", "met", "reason", "gradient_norm"),
+    *("evaluations", "mode", "history", "starts", "parameters", "certificate", "versions", "files"),
+]
+HISTORY = [Point(0, 2.0, 1.0, 0.5, 0.1, 1), Point(1, 1.5, 0.75, 0.01, 0.0, 3)]
+
+
+class Figure:
+    """Stands for a figure: what it writes shows what was drawn."""
+
+    def __init__(self, text: str):
+        self.text = text
+
+    def savefig(self, path: pathlib.Path):
+        pathlib.Path(path).write_text(self.text)
+
+
+def drawn(history, runs, *, title, lane):
+    return Figure(f"{title}: {len(history)} points, {', '.join(runs)}, {lane}")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick():
+    """No lines that depend on the machine's load, and no seconds for what has tests of its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(console, "PATIENCE", math.inf)
+        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        patch.setitem(sys.modules, "diffabs.plot_tuning", types.SimpleNamespace(tuning=drawn))
+        yield
+
+
+@pytest.fixture
+def unproved(monkeypatch):
+    """Proofs have tests of their own, and take seconds."""
+
+    def none(chosen):
+        raise ValueError("no proof was asked for")
+
+    monkeypatch.setattr(proof, "task", none)
+
+
+@pytest.fixture
+def invented(monkeypatch, unproved):
+    """A tuning that has found something, at once; returns what it was asked."""
+    asked = {}
+
+    def tune(loop, **what):
+        asked.update(what, loop=loop)
+        n = what["over"].size
+        metrics = [{name: np.full(n, value) for name in what["measured"]} for value in (0.3, 0.2)]
+        part = replace(loop, {path: 1.1 * np.asarray(dict(values(loop))[path]) for path in what["free"]})
+        start = Start({}, 1.5, 0.0, Reason.CHANGE, HISTORY)
+        return Tuned(
+            part,
+            {},
+            (2.0, 1.5),
+            (0.1, 0.0),
+            tuple(metrics),
+            True,
+            Reason.CHANGE,
+            HISTORY,
+            [start],
+            Mode.FORWARD,
+            (0, 0),
+        )
+
+    monkeypatch.setattr(library, "tune", tune)
+    return asked
+
+
+def values(loop):
+    return [(path, value) for path, _, value in parameters(loop)]
+
+
+@pytest.fixture
+def small(file):
+    return file(SMALL, "small.toml")
+
+
+# A whole one
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tuned")
+    (folder / "small.toml").write_text(SMALL)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(proof, "task", lambda chosen: pytest.fail("asked for a proof too early"))
+        patch.setattr(commands_tune, "_proved", lambda after: commands_tune._Proved({"decay_rate": None}, "no proof"))
+        out = ("--out", folder / "out.toml", "--plot", folder / "a.png")
+        result = run("tune", folder / "small.toml", "--json", *out)
+    return folder, json.loads(result.stdout), result.stderr
+
+
+def test_json_has_what_scripts_rely_on(tuned):
+    folder, document, said = tuned
+    assert list(document) == KEYS
+    assert document["scenario"] == "small"
+    assert document["lanes"] == 2
+    free = document["free"]["controller.gain"]
+    assert (free["before"], free["low"], free["high"]) == ([-4000, -40], [-1e4, -60], [-100, -20])
+    assert all(low < after < high for low, after, high in zip(free["low"], free["after"], free["high"], strict=True))
+    assert free["after"] != free["before"]
+    assert document["objective"]["after"] < 0.95 * document["objective"]["before"]
+    assert document["met"] is True
+    assert document["mode"] == "forward"
+    assert document["reason"] == Reason.LIMIT.value
+    assert document["history"][0]["objective"] == document["objective"]["before"]
+    assert document["history"][-1]["objective"] == document["objective"]["after"]
+    assert document["history"][-1]["iteration"] == 2
+    assert document["evaluations"] == document["history"][-1]["evaluations"] >= 3
+    assert document["gradient_norm"] == document["history"][-1]["gradient"]
+    assert len(document["starts"]) == 1
+    assert document["constraints"][0]["name"] == "overshoot"
+    assert {"diffabs", "jax", "python", "optax", "scipy"} == set(document["versions"])
+    assert document["files"] == {"out": str(folder / "out.toml"), "plot": str(folder / "a.png")}
+    assert said == "no proof\n"
+
+
+def test_what_is_written_loads_and_simulates_to_what_was_reported(tuned):
+    folder, document, _ = tuned
+    before, after = load(folder / "small.toml"), load(folder / "out.toml")
+    for when, chosen in (("before", before), ("after", after)):
+        lanes = [replace(chosen.loop, {"plant.mass": mass}) for mass in (5.3, 6.2)]
+        each = [jax.device_get(measure(loop, chosen.solver, chosen.objectives).metrics) for loop in lanes]
+        for name in chosen.objectives:
+            found = [float(metrics[name]) for metrics in each]
+            # the same numbers, batched and differentiated: rounding only, of runs of 150 steps
+            np.testing.assert_allclose(document["metrics"][when]["mean"][name], np.mean(found), rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(document["metrics"][when]["worst"][name], max(found), rtol=1e-9, atol=1e-12)
+    assert after.tune == before.tune
+    loaded = {path: np.asarray(value, float) for path, value in values(after.loop)}
+    assert set(document["parameters"]) == set(loaded)
+    for path, value in document["parameters"].items():
+        assert value is None or np.array_equal(value, loaded[path])
+    assert document["constraints"][0]["after"] == document["metrics"]["after"]["worst"]["overshoot"]
+
+
+def test_figure_and_file_and_nothing_else_are_left(tuned):
+    folder, document, _ = tuned
+    assert left_in(folder) == {"small.toml", "out.toml", "a.png"}
+    points = len(document["history"])
+    assert (folder / "a.png").read_text() == f"small: {points} points, before, after, plant.mass = 5.3"
+    assert (folder / "out.toml").stat().st_mode & 0o777 == 0o666 & ~console._umask()
+
+
+# What is asked
+
+
+def test_the_section_reaches_the_tuning(small, invented):
+    changes = ("tune.aggregate=cvar", "tune.aggregate.level=0.75", "tune.seed=7", "tune.limits.iae=0.5")
+    sets = [word for change in changes for word in ("--set", change)]
+    document = json.loads(run("tune", small, "--json", "--starts", "4", *sets).stdout)
+    assert invented["free"] == {"controller.gain": ((-1e4, -60.0), (-100.0, -20.0))}
+    assert invented["objective"] == {"iae": 1.0}
+    assert invented["over"].values["plant.mass"].tolist() == [5.3, 6.2]
+    assert tuple(invented["over"].seeds) == (3, 3)
+    assert isinstance(invented["aggregate"], library.CVaR)
+    assert invented["aggregate"].level == 0.75
+    assert [(c.metric, c.bound) for c in invented["constraints"]] == [("overshoot", 0.5), ("iae", 0.5)]
+    assert (invented["method"].starts, invented["method"].seed) == (4, 7)
+    assert invented["method"].stopping.iterations == 2
+    assert document["history"] == [point._asdict() for point in HISTORY]
+
+
+def test_a_latin_hypercube_of_lanes(small, invented):
+    run("tune", small, "--set", "tune.samples=9", "--set", "tune.over.initial.speed_kmh=49,50")
+    lanes = invented["over"].values
+    assert {len(column) for column in lanes.values()} == {9}
+    assert 5.3 <= lanes["plant.mass"].min() < 5.5 < 6.0 < lanes["plant.mass"].max() <= 6.2
+    assert 49 / 3.6 <= lanes["initial.speed"].min() <= lanes["initial.speed"].max() <= 50 / 3.6
+
+
+def test_without_lanes_it_is_the_scenario_itself(small, invented):
+    assert json.loads(run("tune", small, "--json", "--set", "tune.over={}").stdout)["lanes"] == 1
+
+
+def test_table_for_people(small, invented):
+    result = run("tune", small)
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in result.stdout.splitlines() if "│" in line]
+    found = {row[0]: row[1:] for row in rows}
+    assert found["controller.gain"][:2] == ["[-4000, -40]", "[-4400, -44]"]
+    assert found["iae"] == ["0.3", "0.2", "0.3", "0.2", "s"]
+    assert found["overshoot"] == ["0.5", "0.3", "0.2", "yes"]
+    assert found["it ended because"] == [Reason.CHANGE.value]
+    assert "over 2 lanes" in result.stdout
+    assert result.stderr == "no certificate: no proof was asked for\n"
+
+
+def test_how_far_it_is():
+    told = [library.Progress(0, 2, point) for point in HISTORY]
+    assert commands_tune._said([]) == "compiling"
+    line = "loss 0.75, gradient 0.01, violation 0, 2 evaluations, 2 under way"
+    assert commands_tune._said(told) == line
+
+
+def test_progress_is_told_again_when_it_changes(monkeypatch, capsys):
+    monkeypatch.setattr(console, "PATIENCE", 0.0)
+    monkeypatch.setattr(console, "AGAIN", 0.0)
+    steps = iter(["one", "one", "two", "two"])
+    last = ["zero"]
+
+    def detail():
+        last[0] = next(steps, last[0])
+        return last[0]
+
+    import time
+
+    console.waited(lambda: time.sleep(1.0), "working", detail)
+    assert capsys.readouterr().err == "working ... one\nworking ... two\n"
+
+
+# What is proved
+
+
+def test_without_the_design_extra_there_is_no_certificate(small, invented, monkeypatch):
+    monkeypatch.undo()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(library, "tune", lambda loop, **what: fake(loop, what))
+        patch.setitem(sys.modules, "cvxpy", None)
+        lmi.solvers.cache_clear()
+        result = run("tune", small, "--json")
+    document = json.loads(result.stdout)
+    assert document["certificate"]["quadratically_stable"] is None
+    assert 'pip install "diffabs[design]"' in document["certificate"]["reason"]
+    assert result.stderr == f"no certificate: {document['certificate']['reason']}\n"
+
+
+def fake(loop, what):
+    metrics = {name: np.zeros(what["over"].size) for name in what["measured"]}
+    return Tuned(
+        loop, {}, (1.0, 1.0), (0.0, 0.0), (metrics, metrics), True, Reason.GRADIENT, HISTORY, [], Mode.FORWARD, (0, 0)
+    )
+
+
+def test_a_loop_that_is_not_linear_has_no_certificate(small, monkeypatch):
+    monkeypatch.setattr(library, "tune", lambda loop, **what: fake(loop, what))
+    changes = ("controller=relay", "tune.free.reference.slip=0.1,0.3")
+    result = run("tune", small, *(word for change in changes for word in ("--set", change)))
+    assert result.stderr == ("no certificate: controller relay is not linear: it cannot be brought to state feedback\n")
+
+
+@pytest.mark.slow
+def test_a_decay_that_is_asked_for_is_certified(tmp_path):
+    """The packaged scenario, shortened: constraints of all three kinds, and a proof of the result."""
+    changes = ("tune.iterations=2", "solver.duration=0.2", "stop.speed_kmh=15", "tune.limits={}", "solver.step=5e-4",
+               "tune.over={}", "tune.decay=20")  # fmt: skip
+    sets = [word for change in changes for word in ("--set", change)]
+    document = json.loads(run("tune", "slip-cured", "--json", "--out", tmp_path / "c.toml", *sets).stdout)
+    rows = {row["name"]: row for row in document["constraints"]}
+    assert set(rows) == {"certified decay", "damping"}
+    assert rows["certified decay"]["after"] == document["certificate"]["decay_rate"] >= 20 * 0.999
+    assert rows["damping"]["after"] >= 0.7 * 0.999
+    assert document["certificate"]["verified_exactly"] is True
+    assert set(document["versions"]) == {"diffabs", "jax", "python", "optax", "scipy", "cvxpy", "clarabel"}
+    after = json.loads(run("certify", tmp_path / "c.toml", "--json").stdout)
+    assert after["decay_rate"] == pytest.approx(document["certificate"]["decay_rate"], rel=1e-6)
+    assert after["over"] == document["certificate"]["over"]
+
+
+@pytest.mark.parametrize("name", ["slip-lmi", "slip-estimator", "slip-cured"])
+def test_packaged_scenarios_can_be_tuned(name, invented):
+    """The library is asked something that fits."""
+    run("tune", name, "--set", "tune.decay=0", "--set", "tune.damping=0", "--set", "tune.limits={}")
+    loop = invented["loop"]
+    names = ("free", "objective", "over", "solver", "measured", "aggregate", "constraints")
+    library.posed(loop, **{name: invented[name] for name in names})
+
+
+# What could not be done
+
+
+def test_a_constraint_that_is_not_met_could_not_be_done(small, invented, tmp_path):
+    (tmp_path / "old.toml").write_text("old")
+    out = ("--out", tmp_path / "old.toml", "--plot", tmp_path / "a.png")
+    result = run("tune", small, "--json", "--set", "tune.limits.overshoot=0.199", *out, status=1)
+    document = json.loads(result.stdout)
+    assert document["met"] is False
+    unmet = {"name": "overshoot", "bound": 0.199, "before": 0.3, "after": 0.2, "met": False}
+    assert document["constraints"] == [unmet]
+    assert document["files"] == {}
+    assert result.stderr.splitlines()[-1] == f"error: small: not met: overshoot; {Reason.CHANGE.value}"
+    assert left_in(tmp_path) == {"small.toml", "old.toml"}
+    assert (tmp_path / "old.toml").read_text() == "old"
+
+
+def test_within_the_tolerance_is_met(small, invented):
+    """0.2 is 0.05 % above the bound; the method stops at 0.1 %."""
+    document = json.loads(run("tune", small, "--json", "--set", "tune.limits.overshoot=0.1999001").stdout)
+    assert document["met"] is True
+
+
+def test_no_start_that_can_be_used_could_not_be_done(small, monkeypatch):
+    def none(*_, **__):
+        raise StartError(f"{Reason.START.value}: 2 of 2 lanes diverge there")
+
+    monkeypatch.setattr(library, "tune", none)
+    result = run("tune", small, "--json", status=1)
+    assert_one_error_line(result)
+    assert "small: no start can be used: the start diverged" in result.stderr
+
+
+def test_what_does_not_fit_is_bad_input(small, monkeypatch):
+    def none(*_, **__):
+        raise ValueError("something\ndoes not fit")
+
+    monkeypatch.setattr(library, "tune", none)
+    assert_one_error_line(run("tune", small, status=2))
+
+
+def test_interrupted_it_leaves_nothing_half_written(small, tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(library, "tune", interrupted)
+    result = run("tune", small, "--out", tmp_path / "out.toml", "--plot", tmp_path / "a.png", status=130)
+    assert result.stderr == "interrupted\n"
+    assert left_in(tmp_path) == {"small.toml"}
+
+
+# Bad input
+
+
+BAD = [
+    (("--set", "tune.free={}"), "tune.free is empty", '"controller.gain" = '),
+    (("--set", "tune.objective={}"), "tune.objective is empty", "iae = 1.0"),
+    (("--set", "controller=relay"), "tune.free is empty"),
+    (("--set", "controller.gain=-4000,-70"), "controller.gain.1 = -70 is outside (-60, -20) N m/s, N m, its range in"),
+    (("--set", "tune.free.plant.mass=5.3,6"), "plant.mass = 5.3 is outside (5.3, 6) kg, its range in tune.free"),
+    (("--set", "tune.over.initial.speed_kmh=30,50"), "tune.over.initial.speed = 8.33333 m/s is not above stop.speed"),
+    (("--starts", "0"), "tune.starts = 0 is outside [1, 1000]"),
+    (("--set", "tune.limits.overshot=1"), "tune.limits.overshot is not measured; did you mean overshoot?"),
+    (("--plot", "a.bmp"), "--plot a.bmp: the name must end in .png, .pdf, .svg"),
+    (("--out", "tuned"), "--out tuned: the name must end in .toml"),
+    (("--out", "none/c.toml"), "No such file or directory"),
+    (("--set", "tune.decay=9", "--set", "controller=relay", "--set", "tune.free.reference.slip=0.1,0.3"), "not linear"),
+]
+
+
+@pytest.mark.parametrize("case", BAD, ids=[" ".join(case[0]) for case in BAD])
+def test_bad_input_is_one_line_and_leaves_nothing(small, tmp_path, monkeypatch, case):
+    args, *needed = case
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(library, "tune", lambda *_, **__: pytest.fail("tuned"))
+    out = () if "--out" in args else ("--out", "c.toml")
+    result = run("tune", small, *args, *out, "--json", status=2)
+    assert_one_error_line(result)
+    for text in needed:
+        assert text in result.stderr
+    assert left_in(tmp_path) == {"small.toml"}
+
+
+@pytest.mark.parametrize("module", ["optax", "scipy"])
+def test_without_the_extra(small, monkeypatch, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    result = run("tune", small, status=2)
+    assert_one_error_line(result)
+    assert f'{module} needed: pip install "diffabs[tune]"' in result.stderr
