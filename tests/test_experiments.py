@@ -78,3 +78,14 @@ def test_each_specification_of_a_robust_gain_is_kept(tmp_path):
     assert all(row["guaranteed cost"] >= rows["cost alone"]["guaranteed cost"] * 0.999 for row in rows.values())
     assert rows["damping"]["overshoot [%]"] < rows["cost alone"]["overshoot [%]"] / 2
     assert rows["scheduled"]["decay proved [1/s]"] > rows["cost alone"]["decay proved [1/s]"]
+
+
+def test_one_prior_is_enough_to_identify_a_magic_formula():
+    module = experiment("identification")
+    config = module.Config()
+    *_, found = module.from_prior(config, config.priors[0][1])
+    time, distance = np.abs(found.residuals.reshape(-1, 2)).max(axis=0)
+    assert time <= 0.01
+    assert distance <= 0.06
+    np.testing.assert_allclose(float(found.values["plant.inertia"]), 1.0454, rtol=0, atol=2e-3)
+    assert found.uncertainty.degrees == 13
