@@ -1,13 +1,17 @@
 """The README's code runs and says what the README says of it; its commands exist."""
 
+import importlib.resources
 import pathlib
 import re
+import tempfile
+import textwrap
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from diffabs.cli import app
+from diffabs.scenario import load
 
 TEXT = (pathlib.Path(__file__).parent.parent / "README.md").read_text()
 CODE, DESIGN = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
@@ -51,3 +55,15 @@ def test_the_promised_message():
     result = CliRunner().invoke(app, ["simulate", "slip-lmi", "--set", "plant.mass=-1"])
     assert result.exit_code == 2
     assert re.search(r"^    (error: .*)$", TEXT, re.MULTILINE)[1] in result.stderr
+
+
+def test_the_section_for_tuning_is_one():
+    block = re.search(r"^    \[tune\]\n(?:    .*\n)+", TEXT, re.MULTILINE)
+    packaged = importlib.resources.files("diffabs") / "scenarios" / "slip-cured.toml"
+    head = packaged.read_text().partition("[tune]")[0]
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / "mine.toml"
+        path.write_text(head + textwrap.dedent(block[0]))
+        goal = load(path, integrated=False).tune.check(load("slip-cured", integrated=False).loop)
+    assert set(goal.free) == {"controller.controller.gain", "reference.time_constant"}
+    assert goal.batch(0).size == 9

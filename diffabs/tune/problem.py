@@ -123,21 +123,29 @@ class Problem:
         """(starts, p) -> whether the step is stable for the loop there (starts,). Asked of the lanes that are the
         stiffest at the start."""
         values = self.batch.arrays()[0]
+        if self.batch.size > STIFFEST and values:
+            start = np.asarray(self._loops(values)(self.space.place(self.subject)[None]))
+            stiffest = np.argsort(start[0])[:STIFFEST]
+            values = {path: column[stiffest] for path, column in values.items()}
+        limits = self._loops(values)
+        return lambda z: limits(z).min(axis=1) >= self.solver.step
 
-        def loops(z: Any, values: Any) -> Loop:
-            return strong(replace(built(self.space.at(self.subject, z)), values))
+    def _loops(self, values: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
+        """z (starts, p) -> the largest stable steps (starts, lanes) of the loops with these values; compiled once."""
 
-        def limits(z: Any, values: Any) -> np.ndarray:
-            lanes = 0 if values else None
-            batch = jax.jit(jax.vmap(jax.vmap(loops, (None, lanes), axis_size=count), (0, None)))(z, values)
-            flat = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), batch)
+        def loops(z: Any) -> Loop:
+            loop = strong(built(self.space.at(self.subject, z)))
+            if not values:
+                return jax.tree.map(lambda x: x[None], loop)
+            return jax.vmap(lambda lane: strong(replace(loop, lane)))(values)
+
+        compiled = jax.jit(jax.vmap(loops))
+
+        def limits(z: np.ndarray) -> np.ndarray:
+            flat = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), compiled(jnp.asarray(z)))
             return stable_steps(flat).reshape(len(z), -1)
 
-        count = self.batch.size if values else 1
-        if count > STIFFEST:
-            stiffest = np.argsort(limits(self.space.place(self.subject)[None], values)[0])[:STIFFEST]
-            values, count = {path: column[stiffest] for path, column in values.items()}, STIFFEST
-        return lambda z: limits(jnp.asarray(z), values).min(axis=1) >= self.solver.step
+        return limits
 
 
 def automatic(space: Space) -> Mode:
