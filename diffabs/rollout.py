@@ -1,11 +1,11 @@
 """Run a loop: a scan over Runge-Kutta steps that returns a trajectory, or only what is measured.
 
-    each step:   jump at t_k;  z += elapsed (f_after - f_before) for each localised event;  RK4 over [t_k, t_k + h];
-                 the plant's projection;  the objectives' update
+    each step:   the objectives' update over [t_k - h, t_k];  jump at t_k;  z += elapsed (f_after - f_before) for each
+                 localised event;  RK4 over [t_k, t_k + h];  the plant's projection
+    at the end:  the objectives' last update, after the state was moved onto the crossing
 
-A run that crosses its stop is frozen at the instant before; after the scan, one last step lands on the crossing.
-Stopping time, distance and every objective are thus exact to the order of the method and differentiable, wherever the
-crossing falls."""
+A step that crosses the stop is tried again, shorter, until it ends on the crossing. Stopping time, distance and every
+objective are thus exact to the order of the method and differentiable, wherever the crossing falls."""
 
 import dataclasses
 import math
@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.integrate import axpy, rk4_step
+from diffabs.integrate import axpy, forgetful, repeated, rk4_step_and_rate
 from diffabs.loop import Loop, LoopState
 from diffabs.numerics import clamp
 from diffabs.protocols import BrakeOutput, Clock, Ending, Memory, Objective, Sample
@@ -90,9 +90,10 @@ def _call(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], ke
 
 class _Carry(NamedTuple):
     state: LoopState
-    tally: dict[str, Memory]  # accumulators of the objectives
-    k: Any  # number of the last instant
-    t: Any  # its time; after a stop, the time of the crossing
+    tally: dict[str, Memory]  # accumulators of the objectives; `held` is still without the last interval
+    before: Sample  # at the beginning of that interval
+    k: Any  # number of steps taken
+    t: Any  # the present instant; after a stop, that of the crossing
     length: Any  # of the step to try: h, or shorter when landing
     landing: Any  # how many times the last step was tried
     running: Any
@@ -103,52 +104,67 @@ class _Carry(NamedTuple):
 @partial(jax.jit, static_argnames=("steps", "every"))
 def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, steps: int, every: int) -> Run:
     loop = prepared(loop)
-    start = loop.start()
-    first = loop.signals(0.0 * h, start).sample
-    tally = {name: objective.start(first) for name, objective in objectives.items()}
-    no, zero = jnp.asarray(False), jnp.asarray(0)
-    carry = _Carry(start, tally, zero, 0.0 * h, h, zero, loop.stop.margin(first.output) > 0, no, no)
-    carry = _typed(carry, h.dtype)
-    segment = every or max(1, math.isqrt(steps))
-
-    def advance(carry: _Carry) -> _Carry:
-        return jax.lax.scan(lambda c, _: (_step(loop, objectives, h, key, steps, c), None), carry, length=segment)[0]
-
-    def block(carry: _Carry, _: Any) -> tuple[_Carry, Any]:
-        carry = jax.lax.cond(carry.running, advance, lambda c: c, carry)
-        return carry, _seen(loop, carry) if every else None
-
+    carry = _started(loop, objectives, h)
+    step = partial(_step, loop, objectives, h, key, steps)
     first = _seen(loop, carry)
-    block = jax.checkpoint(block, policy=jax.checkpoint_policies.nothing_saveable, prevent_cse=False)
-    carry, seen = jax.lax.scan(block, carry, length=-(-(steps + LANDINGS) // segment))
+    if every:
+        carry, seen = _segments(step, partial(_seen, loop), carry, every, steps + LANDINGS)
+    else:
+        carry, seen = repeated(step, carry, steps + LANDINGS, _running), None
+    carry = _ended(loop, objectives, h, carry)
     last = _seen(loop, carry)
-    trajectory = _assembled(first, seen, last, -(-steps // segment)) if every else None
+    trajectory = _assembled(first, seen, last, -(-steps // every)) if every else None
     ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample, carry.stopped))
     metrics = {name: o.value(carry.tally[name], ending) for name, o in objectives.items()}
     metrics = {name: jnp.where(carry.diverged, jnp.nan, value) for name, value in metrics.items()}
     return Run(metrics, carry.stopped, carry.diverged, ending, trajectory)
 
 
+def _started(loop: Loop, objectives: dict[str, Objective], h: Any) -> _Carry:
+    """The carry at t = 0."""
+    state = loop.start()
+    sample = loop.signals(0.0 * h, state).sample
+    tally = {name: objective.start(sample) for name, objective in objectives.items()}
+    no, zero = jnp.asarray(False), jnp.asarray(0)
+    running = loop.stop.margin(sample.output) > 0
+    return _typed(_Carry(state, tally, sample, zero, 0.0 * h, h, zero, running, no, no), h.dtype)
+
+
+def _segments(step: Any, seen: Any, carry: _Carry, every: int, steps: int) -> tuple[_Carry, Any]:
+    """At least `steps` steps, and what was seen after every `every`-th."""
+
+    def segment(carry: _Carry, _: Any) -> tuple[_Carry, Any]:
+        carry = repeated(step, carry, every, _running)
+        return carry, seen(carry)
+
+    return jax.lax.scan(forgetful(segment), carry, length=-(-steps // every))
+
+
+def _running(carry: _Carry) -> Any:
+    return carry.running
+
+
 def _step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: int, carry: _Carry) -> _Carry:
     """One step; or one try of the last step; or nothing if the run has ended."""
-    state, tally, late = _advance(loop, objectives, h, key, carry)
+    state, tally, before, late = _advance(loop, objectives, h, key, carry)
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state.flow())]))
     trying = carry.landing > 0
     crossed = finite & (loop.stop.margin(loop.plant.output(state.plant)) <= 0)
     landed = carry.running & trying & (carry.landing == LANDINGS)
     ahead = carry.running & finite & ~trying & ~crossed
     search = carry.running & finite & ~landed & ~ahead
-    state, tally = jax.tree.map(
-        lambda a, b: jnp.where(ahead | landed, a, b), (state, tally), (carry.state, carry.tally)
+    taken = ahead | landed
+    state, tally, before = jax.tree.map(
+        lambda a, b: jnp.where(taken, a, b), (state, tally, before), (carry.state, carry.tally, carry.before)
     )
-    k = carry.k + jnp.where(ahead, 1, 0)
-    shorter = clamp(jax.lax.stop_gradient(carry.length + late), 0.0, h)
+    k = carry.k + jnp.where(taken, 1, 0)
     return _Carry(
         state=state,
         tally=tally,
+        before=before,
         k=k,
-        t=jnp.where(landed, carry.t + carry.length + late, jnp.where(ahead, k * h, carry.t)),
-        length=jnp.where(search, shorter, carry.length),
+        t=jnp.where(landed, carry.t + carry.length, jnp.where(ahead, k * h, carry.t)),
+        length=jnp.where(search, clamp(carry.length + late, 0.0, h), carry.length),
         landing=carry.landing + jnp.where(search, 1, 0),
         running=(ahead & (k < steps)) | search,
         stopped=carry.stopped | landed,
@@ -158,45 +174,80 @@ def _step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps:
 
 def _advance(
     loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, carry: _Carry
-) -> tuple[LoopState, dict[str, Memory], Any]:
-    """Jump at the present instant and integrate over carry.length; how much later [s] the margin crosses zero.
-
-    On the last try of the last step that time is zero to rounding, but not its derivative, which is the implicit
-    function theorem's: the state is moved by it, and so carries the derivative of the moment of the crossing.
-    """
+) -> tuple[LoopState, dict[str, Memory], Sample, Any]:
+    """Update, jump, integrate over carry.length: state, accumulators, the sample after the jump, and how much later [s]
+    the margin crosses zero. That time only chooses the next length, so it has no derivative."""
+    held = _updated(loop, objectives, carry, carry.state, carry.t, h)
     state, events = loop.jump(Clock(carry.t, h, carry.k, key), carry.state)
-    held = {name: memory.held for name, memory in carry.tally.items()}
+    tally_flow = {name: memory.flow for name, memory in carry.tally.items()}
 
     def flow(t: Any, z: Any, state: LoopState = state) -> Any:
-        state = state.with_flow(z[0])
-        signals = loop.signals(t, state)
-        rates = {name: o.flow(Memory(z[1][name], held[name]), signals.sample) for name, o in objectives.items()}
-        return loop.flow(t, state, signals), rates
+        return _rates(loop, objectives, held, t, state.with_flow(z[0]), z[1])
 
-    tally_flow = {name: memory.flow for name, memory in carry.tally.items()}
     z = (state.flow(), tally_flow)
     for event in events:
         old = flow(carry.t, (event.before.flow(), tally_flow), event.before)
         new = flow(carry.t, (event.after.flow(), tally_flow), event.after)
         z = axpy(event.elapsed, axpy(-1.0, old, new), z)
     before = loop.signals(carry.t, state.with_flow(z[0])).sample
-    z = rk4_step(flow, carry.t, z, carry.length)
-
-    t = carry.t + carry.length
-    y = loop.plant.output(z[0][0])
-    slope = jax.lax.stop_gradient(loop.stop.rate(y))
-    late = -loop.stop.margin(y) / jnp.where(slope < 0, slope, -jnp.inf)
-    moved = jnp.where(carry.landing == LANDINGS, late, 0.0)
-    loop_flow, tally_flow = axpy(moved, flow(t, z), z)
-    state = state.with_flow(loop_flow)
+    z, rate = rk4_step_and_rate(flow, carry.t, z, carry.length)
+    state = state.with_flow(z[0])
     state = state._replace(plant=loop.plant.project(state.plant))
-    sample = loop.signals(t + moved, state).sample
-    memories = {name: Memory(tally_flow[name], held[name]) for name in objectives}
-    tally = {
-        name: memories[name]._replace(held=o.update(memories[name], before, sample, carry.length + moved))
-        for name, o in objectives.items()
-    }
-    return state, tally, late
+    tally = {name: Memory(z[1][name], held[name]) for name in objectives}
+    return state, tally, before, _late(loop, state.plant, rate[0][0])
+
+
+def _late(loop: Loop, plant: Any, rate: Any) -> Any:
+    """How much later [s] the margin crosses zero if the plant's state goes on at this rate."""
+
+    def margin(x: Any) -> Any:
+        return loop.stop.margin(loop.plant.output(x))
+
+    left, slope = jax.jvp(margin, (plant,), (rate,))
+    return jax.lax.stop_gradient(-left / jnp.where(slope < 0, slope, -jnp.inf))
+
+
+def _rates(
+    loop: Loop, objectives: dict[str, Objective], held: dict[str, Any], t: Any, state: LoopState, tally: dict[str, Any]
+) -> tuple[Any, Any]:
+    """d/dt of the loop's state and of the objectives' integrals `tally`."""
+    signals = loop.signals(t, state)
+    rates = {name: o.flow(Memory(tally[name], held[name]), signals.sample) for name, o in objectives.items()}
+    return loop.flow(t, state, signals), rates
+
+
+def _updated(
+    loop: Loop, objectives: dict[str, Objective], carry: _Carry, state: LoopState, t: Any, h: Any
+) -> dict[str, Any]:
+    """`held` of the accumulators after the last interval, of length h; there is none before the first step."""
+    sample = loop.signals(t, state).sample
+
+    def updated(memory: Memory, objective: Objective) -> Any:
+        held = objective.update(memory, carry.before, sample, h)
+        return jax.tree.map(lambda a, b: jnp.where(carry.k > 0, a, b), held, memory.held)
+
+    return {name: updated(carry.tally[name], o) for name, o in objectives.items()}
+
+
+def _ended(loop: Loop, objectives: dict[str, Objective], h: Any, carry: _Carry) -> _Carry:
+    """Move a stopped run onto its crossing, and update the objectives over the last interval.
+
+    The time to move is zero to rounding, but not its derivative, which is the implicit function theorem's: the state is
+    moved by it, and so carries the derivative of the moment of the crossing.
+    """
+    y = loop.plant.output(carry.state.plant)
+    slope = jax.lax.stop_gradient(loop.stop.rate(y))
+    moved = jnp.where(carry.stopped, -loop.stop.margin(y) / jnp.where(slope < 0, slope, -jnp.inf), 0.0)
+    tally = {name: memory.flow for name, memory in carry.tally.items()}
+    held = {name: memory.held for name, memory in carry.tally.items()}
+    rates = _rates(loop, objectives, held, carry.t, carry.state, tally)
+    flow, tally = axpy(moved, rates, (carry.state.flow(), tally))
+    state = carry.state.with_flow(flow)
+    state = state._replace(plant=loop.plant.project(state.plant))
+    carry = carry._replace(t=carry.t + moved, state=state)
+    carry = carry._replace(tally={name: Memory(tally[name], held[name]) for name in objectives})
+    held = _updated(loop, objectives, carry, state, carry.t, jnp.where(carry.stopped, carry.length + moved, h))
+    return carry._replace(tally={name: Memory(tally[name], held[name]) for name in objectives})
 
 
 def _seen(loop: Loop, carry: _Carry) -> Trajectory:
@@ -204,7 +255,7 @@ def _seen(loop: Loop, carry: _Carry) -> Trajectory:
     return Trajectory(signals.sample, signals.measured, carry.state.plant, carry.running & (carry.landing == 0))
 
 
-def _assembled(first: Trajectory, seen: Trajectory, last: Trajectory, count: int) -> Trajectory:
+def _assembled(first: Trajectory, seen: Any, last: Trajectory, count: int) -> Trajectory:
     """First instant, `count` instants of the scan, and the last one in place of everything after the end."""
 
     def join(a: Any, b: Any, c: Any) -> Any:

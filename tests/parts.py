@@ -233,6 +233,7 @@ VALUES = {  # of the objectives on that run, by hand
     + (2 + 0.5 * 25) * 0.64 * T / 2 * (1 - E**2),
     "effort": 100 * 0.5 + 100 * 0.8 * T * (1 - E) + 25 * 0.64 * T / 2 * (1 - E**2),
     "variation": 4.0 * (1 - E),
+    "torque rate": 4.0 * (1 - np.exp(-1e-3 / T)) / 1e-3,  # over the first step
 }
 
 

@@ -7,9 +7,10 @@
           [ A_i X + B_i F               X ]                                discrete time
 
 With s = 0 these are eqs. (30) and (32) of Maeda and Sugiura after elimination of Z: its minimum costs at most
-(V + 2) n mu more than the least trace X^-1. Where there is no solution yet, a shift s > 0 makes one. The function is
-self-concordant, so the step 1/(1 + decrement) is always admitted, and a small decrement at the end is the proof that
-the point is there (Nesterov and Nemirovskii 1994; Boyd and El Ghaoui 1993 for the shift, "method of centres").
+(V + 2) n mu (discrete time: 2 (V + 1) n mu) more than the least trace X^-1. Where there is no solution yet, a shift
+s > 0 makes one. The function is self-concordant, so the step 1/(1 + decrement) is always admitted, and a small
+decrement at the end proves, but for rounding, that the point is there (Nesterov and Nemirovskii 1994; Boyd and El
+Ghaoui 1993 for the shift, "method of centres").
 
 **Coordinates follow the point.** Each Newton step is made for x = T z, T T' = X, K = F X^-1, where X is the unit matrix
 and the gain is in the closed loops. No weight or gain is too far from 1 for it, and no other scaling is needed.
@@ -47,7 +48,7 @@ class Point(NamedTuple):
 
 class Path(NamedTuple):
     """Where the path is: steps made, the point, shift s, mu, Newton's decrement, steps at the last centre, and whether
-    it came to its end."""
+    there is none."""
 
     steps: Any
     point: Point

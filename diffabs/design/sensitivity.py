@@ -43,11 +43,13 @@ def robust_gain(system: Polytope, Q: Any, R: Any) -> Any:
 def robust_design(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool = False) -> Robust:
     """The gain that minimises trace P over the vertices A (V, n, n), B (V, n, m): eqs. (29)-(32) of Maeda and Sugiura.
 
-    Works under jit, vmap and both modes of differentiation, in all arguments and to any order. Everything is of the
-    point of the central path at MU, whose cost is above the optimum by less than a millionth, and that satisfies the
-    inequalities strictly. Where the optimal gain has a kink (an inequality becomes active or ceases to be: strict
-    complementarity fails), the derivative changes from one side's to the other's within a relative distance of about
-    sqrt(MU) in the weights. Of Q and R the symmetric part counts.
+    Works under jit, vmap and both modes of differentiation, in all arguments. Everything is of the point of the central
+    path at MU, whose cost is above the optimum by less than a millionth, and that satisfies the inequalities strictly.
+    Errors, measured on the rig as d ln K/d ln weight: 1e-5 at the published weights; over eight decades below 1e-4 for
+    nine weights of ten and 5e-4 for the worst, where input is dear and the cost hardly depends on K1. Where the optimal
+    gain has a kink (an inequality becomes active or ceases to be: strict complementarity fails), there is no
+    derivative, and what is returned is that of the central path, which rounds the kink off. Of Q and R the symmetric
+    part counts.
 
     NaN without a solution: a vertex without a stabilising Riccati solution, no gain with a common P, Q that does not
     see every mode, R that is not positive definite, input that is not finite.

@@ -1,0 +1,206 @@
+"""What the gradient of a batch objective costs, in rollouts: forward mode in p parameters, reverse mode, and memory.
+
+The objective is the mean over lanes (masses) of stopping distance [m] + IAE [s]. Loops:
+
+    lmi     rig of [lmi], 50 to 5 km/h, its published gain, torque 0 to 9.03 N m
+    est     quarter car of [est], 100 km/h to rest, PID, fixed slip
+    latch   the same with the slip estimator
+
+Every time is divided by that of the objective alone, `jit` of the mean of `measure`, taken in the same round: rounds
+are interleaved, ratios and times are medians over them. `--quick` leaves the memory out. Prints tables, writes JSON
+with machine, versions and commit.
+
+    python benchmarks/bench_gradient.py [--lanes 256] [--rounds 9] [--loops lmi est latch] [--quick]
+"""
+
+import argparse
+import dataclasses
+import importlib.metadata
+import json
+import os
+import pathlib
+import platform
+import statistics
+import subprocess
+import time
+
+import jax
+import jax.numpy as jnp
+from rich.console import Console
+from rich.table import Table
+
+import diffabs as d
+from diffabs import controllers, objectives, plants, references, roads, stops
+from diffabs.pytree import get
+
+MEASURED = {"stop_distance": objectives.StopDistance(), "iae": objectives.IAE()}
+COUNTS = (1, 2, 4, 6, 8)
+MEMORY_STEPS = (1000, 2000, 4000, 8000, 16000)
+FORWARD_BOUND, REVERSE_BOUND, MEMORY_BOUND = 1.5, 6.0, 2.0  # 1 + 1.5 p; 6; 2
+
+LMI = d.Loop(
+    plant=plants.MirroredRig(),
+    initial=d.BrakeStart(speed=50 / 3.6),
+    stop=stops.SpeedReached(speed=5 / 3.6),
+    controller=controllers.StateFeedback(torque_min=0.0, torque_max=9.03),
+    feedforward=controllers.HoldingInput(),
+)
+EST = d.Loop(
+    plant=plants.QuarterCar(road=roads.MagicFormula(), inertia=1.0539),
+    controller=controllers.PID(ki=5000.0, kd=5.67),
+    reference=references.FixedSlip(),
+)
+EST_PARAMETERS = ("controller.kp", "controller.ki", "controller.kd", "controller.cutoff", "reference.slip")
+EST_PARAMETERS += ("controller.torque_max", "plant.inertia", "plant.road.D")
+# loop, masses [kg], duration [s], parameters: those of the controller first, since tuning moves them.
+CASES = {
+    "lmi": (
+        LMI,
+        (5.3, 6.2),
+        1.7,
+        ("controller.gain", "reference.slip", "controller.torque_max", "plant.road.w4", "plant.road.w1")
+        + ("plant.wheel_inertia", "initial.speed"),
+    ),
+    "est": (EST, (14.0, 16.0), 3.4, EST_PARAMETERS),
+    "latch": (dataclasses.replace(EST, reference=references.PeakLatch()), (14.0, 16.0), 3.4, EST_PARAMETERS),
+}
+
+
+def objective(name, lanes, step, duration=None):
+    """(logarithmic changes of p <= 8 parameters -> mean objective)."""
+    loop, masses, horizon, paths = CASES[name]
+    masses, solver = jnp.linspace(masses[0], masses[1], lanes), d.FixedStep(step, duration or horizon)
+
+    def mean(logs):
+        factors, values = jnp.concatenate([jnp.exp(logs), jnp.ones(len(paths) + 1 - len(logs))]), {}
+        for path in paths:
+            value = jnp.asarray(get(loop, path))
+            values[path] = value * (factors[: value.size] if value.ndim else factors[0])
+            factors = factors[value.size :]
+        changed = d.replace(loop, values)
+
+        def one(mass):
+            metrics = d.measure(d.replace(changed, {"plant.mass": mass}), solver, MEASURED).metrics
+            return metrics["stop_distance"] + metrics["iae"]
+
+        return jnp.mean(jax.vmap(one)(masses))
+
+    return mean
+
+
+def compiled(function, count):
+    """(callable without arguments, seconds of tracing and compilation, bytes of temporary memory)."""
+    logs = jnp.zeros(count)
+    begun = time.perf_counter()
+    program = jax.jit(function).lower(logs).compile()
+    seconds = time.perf_counter() - begun
+    analysis = program.memory_analysis()
+    return lambda: jax.block_until_ready(program(logs)), seconds, getattr(analysis, "temp_size_in_bytes", 0)
+
+
+def timed(name, options):
+    """Rows of one loop: {"value", "forward 1", ..., "reverse"} to medians of seconds and of ratios."""
+    mean = objective(name, options.lanes, options.step)
+    programs = {"value": compiled(mean, 8), "reverse": compiled(jax.grad(mean), 8)}
+    programs |= {f"forward {p}": compiled(jax.jacfwd(mean), p) for p in COUNTS}
+    times = {key: [] for key in programs}
+    for r in range(options.rounds + 1):  # the first warms up
+        for key, (call, _, _) in programs.items():
+            begun = time.perf_counter()
+            call()
+            if r:
+                times[key].append(time.perf_counter() - begun)
+    return {
+        key: {
+            "run_s": statistics.median(times[key]),
+            "ratio": statistics.median(a / b for a, b in zip(times[key], times["value"], strict=True)),
+            "compile_s": seconds,
+            "temporary_bytes": memory,
+        }
+        for key, (_, seconds, memory) in programs.items()
+    }
+
+
+def crossover(rows):
+    """The number of parameters from which reverse mode is the cheaper, on the line through the forward ratios."""
+    ratios = [rows[f"forward {p}"]["ratio"] for p in COUNTS]
+    slope, start = statistics.linear_regression(COUNTS, ratios)
+    return (rows["reverse"]["ratio"] - start) / slope
+
+
+def memory(name, options):
+    """{number of steps: bytes of temporary memory of the reverse gradient}."""
+    sizes = {}
+    for steps in MEMORY_STEPS:
+        mean = objective(name, options.lanes, options.step, steps * options.step)
+        sizes[steps] = compiled(jax.grad(mean), 8)[2]
+    return sizes
+
+
+def main():
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--lanes", type=int, default=256)
+    parser.add_argument("--step", type=float, default=1e-3, help="of integration [s]")
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--loops", nargs="+", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--quick", action="store_true", help="leave the memory out")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/benchmarks/gradient.json"))
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    found = {}
+    for name in options.loops:
+        rows = timed(name, options)
+        sizes = {} if options.quick else memory(name, options)
+        found[name] = {"rows": rows, "crossover": crossover(rows), "memory": sizes}
+        show(name, found[name], options)
+    write(found, options)
+
+
+def show(name, found, options):
+    """One table of times, one line of memory."""
+    table = Table(title=f"{name}: {options.lanes} lanes, medians of {options.rounds} rounds")
+    for heading in ("", "run [ms]", "ratio", "bound", "compile [s]", "temporary [MB]"):
+        table.add_column(heading)
+    for key, row in found["rows"].items():
+        kind, _, count = key.partition(" ")
+        bound = {"value": 1.0, "reverse": REVERSE_BOUND}.get(kind, 1 + FORWARD_BOUND * int(count or 0))
+        table.add_row(
+            key,
+            f"{1e3 * row['run_s']:.1f}",
+            f"{row['ratio']:.2f}",
+            f"{bound:.1f}",
+            f"{row['compile_s']:.1f}",
+            f"{row['temporary_bytes'] / 1e6:.2f}",
+        )
+    console = Console()
+    console.print(table)
+    console.print(f"reverse mode is the cheaper from p = {found['crossover']:.1f}")
+    if found["memory"]:
+        sizes = ", ".join(f"{steps}: {size / 1e6:.2f} MB" for steps, size in found["memory"].items())
+        spread = max(found["memory"].values()) / min(found["memory"].values())
+        console.print(f"temporary memory of reverse mode by steps: {sizes}; factor {spread:.2f} <= {MEMORY_BOUND:g}")
+
+
+def write(found, options):
+    """JSON with machine, versions and commit."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
+    commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    record = {
+        "loops": found,
+        "lanes": options.lanes,
+        "step_s": options.step,
+        "rounds": options.rounds,
+        "device": str(jax.devices()[0]),
+        "machine": {"processor": platform.machine(), "system": platform.system(), "cores": os.cpu_count()},
+        "versions": {name: importlib.metadata.version(name) for name in ("diffabs", "jax", "jaxlib", "numpy")},
+        "python": platform.python_version(),
+        "commit": commit,
+    }
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    Console().print(f"written to {options.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,78 @@
+"""Reverse mode over many steps: how much it keeps, and that it is the derivative that forward mode gives."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffabs as d
+from diffabs import controllers, integrate, plants
+from diffabs.integrate import SLOTS, levels
+from diffabs.objectives import IAE, StopDistance
+from diffabs.pytree import get
+from diffabs.stops import SpeedReached
+
+LOOP = d.Loop(
+    plant=plants.MirroredRig(),
+    initial=d.BrakeStart(speed=50 / 3.6),
+    controller=controllers.StateFeedback(torque_min=0.0, torque_max=9.03),
+    feedforward=controllers.HoldingInput(),
+    stop=SpeedReached(speed=5 / 3.6),
+)
+PATHS = ("plant.mass", "plant.road.w4", "reference.slip", "controller.gain", "initial.speed")
+
+
+def objective(steps, lanes=64, step=1e-3):
+    """Logarithmic changes of the parameters -> mean distance + IAE over masses."""
+
+    def mean(logs):
+        loop = d.replace(LOOP, {p: get(LOOP, p) * jnp.exp(x) for p, x in zip(PATHS, logs, strict=True)})
+
+        def one(factor):
+            run = d.measure(
+                d.replace(loop, {"plant.mass": get(loop, "plant.mass") * factor}),
+                d.FixedStep(step, steps * step),
+                {"distance": StopDistance(), "iae": IAE()},
+            )
+            return run.metrics["distance"] + run.metrics["iae"]
+
+        return jnp.mean(jax.vmap(one)(jnp.linspace(1.0, 1.2, lanes)))
+
+    return mean
+
+
+def memory(steps):
+    """Temporary memory [bytes] of the reverse gradient."""
+    program = jax.jit(jax.grad(objective(steps))).lower(jnp.zeros(len(PATHS))).compile()
+    analysis = program.memory_analysis()
+    assert analysis is not None
+    return analysis.temp_size_in_bytes
+
+
+@pytest.mark.slow
+def test_memory_of_reverse_mode_hardly_grows_with_the_number_of_steps():
+    sizes = [memory(steps) for steps in (1000, 4000, 16000)]
+    assert max(sizes) < 2 * min(sizes), sizes
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 900, 1800, 1801, 1804, 4004, 16004, 10**6])
+def test_nested_scans_make_enough_steps_and_keep_few_carries(count):
+    lengths = levels(count)
+    assert count <= math.prod(lengths) <= 1.002 * count
+    if count >= SLOTS / 2:
+        assert SLOTS / 2 <= sum(lengths) <= 1.5 * SLOTS
+
+
+@pytest.mark.slow
+def test_reverse_forward_and_differences_agree_in_nested_scans(monkeypatch):
+    monkeypatch.setattr(integrate, "SLOTS", 16)
+    jax.clear_caches()
+    assert len(levels(104)) == 2
+    mean, zero = objective(100, lanes=2, step=2e-3), jnp.zeros(len(PATHS))
+    reverse, forward = jax.jit(jax.grad(mean))(zero), jax.jit(jax.jacfwd(mean))(zero)
+    moves = 1e-5 * jnp.eye(len(PATHS))
+    many = jax.jit(jax.vmap(mean))
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(forward, (many(moves) - many(-moves)) / 2e-5, rtol=1e-6, atol=1e-8)
