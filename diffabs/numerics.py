@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from diffabs.pytree import Scalar
@@ -16,10 +17,33 @@ def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
     return jnp.where(jnp.less(x, low), low, jnp.where(jnp.greater(x, high), high, x))
 
 
+def larger(x: Scalar, y: Scalar) -> Any:
+    """max(x, y). Equal, the slope is that in x: `jnp.maximum` shares it between both, by a division in its tangent."""
+    return jnp.where(jnp.greater_equal(x, y), x, y)
+
+
+def smaller(x: Scalar, y: Scalar) -> Any:
+    """min(x, y), with the slope in x where they are equal."""
+    return jnp.where(jnp.less_equal(x, y), x, y)
+
+
+@jax.custom_jvp
+def quotient(x: Scalar, y: Scalar) -> Any:
+    """x/y, whose derivatives (dx - (x/y) dy)/y share one 1/y. JAX's own divide three times more."""
+    return x / y
+
+
+@quotient.defjvp
+def _quotient_slope(at: Any, moves: Any) -> tuple[Any, Any]:
+    inverse = 1.0 / at[1]
+    value = at[0] / at[1]
+    return value, (moves[0] - value * moves[1]) * inverse
+
+
 def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> Any:
     """numerator/denominator, and `otherwise` where the denominator is zero (with zero slope there)."""
     fine = jnp.not_equal(denominator, 0)
-    return jnp.where(fine, numerator / jnp.where(fine, denominator, 1.0), otherwise)
+    return jnp.where(fine, quotient(numerator, jnp.where(fine, denominator, 1.0)), otherwise)
 
 
 def power(base: Scalar, exponent: Scalar) -> Any:

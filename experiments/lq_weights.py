@@ -8,7 +8,7 @@ that any of the three ever found. A gradient counts at its price, measured here 
     gain       (k1, k2) themselves
     Riccati    Q = L L', R = 1, through the regulator of the rig at 20 km/h
     LMI        the same through the paper's robust design over masses and speeds: every trial is a robust gain
-    eight      PID, derivative filter, anti-windup, reference and estimator of the quarter car on twelve roads
+    eight      PID, derivative filter, anti-windup, reference and estimator of the quarter car on 32 roads
 
     python experiments/lq_weights.py
 """
@@ -47,8 +47,8 @@ from diffabs.tune.weights import LQWeights, lq_weights, regulator, robust
 class Config:
     """Every number of the experiment."""
 
-    masses: tuple[float, ...] = (5.3, 5.75, 6.2)  # kg
-    speeds: tuple[float, ...] = (20.0, 35.0, 50.0)  # km/h
+    masses: tuple[float, ...] = (5.3, 5.5, 5.75, 6.0, 6.2)  # kg
+    speeds: tuple[float, ...] = (20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0)  # km/h
     last_speed: float = 5.0  # km/h
     lag: float = 1e-3  # s; without it slip alone drives k2 to its limit
     gain: tuple[float, float] = (-3000.0, -60.0)
@@ -56,10 +56,10 @@ class Config:
     weights: tuple[float, float] = (1e7, 3e3)
     logarithms: tuple[float, float] = (1.0, 10.0)  # of the Cholesky factor's diagonal
     design_speed: float = 20.0  # km/h, of the Riccati equation
-    cost: tuple[float, float, float] = (0.0, 1.0, 1e-4)  # of x1^2, x2^2 and (u - tau*)^2 in what is minimised
+    cost: tuple[float, float, float] = (1e3, 1.0, 1e-4)  # of x1^2, x2^2 and (u - tau*)^2 in what is minimised
     rig_step: float = 5e-4  # s
     rig_duration: float = 1.7
-    roads: int = 12  # of the larger problem
+    roads: int = 32  # of the larger problem
     car_step: float = 1e-3
     car_duration: float = 6.0
     car_stop: float = 2.0  # m/s
@@ -90,7 +90,7 @@ def box(config: Config) -> Any:
 
 
 def car(config: Config) -> tuple[Loop, Batch]:
-    """The quarter car under PID control at the estimated slip, and twelve roads, masses and speeds."""
+    """The quarter car under PID control at the estimated slip, and many roads, masses and speeds."""
     loop = Loop(
         plant=QuarterCar(inertia=1.0539, road=MagicFormula()),
         reference=PeakRobust(slip=0.2, arming=1.0),

@@ -89,3 +89,53 @@ def test_one_prior_is_enough_to_identify_a_magic_formula():
     assert distance <= 0.06
     np.testing.assert_allclose(float(found.values["plant.inertia"]), 1.0454, rtol=0, atol=2e-3)
     assert found.uncertainty.degrees == 13
+
+
+def test_the_cure_is_proved_and_holds_on_what_was_not_tuned_for(tmp_path):
+    module = experiment("cure_overshoot")
+    result = module.main(module.Config(out=str(tmp_path), iterations=1))
+    rows = {row["controller"]: row for row in result["table"]}
+    cure = rows["the cure"]
+    assert cure["overshoot [%]"] <= 1
+    assert cure["settling [s]"] <= 0.1
+    assert (cure["locked [s]"], cure["diverged"], cure["proved"]) == (0, 0, "stable")
+    assert rows["published gain"]["overshoot [%]"] > 90
+    assert rows["cure, filter left out"]["overshoot [%]"] > 10
+    assert rows["cure, gain fixed as at 50 km/h"]["largest frozen |pole|"] > 1
+    assert {"gain at v0 [N m/s, N m]", "limits [N m]"} <= set(result["cure"]["controller"])
+
+
+def test_the_worst_case_found_is_at_least_as_bad_as_samples(tmp_path):
+    module = experiment("worst_case")
+    result = module.main(module.Config(samples=2000, starts=2, iterations=3, out=str(tmp_path)))
+    for row in result["table"]:
+        assert row["worst found [%]"] >= row["worst of 2000 samples [%]"]
+    published, cure = result["table"]
+    assert published["worst found [%]"] > 5 > cure["worst found [%]"]
+
+
+def test_effort_can_be_traded_for_distance(tmp_path):
+    module = experiment("pareto")
+    result = module.main(module.Config(weights=(1e-5, 2.5e-2), iterations=4, random=20, out=str(tmp_path)))
+    short, cheap = result["front"]
+    assert short["distance [m]"] < cheap["distance [m]"]
+    assert short["effort [N2 m2 s]"] > cheap["effort [N2 m2 s]"]
+
+
+def test_tuned_over_roads_no_wheel_locks_longer(tmp_path):
+    module = experiment("pid_over_roads")
+    config = module.Config(roads=8, held_out=8, iterations=2, own_step=1e-3, fine=2e-3, out=str(tmp_path))
+    result = module.main(config)
+    assert len(result["table"]) == 4
+    for row in result["table"]:
+        assert row["worst lane, tuned"] > 1 - 1e-3  # of what friction allows
+        assert (row["lanes locked longer"], row["not stopped"], row["diverged"]) == (0, 0, 0)
+
+
+def test_gradients_need_fewer_rollouts_than_searches_without(tmp_path):
+    module = experiment("lq_weights")
+    config = module.Config(budgets=(120, 1), rig_step=1e-3, repeats=1, out=str(tmp_path))
+    (row,) = module.main(config, ("gain",))["table"]
+    assert row["L-BFGS found"] <= row["Nelder-Mead found"] * (1 + 1e-4)
+    assert row["L-BFGS [rollouts]"] / row["price of a gradient"] < 15
+    assert row["Nelder-Mead [rollouts]"] > 30

@@ -19,7 +19,7 @@ from diffabs.objectives import BRAKING
 from diffabs.pytree import strong
 from diffabs.stability import stable_step, stable_steps
 from diffabs.stops import SpeedReached
-from diffabs.tune import AtMost, Batch, Method, Mode, Poles, Stopping, grid, tune, worst_case
+from diffabs.tune import AtMost, Batch, CertifiedDecay, Method, Mode, Poles, Stopping, grid, tune, worst_case
 from diffabs.tune.problem import Multipliers
 from diffabs.tune.tuning import posed
 from diffabs.tune.weights import lq_weights, regulator
@@ -189,6 +189,30 @@ class TestPoles:
         for i in range(2):
             e = h * np.eye(2)[i]
             np.testing.assert_allclose(slope[:, i], (excess(k + e) - excess(k - e)) / (2 * h), rtol=1e-6, atol=1e-10)
+
+
+class TestCertifiedDecay:
+    """s^2 + (1 - k2) s - k1: of one system the decay that can be proved is that of its slowest mode."""
+
+    NAMES = ("integral of slip error", "slip error")
+    SYSTEM = Polytope(np.array([[[0.0, 1.0], [0.0, -1.0]]]), np.array([[[0.0], [1.0]]]), states=NAMES)
+
+    def excess(self, gain, decay):
+        loop = dataclasses.replace(RIG, controller=controllers.StateFeedback(gain=jnp.asarray(gain)))
+        return CertifiedDecay(self.SYSTEM, decay).excess(loop, {})
+
+    def test_is_what_is_missing_relative_to_what_is_asked(self):
+        gain = np.array([-6.0, -4.0])  # poles -2 and -3
+        np.testing.assert_allclose(self.excess(gain, 3.0), [1 / 3], rtol=1e-5)
+        np.testing.assert_allclose(self.excess(gain, 0.5), [-1.5], rtol=1e-5)
+
+    def test_its_slope_is_that_of_the_slowest_pole(self):
+        slope = jax.jacfwd(lambda k: self.excess(k, 3.0)[0])(jnp.array([-6.0, -4.0]))
+        # (2 s + 1 - k2) ds = s dk2 + dk1 at s = -2, and decay = -s
+        np.testing.assert_allclose(slope, [1 / 3, -2 / 3], rtol=1e-4)
+
+    def test_an_unstable_gain_falls_short_by_its_growth(self):
+        np.testing.assert_allclose(self.excess(np.array([6.0, 0.0]), 1.0), [3.0], rtol=1e-5)  # poles 2 and -3
 
 
 class TestWeights:

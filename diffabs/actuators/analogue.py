@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from diffabs.numerics import clamp
+from diffabs.numerics import clamp, quotient
 from diffabs.protocols import Memory, no_flow, no_jump, no_memory
 from diffabs.pytree import Scalar, param, pytree
 
@@ -44,7 +44,7 @@ class Lag:
     def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
         """control'."""
         del t
-        return (signal - memory.flow) / self.time_constant
+        return quotient(signal - memory.flow, self.time_constant)
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
         """Torque [N m]."""
@@ -69,4 +69,4 @@ class RateLimit:
     def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
         """control'."""
         del t
-        return clamp((signal - memory.flow) / self.time_constant, -self.rate, self.rate)
+        return clamp(quotient(signal - memory.flow, self.time_constant), -self.rate, self.rate)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.numerics import clamp, parabola, ratio, sign
+from diffabs.numerics import clamp, larger, parabola, ratio, sign, smaller
 from diffabs.protocols import Ending, Memory, Sample
 from diffabs.pytree import Scalar, Vector, param, pytree
 
@@ -135,8 +135,8 @@ class MaxSlip:
         greatest, last, earlier = memory.held
         slip = sample.output.slip
         turned = (last > earlier) & (last > slip)
-        vertex = jnp.where(turned, jnp.minimum(parabola(earlier, last, slip)[1], 1.0), slip)
-        return Peak(jnp.maximum(greatest, jnp.maximum(vertex, slip)), slip, last)
+        vertex = jnp.where(turned, smaller(parabola(earlier, last, slip)[1], 1.0), slip)
+        return Peak(larger(greatest, larger(vertex, slip)), slip, last)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Greatest slip."""

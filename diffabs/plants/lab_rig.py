@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.numerics import clamp
+from diffabs.numerics import clamp, quotient, smaller
 from diffabs.plants.wheel import BrakeStart, forward, halted, slip_ratio
 from diffabs.protocols import BrakeOutput, Road
 from diffabs.pytree import Scalar, param, part, pytree
@@ -69,8 +69,8 @@ class LabRig:
         """dx/dt under the brake command `control` [1], limited to [0, 1]."""
         del t
         mu, normal, torque = self.contact(state)
-        wheel = (normal * self.wheel_radius * mu - torque) / self.wheel_inertia
-        drum = -self._drum_torque(state.drum, normal * mu) / self.drum_inertia
+        wheel = quotient(normal * self.wheel_radius * mu - torque, self.wheel_inertia)
+        drum = -quotient(self._drum_torque(state.drum, normal * mu), self.drum_inertia)
         u = clamp(control, 0.0, 1.0)
         target = jnp.where(u >= self.brake_threshold, self.brake_gain * u + self.brake_offset, 0.0)
         return LabRigState(
@@ -86,10 +86,10 @@ class LabRig:
         mu = self.road.friction(slip, self.drum_radius * state.drum, state.distance)
         arm = self.lever * (jnp.sin(self.lever_angle) - mu * jnp.cos(self.lever_angle))
         capacity = state.brake + self.wheel_stiction
-        asked = self.wheel_radius * mu * self.weight_torque / (arm - self.wheel_radius * mu)
-        stuck = jnp.minimum(asked, capacity)
+        asked = quotient(self.wheel_radius * mu * self.weight_torque, arm - self.wheel_radius * mu)
+        stuck = smaller(asked, capacity)
         torque = jnp.where(state.wheel > 0, capacity + self.wheel_friction * state.wheel, stuck)
-        return mu, (self.weight_torque + torque) / arm, torque
+        return mu, quotient(self.weight_torque + torque, arm), torque
 
     def project(self, state: LabRigState) -> LabRigState:
         """Neither wheel turns backwards."""
@@ -99,7 +99,7 @@ class LabRig:
         """Slip, rim speeds, deceleration of the road wheel's rim, distance."""
         v, w = self.drum_radius * state.drum, self.wheel_radius * state.wheel
         mu, normal, _ = self.contact(state)
-        deceleration = self.drum_radius * self._drum_torque(state.drum, normal * mu) / self.drum_inertia
+        deceleration = self.drum_radius * quotient(self._drum_torque(state.drum, normal * mu), self.drum_inertia)
         return BrakeOutput(slip_ratio(v, w, self.crawl_speed), v, w, deceleration, state.distance)
 
     def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:

@@ -11,6 +11,7 @@ is the default. Eq. (12) is for omega2 r2 >= omega1 r1 only; beyond it the slip 
 
 from typing import NamedTuple
 
+from diffabs.numerics import quotient
 from diffabs.plants.wheel import GRAVITY, BrakeStart, forward, halted, slip_ratio
 from diffabs.protocols import BrakeOutput, Road
 from diffabs.pytree import Scalar, param, part, pytree
@@ -47,8 +48,8 @@ class MirroredRig:
         del t
         y = self.output(state)
         push = self.inertia_factor * self.mass * y.deceleration  # Fn mu [N]
-        wheel = (push * self.wheel_radius - control) / self.wheel_inertia
-        body = -y.deceleration / self.body_radius
+        wheel = quotient(push * self.wheel_radius - control, self.wheel_inertia)
+        body = -quotient(y.deceleration, self.body_radius)
         return RigState(halted(state.wheel, wheel), halted(state.body, body), y.speed)
 
     def project(self, state: RigState) -> RigState:
@@ -60,7 +61,7 @@ class MirroredRig:
         v, w = self.body_radius * state.body, self.wheel_radius * state.wheel
         slip = slip_ratio(v, w, self.crawl_speed)
         mu = self.road.friction(slip, v, state.distance)
-        return BrakeOutput(slip, v, w, mu * GRAVITY / self.inertia_factor, state.distance)
+        return BrakeOutput(slip, v, w, quotient(mu * GRAVITY, self.inertia_factor), state.distance)
 
     def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
         """tau* = m g r1 mu + (1 - slip) J1 mu g/(c r1), the zero of eq. (14)."""

@@ -9,6 +9,7 @@ neglected."""
 
 from typing import NamedTuple
 
+from diffabs.numerics import quotient
 from diffabs.plants.wheel import GRAVITY, BrakeStart, forward, halted, slip_ratio
 from diffabs.protocols import BrakeOutput, Road
 from diffabs.pytree import Scalar, param, part, pytree
@@ -42,8 +43,8 @@ class QuarterCar:
         """dx/dt under the brake torque `control` [N m]."""
         del t
         mu = self.output(state).deceleration / GRAVITY
-        net = self.radius * mu * self.mass * GRAVITY - control
-        return QuarterCarState(halted(state.speed, -mu * GRAVITY), halted(state.spin, net / self.inertia), state.speed)
+        spin = quotient(self.radius * mu * self.mass * GRAVITY - control, self.inertia)
+        return QuarterCarState(halted(state.speed, -mu * GRAVITY), halted(state.spin, spin), state.speed)
 
     def project(self, state: QuarterCarState) -> QuarterCarState:
         """Neither car nor wheel moves backwards."""

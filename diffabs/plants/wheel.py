@@ -4,6 +4,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from diffabs.numerics import larger, quotient
 from diffabs.pytree import Scalar, param, pytree
 
 GRAVITY = 9.81  # m/s^2, the value behind every number of the papers
@@ -22,13 +23,13 @@ def slip_ratio(speed: Scalar, wheel_speed: Scalar, crawl: Scalar) -> Any:
 
     C1 at v = w. Below the crawl speed [m/s] the slip goes to zero with v - w instead of dividing by zero.
     """
-    return (speed - wheel_speed) / jnp.maximum(jnp.maximum(speed, wheel_speed), crawl)
+    return quotient(speed - wheel_speed, larger(larger(speed, wheel_speed), crawl))
 
 
 def halted(speed: Scalar, rate: Scalar) -> Any:
     """The rate of a speed that cannot become negative: at standstill only what speeds up acts. Brake friction balances
     the rest, as dry friction does."""
-    return jnp.where(jnp.greater(speed, 0), rate, jnp.maximum(rate, 0.0))
+    return jnp.where(jnp.greater(speed, 0), rate, larger(rate, 0.0))
 
 
 def forward(speed: Scalar) -> Any:

@@ -8,7 +8,7 @@ the slip of greatest friction" is not true of this curve: its local peak lies at
 
 from typing import Any
 
-from diffabs.numerics import odd, power
+from diffabs.numerics import odd, power, quotient
 from diffabs.pytree import Scalar, param, pytree
 
 
@@ -30,7 +30,7 @@ class RationalCurve:
 
     def _curve(self, s: Any) -> Any:
         p = power(s, self.q)
-        return self.w4 * p / (self.a + p) + s * (self.w1 + s * (self.w2 + s * self.w3))
+        return quotient(self.w4 * p, self.a + p) + s * (self.w1 + s * (self.w2 + s * self.w3))
 
 
 RIG = RationalCurve()
