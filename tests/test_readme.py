@@ -14,7 +14,7 @@ from diffabs.cli import app
 from diffabs.scenario import load
 
 TEXT = (pathlib.Path(__file__).parent.parent / "README.md").read_text()
-CODE, DESIGN = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+CODE, DESIGN, TUNE = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 
 def test_the_twelve_lines_run():
@@ -44,6 +44,16 @@ def test_the_robust_design_runs():
     assert names["found"].certificate.verified_exactly
     assert names["found"].certificate.decay_rate >= 20.0
     assert names["published"].quadratically_stable is False
+
+
+@pytest.mark.slow
+def test_the_tuning_runs():
+    names = {}
+    exec(compile(CODE.rsplit("masses, grips", 1)[0], "README.md", "exec"), names)
+    exec(compile(TUNE, "README.md", "exec"), names)
+    found = names["found"]
+    assert found.objective[1] < 0.6 * found.objective[0]
+    assert np.max(found.metrics[1]["overshoot"]) < 0.02
 
 
 @pytest.mark.parametrize("command", re.findall(r"^    diffabs ((?:list|certify) .*)$", TEXT, re.MULTILINE))
