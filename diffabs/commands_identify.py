@@ -130,7 +130,7 @@ def _identified(
 ) -> tuple["Identified", dict[str, float]]:
     """The fit, and the standard deviations it was made with. What is not given is first the spread of a column, then
     that of its residuals, until it hardly changes. Raises ValueError."""
-    from diffabs.tune.identify import identify
+    from diffabs.tune.identification import identify
     from diffabs.tune.traces import Traces
 
     solver, columns = _solver(chosen.solver, readings), readings.columns

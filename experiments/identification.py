@@ -30,7 +30,7 @@ from diffabs.roads import SPLINE_B, MagicFormula, Tabulated
 from diffabs.roads.tabulated import PiecewiseCubic
 from diffabs.stops import Standstill
 from diffabs.tune.fit import Identified, Tolerances
-from diffabs.tune.identify import identify
+from diffabs.tune.identification import identify
 from diffabs.tune.squares import gaussian
 from diffabs.tune.table import Table
 

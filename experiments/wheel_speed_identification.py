@@ -22,7 +22,7 @@ from diffabs.plants import QuarterCar
 from diffabs.roads import MagicFormula
 from diffabs.stops import Standstill
 from diffabs.tune.fit import Identified, Tolerances
-from diffabs.tune.identify import identify
+from diffabs.tune.identification import identify
 from diffabs.tune.traces import Traces
 
 PATHS = ("plant.inertia", "plant.road.B", "plant.road.C", "plant.road.D", "plant.road.E")

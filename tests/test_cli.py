@@ -284,7 +284,7 @@ def test_control_c_ends_a_long_run_with_one_line(tmp_path):
             if line.startswith("simulating"):
                 break
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        out, err = process.communicate(timeout=120)
     assert process.returncode == 130
     assert (out, err) == ("", "interrupted\n")
     assert left_in(tmp_path) == set()

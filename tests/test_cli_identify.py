@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
 
-import diffabs.tune.identify as library
+import diffabs.tune.identification as library
 from diffabs import commands_identify, console, scenario
 from diffabs.readings import read
 from diffabs.scenario import ScenarioError, load

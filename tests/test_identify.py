@@ -13,7 +13,7 @@ from diffabs import controllers, objectives, plants, references, roads, stops
 from diffabs.pytree import Scalar, param, pytree, replace
 from diffabs.tune.descent import Reason
 from diffabs.tune.fit import Tolerances, fit
-from diffabs.tune.identify import identify
+from diffabs.tune.identification import identify
 from diffabs.tune.squares import gaussian
 from diffabs.tune.table import Table
 from diffabs.tune.traces import Traces

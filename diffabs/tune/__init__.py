@@ -17,7 +17,7 @@ from diffabs.tune.descent import Stopping as Stopping
 from diffabs.tune.fit import Identified as Identified
 from diffabs.tune.fit import Tolerances as Tolerances
 from diffabs.tune.fit import fit as fit
-from diffabs.tune.identify import identify as identify
+from diffabs.tune.identification import identify as identify
 from diffabs.tune.problem import Mode as Mode
 from diffabs.tune.result import Method as Method
 from diffabs.tune.result import Progress as Progress
