@@ -70,7 +70,7 @@ class Config:
     stop: float = 2.0  # m/s; from there at the last deceleration. Slower, these steps are not stable for large kp
     longest: float = 40.0  # s
     own_step: float = 5e-5  # s, on the paper's own road, to 0.05 m/s
-    iterations: int = 20
+    iterations: int = 10
     confidence: float = 0.95
     out: str = "out/experiments/pid_over_roads"
 
@@ -153,7 +153,7 @@ def tuned(config: Config, known: Family, one: Loop, progress: Any = None) -> Tun
         objective={"stop_distance": 1.0},
         over=known.with_paper(config.own_share),
         solver=FixedStep(step=config.step, duration=config.longest),
-        method=Method(stopping=Stopping(iterations=config.iterations, change=1e-6)),
+        method=Method(stopping=Stopping(iterations=config.iterations, change=1e-5)),
         progress=progress,
     )
 
