@@ -2,7 +2,9 @@
 
 The quarter car of Aoki and Nakamura stops from 100 km/h under PI control of a fixed slip. Distance and effort, the
 integral of u^2 dt, cannot both be least: for a row of weights between them, target slip, kp and ki are tuned by
-gradients. Each result is a point of the front; random parameters of the same ranges lie above it.
+gradients. Each result is a point of the front; random parameters of the same ranges lie on or above it. The front is
+nearly a line, because the brake has to carry the momentum away whatever it does; what can be saved is what chatter, a
+locked wheel or slip beyond the peak waste.
 
     python experiments/pareto.py
 """
@@ -30,7 +32,7 @@ MEASURED = {**BRAKING, "effort": Effort()}
 class Config:
     """Every number of the experiment."""
 
-    weights: tuple[float, ...] = (1e-5, 1e-3, 3e-3, 6e-3, 1.2e-2, 2.5e-2)  # m per N^2 m^2 s, of the effort
+    weights: tuple[float, ...] = (1e-5, 1e-3, 1.5e-3, 2e-3, 2.5e-3, 3e-3, 4e-3)  # m per N^2 m^2 s, of the effort
     ranges: tuple[tuple[str, float, float], ...] = (
         ("reference.slip", 0.01, 0.3),
         ("controller.kp", 300.0, 8000.0),
@@ -102,7 +104,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
     record.show("Stopping distance against control effort, from 100 km/h", rows)
     points = np.array([row["effort [N2 m2 s]"] for row in rows]), np.array([row["distance [m]"] for row in rows])
     effort, distance = scattered(config)
-    near = distance < 2 * points[1].max()
+    near = distance < 1.1 * points[1].max()
     figure = plot_tuning.pareto(
         {"tuned by gradients": points, "random parameters": (effort[near], distance[near])},
         marks={"published conventional PI": published(config)},

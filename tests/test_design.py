@@ -358,6 +358,7 @@ def form(proof, speed):
     return np.array([[np.interp(speed, nodes, p[:, i, j]) for j in range(2)] for i in range(2)])
 
 
+@pytest.mark.slow
 def test_published_gain_is_proved_for_a_speed_that_cannot_jump():
     proof = certify((-11753.0, -48.0), chain(), Spec(rates=RATES, decay=5.0))
     assert proof.verified_exactly
