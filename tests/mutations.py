@@ -313,7 +313,7 @@ MUTATIONS = [
         "design: eq. (30) without Q",
         "design/inequalities.py",
         "[q_root @ x @ even, np.eye(n)], [f @ even, None, np.eye(m)]]",
-        "[0 * q_root @ x @ even, np.eye(n)], [f @ even, None, np.eye(m)]])",
+        "[0 * q_root @ x @ even, np.eye(n)], [f @ even, None, np.eye(m)]]",
         "test_design.py::test_one_vertex_is_the_closed_form_over_ten_decades",
     ),
     Mutation(
