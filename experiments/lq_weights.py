@@ -12,7 +12,7 @@ ratio of times.
     schedule   gains at six speeds and the filter of the target: thirteen
     eight      PID, derivative filter, anti-windup, reference and estimator of the quarter car on 32 roads
 
-    python experiments/lq_weights.py
+    python experiments/lq_weights.py      (needs the package cma, of the dependency group test)
 """
 
 import dataclasses

@@ -670,6 +670,13 @@ MUTATIONS = [
         "test_tune.py::TestAggregates::test_cvar_is_rockafellar_and_uryasevs_minimum",
     ),
     Mutation(
+        "tune: no curvature condition",
+        "tune/descent.py",
+        "elif float(found.gradient @ lane.update) < WOLFE * slope and not longest:",
+        "elif False:",
+        "test_tune.py::TestDescent::test_a_kink_does_not_stop_it",
+    ),
+    Mutation(
         "tune: unstable steps entered",
         "tune/descent.py",
         "return found, fine & self.steady(z)",
