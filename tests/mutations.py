@@ -674,7 +674,14 @@ MUTATIONS = [
         "tune/descent.py",
         "elif float(found.gradient @ lane.update) < WOLFE * slope and not longest:",
         "elif False:",
-        "test_tune.py::TestDescent::test_a_kink_does_not_stop_it",
+        "test_tune.py::TestDescent::test_a_step_that_is_much_too_short_is_not_content_with_little",
+    ),
+    Mutation(
+        "tune: jumps climbed for ever",
+        "tune/descent.py",
+        "if lane.jumps >= JUMPS:",
+        "if False:",
+        "test_tune.py::TestDescent::test_where_the_loss_jumps_it_ends_soon",
     ),
     Mutation(
         "tune: unstable steps entered",

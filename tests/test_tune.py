@@ -213,6 +213,23 @@ class TestDescent:
         (lane,) = descend(lambda z: jnp.abs(z[0] - 1) + 10 * jnp.abs(z[1] + 2 * z[0]) + 0.1 * z[0] ** 2, [3.0, 1.0])
         np.testing.assert_allclose(lane.z, [1.0, -2.0], rtol=0, atol=1e-4)
 
+    def test_a_step_that_is_much_too_short_is_not_content_with_little(self):
+        """Weak Wolfe conditions, written out here, where the first direction is a thousandth of the way."""
+        f = lambda z: 1e-3 * jnp.sum(jnp.sqrt(1 + z**2))  # noqa: E731
+        start = np.array([1.0, -0.7])
+        (lane,) = descend(f, start, iterations=1)
+        before, after = jax.grad(f)(jnp.asarray(start)), jax.grad(f)(jnp.asarray(lane.z))
+        step = lane.z - start
+        assert f(lane.z) <= f(start) + 1e-4 * before @ step
+        assert after @ step >= 0.9 * (before @ step)
+
+    def test_where_the_loss_jumps_it_ends_soon(self):
+        """A wall at z0 = 0.3, which the slope points across: twelve trials, twice."""
+        (lane,) = descend(lambda z: z[0] + z[1] ** 2 + jnp.where(z[0] < 0.3, 1e3, 0.0), [0.7, 1.0])
+        assert lane.reason is Reason.JUMP
+        assert 0.3 <= lane.z[0] < 0.31
+        assert lane.evaluations < 60
+
     def test_it_backs_away_from_where_nothing_is_defined(self):
         """sqrt is NaN beyond 1, right where the first long steps go."""
         (lane,) = descend(lambda z: jnp.sum((z - 0.99) ** 2) - 1e-3 * jnp.sum(jnp.sqrt(1 - z)), [-3.0, -0.5])

@@ -25,6 +25,7 @@ ARMIJO, WOLFE = 1e-4, 0.9
 SHORTEST = 1e-10  # of t
 EXPANSION = 4.0
 TRIALS = 12  # of a line search that has found something better, before it is content with that
+JUMPS = 2  # such searches in a row: no point beyond is better, so the loss jumps there and its gradient is no guide
 LONGEST = 2.0  # of a component of u, in units of z: about half of a finite range
 PATIENCE = 3  # accepted steps in a row that gain nothing
 
@@ -35,6 +36,7 @@ class Reason(enum.Enum):
     GRADIENT = "the gradient is zero within its tolerance"
     CHANGE = "steps no longer change the loss within its tolerance"
     STEP = "no shorter step makes the loss smaller"
+    JUMP = "the loss jumps up just beyond, twice in a row"
     LIMIT = "the limit of iterations was reached"
     START = "the start diverged, or the integration step is not stable there"
 
@@ -75,6 +77,7 @@ class Lane:
     better: tuple[np.ndarray, Any] | None = None
     trials: int = 0
     idle: int = 0
+    jumps: int = 0
     evaluations: int = 1
     iterations: int = 0
     reason: Reason | None = None
@@ -184,8 +187,10 @@ class Descent:
         elif float(found.gradient @ lane.update) < WOLFE * slope and not longest:
             lane.low, lane.better = lane.t, (z, found)
         else:
+            lane.jumps = 0
             return z, found
         if lane.better and lane.trials >= TRIALS:
+            lane.jumps += np.isfinite(lane.high)
             return lane.better
         lane.t = _next(lane, float(found.loss) if fine else np.inf, slope)
         if lane.t < SHORTEST:
@@ -206,6 +211,8 @@ class Descent:
             return Reason.GRADIENT
         if lane.idle >= PATIENCE:
             return Reason.CHANGE
+        if lane.jumps >= JUMPS:
+            return Reason.JUMP
         return Reason.LIMIT if lane.iterations >= self.stopping.iterations else None
 
     def _propose(self, lanes: list[Lane], fresh: list[bool]) -> None:
