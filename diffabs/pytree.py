@@ -13,7 +13,7 @@ does it on the host, and names every offender at once.
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -184,14 +184,30 @@ def _show(value: Any) -> str:
     return f"{float(array):g}" if array.ndim == 0 else np.array2string(array, threshold=8, precision=4)
 
 
+def elements(part: Any) -> dict[str, Spec]:
+    """What each single number below `part` may be, by path; those of a list have their place at the end."""
+    found: dict[str, Spec] = {}
+    for path, spec, value in parameters(part):
+        shape = np.shape(value)
+        found |= {".".join([path, *map(str, at)]): spec for at in np.ndindex(shape)} if shape else {path: spec}
+    return found
+
+
 def get(part: Any, path: str) -> Any:
-    """The value at a dotted path: `get(loop, "plant.road.scale")`. Raises KeyError naming what is there instead."""
+    """The value at a dotted path, `plant.road.scale`, or `controller.gain.0` for one of a list. Raises KeyError naming
+    what is there instead."""
     for name in path.split("."):
-        names = [child.rpartition(".")[2] for child, _, _ in _children(part, "")]
+        names = _names(part)
         if name not in names:
             raise KeyError(f"no '{name}' in {path}; there is {', '.join(names) or 'nothing'}")
-        part = part[int(name)] if isinstance(part, tuple) else getattr(part, name)
+        part = getattr(part, name) if dataclasses.is_dataclass(part) else part[int(name)]
     return part
+
+
+def _names(part: Any) -> list[str]:
+    if isinstance(part, tuple) or dataclasses.is_dataclass(part):
+        return [child.rpartition(".")[2] for child, _, _ in _children(part, "")]
+    return [str(i) for i in range(np.shape(part)[0])] if np.ndim(part) else []
 
 
 def replace(part: T, values: Mapping[str, Any]) -> T:
@@ -207,11 +223,13 @@ def replace(part: T, values: Mapping[str, Any]) -> T:
 
 def _replace(part: Any, names: list[str], value: Any) -> Any:
     head, *rest = names
+    if not dataclasses.is_dataclass(part) and not isinstance(part, tuple):
+        return jnp.asarray(part).at[int(head)].set(_replace(part[int(head)], rest, value) if rest else value)
     if isinstance(part, tuple):
         i = int(head)
         return (*part[:i], _replace(part[i], rest, value) if rest else value, *part[i + 1 :])
     new = _replace(getattr(part, head), rest, value) if rest else value
-    return dataclasses.replace(part, **{head: new})
+    return dataclasses.replace(part, **{head: new})  # pyright: ignore[reportArgumentType]  # an instance
 
 
 def strong(tree: T) -> T:
@@ -236,3 +254,26 @@ def prepared(part: Any) -> Any:
     inner = {f.name: prepared(getattr(part, f.name)) for f in dataclasses.fields(part) if "part" in f.metadata}
     part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
     return part.prepared() if hasattr(part, "prepared") else part
+
+
+def separated(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[Any], Any]]:
+    """`make` over a batch, with what does not depend on the batch worked out once: the leaves (n, ...) that do, and a
+    function from those of one member to the whole. In a loop over lanes constants then stay numbers, which a processor
+    keeps in registers, instead of becoming columns."""
+    one = jax.tree.map(lambda x: x[0], batch)
+    program, shape = jax.make_jaxpr(make, return_shape=True)(one)
+    depends = set(program.jaxpr.invars)
+    for step in program.jaxpr.eqns:
+        if any(not hasattr(v, "val") and v in depends for v in step.invars):
+            depends.update(step.outvars)
+    moves = [not hasattr(v, "val") and v in depends for v in program.jaxpr.outvars]
+    fixed, tree = jax.tree.leaves(make(one)), jax.tree.structure(shape)
+
+    def moving(member: Any) -> list[Any]:
+        return [x for x, on in zip(jax.tree.leaves(make(member)), moves, strict=True) if on]
+
+    def whole(leaves: list[Any]) -> Any:
+        rest = iter(leaves)
+        return tree.unflatten([next(rest) if on else x for x, on in zip(fixed, moves, strict=True)])
+
+    return jax.vmap(moving)(batch), whole

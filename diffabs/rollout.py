@@ -80,15 +80,22 @@ def measure(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], 
 
 
 def _call(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
+    loop, objectives, h = arguments(loop, solver, objectives)
+    return _run(loop, objectives, h, key, steps=solver.steps, every=every)
+
+
+def arguments(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
+    """Loop, objectives and step, of one data type. Raises ValueError."""
     for name in ("step", "duration", "every"):
         if not 0 < getattr(solver, name) < math.inf:
             raise ValueError(f"solver.{name} = {getattr(solver, name)} is not positive and finite")
     loop, objectives = strong((loop, dict(objectives)))
-    dtype = jax.tree.leaves(loop)[0].dtype
-    return _run(loop, objectives, jnp.asarray(solver.step, dtype), key, steps=solver.steps, every=every)
+    return loop, objectives, jnp.asarray(solver.step, jax.tree.leaves(loop)[0].dtype)
 
 
-class _Carry(NamedTuple):
+class Carry(NamedTuple):
+    """A run on its way."""
+
     state: LoopState
     tally: dict[str, Memory]  # accumulators of the objectives; `held` is still without the last interval
     before: Sample  # at the beginning of that interval
@@ -104,47 +111,52 @@ class _Carry(NamedTuple):
 @partial(jax.jit, static_argnames=("steps", "every"))
 def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, steps: int, every: int) -> Run:
     loop = prepared(loop)
-    carry = _started(loop, objectives, h)
-    step = partial(_step, loop, objectives, h, key, steps)
+    carry = started(loop, objectives, h)
+    stepped = partial(step, loop, objectives, h, key, steps)
     first = _seen(loop, carry)
     if every:
-        carry, seen = _segments(step, partial(_seen, loop), carry, every, steps + LANDINGS)
+        carry, seen = _segments(stepped, partial(_seen, loop), carry, every, steps + LANDINGS)
     else:
-        carry, seen = repeated(step, carry, steps + LANDINGS, _running), None
+        carry, seen = repeated(stepped, carry, steps + LANDINGS, _running), None
+    done, last = judged(loop, objectives, h, carry)
+    return done._replace(trajectory=_assembled(first, seen, last, -(-steps // every))) if every else done
+
+
+def judged(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) -> tuple[Run, Trajectory]:
+    """The result of a run that is over, and its last instant."""
     carry = _ended(loop, objectives, h, carry)
     last = _seen(loop, carry)
-    trajectory = _assembled(first, seen, last, -(-steps // every)) if every else None
     ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample, carry.stopped))
     metrics = {name: o.value(carry.tally[name], ending) for name, o in objectives.items()}
     metrics = {name: jnp.where(carry.diverged, jnp.nan, value) for name, value in metrics.items()}
-    return Run(metrics, carry.stopped, carry.diverged, ending, trajectory)
+    return Run(metrics, carry.stopped, carry.diverged, ending, None), last
 
 
-def _started(loop: Loop, objectives: dict[str, Objective], h: Any) -> _Carry:
+def started(loop: Loop, objectives: dict[str, Objective], h: Any) -> Carry:
     """The carry at t = 0."""
     state = loop.start()
     sample = loop.signals(0.0 * h, state).sample
     tally = {name: objective.start(sample) for name, objective in objectives.items()}
     no, zero = jnp.asarray(False), jnp.asarray(0)
     running = loop.stop.margin(sample.output) > 0
-    return _typed(_Carry(state, tally, sample, zero, 0.0 * h, h, zero, running, no, no), h.dtype)
+    return _typed(Carry(state, tally, sample, zero, 0.0 * h, h, zero, running, no, no), h.dtype)
 
 
-def _segments(step: Any, seen: Any, carry: _Carry, every: int, steps: int) -> tuple[_Carry, Any]:
+def _segments(step: Any, seen: Any, carry: Carry, every: int, steps: int) -> tuple[Carry, Any]:
     """At least `steps` steps, and what was seen after every `every`-th."""
 
-    def segment(carry: _Carry, _: Any) -> tuple[_Carry, Any]:
+    def segment(carry: Carry, _: Any) -> tuple[Carry, Any]:
         carry = repeated(step, carry, every, _running)
         return carry, seen(carry)
 
     return jax.lax.scan(forgetful(segment), carry, length=-(-steps // every))
 
 
-def _running(carry: _Carry) -> Any:
+def _running(carry: Carry) -> Any:
     return carry.running
 
 
-def _step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: int, carry: _Carry) -> _Carry:
+def step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: int, carry: Carry) -> Carry:
     """One step; or one try of the last step; or nothing if the run has ended."""
     state, tally, before, late = _advance(loop, objectives, h, key, carry)
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state.flow())]))
@@ -158,7 +170,7 @@ def _step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps:
         lambda a, b: jnp.where(taken, a, b), (state, tally, before), (carry.state, carry.tally, carry.before)
     )
     k = carry.k + jnp.where(taken, 1, 0)
-    return _Carry(
+    return Carry(
         state=state,
         tally=tally,
         before=before,
@@ -173,7 +185,7 @@ def _step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps:
 
 
 def _advance(
-    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, carry: _Carry
+    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, carry: Carry
 ) -> tuple[LoopState, dict[str, Memory], Sample, Any]:
     """Update, jump, integrate over carry.length: state, accumulators, the sample after the jump, and how much later [s]
     the margin crosses zero. That time only chooses the next length, so it has no derivative."""
@@ -217,7 +229,7 @@ def _rates(
 
 
 def _updated(
-    loop: Loop, objectives: dict[str, Objective], carry: _Carry, state: LoopState, t: Any, h: Any
+    loop: Loop, objectives: dict[str, Objective], carry: Carry, state: LoopState, t: Any, h: Any
 ) -> dict[str, Any]:
     """`held` of the accumulators after the last interval, of length h; there is none before the first step."""
     sample = loop.signals(t, state).sample
@@ -229,7 +241,7 @@ def _updated(
     return {name: updated(carry.tally[name], o) for name, o in objectives.items()}
 
 
-def _ended(loop: Loop, objectives: dict[str, Objective], h: Any, carry: _Carry) -> _Carry:
+def _ended(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) -> Carry:
     """Move a stopped run onto its crossing, and update the objectives over the last interval.
 
     The time to move is zero to rounding, but not its derivative, which is the implicit function theorem's: the state is
@@ -250,7 +262,7 @@ def _ended(loop: Loop, objectives: dict[str, Objective], h: Any, carry: _Carry) 
     return carry._replace(tally={name: Memory(tally[name], held[name]) for name in objectives})
 
 
-def _seen(loop: Loop, carry: _Carry) -> Trajectory:
+def _seen(loop: Loop, carry: Carry) -> Trajectory:
     signals = loop.signals(carry.t, carry.state)
     return Trajectory(signals.sample, signals.measured, carry.state.plant, carry.running & (carry.landing == 0))
 

@@ -16,7 +16,8 @@ from diffabs.timing import period_problems, steps
 class Noise:
     """Gaussian noise of these standard deviations, drawn every `period` and held. Needs a key: `rollout(..., key=)`.
 
-    The k-th draw is a function of (key, k), so a run is deterministic and differentiable in the deviations.
+    The k-th draw is a function of (key, k), so a run is deterministic and differentiable in the deviations. A channel
+    whose deviation is 0 draws nothing, which takes most of the time, and has no derivative there.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0)
@@ -41,19 +42,24 @@ class Noise:
         if clock.key is None:
             raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
         n = steps(self.period, clock.h)
-        z = jax.random.normal(jax.random.fold_in(clock.key, clock.k // n), (4,), jnp.result_type(signal.slip))
-        drawn = BrakeOutput(
-            self.slip * z[0],
-            self.speed * z[1],
-            self.wheel_speed * z[2],
-            self.deceleration * z[3],
-            0.0 * signal.distance,
-        )
-        return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(clock.k % n == 0, a, b), drawn, memory.held)))
+        draw = clock.k // n
+        deviations = (self.slip, self.speed, self.wheel_speed, self.deceleration)
+        noise = [_drawn(d, clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
+        held = BrakeOutput(noise[0], noise[1], noise[2], noise[3], 0.0 * signal.distance)
+        return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(draw * n == clock.k, a, b), held, memory.held)))
 
     def grid_problems(self, step: float) -> Iterator[str]:
         """A period off the integration grid."""
         yield from period_problems("period", self.period, step)
+
+
+def _drawn(deviation: Scalar, key: Any, number: Any) -> Any:
+    deviation = jnp.asarray(deviation)
+
+    def draw() -> Any:
+        return deviation * jax.random.normal(jax.random.fold_in(key, number), (), deviation.dtype)
+
+    return jax.lax.cond(deviation > 0, draw, lambda: 0.0 * deviation)
 
 
 @pytree

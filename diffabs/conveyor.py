@@ -1,0 +1,94 @@
+"""Many runs at once, none of which waits for another: for values, not for gradients.
+
+A batch under `jax.vmap` runs until its slowest lane ends. Here `width` lanes run at a time, like boxes on a belt: every
+ROUND steps what has ended is taken off and the next lanes are put in its place."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.loop import Loop
+from diffabs.protocols import Objective
+from diffabs.pytree import prepared, replace, separated, strong
+from diffabs.rollout import Carry, FixedStep, Run, arguments, judged, started, step
+
+WIDTH = 1024  # lanes whose state stays in a processor's cache
+ROUND = 64  # steps
+
+
+def measure_lanes(
+    loop: Loop,
+    values: Mapping[str, Any],
+    solver: FixedStep,
+    objectives: Mapping[str, Objective],
+    *,
+    keys: Any = None,
+    width: int = WIDTH,
+) -> Run:
+    """What `jax.vmap` of `measure` computes for lanes that differ in the values (lanes,) at these paths, and in their
+    keys. Compiled once for a number of lanes and paths; not differentiable in reverse mode.
+
+    Raises ValueError without values, and for what `measure` objects to."""
+    if not values:
+        raise ValueError("no value differs between the lanes")
+    loop, objectives, h = arguments(loop, solver, objectives)
+    values = strong(jax.tree.map(lambda x: jnp.asarray(x, h.dtype), dict(values)))
+    return _run(loop, values, objectives, h, keys, steps=solver.steps, width=width)
+
+
+class _Belt(NamedTuple):
+    """Lanes on their way: what is their own of their loops, key and carry of each; its number (how many lanes there are
+    if it has none), the next number; and what has ended, by number."""
+
+    leaves: Any
+    keys: Any
+    carry: Carry
+    number: Any
+    next: Any
+    ended: Run
+
+
+@partial(jax.jit, static_argnames=("steps", "width"))
+def _run(
+    loop: Loop, values: dict[str, Any], objectives: dict[str, Objective], h: Any, keys: Any, *, steps: int, width: int
+) -> Run:
+    count = len(next(iter(values.values())))
+    leaves, built = separated(lambda v: prepared(replace(loop, v)), values)
+    step_all = jax.vmap(lambda mine, key, carry: step(built(mine), objectives, h, key, steps, carry))
+    start = jax.vmap(lambda mine: started(built(mine), objectives, h))
+    judge = jax.vmap(lambda mine, carry: judged(built(mine), objectives, h, carry)[0])
+
+    def taken(number: Any) -> tuple[Any, Any, Carry]:
+        """Lanes at their start; beyond the last one a copy of it that does not run."""
+        mine, key = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys))
+        carry = start(mine)
+        return mine, key, carry._replace(running=carry.running & (number < count))
+
+    def round_(belt: _Belt) -> _Belt:
+        def some(carry: Carry, _: Any) -> tuple[Carry, None]:
+            return step_all(belt.leaves, belt.keys, carry), None
+
+        carry = jax.lax.scan(some, belt.carry, length=ROUND)[0]
+        free = ~carry.running
+        place = jnp.where(free, belt.number, count)
+        ended = jax.tree.map(lambda all, x: all.at[place].set(x, mode="drop"), belt.ended, judge(belt.leaves, carry))
+        number = jnp.where(free, belt.next + jnp.cumsum(free) - 1, belt.number)
+        old = (belt.leaves, belt.keys, carry)
+        mine, key, carry = jax.tree.map(partial(_by_lane, free), taken(number), old)
+        return _Belt(mine, key, carry, jnp.minimum(number, count), belt.next + jnp.sum(free), ended)
+
+    number = jnp.arange(min(width, count))
+    first = taken(number)
+    shapes = jax.eval_shape(judge, first[0], first[2])
+    ended = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
+    belt = _Belt(*first, number, number[-1] + 1, ended)
+    return jax.lax.while_loop(lambda belt: jnp.any(belt.number < count), round_, belt).ended
+
+
+def _by_lane(which: Any, a: Any, b: Any) -> Any:
+    if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_by_lane(which, jax.random.key_data(a), jax.random.key_data(b)))
+    return jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)
