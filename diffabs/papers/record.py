@@ -1,12 +1,9 @@
 """What a published result consists of: rows, figures, honest notes, and where the numbers come from."""
 
 import dataclasses
-import importlib.metadata
 import json
 import os
 import pathlib
-import platform
-import subprocess
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -16,8 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-import diffabs
-from diffabs import plot
+from diffabs import plot, provenance
 from diffabs.rollout import FixedStep, Run
 
 
@@ -55,22 +51,7 @@ def solver(step: FixedStep, **more: Any) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Of everything that can change a number, and the commit where there is one."""
-    found = {name: importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy", "matplotlib")}
-    platforms = {"python": platform.python_version(), "backend": jax.default_backend(), "machine": platform.machine()}
-    return {"diffabs": diffabs.__version__, **found, **platforms, **_commit()}
-
-
-def _commit() -> dict[str, str]:
-    """The commit of a working copy, marked where files differ from it; nothing for an installed package."""
-    root = pathlib.Path(diffabs.__file__).parent.parent
-    if not (root / ".git").exists():
-        return {}
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=10)
-    except (OSError, subprocess.TimeoutExpired):
-        return {}
-    return {"commit": answer.stdout.strip()} if answer.returncode == 0 else {}
+    return provenance.versions("jax", "jaxlib", "numpy", "matplotlib") | provenance.commit()
 
 
 def write(folder: pathlib.Path, summary: dict[str, Any], name: str = "summary.json") -> dict[str, Any]:
