@@ -1,0 +1,23 @@
+"""Monte-Carlo sweeps: what varies, who computes it, where it is kept, and what it says. Needs `diffabs[sweep]`."""
+
+from diffabs.sweep.designs import Corners as Corners
+from diffabs.sweep.designs import Grid as Grid
+from diffabs.sweep.designs import LatinHypercube as LatinHypercube
+from diffabs.sweep.designs import Random as Random
+from diffabs.sweep.designs import Saltelli as Saltelli
+from diffabs.sweep.designs import Sobol as Sobol
+from diffabs.sweep.discrete import Categorical as Categorical
+from diffabs.sweep.discrete import Empirical as Empirical
+from diffabs.sweep.discrete import Rows as Rows
+from diffabs.sweep.distributions import LogNormal as LogNormal
+from diffabs.sweep.distributions import Normal as Normal
+from diffabs.sweep.distributions import Triangular as Triangular
+from diffabs.sweep.distributions import Uniform as Uniform
+from diffabs.sweep.engines import Local as Local
+from diffabs.sweep.results import Results as Results
+from diffabs.sweep.run import Progress as Progress
+from diffabs.sweep.run import sweep as sweep
+from diffabs.sweep.space import Correlation as Correlation
+from diffabs.sweep.space import Space as Space
+from diffabs.sweep.store import SweepError as SweepError
+from diffabs.sweep.study import Study as Study

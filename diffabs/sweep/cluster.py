@@ -1,0 +1,125 @@
+"""Chunks computed by the workers of a Dask cluster: one on this machine, or one that is there.
+
+A worker compiles a study once and computes one chunk at a time on one device; start one worker for each device.
+Chunks come back as the bytes of their files, so workers need no common disk, and only this process writes. A chunk
+whose worker dies is given to another one.
+
+Dask sends programs, by pickle: its scheduler and workers must be machines that trust each other."""
+
+import contextlib
+import logging
+import os
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from typing import Any
+
+from distributed import Client, KilledWorker, LocalCluster, as_completed
+
+from diffabs import provenance
+from diffabs.sweep.engines import DECISIVE, Done, done
+from diffabs.sweep.runner import Runner
+from diffabs.sweep.store import SweepError, differences
+from diffabs.sweep.study import Study
+
+AHEAD = 2  # chunks in hand for each thread of the workers
+DEATHS = 20  # workers that a chunk may cost
+TIMEOUT = 10.0  # s for a scheduler to answer
+
+
+class Dask:
+    """An engine: the cluster of a scheduler (tcp://host:port), or `workers` processes on this machine."""
+
+    def __init__(self, scheduler: str | None = None, workers: int | None = None):
+        """As many workers as there are processors if not given."""
+        self.scheduler, self.workers = scheduler, workers or os.cpu_count() or 1
+
+    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Iterator[Done]:
+        """As they are finished. Raises SweepError for a scheduler that does not answer, has no workers, or has some
+        with other versions; and for a chunk that all workers die of."""
+        with self._client() as client:
+            _check(client)
+            yield from _completed(client, study, chunks, stopping)
+
+    @contextlib.contextmanager
+    def _client(self) -> Iterator[Client]:
+        with contextlib.ExitStack() as opened:
+            if self.scheduler is None:
+                cluster = LocalCluster(
+                    n_workers=self.workers, threads_per_worker=1, dashboard_address=":0", silence_logs=logging.CRITICAL
+                )
+                where: Any = opened.enter_context(cluster)
+            else:
+                where = self.scheduler
+            try:
+                client = opened.enter_context(Client(where, timeout=TIMEOUT))
+            except (OSError, ValueError) as error:
+                raise SweepError(f"the scheduler at {where} cannot be reached: {str(error).splitlines()[0]}") from None
+            yield client
+
+
+def _check(client: Client) -> None:
+    try:
+        client.wait_for_workers(1, timeout=TIMEOUT)
+    except TimeoutError:
+        raise SweepError(f"the scheduler has no worker within {TIMEOUT:g} s") from None
+    here = provenance.versions(*DECISIVE)
+    answers: Any = client.run(provenance.versions, *DECISIVE)
+    for worker, there in answers.items():
+        for line in differences(there, here):
+            raise SweepError(f"worker {worker}: {line}; results would not be those of one run")
+
+
+def _completed(client: Client, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Iterator[Done]:
+    """Never more in hand than the workers need."""
+    rest, deaths, finished = iter(chunks), dict.fromkeys(chunks, 0), as_completed()
+    inside: dict[Any, int] = {}
+
+    def give(chunk: int) -> None:
+        future = client.submit(compute, study, chunk, key=f"chunk-{chunk}-{deaths[chunk]}", pure=False)
+        inside[future] = chunk
+        finished.add(future)
+
+    def fill() -> None:
+        threads: Any = client.nthreads()
+        room = AHEAD * max(1, sum(threads.values())) - len(inside)
+        for chunk in [c for _, c in zip(range(room), rest, strict=False)]:
+            give(chunk)
+
+    fill()
+    while inside:
+        future = next(finished)
+        chunk = inside.pop(future)
+        try:
+            yield future.result()
+        except KilledWorker:
+            deaths[chunk] += 1
+            if deaths[chunk] > DEATHS:
+                raise SweepError(f"chunk {chunk}: its workers died {deaths[chunk]} times") from None
+            give(chunk)
+        if not stopping():
+            fill()
+
+
+def compute(study: Study, chunk: int) -> Done:
+    """A chunk, on a worker."""
+    return done(study, chunk, _runner(_Same(study)).run([chunk])[0])
+
+
+class _Same:
+    """Studies that were sent twice are one."""
+
+    def __init__(self, study: Study):
+        self.study, self.name = study, repr(study.table())
+
+    def __hash__(self) -> int:
+        return hash(self.name)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.name == other.name
+
+
+@lru_cache(maxsize=2)
+def _runner(same: _Same) -> Runner:
+    import jax
+
+    return Runner(same.study, jax.local_devices()[:1])

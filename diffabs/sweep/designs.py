@@ -1,0 +1,298 @@
+"""Where in the unit cube the samples of a sweep lie. Sample i is a function of (seed, i), or of (seed, i, samples) for
+a design that is a finite set; so a chunk [start, stop) can be drawn by itself.
+
+The points of a random design are odd multiples of 2^-53, those of Sobol' sequences odd multiples of 2^-33: never 0, 1,
+and 1 - u is exact. SciPy's sequences have up to 64 bits, but in SciPy 1.17 `fast_forward` raises for more than 32."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.sweep.distributions import reach
+from diffabs.sweep.tables import described, kebab, listed, number, table, whole, written
+
+MOST = 2**32 - 1  # samples, whose numbers have 32 bits in JAX's keys and in the sequences; and the greatest seed
+MOST_AT_ONCE = 1_000_000  # of a Latin hypercube, which has to be made as a whole
+BITS = 32
+
+
+class Design(Protocol):
+    """How samples fill the unit cube."""
+
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+        """Samples start, ..., stop - 1: (stop - start, dimension), in (0, 1), or [0, 1] for grids and corners."""
+        ...
+
+    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        """How many samples there are. Raises ValueError if there cannot be as many as wanted."""
+        ...
+
+    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+        """One line for each field that cannot be, or cannot with these variables."""
+        ...
+
+    def table(self) -> dict[str, Any]:
+        """As values of TOML, which `read` reads."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Random:
+    """Independent samples: bits of JAX's `fold_in(key(seed), i)` (Threefry), 52 to a number."""
+
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+        del samples
+        high, low = np.moveaxis(np.asarray(_words(_seed(seed), np.uint32(start), stop - start, dimension)), -1, 0)
+        return (high * 2.0**20 + (low >> 12) + 0.5) * 2.0**-52
+
+    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        del variables
+        return _counted(samples)
+
+    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+        yield from ()
+
+    def table(self) -> dict[str, Any]:
+        return table(self)
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def _words(seed: Any, start: Any, count: int, dimension: int) -> jax.Array:
+    key = jax.random.key(seed, impl="threefry2x32")
+    numbers = start + jax.lax.iota(jnp.uint32, count)
+    return jax.vmap(lambda i: jax.random.bits(jax.random.fold_in(key, i), (dimension, 2), jnp.uint32))(numbers)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sobol:
+    """Scrambled Sobol' sequences (SciPy's: linear matrix scramble and digital shift, Matousek 1998), one after another.
+
+    replicates: how many, scrambled independently: the spread of their means tells the error. Each is balanced only if
+        it has a power of two of samples (Owen 2020, arXiv:2008.08051)"""
+
+    replicates: int = 1
+
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+        block = samples // self.replicates
+        points = [np.empty((0, dimension))]
+        for r in range(start // block, math.ceil(stop / block)):
+            first, last = max(start - r * block, 0), min(stop - r * block, block)
+            points.append(_sequence(seed, r, first, last, dimension))
+        return np.concatenate(points)
+
+    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        del variables
+        return _multiple(_counted(samples), self.replicates, "the number of replicates")
+
+    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+        if self.replicates < 1:
+            yield f"{name}: replicates = {self.replicates} is not positive"
+
+    def table(self) -> dict[str, Any]:
+        return table(self)
+
+
+def _sequence(seed: int, replicate: int, start: int, stop: int, dimension: int) -> np.ndarray:
+    """Points of one scrambled sequence, moved by half of their last bit. Skipping 10^7 points takes a tenth of a
+    second."""
+    from scipy.stats import qmc
+
+    engine = qmc.Sobol(dimension, bits=BITS, rng=_generator(seed, replicate))
+    if start == 0 < stop:
+        # The first point by itself: a first draw that is no power of two would warn, but chunks may have any length.
+        points = np.concatenate([engine.random(1), engine.random(stop - 1)])
+    else:
+        points = engine.fast_forward(start).random(stop - start)
+    return points + 0.5 ** (BITS + 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class LatinHypercube:
+    """SciPy's Latin hypercube: each variable has one sample in each of its N strata. All are drawn at once and kept."""
+
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+        return _hypercube(seed, samples, dimension)[start:stop]
+
+    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        del variables
+        if (count := _counted(samples)) > MOST_AT_ONCE:
+            raise ValueError(f"samples = {count} are more than a latin-hypercube can have, {MOST_AT_ONCE}; use sobol")
+        return count
+
+    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+        yield from ()
+
+    def table(self) -> dict[str, Any]:
+        return table(self)
+
+
+@functools.lru_cache(1)
+def _hypercube(seed: int, samples: int, dimension: int) -> np.ndarray:
+    from scipy.stats import qmc
+
+    points = qmc.LatinHypercube(dimension, rng=_generator(seed, 0)).random(samples)
+    points = np.clip(points, 0.5**53, 1 - 0.5**53)
+    points.flags.writeable = False
+    return points
+
+
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """Every combination of levels, the last variable changing fastest.
+
+    levels: of every variable, or of each by name: how many, which are equally spaced in u from 0 to 1, or a tuple of u.
+        What is drawn from a list, `Categorical` and `Rows`, has a level for each of its items unless it is given u."""
+
+    levels: int | Mapping[str, int | tuple[float, ...]]
+
+    def over(self, variables: Mapping[str, Any]) -> "Grid":
+        """The same with the levels u of each of these variables, in their order."""
+        return Grid({name: tuple(map(float, self._axis(name, item))) for name, item in variables.items()})
+
+    def _axis(self, name: str, variable: Any) -> Any:
+        levels = self.levels if isinstance(self.levels, int) else self.levels.get(name, 0)
+        if not isinstance(levels, int):
+            return levels
+        return variable.middles() if hasattr(variable, "middles") else np.linspace(0, 1, levels)
+
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+        """Of a grid `over` its variables, or with one number of levels for all."""
+        del seed, samples
+        given = [self.levels] * dimension if isinstance(self.levels, int) else list(self.levels.values())
+        if len(given) != dimension:
+            raise ValueError(f"levels are given for {len(given)} variables, not {dimension}")
+        axes = [np.linspace(0, 1, levels) if isinstance(levels, int) else np.array(levels) for levels in given]
+        places = np.unravel_index(np.arange(start, stop), [len(axis) for axis in axes])
+        return np.stack([axis[place] for axis, place in zip(axes, places, strict=True)], 1)
+
+    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        sizes = [len(self._axis(name, item)) for name, item in variables.items()]
+        return _exactly(math.prod(sizes), samples, f"the grid {' x '.join(map(str, sizes))}")
+
+    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+        given = {"levels": self.levels} if isinstance(self.levels, int) else self.levels
+        for path, levels in given.items():
+            if isinstance(levels, int) and levels < 2:
+                yield f"{name}: {path} = {levels} levels are fewer than 2"
+            elif not isinstance(levels, int) and not (levels and all(0 <= u <= 1 for u in levels)):
+                yield f"{name}: {path} = {list(levels)} are not quantile levels in [0, 1]"
+        if variables is None:
+            return
+        if not isinstance(self.levels, int):
+            missing = [p for p, v in variables.items() if p not in self.levels and not hasattr(v, "middles")]
+            yield from (f"{name}: levels of {path} are missing" for path in missing)
+            yield from (f"{name}: {path} is not a variable" for path in self.levels if path not in variables)
+        for path, variable in variables.items():
+            if not hasattr(variable, "middles") and {0.0, 1.0} & set(self._axis(path, variable)):
+                yield from _unbounded(name, path, variable, "grid")
+
+    def table(self) -> dict[str, Any]:
+        return table(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Corners:
+    """The 2^d corners of the box of supports, the last variable changing fastest."""
+
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+        return Grid(2).unit(seed, start, stop, dimension, samples)
+
+    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        return _exactly(2 ** len(variables), samples, "the corners")
+
+    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+        for path, variable in (variables or {}).items():
+            if not hasattr(variable, "middles"):
+                yield from _unbounded(name, path, variable, "corners")
+            elif len(variable.middles()) != 2:
+                yield f"{name}: {path} is one of {len(variable.middles())}; corners need two ends; use grid"
+
+    def table(self) -> dict[str, Any]:
+        return table(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class Saltelli:
+    """Rows of d + 2 samples for Sobol' sensitivity indices: A, B, and A with column j from B for j = 0, ..., d - 1.
+
+    Row r of A and B is point r of one scrambled Sobol' sequence of dimension 2 d. Saltelli et al. 2010, Computer
+    Physics Communications 181, 259."""
+
+    def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
+        del samples
+        row, which = np.divmod(np.arange(start, stop), dimension + 2)
+        first, last = start // (dimension + 2), math.ceil(stop / (dimension + 2))
+        a, b = np.split(_sequence(seed, 0, first, last, 2 * dimension)[row - first], 2, axis=1)
+        from_b = (which[:, None] - 2 == np.arange(dimension)) | (which[:, None] == 1)
+        return np.where(from_b, b, a)
+
+    def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
+        return _multiple(_counted(samples), len(variables) + 2, "the number of variables plus 2")
+
+    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+        yield from ()
+
+    def table(self) -> dict[str, Any]:
+        return table(self)
+
+
+KINDS = {kebab(cls): cls for cls in (Random, Sobol, LatinHypercube, Grid, Corners, Saltelli)}
+
+
+def read(given: Any, where: str) -> Design:
+    """The design of a table, or of the bare name of a type. Raises ValueError, in one line."""
+    return described(KINDS, {"type": given} if isinstance(given, str) else given, where, levels=_levels)
+
+
+def _levels(given: Any, where: str) -> Any:
+    if isinstance(given, Mapping):
+        return {path: _level(item, f"{where}.{path}") for path, item in given.items()}
+    return whole(given, where)
+
+
+def _level(given: Any, where: str) -> Any:
+    return listed(number)(given, where) if isinstance(given, list | tuple) else whole(given, where)
+
+
+def _seed(seed: int) -> np.uint32:
+    if not 0 <= seed <= MOST:
+        raise ValueError(f"seed = {seed} is outside [0, {MOST}]")
+    return np.uint32(seed)
+
+
+def _generator(seed: int, stream: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(int(_seed(seed)), spawn_key=(stream,)))
+
+
+def _counted(samples: int | None) -> int:
+    if samples is None:
+        raise ValueError("samples is missing: how many there shall be")
+    if not 1 <= samples <= MOST:
+        raise ValueError(f"samples = {samples} is outside [1, {MOST}]")
+    return samples
+
+
+def _multiple(samples: int, of: int, what: str) -> int:
+    below = samples // of * of
+    if below != samples:
+        near = f"{below} or {below + of}" if below else str(of)
+        raise ValueError(f"samples = {samples} is not a multiple of {of}, {what}; {near} would be")
+    return samples
+
+
+def _exactly(count: int, samples: int | None, what: str) -> int:
+    if samples not in (None, count):
+        raise ValueError(f"samples = {samples} is not {count}, the number of points of {what}")
+    return _counted(count)
+
+
+def _unbounded(name: str, path: str, variable: Any, design: str) -> Iterator[str]:
+    own = reach(variable)
+    if own.open_low or own.open_high:
+        yield f"{name}: {path} = {written(variable)} reaches {own.interval()}; {design} needs a finite, closed support"

@@ -1,0 +1,74 @@
+"""Who computes the chunks: the devices of this process, or a Dask cluster (`cluster`)."""
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+
+from diffabs.sweep.runner import Columns, Runner
+from diffabs.sweep.store import encoded
+from diffabs.sweep.study import Study
+
+DECISIVE = ("jax", "jaxlib", "numpy", "scipy", "pyarrow")  # packages that can change a bit of the result
+
+
+class Done(NamedTuple):
+    """A chunk: the bytes of its file, how many lanes it has, and how many of them failed and diverged."""
+
+    chunk: int
+    data: bytes
+    lanes: int
+    failed: int
+    diverged: int
+
+
+class Engine(Protocol):
+    """Computes chunks in any order."""
+
+    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Iterator[Done]:
+        """Every chunk once; ends early, after what it has begun, when `stopping()`."""
+        ...
+
+
+class Local:
+    """All devices of this process, a chunk on each at a time."""
+
+    def __init__(self, devices: Sequence[Any] | None = None):
+        """All local ones if not given."""
+        self.devices = list(devices or jax.local_devices())
+
+    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Iterator[Done]:
+        """In order."""
+        runner = Runner(study, self.devices)
+        for together in batched(chunks, len(self.devices)):
+            for chunk, columns in zip(together, runner.run(together), strict=True):
+                yield done(study, chunk, columns)
+            if stopping():
+                return
+
+
+def done(study: Study, chunk: int, columns: Columns) -> Done:
+    """A chunk's columns, counted and encoded."""
+    failed = failures(study, columns)
+    return Done(chunk, encoded(columns), len(failed), int(failed.sum()), int(columns["diverged"].sum()))
+
+
+def failures(study: Study, columns: Any) -> np.ndarray:
+    """Lanes that diverged, did not stop, locked, or left a bound of the study (lanes,)."""
+    failed = np.asarray(columns["diverged"]) | ~np.asarray(columns["stopped"])
+    bounds = failing({"objectives": study.objectives, "failures": study.failures})
+    return np.any([failed, *(np.asarray(columns[name]) > bound for name, bound in bounds.items())], axis=0)
+
+
+def failing(study: Mapping[str, Any]) -> dict[str, float]:
+    """Bounds of metrics, beyond which a lane has failed: those of the study, and a wheel that locks."""
+    return {**({"locked_time": 0.0} if "locked_time" in study["objectives"] else {}), **study["failures"]}
+
+
+def batched(items: Sequence[int], size: int) -> Iterator[list[int]]:
+    """Lists of `size`, the last one shorter."""
+    rest = iter(items)
+    while batch := list(itertools.islice(rest, size)):
+        yield batch

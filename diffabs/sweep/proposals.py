@@ -1,0 +1,291 @@
+"""Importance sampling from mixtures of normals, centred where a few failures lie or where gradients lead.
+
+    P = E_q[w 1_F],   q(z) = sum_k a_k N(z; c_k, u_k u_k' + s_k^2 (I - u_k u_k')),   u = c/|c|,   w = phi/q
+
+    E_q[w^2 1_F]/P^2 = E[w|F]/P
+
+The last equation foretells the variance of importance sampling from failures alone, before a run is spent. The
+variance is finite whatever the centres since s^2 > 1/2; s, one number for all directions across, follows the curvature
+of the limit and stays near one in the many directions that do not matter.
+
+Centres: maximum likelihood of the failures (expectation maximisation; cross-entropy method, R. Y. Rubinstein and D. P.
+Kroese, The Cross-Entropy Method, 2004), or design points, the points of F nearest to the origin (improved HL-RF,
+Y. Zhang and A. Der Kiureghian, Two improved algorithms for reliability analysis, in Reliability and Optimization of
+Structural Systems, 1995)."""
+
+import math
+import statistics
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+COMPONENTS = (1, 2, 4, 8, 16)  # numbers of centres that are tried
+FITTING = 15  # steps of expectation maximisation
+DEFENCE = 0.1  # of the draws, shared equally by all centres: the failures at hand may miss where others are
+SCALES = 0.8, 2.0  # least and greatest s: the weights' variance is finite above sqrt(1/2)
+ITERATIONS = 30  # of a search for a design point, and so its gradients
+SAME = 0.5  # distance below which two design points are one
+CLOSE = 0.05  # length of a step that ends a search: a centre need not be more accurate
+SHORTEST = 1e-3  # share of a step
+CONFIDENCE = 0.95
+STARTS = 8  # of searches for design points
+GAIN = 0.5  # of the coefficient of variation, that importance sampling must promise
+APART = 4.0  # standard deviations between two estimates that do not agree
+
+Score = Callable[[np.ndarray], np.ndarray]
+Gradient = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+Fit = Callable[[np.ndarray], "Mixture"]
+
+
+class Estimate(NamedTuple):
+    """A probability, its coefficient of variation, and an interval of 95 %."""
+
+    probability: float
+    cov: float
+    interval: tuple[float, float]
+
+
+class Importance(NamedTuple):
+    """Importance sampling around `centres` (k, d); the effective sample size (sum w)^2/sum w^2; the coefficient of
+    variation that was foretold."""
+
+    estimate: Estimate
+    effective: float
+    foretold: float
+    centres: np.ndarray
+
+
+class Runs:
+    """The score and its gradient, counted; NaN becomes -inf, which fails at no threshold."""
+
+    def __init__(self, score: Score, gradient: Gradient | None, tolerated: float):
+        """None for no gradient; the share of runs that may diverge."""
+        self.score, self.slope, self.tolerated = score, gradient, tolerated
+        self.evaluations = self.gradients = self.diverged = 0
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        self.evaluations += len(z)
+        return self._clean(self.score(z), z)
+
+    def gradient(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        assert self.slope is not None
+        self.gradients += len(z)
+        score, slope = self.slope(z)
+        slope = np.array(slope, float)
+        if slope.shape != z.shape:
+            raise ValueError(f"the derivative of the score of {z.shape} must be {z.shape}, not {slope.shape}")
+        return self._clean(score, z), slope
+
+    def _clean(self, score: np.ndarray, z: np.ndarray) -> np.ndarray:
+        score = np.array(score, float)
+        if score.shape != (len(z),):
+            raise ValueError(f"the score of {z.shape} must be ({len(z)},), not {score.shape}")
+        lost = np.isnan(score)
+        self.diverged += int(np.sum(lost))
+        return np.where(lost, -np.inf, score)
+
+    def since(self, evaluations: int, diverged: int) -> int:
+        """How many runs diverged, after that many before; too many are an error."""
+        lost, of = self.diverged - diverged, self.evaluations - evaluations
+        if lost > self.tolerated * of:
+            raise ValueError(f"{lost} of {of} runs diverged: make the score +inf or -inf there, or `tolerated` greater")
+        return lost
+
+
+class Mixture(NamedTuple):
+    """Normal distributions with centres (k, d) and weights (k,), of variance one along the centre's direction u, in
+    which the density falls, and s^2 (k,) across: c + u u'x + s (x - u u'x), x ~ N(0, I)."""
+
+    centres: np.ndarray
+    weights: np.ndarray
+    scales: np.ndarray  # s
+
+    @property
+    def directions(self) -> np.ndarray:
+        """u (k, d)."""
+        size = np.linalg.norm(self.centres, axis=1, keepdims=True)
+        return np.where(size > 0, self.centres / np.where(size > 0, size, 1.0), np.eye(1, self.centres.shape[1]))
+
+    def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Points (count, d)."""
+        chosen = rng.choice(len(self.weights), size=count, p=self.weights)
+        x, u, s = rng.standard_normal((count, self.centres.shape[1])), self.directions[chosen], self.scales[chosen]
+        return self.centres[chosen] + s[:, None] * x + ((1 - s) * np.sum(u * x, axis=1))[:, None] * u
+
+    def log_weight(self, z: np.ndarray) -> np.ndarray:
+        """log(phi/q) at z (n, d)."""
+        return -np.logaddexp.reduce(self._terms(z)[0], axis=1)
+
+    def parts(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """With which probability z (n, d) was drawn around each centre (n, k), and the square of its distance from the
+        line through the origin and that."""
+        terms, across = self._terms(z)
+        odds = np.exp(terms - np.max(terms, axis=1, keepdims=True))
+        return odds / np.sum(odds, axis=1, keepdims=True), across
+
+    def _terms(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        along, square = z @ self.directions.T, np.sum(z**2, axis=1)[:, None]
+        across, size = np.maximum(square - along**2, 0.0), np.linalg.norm(self.centres, axis=1)
+        log_q = -0.5 * ((along - size) ** 2 + across / self.scales**2) - (z.shape[1] - 1) * np.log(self.scales)
+        return np.log(self.weights) + log_q + 0.5 * square, across
+
+
+def proposal(
+    failures: np.ndarray, group: np.ndarray, probability: float, centres: np.ndarray | None = None
+) -> tuple[Mixture, float]:
+    """The mixture of least second moment E_q[w^2 1_F]/P^2, and the logarithm of that.
+
+    failures (n, d): distributed as phi on F
+    group (n,): failures with the same integer depend on each other; odd groups foretell for even ones and vice versa
+    probability: P
+    centres (k, d): an alternative to those fitted to the failures; only their weights are fitted
+    """
+    fits: list[Fit] = [lambda z, k=k: _fitted(z, spread(z, k), moving=True) for k in COMPONENTS]
+    if centres is not None:
+        fits.append(lambda z: _fitted(z, centres, moving=False))
+    odd = group % 2 == 1
+    moments = [_second_moment(fit, failures, odd) - np.log(probability) for fit in fits]
+    best = int(np.argmin(moments))
+    return fits[best](failures), float(moments[best])
+
+
+def _second_moment(fit: Fit, failures: np.ndarray, odd: np.ndarray) -> float:
+    """log E[w|F], of weights fitted to other failures than those averaged over."""
+    halves = failures[odd], failures[~odd]
+    if min(map(len, halves)) == 0:
+        return np.inf
+    logs = [fit(known).log_weight(other) for known, other in (halves, halves[::-1])]
+    return np.logaddexp.reduce(np.concatenate(logs)) - np.log(len(failures))
+
+
+def _fitted(z: np.ndarray, centres: np.ndarray, *, moving: bool) -> Mixture:
+    """Weights and scales of most likelihood, and centres, too, if `moving`."""
+    count, d = len(centres), z.shape[1]
+    found = Mixture(centres, np.full(count, 1 / count), np.ones(count))
+    for _ in range(FITTING):
+        parts, across = found.parts(z)
+        total = np.maximum(parts.sum(axis=0), np.finfo(float).tiny)
+        square = np.sum(parts * across, axis=0) / total / max(d - 1, 1)
+        found = Mixture(
+            parts.T @ z / total[:, None] if moving else centres,
+            (1 - DEFENCE) * parts.mean(axis=0) + DEFENCE / count,
+            np.clip(np.sqrt(square), *SCALES),
+        )
+    return found
+
+
+def spread(z: np.ndarray, count: int) -> np.ndarray:
+    """Up to `count` of the points z (n, d): the nearest to the origin, then always the one whose direction is farthest
+    from those chosen before."""
+    size = np.linalg.norm(z, axis=1)
+    directions = z / np.maximum(size, np.finfo(float).tiny)[:, None]
+    chosen = [int(np.argmin(size))]
+    cosine = directions @ directions[chosen[0]]
+    while len(chosen) < min(count, len(z)):
+        chosen.append(int(np.argmin(cosine)))
+        cosine = np.maximum(cosine, directions @ directions[chosen[-1]])
+    return z[chosen]
+
+
+def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> np.ndarray:
+    """Local minima (k, d) of |z| on g(z) = threshold, from all starts (n, d) together, the nearest first.
+
+        z' = (a'z + threshold - g) a/|a|^2,   a = dg/dz
+
+    z + t (z' - z) is taken if |z|^2/2 + 2 (|z| + 1)/|a| |threshold - g| falls, and t halved if not.
+
+    A search that meets a kink, a plateau (a = 0) or a diverged run stops where it is, which is a poor centre but no
+    error: any centre will do for an unbiased estimate."""
+    z = starts.copy()
+    score, slope = gradient(z)
+    t = np.ones(len(z))
+    for _ in range(ITERATIONS):
+        with np.errstate(all="ignore"):
+            squared = np.sum(slope**2, axis=1)
+            move = ((np.sum(slope * z, axis=1) + threshold - score) / squared)[:, None] * slope - z
+            penalty = 2 * (np.linalg.norm(z, axis=1) + 1) / np.sqrt(squared)
+            length = np.linalg.norm(move, axis=1)
+            go = np.flatnonzero(np.isfinite(length) & (length > CLOSE) & (t > SHORTEST))
+        if len(go) == 0:
+            break
+        trial = z[go] + t[go, None] * move[go]
+        value, steep = gradient(trial)
+        merit = 0.5 * np.sum(trial**2, axis=1) + penalty[go] * np.abs(threshold - value)
+        better = merit < 0.5 * np.sum(z[go] ** 2, axis=1) + penalty[go] * np.abs(threshold - score[go])
+        taken = go[better]
+        z[taken], score[taken], slope[taken] = trial[better], value[better], steep[better]
+        t[go] = np.where(better, 1.0, 0.5 * t[go])
+    return _distinct(z[np.argsort(np.linalg.norm(z, axis=1), kind="stable")])
+
+
+def _distinct(points: np.ndarray) -> np.ndarray:
+    kept: list[np.ndarray] = []
+    for point in points:
+        if all(np.linalg.norm(point - other) > SAME for other in kept):
+            kept.append(point)
+    return np.array(kept)
+
+
+def refined(
+    runs: Runs,
+    failures: np.ndarray,
+    group: np.ndarray,
+    subset: Estimate,
+    *,
+    threshold: float,
+    draws: int,
+    rng: np.random.Generator,
+) -> tuple[Importance | None, str]:
+    """Importance sampling, if the failures (n, d) of subset simulation foretell that it pays, and what came of it.
+    `group` (n,) as for `proposal`."""
+    centres = None
+    if runs.slope:
+        centres = design_points(runs.gradient, spread(failures, STARTS), threshold)
+    mixture, moment = proposal(failures, group, subset.probability, centres)
+    foretold = math.sqrt(math.expm1(min(max(moment, 0.0), 700.0)) / draws)
+    if foretold > GAIN * subset.cov:
+        return None, f"subset simulation: {foretold:.2g} is the coefficient of variation to be had otherwise"
+    before = runs.evaluations, runs.diverged
+    found = importance_sampling(runs, threshold, mixture, draws, foretold, rng)
+    runs.since(*before)
+    if pays(found, subset):
+        return found, "importance sampling: less uncertain than subset simulation, and not in contradiction"
+    return found, "subset simulation: importance sampling is far below, or more uncertain"
+
+
+def pays(found: Importance, subset: Estimate) -> bool:
+    """Whether importance sampling is less uncertain, and not too low, as it is where it misses failures."""
+    cov = found.estimate.cov
+    if cov > subset.cov:
+        return False
+    below = math.log(subset.probability / found.estimate.probability)
+    return below <= APART * math.sqrt(math.log1p(cov**2) + math.log1p(subset.cov**2))
+
+
+def importance_sampling(
+    score: Score, threshold: float, mixture: Mixture, draws: int, foretold: float, rng: np.random.Generator
+) -> Importance:
+    """Unbiased whatever the mixture. The coefficient of variation is the one seen or foretold, whichever is greater,
+    as both are low where heavy weights are rare. Interval: of log P, by Student's t of (effective size - 1) degrees."""
+    z = mixture.draw(draws, rng)
+    weights = np.where(score(z) >= threshold, np.exp(mixture.log_weight(z)), 0.0)
+    probability = float(np.mean(weights))
+    if probability == 0:
+        return Importance(Estimate(0.0, np.inf, (0.0, 1.0)), 0.0, foretold, mixture.centres)
+    cov = max(float(np.std(weights, ddof=1)) / math.sqrt(draws) / probability, foretold)
+    effective = float(np.sum(weights) ** 2 / np.sum(weights**2))
+    return Importance(around(probability, cov, cov, effective - 1), effective, foretold, mixture.centres)
+
+
+def around(probability: float, cov: float, deviation: float, degrees: float) -> Estimate:
+    """With the interval P exp(+- t deviation) of a standard deviation of log P."""
+    reach = math.exp(min(student(degrees) * deviation, 700.0))
+    return Estimate(probability, cov, (probability / reach, min(1.0, probability * reach)))
+
+
+def student(degrees: float) -> float:
+    """The upper quantile of Student's t for a two-sided interval of 95 %, Cornish and Fisher's expansion about the
+    normal: within 2 % from 4 degrees, and fewer are counted as 2."""
+    z, n = statistics.NormalDist().inv_cdf(0.5 + CONFIDENCE / 2), max(degrees, 2.0)
+    return z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)

@@ -1,0 +1,117 @@
+"""Chunks of lanes in one compiled function.
+
+A block is a number of lanes of one structure, always as many. On D devices D blocks run at once, one each, by
+`shard_map`; every device runs the same program on a block of the same shape, so a lane's result does not depend on D.
+Without alternatives of parts a block is a whole chunk; with them a chunk is sorted into blocks of an eighth, the last
+of each structure filled up with copies."""
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec
+
+from diffabs.conveyor import measure_lanes
+from diffabs.sweep.study import FLAGS, Study, noise_key, numbers
+
+PARTS_OF_A_CHUNK = 8
+
+Columns = dict[str, np.ndarray]
+
+
+class _Block(NamedTuple):
+    """Lanes of a chunk (the place in a list of chunks), and their parameters."""
+
+    chunk: int
+    lanes: np.ndarray  # places in the chunk
+    values: dict[str, np.ndarray]
+    samples: np.ndarray
+
+
+class Runner:
+    """Runs chunks of a study on some devices of this process; compiles once for each structure of the loop."""
+
+    def __init__(self, study: Study, devices: Sequence[Any] | None = None):
+        """`devices`: all local ones if not given."""
+        self.study = study
+        self.devices = list(devices or jax.local_devices())
+        self.size = study.chunk if not study.parts else -(-study.chunk // PARTS_OF_A_CHUNK)
+        self._programs: dict[tuple[str, ...], Any] = {}
+
+    def run(self, chunks: Sequence[int]) -> list[Columns]:
+        """The columns of each chunk: sample, one per variable, metrics, stopped, diverged."""
+        drawn = [self._drawn(c) for c in chunks]
+        for columns in drawn:
+            columns |= {name: np.zeros(len(columns["sample"]), self.study.dtype) for name in self.study.objectives}
+            columns |= {name: np.zeros(len(columns["sample"]), bool) for name in FLAGS}
+        for names, blocks in self._sorted(drawn).items():
+            for k in range(0, len(blocks), len(self.devices)):
+                together = blocks[k : k + len(self.devices)]
+                for block, found in zip(together, self._together(names, together), strict=True):
+                    for name, column in found.items():
+                        drawn[block.chunk][name][block.lanes] = column[: len(block.lanes)]
+        return drawn
+
+    def _drawn(self, chunk: int) -> Columns:
+        start, stop = self.study.bounds(chunk)
+        return {"sample": np.arange(start, stop), **self.study.draw(start, stop)}
+
+    def _sorted(self, drawn: list[Columns]) -> dict[tuple[str, ...], list[_Block]]:
+        """Blocks by the names of their parts."""
+        found: dict[tuple[str, ...], list[_Block]] = {}
+        for c, columns in enumerate(drawn):
+            names = np.array([np.asarray(columns[path], str) for path in self.study.parts]).T
+            names = names.reshape(len(columns["sample"]), len(self.study.parts))
+            values = numbers({path: columns[path] for path in self.study.space.paths})
+            for kind in sorted(set(map(tuple, names.tolist()))):
+                members = np.flatnonzero((names == np.array(kind, dtype=names.dtype)).all(axis=1))
+                for k in range(0, len(members), self.size):
+                    lanes = members[k : k + self.size]
+                    filled = np.resize(lanes, self.size)
+                    block = _Block(c, lanes, {p: v[filled] for p, v in values.items()}, columns["sample"][filled])
+                    found.setdefault(kind, []).append(block)
+        return found
+
+    def _together(self, names: tuple[str, ...], blocks: list[_Block]) -> Iterator[Columns]:
+        """As many blocks as there are devices, or fewer; then the last stands in for the others."""
+        filled = blocks + [blocks[-1]] * (len(self.devices) - len(blocks))
+        with precision(self.study.dtype):
+            values = {p: np.stack([b.values[p] for b in filled]).astype(self.study.dtype) for p in blocks[0].values}
+            samples = np.stack([b.samples for b in filled]).astype(np.uint32)
+            found = jax.device_get(self._program(names)(values, samples))
+        for i in range(len(blocks)):
+            yield {name: column[i] for name, column in found.items()}
+
+    def _program(self, names: tuple[str, ...]) -> Any:
+        if names not in self._programs:
+            loop = self.study.variant(dict(zip(self.study.parts, names, strict=True)))
+            loop = jax.tree.map(lambda x: np.asarray(x, self.study.dtype), loop)
+            mesh = Mesh(np.array(self.devices), ("lanes",))
+            spec = PartitionSpec("lanes")
+            local = jax.shard_map(
+                lambda values, samples: _on_one_device(self.study, loop, values, samples),
+                mesh=mesh,
+                in_specs=(spec, spec),
+                out_specs=spec,
+                check_vma=False,
+            )
+            self._programs[names] = jax.jit(local)
+        return self._programs[names]
+
+
+def _on_one_device(study: Study, loop: Any, values: Mapping[str, Any], samples: Any) -> dict[str, Any]:
+    """One block (1, lanes): metrics and flags."""
+    keys = jax.vmap(lambda sample: noise_key(study.seed, sample))(samples[0])
+    mine = {path: column[0] for path, column in values.items()}
+    done = measure_lanes(loop, mine, study.solver, study.objectives, keys=keys)
+    flags = {"stopped": done.stopped, "diverged": done.diverged}
+    return {name: column[None] for name, column in (done.metrics | flags).items()}
+
+
+@contextlib.contextmanager
+def precision(dtype: str) -> Iterator[None]:
+    """JAX's default type inside, whatever it is outside."""
+    with jax.enable_x64(dtype == "float64"):
+        yield

@@ -1,0 +1,296 @@
+"""What one column of a sweep says about the law behind it: point estimates, each with a confidence interval.
+
+    mean            m -+ t s/sqrt(n)                                                   Student
+    deviation       s sqrt(c) exp(-+ z c e/2),  e^2 = (g - (n-3)/n)/(n-1)              Bonett (2006)
+    probability     Beta quantiles of k failures among n                               Clopper and Pearson (1934)
+    quantile        x_(r), x_(s):  P(B < r) <= a/2,  P(B >= s) <= a/2,  B ~ Bin(n, p)  order statistics, any law
+    CVaR            c - t*_(1-a/2) e,  c - t*_(a/2) e                                  studentised bootstrap
+
+with 1 - a the confidence, c = n/(n - z) and g = n M4/M2^2, Mp the sum of p-th powers of deviations from m (Bonett takes
+them from a trimmed mean, which cannot be merged). The chi-square interval for a deviation is not offered: off the
+normal law it is wrong at every n. An end that data cannot give is infinite. Columns are finite; lanes that diverged are
+counted and left out before.
+
+D. G. Bonett, Approximate confidence interval for standard deviation of nonnormal distributions, Comput. Stat. Data
+Anal. 50 (2006). P. Pébay, Formulas for robust, one-pass parallel computation of covariances and arbitrary-order
+statistical moments, Sandia report SAND2008-6212 (2008). R. T. Rockafellar and S. Uryasev, Optimization of conditional
+value-at-risk, J. Risk 2 (2000)."""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+REPLICATES = 999
+FEWEST = 10  # samples in the tail: CVaR's interval covers 92 to 95 % from there on
+ATOMS = 1024  # of a resampled tail: the greatest half of them single samples, the others means of neighbours
+BLOCK = 128  # replicates at a time
+
+
+class Estimate(NamedTuple):
+    """A number, the ends of its interval, the confidence, and the number of samples behind it."""
+
+    value: float
+    low: float
+    high: float
+    confidence: float
+    samples: int
+
+    def table(self) -> dict[str, float]:
+        """As plain values."""
+        return self._asdict()
+
+
+def column(values: Any, least: int = 1) -> np.ndarray:
+    """As float64, (n,). Raises ValueError for other shapes, for fewer than `least`, and for values not finite."""
+    x = np.asarray(values, dtype=np.float64)
+    if x.ndim != 1:
+        raise ValueError(f"a column has one axis, this has shape {x.shape}")
+    if (bad := x.size - np.count_nonzero(np.isfinite(x))) > 0:
+        raise ValueError(f"{bad} of {x.size} values are NaN or infinite: leave diverged lanes out first")
+    if x.size < least:
+        raise ValueError(f"{x.size} values, at least {least} are needed")
+    return x
+
+
+def upper(confidence: float) -> float:
+    """1 - a/2. Raises ValueError for a confidence outside (0, 1)."""
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence = {confidence:g} is outside (0, 1)")
+    return 0.5 + confidence / 2
+
+
+def outer(replicates: int, confidence: float) -> int:
+    """Index of the sorted replicate beyond which a/2 of them lie. Raises ValueError if there are too few for one."""
+    place = math.floor((replicates + 1) * (1 - upper(confidence)) + 1e-9) - 1
+    if place < 0:
+        raise ValueError(f"{replicates} replicates are too few for confidence = {confidence:g}")
+    return place
+
+
+@dataclasses.dataclass(frozen=True)
+class Moments:
+    """Count, mean, sums of second, third and fourth powers of deviations from it, least and greatest value.
+
+    No samples are a valid start of merging.
+    """
+
+    count: int = 0
+    centre: float = 0.0
+    second: float = 0.0
+    third: float = 0.0
+    fourth: float = 0.0
+    least: float = math.inf
+    greatest: float = -math.inf
+
+    @classmethod
+    def of(cls, values: Any) -> "Moments":
+        """Of a column, in two passes. Raises ValueError for values not finite."""
+        x = column(values, least=0)
+        if not x.size:
+            return cls()
+        d = x - x.mean()
+        squares = d * d
+        second, fourth = squares.sum(), np.square(squares).sum()
+        third = np.multiply(squares, d, out=squares).sum()
+        return cls(x.size, float(x.mean()), float(second), float(third), float(fourth), float(x.min()), float(x.max()))
+
+    def merge(self, other: "Moments") -> "Moments":
+        """Of both samples together, in any order to rounding. Pébay (2008)."""
+        if not (self.count and other.count):
+            return self if self.count else other
+        a, b, n = self.count, other.count, self.count + other.count
+        step = (other.centre - self.centre) / n
+        second = self.second + other.second + step**2 * n * a * b
+        third = self.third + other.third + 3 * step * (a * other.second - b * self.second)
+        third += step**3 * n * a * b * (a - b)
+        fourth = self.fourth + other.fourth + 4 * step * (a * other.third - b * self.third)
+        fourth += 6 * step**2 * (a * a * other.second + b * b * self.second)
+        fourth += step**4 * n * a * b * (a * a - a * b + b * b)
+        least, greatest = min(self.least, other.least), max(self.greatest, other.greatest)
+        return Moments(n, self.centre + b * step, second, third, fourth, least, greatest)
+
+    def mean(self, *, confidence: float = 0.95) -> Estimate:
+        """Mean. Raises ValueError for fewer than two samples."""
+        n = self._enough(2)
+        half = float(stats.t.ppf(upper(confidence), n - 1)) * math.sqrt(self.second / (n - 1) / n)
+        return Estimate(self.centre, self.centre - half, self.centre + half, confidence, n)
+
+    def deviation(self, *, confidence: float = 0.95) -> Estimate:
+        """Standard deviation; of equal samples 0, from 0 to 0. Raises ValueError for fewer than four samples."""
+        n = self._enough(4)
+        z, s = float(stats.norm.ppf(upper(confidence))), math.sqrt(self.second / (n - 1))
+        if n < 2 * z:  # c leaves all bounds
+            return Estimate(s, 0.0, math.inf, confidence, n)
+        g = max(n * (self.fourth / self.second) / self.second, 1.0) if self.second > 0 else 1.0
+        c = n / (n - z)
+        middle, factor = s * math.sqrt(c), math.exp(z * c * math.sqrt((g - (n - 3) / n) / (n - 1)) / 2)
+        return Estimate(s, middle / factor, middle * factor, confidence, n)
+
+    def _enough(self, least: int) -> int:
+        if self.count < least:
+            raise ValueError(f"{self.count} samples, at least {least} are needed")
+        return self.count
+
+
+class Count(NamedTuple):
+    """Failures among samples."""
+
+    failures: int
+    samples: int
+
+    def merge(self, other: "Count") -> "Count":
+        """Of both samples together."""
+        return Count(self.failures + other.failures, self.samples + other.samples)
+
+    def probability(self, *, confidence: float = 0.95) -> Estimate:
+        """Clopper-Pearson: covers at least as often as asked. Raises ValueError for counts that are none."""
+        k, n, top = self.failures, self.samples, upper(confidence)
+        if not (0 <= k <= n and n > 0):
+            raise ValueError(f"{k} failures among {n} samples")
+        low = float(stats.beta.ppf(1 - top, k, n - k + 1)) if k > 0 else 0.0
+        high = float(stats.beta.ppf(top, k + 1, n - k)) if k < n else 1.0
+        return Estimate(k / n, low, high, confidence, n)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Tail:
+    """The k greatest values, descending, and the indices of their samples; of equal values the lower index first.
+
+    values, indices: (k,), or shorter while there are fewer samples
+    """
+
+    k: int
+    values: np.ndarray
+    indices: np.ndarray
+
+    @classmethod
+    def of(cls, values: Any, indices: Any, k: int) -> "Tail":
+        """From a column and the index of each sample. Raises ValueError for lengths that differ, and for k < 1."""
+        x, index = column(values, least=0), np.asarray(indices)
+        if x.shape != index.shape or k < 1:
+            raise ValueError(f"k = {k} of {x.size} values with indices of shape {index.shape}")
+        if k < x.size:
+            kept = x >= np.partition(x, x.size - k)[x.size - k]
+            x, index = x[kept], index[kept]
+        order = np.lexsort((index, -x))[:k]
+        return cls(k, x[order], index[order])
+
+    def merge(self, other: "Tail") -> "Tail":
+        """Of both samples together. Raises ValueError for another k."""
+        if self.k != other.k:
+            raise ValueError(f"tails of {self.k} and {other.k} values do not merge")
+        both = np.concatenate([self.values, other.values]), np.concatenate([self.indices, other.indices])
+        return Tail.of(*both, self.k)
+
+
+def quantile(values: Any, level: float, *, confidence: float = 0.95) -> Estimate:
+    """The value that a fraction `level` of the law does not exceed, for any law: between two order statistics.
+
+    An end is infinite where no order statistic gives the confidence asked. Discreteness makes it conservative; exactly,
+    a continuous law is covered with P(r <= B < s). Raises ValueError for a level outside (0, 1).
+    """
+    return _quantile(np.sort(column(values)), level, confidence)
+
+
+def cvar(
+    values: Any, level: float, *, confidence: float = 0.95, replicates: int = REPLICATES, seed: int = 0
+) -> Estimate:
+    """Mean of the greatest fraction 1 - level, the sample at its edge in part; the same seed, the same interval.
+
+    The interval is infinite with fewer than 10 samples in the tail. Measured for n = 500 to 2000, levels 0.9 and 0.95,
+    six laws: the percentile bootstrap covers 89 to 95 %, BCa 90 to 95 %, the studentised 92 to 96 %. Raises ValueError
+    for a level outside [0, 1), and for too few replicates.
+    """
+    return _cvar(np.sort(column(values)), level, confidence, replicates, seed)
+
+
+def replicated(estimates: Any, *, confidence: float = 0.95) -> Estimate:
+    """Mean of one estimate per independent randomisation (scrambled Sobol' points), with a t interval.
+
+    Raises ValueError for fewer than two.
+    """
+    return Moments.of(estimates).mean(confidence=confidence)
+
+
+def summary(
+    values: Any, confidence: float = 0.95, levels: Sequence[float] = (0.05, 0.5, 0.95), tail: float = 0.95
+) -> dict[str, dict[str, float]]:
+    """Mean, deviation, quantiles and CVaR by name (`quantile 0.05`). Raises ValueError for fewer than four values."""
+    ordered = np.sort(column(values, least=4))
+    moments = Moments.of(ordered)
+    found = {"mean": moments.mean(confidence=confidence), "deviation": moments.deviation(confidence=confidence)}
+    found |= {f"quantile {level:g}": _quantile(ordered, level, confidence) for level in levels}
+    found[f"cvar {tail:g}"] = _cvar(ordered, tail, confidence, REPLICATES, 0)
+    return {name: one.table() for name, one in found.items()}
+
+
+def _quantile(ordered: np.ndarray, level: float, confidence: float) -> Estimate:
+    if not 0 < level < 1:
+        raise ValueError(f"level = {level:g} is outside (0, 1)")
+    n, top = len(ordered), upper(confidence)
+    r, s = int(stats.binom.ppf(1 - top, n, level)), int(stats.binom.isf(1 - top, n, level)) + 1
+    low = float(ordered[r - 1]) if r > 0 else -math.inf
+    high = float(ordered[s - 1]) if s <= n else math.inf
+    value = min(max(float(np.quantile(ordered, level)), low), high)  # interpolation leaves it at extreme levels of few
+    return Estimate(value, low, high, confidence, n)
+
+
+def _cvar(ordered: np.ndarray, level: float, confidence: float, replicates: int, seed: int) -> Estimate:
+    if not 0 <= level < 1:
+        raise ValueError(f"level = {level:g} is outside [0, 1)")
+    n, place = len(ordered), outer(replicates, confidence)
+    share = n * (1 - level)
+    reach = min(n, math.ceil(share + 8 * math.sqrt(share)) + FEWEST)  # no resample's tail will reach beyond
+    tail = ordered[n - reach :][::-1]
+    offset = tail[0]  # so that a tail of equal values has no spread at all, not one of rounding
+    ((value, _),) = _tail_means(tail - offset, np.ones((1, reach)), share, n)
+    if share < FEWEST:
+        return Estimate(float(value + offset), -math.inf, math.inf, confidence, n)
+    atoms, sizes = _atoms(tail - offset)
+    ((centre, error),) = _tail_means(atoms, sizes[None].astype(float), share, n)
+    found = np.concatenate([_tail_means(atoms, w, share, n) for w in _resampled(sizes, n, replicates, seed)])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = (found[:, 0] - centre) / found[:, 1]
+        sides = np.sort(np.where(np.isnan(ratios), 0.0, ratios))[[-1 - place, place]]
+        ends = value - sides * error
+    plain = np.sort(found[:, 0])[[place, -1 - place]]  # where this or a resample's tail has no spread: percentiles
+    low, high = np.where(np.isfinite(ends) & (error > 0), ends, plain)
+    return Estimate(float(value + offset), float(low + offset), float(high + offset), confidence, n)
+
+
+def _tail_means(tail: np.ndarray, weights: np.ndarray, share: float, n: int) -> np.ndarray:
+    """CVaR and its standard error, (replicates, 2), from descending values (k,) and weights (replicates, k).
+
+    CVaR is the mean of y = q + max(x - q, 0) n/share, q the quantile, and e = std(y)/sqrt(n) its standard error.
+    """
+    reached = np.cumsum(weights, axis=1)
+    taken = np.clip(share - (reached - weights), 0.0, weights)
+    edge = np.minimum(np.count_nonzero(reached < share, axis=1), len(tail) - 1)
+    excess = np.maximum(tail - tail[edge][:, None], 0.0)
+    first, second = (np.einsum("rk,rk->r", weights, power) / n for power in (excess, excess**2))
+    return np.stack([taken @ tail / share, np.sqrt(np.maximum(second - first**2, 0.0) * n) / share], axis=1)
+
+
+def _atoms(tail: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The descending tail with at most ATOMS values, and how many samples each stands for.
+
+    What varies within an atom is lost to the bootstrap: a share of about 1/ATOMS^2 of the variance.
+    """
+    single = ATOMS // 2
+    if len(tail) <= ATOMS:
+        return tail, np.ones(len(tail), dtype=int)
+    edges = np.concatenate([np.arange(single), np.linspace(single, len(tail), ATOMS - single + 1).astype(int)])
+    sizes = np.diff(edges)
+    return np.add.reduceat(tail, edges[:-1]) / sizes, sizes
+
+
+def _resampled(sizes: np.ndarray, n: int, replicates: int, seed: int) -> Iterator[np.ndarray]:
+    """How often each atom occurs when n are drawn of n, in blocks (replicates, atoms); the rest is below the tail."""
+    random, total = np.random.default_rng(seed), int(sizes.sum())
+    totals = random.binomial(n, total / n, size=replicates)
+    for start in range(0, replicates, BLOCK):
+        yield random.multinomial(totals[start : start + BLOCK], sizes / total).astype(float)

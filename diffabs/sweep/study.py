@@ -1,0 +1,168 @@
+"""What a sweep runs: a loop, what varies in it, how it is integrated, and what is measured.
+
+Lane i is a function of (seed, i) alone: its parameters come from the design, its noise from `fold_in(key, i)`. It is
+computed in chunk i // chunk, and nothing about it depends on who computes that chunk, or when."""
+
+import dataclasses
+import difflib
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffabs.loop import Loop
+from diffabs.objectives import BRAKING
+from diffabs.protocols import Objective
+from diffabs.pytree import elements, get, problems, replace
+from diffabs.rollout import FixedStep
+from diffabs.sweep.discrete import Categorical
+from diffabs.sweep.space import Space
+
+DTYPES = ("float32", "float64")
+MOST_SAMPLES = 2**32 - 1  # keys are folded with 32 bits
+MOST_LANES = 2**20  # of a chunk
+NOISE = 2**32 - 1  # of the stream of keys, folded into the seed where the random design folds the number of a sample
+FLAGS = ("stopped", "diverged")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Study:
+    """A sweep, fully described.
+
+    space: distributions by dotted path, `plant.mass` or `controller.gain.0`, and the design that draws from them
+    parts: for a path drawn by a `Categorical` of names, the part that each name stands for
+    failures: metrics whose excess over a bound counts as a failure; not stopping, locking and diverging always count
+    chunk: lanes that are computed and stored together; results are the same to the bit for the same chunk
+    """
+
+    loop: Loop
+    space: Space
+    samples: int
+    solver: FixedStep
+    objectives: Mapping[str, Objective] = dataclasses.field(default_factory=lambda: dict(BRAKING))
+    seed: int = 0
+    chunk: int = 4096
+    dtype: str = "float64"
+    parts: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
+    failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def chunks(self) -> int:
+        """How many chunks there are; the last may be shorter."""
+        return -(-self.samples // self.chunk)
+
+    def bounds(self, chunk: int) -> tuple[int, int]:
+        """First sample of a chunk and one past its last."""
+        return chunk * self.chunk, min((chunk + 1) * self.chunk, self.samples)
+
+    def check(self) -> "Study":
+        """Raises ValueError, in one line, for everything that is wrong."""
+        lines = [*self._wrong_numbers(), *self._wrong_variables()] or list(problems(self.loop))
+        if lines:
+            raise ValueError("; ".join(lines))
+        return self
+
+    def draw(self, start: int, stop: int) -> dict[str, np.ndarray]:
+        """Values of the samples by path."""
+        return self.space.draw(self.seed, start, stop, self.samples)
+
+    def lane(self, i: int) -> tuple[Loop, jax.Array]:
+        """Loop and random key of sample i. Raises ValueError for a sample that is not in the sweep."""
+        if not 0 <= i < self.samples:
+            raise ValueError(f"sample {i} is outside [0, {self.samples - 1}]")
+        values = {path: column[0] for path, column in self.draw(i, i + 1).items()}
+        return replace(self.variant(values), numbers(values)), noise_key(self.seed, i)
+
+    def variant(self, values: Mapping[str, Any]) -> Loop:
+        """The loop with the parts that a sample's names stand for."""
+        return replace(self.loop, {path: self.parts[path][str(values[path])] for path in self.parts})
+
+    def table(self) -> dict[str, Any]:
+        """Everything that decides the results, as values of JSON."""
+        own = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype", "failures")}
+        return json.loads(
+            json.dumps(
+                {
+                    **own,
+                    "solver": {"step": self.solver.step, "duration": self.solver.duration},
+                    "space": self.space.table(),
+                    "loop": plain(self.loop),
+                    "parts": {
+                        path: {n: plain(part) for n, part in choices.items()} for path, choices in self.parts.items()
+                    },
+                    "objectives": {name: plain(part) for name, part in self.objectives.items()},
+                }
+            )
+        )
+
+    def _wrong_numbers(self) -> Iterator[str]:
+        for name, most in (("samples", MOST_SAMPLES), ("chunk", MOST_LANES)):
+            value = getattr(self, name)
+            if not (isinstance(value, int) and 1 <= value <= most):
+                yield f"{name} = {value} is outside [1, {most}]"
+        if not 0 <= self.seed < 2**32:
+            yield f"seed = {self.seed} is outside [0, {2**32 - 1}]"
+        if self.dtype not in DTYPES:
+            yield f"dtype = {self.dtype} is neither {' nor '.join(DTYPES)}"
+        for name, bound in self.failures.items():
+            if name not in self.objectives:
+                yield f"failures.{name} is not measured; there is {', '.join(self.objectives)}"
+            elif not np.isfinite(bound):
+                yield f"failures.{name} = {bound} is not a finite number"
+
+    def _wrong_variables(self) -> Iterator[str]:
+        wrong = list(self.space.problems())
+        yield from wrong
+        known = elements(self.loop)
+        for path in self.space.paths:
+            if path in self.parts:
+                yield from _wrong_parts(path, self.space.variables.get(path), self.parts[path], self.loop)
+            elif path not in known:
+                near = difflib.get_close_matches(path, known, 1, 0.5)
+                yield f"{path} is not a parameter of this loop" + (f"; did you mean {near[0]}?" if near else "")
+        yield from (f"parts.{path} has no distribution" for path in self.parts if path not in self.space.paths)
+        if not wrong:
+            yield from self.space.leaving(known)
+            try:
+                self.space.design.count(self.space.variables, self.samples)
+            except ValueError as error:
+                yield str(error)
+
+
+def _wrong_parts(path: str, distribution: Any, choices: Mapping[str, Any], loop: Loop) -> Iterator[str]:
+    try:
+        get(loop, path)
+    except KeyError as error:
+        yield str(error.args[0])
+    if not isinstance(distribution, Categorical):
+        yield f"{path} stands for parts and needs a Categorical of their names"
+    else:
+        missing = [str(name) for name in distribution.choices if str(name) not in choices]
+        if missing:
+            yield f"{path}: no part is called {', '.join(missing)}; there is {', '.join(choices)}"
+    for name, part in choices.items():
+        yield from problems(part, f"{path} {name}: ")
+
+
+def numbers(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those values that are numbers, not names."""
+    return {path: value for path, value in values.items() if np.asarray(value).dtype.kind in "fiu"}
+
+
+def noise_key(seed: Any, i: Any) -> jax.Array:
+    """The key of sample i's sensors."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), NOISE), i)
+
+
+def plain(part: Any) -> Any:
+    """A part as values of JSON: its type and its fields."""
+    if dataclasses.is_dataclass(part):
+        fields = {f.name: plain(getattr(part, f.name)) for f in dataclasses.fields(part)}
+        return {"type": type(part).__name__, **fields}
+    if isinstance(part, tuple):
+        return [plain(item) for item in part]
+    if isinstance(part, str | bool | int | None):
+        return part
+    return np.asarray(part, float).tolist()

@@ -1,0 +1,71 @@
+"""Trajectories of chosen samples, run again and kept in a zarr group: dimensions `sample` and `time`.
+
+`xarray.open_zarr(folder / "trajectories.zarr", consolidated=False)` opens it."""
+
+import dataclasses
+import pathlib
+import shutil
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import zarr
+
+from diffabs.rollout import Trajectory, rollout
+from diffabs.sweep.runner import precision
+from diffabs.sweep.study import Study
+
+NAME = "trajectories.zarr"
+MOST_INSTANTS = 2000  # of a trajectory
+UNITS = {
+    "time": "s",
+    "slip": "1",
+    "target": "1",
+    "speed": "m/s",
+    "wheel_speed": "m/s",
+    "deceleration": "m/s^2",
+    "distance": "m",
+    "command": "N m",
+    "control": "N m",
+}
+
+
+def keep(study: Study, folder: str | pathlib.Path, samples: Sequence[int]) -> pathlib.Path:
+    """Run these samples again and write their trajectories, whole or not at all, in place of earlier ones.
+
+    Raises ValueError for a sample that is not in the sweep."""
+    path = pathlib.Path(folder) / NAME
+    seen = [_signals(trajectory(study, i)) for i in samples]
+    temporary = path.with_name(f"{NAME}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    group = zarr.open_group(temporary, mode="w")
+    numbers = {"sample": np.asarray(samples, np.int64)}
+    numbers |= {name: np.stack([signals[name] for signals in seen]) for name in UNITS}
+    for name, values in numbers.items():
+        dimensions = ("sample", "instant")[: values.ndim]
+        array = group.create_array(name, shape=values.shape, dtype=values.dtype, dimension_names=dimensions)
+        array[...] = values
+        array.attrs["units"] = UNITS.get(name, "")
+    shutil.rmtree(path, ignore_errors=True)
+    temporary.rename(path)
+    return path
+
+
+def trajectory(study: Study, i: int) -> Trajectory:
+    """One sample's run, on the host. After its end the last instant is repeated."""
+    loop, key = study.lane(i)
+    every = max(study.solver.every, -(-study.solver.steps // MOST_INSTANTS))
+    with precision(study.dtype):
+        loop = jax.tree.map(lambda x: jnp.asarray(x, study.dtype), loop)
+        run = jax.device_get(rollout(loop, dataclasses.replace(study.solver, every=every), key=key))
+    assert run.trajectory is not None
+    return run.trajectory
+
+
+def _signals(seen: Trajectory) -> dict[str, np.ndarray]:
+    """By name (instants,)."""
+    sample, y = seen.sample, seen.sample.output
+    outputs = {name: getattr(y, name) for name in ("slip", "speed", "wheel_speed", "deceleration", "distance")}
+    others = {"time": sample.t, "target": sample.target, "command": sample.command, "control": sample.control}
+    return {name: np.asarray(values) for name, values in (outputs | others).items()}
