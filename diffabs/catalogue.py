@@ -178,7 +178,7 @@ def filled(template: Any, table: dict[str, Any], family: str, path: str) -> Any:
 
 
 # What a scenario has besides the fields of a loop.
-OTHERS = ("road", "solver", "objective", "design", "tune", "title", "description")
+OTHERS = ("road", "solver", "objective", "design", "tune", "sweep", "title", "description")
 
 
 def joined(path: str, key: str) -> str:

@@ -11,7 +11,16 @@ from typing import Annotated, Any, NoReturn
 import jax
 import typer
 
-from diffabs import __version__, catalogue, commands_design, commands_identify, commands_tune, console, show
+from diffabs import (
+    __version__,
+    catalogue,
+    commands_design,
+    commands_identify,
+    commands_sweep,
+    commands_tune,
+    console,
+    show,
+)
 from diffabs.rollout import Run, measure, rollout
 from diffabs.scenario import Scenario, header, load, names
 
@@ -61,22 +70,33 @@ def setup(
 
 @app.command()
 def simulate(
-    scenario: console.ScenarioName,
+    scenario: Annotated[
+        str | None, typer.Argument(help="A TOML file, or the name of a packaged scenario.", show_default=False)
+    ] = None,
     changes: console.Changes = None,
     as_json: console.Json = False,
     csv: Annotated[pathlib.Path | None, typer.Option(help="Write the trajectory to this file.")] = None,
     plot: Annotated[pathlib.Path | None, typer.Option(help="Draw the run to this file (.png, .pdf, .svg).")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of noisy sensors; the same as --set solver.seed=N.")] = None,
+    from_sweep: Annotated[
+        pathlib.Path | None, typer.Option(metavar="DIR", help="Run a sample of this sweep again.")
+    ] = None,
+    sample: Annotated[int | None, typer.Option(help="Which one, with --from-sweep.")] = None,
 ) -> None:
     """Run a scenario once and show its metrics."""
-    with console.guarded():
+    with console.guarded(), commands_sweep.reported():
+        _check_source(scenario, from_sweep, sample, changes, seed)
         _check_targets(csv, plot)
         changes = [*(changes or ()), *([] if seed is None else [f"solver.seed={seed}"])]
         with contextlib.ExitStack() as files:
             csv_file = files.enter_context(console.new_file(csv, "--csv")) if csv else None
             picture = files.enter_context(console.new_file(plot, "--plot")) if plot else None
-            chosen = console.waited(lambda: load(scenario, changes), "checking the scenario")
-            run = console.waited(lambda: _run(chosen, keep=bool(csv or plot)), f"simulating {chosen.name}")
+            if from_sweep and sample is not None:
+                chosen, key = console.waited(lambda: commands_sweep.sample(from_sweep, sample), "reading the sweep")
+            else:
+                chosen = console.waited(lambda: load(scenario or "", changes), "checking the scenario")
+                key = chosen.key()
+            run = console.waited(lambda: _run(chosen, key, keep=bool(csv or plot)), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
                 show.write_csv(run.trajectory, getattr(chosen.loop.plant, "control_unit", "N m"), csv_file)
             if picture:
@@ -94,20 +114,30 @@ def simulate(
             )
 
 
+def _check_source(scenario: Any, from_sweep: Any, sample: int | None, changes: Any, seed: int | None) -> None:
+    """Raises typer.Exit: either a scenario, or a sweep and a sample of it as it is."""
+    if (scenario is None) == (from_sweep is None):
+        console.fail("what shall be run: a SCENARIO, or --from-sweep DIR --sample N")
+    if (from_sweep is None) != (sample is None):
+        console.fail("--from-sweep DIR and --sample N need each other")
+    if from_sweep and (changes or seed is not None):
+        console.fail("a sample of a sweep is run as it was: no --set, no --seed")
+
+
 def _check_targets(csv: pathlib.Path | None, plot: pathlib.Path | None) -> None:
     console.check_picture(plot)
     if csv and plot and csv.resolve() == plot.resolve():
         console.fail(f"--csv and --plot are the same file, {csv}")
 
 
-def _run(chosen: Scenario, keep: bool) -> Run:
+def _run(chosen: Scenario, key: Any, keep: bool) -> Run:
     """The run, on the host."""
     if not keep:
-        return jax.device_get(measure(chosen.loop, chosen.solver, chosen.objectives, key=chosen.key()))
+        return jax.device_get(measure(chosen.loop, chosen.solver, chosen.objectives, key=key))
     steps = chosen.solver.steps
     every = min(max(chosen.solver.every, math.ceil(steps / MOST_ROWS)), steps)
     solver = dataclasses.replace(chosen.solver, every=every)
-    return jax.device_get(rollout(chosen.loop, solver, chosen.objectives, key=chosen.key()))
+    return jax.device_get(rollout(chosen.loop, solver, chosen.objectives, key=key))
 
 
 def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -> dict[str, Any]:
@@ -126,6 +156,7 @@ app.command()(commands_design.design)
 app.command()(commands_design.certify)
 app.command()(commands_tune.tune)
 app.command()(commands_identify.identify)
+app.command()(commands_sweep.sweep)
 
 
 @app.command("list")

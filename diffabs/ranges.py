@@ -1,4 +1,5 @@
-"""Tables of a scenario whose keys are parameters of the loop: `[design.over]`, `[tune.free]`, `[tune.over]`.
+"""Tables of a scenario whose keys are parameters of the loop: `[design.over]`, `[tune.free]`, `[tune.over]`,
+`[sweep.over]`.
 
     "plant.mass" = ...                   a path of the loop, as one key with dots or as nested tables
     "road.scale" = ...                   the road has a section of its own, here as elsewhere
@@ -14,7 +15,7 @@ from typing import Any
 from diffabs.catalogue import DEEPEST, KMH, ScenarioError, shown, unknown
 from diffabs.pytree import Spec
 
-TABLES = (("design", "over"), ("tune", "free"), ("tune", "over"))
+TABLES = (("design", "over"), ("tune", "free"), ("tune", "over"), ("sweep", "over"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +61,7 @@ def flat(table: Mapping[str, Any], section: str) -> dict[str, Any]:
         path, value = pending.pop(0)
         if path.count(".") > DEEPEST:
             raise ScenarioError(f"{section}: {shown(path)} is nested more than {DEEPEST} deep")
-        if isinstance(value, dict):
+        if isinstance(value, dict) and not {"type", "choices"} & value.keys():
             pending[:0] = [(f"{path}.{key}", item) for key, item in value.items()]
             continue
         path = canonical(path)

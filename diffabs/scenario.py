@@ -5,6 +5,7 @@
     [objective]    name = a part; adds to, or changes, those of every braking report
     [design]       what a robust gain is asked for, and over which ranges: see `robust`
     [tune]         which parameters are free, what is made small, and over which runs: see `goal`
+    [sweep]        what varies in a Monte-Carlo sweep, and what counts as a failure: see `variation`
 
 What is left out has its default. Speeds may be given in km/h: `speed_kmh`. A value is never evaluated as code."""
 
@@ -20,7 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import goal, ranges, robust, toml
+from diffabs import goal, ranges, robust, toml, variation
 from diffabs.catalogue import OTHERS, build, filled, joined, number, shown, unknown, whole, wrong
 from diffabs.catalogue import ScenarioError as ScenarioError
 from diffabs.loop import Loop
@@ -40,7 +41,7 @@ TIME = Spec("s", low=0.0, open_low=True)
 @dataclasses.dataclass(frozen=True)
 class Scenario:
     """What is run: a loop, how it is integrated [s], what is measured, the seed of its noise; what a design must do,
-    and what is tuned."""
+    what is tuned, and what varies in a sweep."""
 
     name: str
     title: str = ""
@@ -51,6 +52,7 @@ class Scenario:
     seed: int = 0
     design: robust.Task = dataclasses.field(default_factory=robust.Task)
     tune: goal.Goal = dataclasses.field(default_factory=goal.Goal)
+    sweep: variation.Variation = dataclasses.field(default_factory=variation.Variation)
 
     def key(self) -> jax.Array:
         """The random key of a run."""
@@ -77,7 +79,12 @@ def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = (), *, int
     a step that is not stable for the loop (not asked for a scenario that will not be integrated).
     """
     name, raw = _read(name_or_path)
-    table = _parsed(raw, str(name_or_path))
+    return loads(raw, name, str(name_or_path), overrides, integrated=integrated)
+
+
+def loads(raw: bytes, name: str, origin: str, overrides: Sequence[str] = (), *, integrated: bool = True) -> Scenario:
+    """The scenario in a text; `origin` is its name in messages. Raises ScenarioError, as `load`."""
+    table = _parsed(raw, origin)
     for override in overrides:
         _override(table, override)
     scenario = _assembled(name, table)
@@ -196,6 +203,7 @@ def _assembled(name: str, table: dict[str, Any]) -> Scenario:
         seed=seed,
         design=robust.read(table.get("design", {}), loop),
         tune=goal.read(table.get("tune", {}), loop, objectives),
+        sweep=variation.read(table.get("sweep", {}), loop, objectives),
     )
 
 
@@ -267,5 +275,5 @@ def dump(scenario: Scenario) -> str:
     solver = {name: getattr(scenario.solver, name) for name in ("step", "duration", "every")}
     sections["solver"] = {**solver, "seed": scenario.seed}
     sections["objective"] = {name: toml.table("objective", part) for name, part in scenario.objectives.items()}
-    sections["design"], sections["tune"] = scenario.design.table(), scenario.tune.table()
+    sections |= {name: getattr(scenario, name).table() for name in ("design", "tune", "sweep")}
     return toml.document({key: getattr(scenario, key) for key in TEXTS}, sections)

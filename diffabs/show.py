@@ -25,14 +25,15 @@ PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost
 
 def as_json(value: Any) -> None:
     """One JSON document on stdout; numbers that JSON does not have are null."""
-    typer.echo(json.dumps(_finite(value), indent=2, allow_nan=False))
+    typer.echo(json.dumps(finite(value), indent=2, allow_nan=False))
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """Numbers that JSON does not have become null."""
     if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
+        return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -175,6 +176,41 @@ def identified(result: dict[str, Any]) -> None:
     say(f"it ended because {result['reason']}, after {result['evaluations']} evaluations")
     for name, path in result["files"].items():
         say(f"{name}: {path}")
+
+
+def swept(result: dict[str, Any], chosen: Scenario) -> None:
+    """Failures, statistics with intervals, what moves what, the worst samples."""
+    failures = Table("failure", "lanes", "probability", "low", "high")
+    for name, row in result["failures"].items():
+        failures.add_row(name, str(row["count"]), *_estimate(row))
+    percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
+    _print(f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", failures)
+    kinds = list(next((row for row in result["metrics"].values() if row), {}))
+    kinds = [kind for kind in kinds if kind not in ("least", "greatest")]
+    metrics = Table("metric", "unit", "", "value", "low", "high")
+    for name, row in result["metrics"].items():
+        for i, kind in enumerate(kinds):
+            first = (name, unit_of(chosen.objectives[name])) if i == 0 else ("", "")
+            metrics.add_row(*first, kind, *_estimate(row[kind]))
+        metrics.add_section()
+    _print("statistics of the lanes that did not diverge", metrics)
+    paths = list(next(iter(result["sensitivity"].values()), {}))
+    if paths:
+        kind = list(next(iter(result["sensitivity"].values()))[paths[0]])[-1]
+        moves = Table("metric", *paths)
+        for name, row in result["sensitivity"].items():
+            moves.add_row(
+                name, *("" if row[p][kind]["value"] is None else f"{row[p][kind]['value']:.3f}" for p in paths)
+            )
+        _print({"spearman": "rank correlations", "total": "total Sobol' indices"}[kind], moves)
+    for name, rows in result["worst"].items():
+        if rows:
+            say(f"greatest {name}: {_brief(rows[0]['value'])} in sample {rows[0]['sample']}")
+    say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
+
+
+def _estimate(row: dict[str, Any]) -> list[str]:
+    return ["" if row[key] is None else _brief(row[key]) for key in ("value", "low", "high")]
 
 
 def _brief(value: Any) -> str:

@@ -160,7 +160,7 @@ def test_seed_decides_the_noise():
 @pytest.fixture
 def simulated(whole, runs, monkeypatch):
     """Every simulation gives the run of slip-lmi."""
-    monkeypatch.setattr(cli, "_run", lambda chosen, keep: runs[0])
+    monkeypatch.setattr(cli, "_run", lambda chosen, key, keep: runs[0])
 
 
 def test_lab_rig_commands_have_no_torque_unit(tmp_path, simulated):
