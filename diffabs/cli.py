@@ -14,6 +14,7 @@ import typer
 from diffabs import (
     __version__,
     catalogue,
+    commands_compare,
     commands_design,
     commands_identify,
     commands_sweep,
@@ -157,6 +158,7 @@ app.command()(commands_design.certify)
 app.command()(commands_tune.tune)
 app.command()(commands_identify.identify)
 app.command()(commands_sweep.sweep)
+app.command()(commands_compare.compare)
 
 
 @app.command("list")

@@ -9,8 +9,10 @@ import pathlib
 import shlex
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
@@ -20,7 +22,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from diffabs import console, show, variation
-from diffabs.catalogue import ScenarioError, unknown
+from diffabs.catalogue import ScenarioError, unit_of, unknown
+from diffabs.pytree import elements
 from diffabs.scenario import Scenario, dump, load, loads
 
 if TYPE_CHECKING:
@@ -54,6 +57,8 @@ def sweep(
     """Run a scenario for many values of what [sweep.over] varies, and show statistics with confidence intervals."""
     with console.guarded(), reported():
         _check_options(engine, scheduler, workers, devices, figures)
+        if samples is not None and samples < 1:
+            console.fail(f"--samples {samples} is not positive")
         if devices:
             jax.config.update("jax_num_cpu_devices", devices)
         given = {"samples": samples, "seed": seed}
@@ -61,12 +66,13 @@ def sweep(
         chosen = console.waited(lambda: load(scenario, changes), "checking the scenario")
         study = variation.study(chosen)
         kept = _numbers(keep, study.samples)
-        found = _run(study, chosen, out, resume, _engine(engine, scheduler, workers))
-        if not found.complete:
-            again = shlex.join([*sys.argv[1:], *([] if resume else ["--resume"])])
-            console.say(f"interrupted: finished chunks are in {out}; go on with: diffabs {again}")
-            raise typer.Exit(console.INTERRUPTED)
-        result = console.waited(lambda: _result(found, study, out, kept, figures), "computing statistics")
+        with _continued():
+            found = _run(study, chosen, out, resume, _engine(engine, scheduler, workers))
+            if not found.complete:
+                again = shlex.join([*sys.argv[1:], *([] if resume else ["--resume"])])
+                console.say(f"interrupted: finished chunks are in {out}; go on with: diffabs {again}")
+                raise typer.Exit(console.INTERRUPTED)
+            result = console.waited(lambda: _result(found, study, out, kept, figures), "computing statistics")
         show.as_json(result) if as_json else show.swept(result, chosen)
 
 
@@ -89,13 +95,20 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
 
 @contextlib.contextmanager
 def reported() -> Iterator[None]:
-    """A sweep that cannot be started or read is bad input; a full disk says how to go on."""
+    """A sweep that cannot be started or read is bad input."""
     try:
         yield
     except ValueError as error:
         if isinstance(error, ScenarioError) or type(error).__name__ != "SweepError":
             raise
         console.fail(str(error))
+
+
+@contextlib.contextmanager
+def _continued() -> Iterator[None]:
+    """A full disk says how to go on."""
+    try:
+        yield
     except OSError as error:
         console.fail(f"{' '.join(str(error).split())}; finished chunks stay, --resume goes on", console.FAILED)
 
@@ -146,7 +159,24 @@ def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, engi
 
     source = {"scenario": dump(chosen), "name": chosen.name}
     with _interruptible() as stopping, _watched() as told:
-        return run(study, out, resume=resume, engine=engine, progress=told, stopping=stopping, source=source)
+        return _aside(
+            lambda: run(study, out, resume=resume, engine=engine, progress=told, stopping=stopping, source=source)
+        )
+
+
+def _aside(work: Callable[[], "Results"]) -> "Results":
+    """The result of `work` in a thread of its own, because Ctrl-C cannot interrupt compiled code in the main one.
+    Raises what it raises."""
+    result: Future[Results] = Future()
+
+    def run() -> None:
+        try:
+            result.set_result(work())
+        except BaseException as error:
+            result.set_exception(error)
+
+    threading.Thread(target=run, name=console.WORKER, daemon=True).start()
+    return result.result()
 
 
 @contextlib.contextmanager
@@ -212,7 +242,9 @@ def _result(found: "Results", study: "Study", out: pathlib.Path, kept: list[int]
 
         folder = out / FIGURES
         folder.mkdir(exist_ok=True)
-        result["files"]["figures"] = [str(path) for path in draw(found, folder)]
+        units = {path: spec.unit for path, spec in elements(study.loop).items()}
+        units |= {name: unit_of(objective) for name, objective in study.objectives.items()}
+        result["files"]["figures"] = [str(path) for path in draw(found, result, folder, units)]
     document = json.dumps(show.finite(result), indent=1, allow_nan=False)
     write_whole(out / SUMMARY, document.encode())
     return result

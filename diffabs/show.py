@@ -209,6 +209,17 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
     say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
 
 
+def compared(result: dict[str, Any]) -> None:
+    """Means of two sweeps, and their difference sample by sample."""
+    table = Table("metric", "first", "second", "second - first", "low", "high", "less in", "variance reduction")
+    for name, row in result["metrics"].items():
+        less = f"{100 * row['share in which the second is less']['value']:.1f} %"
+        means = (_brief(row[key]) for key in ("first", "second"))
+        table.add_row(name, *means, *_estimate(row["difference"]), less, _brief(row["variance reduction"]))
+    out = f", {result['left out']} left out that diverged" if result["left out"] else ""
+    _print(f"{result['second']} against {result['first']}: {result['samples']} common samples{out}", table)
+
+
 def _estimate(row: dict[str, Any]) -> list[str]:
     return ["" if row[key] is None else _brief(row[key]) for key in ("value", "low", "high")]
 

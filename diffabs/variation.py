@@ -16,7 +16,7 @@
     [sweep.failures]
     overshoot = 0.5                                           # more is a failure; so is not to stop, or to lock
 
-The distributions are those of `diffabs.sweep.distributions`. Only reading is done without the extra `diffabs[sweep]`."""
+The distributions are those of `diffabs.sweep.distributions`. Reading needs no extra, running `diffabs[sweep]`."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping

@@ -14,6 +14,7 @@ from diffabs.cli import app
 from diffabs.scenario import load
 
 TEXT = (pathlib.Path(__file__).parent.parent / "README.md").read_text()
+SWEEPS = (pathlib.Path(__file__).parent.parent / "docs" / "sweeps.md").read_text()
 CODE, DESIGN, TUNE = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 
@@ -54,6 +55,18 @@ def test_the_tuning_runs():
     found = names["found"]
     assert found.objective[1] < 0.6 * found.objective[0]
     assert np.max(found.metrics[1]["overshoot"]) < 0.02
+
+
+def test_the_sweep_of_the_page_on_sweeps_runs(tmp_path, monkeypatch):
+    (code,) = re.findall(r"```python\n(.*?)```", SWEEPS, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(compile(code.replace("256", "64").replace("128", "32"), "sweeps.md", "exec"), names)
+    frame = names["frame"]
+    assert len(frame) == 64
+    assert frame["plant.mass"].between(5.3, 6.2).all()
+    assert (frame["stop_distance"].corr(frame["plant.road.w4"])) < -0.9
+    assert len(list((tmp_path / "out" / "sweep" / "chunks").iterdir())) == 2
 
 
 @pytest.mark.parametrize("command", re.findall(r"^    diffabs ((?:list|certify) .*)$", TEXT, re.MULTILINE))

@@ -7,12 +7,15 @@ whose worker dies is given to another one.
 Dask sends programs, by pickle: its scheduler and workers must be machines that trust each other."""
 
 import contextlib
+import dataclasses
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import lru_cache
 from typing import Any
 
+import jax
+import numpy as np
 from distributed import Client, KilledWorker, LocalCluster, as_completed
 
 from diffabs import provenance
@@ -22,7 +25,7 @@ from diffabs.sweep.store import SweepError, differences
 from diffabs.sweep.study import Study
 
 AHEAD = 2  # chunks in hand for each thread of the workers
-DEATHS = 20  # workers that a chunk may cost
+DEATHS = 5  # times that a chunk may be given up by the scheduler, each after four workers died with it in hand
 TIMEOUT = 10.0  # s for a scheduler to answer
 
 
@@ -33,12 +36,12 @@ class Dask:
         """As many workers as there are processors if not given."""
         self.scheduler, self.workers = scheduler, workers or os.cpu_count() or 1
 
-    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Iterator[Done]:
+    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Generator[Done, None, None]:
         """As they are finished. Raises SweepError for a scheduler that does not answer, has no workers, or has some
         with other versions; and for a chunk that all workers die of."""
         with self._client() as client:
             _check(client)
-            yield from _completed(client, study, chunks, stopping)
+            yield from _completed(client, _portable(study), chunks, stopping)
 
     @contextlib.contextmanager
     def _client(self) -> Iterator[Client]:
@@ -75,7 +78,7 @@ def _completed(client: Client, study: Study, chunks: Sequence[int], stopping: Ca
     inside: dict[Any, int] = {}
 
     def give(chunk: int) -> None:
-        future = client.submit(compute, study, chunk, key=f"chunk-{chunk}-{deaths[chunk]}", pure=False)
+        future = client.submit(compute, study, chunk, pure=False)  # a key of its own, as other clients have theirs
         inside[future] = chunk
         finished.add(future)
 
@@ -100,6 +103,18 @@ def _completed(client: Client, study: Study, chunks: Sequence[int], stopping: Ca
             fill()
 
 
+def _portable(study: Study) -> Study:
+    """Without arrays of JAX: a process whose default is float32 would read them with half of their digits."""
+
+    def plain(x: Any) -> Any:
+        return np.asarray(x) if isinstance(x, jax.Array) else x
+
+    # One by one: `tree.map` would sort them, and with them the columns.
+    objectives = {name: jax.tree.map(plain, one) for name, one in study.objectives.items()}
+    parts = {path: {name: jax.tree.map(plain, one) for name, one in by.items()} for path, by in study.parts.items()}
+    return dataclasses.replace(study, loop=jax.tree.map(plain, study.loop), parts=parts, objectives=objectives)
+
+
 def compute(study: Study, chunk: int) -> Done:
     """A chunk, on a worker."""
     return done(study, chunk, _runner(_Same(study)).run([chunk])[0])
@@ -120,6 +135,4 @@ class _Same:
 
 @lru_cache(maxsize=2)
 def _runner(same: _Same) -> Runner:
-    import jax
-
     return Runner(same.study, jax.local_devices()[:1])

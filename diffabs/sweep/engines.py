@@ -1,7 +1,7 @@
 """Who computes the chunks: the devices of this process, or a Dask cluster (`cluster`)."""
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -27,22 +27,23 @@ class Done(NamedTuple):
 class Engine(Protocol):
     """Computes chunks in any order."""
 
-    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Iterator[Done]:
-        """Every chunk once; ends early, after what it has begun, when `stopping()`."""
+    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Generator[Done, None, None]:
+        """Every chunk once; ends early, after what it has begun, when `stopping()`, and at once when it is closed."""
         ...
 
 
 class Local:
-    """All devices of this process, a chunk on each at a time."""
+    """All devices of this process, a chunk on each at a time. Of P processes (`jax.distributed`), each takes every P-th
+    chunk."""
 
     def __init__(self, devices: Sequence[Any] | None = None):
         """All local ones if not given."""
         self.devices = list(devices or jax.local_devices())
 
-    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Iterator[Done]:
+    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Generator[Done, None, None]:
         """In order."""
         runner = Runner(study, self.devices)
-        for together in batched(chunks, len(self.devices)):
+        for together in batched(chunks[jax.process_index() :: jax.process_count()], len(self.devices)):
             for chunk, columns in zip(together, runner.run(together), strict=True):
                 yield done(study, chunk, columns)
             if stopping():

@@ -50,7 +50,8 @@ class Results:
 
     def is_number(self, name: str) -> bool:
         """Whether a column holds numbers, not names."""
-        return pa.types.is_floating(self._schema().field(name).type)
+        kind = self._schema().field(name).type
+        return pa.types.is_floating(kind) or pa.types.is_integer(kind)
 
     def _schema(self) -> pa.Schema:
         return pq.read_schema(next(iter(self.files.values())))

@@ -1,15 +1,22 @@
 """Run a sweep into a folder, or go on with one."""
 
+import contextlib
 import pathlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
 
 from diffabs import provenance
 from diffabs.sweep.engines import DECISIVE, Engine, Local
 from diffabs.sweep.results import Results
-from diffabs.sweep.store import Store
+from diffabs.sweep.store import Store, SweepError
 from diffabs.sweep.study import Study
+
+HERE, MISSING, UNKNOWN = 0, 1, 2  # a chunk
 
 
 class Progress(NamedTuple):
@@ -42,6 +49,9 @@ def sweep(
 ) -> Results:
     """Compute every chunk that the folder does not have yet, and open it.
 
+    Of several processes (`jax.distributed.initialize`) that all call this with the same study and a folder on a common
+    disk, the first has the lock and the manifest, each computes and writes its share, and all return the whole.
+
     stopping: asked after every chunk; True ends the run, and `resume` goes on later
     source: put into the manifest, for whoever reads it
 
@@ -52,16 +62,38 @@ def sweep(
     """
     study.check()
     store = Store(pathlib.Path(out))
-    with store.locked():
-        described = {"study": study.table(), "versions": provenance.versions(*DECISIVE), **provenance.commit()}
-        store.begin({**described, "source": dict(source or {})}, resume=resume)
-        whole, damaged = store.scan()
-        missing = [chunk for chunk in range(study.chunks) if chunk not in whole]
+    with _begun(store, study, resume, source or {}) as (missing, damaged):
         tally = _Tally(study, missing, tuple(damaged), progress)
-        for done in (engine or Local()).run(study, missing, stopping):
-            store.write(done.chunk, done.data)
-            tally.add(done)
+        if missing:
+            with contextlib.closing((engine or Local()).run(study, missing, stopping)) as finished:
+                for done in finished:
+                    store.write(done.chunk, done.data)
+                    tally.add(done)
     return Results(store.folder)
+
+
+@contextlib.contextmanager
+def _begun(
+    store: Store, study: Study, resume: bool, source: Mapping[str, Any]
+) -> Iterator[tuple[list[int], list[int]]]:
+    """The chunks that are missing, and those of them that were damaged. Until every process is done, the first one has
+    the folder's lock."""
+    found, damaged = np.full(study.chunks, UNKNOWN, np.int8), []
+    with contextlib.ExitStack() as held:
+        try:
+            if jax.process_index() == 0:
+                held.enter_context(store.locked())
+                described = {"study": study.table(), "versions": provenance.versions(*DECISIVE), **provenance.commit()}
+                store.begin({**described, "source": dict(source)}, resume=resume)
+                whole, damaged = store.scan()
+                found[:] = np.where(np.isin(np.arange(study.chunks), list(whole)), HERE, MISSING)
+        finally:  # whatever happened: the others wait for this
+            found = multihost_utils.broadcast_one_to_all(found)
+        if UNKNOWN in found:
+            raise SweepError(f"{store.folder}: the first process could not begin, and says why")
+        yield np.flatnonzero(found == MISSING).tolist(), damaged
+        if jax.process_count() > 1:
+            multihost_utils.sync_global_devices("chunks")
 
 
 class _Tally:

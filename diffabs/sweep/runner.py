@@ -1,20 +1,20 @@
 """Chunks of lanes in one compiled function.
 
-A block is a number of lanes of one structure, always as many. On D devices D blocks run at once, one each, by
-`shard_map`; every device runs the same program on a block of the same shape, so a lane's result does not depend on D.
-Without alternatives of parts a block is a whole chunk; with them a chunk is sorted into blocks of an eighth, the last
-of each structure filled up with copies."""
+A block is a number of lanes of one structure, always as many. On D devices D blocks run at once, each in a program of
+its own. A program sharded over the devices (`shard_map`) is another one for each D, and rounds otherwise; this one is
+always the same, so a lane's result does not depend on D. Without alternatives of parts a block is a whole chunk; with
+them a chunk is sorted into blocks of an eighth, the last of each structure filled up with copies."""
 
-import contextlib
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 
 from diffabs.conveyor import measure_lanes
-from diffabs.sweep.study import FLAGS, Study, noise_key, numbers
+from diffabs.sweep.study import FLAGS, Study, noise_key, numbers, precision
 
 PARTS_OF_A_CHUNK = 8
 
@@ -39,6 +39,7 @@ class Runner:
         self.devices = list(devices or jax.local_devices())
         self.size = study.chunk if not study.parts else -(-study.chunk // PARTS_OF_A_CHUNK)
         self._programs: dict[tuple[str, ...], Any] = {}
+        self._pool = ThreadPoolExecutor(len(self.devices))
 
     def run(self, chunks: Sequence[int]) -> list[Columns]:
         """The columns of each chunk: sample, one per variable, metrics, stopped, diverged."""
@@ -75,43 +76,28 @@ class Runner:
         return found
 
     def _together(self, names: tuple[str, ...], blocks: list[_Block]) -> Iterator[Columns]:
-        """As many blocks as there are devices, or fewer; then the last stands in for the others."""
-        filled = blocks + [blocks[-1]] * (len(self.devices) - len(blocks))
+        """One block on each device, or fewer."""
+        program = self._program(names)
+        return self._pool.map(lambda block, device: self._alone(program, block, device), blocks, self.devices)
+
+    def _alone(self, program: Any, block: _Block, device: Any) -> Columns:
         with precision(self.study.dtype):
-            values = {p: np.stack([b.values[p] for b in filled]).astype(self.study.dtype) for p in blocks[0].values}
-            samples = np.stack([b.samples for b in filled]).astype(np.uint32)
-            found = jax.device_get(self._program(names)(values, samples))
-        for i in range(len(blocks)):
-            yield {name: column[i] for name, column in found.items()}
+            values = {path: column.astype(self.study.dtype) for path, column in block.values.items()}
+            return jax.device_get(program(*jax.device_put((values, block.samples.astype(np.uint32)), device)))
 
     def _program(self, names: tuple[str, ...]) -> Any:
         if names not in self._programs:
             loop = self.study.variant(dict(zip(self.study.parts, names, strict=True)))
-            loop = jax.tree.map(lambda x: np.asarray(x, self.study.dtype), loop)
-            mesh = Mesh(np.array(self.devices), ("lanes",))
-            spec = PartitionSpec("lanes")
-            local = jax.shard_map(
-                lambda values, samples: _on_one_device(self.study, loop, values, samples),
-                mesh=mesh,
-                in_specs=(spec, spec),
-                out_specs=spec,
-                check_vma=False,
+            loop, objectives = jax.tree.map(
+                lambda x: np.asarray(x, self.study.dtype), (loop, dict(self.study.objectives))
             )
-            self._programs[names] = jax.jit(local)
+            study = dataclasses.replace(self.study, objectives=objectives)
+            self._programs[names] = jax.jit(lambda values, samples: _block(study, loop, values, samples))
         return self._programs[names]
 
 
-def _on_one_device(study: Study, loop: Any, values: Mapping[str, Any], samples: Any) -> dict[str, Any]:
-    """One block (1, lanes): metrics and flags."""
-    keys = jax.vmap(lambda sample: noise_key(study.seed, sample))(samples[0])
-    mine = {path: column[0] for path, column in values.items()}
-    done = measure_lanes(loop, mine, study.solver, study.objectives, keys=keys)
-    flags = {"stopped": done.stopped, "diverged": done.diverged}
-    return {name: column[None] for name, column in (done.metrics | flags).items()}
-
-
-@contextlib.contextmanager
-def precision(dtype: str) -> Iterator[None]:
-    """JAX's default type inside, whatever it is outside."""
-    with jax.enable_x64(dtype == "float64"):
-        yield
+def _block(study: Study, loop: Any, values: Mapping[str, Any], samples: Any) -> dict[str, Any]:
+    """Metrics and flags of a block of lanes."""
+    keys = jax.vmap(lambda sample: noise_key(study.seed, sample))(samples)
+    done = measure_lanes(loop, values, study.solver, study.objectives, keys=keys)
+    return done.metrics | {"stopped": done.stopped, "diverged": done.diverged}

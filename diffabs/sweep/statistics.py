@@ -202,8 +202,8 @@ def cvar(
     """Mean of the greatest fraction 1 - level, the sample at its edge in part; the same seed, the same interval.
 
     The interval is infinite with fewer than 10 samples in the tail. Measured for n = 500 to 2000, levels 0.9 and 0.95,
-    six laws: the percentile bootstrap covers 89 to 95 %, BCa 90 to 95 %, the studentised 92 to 96 %. Raises ValueError
-    for a level outside [0, 1), and for too few replicates.
+    six laws: the percentile bootstrap covers 89 to 95 %, BCa 90 to 95 %, the studentised 92 to 96 %. Percentiles stand
+    in where tails have no spread. Raises ValueError for a level outside [0, 1), and for too few replicates.
     """
     return _cvar(np.sort(column(values)), level, confidence, replicates, seed)
 
@@ -246,11 +246,10 @@ def _cvar(ordered: np.ndarray, level: float, confidence: float, replicates: int,
     share = n * (1 - level)
     reach = min(n, math.ceil(share + 8 * math.sqrt(share)) + FEWEST)  # no resample's tail will reach beyond
     tail = ordered[n - reach :][::-1]
-    offset = tail[0]  # so that a tail of equal values has no spread at all, not one of rounding
-    ((value, _),) = _tail_means(tail - offset, np.ones((1, reach)), share, n)
+    ((value, _),) = _tail_means(tail, np.ones((1, reach)), share, n)
     if share < FEWEST:
-        return Estimate(float(value + offset), -math.inf, math.inf, confidence, n)
-    atoms, sizes = _atoms(tail - offset)
+        return Estimate(float(value), -math.inf, math.inf, confidence, n)
+    atoms, sizes = _atoms(tail)
     ((centre, error),) = _tail_means(atoms, sizes[None].astype(float), share, n)
     found = np.concatenate([_tail_means(atoms, w, share, n) for w in _resampled(sizes, n, replicates, seed)])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -259,7 +258,7 @@ def _cvar(ordered: np.ndarray, level: float, confidence: float, replicates: int,
         ends = value - sides * error
     plain = np.sort(found[:, 0])[[place, -1 - place]]  # where this or a resample's tail has no spread: percentiles
     low, high = np.where(np.isfinite(ends) & (error > 0), ends, plain)
-    return Estimate(float(value + offset), float(low + offset), float(high + offset), confidence, n)
+    return Estimate(float(value), float(low), float(high), confidence, n)
 
 
 def _tail_means(tail: np.ndarray, weights: np.ndarray, share: float, n: int) -> np.ndarray:

@@ -83,6 +83,7 @@ class Store:
         if found:
             more = f", and {len(found) - 3} more" if len(found) > 3 else ""
             raise SweepError(f"{self.folder} holds another sweep: {'; '.join(found[:3])}{more}")
+        self.chunks.mkdir(exist_ok=True)
 
     def _begin_new(self, manifest: Mapping[str, Any]) -> None:
         if self.chunks.is_dir() and any(self.chunks.iterdir()):
@@ -120,6 +121,9 @@ def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
         manifest = json.loads(path.read_bytes())
         if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
             raise ValueError(f"format {manifest.get('format') if isinstance(manifest, dict) else None} is not {FORMAT}")
+        for name in ("study", "source"):
+            if not isinstance(manifest.get(name), dict):
+                raise ValueError(f"{name} is missing")
     except OSError as error:
         raise SweepError(f"{folder} is no sweep: {MANIFEST}: {error.strerror}") from None
     except ValueError as error:

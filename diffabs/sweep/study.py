@@ -3,6 +3,7 @@
 Lane i is a function of (seed, i) alone: its parameters come from the design, its noise from `fold_in(key, i)`. It is
 computed in chunk i // chunk, and nothing about it depends on who computes that chunk, or when."""
 
+import contextlib
 import dataclasses
 import difflib
 import json
@@ -21,8 +22,7 @@ from diffabs.sweep.discrete import Categorical
 from diffabs.sweep.space import Space
 
 DTYPES = ("float32", "float64")
-MOST_SAMPLES = 2**32 - 1  # keys are folded with 32 bits
-MOST_LANES = 2**20  # of a chunk
+RANGES = (("samples", 1, 2**32 - 1), ("chunk", 1, 2**20), ("seed", 0, 2**32 - 1))  # keys are folded with 32 bits
 NOISE = 2**32 - 1  # of the stream of keys, folded into the seed where the random design folds the number of a sample
 FLAGS = ("stopped", "diverged")
 
@@ -61,7 +61,7 @@ class Study:
         """Raises ValueError, in one line, for everything that is wrong."""
         lines = [*self._wrong_numbers(), *self._wrong_variables()] or list(problems(self.loop))
         if lines:
-            raise ValueError("; ".join(lines))
+            raise ValueError("; ".join(dict.fromkeys(lines)))
         return self
 
     def draw(self, start: int, stop: int) -> dict[str, np.ndarray]:
@@ -73,7 +73,8 @@ class Study:
         if not 0 <= i < self.samples:
             raise ValueError(f"sample {i} is outside [0, {self.samples - 1}]")
         values = {path: column[0] for path, column in self.draw(i, i + 1).items()}
-        return replace(self.variant(values), numbers(values)), noise_key(self.seed, i)
+        with precision("float64"):
+            return replace(self.variant(values), numbers(values)), noise_key(self.seed, i)
 
     def variant(self, values: Mapping[str, Any]) -> Loop:
         """The loop with the parts that a sample's names stand for."""
@@ -81,7 +82,8 @@ class Study:
 
     def table(self) -> dict[str, Any]:
         """Everything that decides the results, as values of JSON."""
-        own = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype", "failures")}
+        own: dict[str, Any] = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
+        own["failures"] = {name: float(bound) for name, bound in self.failures.items()}
         return json.loads(
             json.dumps(
                 {
@@ -98,14 +100,19 @@ class Study:
         )
 
     def _wrong_numbers(self) -> Iterator[str]:
-        for name, most in (("samples", MOST_SAMPLES), ("chunk", MOST_LANES)):
+        for name, least, most in RANGES:
             value = getattr(self, name)
-            if not (isinstance(value, int) and 1 <= value <= most):
-                yield f"{name} = {value} is outside [1, {most}]"
-        if not 0 <= self.seed < 2**32:
-            yield f"seed = {self.seed} is outside [0, {2**32 - 1}]"
+            if not isinstance(value, int):
+                yield f"{name} = {value!r} is not a whole number"
+            elif not least <= value <= most:
+                yield f"{name} = {value} is outside [{least}, {most}]"
         if self.dtype not in DTYPES:
             yield f"dtype = {self.dtype} is neither {' nor '.join(DTYPES)}"
+        for name in ("step", "duration"):
+            if not 0 < getattr(self.solver, name) < np.inf:
+                yield f"solver.{name} = {getattr(self.solver, name)} is not positive and finite"
+        for name in {"sample", *FLAGS, *self.space.paths} & self.objectives.keys():
+            yield f"objectives.{name}: another column of the table has this name"
         for name, bound in self.failures.items():
             if name not in self.objectives:
                 yield f"failures.{name} is not measured; there is {', '.join(self.objectives)}"
@@ -149,6 +156,13 @@ def _wrong_parts(path: str, distribution: Any, choices: Mapping[str, Any], loop:
 def numbers(values: Mapping[str, Any]) -> dict[str, Any]:
     """Those values that are numbers, not names."""
     return {path: value for path, value in values.items() if np.asarray(value).dtype.kind in "fiu"}
+
+
+@contextlib.contextmanager
+def precision(dtype: str) -> Iterator[None]:
+    """JAX's default type inside, whatever it is outside."""
+    with jax.enable_x64(dtype == "float64"):
+        yield
 
 
 def noise_key(seed: Any, i: Any) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Trajectories of chosen samples, run again and kept in a zarr group: dimensions `sample` and `time`.
+"""Trajectories of chosen samples, run again and kept in a zarr group: dimensions `sample` and `instant`.
 
 `xarray.open_zarr(folder / "trajectories.zarr", consolidated=False)` opens it."""
 
@@ -13,8 +13,7 @@ import numpy as np
 import zarr
 
 from diffabs.rollout import Trajectory, rollout
-from diffabs.sweep.runner import precision
-from diffabs.sweep.study import Study
+from diffabs.sweep.study import Study, precision
 
 NAME = "trajectories.zarr"
 MOST_INSTANTS = 2000  # of a trajectory

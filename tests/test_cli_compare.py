@@ -1,0 +1,80 @@
+"""`diffabs sweep` and `diffabs compare`, in this process: what the tables say, on sweeps of a few lanes."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import run
+
+from diffabs.sweep import Results
+
+SMALL = ("--samples", "24", "--set", "sweep.chunk=16", "--set", "initial.speed_kmh=30", "--set", "stop.speed_kmh=25")
+SMALL += ("--set", "solver.step=1e-3", "--set", "solver.duration=1.0", "--set", "sweep.over.initial.speed_kmh=[28,32]")
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """The same samples under two references, and the JSON of the first."""
+    folder = tmp_path_factory.mktemp("swept")
+    document = json.loads(run("sweep", "slip-lmi", "--out", folder / "a", "--json", *SMALL).stdout)
+    filtered = ("--set", "reference=filtered-slip", "--set", "reference.time_constant=0.02")
+    run("sweep", "slip-lmi", "--out", folder / "b", *SMALL, *filtered)
+    run("sweep", "slip-lmi", "--out", folder / "c", *SMALL, "--seed", "1")
+    return folder, document
+
+
+def test_the_document_is_about_the_table(swept):
+    folder, document = swept
+    found = Results(folder / "a")
+    assert document["samples"] == 24
+    assert document["digest"] == found.digest
+    overshoot = found.column("overshoot")
+    assert document["metrics"]["overshoot"]["mean"]["value"] == pytest.approx(overshoot.mean(), rel=1e-12)
+    assert document["metrics"]["overshoot"]["greatest"] == overshoot.max()
+    assert document["worst"]["overshoot"][0] == {"sample": int(overshoot.argmax()), "value": overshoot.max()}
+    failed = document["failures"]["overshoot > 0.6"]
+    assert failed["count"] == np.sum(overshoot > 0.6)
+    assert json.loads((folder / "a" / "summary.json").read_text()) == document
+
+
+def test_a_comparison_is_sample_by_sample(swept):
+    folder, _ = swept
+    result = json.loads(run("compare", folder / "a", folder / "b", "--metric", "overshoot", "--json").stdout)
+    a, b = (Results(folder / name).column("overshoot") for name in "ab")
+    row = result["metrics"]["overshoot"]
+    assert row["difference"]["value"] == pytest.approx(np.mean(b - a), rel=1e-12)
+    assert row["share in which the second is less"]["value"] == 1.0
+    spread = np.std(b - a, ddof=1) / np.sqrt(24)
+    assert row["difference"]["high"] - row["difference"]["low"] == pytest.approx(2 * 2.0686576104190406 * spread, rel=1e-9)
+
+
+def test_only_common_samples_are_compared(swept):
+    folder, _ = swept
+    result = run("compare", folder / "a", folder / "c", status=2)
+    assert "the samples are not the same: seed is 0 in the first, 1" in result.stderr
+    result = run("compare", folder / "a", folder / "b", "--metric", "overshot", status=2)
+    assert "--metric overshot is not in both; did you mean overshoot?" in result.stderr
+    result = run("compare", folder / "a", folder, status=2)
+    assert "is no sweep" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("sweep.samples=-5",), "sweep.samples = -5 is outside [0, 4294967295]"),
+        (('sweep.over."plant.mas"=[5.0,6.0]',), "sweep.over.plant.mas is not a parameter of this loop; did you mean plant"),
+        (('sweep.over."plant.mass"={type="normal",mean=5.7,deviation=1.0}',), "outside (0, inf) kg"),
+        (('sweep.over."plant.mass"={type="norma",mean=5.7}',), "norma"),
+        (('sweep.over."plant.mass"=[6.0,5.0]',), "low = 6 is not below high = 5"),
+        (('sweep.design="sobols"',), "did you mean sobol"),
+        (("sweep.failures.overshot=1.0",), "did you mean overshoot"),
+        (('sweep.dtype="float16"',), "sweep.dtype"),
+        (("sweep.over={}",), "sweep.over is empty"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, options, message):
+    changes = [part for option in options for part in ("--set", option)]
+    result = run("sweep", "slip-lmi", "--out", tmp_path / "s", *changes, status=2)
+    (line,) = [line for line in result.stderr.splitlines() if line.startswith("error: ")]
+    assert message in line
+    assert not (tmp_path / "s").exists()
