@@ -1,8 +1,8 @@
 """The probability that a metric of a study exceeds a bound, where it is too small to be counted.
 
 Standard normal coordinates z are mapped to the parameters by `Space.normal`, and the metric of the run is the score of
-`rare.subset_simulation`. All runs share one sequence of sensor noise: the probability is that over the parameters, given
-this noise."""
+`rare.subset_simulation`. All runs share one sequence of sensor noise: the probability is that over the parameters,
+given this noise."""
 
 from typing import Any
 
