@@ -193,9 +193,9 @@ def _choice(key: str, given: Any, default: Any) -> tuple[Any, dict[str, Any]]:
     table = {"choices": given} if isinstance(given, list) else given
     if not isinstance(table, dict) or not isinstance(table.get("choices"), list) or not table["choices"]:
         raise wrong(where, given, "a list of parts, or a table of choices and weights,")
-    for key in table:
-        if key not in ("choices", "weights", "type"):
-            raise unknown(f"{where}.{key} is not a field of a choice", key, ("choices", "weights"))
+    for name in table:
+        if name not in ("choices", "weights", "type"):
+            raise unknown(f"{where}.{name} is not a field of a choice", name, ("choices", "weights"))
     family = key if key in FAMILIES else family_of(key, key)
     names = [item if isinstance(item, str) else f"{i}" for i, item in enumerate(table["choices"])]
     parts = {

@@ -1,0 +1,364 @@
+"""Figures of sweeps: what is drawn are the columns. The sweeps are made up, a manifest and chunks without any run."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+from matplotlib.text import Text
+from scipy.stats import beta
+
+from diffabs import plot_sweep as plots
+from diffabs.sweep import Results
+from diffabs.sweep.store import MANIFEST, Store
+from diffabs.sweep.store import encoded as chunk
+from diffabs.sweep.summary import summary
+
+N = 1200
+A, B, C = np.random.default_rng(5).random((3, N))
+OVERSHOOT = (B - 0.5) ** 2 + 0.1 * C + 1e-3 * A  # worst at both ends of b, which no correlation sees
+DIVERGED = np.isin(np.arange(N), (7, 500, 1100))
+
+
+@pytest.fixture
+def made(tmp_path):
+    """Write a sweep of two chunks; columns that are not given are those of runs that all ended well."""
+
+    def write(variables, metrics, *, design="random", failures=None, stopped=True, diverged=False, name="", **study):
+        n = len(next(iter(variables.values())))
+        flags = {"stopped": np.full(n, stopped), "diverged": np.full(n, diverged)}
+        metrics = {key: np.where(flags["diverged"], np.nan, column) for key, column in metrics.items()}
+        columns = {"sample": np.arange(n), **variables, **metrics, **flags}
+        store, size = Store(tmp_path / str(len(list(tmp_path.iterdir())))), -(-n // 2)
+        store.chunks.mkdir(parents=True)
+        space = {"variables": {key: {} for key in variables}, "design": {"type": design}}
+        table = {"samples": n, "chunk": size, "dtype": "float64", "failures": failures or {}, "space": space, **study}
+        table["objectives"] = {key: {} for key in metrics}
+        (store.folder / MANIFEST).write_text(json.dumps({"format": 1, "study": table, "source": {"name": name}}))
+        for i in range(-(-n // size)):
+            store.write(i, chunk({key: column[i * size : (i + 1) * size] for key, column in columns.items()}))
+        return Results(store.folder)
+
+    return write
+
+
+@pytest.fixture
+def found(made):
+    """Three variables, a metric that varies and one that does not; three runs diverged, some did not stop."""
+    metrics = {"locked_time": np.zeros(N), "overshoot": OVERSHOOT, "effort": 5 + A}
+    variables = {"plant.a": A, "initial.speed": B, "plant.c": C}
+    bound = {"overshoot": 0.3}
+    return made(variables, metrics, failures=bound, stopped=C > 0.1, diverged=DIVERGED, name="rig")
+
+
+UNITS = {"initial.speed": "m/s", "plant.c": "kg", "overshoot": "1"}
+
+
+def panels(figure):
+    return {ax.get_xlabel().split(" [")[0]: ax for ax in figure.axes}
+
+
+def lines(ax):
+    return {line.get_label(): np.array(line.get_data(), float) for line in ax.get_lines()}
+
+
+def test_histograms_are_those_of_the_runs_that_did_not_diverge(found):
+    figure = plots.distributions(found, UNITS)
+    assert list(panels(figure)) == ["overshoot", "effort"]  # locked_time is constant
+    ax, values = panels(figure)["overshoot"], OVERSHOOT[~DIVERGED]
+    counts, edges, _ = ax.patches[0].get_data()
+    np.testing.assert_array_equal(counts, np.histogram(values, edges)[0])
+    assert counts.sum() == N - 3
+    assert (edges[0], edges[-1]) == (values.min(), values.max())
+    marked = [line.get_xdata()[0] for line in ax.get_lines()]
+    assert marked == pytest.approx([*np.quantile(values, (0.5, 0.05, 0.95)), 0.3], rel=1e-14)
+    assert ax.get_xlabel() == "overshoot [1]"
+    assert figure.get_suptitle() == "rig: distributions of 1,197 runs (3 diverged)"
+
+
+def test_what_would_press_a_histogram_together_is_counted_outside(made):
+    values = np.r_[A, 1e3, 2e3]
+    ax = plots.distributions(made({"a": np.r_[A, 0, 1]}, {"effort": values})).axes[0]
+    counts, edges, _ = ax.patches[0].get_data()
+    assert counts.sum() == N
+    assert edges[-1] < 4
+    assert ax.get_ylabel() == "runs (2 more outside)"
+
+
+def test_a_bound_far_from_the_data_does_not_press_them_together(made):
+    near, far = (
+        plots.distributions(made({"a": A}, {"effort": A}, failures={"effort": bound})).axes[0] for bound in (1.5, 30.0)
+    )
+    assert near.get_xlim()[1] > 1.5
+    assert far.get_xlim()[1] < 1.1
+    assert "bound 30" in lines(far)
+
+
+def test_exceedance_is_one_minus_the_empirical_distribution(found):
+    figure = plots.exceedance(found, UNITS, confidence=0.9)
+    ax, values = panels(figure)["overshoot"], OVERSHOOT[~DIVERGED]
+    x, share = lines(ax)["runs"]
+    inner = x[1:-1].reshape(-1, 2)
+    assert len(inner) > 60
+    np.testing.assert_array_equal(inner[:, 0], inner[:, 1])
+    for at, (before, after) in zip(inner[:, 0], share[1:-1].reshape(-1, 2), strict=True):
+        assert (before, after) == (np.mean(values >= at), np.mean(values > at))
+    assert np.isin(np.sort(values)[-20:], inner).all()  # near its end, step by step
+    assert (share[0], share[-1], ax.get_yscale()) == (1, 0, "log")
+    assert lines(ax)["bound 0.3"][0, 0] == 0.3
+
+
+def test_the_band_is_that_of_clopper_and_pearson(found):
+    ax, n = panels(plots.exceedance(found, confidence=0.9))["overshoot"], N - 3
+    x, share = lines(ax)["runs"]
+    k = np.round(share * n)
+    low = np.where(k > 0, beta.ppf(0.05, np.maximum(k, 1), n - k + 1), 0.0)
+    high = np.where(k < n, beta.ppf(0.95, k + 1, np.maximum(n - k, 1)), 1.0)
+    (band,) = ax.collections
+    drawn = band.get_paths()[0].vertices
+    assert band.get_label() == "90 % band"
+    for at, *ends in zip(x, low, high, strict=True):
+        assert all(np.isclose(drawn, (at, end), rtol=1e-12, atol=0).all(axis=1).any() for end in ends)
+
+
+@pytest.mark.parametrize(("design", "label"), [("sobol", "95 % band (as if independent)"), ("grid", None)])
+def test_a_band_says_what_it_takes_for_granted(made, design, label):
+    (ax,) = plots.exceedance(made({"a": A}, {"effort": A}, design=design)).axes
+    assert [band.get_label() for band in ax.collections] == ([label] if label else [])
+
+
+def test_of_a_saltelli_design_the_rows_a_are_drawn(made):
+    sweep = made({"a": A, "b": B}, {"effort": A}, design="saltelli")
+    (ax,) = plots.exceedance(sweep).axes
+    x, share = lines(ax)["runs"]
+    assert set(x[1:-1]) <= set(A[::4])
+    assert share[2] == 1 - 4 / N
+    counts, *_ = plots.distributions(sweep).axes[0].patches[0].get_data()
+    assert counts.sum() == N / 4
+
+
+def test_the_worst_are_marked_and_named(found):
+    figure = plots.worst(found, UNITS, count=6)
+    ax = figure.axes[0]
+    values = np.where(DIVERGED, -np.inf, OVERSHOOT)
+    ends = np.argsort(-values)[:6]
+    np.testing.assert_allclose(lines(ax)["the worst 6, sample: value"], [3.6 * B[ends], C[ends]], rtol=1e-14)
+    assert {text.get_text() for text in ax.texts} == {f"{i}: {values[i]:.4g}" for i in ends}
+    for text in ax.texts:
+        i = int(text.get_text().split(":")[0])
+        assert text.xy == pytest.approx((3.6 * B[i], C[i]))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("initial.speed [km/h]", "plant.c [kg]")
+    (dots,) = ax.collections
+    assert len(dots.get_offsets()) == N - 3
+    assert figure.axes[1].get_ylabel() == "overshoot [1], line: bound 0.3"
+
+
+def test_names_of_the_worst_do_not_cover_each_other_or_the_points(found):
+    figure = plots.worst(found)
+    figure.draw_without_rendering()
+    ax = figure.axes[0]
+    boxes = [Text.get_window_extent(text) for text in ax.texts]  # without the line to the point
+    assert len(boxes) == 10
+    heights = sorted((box.y0, box.y1) for box in boxes)
+    assert all(below[1] <= above[0] for below, above in itertools.pairwise(heights))
+    assert all(box.x0 > ax.bbox.x1 and box.x1 < figure.axes[1].bbox.x0 for box in boxes)
+
+
+def test_of_many_runs_some_are_drawn_and_the_worst_of_all(made):
+    n = 40_000
+    x, y = np.random.default_rng(1).random((2, n))
+    metric = np.where(np.isin(np.arange(n), (17, 39_000)), 2 + x, y)
+    ax = plots.worst(made({"x": x, "y": y}, {"effort": metric}), count=2).axes[0]
+    points = ax.collections[0].get_offsets()
+    assert 4900 < len(points) <= 5000
+    drawn = set(map(tuple, points.tolist()))
+    assert drawn <= set(zip(x.tolist(), y.tolist(), strict=True)) | set(zip(y.tolist(), x.tolist(), strict=True))
+    marks = np.array(lines(ax)["the worst 2, sample: value"])
+    assert set(map(tuple, marks.T.tolist())) <= drawn
+    assert {text.get_text().split(":")[0] for text in ax.texts} == {"17", "39000"}
+
+
+def test_a_metric_that_varies_is_taken_where_none_has_a_bound(made):
+    sweep = made({"a": A}, {"locked_time": 0 * A, "effort": A**2})
+    (ax, _) = plots.worst(sweep, {"effort": "J"}).axes
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("a", "effort [J]")
+    np.testing.assert_allclose(
+        sorted(map(tuple, ax.collections[0].get_offsets().tolist())), np.c_[A, A**2][A.argsort()]
+    )
+
+
+DOCUMENT = {
+    "confidence": 0.9,
+    "sensitivity": {
+        "effort": {
+            "a": {"spearman": {"value": 0.1, "low": -0.1, "high": 0.3}},
+            "b": {"spearman": {"value": -0.8, "low": -0.9, "high": -0.7}},
+            "c": {"spearman": {"value": None, "low": None, "high": None}},
+        },
+        "locked_time": {path: {"spearman": {"value": None, "low": None, "high": None}} for path in "abc"},
+    },
+}
+
+
+def test_rank_correlations_have_bars_and_intervals(made):
+    sweep = made({"a": A, "b": B, "c": 0 * C}, {"effort": A, "locked_time": 0 * A})
+    (ax,) = plots.sensitivity(sweep, DOCUMENT).axes
+    assert [text.get_text() for text in ax.get_yticklabels()] == ["b", "a"]
+    assert [bar.get_width() for bar in ax.patches] == [-0.8, 0.1]
+    centres = [bar.get_y() + bar.get_height() / 2 for bar in ax.patches]
+    assert centres == pytest.approx([0, 1])
+    drawn = [line.get_xydata().tolist() for line in ax.get_lines() if len(set(line.get_ydata())) == 1]
+    assert drawn == [[[-0.9, centres[0]], [-0.7, centres[0]]], [[-0.1, centres[1]], [0.3, centres[1]]]]
+
+
+def test_sobol_indices_have_two_bars_and_no_interval_where_there_is_none(made):
+    one = {"value": 0.6, "low": 0.5, "high": 0.7}
+    rows = {"a": {"first": one, "total": {**one, "value": 0.9}}, "b": {"first": one, "total": {**one, "low": None}}}
+    sweep = made({"a": A, "b": B}, {"effort": A}, design="saltelli")
+    figure = plots.sensitivity(sweep, {"confidence": 0.95, "sensitivity": {"effort": rows}})
+    ax = figure.axes[0]
+    assert [bar.get_width() for bar in ax.patches] == [0.6, 0.6, 0.9, 0.6]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["first", "total"]
+    assert sum(len(set(line.get_ydata())) == 1 for line in ax.get_lines()) == 3
+
+
+def test_no_sensitivities_no_figure(made):
+    assert (
+        plots.sensitivity(made({"a": A}, {"effort": A}, design="grid"), {"confidence": 0.95, "sensitivity": {}}) is None
+    )
+
+
+def shares(x, y, edges, failed):
+    """By looking at each cell."""
+    table = np.full([len(edge) - 1 for edge in edges], np.nan)
+    for i, j in np.ndindex(table.shape):
+        right, top = i == table.shape[0] - 1, j == table.shape[1] - 1
+        across = (x >= edges[0][i]) & ((x < edges[0][i + 1]) | right)
+        up = (y >= edges[1][j]) & ((y < edges[1][j + 1]) | top)
+        table[i, j] = np.mean(failed[across & up]) if np.any(across & up) else np.nan
+    return table
+
+
+def mesh(ax):
+    """Edges across and upward, and the table (across, upward) with NaN for masked cells."""
+    drawn = ax.collections[0]
+    corners = drawn.get_coordinates()
+    return (corners[0, :, 0], corners[:, 0, 1]), np.ma.filled(drawn.get_array().astype(float), np.nan).T
+
+
+def test_the_map_has_the_share_of_failed_runs(found):
+    figure = plots.failure_map(found, UNITS)
+    ax = figure.axes[0]
+    edges, table = mesh(ax)
+    failed = DIVERGED | (C <= 0.1) | (OVERSHOOT > 0.3)
+    np.testing.assert_allclose(table, shares(C, 3.6 * B, edges, failed), rtol=1e-14)
+    assert table.shape == (10, 10)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("plant.c [kg]", "initial.speed [km/h]")
+    assert ax.get_title() == "failed: diverged, not stopped, locked_time > 0, overshoot > 0.3"
+    assert figure.get_suptitle() == f"rig: {failed.sum()} failed of 1,200 runs (3 diverged)"
+
+
+@pytest.mark.parametrize("kind", ["diverged", "stopped", "locked", "bound"])
+def test_each_kind_of_failure_is_in_the_map(made, kind):
+    bad = A > 0.7
+    sweep = made(
+        {"a": A, "b": B},
+        {"locked_time": np.where(bad & (kind == "locked"), 0.01, 0.0), "effort": B + 2 * (bad & (kind == "bound"))},
+        failures={"effort": 1.5},
+        stopped=~bad | (kind != "stopped"),
+        diverged=bad & (kind == "diverged"),
+    )
+    ax = plots.failure_map(sweep).axes[0]
+    edges, table = mesh(ax)
+    assert ax.get_xlabel() == "a"
+    np.testing.assert_allclose(table, shares(A, B, edges, bad), rtol=1e-14)
+
+
+def test_cells_without_a_run_are_empty_and_levels_have_cells_of_their_own(made):
+    """On a triangle of levels."""
+    x, y = (np.repeat(level, 4) for level in np.tril_indices(6))
+    ax = plots.failure_map(made({"x": x + 0.0, "y": y + 0.0}, {"effort": x + 0.5 * y}, failures={"effort": 4.2})).axes[
+        0
+    ]
+    edges, table = mesh(ax)
+    np.testing.assert_array_equal(edges, [np.arange(-0.5, 6)] * 2)
+    np.testing.assert_array_equal(np.isnan(table), np.triu(np.ones((6, 6)), 1) > 0)
+    assert table[4, 0] == 0
+    assert table[4, 1] == table[5, 0] == 1
+
+
+def test_a_map_where_nothing_failed_is_over_what_moves_the_metric(found, made):
+    metrics = {"overshoot": OVERSHOOT, "effort": 5 + A}
+    sweep = made({"a": A, "b": B, "c": C}, metrics, failures={"overshoot": 9.0})
+    ax = plots.failure_map(sweep).axes[0]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("b", "c")
+    assert (mesh(ax)[1] == 0).all()
+    assert ax.collections[0].get_clim() == (0, 1)
+
+
+def test_names_are_cells_upward(made):
+    roads = np.array(["wet", "dry", "snow"])[np.random.default_rng(6).integers(3, size=N)]
+    failed = (roads == "snow") & (A > 0.5)
+    sweep = made({"road": roads, "a": A, "b": B}, {"effort": failed + 0.1 * B}, failures={"effort": 0.5})
+    ax = plots.failure_map(sweep).axes[0]
+    edges, table = mesh(ax)
+    order = ["dry", "snow", "wet"]
+    assert [text.get_text() for text in ax.get_yticklabels()] == order
+    assert ax.get_xlabel() == "a"
+    expected = shares(A, np.array([order.index(name) for name in roads]), edges, failed)
+    np.testing.assert_allclose(table, expected, rtol=1e-14)
+    scatter = plots.worst(sweep).axes[0]
+    assert {scatter.get_xlabel(), scatter.get_ylabel()} == {"a", "b"}  # numbers first
+
+
+def test_with_one_variable_the_map_is_a_strip(made):
+    ax = plots.failure_map(made({"a": A}, {"effort": A}, failures={"effort": 0.6})).axes[0]
+    (across, _), table = mesh(ax)
+    assert table.shape == (len(across) - 1, 1) == (24, 1)
+    np.testing.assert_allclose(table[:, 0], shares(A, 0 * A, (across, np.array([0, 1])), A > 0.6)[:, 0], rtol=1e-14)
+    assert not ax.yaxis.get_visible()
+
+
+def test_a_number_of_a_list_has_its_own_unit(made):
+    sweep = made({"gain.0": A, "gain.1": B}, {"effort": A + 2 * B})
+    ax = plots.worst(sweep, dict.fromkeys(("gain.0", "gain.1"), "N m/s, N m")).axes[0]
+    assert {ax.get_xlabel(), ax.get_ylabel()} == {"gain.0 [N m/s]", "gain.1 [N m]"}
+
+
+def test_draw_writes_what_there_is(found, tmp_path):
+    paths = plots.draw(found, summary(found), tmp_path, UNITS)
+    names = ["distributions", "exceedance", "worst", "sensitivity", "failure_map"]
+    assert [path.name for path in paths] == [f"{name}.png" for name in names]
+    for path in paths:
+        assert path.read_bytes().startswith(b"\x89PNG")
+        assert path.stat().st_size > 10_000
+
+
+ODD = {
+    "one run": ({"a": A[:1]}, {"effort": A[:1]}, {}, []),
+    "two runs": ({"a": A[:2]}, {"effort": A[:2]}, {}, ["distributions", "exceedance", "worst", "failure_map"]),
+    "all diverged": ({"a": A}, {"effort": A}, {"diverged": True}, ["failure_map"]),
+    "none stopped": ({"a": A, "b": B}, {"effort": 0 * A}, {"stopped": False}, ["failure_map"]),
+    "nothing varies": ({"a": 0 * A}, {"effort": 0 * A}, {}, []),
+    "rounding": ({"a": A}, {"effort": 1 + 4e-16 * (A > 0.5)}, {}, ["failure_map"]),
+    "names": (
+        {"road": np.array(["x", "y"])[(A > 0.5) * 1], "tyre": np.array(["u", "v"])[(B > 0.5) * 1]},
+        {"effort": (A > 0.5) + C},
+        {},
+        ["distributions", "exceedance", "worst", "failure_map"],
+    ),
+    "corners": (
+        {"a": np.array([0.0, 0, 1, 1]), "b": np.array([0.0, 1, 0, 1])},
+        {"effort": np.array([0.0, 1, 2, 4])},
+        {"design": "corners"},
+        ["distributions", "exceedance", "worst", "failure_map"],
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", list(ODD))
+def test_odd_sweeps_are_drawn_without_a_warning(made, tmp_path, monkeypatch, kind):
+    variables, metrics, given, names = ODD[kind]
+    monkeypatch.setattr(plots, "save", lambda figure, path: (figure.draw_without_rendering(), path)[1])
+    sweep = made(variables, metrics, **given)
+    assert [path.stem for path in plots.draw(sweep, summary(sweep), tmp_path, {})] == names
