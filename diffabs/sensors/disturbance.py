@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 
 from diffabs.integrate import axpy
 from diffabs.protocols import BrakeOutput, Clock, Jump, Memory, no_flow, no_jump, no_memory
@@ -17,7 +18,7 @@ class Noise:
     """Gaussian noise of these standard deviations, drawn every `period` and held. Needs a key: `rollout(..., key=)`.
 
     The k-th draw is a function of (key, k), so a run is deterministic and differentiable in the deviations. A channel
-    whose deviation is 0 draws nothing, which takes most of the time, and has no derivative there.
+    whose deviation is 0 draws nothing, which would take most of the time.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0)
@@ -44,7 +45,7 @@ class Noise:
         n = steps(self.period, clock.h)
         draw = clock.k // n
         deviations = (self.slip, self.speed, self.wheel_speed, self.deceleration)
-        noise = [_drawn(d, clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
+        noise = [_drawn(jnp.asarray(d), clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
         held = BrakeOutput(noise[0], noise[1], noise[2], noise[3], 0.0 * signal.distance)
         return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(draw * n == clock.k, a, b), held, memory.held)))
 
@@ -53,13 +54,22 @@ class Noise:
         yield from period_problems("period", self.period, step)
 
 
-def _drawn(deviation: Scalar, key: Any, number: Any) -> Any:
-    deviation = jnp.asarray(deviation)
+@jax.custom_jvp
+def _drawn(deviation: Any, key: Any, number: Any) -> Any:
+    """deviation z: z is drawn only where it counts, or where it is the derivative."""
+    return jax.lax.cond(deviation != 0, lambda: deviation * _normal(deviation, key, number), lambda: 0.0 * deviation)
 
-    def draw() -> Any:
-        return deviation * jax.random.normal(jax.random.fold_in(key, number), (), deviation.dtype)
 
-    return jax.lax.cond(deviation > 0, draw, lambda: 0.0 * deviation)
+def _rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    value, moving = _drawn(*primals), type(tangents[0]) is not SymbolicZero
+    return value, tangents[0] * _normal(*primals) if moving else jnp.zeros_like(value)
+
+
+_drawn.defjvp(_rule, symbolic_zeros=True)
+
+
+def _normal(like: Any, key: Any, number: Any) -> Any:
+    return jax.random.normal(jax.random.fold_in(key, number), (), like.dtype)
 
 
 @pytree
