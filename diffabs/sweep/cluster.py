@@ -66,7 +66,10 @@ def _check(client: Client) -> None:
     except TimeoutError:
         raise SweepError(f"the scheduler has no worker within {TIMEOUT:g} s") from None
     here = provenance.versions(*DECISIVE)
-    answers: Any = client.run(provenance.versions, *DECISIVE)
+    try:
+        answers: Any = client.run(provenance.versions, *DECISIVE)
+    except (ImportError, OSError, ValueError) as error:
+        raise SweepError(f"a worker cannot say its versions: {str(error).splitlines()[0]}") from None
     for worker, there in answers.items():
         for line in differences(there, here):
             raise SweepError(f"worker {worker}: {line}; results would not be those of one run")

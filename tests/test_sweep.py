@@ -1,0 +1,465 @@
+"""A sweep's table against runs one by one; what does not change it; how it is opened, replayed, and refused."""
+
+import dataclasses
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import assert_one_error_line, left_in, run
+
+import diffabs as d
+from diffabs import console, roads, variation
+from diffabs.objectives import Effort
+from diffabs.rollout import measure, rollout
+from diffabs.scenario import loads
+from diffabs.sweep import Categorical, Local, Normal, Results, Space, SweepError, Uniform, sweep
+from diffabs.sweep.trajectories import keep
+
+pytestmark = [pytest.mark.xdist_group("sweep"), pytest.mark.usefixtures("any_step_is_stable")]
+
+SMALL = """
+title = "small"
+plant = "mirrored-rig"
+[initial]
+speed_kmh = 30.0
+[stop]
+type = "speed-reached"
+speed_kmh = 25.0
+[controller]
+type = "state-feedback"
+gain = [-4000.0, -40.0]
+[sensor]
+type = "noise"
+slip = 0.005
+period = 4e-3
+[solver]
+step = 2e-3
+duration = 0.25
+[sweep]
+samples = 150
+chunk = 64
+seed = 3
+[sweep.over]
+"plant.mass" = [5.3, 6.2]
+"initial.speed_kmh" = [28.0, 34.0]
+"controller.gain.0" = { type = "triangular", low = -5e3, mode = -4e3, high = -3e3 }
+"controller.gain.1" = { type = "categorical", choices = [-40.0, 1e308], weights = [0.9, 0.1] }
+[sweep.failures]
+overshoot = 0.3
+"""
+ROAD = 'road = ["rig", { type = "scaled", road = "rig-unrounded", scale = 0.9 }]\n[sweep.failures]'
+ROADS = SMALL.replace("[sweep.failures]", ROAD)
+SINGLE = SMALL.replace("1e308", "3e38")  # diverges in float32
+TOLERANCE = {"rtol": 1e-9, "atol": 1e-12}  # the same operations, compiled apart: rounding, of runs of 125 steps
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick():
+    """No lines that depend on the machine's load."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(console, "PATIENCE", math.inf)
+        yield
+
+
+def described(text):
+    return variation.study(loads(text.encode(), "small", "small.toml"))
+
+
+@pytest.fixture(scope="module")
+def study():
+    return described(SMALL)
+
+
+@pytest.fixture(scope="module")
+def swept(study, tmp_path_factory):
+    return sweep(study, tmp_path_factory.mktemp("small") / "out")
+
+
+@pytest.fixture(scope="module")
+def with_roads():
+    return described(ROADS)
+
+
+@pytest.fixture(scope="module")
+def over_roads(with_roads, tmp_path_factory):
+    return sweep(with_roads, tmp_path_factory.mktemp("roads") / "out")
+
+
+def metrics(found):
+    """Every column that is computed, by name."""
+    return {name: found.column(name) for name in (*found.metrics, "stopped", "diverged")}
+
+
+def one_by_one(study, samples):
+    """Every column that is computed, of these samples, each run by itself."""
+    runs = []
+    with jax.enable_x64(study.dtype == "float64"):
+        for i in samples:
+            loop, key = study.lane(i)
+            loop = jax.tree.map(lambda x: jnp.asarray(x, study.dtype), loop)
+            done = measure(loop, study.solver, study.objectives, key=key)
+            runs.append(jax.device_get(done.metrics | {"stopped": done.stopped, "diverged": done.diverged}))
+    return {name: np.array([one[name] for one in runs]) for name in runs[0]}
+
+
+def same(found, expected, **tolerance):
+    assert found.keys() == expected.keys()
+    for name, column in found.items():
+        np.testing.assert_allclose(column, expected[name], err_msg=name, **tolerance)
+
+
+# What is in the table
+
+
+def test_each_row_is_its_lane_run_by_itself(with_roads, over_roads):
+    assert over_roads.column("sample").tolist() == list(range(150))
+    same(metrics(over_roads), one_by_one(with_roads, range(150)), **TOLERANCE)
+
+
+def test_parameters_are_the_drawn_ones(with_roads, over_roads):
+    drawn = with_roads.draw(0, 150)
+    assert over_roads.variables == list(drawn)
+    assert [name for name in over_roads.variables if not over_roads.is_number(name)] == ["plant.road"]
+    for path, column in drawn.items():
+        assert np.array_equal(over_roads.column(path), column)
+    assert set(drawn["plant.road"]) == {"rig", "1"}
+    for i in (0, 149):
+        loop, _ = with_roads.lane(i)
+        assert loop.plant.mass == drawn["plant.mass"][i]
+        assert loop.controller.gain.tolist() == [drawn["controller.gain.0"][i], drawn["controller.gain.1"][i]]
+        assert isinstance(loop.plant.road, roads.Scaled) == (drawn["plant.road"][i] == "1")
+
+
+def test_lanes_that_diverge_are_counted_and_kept_with_their_parameters(study, swept):
+    bad = swept.column("controller.gain.1") > 0
+    assert 5 < bad.sum() < 40
+    assert np.array_equal(swept.column("diverged"), bad)
+    rows = swept.diverged()
+    assert rows.column("sample").to_numpy().tolist() == np.flatnonzero(bad).tolist()
+    assert np.array_equal(rows.column("plant.mass").to_numpy(), study.draw(0, 150)["plant.mass"][bad])
+    assert np.isnan(rows.column("iae").to_numpy()).all()
+    assert np.isfinite(swept.column("iae")[~bad]).all()
+
+
+def test_failures_are_counted_while_it_runs(study, swept, tmp_path):
+    told = []
+    sweep(study, tmp_path / "out", progress=told.append)
+    diverged, stopped = swept.column("diverged"), swept.column("stopped")
+    failed = diverged | ~stopped | (swept.column("overshoot") > 0.3) | (swept.column("locked_time") > 0)
+    assert diverged.sum() < failed.sum() < 150
+    assert [(at.samples, at.here) for at in told] == [(0, 0), (64, 64), (128, 128), (150, 150)]
+    assert (told[-1].total, told[-1].failed, told[-1].diverged) == (150, failed.sum(), diverged.sum())
+
+
+def test_worst(swept):
+    values = np.nan_to_num(swept.column("overshoot"), nan=-np.inf)
+    rows = swept.worst("overshoot", 7)
+    assert rows.column("sample").to_numpy().tolist() == np.argsort(values)[::-1][:7].tolist()
+    assert rows.column("overshoot").to_numpy().tolist() == np.sort(values)[::-1][:7].tolist()
+
+
+def test_a_lane_does_not_depend_on_jaxs_precision(study):
+    loop, key = study.lane(5)
+    with jax.enable_x64(False):
+        other, same_key = study.lane(5)
+    assert np.array_equal(jax.random.key_data(key), jax.random.key_data(same_key))
+    for a, b in zip(jax.tree.leaves(loop), jax.tree.leaves(other), strict=True):
+        assert np.array_equal(np.asarray(a, float), np.asarray(b, float))
+
+
+# What does not change it
+
+
+def test_the_length_of_a_chunk_changes_rounding_only(study, swept, tmp_path):
+    found = sweep(dataclasses.replace(study, chunk=37), tmp_path / "out")
+    assert len(found.files) == 5
+    same(metrics(found), metrics(swept), **TOLERANCE)
+    for path in swept.variables:
+        assert np.array_equal(found.column(path), swept.column(path))
+
+
+def test_float32(tmp_path):
+    """Against runs in float32: noise is drawn from other bits than in float64."""
+    single = dataclasses.replace(described(SINGLE), dtype="float32", samples=70)
+    found = sweep(single, tmp_path / "out")
+    assert found.column("iae").dtype == np.float32
+    assert found.column("plant.mass").dtype == np.float64
+    # rounding of 125 steps, 1e-7 each, of slips and times of order 1
+    same(metrics(found), one_by_one(single, range(70)), rtol=1e-4, atol=2e-5)
+
+
+def test_objectives_of_another_precision_do_not_lower_it(study, swept, tmp_path):
+    with jax.enable_x64(False):
+        effort = Effort()
+        low = {**study.objectives, "effort": jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), effort)}
+    found = sweep(dataclasses.replace(study, objectives=low), tmp_path / "out")
+    np.testing.assert_allclose(found.column("iae"), swept.column("iae"), **TOLERANCE)
+
+
+def test_stopped_and_continued_is_the_same_to_the_bit(study, swept, tmp_path):
+    part = sweep(study, tmp_path / "out", stopping=lambda: True)
+    assert (len(part.files), part.complete) == (1, False)
+    told = []
+    whole = sweep(study, tmp_path / "out", resume=True, progress=told.append)
+    assert (told[0].samples, told[-1].here) == (64, 86)
+    assert whole.complete
+    assert whole.digest == swept.digest
+
+
+def test_a_finished_sweep_is_not_computed_again(study, swept):
+    class Nobody:
+        def run(self, *_):
+            raise AssertionError
+
+    assert sweep(study, swept.folder, resume=True, engine=Nobody()).digest == swept.digest
+
+
+def test_two_devices_change_no_bit(over_roads, file, tmp_path):
+    """The command in a process of its own, as the number of devices is fixed when JAX starts."""
+    command = ["sweep", file(ROADS), "--out", tmp_path / "out", "--devices", "2", "--json"]
+    done = subprocess.run(
+        [sys.executable, "-m", "diffabs", *map(str, command)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir},
+    )
+    assert json.loads(done.stdout)["digest"] == over_roads.digest
+
+
+def test_every_device_is_used(study, monkeypatch):
+    from diffabs.sweep import engines
+
+    asked = []
+
+    class Runner:
+        def __init__(self, study, devices):
+            asked.append(devices)
+
+        def run(self, chunks):
+            asked.append(chunks)
+            return [{"diverged": np.zeros(2, bool), "stopped": np.ones(2, bool), "iae": np.ones(2)} for _ in chunks]
+
+    monkeypatch.setattr(engines, "Runner", Runner)
+    few = dataclasses.replace(study, objectives={}, failures={})
+    found = [one.chunk for one in Local(["a", "b"]).run(few, [0, 3, 4, 6, 7], lambda: False)]
+    assert asked == [["a", "b"], [0, 3], [4, 6], [7]]
+    assert found == [0, 3, 4, 6, 7]
+
+
+# How it is opened
+
+
+def test_pandas_polars_and_xarray_in_one_call_each(over_roads):
+    mass, road = over_roads.column("plant.mass"), over_roads.column("plant.road")
+    frame = over_roads.pandas()
+    assert frame.index.name == "sample"
+    assert np.array_equal(frame["plant.mass"], mass)
+    assert frame["plant.road"].astype(str).tolist() == road.tolist()
+    table = over_roads.polars()
+    assert np.array_equal(table["plant.mass"].to_numpy(), mass)
+    assert table["plant.road"].cast(str).to_list() == road.tolist()
+    data = over_roads.xarray()
+    assert dict(data.sizes) == {"sample": 150}
+    assert np.array_equal(data["plant.mass"], mass)
+    assert float(data["iae"].sel(sample=149)) == over_roads.column("iae")[149]
+
+
+def test_the_folder_of_chunks_is_a_data_set(over_roads):
+    import duckdb
+    import pandas
+    import polars
+
+    chunks = over_roads.folder / "chunks"
+    query = f"""select "plant.road", count(*), avg("stop_time") from '{chunks}/*.parquet' where not diverged
+                group by 1 order by 1"""
+    rows = duckdb.sql(query).fetchall()
+    good, road = ~over_roads.column("diverged"), over_roads.column("plant.road")
+    for (name, count, mean), expected in zip(rows, ("1", "rig"), strict=True):
+        there = good & (road == expected)
+        assert (name, count) == (expected, there.sum())
+        np.testing.assert_allclose(mean, over_roads.column("stop_time")[there].mean(), rtol=1e-12)
+    assert np.array_equal(pandas.read_parquet(chunks).sort_values("sample")["iae"], over_roads.column("iae"), True)
+    assert polars.scan_parquet(chunks / "*.parquet").select("sample").collect().height == 150
+
+
+def test_trajectories_are_those_of_rollout(study, tmp_path):
+    import xarray
+
+    data = xarray.open_zarr(keep(study, tmp_path, [7, 3]), consolidated=False)
+    assert dict(data.sizes) == {"sample": 2, "instant": study.solver.steps + 1}
+    assert data["sample"].values.tolist() == [7, 3]
+    assert (data["time"].attrs["units"], data["speed"].attrs["units"]) == ("s", "m/s")
+    loop, key = study.lane(3)
+    seen = rollout(loop, study.solver, key=key).trajectory.sample
+    expected = {"time": seen.t, "slip": seen.output.slip, "command": seen.command, "distance": seen.output.distance}
+    for name, values in expected.items():
+        np.testing.assert_allclose(data[name].sel(sample=3), values, err_msg=name, **TOLERANCE)
+    assert left_in(tmp_path) == {"trajectories.zarr"}
+
+
+# From the command line
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def by_command(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(request.param)
+    (folder / "small.toml").write_text(SMALL if request.param == "float64" else SINGLE)
+    changes = ("--set", f"sweep.dtype={request.param}", "--samples", "70", "--keep", "1,69", "--json")
+    done = run("sweep", folder / "small.toml", "--out", folder / "out", *changes)
+    return folder / "out", json.loads(done.stdout), done.stderr
+
+
+def test_the_command_computes_the_table(by_command, swept):
+    folder, document, said = by_command
+    assert (document["samples"], document["complete"], said) == (70, True, "")
+    found = Results(folder)
+    assert found.digest == document["digest"]
+    assert left_in(folder) == {".lock", "manifest.json", "chunks", "summary.json", "trajectories.zarr"}
+    if found.study["dtype"] == "float64":
+        assert (folder / "chunks" / swept.files[0].name).read_bytes() == swept.files[0].read_bytes()
+
+
+def test_a_sample_that_is_simulated_again_is_its_row(by_command):
+    folder, document, _ = by_command
+    table = Results(folder).pandas()
+    good, bad = document["worst"]["overshoot"][0]["sample"], document["diverged"]["samples"][0]
+    tolerance = TOLERANCE if table["iae"].dtype == float else {"rtol": 1e-4, "atol": 2e-5}
+    for number, status in ((good, 0), (bad, 1)):
+        again = json.loads(run("simulate", "--from-sweep", folder, "--sample", number, "--json", status=status).stdout)
+        assert (again["stopped"], again["diverged"]) == tuple(table.loc[number, ["stopped", "diverged"]])
+        for name, value in again["metrics"].items():
+            np.testing.assert_allclose(math.nan if value is None else value, table.loc[number, name], **tolerance)
+
+
+# What cannot be
+
+
+BAD = [
+    (("--samples", "0"), "--samples 0 is not positive"),
+    (("--samples", "-5"), "--samples -5 is not positive"),
+    (("--set", "sweep.samples=-5"), "sweep.samples = -5 is outside [0, 4294967295]"),
+    (("--set", "sweep.chunk=0"), "sweep.chunk = 0 is outside [1, 1048576]"),
+    (("--seed", "-1"), "sweep.seed = -1 is outside"),
+    (("--set", "sweep.over.plant.mas=1,2"), "sweep.over.plant.mas is not a parameter of this loop; did you mean"),
+    (("--set", "sweep.over.plant.mass=-1,2"), "sweep.over.plant.mass", "(0, inf) kg"),
+    (("--set", "sweep.over.plant.mass=[6,5]"), "sweep.over.plant.mass"),
+    (("--set", "sweep.over.controller.gain.7=1,2"), "sweep.over.controller.gain.7 is not a parameter of this loop"),
+    (("--set", 'sweep.over.road=["glass"]'), "sweep.over.road.0"),
+    (("--set", "sweep.failures.overshot=1"), "sweep.failures.overshot is not measured; did you mean overshoot?"),
+    (("--engine", "spark"), "--engine spark is unknown"),
+    (("--scheduler", "tcp://127.0.0.1:1"), "--scheduler tcp://127.0.0.1:1 needs --engine dask"),
+    (("--devices", "2", "--engine", "dask"), "--devices 2 needs --engine local"),
+    (("--keep", "1,150"), "--keep 150 is outside [0, 149]"),
+    (("--keep", "first"), "--keep first is no list of sample numbers"),
+]
+
+
+@pytest.mark.parametrize("case", BAD, ids=[" ".join(case[0]) for case in BAD])
+def test_bad_input_is_one_line_and_leaves_nothing(file, tmp_path, case):
+    args, *needed = case
+    result = run("sweep", file(SMALL), "--out", tmp_path / "out", *args, status=2)
+    assert_one_error_line(result)
+    for text in needed:
+        assert text in result.stderr
+    assert left_in(tmp_path) == {"mine.toml"}
+
+
+def test_nothing_varies(file, tmp_path):
+    text = SMALL[: SMALL.index("[sweep.over]")]
+    result = run("sweep", file(text), "--out", tmp_path / "out", status=2)
+    assert_one_error_line(result)
+    assert "sweep.over is empty" in result.stderr
+
+
+def test_a_folder_that_cannot_be_written(file):
+    scenario = file(SMALL)
+    result = run("sweep", scenario, "--out", scenario / "out", status=2)
+    assert_one_error_line(result)
+    assert result.stderr == f"error: {scenario / 'out'} cannot be written: Not a directory\n"
+
+
+def test_a_folder_with_something_else_is_left_alone(file, tmp_path):
+    scenario = file(SMALL)
+    (tmp_path / "summary.json").write_text("mine")
+    (tmp_path / "notes.tmp").write_text("mine")
+    result = run("sweep", scenario, "--out", tmp_path, status=2)
+    assert_one_error_line(result)
+    assert f"{tmp_path} is no sweep, but holds mine.toml; choose a folder that is new or empty" in result.stderr
+    assert left_in(tmp_path) == {".lock", "mine.toml", "summary.json", "notes.tmp"}
+
+
+def test_a_sweep_is_not_begun_again_over_another(file, swept):
+    before = {path.name: path.read_bytes() for path in swept.folder.iterdir() if path.is_file()}
+    result = run("sweep", file(SMALL), "--out", swept.folder, status=2)
+    assert_one_error_line(result)
+    assert "already holds a sweep; --resume continues it" in result.stderr
+    assert before == {path.name: path.read_bytes() for path in swept.folder.iterdir() if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("args", "needed"),
+    [
+        (("--from-sweep", "{}", "--sample", "150"), "--sample 150 is outside [0, 149]"),
+        (("--from-sweep", "{}", "--sample", "0"), "was not swept from a scenario; Study.lane(0) is this sample"),
+        (("--from-sweep", "{}/chunks", "--sample", "0"), "is no sweep: manifest.json: No such file or directory"),
+    ],
+)
+def test_a_sample_that_is_not_there(swept, args, needed, monkeypatch):
+    if "outside" in needed:
+        source = {"scenario": SMALL, "name": "small"}
+        there = {"format": 1, **json.loads((swept.folder / "manifest.json").read_text()), "source": source}
+        monkeypatch.setattr("diffabs.sweep.store.read_manifest", lambda folder: there)
+    result = run("simulate", *(arg.format(swept.folder) for arg in args), status=2)
+    assert_one_error_line(result)
+    assert needed in result.stderr
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"format": 1}', '{"format": 2, "study": {}, "source": {}}'])
+def test_a_manifest_that_cannot_be_read(tmp_path, text):
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(SweepError, match=r"is no sweep that can be read: manifest.json: [^\n]+\Z"):
+        Results(tmp_path)
+
+
+WRONG = [
+    ({"samples": 0}, "samples = 0 is outside [1, 4294967295]"),
+    ({"samples": -3}, "samples = -3 is outside [1, 4294967295]"),
+    ({"samples": 2.5}, "samples = 2.5 is not a whole number"),
+    ({"chunk": 0}, "chunk = 0 is outside [1, 1048576]"),
+    ({"seed": 1.5}, "seed = 1.5 is not a whole number"),
+    ({"seed": -1}, "seed = -1 is outside [0, 4294967295]"),
+    ({"dtype": "float16"}, "dtype = float16 is neither float32 nor float64"),
+    ({"solver": d.FixedStep(-1.0, 0.25)}, "solver.step = -1.0 is not positive and finite"),
+    ({"solver": d.FixedStep(1e-3, math.nan)}, "solver.duration = nan is not positive and finite"),
+    ({"failures": {"overshot": 1.0}}, "failures.overshot is not measured"),
+    ({"failures": {"overshoot": math.nan}}, "failures.overshoot = nan is not a finite number"),
+    ({"objectives": {"stopped": Effort()}, "failures": {}}, "objectives.stopped: another column"),
+    ({"space": Space({"plant.mas": Uniform(5.0, 6.0)})}, "plant.mas is not a parameter of this loop; did you mean"),
+    ({"space": Space({"plant.mass": Normal(5.0, 1.0)})}, "plant.mass"),
+    ({"space": Space({"plant.road": Categorical(("dry",))})}, "plant.road is not a parameter of this loop"),
+    ({"space": Space({})}, "variables are empty: nothing varies"),
+]
+
+
+@pytest.mark.parametrize(("changes", "needed"), WRONG, ids=[needed for _, needed in WRONG])
+def test_a_study_that_cannot_be(study, tmp_path, changes, needed):
+    with pytest.raises(ValueError, match=re.escape(needed)) as error:
+        sweep(dataclasses.replace(study, **changes), tmp_path / "out")
+    assert str(error.value).count("\n") == 0
+    assert str(error.value).count(needed) == 1
+    assert left_in(tmp_path) == set()
+
+
+def test_a_study_has_a_table_of_plain_values(study):
+    failures = {"overshoot": np.float32(0.5)}
+    table = dataclasses.replace(study, failures=failures).check().table()
+    assert json.loads(json.dumps(table)) == table
+    assert table["failures"] == {"overshoot": 0.5}
