@@ -80,7 +80,7 @@ class Results:
 
     def polars(self) -> Any:
         """A polars.DataFrame."""
-        import polars
+        import polars  # pyright: ignore[reportMissingImports]  # the user has it, or not
 
         return polars.from_arrow(self.table())
 
