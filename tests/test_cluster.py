@@ -24,7 +24,7 @@ from diffabs.scenario import loads
 from diffabs.sweep import cluster, sweep
 from diffabs.sweep.cluster import Dask
 
-pytestmark = pytest.mark.xdist_group("cluster")  # they share two workers
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("cluster")]  # they share two workers
 
 SCENARIO = """
 plant = "mirrored-rig"

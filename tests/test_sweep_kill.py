@@ -266,6 +266,7 @@ def test_control_c_says_how_to_go_on(whole, tmp_path):
     assert there < chunks(folder)
 
 
+@pytest.mark.slow
 def test_control_c_twice_does_not_wait(whole, tmp_path):
     """For a chunk that takes minutes. What it leaves can be continued."""
     folder = tmp_path / "out"
