@@ -22,15 +22,16 @@ from diffabs import (
     console,
     show,
 )
+from diffabs.loop import task
 from diffabs.rollout import Run, measure, rollout
-from diffabs.scenario import Scenario, header, load, names
+from diffabs.scenario import Scenario, header, names
 
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,  # plain usage errors: one line that scripts and people can read
     pretty_exceptions_enable=False,
-    help="Simulate, differentiate, tune and certify controllers for braking wheels.",
+    help="Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers.",
 )
 
 MOST_ROWS = 20_000  # of a trajectory
@@ -64,7 +65,7 @@ def setup(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """Simulate, differentiate, tune and certify controllers for braking wheels."""
+    """Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers."""
     del version
     jax.config.update("jax_enable_x64", True)
 
@@ -95,24 +96,32 @@ def simulate(
             if from_sweep and sample is not None:
                 chosen, key = console.waited(lambda: commands_sweep.sample(from_sweep, sample), "reading the sweep")
             else:
-                chosen = console.waited(lambda: load(scenario or "", changes), "checking the scenario")
+                chosen = console.loaded(scenario or "", changes)
                 key = chosen.key()
             run = console.waited(lambda: _run(chosen, key, keep=bool(csv or plot)), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
                 show.write_csv(run.trajectory, getattr(chosen.loop.plant, "control_unit", "N m"), csv_file)
             if picture:
-                from diffabs.plot import braking
+                from diffabs import plot as figures
 
-                braking(run, title=chosen.title or chosen.name).savefig(picture)
+                draw = getattr(figures, task(chosen.loop.plant))
+                draw(run, title=chosen.title or chosen.name).savefig(picture)
         result = _result(chosen, run, {"csv": csv, "plot": plot})
         show.as_json(result) if as_json else show.run(result, chosen)
         if result["diverged"]:
             console.fail(f"{chosen.name} diverged: a number became infinite or NaN, so there are no metrics", 1)
-        if not result["stopped"]:
-            console.say(
-                f"warning: NOT STOPPED within solver.duration = {chosen.solver.duration:g} s; stop_time and"
-                " stop_distance are extrapolated with the last deceleration"
-            )
+        if warning := _warning(chosen, result):
+            console.say(f"warning: {warning}")
+
+
+def _warning(chosen: Scenario, result: dict[str, Any]) -> str:
+    """What a reader of the metrics must know about how the run ended."""
+    if task(chosen.loop.plant) == "balance":
+        return "FELL: the frame reached the stop's angle" if result["stopped"] else ""
+    if result["stopped"]:
+        return ""
+    duration = f"NOT STOPPED within solver.duration = {chosen.solver.duration:g} s"
+    return f"{duration}; stop_time and stop_distance are extrapolated with the last deceleration"
 
 
 def _check_source(scenario: Any, from_sweep: Any, sample: int | None, changes: Any, seed: int | None) -> None:

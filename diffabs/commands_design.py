@@ -12,7 +12,6 @@ import typer
 
 from diffabs import console, proof, show
 from diffabs.pytree import parameters
-from diffabs.scenario import load
 
 CHECK = "check it with: python experiments/check_certificate.py"
 
@@ -72,7 +71,7 @@ def _file(out: pathlib.Path | None) -> contextlib.AbstractContextManager[pathlib
 
 
 def _task(scenario: str, changes: Sequence[str], gain: str | None = None, *, weighed: bool = False) -> proof.Task:
-    return proof.task(load(scenario, changes, integrated=False), gain, weighed=weighed)
+    return proof.task(console.loaded(scenario, changes, integrated=False), gain, weighed=weighed)
 
 
 def _show(result: dict[str, Any], task: proof.Task, as_json: bool) -> None:

@@ -18,7 +18,7 @@ from diffabs.pytree import get, parameters
 from diffabs.ranges import flat
 from diffabs.readings import UNITS, Readings, read
 from diffabs.rollout import FixedStep
-from diffabs.scenario import Scenario, dump, load
+from diffabs.scenario import Scenario, dump
 
 if TYPE_CHECKING:
     from diffabs.tune.fit import Identified
@@ -61,7 +61,7 @@ def identify(
         with console.new_file(out, "--out") if out else contextlib.nullcontext() as file:
             readings = _readings(data, column)
             noise = _noise(sigma or (), readings)
-            chosen = console.waited(lambda: load(scenario, changes or ()), "checking the scenario")
+            chosen = console.loaded(scenario, changes)
             ranges = _ranges(free, chosen)
             message = f"identifying {chosen.name}"
             found, noise = console.waited(lambda: _identified(chosen, readings, ranges, noise), message)

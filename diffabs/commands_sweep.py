@@ -24,7 +24,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from diffabs import console, show, variation
 from diffabs.catalogue import ScenarioError, unit_of, unknown
 from diffabs.pytree import elements
-from diffabs.scenario import Scenario, dump, load, loads
+from diffabs.scenario import Scenario, dump, loads
 
 if TYPE_CHECKING:
     from diffabs.sweep import Progress as Told
@@ -63,7 +63,7 @@ def sweep(
             jax.config.update("jax_num_cpu_devices", devices)
         given = {"samples": samples, "seed": seed}
         changes = [*(changes or ()), *(f"sweep.{k}={v}" for k, v in given.items() if v is not None)]
-        chosen = console.waited(lambda: load(scenario, changes), "checking the scenario")
+        chosen = console.loaded(scenario, changes)
         study = variation.study(chosen)
         kept = _numbers(keep, study.samples)
         with _continued():

@@ -14,7 +14,7 @@ import typer
 from diffabs import console, proof, show
 from diffabs.pytree import get, parameters
 from diffabs.rollout import Trajectory, rollout
-from diffabs.scenario import Scenario, dump, load
+from diffabs.scenario import Scenario, dump
 
 if TYPE_CHECKING:
     from diffabs.tune import Batch, Progress, Tuned
@@ -60,7 +60,7 @@ def tune(
         with contextlib.ExitStack() as files:
             out_file = files.enter_context(console.new_file(out, "--out")) if out else None
             picture = files.enter_context(console.new_file(plot, "--plot")) if plot else None
-            chosen = console.waited(lambda: load(scenario, changes), "checking the scenario")
+            chosen = console.loaded(scenario, changes)
             result, told = _tuned(chosen, out_file, picture)
             if not result["met"]:  # inside, so that no file is written
                 _show(result, told, chosen, as_json)

@@ -10,13 +10,14 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, NoReturn, TypeVar
 
 import typer
 from rich.console import Console
 
 from diffabs.catalogue import ScenarioError
+from diffabs.scenario import Scenario, load
 
 T = TypeVar("T")
 
@@ -99,6 +100,14 @@ def waited(work: Callable[[], T], message: str, detail: Callable[[], str] | None
     if errors:
         raise errors[0]
     return result[0]
+
+
+def loaded(scenario: str, changes: Sequence[str] | None, *, integrated: bool = True) -> Scenario:
+    """A scenario; says what is allowed in it but hardly meant. Raises ScenarioError."""
+    chosen = waited(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
+    for line in chosen.cautions():
+        say(f"warning: {line}")
+    return chosen
 
 
 def leave(status: Any) -> NoReturn:

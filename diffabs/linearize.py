@@ -218,7 +218,7 @@ class SlipModel:
         if isinstance(self.actuator, Lag):
             system = _behind_lag(system, self.actuator.time_constant)
         if isinstance(self.sampling, Sampling):
-            system = _held(system, self.sampling.period, self.sampling.delay)
+            system = held(system, self.sampling.period, self.sampling.delay)
         return system
 
     def with_memory(self, system: StateSpace) -> StateSpace:
@@ -257,7 +257,7 @@ def _behind_lag(system: StateSpace, time_constant: Any) -> StateSpace:
     return StateSpace(wider, jnp.zeros((n + 1, 1), a.dtype).at[n, 0].set(rate))
 
 
-def _held(system: StateSpace, period: Any, delay: Any) -> StateSpace:
+def held(system: StateSpace, period: Any, delay: Any) -> StateSpace:
     """One period of the system under an input that is the last state, the previous input, until `delay`, then the new
     one: x(T) = e^(A T) x + e^(A (T - d)) G(d) u_old + G(T - d) u,  G(s) = integral of e^(A r) B over r in [0, s]."""
     (a, b), n, m = system, *system.B.shape

@@ -9,12 +9,12 @@ A `Loop` is one pytree: every parameter of every part is a leaf with a dotted pa
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from diffabs.actuators import VoltageLimit
 from diffabs.blocks import Direct
-from diffabs.controllers import PID, NoFeedforward
-from diffabs.plants import BrakeStart, QuarterCar
+from diffabs.controllers import PID, BalanceFeedback, NoFeedforward
+from diffabs.plants import ArmBalance, BalanceStart, BrakeStart, QuarterCar
 from diffabs.protocols import (
     Block,
-    BrakeOutput,
     Clock,
     Feedforward,
     Memory,
@@ -25,8 +25,8 @@ from diffabs.protocols import (
     Tracking,
 )
 from diffabs.pytree import Scalar, part, pytree
-from diffabs.references import FixedSlip
-from diffabs.stops import Standstill
+from diffabs.references import FixedSlip, Upright
+from diffabs.stops import Fallen, Standstill
 
 BLOCKS = ("sensor", "reference", "controller", "actuator")
 
@@ -53,7 +53,7 @@ class Signals(NamedTuple):
     """Every signal of the loop at an instant."""
 
     sample: Sample
-    measured: BrakeOutput
+    measured: Any
     tracking: Tracking
 
 
@@ -140,7 +140,25 @@ class Loop:
             if hasattr(block, "grid_problems"):
                 yield from (f"{name}.{line}" for line in block.grid_problems(step))
 
-    def _tracking(self, t: Scalar, reference: Memory, measured: BrakeOutput) -> Tracking:
+    def _tracking(self, t: Scalar, reference: Memory, measured: Any) -> Tracking:
         target = self.reference.output(t, reference, measured)
         setpoint = self.reference.setpoint(reference)
         return Tracking(target, measured, self.feedforward.input(self.plant, measured, setpoint))
+
+
+def task(plant: Plant) -> str:
+    """What a plant is controlled for: braking, or balance."""
+    return getattr(plant, "task", "braking")
+
+
+TYPICAL = {  # of each task
+    "braking": Loop(),
+    "balance": Loop(
+        plant=ArmBalance(),
+        initial=BalanceStart(),
+        reference=Upright(),
+        controller=BalanceFeedback(),
+        actuator=VoltageLimit(),
+        stop=Fallen(),
+    ),
+}

@@ -89,6 +89,33 @@ def braking(run: Run, *, title: str = "") -> Figure:
     return figure
 
 
+def balance(run: Run, *, title: str = "") -> Figure:
+    """A run of a two-wheeler at a glance: angles, rates, voltage, torque. Raises ValueError for a run without a
+    trajectory, as `measure` returns it."""
+    seen = _trajectory(run)
+    figure, (angles, rates, voltage, torque) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
+    t, sample = np.asarray(seen.sample.t), seen.sample
+    angle_lines(angles, seen)
+    label(angles, "", "angle [rad]")
+    angle_lines(rates, seen, "_rate")
+    label(rates, "", "rate [rad/s]", legend=False)
+    voltage.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
+    voltage.plot(t, sample.control, color=COLOURS[0], label="control")
+    most = np.max(np.abs(sample.control))
+    voltage.set_ylim(-1.5 * most - 1e-9, 1.5 * most + 1e-9)  # a command far beyond the supply says no more
+    label(voltage, "time [s]", "voltage [V]")
+    torque.plot(t, sample.output.stall * sample.control + sample.output.drag, color=COLOURS[0])
+    label(torque, "time [s]", "motor torque [N m]")
+    return figure
+
+
+def angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
+    """Draw frame, arm and rider into an axes; their rates with the suffix `_rate`."""
+    for i, (name, words) in enumerate({"theta": "frame", "psi": "arm", "phi": "rider"}.items()):
+        values = getattr(seen.sample.output, name + suffix)
+        ax.plot(np.asarray(seen.sample.t), values, DASHES[i], color=COLOURS[i], label=f"{words} {name}")
+
+
 def slips(runs: Mapping[str, Trajectory], *, title: str = "", until: float | None = None) -> Figure:
     """Slip over time, one curve per run, and the setpoint of the first."""
     figure, (ax,) = sheet(title=title, size=(6.4, 3.8))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffabs.plot import COLOURS, GREY, KMH, Axes, Figure, label, save, sheet
-from diffabs.sweep.engines import failing
+from diffabs.sweep.engines import failing, missed
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics import Count, Tail
 
@@ -137,7 +137,8 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """The share of failed runs in cells of the two variables that move it most, or that move the metric of `worst` most
     if too few failed, or did not; cells without a run are grey. None where no variable varies."""
     view = _View(found, units)
-    rules = [~view.good, ~found.column("stopped"), *(found.column(name) > view.bounds[name] for name in view.bounds)]
+    late = missed(found.column("stopped"), found.study["objectives"])
+    rules = [~view.good, late, *(found.column(name) > view.bounds[name] for name in view.bounds)]
     failed = np.any(rules, axis=0)
     rows, result = (every := np.full(len(failed), True)), failed
     if view.leading and min(np.sum(failed), np.sum(~failed)) < FEW:

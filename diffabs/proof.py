@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from diffabs import console, show
+from diffabs.balance_model import BalanceModel
 from diffabs.catalogue import ScenarioError, shown
 from diffabs.controllers import ProportionalFeedback, Sampled
 from diffabs.loop import Loop
@@ -55,6 +56,7 @@ def task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) ->
         raise ScenarioError("design.Q and design.R are missing: a design minimises the cost that they weigh")
     from diffabs.design import Spec, lmi
     from diffabs.design.box import polytope
+    from diffabs.design.gridded import gridded
     from diffabs.design.reduction import state_feedback
 
     reduced, wanted = state_feedback(chosen.loop), chosen.design
@@ -67,14 +69,15 @@ def task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) ->
         raise ScenarioError(f"design.{error}; the states are {', '.join(states)}") from None
     lmi.solvers()  # says what is missing before anything is computed
     reduced, model, over = _followed(chosen.loop, reduced, wanted.box(chosen.loop))
-    return Task(chosen, reduced, values, model, over, polytope(model, over), spec)
+    systems = gridded(model, over) if isinstance(model, BalanceModel) else polytope(model, over)
+    return Task(chosen, reduced, values, model, over, systems, spec)
 
 
 def _followed(loop: Loop, reduced: "Reduced", box: Box) -> tuple["Reduced", Any, Box]:
     """The linear model and its box; where the gain follows the speed, those in which it is one gain, whose proof covers
     every fall of the speed that friction allows."""
     controller = loop.controller.controller if isinstance(loop.controller, Sampled) else loop.controller
-    if not isinstance(controller, ProportionalFeedback):
+    if not isinstance(controller, ProportionalFeedback) or isinstance(reduced.model, BalanceModel):
         return reduced, reduced.model, box
     from diffabs.design.scaled import SpeedScaled, fall
 

@@ -14,9 +14,12 @@ Sensor, Reference, Controller and Actuator are `Block`s: dynamic systems with a 
 inside every Runge-Kutta stage, the jump once at the start of every step; that is how a continuous PID and a computer's
 relay live in one loop. Nothing here is a base class: a part satisfies a contract by its shape.
 
+A plant has a task, braking or balance, which says what it shows: a `BrakeOutput` or a `BalanceOutput`. Blocks, stops
+and objectives that read one do not fit a loop of the other.
+
 Conventions. Arguments come in the order (t, x, u). SI units. slip = (v - r omega)/v, positive in braking. A positive
 torque brakes. State feedback is u = K x with x = (integral of (slip - target), slip - target): the sign of K is the
-papers', so a stabilising K is negative.
+papers', so a stabilising K is negative. A balance leans to the side of positive angles, and u = K x there too.
 """
 
 from typing import Any, NamedTuple, Protocol
@@ -32,6 +35,28 @@ class BrakeOutput(NamedTuple):
     wheel_speed: Scalar  # [m/s] r omega, of the wheel's rim
     deceleration: Scalar  # [m/s^2] of the vehicle, positive in braking
     distance: Scalar  # [m] travelled
+
+
+class BalanceOutput(NamedTuple):
+    """What a balancing plant shows of itself, and what a sensor measures. Motor torque = stall * voltage + drag."""
+
+    theta: Scalar  # [rad] frame, from the vertical
+    psi: Scalar  # [rad] arm, from the frame
+    phi: Scalar  # [rad] rider, from the frame
+    theta_rate: Scalar  # [rad/s]
+    psi_rate: Scalar  # [rad/s]
+    phi_rate: Scalar  # [rad/s]
+    stall: Scalar  # [N m/V] torque per volt
+    drag: Scalar  # [N m] torque without voltage
+
+
+Output = BrakeOutput | BalanceOutput
+
+UNITS = {  # of every output
+    **{"slip": "1", "speed": "m/s", "wheel_speed": "m/s", "deceleration": "m/s^2", "distance": "m"},
+    **{"theta": "rad", "psi": "rad", "phi": "rad", "theta_rate": "rad/s", "psi_rate": "rad/s", "phi_rate": "rad/s"},
+    **{"stall": "N m/V", "drag": "N m"},
+}
 
 
 class Memory(NamedTuple):
@@ -51,10 +76,10 @@ class Clock(NamedTuple):
 
 
 class Tracking(NamedTuple):
-    """What a controller is given: target slip [1], measured output, and the feed-forward input."""
+    """What a controller is given: target (a slip [1], or 0 rad), measured output, and the feed-forward input."""
 
     target: Scalar
-    measured: BrakeOutput
+    measured: Any
     feedforward: Scalar
 
 
@@ -62,10 +87,10 @@ class Sample(NamedTuple):
     """What is seen of a run at an instant; the input of an objective."""
 
     t: Scalar  # [s]
-    output: BrakeOutput  # the truth, not the measurement
-    target: Scalar  # [1] what the controller is told to follow now
-    setpoint: Scalar  # [1] where the target will settle
-    feedforward: Scalar  # [N m]
+    output: Any  # the truth, not the measurement: a BrakeOutput or a BalanceOutput
+    target: Scalar  # [1 or rad] what the controller is told to follow now
+    setpoint: Scalar  # [1 or rad] where the target will settle
+    feedforward: Scalar  # [N m or V]
     command: Scalar  # what the controller asks for
     control: Scalar  # what the actuator delivers
 
@@ -103,12 +128,12 @@ class Plant(Protocol):
         """The nearest admissible state, applied after every step: a stopped wheel does not turn backwards."""
         ...
 
-    def output(self, state: Any) -> BrakeOutput:
+    def output(self, state: Any) -> Any:
         """What is seen of the state."""
         ...
 
-    def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
-        """The control that holds the slip at `target`: the feed-forward tau*."""
+    def holding(self, output: Any, target: Scalar) -> Scalar:
+        """The control that holds the plant at `target`: the feed-forward tau*."""
         ...
 
 
@@ -142,7 +167,7 @@ class Jump(NamedTuple):
 
 
 class Reference(Block, Protocol):
-    """A Block whose output is the target slip."""
+    """A Block whose output is the target."""
 
     def setpoint(self, memory: Memory) -> Scalar:
         """Where the target will settle, as known now: what settling and overshoot are measured against."""
@@ -152,19 +177,19 @@ class Reference(Block, Protocol):
 class Feedforward(Protocol):
     """The input that a controller adds its feedback to."""
 
-    def input(self, plant: Any, output: BrakeOutput, target: Scalar) -> Scalar:
-        """Control [N m] for a target slip."""
+    def input(self, plant: Any, output: Any, target: Scalar) -> Scalar:
+        """Control [N m] for a target."""
         ...
 
 
 class Stop(Protocol):
     """When a run ends."""
 
-    def margin(self, output: BrakeOutput) -> Scalar:
+    def margin(self, output: Any) -> Scalar:
         """Positive while the run goes on; the run ends where it crosses zero."""
         ...
 
-    def rate(self, output: BrakeOutput) -> Scalar:
+    def rate(self, output: Any) -> Scalar:
         """d(margin)/dt, negative near the end: the slope for landing on the crossing."""
         ...
 

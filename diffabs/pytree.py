@@ -23,6 +23,7 @@ from jax.typing import ArrayLike
 
 Scalar = Any  # a float, a NumPy or JAX scalar, a tracer; a batch of them under vmap
 Vector = Any  # the same with one axis
+Matrix = Any  # with two
 
 T = TypeVar("T")
 
@@ -76,9 +77,9 @@ def param(
         infinite,
         tunable,
     )
-    if isinstance(default, tuple | list):
-        values = tuple(float(v) for v in default)
-        return dataclasses.field(default_factory=lambda: np.array(values), metadata={"spec": spec})
+    if isinstance(default, tuple | list | np.ndarray):
+        values = np.array(default, float)
+        return dataclasses.field(default_factory=values.copy, metadata={"spec": spec})
     return dataclasses.field(default=default, metadata={"spec": spec})
 
 
@@ -165,6 +166,15 @@ def problems(part: Any, prefix: str = "") -> Iterator[str]:
             yield from problems(value, f"{name}.")
     if own is not None and not found:
         yield from (prefix + line for line in own())
+
+
+def cautions(part: Any, prefix: str = "") -> Iterator[str]:
+    """One line for each thing that is allowed but hardly meant: what the parts' methods `cautions` say."""
+    for name, field, value in _children(part, prefix):
+        if field is None or "spec" not in field.metadata:
+            yield from cautions(value, f"{name}.")
+    if hasattr(part, "cautions"):
+        yield from (prefix + line for line in part.cautions())
 
 
 def check(part: T, prefix: str = "") -> T:

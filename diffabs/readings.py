@@ -10,10 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.catalogue import ScenarioError, shown
-from diffabs.protocols import BrakeOutput
+from diffabs.protocols import UNITS as UNITS
 
 LARGEST = 100_000_000  # bytes
-UNITS = BrakeOutput(slip="1", speed="m/s", wheel_speed="m/s", deceleration="m/s^2", distance="m")._asdict()
 TIME = "t [s]"
 HEADERS = {f"{name} [{unit}]": name for name, unit in UNITS.items()}
 IGNORED = ("target [", "command [", "control [")  # what is simulated but not measured

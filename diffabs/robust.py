@@ -20,7 +20,7 @@ from diffabs.blocks import Series
 from diffabs.catalogue import ScenarioError, joined, number, shown, unknown, wrong
 from diffabs.controllers import Sampled
 from diffabs.linearize import SlipModel
-from diffabs.loop import Loop
+from diffabs.loop import Loop, task
 from diffabs.pytree import Spec, parameters
 from diffabs.ranges import Entry, entries
 
@@ -140,6 +140,8 @@ def _range(entry: Entry, shape: tuple[int, ...]) -> Range:
 
 def _known(loop: Loop) -> dict[str, _Parameter]:
     """What can have a range, by path of the loop. The model's names for the rest of the loop are `reduction`'s."""
+    if task(loop.plant) == "balance":
+        return {path: _Parameter(path, spec, np.shape(x)) for path, spec, x in parameters(loop.plant, "plant.")}
     model = {field.name: field.metadata["spec"] for field in dataclasses.fields(SlipModel) if "spec" in field.metadata}
     found = {"initial.speed": _Parameter("speed", model["speed"]), "reference.slip": _Parameter("slip", model["slip"])}
     for path, spec, value in parameters(loop.plant, "plant."):

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from diffabs.integrate import axpy, forgetful, repeated, rk4_step_and_rate
 from diffabs.loop import Loop, LoopState
 from diffabs.numerics import clamp
-from diffabs.protocols import BrakeOutput, Clock, Ending, Memory, Objective, Sample
+from diffabs.protocols import Clock, Ending, Memory, Objective, Sample
 from diffabs.pytree import prepared, strong
 
 LANDINGS = 4  # Newton iterations for the length of the last step; quadratic from an error below one step
@@ -43,7 +43,7 @@ class Trajectory(NamedTuple):
     """What was seen, with a leading time axis. After the end of a run its last sample is repeated."""
 
     sample: Sample
-    measured: BrakeOutput
+    measured: Any  # output of the sensor
     state: Any  # of the plant
     running: Any  # bool: False once the run has ended
 

@@ -2,12 +2,13 @@
 
     [plant] [road] [initial] [sensor] [reference] [feedforward] [controller] [actuator] [stop]    a part each: `type`
     [solver]       step [s], duration [s], every (trajectories keep every so many steps), seed (of noisy sensors)
-    [objective]    name = a part; adds to, or changes, those of every braking report
+    [objective]    name = a part; adds to, or changes, those of every report of the task
     [design]       what a robust gain is asked for, and over which ranges: see `robust`
     [tune]         which parameters are free, what is made small, and over which runs: see `goal`
     [sweep]        what varies in a Monte-Carlo sweep, and what counts as a failure: see `variation`
 
-What is left out has its default. Speeds may be given in km/h: `speed_kmh`. A value is never evaluated as code."""
+What is left out has its default, for the task of the plant, braking or balance. Speeds may be given in km/h:
+`speed_kmh`. A value is never evaluated as code."""
 
 import dataclasses
 import importlib.resources
@@ -24,10 +25,11 @@ import numpy as np
 from diffabs import goal, ranges, robust, toml, variation
 from diffabs.catalogue import OTHERS, build, filled, joined, number, shown, unknown, whole, wrong
 from diffabs.catalogue import ScenarioError as ScenarioError
-from diffabs.loop import Loop
-from diffabs.objectives import BRAKING
+from diffabs.loop import TYPICAL, Loop, task
+from diffabs.misfits import misfits
+from diffabs.objectives import BRAKING, REPORTS
 from diffabs.protocols import Objective
-from diffabs.pytree import Spec, problems
+from diffabs.pytree import Spec, cautions, problems
 from diffabs.rollout import FixedStep
 from diffabs.stability import stable_step
 
@@ -57,6 +59,10 @@ class Scenario:
     def key(self) -> jax.Array:
         """The random key of a run."""
         return jax.random.key(self.seed)
+
+    def cautions(self) -> list[str]:
+        """What is allowed but hardly meant, a line each."""
+        return list(cautions(self.loop))
 
 
 def names() -> list[str]:
@@ -88,7 +94,9 @@ def loads(raw: bytes, name: str, origin: str, overrides: Sequence[str] = (), *, 
     for override in overrides:
         _override(table, override)
     scenario = _assembled(name, table)
-    for lines in (_wrong_values(scenario), _wrong_together(scenario), _unstable(scenario) if integrated else ()):
+    unfit = misfits(scenario.loop, scenario.objectives)
+    unstable = _unstable(scenario) if integrated else ()
+    for lines in (_wrong_values(scenario), unfit, _wrong_together(scenario), unstable):
         found = [re.sub(r"^plant\.road\b", "road", line) for line in lines]
         if found:
             raise ScenarioError("; ".join(found))
@@ -189,11 +197,12 @@ def _assembled(name: str, table: dict[str, Any]) -> Scenario:
     given = table.get("objective", {})
     if not isinstance(given, dict):
         raise wrong("objective", given, "a table of objectives")
+    loop = _loop(sections)
+    report = REPORTS[task(loop.plant)]
     measured = {
-        key: build("objective", value, BRAKING.get(key), joined("objective", key)) for key, value in given.items()
+        key: build("objective", value, report.get(key), joined("objective", key)) for key, value in given.items()
     }
-    loop = filled(Loop(), sections, "", "")
-    objectives = {**BRAKING, **measured}
+    objectives = {**report, **measured}
     return Scenario(
         name=name,
         **text,
@@ -205,6 +214,15 @@ def _assembled(name: str, table: dict[str, Any]) -> Scenario:
         tune=goal.read(table.get("tune", {}), loop, objectives),
         sweep=variation.read(table.get("sweep", {}), loop, objectives),
     )
+
+
+def _loop(sections: dict[str, Any]) -> Loop:
+    """What is left out is as usual for the plant's task."""
+    usual = Loop()
+    if "plant" in sections:
+        plant = filled(usual, {"plant": sections["plant"]}, "", "").plant
+        usual = TYPICAL[task(plant)]
+    return filled(usual, sections, "", "")
 
 
 def _text(value: Any, path: str) -> str:

@@ -16,6 +16,7 @@ from rich.table import Table
 from diffabs import __version__
 from diffabs.catalogue import unit_of
 from diffabs.console import say
+from diffabs.protocols import UNITS
 from diffabs.rollout import Trajectory
 from diffabs.scenario import Scenario
 
@@ -48,12 +49,8 @@ def write_csv(trajectory: Trajectory, control_unit: str, path: pathlib.Path) -> 
     sample, y = trajectory.sample, trajectory.sample.output
     columns = {
         "t [s]": sample.t,
-        "slip [1]": y.slip,
-        "speed [m/s]": y.speed,
-        "wheel_speed [m/s]": y.wheel_speed,
-        "deceleration [m/s^2]": y.deceleration,
-        "distance [m]": y.distance,
-        "target [1]": sample.target,
+        **{f"{name} [{UNITS[name]}]": column for name, column in y._asdict().items()},
+        f"target [{UNITS[y._fields[0]]}]": sample.target,
         f"command [{control_unit}]": sample.command,
         f"control [{control_unit}]": sample.control,
     }
@@ -128,8 +125,10 @@ def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict:
     vertices = Table("vertex", *names, "largest |pole| [1]" if discrete else "slowest pole, real part [1/s]")
     for i, (corner, pole) in enumerate(zip(corners, result["poles"], strict=True)):
         vertices.add_row(str(i), *(f"{value:.6g}" for value in corner.values()), f"{pole:.6g}")
-    checked = result["coverage"]["checked"] if result["coverage"] else 0
-    _print(f"{result['vertices']} vertices; their hull covers {checked} systems checked within the ranges", vertices)
+    covered = (
+        result["coverage"] and f"; their hull covers {result['coverage']['checked']} systems checked within the ranges"
+    )
+    _print(f"{result['vertices']} vertices{covered or ', the systems on a grid of the ranges'}", vertices)
 
 
 def tuned(result: dict[str, Any], chosen: Scenario) -> None:

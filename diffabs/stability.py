@@ -3,15 +3,17 @@
 RK4 is stable on a mode lambda while |R(h lambda)| <= 1, R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24. A braking loop stiffens
 as it slows down, its slip rate going with 1/v, so the loop is linearised at speeds down to the stop: at slips close to
 the setpoint, where the controller is not at a limit, and at slips all over the friction curve, which is steepest near
-0. Held memories do not move: a sampled controller is not judged here.
+0. A balance is linearised upright and at its start. Held memories do not move: a sampled controller is not judged here.
 """
+
+import dataclasses
 
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.loop import Loop
+from diffabs.loop import Loop, task
 from diffabs.pytree import replace, strong
 
 SPEEDS = 6  # between start and stop, in geometric progression: the ends decide
@@ -55,7 +57,9 @@ REACH = _reach(ANGLES)
 @jax.jit
 @jax.vmap
 def _jacobians(loop: Loop) -> jax.Array:
-    """d(flow)/d(flow) over the grid of speeds and slips (SPEEDS, slips, n, n)."""
+    """d(flow)/d(flow) over the grid of speeds and slips (SPEEDS, slips, n, n), or over two states (1, 2, n, n)."""
+    if task(loop.plant) == "balance":
+        return jax.vmap(lambda share: _balance_jacobian(loop, share))(jnp.array([0.0, 1.0]))[None]
     state = loop.start()
     setpoint = loop.reference.setpoint(state.reference)
     near = jnp.concatenate([setpoint - jnp.array(OFFSETS), setpoint + jnp.array(OFFSETS)])
@@ -65,7 +69,15 @@ def _jacobians(loop: Loop) -> jax.Array:
 
 
 def _jacobian(loop: Loop, speed: jax.Array, slip: jax.Array) -> jax.Array:
-    loop = replace(loop, {"initial.speed": speed, "initial.slip": slip})
+    return _of_flow(replace(loop, {"initial.speed": speed, "initial.slip": slip}))
+
+
+def _balance_jacobian(loop: Loop, share: jax.Array) -> jax.Array:
+    """At a share of the initial angles and rates."""
+    return _of_flow(dataclasses.replace(loop, initial=jax.tree.map(lambda x: share * x, loop.initial)))
+
+
+def _of_flow(loop: Loop) -> jax.Array:
     state = loop.start()
     z, unravel = jax.flatten_util.ravel_pytree(state.flow())
 

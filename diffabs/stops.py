@@ -1,10 +1,11 @@
-"""When a braking run ends, and what is left after its last sample."""
+"""When a run ends, and what is left after its last sample."""
 
+import math
 from typing import Any
 
 import jax.numpy as jnp
 
-from diffabs.protocols import BrakeOutput, Sample
+from diffabs.protocols import BalanceOutput, BrakeOutput, Sample
 from diffabs.pytree import Scalar, param, pytree
 
 LEAST_DECELERATION = 1e-3  # m/s^2, so that a car that only rolls gets a finite, very long, stopping distance
@@ -50,6 +51,26 @@ class Standstill:
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """v/a and v^2/(2 a)."""
         return _braked(sample, 0.0, stopped)
+
+
+@pytree
+class Fallen:
+    """The run of a two-wheeler ends where its frame leans by `angle`: pi/2 is the ground."""
+
+    angle: Scalar = param(default=math.pi / 2, unit="rad", above=0.0, high=math.pi)
+
+    def margin(self, output: BalanceOutput) -> Scalar:
+        """angle^2 - theta^2 [rad^2]."""
+        return self.angle**2 - output.theta**2
+
+    def rate(self, output: BalanceOutput) -> Scalar:
+        """d(margin)/dt."""
+        return -2 * output.theta * output.theta_rate
+
+    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
+        """Nothing is left."""
+        del stopped
+        return 0.0 * sample.t, 0.0 * sample.t
 
 
 def _braked(sample: Sample, end: Scalar, stopped: Any) -> tuple[Any, Any]:

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs import actuators, blocks, controllers, objectives, plants, references, roads, sensors, stops
 from diffabs.integrate import axpy, rk4_step
-from diffabs.protocols import BrakeOutput, Clock, Ending, Memory, Sample, Tracking
+from diffabs.protocols import BalanceOutput, BrakeOutput, Clock, Ending, Memory, Sample, Tracking
 from diffabs.pytree import strong
 
 FAMILIES = (roads, plants, controllers, references, actuators, sensors, objectives, stops, blocks)
@@ -48,6 +48,14 @@ PLANTS: dict[str, Any] = {
     "lab rig, unrounded": plants.LabRig(road=roads.RIG_UNROUNDED),
 }
 
+BALANCES: dict[str, Any] = {
+    "arm": plants.ArmBalance(),
+    "arm, hanging": plants.ArmBalance(arm_length=-0.5, rider_mass=70.0),
+    "arm, geared": plants.ArmBalance(torque_constant=0.1, back_emf=0.1, gear=100.0, rotor_inertia=2e-4, resistance=0.2),
+    "acrobot": plants.ACROBOT,
+    "arm, as printed": plants.PrintedArm(),
+}
+
 _PID = controllers.PID(kp=150.0, ki=800.0, kd=1.5, torque_min=-5.0)
 
 CONTROLLERS: dict[str, Any] = {
@@ -73,6 +81,14 @@ CONTROLLERS: dict[str, Any] = {
     "relay": controllers.Relay(torque_min=2.0),
     "sliding mode": controllers.SlidingMode(gain=60.0, boundary=0.1, torque_max=70.0),
     "sampled pid": controllers.Sampled(controller=_PID, period=2e-3, delay=5e-4),
+    "balance feedback": controllers.BalanceFeedback(),
+    "observer feedback": controllers.ObserverFeedback(
+        gain=np.array([900.0, -40.0, 300.0, 250.0, -3.0, 100.0]),
+        transition=0.9 * np.eye(6) + 0.01 * np.eye(6, k=3),
+        entry=np.array([0.0, 0.0, 0.0, -0.01, 0.03, 0.02]),
+        correction=np.linspace(0.05, 0.6, 12).reshape(6, 2),
+        voltage_max=60.0,
+    ),
     "sampled relay": controllers.Sampled(controller=controllers.Relay(), delay=3e-4),
 }
 
@@ -81,12 +97,14 @@ REFERENCES: dict[str, Any] = {
     "filtered": references.FilteredSlip(),
     "literal": references.PeakLiteral(),
     "latch": references.PeakLatch(),
+    "upright": references.Upright(),
     "robust": references.PeakRobust(time_constant=0.002, threshold=0.01),
 }
 
 ACTUATORS: dict[str, Any] = {
     "direct": blocks.Direct(),
     "limits": actuators.Limits(low=5.0, high=60.0),
+    "voltage": actuators.VoltageLimit(voltage_max=40.0),
     "lag": actuators.Lag(),
     "rate limit": actuators.RateLimit(),
     "delay": actuators.Delay(time=2.3e-3, capacity=8),
@@ -101,14 +119,19 @@ SENSORS: dict[str, Any] = {
     "bias": sensors.Bias(slip=0.01, deceleration=-0.2),
     "quantisation": sensors.Quantisation(slip=0.013, wheel_speed=0.1),
     "wheel speed": sensors.WheelSpeed(),
+    "angles": sensors.AngleSensor(theta=0.01, psi=0.02, period=2e-3),
     "accelerometer": sensors.IntegratedAccelerometer(bias=0.05),
     "series": blocks.Series(blocks=(sensors.Noise(deceleration=0.05), sensors.WheelSpeed())),
 }
 
 PARTS: dict[str, dict[str, Any]] = {
     "road": ROADS,
-    "plant": PLANTS,
-    "initial": {"default": plants.BrakeStart(), "slipping": plants.BrakeStart(speed=20.0, slip=0.1)},
+    "plant": PLANTS | BALANCES,
+    "initial": {
+        "default": plants.BrakeStart(),
+        "slipping": plants.BrakeStart(speed=20.0, slip=0.1),
+        "leaning": plants.BalanceStart(theta=0.1),
+    },
     "controller": CONTROLLERS,
     "reference": REFERENCES,
     "actuator": ACTUATORS,
@@ -123,7 +146,7 @@ PARTS: dict[str, dict[str, Any]] = {
         "constant": controllers.ConstantInput(value=2.5),
         "holding": controllers.HoldingInput(),
     },
-    "stop": {"speed reached": stops.SpeedReached(), "standstill": stops.Standstill()},
+    "stop": {"speed reached": stops.SpeedReached(), "standstill": stops.Standstill(), "fallen": stops.Fallen()},
     "objective": {
         **objectives.BRAKING,
         "itae": objectives.ITAE(),
@@ -131,6 +154,9 @@ PARTS: dict[str, dict[str, Any]] = {
         "effort": objectives.Effort(),
         "torque rate": objectives.TorqueRate(),
         "variation": objectives.Variation(),
+        **{f"balance: {name}": part for name, part in objectives.BALANCE.items()},
+        "balance: soft loss": objectives.SoftLoss(radius=0.05, softness=0.7),
+        "balance: cost": objectives.BalanceCost(q=np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), r=0.5),
     },
 }
 
@@ -167,14 +193,30 @@ def output_at(t: Any) -> BrakeOutput:
     return BrakeOutput(slip, speed, (1 - slip) * speed, 8.0 - 3e5 * (t - 4.3e-3) ** 2, 20.0 * t)
 
 
-def signal_at(family: str, t: Any) -> Any:
+def leaning_at(t: Any) -> BalanceOutput:
+    """A two-wheeler on its way upright: every angle falls with the time constant 0.1 s."""
+    left = jnp.exp(-t / 0.1)
+    angles = [size * left for size in (0.3, -0.6, 0.2)]
+    return BalanceOutput(*angles, *(-10.0 * x for x in angles), 10.0 + 0.0 * t, 50.0 * left)
+
+
+OBJECTIVES_OF_BALANCE = (
+    objectives.BalanceCost,
+    objectives.SoftLoss,
+    *(type(part) for part in objectives.BALANCE.values()),
+)
+OF_BALANCE = (controllers.BalanceFeedback, controllers.ObserverFeedback, references.Upright, sensors.AngleSensor)
+
+
+def signal_at(family: str, block: Any, t: Any) -> Any:
     """What a block of this family is given at time t."""
+    seen = leaning_at(t) if isinstance(block, OF_BALANCE) else output_at(t)
     if family == "controller":
-        return Tracking(0.2 + 0.0 * t, output_at(t), 20.0 + 300.0 * t)
-    return 20.0 + 50.0 * jnp.sin(200.0 * t + 0.5) if family == "actuator" else output_at(t)
+        return Tracking(0.2 + 0.0 * t, seen, 20.0 + 300.0 * t)
+    return 20.0 + 50.0 * jnp.sin(200.0 * t + 0.5) if family == "actuator" else seen
 
 
-def sample_at(t: Any) -> Sample:
+def braking_at(t: Any) -> Sample:
     """A locked wheel whose slip falls from 1 to the setpoint 0.2 with the time constant 0.1 s; torque 10 + 5 e."""
     excess = 0.8 * jnp.exp(-t / 0.1)
     y = BrakeOutput(0.2 + excess, 20.0 - 8.0 * t, 16.0 - 8.0 * t, 8.0 + 0.0 * t, 20.0 * t - 4.0 * t**2)
@@ -184,7 +226,7 @@ def sample_at(t: Any) -> Sample:
 def block_run(family: str, block: Any, steps: int = 8) -> Any:
     """Outputs, continuous memories and moments of events over some steps, by Euler: what a loop asks of a block."""
     t = H * jnp.arange(steps)
-    signals = signal_at(family, t)
+    signals = signal_at(family, block, t)
 
     def step(memory: Memory, inputs: Any) -> Any:
         t, k, signal = inputs
@@ -196,18 +238,25 @@ def block_run(family: str, block: Any, steps: int = 8) -> Any:
     return jax.lax.scan(step, start, (t, jnp.arange(steps), signals))[1]
 
 
+def balancing_at(t: Any) -> Sample:
+    """The same run under a voltage 5 + 20 exp(-t/0.1)."""
+    voltage = 5.0 + 20.0 * jnp.exp(-t / 0.1)
+    return Sample(t, leaning_at(t), 0.0 * t, 0.0 * t, 0.0 * t, voltage, voltage)
+
+
 RUNS = {family: partial(block_run, family) for family, _ in BLOCKS}
 
 
 def mirrored_at(t: Any) -> Sample:
     """The same run with the error of the other sign: slip below the setpoint."""
-    sample = sample_at(t)
+    sample = braking_at(t)
     return sample._replace(output=sample.output._replace(slip=2 * sample.setpoint - sample.output.slip))
 
 
-def objective_run(objective: Any, sample_at: Any = sample_at, end: float = 0.5, steps: int = 500) -> Any:
-    """The value of an objective on the run of `sample_at`, streamed as the rollout does."""
+def objective_run(objective: Any, sample_at: Any = None, end: float = 0.5, steps: int = 500) -> Any:
+    """The value of an objective on the run of its task, or another, streamed as the rollout does."""
     h = end / steps
+    sample_at = sample_at or (balancing_at if isinstance(objective, OBJECTIVES_OF_BALANCE) else braking_at)
 
     def step(memory: Memory, k: Any) -> Any:
         t = k * h
@@ -219,7 +268,8 @@ def objective_run(objective: Any, sample_at: Any = sample_at, end: float = 0.5, 
 
 
 E, T = np.exp(-5.0), 0.1  # the error is 0.8 exp(-t/T), 0.8 E at the end; x1 = 0.8 T (1 - exp(-t/T)), u - ff = 5 e
-VALUES = {  # of the objectives on that run, by hand
+SQUARES = np.array([0.09, 0.36, 0.04, 9.0, 36.0, 4.0])  # of the balance's angles and rates at the start
+VALUES = {  # of the objectives on those runs, by hand
     "stop_time": 0.5 + 0.25,
     "stop_distance": 20 * 0.5 - 4 * 0.25 + 0.7,
     "max_slip": 1.0,
@@ -233,6 +283,16 @@ VALUES = {  # of the objectives on that run, by hand
     + (2 + 0.5 * 25) * 0.64 * T / 2 * (1 - E**2),
     "effort": 100 * 0.5 + 100 * 0.8 * T * (1 - E) + 25 * 0.64 * T / 2 * (1 - E**2),
     "variation": 4.0 * (1 - E),
+    "balance: settling_time": T * np.log(0.6 / 0.01),
+    "balance: peak_lean": 0.3,
+    "balance: peak_arm_angle": 0.6,
+    "balance: peak_voltage": 25.0,
+    "balance: peak_torque": 10 * 25.0 + 50.0,
+    "balance: final_norm": np.sqrt(SQUARES.sum()) * E,
+    "balance: fell": 1.0,  # the run below ends at its stop
+    "balance: soft loss": 1 / (1 + (0.05 / (np.sqrt(SQUARES.sum()) * E)) ** (1 / 0.7)),
+    "balance: cost": SQUARES @ np.arange(1.0, 7.0) * T / 2 * (1 - E**2)
+    + 0.5 * (25 * 0.5 + 200 * T * (1 - E) + 400 * T / 2 * (1 - E**2)),
     "torque rate": 4.0 * (1 - np.exp(-1e-3 / T)) / 1e-3,  # over the first step
 }
 

@@ -14,7 +14,7 @@ import pytest
 from commands import assert_one_error_line, left_in, run
 
 import diffabs
-from diffabs import catalogue, cli, scenario
+from diffabs import catalogue, cli, console, scenario
 from diffabs.objectives import BRAKING
 from diffabs.stability import stable_step
 
@@ -210,7 +210,7 @@ def test_step_that_is_not_stable(monkeypatch):
 )
 def test_target_that_cannot_be_written(tmp_path, monkeypatch, args, needed):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "load", lambda *_: pytest.fail("looked at the scenario first"))
+    monkeypatch.setattr(console, "load", lambda *_: pytest.fail("looked at the scenario first"))
     (tmp_path / "file").write_text("")
     result = run("simulate", "slip-lmi", *args, status=2)
     assert_one_error_line(result)

@@ -83,7 +83,7 @@ def test_ranges(family, part):
         bad += [spec.low - (0 if spec.open_low else 1e-3)] if np.isfinite(spec.low) else []
         bad += [spec.high + (0 if spec.open_high else 1e-3)] if np.isfinite(spec.high) else []
         for x in bad:
-            new = replace(part, {path: np.where(np.arange(np.size(old)) == 0, x, old).reshape(np.shape(old))})
+            new = replace(part, {path: np.where(np.arange(np.size(old)).reshape(np.shape(old)) == 0, x, old)})
             with pytest.raises(ValueError, match="is outside") as error:
                 check(new)
             assert str(error.value).startswith(f"{path} = ")
@@ -233,7 +233,7 @@ EVERY_BLOCK = [pytest.param(*key, block, id=": ".join(key)) for key, block in BL
 @pytest.mark.parametrize(("family", "name", "block"), EVERY_BLOCK)
 def test_block_keeps_the_structure_of_its_memory(family, name, block, dtype):
     """Else a scan over it fails, obscurely."""
-    block, signal, t = struct((block, parts.signal_at(family, 0.0), 0.0), dtype)
+    block, signal, t = struct((block, parts.signal_at(family, block, 0.0), 0.0), dtype)
     memory = jax.eval_shape(lambda b, s: b.start(s), block, signal)
     assert struct(memory, dtype) == struct(memory)
     assert struct(jax.eval_shape(lambda b, m, s, t: b.flow(t, m, s), block, memory, signal, t)) == struct(memory.flow)
@@ -288,7 +288,7 @@ def test_block_output_stays_within_its_limits(family, name, low, numbers):
 def test_objective(name):
     """Against the integrals by hand. Crossings are interpolated linearly: h^2/(8 T) = 1.3e-6 s; RK4 leaves 1e-9."""
     objective = PARTS["objective"][name]
-    atol = 2e-6 if name in ("settling_time", "locked_time") else 1e-9
+    atol = 2e-6 if name.endswith(("settling_time", "locked_time")) else 1e-9
     np.testing.assert_allclose(value(parts.objective_run, objective), parts.VALUES[name], rtol=1e-8, atol=atol)
     exact, differenced = jacobian(parts.objective_run, objective), differences(parts.objective_run, objective)
     np.testing.assert_allclose(exact, differenced, rtol=1e-5, atol=1e-8)

@@ -122,8 +122,15 @@ def test_what_is_left_out_has_its_default(file):
 
 
 def test_members_are_told_by_shape():
-    assert set(catalogue.types("plant")) == {"quarter-car", "mirrored-rig", "lab-rig"}
-    assert set(catalogue.types("initial")) == {"brake-start"}
+    assert set(catalogue.types("plant")) == {
+        "quarter-car",
+        "mirrored-rig",
+        "lab-rig",
+        "arm-balance",
+        "acrobot",
+        "printed-arm",
+    }
+    assert set(catalogue.types("initial")) == {"brake-start", "balance-start"}
     assert {"burckhardt", "snow", "rig-unrounded", "spline-b"} <= set(catalogue.types("road"))
     assert not {"peak", "piecewise-cubic"} & set(catalogue.types("road"))
     assert "pid" in catalogue.types("controller")
@@ -132,7 +139,7 @@ def test_members_are_told_by_shape():
     assert not set(catalogue.types("controller")) & {*catalogue.types("antiwindup"), *catalogue.types("feedforward")}
     assert {"direct", "series", "lag"} <= set(catalogue.types("actuator"))
     assert {"direct", "series", "noise"} <= set(catalogue.types("sensor"))
-    assert set(catalogue.types("stop")) == {"standstill", "speed-reached"}
+    assert set(catalogue.types("stop")) == {"standstill", "speed-reached", "fallen"}
     assert catalogue.types("road")["snow"] is roads.SNOW
 
 

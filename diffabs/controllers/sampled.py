@@ -42,7 +42,7 @@ class Sampled:
 
     def start(self, signal: Tracking) -> Memory:
         """Output zero until the first sample has been computed."""
-        zero = 0.0 * signal.measured.slip
+        zero = 0.0 * signal.target
         return Memory(held=SampledMemory(self.controller.start(signal), zero, zero, zero, zero))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:

@@ -55,14 +55,14 @@ def polytope(model: Any, over: Mapping[str, Sequence[float]], *, grid: int = 9, 
             parameter's range, a period that varies, more than 2^12 vertices, matrices that are not finite.
     """
     _scipy()
-    low, high = _bounds(model, over)
+    low, high = bounds(model, over)
     free = tuple(path for path in over if low[path] < high[path])
     if 2 ** len(free) > LARGEST:
         raise ValueError(f"a box of {len(free)} parameters has {2 ** len(free)} corners, more than {LARGEST}; fix some")
     model = replace(model, low)
     box = np.array([[low[path], high[path]] for path in free]).reshape(-1, 2)
     corners = np.array(list(itertools.product(*box))).reshape(2 ** len(free), len(free))
-    data = _systems(model, free, corners)
+    data = systems(model, free, corners)
     rows, kept, coverage = _covered(model, free, box, data, grid, most)
     n, m = data.order, data.inputs
     a, b = np.split(rows, [n * n], axis=1)
@@ -81,7 +81,7 @@ def schedule(
     """
     if along not in over:
         raise ValueError(f"along = '{along}' is not a parameter of the box; there is {', '.join(over) or 'nothing'}")
-    low, high = (bound[along] for bound in _bounds(model, over))
+    low, high = (bound[along] for bound in bounds(model, over))
     if isinstance(nodes, int):
         if nodes < 1:
             raise ValueError(f"nodes = {nodes} cells; it needs at least 1")
@@ -102,7 +102,7 @@ def _scipy() -> None:
         raise ModuleNotFoundError('a polytope needs SciPy: pip install "diffabs[design]"') from None
 
 
-def _bounds(model: Any, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
+def bounds(model: Any, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
     """The low and the high end of every interval, checked."""
     known = {path: value for path, _, value in parameters(model)}
     for path, ends in over.items():
@@ -127,7 +127,7 @@ def _batch(model: Any, free: tuple[str, ...], points: Any) -> Any:
     return jax.vmap(lambda p: replace(model, dict(zip(free, p, strict=True))).matrices())(points)
 
 
-def _systems(model: Any, free: tuple[str, ...], points: np.ndarray) -> _Data:
+def systems(model: Any, free: tuple[str, ...], points: np.ndarray) -> _Data:
     """The matrices at points (N, k) of the box, in float64."""
     parts, n, m = [], 0, 0
     with jax.enable_x64(True):
@@ -162,7 +162,7 @@ def _covered(
         return corners.rows, [0], Coverage(1, 0.0, 1.0)
     seen, hull = corners.rows, None
     for i in range(ROUNDS):
-        new = _systems(model, free, _points(box, (grid - 1) * 2 ** min(i, 1) + 1, most, i)).rows
+        new = systems(model, free, _points(box, (grid - 1) * 2 ** min(i, 1) + 1, most, i)).rows
         seen, reach = np.concatenate([seen, new]), hull.reach(new)[0] if hull else 1.0
         if hull and reach <= 1 + SLACK:
             break

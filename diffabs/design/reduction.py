@@ -1,6 +1,7 @@
 """A loop's controller as static state feedback u = K x on a linear slip model: what a certificate is about.
 
     StateFeedback   K = (k1, k2)
+    BalanceFeedback K as it is, on the model of a balance: see `upright`
     PID             K = (-ki, -(kp + kd wc), ..., kd wc), the last state being the slip error behind the filter wc
 
 since e = target - slip = -x2, and d = -x_f in Aoki and Nakamura's eq. (13). `Sampled` makes the model a discrete one;
@@ -16,10 +17,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.actuators import Delay, Lag, Limits, RateLimit
+from diffabs.balance_model import BalanceModel
 from diffabs.blocks import Direct, Series
-from diffabs.controllers import PID, HoldingInput, NoAntiWindup, ProportionalFeedback, Sampled, StateFeedback
+from diffabs.controllers import (
+    PID,
+    BalanceFeedback,
+    HoldingInput,
+    NoAntiWindup,
+    ProportionalFeedback,
+    Sampled,
+    StateFeedback,
+)
+from diffabs.design.upright import upright
 from diffabs.linearize import Continuous, LowPass, Sampling, SlipModel
-from diffabs.loop import Loop
+from diffabs.loop import Loop, task
 from diffabs.pytree import check
 from diffabs.references import FixedSlip
 from diffabs.sensors import Bias, Noise
@@ -29,7 +40,7 @@ class Reduced(NamedTuple):
     """u = gain x on `model`, gain of shape (n,). `exact`: near the target, inside all limits and at a frozen speed,
     this is the loop's own linearisation. `neglected` says what it leaves out, in sentences."""
 
-    model: SlipModel
+    model: SlipModel | BalanceModel
     gain: np.ndarray
     exact: bool
     neglected: tuple[str, ...]
@@ -42,6 +53,8 @@ def state_feedback(loop: Loop) -> Reduced:
         ValueError: a controller or an actuator that is not linear, a parameter out of its range, a setpoint of 1.
     """
     check(loop)
+    if task(loop.plant) == "balance":
+        return Reduced(*upright(loop))
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     controller = sampled.controller if sampled else loop.controller
     integral, _, derivative, cutoff = map(float, _gains(controller))
@@ -69,6 +82,8 @@ def feedback(loop: Loop, states: Sequence[str]) -> Any:
         ValueError: a controller that is not linear.
     """
     controller = loop.controller.controller if isinstance(loop.controller, Sampled) else loop.controller
+    if isinstance(controller, BalanceFeedback):
+        return jnp.asarray(controller.gain, float)
     integral, proportional, derivative, _ = _gains(controller)
     gains = {
         "integral of slip error": integral,

@@ -1,4 +1,4 @@
-"""Objectives: what is measured on a run, streamed. `BRAKING` are those every braking report shows."""
+"""Objectives: what is measured on a run, streamed. `BRAKING` and `BALANCE` are those of every report of a task."""
 
 from diffabs.objectives.accuracy import IAE as IAE
 from diffabs.objectives.accuracy import ITAE as ITAE
@@ -7,6 +7,15 @@ from diffabs.objectives.accuracy import MaxSlip as MaxSlip
 from diffabs.objectives.accuracy import Overshoot as Overshoot
 from diffabs.objectives.accuracy import QuadraticCost as QuadraticCost
 from diffabs.objectives.accuracy import SettlingTime as SettlingTime
+from diffabs.objectives.balance import BalanceCost as BalanceCost
+from diffabs.objectives.balance import Fell as Fell
+from diffabs.objectives.balance import FinalNorm as FinalNorm
+from diffabs.objectives.balance import PeakArmAngle as PeakArmAngle
+from diffabs.objectives.balance import PeakLean as PeakLean
+from diffabs.objectives.balance import PeakTorque as PeakTorque
+from diffabs.objectives.balance import PeakVoltage as PeakVoltage
+from diffabs.objectives.balance import RestTime as RestTime
+from diffabs.objectives.balance import SoftLoss as SoftLoss
 from diffabs.objectives.braking import Effort as Effort
 from diffabs.objectives.braking import LockedTime as LockedTime
 from diffabs.objectives.braking import StopDistance as StopDistance
@@ -24,3 +33,15 @@ BRAKING = {
     "final_slip_error": FinalSlipError(),
     "locked_time": LockedTime(),
 }
+
+BALANCE = {
+    "settling_time": RestTime(),
+    "peak_lean": PeakLean(),
+    "peak_arm_angle": PeakArmAngle(),
+    "peak_voltage": PeakVoltage(),
+    "peak_torque": PeakTorque(),
+    "final_norm": FinalNorm(),
+    "fell": Fell(),
+}
+
+REPORTS = {"braking": BRAKING, "balance": BALANCE}  # by the task of the plant

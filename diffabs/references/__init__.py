@@ -5,3 +5,4 @@ from diffabs.references.estimator import PeakLiteral as PeakLiteral
 from diffabs.references.estimator import PeakRobust as PeakRobust
 from diffabs.references.setpoint import FilteredSlip as FilteredSlip
 from diffabs.references.setpoint import FixedSlip as FixedSlip
+from diffabs.references.upright import Upright as Upright

@@ -1,5 +1,6 @@
 """Sensors: output -> measured output."""
 
+from diffabs.sensors.angles import AngleSensor as AngleSensor
 from diffabs.sensors.disturbance import Bias as Bias
 from diffabs.sensors.disturbance import Noise as Noise
 from diffabs.sensors.disturbance import Quantisation as Quantisation

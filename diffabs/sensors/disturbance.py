@@ -45,7 +45,7 @@ class Noise:
         n = steps(self.period, clock.h)
         draw = clock.k // n
         deviations = (self.slip, self.speed, self.wheel_speed, self.deceleration)
-        noise = [_drawn(jnp.asarray(d), clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
+        noise = [drawn(jnp.asarray(d), clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
         held = BrakeOutput(noise[0], noise[1], noise[2], noise[3], 0.0 * signal.distance)
         return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(draw * n == clock.k, a, b), held, memory.held)))
 
@@ -55,17 +55,17 @@ class Noise:
 
 
 @jax.custom_jvp
-def _drawn(deviation: Any, key: Any, number: Any) -> Any:
+def drawn(deviation: Any, key: Any, number: Any) -> Any:
     """deviation z: z is drawn only where it counts, or where it is the derivative."""
     return jax.lax.cond(deviation != 0, lambda: deviation * _normal(deviation, key, number), lambda: 0.0 * deviation)
 
 
 def _rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    value, moving = _drawn(*primals), type(tangents[0]) is not SymbolicZero
+    value, moving = drawn(*primals), type(tangents[0]) is not SymbolicZero
     return value, tangents[0] * _normal(*primals) if moving else jnp.zeros_like(value)
 
 
-_drawn.defjvp(_rule, symbolic_zeros=True)
+drawn.defjvp(_rule, symbolic_zeros=True)
 
 
 def _normal(like: Any, key: Any, number: Any) -> Any:

@@ -1,7 +1,7 @@
 """Who computes the chunks: the devices of this process, or a Dask cluster (`cluster`)."""
 
 import itertools
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -58,14 +58,20 @@ def done(study: Study, chunk: int, columns: Columns) -> Done:
 
 def failures(study: Study, columns: Any) -> np.ndarray:
     """Lanes that diverged, did not stop, locked, or left a bound of the study (lanes,)."""
-    failed = np.asarray(columns["diverged"]) | ~np.asarray(columns["stopped"])
+    failed = np.asarray(columns["diverged"]) | missed(columns["stopped"], columns)
     bounds = failing({"objectives": study.objectives, "failures": study.failures})
     return np.any([failed, *(np.asarray(columns[name]) > bound for name, bound in bounds.items())], axis=0)
 
 
 def failing(study: Mapping[str, Any]) -> dict[str, float]:
-    """Bounds of metrics, beyond which a lane has failed: those of the study, and a wheel that locks."""
-    return {**({"locked_time": 0.0} if "locked_time" in study["objectives"] else {}), **study["failures"]}
+    """Bounds of metrics, beyond which a lane has failed: those of the study, a wheel that locks, a fall."""
+    always = {name: 0.0 for name in ("locked_time", "fell") if name in study["objectives"]}
+    return {**always, **study["failures"]}
+
+
+def missed(stopped: Any, names: Iterable[str]) -> np.ndarray:
+    """Which lanes did not reach their stop, a failure; but where a fall is measured, the stop is the fall."""
+    return np.zeros(np.shape(stopped), bool) if "fell" in names else ~np.asarray(stopped)
 
 
 def batched(items: Sequence[int], size: int) -> Iterator[list[int]]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.sweep.engines import failing
+from diffabs.sweep.engines import failing, missed
 from diffabs.sweep.results import Results
 from diffabs.sweep.sensitivity import correlations, sobol_indices
 from diffabs.sweep.statistics import Count, Tail, cvar, quantile, replicated
@@ -78,7 +78,7 @@ class _View:
 
 def _failures(found: Results, view: _View, confidence: float) -> Iterator[tuple[str, Any]]:
     columns = {name: found.column(name) for name in failing(found.study) | {"stopped": 0, "diverged": 0}}
-    kinds = {"diverged": columns["diverged"], "not stopped": ~columns["stopped"]}
+    kinds = {"diverged": columns["diverged"], "not stopped": missed(columns["stopped"], found.study["objectives"])}
     kinds |= {f"{name} > {bound:g}": columns[name] > bound for name, bound in failing(found.study).items()}
     kinds["any"] = np.any(list(kinds.values()), axis=0)
     for name, failed in kinds.items():

@@ -11,14 +11,12 @@ import numpy as np
 
 from diffabs.loop import Loop
 from diffabs.numerics import clamp, ratio
-from diffabs.protocols import BrakeOutput
+from diffabs.protocols import UNITS
 from diffabs.pytree import replace, strong
 from diffabs.rollout import FixedStep, rollout
 from diffabs.tune.batch import Batch
 from diffabs.tune.comparison import Comparison, check_positive
 from diffabs.tune.fit import Identified
-
-UNITS = BrakeOutput(slip="1", speed="m/s", wheel_speed="m/s", deceleration="m/s^2", distance="m")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -26,7 +24,7 @@ class Traces:
     """Measured signals over time.
 
     t (n,): instants [s], increasing, from the start of braking; not necessarily equally spaced
-    columns: (n,) by the name of a `BrakeOutput`'s field; with several runs (runs, n)
+    columns: (n,) by the name of a field of the plant's output; with several runs (runs, n)
     sigma: standard deviation of each column's noise, in its unit: a number, or of the column's shape. None where it is
         not known, with one column only
     over: what differs between runs: parameters by path, one row per run
@@ -87,9 +85,9 @@ class Traces:
             raise ValueError(f"t has shape {t.shape}; it must be finite numbers in increasing order [s]")
         if t[0] < 0 or t[-1] > solver.duration:
             raise ValueError(f"t = {t[0]:g} ... {t[-1]:g} s leaves [0, {solver.duration:g}] s, the solver's duration")
-        if not self.columns or set(self.columns) - set(BrakeOutput._fields):
+        if not self.columns or set(self.columns) - set(_shown(loop)):
             named = ", ".join(self.columns) or "none"
-            raise ValueError(f"columns: {named}; there is {', '.join(BrakeOutput._fields)}")
+            raise ValueError(f"columns: {named}; there is {', '.join(_shown(loop))}")
         shapes = (self.shape, self.shape[1:]) if self.shape[0] == 1 else (self.shape,)
         for name, column in self.columns.items():
             _check_column(name, np.asarray(column, float), t, shapes)
@@ -107,7 +105,12 @@ class Traces:
         for name, value in self.sigma.items():
             if np.shape(value) not in ((), self.shape[1:], self.shape):
                 raise ValueError(f"sigma.{name} has shape {np.shape(value)}, not () or {self.shape}")
-            check_positive(f"sigma.{name}", value, getattr(UNITS, name))
+            check_positive(f"sigma.{name}", value, UNITS[name])
+
+
+def _shown(loop: Loop) -> tuple[str, ...]:
+    """What the plant shows of itself."""
+    return jax.eval_shape(lambda loop: loop.plant.output(loop.plant.start(loop.initial)), strong(loop))._fields
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,0 +1,21 @@
+"""The supply of a motor: what voltage it can give."""
+
+from diffabs.numerics import clamp
+from diffabs.protocols import Memory, no_flow, no_jump, no_memory
+from diffabs.pytree import Scalar, param, pytree
+
+
+@pytree
+class VoltageLimit:
+    """control = clamp(command, -voltage_max, voltage_max)."""
+
+    voltage_max: Scalar = param(default=48.0, unit="V", above=0.0)
+
+    start = no_memory
+    flow = no_flow
+    jump = no_jump
+
+    def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """Voltage [V]."""
+        del t, memory
+        return clamp(signal, -self.voltage_max, self.voltage_max)

@@ -1,0 +1,171 @@
+"""What is measured of a balance: whether it fell, how soon it rests, what the arm and the motor had to do."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.objectives.accuracy import integral, nothing, unchanged
+from diffabs.protocols import BalanceOutput, Ending, Memory, Sample
+from diffabs.pytree import Scalar, Vector, param, pytree
+
+RATES = ("theta_rate", "psi_rate", "phi_rate")
+ANGLES = ("theta", "psi", "phi")
+
+
+def _zero(sample: Sample) -> Scalar:
+    return 0.0 * sample.t
+
+
+def _norm(output: BalanceOutput) -> Any:
+    """|x|, with a finite slope at 0."""
+    square = sum(getattr(output, name) ** 2 for name in ANGLES + RATES)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+@pytree
+class Fell:
+    """1 if the run ended before its time, by a fall; else 0 [1]."""
+
+    flow, update = nothing, unchanged
+
+    def start(self, sample: Sample) -> Memory:
+        """Nothing to remember."""
+        del sample
+        return Memory()
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Whether the stop was reached."""
+        del memory
+        return jnp.where(ending.stopped, 1.0, 0.0) + 0.0 * ending.sample.t
+
+
+@pytree
+class FinalNorm:
+    """sqrt(x'x) at the end [1], x = (theta, psi, phi, theta', psi', phi') in rad and rad/s."""
+
+    start, flow, update = Fell.start, nothing, unchanged
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Of the last sample."""
+        del memory
+        return _norm(ending.sample.output)
+
+
+def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
+    """start, flow, update and value of the greatest size(sample), at either end of every step: control jumps."""
+
+    def start(self: Any, sample: Sample) -> Memory:
+        """The first."""
+        del self
+        return Memory(held=size(sample))
+
+    def update(self: Any, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Scalar:
+        """The greater of what was, and of both ends of the step."""
+        del self, h
+        return jnp.maximum(memory.held, jnp.maximum(size(before), size(sample)))
+
+    def value(self: Any, memory: Memory, ending: Ending) -> Scalar:
+        """The greatest."""
+        del self, ending
+        return memory.held
+
+    return start, nothing, update, value
+
+
+@pytree
+class PeakLean:
+    """Greatest |theta| of the frame [rad], at the instants of the integration."""
+
+    start, flow, update, value = _peak(lambda sample: jnp.abs(sample.output.theta))
+
+
+@pytree
+class PeakArmAngle:
+    """Greatest |psi| of the arm [rad], at the instants of the integration."""
+
+    start, flow, update, value = _peak(lambda sample: jnp.abs(sample.output.psi))
+
+
+@pytree
+class PeakVoltage:
+    """Greatest |u| that the motor gets [V]."""
+
+    start, flow, update, value = _peak(lambda sample: jnp.abs(sample.control))
+
+
+@pytree
+class PeakTorque:
+    """Greatest |tau| between frame and arm [N m]."""
+
+    start, flow, update, value = _peak(
+        lambda sample: jnp.abs(sample.output.stall * sample.control + sample.output.drag)
+    )
+
+
+@pytree
+class SoftLoss:
+    """1/(1 + (radius/|x|)^(1/softness)) of the last state [1], |x| as in `FinalNorm`: near 0 for a run that comes to
+    rest, near 1 for one that runs away, and smooth between. Its mean over starts is one minus a soft share of the
+    region of attraction; see `basin`."""
+
+    radius: Scalar = param(default=0.1, unit="1", above=0.0)
+    softness: Scalar = param(default=0.3, unit="1", above=0.0)
+
+    start, flow, update = Fell.start, nothing, unchanged
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """A sigmoid of log |x|."""
+        del memory
+        size = jnp.maximum(_norm(ending.sample.output), 1e-12)
+        return jax.nn.sigmoid((jnp.log(size) - jnp.log(self.radius)) / self.softness)
+
+
+@pytree
+class RestTime:
+    """Since when every angle has stayed within `band` of upright [s]; the end of the run if the last did not."""
+
+    band: Scalar = param(default=0.01, unit="rad", above=0.0)
+
+    flow = nothing
+
+    def start(self, sample: Sample) -> Memory:
+        """Not yet."""
+        return Memory(held=_zero(sample))
+
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Scalar:
+        """The crossing into the band, interpolated linearly; its end where a step ends outside."""
+        a, b = self._beyond(before), self._beyond(sample)
+        inside = jnp.less_equal(b, 0)
+        part = jnp.where((a > 0) & inside, a / jnp.where(a > b, a - b, 1.0), 0.0)
+        entered = jnp.where(a > 0, sample.t - (1 - part) * h, memory.held)
+        return jnp.where(inside, entered, sample.t)
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Time [s]."""
+        del ending
+        return memory.held
+
+    def _beyond(self, sample: Sample) -> Any:
+        angles = [jnp.abs(getattr(sample.output, name)) for name in ANGLES]
+        return jnp.maximum(jnp.maximum(angles[0], angles[1]), angles[2]) - self.band
+
+
+@pytree
+class BalanceCost:
+    """Integral of x'diag(q) x + r u^2 dt [rad^2 s], u the voltage that the motor gets [V]."""
+
+    q: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
+    r: Scalar = param(default=0.0, unit="rad^2/V^2", low=0.0)
+
+    update, value = unchanged, integral
+
+    def start(self, sample: Sample) -> Memory:
+        """Zero."""
+        return Memory(flow=_zero(sample))
+
+    def flow(self, memory: Memory, sample: Sample) -> Scalar:
+        """The integrand."""
+        del memory
+        squares = [w * getattr(sample.output, name) ** 2 for w, name in zip(self.q, ANGLES + RATES, strict=True)]
+        return sum(squares[1:], squares[0]) + self.r * sample.control**2

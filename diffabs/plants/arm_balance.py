@@ -1,0 +1,218 @@
+"""A two-wheeler seen from behind: its frame on the ground contact line, an arm that a motor turns, and a rider.
+
+    theta1 = theta        frame, from the vertical       theta2 = psi, theta3 = phi     arm and rider, from the frame
+
+    M q'' + h + G = (0, tau, -K phi - d phi'),   q = (theta, psi, phi)
+    M = [[a + p2 + p3 + 2 c2 cos psi + 2 c3 cos phi, p2 + c2 cos psi, p3 + c3 cos phi], [., p2 + N^2 Jr, 0], [., 0, p3]]
+    h = [-c2 sin psi (2 theta' psi' + psi'^2) - c3 sin phi (2 theta' phi' + phi'^2), c2 sin psi theta'^2,
+         c3 sin phi theta'^2]
+    G = -g [b1 sin theta + b2 sin(theta + psi) + b3 sin(theta + phi), b2 sin(theta + psi), b3 sin(theta + phi)]
+    tau = (Kt/Rm) u - (Kt Kb/Rm + fm) psi'
+
+    a = I1 + m1 lg^2 + (m2 + m3) l^2   p2 = I2 + m2 Lg^2   p3 = I3 + m3 hg^2   c2 = m2 l Lg   c3 = m3 l hg
+    b1 = m1 lg + (m2 + m3) l           b2 = m2 Lg          b3 = m3 hg
+
+Fumita, section 2, whose kinetic energy, eqs. (1), (3), (5), this is. The paper's potential energy has theta1 - theta2
+and theta1 - theta3 where its kinetic energy has the sums: two conventions in one Lagrangian. Eqs. (4) and (6) also lack
+g in their first terms, eq. (8) lacks l in the term with theta2'^2, and the centrifugal terms of (9), (10) have the
+other sign. Here everything follows from one Lagrangian; `PrintedArm` is the paper's own linear model. Without a rider
+(mass, stiffness and damping 0) this is the Acrobot of Spong. A gear of ratio N and a rotor of inertia Jr, which the
+paper does not have, act as N Kt, N Kb and N^2 Jr about the arm's joint; what the spinning rotor does to the frame is
+left out.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from diffabs.numerics import quotient
+from diffabs.protocols import BalanceOutput
+from diffabs.pytree import Scalar, param, pytree
+
+
+class ArmState(NamedTuple):
+    """Angles of frame, arm and rider [rad], and their rates [rad/s]."""
+
+    theta: Scalar
+    psi: Scalar
+    phi: Scalar
+    theta_rate: Scalar
+    psi_rate: Scalar
+    phi_rate: Scalar
+
+
+class Lumps(NamedTuple):
+    """What the equations contain of masses and lengths: a, p2, p3, c2, c3 [kg m^2], b1, b2, b3 [kg m]."""
+
+    a: Scalar
+    p2: Scalar
+    p3: Scalar
+    c2: Scalar
+    c3: Scalar
+    b1: Scalar
+    b2: Scalar
+    b3: Scalar
+
+
+@pytree
+class BalanceStart:
+    """Angles [rad] and rates [rad/s] of frame (theta), arm (psi) and rider (phi) at t = 0."""
+
+    theta: Scalar = param(default=0.0, unit="rad")
+    psi: Scalar = param(default=0.0, unit="rad")
+    phi: Scalar = param(default=0.0, unit="rad")
+    theta_rate: Scalar = param(default=0.0, unit="rad/s")
+    psi_rate: Scalar = param(default=0.0, unit="rad/s")
+    phi_rate: Scalar = param(default=0.0, unit="rad/s")
+
+
+@pytree
+class ArmBalance:
+    """Frame, arm and rider under the voltage of the arm's motor. A negative `arm_length` is an arm that hangs."""
+
+    body_mass: Scalar = param(default=30.0, unit="kg", above=0.0)
+    arm_mass: Scalar = param(default=20.0, unit="kg", above=0.0)
+    rider_mass: Scalar = param(default=50.0, unit="kg", low=0.0)
+    body_height: Scalar = param(default=0.6, unit="m", above=0.0)
+    mount_height: Scalar = param(default=0.7, unit="m", above=0.0)
+    arm_length: Scalar = param(default=0.5, unit="m")
+    rider_height: Scalar = param(default=0.6, unit="m")
+    body_inertia: Scalar = param(default=3.6, unit="kg m^2", low=0.0)
+    arm_inertia: Scalar = param(default=1.7, unit="kg m^2", above=0.0)
+    rider_inertia: Scalar = param(default=6.0, unit="kg m^2", above=0.0)
+    stiffness: Scalar = param(default=1000.0, unit="N m/rad", low=0.0)
+    damping: Scalar = param(default=100.0, unit="N m s/rad", low=0.0)
+    resistance: Scalar = param(default=3.0, unit="ohm", above=0.0)
+    torque_constant: Scalar = param(default=30.0, unit="N m/A", above=0.0)
+    back_emf: Scalar = param(default=30.0, unit="V s/rad", low=0.0)
+    friction: Scalar = param(default=0.02, unit="N m s/rad", low=0.0)
+    gear: Scalar = param(default=1.0, unit="1", above=0.0)
+    rotor_inertia: Scalar = param(default=0.0, unit="kg m^2", low=0.0)
+    gravity: Scalar = param(default=9.81, unit="m/s^2", above=0.0)
+
+    control_unit = "V"
+    task = "balance"
+
+    def lumps(self) -> Lumps:
+        """Masses and lengths as they enter the equations."""
+        upper = self.arm_mass + self.rider_mass
+        return Lumps(
+            a=self.body_inertia + self.body_mass * self.body_height**2 + upper * self.mount_height**2,
+            p2=self.arm_inertia + self.arm_mass * self.arm_length**2,
+            p3=self.rider_inertia + self.rider_mass * self.rider_height**2,
+            c2=self.arm_mass * self.mount_height * self.arm_length,
+            c3=self.rider_mass * self.mount_height * self.rider_height,
+            b1=self.body_mass * self.body_height + upper * self.mount_height,
+            b2=self.arm_mass * self.arm_length,
+            b3=self.rider_mass * self.rider_height,
+        )
+
+    def motor(self) -> tuple[Scalar, Scalar]:
+        """Torque per volt [N m/V] and damping [N m s/rad] of the motor, seen from the arm. Eq. (11)."""
+        stall = self.gear * self.torque_constant / self.resistance
+        return stall, stall * self.gear * self.back_emf + self.friction
+
+    def start(self, initial: BalanceStart) -> ArmState:
+        """The state with these angles and rates."""
+        return ArmState(*(getattr(initial, name) for name in ArmState._fields))
+
+    def derivative(self, t: Scalar, state: ArmState, control: Scalar) -> ArmState:
+        """dx/dt under the motor voltage `control` [V]. M is inverted by its Schur complement: p2 and p3 stand alone."""
+        del t
+        stall, drag = self.motor()
+        rates = (state.theta_rate, state.psi_rate, state.phi_rate)
+        return ArmState(*rates, *self.accelerations(state, stall * control - drag * state.psi_rate))
+
+    def accelerations(self, state: ArmState, torque: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+        """theta'', psi'', phi'' [rad/s^2] under a torque between frame and arm [N m]."""
+        theta, psi, phi, v1, v2, v3 = state
+        _, _, _, c2, c3, b1, b2, b3 = lumps = self.lumps()
+        (sin1, cos1), (sin2, cos2), (sin3, cos3) = ((jnp.sin(x), jnp.cos(x)) for x in (theta, psi, phi))
+        arm = self.gravity * b2 * (sin1 * cos2 + cos1 * sin2)
+        rider = self.gravity * b3 * (sin1 * cos3 + cos1 * sin3)
+        r1 = c2 * sin2 * v2 * (2 * v1 + v2) + c3 * sin3 * v3 * (2 * v1 + v3)
+        r1 = r1 + self.gravity * b1 * sin1 + arm + rider
+        r2 = torque - c2 * sin2 * v1**2 + arm
+        r3 = -self.stiffness * phi - self.damping * v3 - c3 * sin3 * v1**2 + rider
+        m11, m12, m13, m22, m33 = _mass(lumps, cos2, cos3, self.gear**2 * self.rotor_inertia)
+        by2, by3 = m12 / m22, m13 / m33
+        first = quotient(r1 - by2 * r2 - by3 * r3, m11 - by2 * m12 - by3 * m13)
+        return first, r2 / m22 - by2 * first, r3 / m33 - by3 * first
+
+    def project(self, state: ArmState) -> ArmState:
+        """Every state is admissible; that the vehicle has fallen is for the stop to say."""
+        return state
+
+    def output(self, state: ArmState) -> BalanceOutput:
+        """Angles, rates, and what the motor makes of a voltage."""
+        stall, drag = self.motor()
+        return BalanceOutput(*state, stall + 0.0 * state.theta, -drag * state.psi_rate)
+
+    def holding(self, output: BalanceOutput, target: Scalar) -> Scalar:
+        """No voltage holds anything but the upright position, which needs none."""
+        del target
+        return 0.0 * output.theta
+
+    def kinetic_energy(self, state: ArmState) -> Scalar:
+        """q' M q'/2 [J]."""
+        _, psi, phi, v1, v2, v3 = state
+        m11, m12, m13, m22, m33 = _mass(self.lumps(), jnp.cos(psi), jnp.cos(phi), self.gear**2 * self.rotor_inertia)
+        return 0.5 * (m11 * v1**2 + m22 * v2**2 + m33 * v3**2) + (m12 * v2 + m13 * v3) * v1
+
+    def potential_energy(self, state: ArmState) -> Scalar:
+        """Gravity, 0 at the ground, and the rider's spring [J]."""
+        lumps = self.lumps()
+        heights = (
+            lumps.b1 * jnp.cos(state.theta)
+            + lumps.b2 * jnp.cos(state.theta + state.psi)
+            + lumps.b3 * jnp.cos(state.theta + state.phi)
+        )
+        return self.gravity * heights + 0.5 * self.stiffness * state.phi**2
+
+    def energy(self, state: ArmState) -> Scalar:
+        """Kinetic and potential energy [J]. energy' = tau psi' - d phi'^2."""
+        return self.kinetic_energy(state) + self.potential_energy(state)
+
+    def power(self, state: ArmState, control: Scalar) -> tuple[Scalar, Scalar]:
+        """What the motor puts in, tau psi', and what the rider's damper takes out, d phi'^2 [W]."""
+        stall, drag = self.motor()
+        torque = stall * control - drag * state.psi_rate
+        return torque * state.psi_rate, self.damping * state.phi_rate**2
+
+    def cautions(self) -> Iterator[str]:
+        """A rider whom the spring cannot hold."""
+        least = self.rider_mass * self.gravity * self.rider_height
+        if not self.stiffness > least:
+            yield (
+                f"stiffness = {self.stiffness:g} N m/rad does not hold the rider: even on an upright frame that needs "
+                f"more than m3 g hg = {least:g} N m/rad"
+            )
+
+
+def _mass(lumps: Lumps, cos2: Scalar, cos3: Scalar, rotor: Scalar) -> tuple[Any, ...]:
+    """m11, m12, m13, m22, m33 of the mass matrix [kg m^2]; m23 is 0."""
+    m12, m13 = lumps.p2 + lumps.c2 * cos2, lumps.p3 + lumps.c3 * cos3
+    m11 = lumps.a + m12 + m13 + lumps.c2 * cos2 + lumps.c3 * cos3
+    return m11, m12, m13, lumps.p2 + rotor, lumps.p3
+
+
+ACROBOT = ArmBalance(
+    body_mass=1.0,
+    arm_mass=1.0,
+    rider_mass=0.0,
+    body_height=0.5,
+    mount_height=1.0,
+    arm_length=1.0,
+    body_inertia=0.083,
+    arm_inertia=0.33,
+    stiffness=0.0,
+    damping=0.0,
+    resistance=1.0,
+    torque_constant=1.0,
+    back_emf=0.0,
+    friction=0.0,
+    gravity=9.8,
+)
+"""Spong's Acrobot, driven by a torque [N m]. A rider without mass remains, who turns with his own inertia and touches
+nothing."""

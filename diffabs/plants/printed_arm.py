@@ -1,0 +1,57 @@
+"""The two-wheeler as the paper's equations are printed, linear: only to show what its Fig. 3 shows.
+
+    (a + p2 + p3 + 2 c2 + 2 c3) theta'' + (p2 + c2) psi'' + (p3 + c3) phi''
+                         = g (b1 theta + b2 (theta - psi) + b3 (theta - phi))
+    (p2 + c2) theta'' + p2 psi'' = tau + g b2 (theta - psi)
+    (p3 + c3) theta'' + p3 phi'' = -K phi - d phi' + g b3 (theta - phi)
+
+Fumita, eqs. (8)-(10), for small angles. The matrix of gravity, d(right sides)/dq, is not symmetric: these forces come
+from no potential, and no machine has them. In these equations the arm falls to the side that lifts the frame.
+"""
+
+from diffabs.numerics import quotient
+from diffabs.plants.arm_balance import ArmBalance, ArmState, BalanceStart
+from diffabs.protocols import BalanceOutput
+from diffabs.pytree import Scalar, part, pytree
+
+
+@pytree
+class PrintedArm:
+    """The paper's linear equations with the parameters of a machine. Not mechanics: a reproduction of a misprint."""
+
+    machine: ArmBalance = part(default=ArmBalance)
+
+    control_unit = "V"
+    task = "balance"
+
+    def start(self, initial: BalanceStart) -> ArmState:
+        """The state with these angles and rates."""
+        return self.machine.start(initial)
+
+    def derivative(self, t: Scalar, state: ArmState, control: Scalar) -> ArmState:
+        """dx/dt under the motor voltage `control` [V]."""
+        del t
+        m, (a, p2, p3, c2, c3, b1, b2, b3) = self.machine, self.machine.lumps()
+        stall, drag = m.motor()
+        theta, psi, phi, *_ = state
+        rates = (state.theta_rate, state.psi_rate, state.phi_rate)
+        arm, rider = m.gravity * b2 * (theta - psi), m.gravity * b3 * (theta - phi)
+        r1 = m.gravity * b1 * theta + arm + rider
+        r2 = stall * control - drag * state.psi_rate + arm
+        r3 = -m.stiffness * phi - m.damping * state.phi_rate + rider
+        m12, m13, m22 = p2 + c2, p3 + c3, p2 + m.gear**2 * m.rotor_inertia
+        by2, by3 = m12 / m22, m13 / p3
+        first = quotient(r1 - by2 * r2 - by3 * r3, a + m12 + m13 + c2 + c3 - by2 * m12 - by3 * m13)
+        return ArmState(*rates, first, r2 / m22 - by2 * first, r3 / p3 - by3 * first)
+
+    def project(self, state: ArmState) -> ArmState:
+        """Every state is admissible."""
+        return state
+
+    def output(self, state: ArmState) -> BalanceOutput:
+        """Angles, rates, and what the motor makes of a voltage."""
+        return self.machine.output(state)
+
+    def holding(self, output: BalanceOutput, target: Scalar) -> Scalar:
+        """Nothing is held but the upright position."""
+        return self.machine.holding(output, target)

@@ -1,0 +1,51 @@
+"""What a real vehicle measures of its balance: the frame's angle and the arm's, not the rider's."""
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.protocols import BalanceOutput, Clock, Jump, Memory, no_flow
+from diffabs.pytree import Scalar, param, pytree
+from diffabs.sensors.disturbance import drawn
+from diffabs.timing import period_problems, steps
+
+
+@pytree
+class AngleSensor:
+    """theta and psi with Gaussian noise of these standard deviations, drawn every `period` and held; everything else is
+    not measured and reads 0. Needs a key unless both deviations are 0: `rollout(..., key=)`."""
+
+    theta: Scalar = param(default=0.0, unit="rad", low=0.0)
+    psi: Scalar = param(default=0.0, unit="rad", low=0.0)
+    period: Scalar = param(default=0.01, unit="s", above=0.0, tunable=False)
+
+    flow = no_flow
+
+    def start(self, signal: BalanceOutput) -> Memory:
+        """No noise before the first draw."""
+        zero = 0.0 * signal.theta
+        return Memory(held=(zero, zero))
+
+    def output(self, t: Scalar, memory: Memory, signal: BalanceOutput) -> BalanceOutput:
+        """Both angles with noise."""
+        del t
+        nothing = jax.tree.map(lambda x: 0.0 * x, signal)
+        return nothing._replace(theta=signal.theta + memory.held[0], psi=signal.psi + memory.held[1])
+
+    def jump(self, clock: Clock, memory: Memory, signal: BalanceOutput) -> Jump:
+        """Draw at the instants of the period. Raises ValueError without a key."""
+        del signal
+        if clock.key is None:
+            raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
+        n = steps(self.period, clock.h)
+        number = clock.k // n
+        held = tuple(
+            drawn(jnp.asarray(deviation), clock.key, 2 * number + i)
+            for i, deviation in enumerate((self.theta, self.psi))
+        )
+        return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(number * n == clock.k, a, b), held, memory.held)))
+
+    def grid_problems(self, step: float) -> Iterator[str]:
+        """A period off the integration grid."""
+        yield from period_problems("period", self.period, step)
