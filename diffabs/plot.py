@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from diffabs.objectives.balance import motor_torque
 from diffabs.protocols import Road
 from diffabs.rollout import Run, Trajectory
 
@@ -104,7 +105,7 @@ def balance(run: Run, *, title: str = "") -> Figure:
     most = np.max(np.abs(sample.control))
     voltage.set_ylim(-1.5 * most - 1e-9, 1.5 * most + 1e-9)  # a command far beyond the supply says no more
     label(voltage, "time [s]", "voltage [V]")
-    torque.plot(t, sample.output.stall * sample.control + sample.output.drag, color=COLOURS[0])
+    torque.plot(t, motor_torque(sample), color=COLOURS[0])
     label(torque, "time [s]", "motor torque [N m]")
     return figure
 

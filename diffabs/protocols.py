@@ -38,7 +38,8 @@ class BrakeOutput(NamedTuple):
 
 
 class BalanceOutput(NamedTuple):
-    """What a balancing plant shows of itself, and what a sensor measures. Motor torque = stall * voltage + drag."""
+    """What a balancing plant shows of itself, and what a sensor measures. The motor's torque under a voltage u is
+    constant * clamp((u - emf)/resistance, -current_max, current_max)."""
 
     theta: Scalar  # [rad] frame, from the vertical
     psi: Scalar  # [rad] arm, from the frame
@@ -46,8 +47,10 @@ class BalanceOutput(NamedTuple):
     theta_rate: Scalar  # [rad/s]
     psi_rate: Scalar  # [rad/s]
     phi_rate: Scalar  # [rad/s]
-    stall: Scalar  # [N m/V] torque per volt
-    drag: Scalar  # [N m] torque without voltage
+    constant: Scalar  # [N m/A] torque per ampere, at the joint
+    emf: Scalar  # [V] that the turning joint induces
+    resistance: Scalar  # [ohm]
+    current_max: Scalar  # [A]
 
 
 Output = BrakeOutput | BalanceOutput
@@ -55,7 +58,7 @@ Output = BrakeOutput | BalanceOutput
 UNITS = {  # of every output
     **{"slip": "1", "speed": "m/s", "wheel_speed": "m/s", "deceleration": "m/s^2", "distance": "m"},
     **{"theta": "rad", "psi": "rad", "phi": "rad", "theta_rate": "rad/s", "psi_rate": "rad/s", "phi_rate": "rad/s"},
-    **{"stall": "N m/V", "drag": "N m"},
+    **{"constant": "N m/A", "emf": "V", "resistance": "ohm", "current_max": "A"},
 }
 
 

@@ -51,7 +51,9 @@ PLANTS: dict[str, Any] = {
 BALANCES: dict[str, Any] = {
     "arm": plants.ArmBalance(),
     "arm, hanging": plants.ArmBalance(arm_length=-0.5, rider_mass=70.0),
-    "arm, geared": plants.ArmBalance(torque_constant=0.1, back_emf=0.1, gear=100.0, rotor_inertia=2e-4, resistance=0.2),
+    "arm, geared": plants.ArmBalance(
+        torque_constant=0.1, back_emf=0.1, gear=100.0, rotor_inertia=2e-4, current_max=60.0
+    ),
     "acrobot": plants.ACROBOT,
     "arm, as printed": plants.PrintedArm(),
 }
@@ -197,7 +199,9 @@ def leaning_at(t: Any) -> BalanceOutput:
     """A two-wheeler on its way upright: every angle falls with the time constant 0.1 s."""
     left = jnp.exp(-t / 0.1)
     angles = [size * left for size in (0.3, -0.6, 0.2)]
-    return BalanceOutput(*angles, *(-10.0 * x for x in angles), 10.0 + 0.0 * t, 50.0 * left)
+    return BalanceOutput(
+        *angles, *(-10.0 * x for x in angles), 30.0 + 0.0 * t, -15.0 * left, 3.0 + 0.0 * t, 20.0 + 0.0 * t
+    )
 
 
 OBJECTIVES_OF_BALANCE = (
@@ -287,7 +291,7 @@ VALUES = {  # of the objectives on those runs, by hand
     "balance: peak_lean": 0.3,
     "balance: peak_arm_angle": 0.6,
     "balance: peak_voltage": 25.0,
-    "balance: peak_torque": 10 * 25.0 + 50.0,
+    "balance: peak_torque": 30.0 * (25.0 + 15.0) / 3.0,
     "balance: final_norm": np.sqrt(SQUARES.sum()) * E,
     "balance: fell": 1.0,  # the run below ends at its stop
     "balance: soft loss": 1 / (1 + (0.05 / (np.sqrt(SQUARES.sum()) * E)) ** (1 / 0.7)),

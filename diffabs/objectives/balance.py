@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from diffabs.numerics import clamp
 from diffabs.objectives.accuracy import integral, nothing, unchanged
 from diffabs.protocols import BalanceOutput, Ending, Memory, Sample
 from diffabs.pytree import Scalar, Vector, param, pytree
@@ -94,13 +95,17 @@ class PeakVoltage:
     start, flow, update, value = _peak(lambda sample: jnp.abs(sample.control))
 
 
+def motor_torque(sample: Sample) -> Any:
+    """What the motor gives [N m], without its friction."""
+    y = sample.output
+    return y.constant * clamp((sample.control - y.emf) / y.resistance, -y.current_max, y.current_max)
+
+
 @pytree
 class PeakTorque:
-    """Greatest |tau| between frame and arm [N m]."""
+    """Greatest torque of the motor [N m], in absolute value and without its friction."""
 
-    start, flow, update, value = _peak(
-        lambda sample: jnp.abs(sample.output.stall * sample.control + sample.output.drag)
-    )
+    start, flow, update, value = _peak(lambda sample: jnp.abs(motor_torque(sample)))
 
 
 @pytree

@@ -7,7 +7,7 @@
     h = [-c2 sin psi (2 theta' psi' + psi'^2) - c3 sin phi (2 theta' phi' + phi'^2), c2 sin psi theta'^2,
          c3 sin phi theta'^2]
     G = -g [b1 sin theta + b2 sin(theta + psi) + b3 sin(theta + phi), b2 sin(theta + psi), b3 sin(theta + phi)]
-    tau = (Kt/Rm) u - (Kt Kb/Rm + fm) psi'
+    tau = (Kt/Rm) u - (Kt Kb/Rm + fm) psi'    while the current (u - Kb psi')/Rm is within its limit
 
     a = I1 + m1 lg^2 + (m2 + m3) l^2   p2 = I2 + m2 Lg^2   p3 = I3 + m3 hg^2   c2 = m2 l Lg   c3 = m3 l hg
     b1 = m1 lg + (m2 + m3) l           b2 = m2 Lg          b3 = m3 hg
@@ -25,8 +25,9 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
-from diffabs.numerics import quotient
+from diffabs.numerics import clamp, quotient
 from diffabs.protocols import BalanceOutput
 from diffabs.pytree import Scalar, param, pytree
 
@@ -88,6 +89,7 @@ class ArmBalance:
     back_emf: Scalar = param(default=30.0, unit="V s/rad", low=0.0)
     friction: Scalar = param(default=0.02, unit="N m s/rad", low=0.0)
     gear: Scalar = param(default=1.0, unit="1", above=0.0)
+    current_max: Scalar = param(default=np.inf, unit="A", above=0.0, infinite=True)
     rotor_inertia: Scalar = param(default=0.0, unit="kg m^2", low=0.0)
     gravity: Scalar = param(default=9.81, unit="m/s^2", above=0.0)
 
@@ -108,10 +110,11 @@ class ArmBalance:
             b3=self.rider_mass * self.rider_height,
         )
 
-    def motor(self) -> tuple[Scalar, Scalar]:
-        """Torque per volt [N m/V] and damping [N m s/rad] of the motor, seen from the arm. Eq. (11)."""
-        stall = self.gear * self.torque_constant / self.resistance
-        return stall, stall * self.gear * self.back_emf + self.friction
+    def torque(self, psi_rate: Scalar, control: Scalar) -> Any:
+        """tau [N m] under a voltage [V], eq. (11): N Kt i - fm psi', i = (u - N Kb psi')/Rm within its limit."""
+        current = quotient(control - self.gear * self.back_emf * psi_rate, self.resistance)
+        current = clamp(current, -self.current_max, self.current_max)
+        return self.gear * self.torque_constant * current - self.friction * psi_rate
 
     def start(self, initial: BalanceStart) -> ArmState:
         """The state with these angles and rates."""
@@ -120,9 +123,8 @@ class ArmBalance:
     def derivative(self, t: Scalar, state: ArmState, control: Scalar) -> ArmState:
         """dx/dt under the motor voltage `control` [V]. M is inverted by its Schur complement: p2 and p3 stand alone."""
         del t
-        stall, drag = self.motor()
         rates = (state.theta_rate, state.psi_rate, state.phi_rate)
-        return ArmState(*rates, *self.accelerations(state, stall * control - drag * state.psi_rate))
+        return ArmState(*rates, *self.accelerations(state, self.torque(state.psi_rate, control)))
 
     def accelerations(self, state: ArmState, torque: Scalar) -> tuple[Scalar, Scalar, Scalar]:
         """theta'', psi'', phi'' [rad/s^2] under a torque between frame and arm [N m]."""
@@ -146,8 +148,9 @@ class ArmBalance:
 
     def output(self, state: ArmState) -> BalanceOutput:
         """Angles, rates, and what the motor makes of a voltage."""
-        stall, drag = self.motor()
-        return BalanceOutput(*state, stall + 0.0 * state.theta, -drag * state.psi_rate)
+        like = 0.0 * state.theta
+        motor = (self.gear * self.torque_constant, self.gear * self.back_emf * state.psi_rate, self.resistance)
+        return BalanceOutput(*state, *(x + like for x in (*motor, self.current_max)))
 
     def holding(self, output: BalanceOutput, target: Scalar) -> Scalar:
         """No voltage holds anything but the upright position, which needs none."""
@@ -176,9 +179,7 @@ class ArmBalance:
 
     def power(self, state: ArmState, control: Scalar) -> tuple[Scalar, Scalar]:
         """What the motor puts in, tau psi', and what the rider's damper takes out, d phi'^2 [W]."""
-        stall, drag = self.motor()
-        torque = stall * control - drag * state.psi_rate
-        return torque * state.psi_rate, self.damping * state.phi_rate**2
+        return self.torque(state.psi_rate, control) * state.psi_rate, self.damping * state.phi_rate**2
 
     def cautions(self) -> Iterator[str]:
         """A rider whom the spring cannot hold."""

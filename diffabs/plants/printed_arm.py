@@ -32,12 +32,11 @@ class PrintedArm:
         """dx/dt under the motor voltage `control` [V]."""
         del t
         m, (a, p2, p3, c2, c3, b1, b2, b3) = self.machine, self.machine.lumps()
-        stall, drag = m.motor()
         theta, psi, phi, *_ = state
         rates = (state.theta_rate, state.psi_rate, state.phi_rate)
         arm, rider = m.gravity * b2 * (theta - psi), m.gravity * b3 * (theta - phi)
         r1 = m.gravity * b1 * theta + arm + rider
-        r2 = stall * control - drag * state.psi_rate + arm
+        r2 = m.torque(state.psi_rate, control) + arm
         r3 = -m.stiffness * phi - m.damping * state.phi_rate + rider
         m12, m13, m22 = p2 + c2, p3 + c3, p2 + m.gear**2 * m.rotor_inertia
         by2, by3 = m12 / m22, m13 / p3
