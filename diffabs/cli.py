@@ -207,7 +207,7 @@ def _listed(plural: str) -> dict[str, Any]:
 
 @app.command()
 def reproduce(
-    name: Annotated[str, typer.Argument(help="slip-lmi, slip-estimator, or all.")] = "all",
+    name: Annotated[str, typer.Argument(help="slip-lmi, slip-estimator, arm-balance, or all.")] = "all",
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the results, one folder per paper.")] = pathlib.Path(
         "out"
     ),

@@ -117,6 +117,12 @@ def angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
         ax.plot(np.asarray(seen.sample.t), values, DASHES[i], color=COLOURS[i], label=f"{words} {name}")
 
 
+def region(ax: Axes, first: Any, second: Any, inside: Any) -> None:
+    """Shade the cells of a grid, first axis to the right, whose value is true."""
+    levels, colours = [-0.5, 0.5, 1.5], ("#F3E3D7", COLOURS[0])
+    ax.contourf(np.asarray(first), np.asarray(second), np.asarray(inside, float).T, levels=levels, colors=colours)
+
+
 def slips(runs: Mapping[str, Trajectory], *, title: str = "", until: float | None = None) -> Figure:
     """Slip over time, one curve per run, and the setpoint of the first."""
     figure, (ax,) = sheet(title=title, size=(6.4, 3.8))

@@ -39,3 +39,17 @@ def mode_bounds(A: Any, B: Any, start: Any, limit: float) -> dict[float, float]:
             reach, there = abs(np.real(w) @ b) * limit / pole.real, abs(np.real(w) @ d)
             found[float(pole.real)] = float(reach / there) if there > 0 else np.inf
     return found
+
+
+def zeros(A: Any, B: Any, output: Any) -> np.ndarray:
+    """Finite transmission zeros of x' = A x + B u, y = c'x, one input: where the Rosenbrock matrix loses rank. They are
+    the poles of the inverse, which exists on the states that keep y at 0: with relative degree r, the eigenvalues of
+    (I - B (c'A^(r-1)B)^-1 c'A^(r-1)) A other than r zeros of its own making."""
+    a, b, c = np.asarray(A, float), np.asarray(B, float).reshape(-1, 1), np.asarray(output, float).reshape(1, -1)
+    degree, row = 1, c
+    while abs((row @ b).item()) <= 1e-12 * np.linalg.norm(row) * np.linalg.norm(b):
+        degree, row = degree + 1, row @ a
+        if degree > len(a):
+            return np.array([])
+    found = np.linalg.eigvals(a - b @ (row @ a) / (row @ b).item())
+    return np.delete(found, np.argsort(np.abs(found))[:degree])

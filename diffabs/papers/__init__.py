@@ -22,4 +22,8 @@ def _paper(module: str) -> Reproduction:
     return reproduce
 
 
-PAPERS: dict[str, Reproduction] = {"slip-lmi": _paper("slip_lmi"), "slip-estimator": _paper("slip_estimator")}
+PAPERS: dict[str, Reproduction] = {
+    "slip-lmi": _paper("slip_lmi"),
+    "slip-estimator": _paper("slip_estimator"),
+    "arm-balance": _paper("arm_balance"),
+}

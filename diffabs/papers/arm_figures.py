@@ -1,0 +1,78 @@
+"""Figures of `arm_balance`."""
+
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from diffabs import plot
+from diffabs.basin import Basin
+from diffabs.design.recovery import mode_bounds
+from diffabs.rollout import Run
+
+
+def figures(
+    seen: Mapping[str, Run],
+    basins: Mapping[str, Basin],
+    riders: np.ndarray,
+    over_riders: Mapping[str, tuple[Any, np.ndarray]],
+    limit: np.ndarray,
+    start: np.ndarray,
+    hanging: Any,
+) -> dict[str, Any]:
+    """By file name."""
+    return {
+        "fig3_printed_and_correct": _claim(seen),
+        "hanging_arm": plot.balance(seen["hanging"], title="Hanging arm at 48 V, from 0.06 of the start of Fig. 3"),
+        "attraction_48V": _maps(basins, start, hanging),
+        "riders": _riders(riders, over_riders, limit),
+    }
+
+
+def saved(drawn: Mapping[str, Any], folder: pathlib.Path) -> list[pathlib.Path]:
+    """Write them."""
+    return [plot.save(figure, folder / f"{name}.png") for name, figure in drawn.items()]
+
+
+def _claim(seen: Mapping[str, Run]) -> Any:
+    figure, axes = plot.sheet(1, 3, title="The same start, the same kind of LQR", size=(4.6, 3.4))
+    titles = {
+        "printed": "the paper's printed equations (its Fig. 3)",
+        "correct, no limit": "correct equations, any voltage: falls",
+        "correct, 48 V": "correct equations, 48 V: falls",
+    }
+    for i, (ax, (name, title)) in enumerate(zip(axes, titles.items(), strict=True)):
+        trajectory = seen[name].trajectory
+        assert trajectory is not None
+        plot.angle_lines(ax, trajectory)
+        plot.label(ax, "time [s]", "" if i else "angle [rad]", title, legend=i == 0)
+        ax.set_xlim(0, 6.0 if i == 0 else float(trajectory.sample.t[-1]) * 1.05)
+    return figure
+
+
+def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
+    figure, axes = plot.sheet(
+        1, len(basins), title="Hanging arm at 48 V: which starts are recovered", size=(5.0, 4.4), sharey=True
+    )
+    (theta,), (phi,) = (mode_bounds(hanging.A, hanging.B, np.eye(6)[i], 48.0).values() for i in (0, 2))
+    for i, (ax, (name, basin)) in enumerate(zip(axes, basins.items(), strict=True)):
+        plot.region(ax, basin.first, basin.second, basin.recovered)
+        for sign in (-1, 1):
+            words = "no control beyond (linear)" if sign > 0 else None
+            ax.plot(basin.first, phi * (sign - basin.first / theta), color="black", linewidth=1.2, label=words)
+        ax.plot(basin.first, basin.first * start[2] / start[0], ":", color="black", label="multiples of Fig. 3's start")
+        ax.set_ylim(basin.second[0], basin.second[-1])
+        title = f"{name}: {100 * basin.share:.1f} % of the box"
+        plot.label(ax, "frame theta0 [rad]", "" if i else "rider phi0 [rad]", title, legend=i == 0)
+    return figure
+
+
+def _riders(riders: np.ndarray, found: Mapping[str, tuple[Any, np.ndarray]], limit: np.ndarray) -> Any:
+    figure, (ax,) = plot.sheet(title="One gain for every rider, hanging arm, 48 V", size=(6.6, 4.0))
+    ax.plot(riders, limit, color="black", linewidth=1.2, label="no control beyond (linear)")
+    for i, (name, (_, multiples)) in enumerate(found.items()):
+        ax.plot(riders, multiples, "o" + plot.DASHES[i], color=plot.COLOURS[i], markersize=4, label=name)
+    plot.label(ax, "rider [kg]", "recovered multiple of (0.5, 0, 0.2) rad")
+    ax.set_ylim(0, None)
+    return figure
