@@ -157,7 +157,7 @@ PARTS: dict[str, dict[str, Any]] = {
         "torque rate": objectives.TorqueRate(),
         "variation": objectives.Variation(),
         **{f"balance: {name}": part for name, part in objectives.BALANCE.items()},
-        "balance: soft loss": objectives.SoftLoss(radius=0.05, softness=0.7),
+        "balance: soft loss": objectives.SoftLoss(weight=np.arange(1.0, 7.0), radius=0.05, softness=0.7),
         "balance: cost": objectives.BalanceCost(q=np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), r=0.5),
     },
 }
@@ -294,7 +294,7 @@ VALUES = {  # of the objectives on those runs, by hand
     "balance: peak_torque": 30.0 * (25.0 + 15.0) / 3.0,
     "balance: final_norm": np.sqrt(SQUARES.sum()) * E,
     "balance: fell": 1.0,  # the run below ends at its stop
-    "balance: soft loss": 1 / (1 + (0.05 / (np.sqrt(SQUARES.sum()) * E)) ** (1 / 0.7)),
+    "balance: soft loss": 1 / (1 + (0.05 / (np.sqrt(SQUARES @ np.arange(1.0, 7.0)) * E)) ** (1 / 0.7)),
     "balance: cost": SQUARES @ np.arange(1.0, 7.0) * T / 2 * (1 - E**2)
     + 0.5 * (25 * 0.5 + 200 * T * (1 - E) + 400 * T / 2 * (1 - E**2)),
     "torque rate": 4.0 * (1 - np.exp(-1e-3 / T)) / 1e-3,  # over the first step

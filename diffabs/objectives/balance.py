@@ -18,9 +18,9 @@ def _zero(sample: Sample) -> Scalar:
     return 0.0 * sample.t
 
 
-def _norm(output: BalanceOutput) -> Any:
+def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Any:
     """|x|, with a finite slope at 0."""
-    square = sum(getattr(output, name) ** 2 for name in ANGLES + RATES)
+    square = sum(w * getattr(output, name) ** 2 for w, name in zip(weights, ANGLES + RATES, strict=True))
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
@@ -110,10 +110,11 @@ class PeakTorque:
 
 @pytree
 class SoftLoss:
-    """1/(1 + (radius/|x|)^(1/softness)) of the last state [1], |x| as in `FinalNorm`: near 0 for a run that comes to
-    rest, near 1 for one that runs away, and smooth between. Its mean over starts is one minus a soft share of the
-    region of attraction; see `basin`."""
+    """1/(1 + (radius/|x|)^(1/softness)) of the last state [1], |x|^2 = sum of weight x^2 in rad and rad/s: near 0 for a
+    run that comes to rest, near 1 for one that runs away, and smooth between. Its mean over starts is one minus a soft
+    share of the region of attraction; see `basin`."""
 
+    weight: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
     radius: Scalar = param(default=0.1, unit="1", above=0.0)
     softness: Scalar = param(default=0.3, unit="1", above=0.0)
 
@@ -122,7 +123,7 @@ class SoftLoss:
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """A sigmoid of log |x|."""
         del memory
-        size = jnp.maximum(_norm(ending.sample.output), 1e-12)
+        size = jnp.maximum(_norm(ending.sample.output, self.weight), 1e-12)
         return jax.nn.sigmoid((jnp.log(size) - jnp.log(self.radius)) / self.softness)
 
 

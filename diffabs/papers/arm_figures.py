@@ -63,6 +63,7 @@ def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
             ax.plot(basin.first, phi * (sign - basin.first / theta), color="black", linewidth=1.2, label=words)
         ax.plot(basin.first, basin.first * start[2] / start[0], ":", color="black", label="multiples of Fig. 3's start")
         ax.set_ylim(basin.second[0], basin.second[-1])
+        ax.locator_params(axis="x", nbins=5)
         title = f"{name}: {100 * basin.share:.1f} % of the box"
         plot.label(ax, "frame theta0 [rad]", "" if i else "rider phi0 [rad]", title, legend=i == 0)
     return figure
