@@ -6,17 +6,20 @@ whose worker dies is given to another one.
 
 Dask sends programs, by pickle: its scheduler and workers must be machines that trust each other."""
 
+import asyncio
 import contextlib
 import dataclasses
 import logging
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
 
 import jax
 import numpy as np
-from distributed import Client, KilledWorker, LocalCluster, as_completed
+from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
+from distributed.comm import connect
 
 from diffabs import provenance
 from diffabs.sweep.engines import DECISIVE, Done, done
@@ -54,10 +57,28 @@ class Dask:
             else:
                 where = self.scheduler
             try:
+                if where is self.scheduler:
+                    _call(where)
                 client = opened.enter_context(Client(where, timeout=TIMEOUT))
-            except (OSError, ValueError) as error:
-                raise SweepError(f"the scheduler at {where} cannot be reached: {str(error).splitlines()[0]}") from None
+            except (OSError, TypeError, ValueError) as error:  # TypeError: tls without certificates
+                why = str(error).splitlines()[0] if str(error) else f"no answer within {TIMEOUT:g} s"
+                raise SweepError(f"the scheduler at {where} cannot be reached: {why}") from None
             yield client
+
+
+def _call(scheduler: str) -> None:
+    """Connect, and no more: a client that does not reach its scheduler leaves a thread behind which can block the next.
+    Raises OSError, TypeError or ValueError; a TimeoutError also where something listens that is no scheduler."""
+
+    async def call() -> None:
+        comm = await connect(scheduler, timeout=TIMEOUT, **Security().get_connection_args("client"))
+        comm.abort()
+
+    async def patient() -> None:
+        await asyncio.wait_for(call(), TIMEOUT + 1)  # `connect` itself waits for ever for the first words
+
+    with ThreadPoolExecutor(1) as apart:  # a notebook's thread runs a loop already
+        apart.submit(lambda: asyncio.run(patient())).result()
 
 
 def _check(client: Client) -> None:
