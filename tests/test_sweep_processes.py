@@ -19,6 +19,15 @@ pytestmark = [
 PAGE = (pathlib.Path(__file__).parent.parent / "docs" / "sweeps.md").read_text()
 SCRIPT = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)[1]
 COMMANDS = re.findall(r"^      python (many\.py .*?)  +#", PAGE, re.MULTILINE)
+FULL = """
+from diffabs.sweep.store import Store
+
+def full(*_):
+    raise OSError(28, "No space left on device")
+
+if number == "1":
+    Store.write = full
+"""
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +82,9 @@ def test_a_process_that_dies_ends_the_others_and_the_commands_go_on(folder, dige
         processes[victim].kill()
         other = processes[1 - victim]
         if victim == 1:  # JAX ends this one only when it has missed the heart beats of 100 s
-            assert any("another process died; finished chunks stay, and resume goes on" in line for line in other.stderr)
+            assert any(
+                "another process died; finished chunks stay, and resume goes on" in line for line in other.stderr
+            )
             other.kill()
         assert other.wait(PATIENCE) != 0
     finally:
@@ -88,7 +99,9 @@ def test_a_process_that_dies_ends_the_others_and_the_commands_go_on(folder, dige
 
 
 def test_a_full_disk_of_one_process_is_said_after_the_other_has_finished(folder):
-    full = "def full(*_):\n    raise OSError(28, 'No space left on device')\n\nif number == '1':\n    Store.write = full\n"
+    full = (
+        "def full(*_):\n    raise OSError(28, 'No space left on device')\n\nif number == '1':\n    Store.write = full\n"
+    )
     broken = SCRIPT.replace("\nprint(", f"from diffabs.sweep.store import Store\n{full}print(")
     (folder / "many.py").write_text(broken.replace(".digest", ".complete"))
     processes = all_started(folder)
