@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
-from distributed.comm import connect
+from distributed.comm.core import connect
 
 from diffabs import provenance
 from diffabs.sweep.engines import DECISIVE, Done, done
