@@ -71,7 +71,7 @@ def test_runs_that_diverge_are_an_answer_that_cannot_be_had(scenario):
 
 @pytest.mark.slow
 def test_the_example_of_the_page_on_sweeps():
-    (command,) = re.findall(r"^    diffabs (rare .*(?:\\\n.*)*)$", PAGE, re.MULTILINE)
+    (command,) = re.findall(r"^    diffabs (rare (?:.*\\\n)*.*)$", PAGE, re.MULTILINE)
     words = shlex.split(command.replace("\\\n", " "))
     result = json.loads(run(*words, "--json").stdout)
     printed = re.search(r"probability of ([\d.e-]+)\s+\(([\d.e-]+) to\s+([\d.e-]+)\)", PAGE)
