@@ -3,7 +3,8 @@
     python tests/mutations.py [part of a name ...]
 
 Exit status 1 if a mutation survives, if its text is no longer in the file, or if a named test fails without it. Not
-collected by pytest; run it weekly, and when a test is added: add a line to MUTATIONS.
+collected by pytest; run it weekly, and when a test is added: add a line to MUTATIONS, or to the
+list of its subject in another file.
 """
 
 import os
@@ -13,6 +14,8 @@ import subprocess
 import sys
 import tempfile
 from typing import NamedTuple
+
+from mutations_sweep import SWEEP
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 
@@ -753,6 +756,7 @@ MUTATIONS = [
         "jnp.abs(sample.control - last)",
         "test_rollout.py::test_the_torque_rate_of_a_lag_is_that_of_its_exponential",
     ),
+    *(Mutation(*each) for each in SWEEP),
 ]
 
 
