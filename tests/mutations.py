@@ -3,8 +3,8 @@
     python tests/mutations.py [part of a name ...]
 
 Exit status 1 if a mutation survives, if its text is no longer in the file, or if a named test fails without it. Not
-collected by pytest; run it weekly, and when a test is added: add a line to MUTATIONS, or to the
-list of its subject in another file.
+collected by pytest; run it weekly, and when a test is added: add a line to MUTATIONS (of
+sweeps: in mutations_sweep.py).
 """
 
 import os
@@ -776,8 +776,8 @@ def passes(tests: list[str], folder: pathlib.Path) -> bool:
 
 
 def copied(folder: pathlib.Path) -> None:
-    """The package, its tests and experiments, and a proof that it is this copy that Python finds."""
-    for name in ("diffabs", "tests", "experiments"):
+    """The package, its tests, experiments and pages, and a proof that it is this copy that Python finds."""
+    for name in ("diffabs", "tests", "experiments", "docs"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", folder)
     command = [sys.executable, "-c", "import diffabs; print(diffabs.__file__)"]
