@@ -326,16 +326,18 @@ def without(folder, name):
 def test_a_worker_with_other_versions(scenario, tmp_path):
     """Of the package and of JAX; and one that has no diffabs at all."""
     there = {
-        'versions.diffabs is "9.9" there, ': pretended(tmp_path / "a", "diffabs", "9.9"),
-        'versions.jax is "0.1" there, ': pretended(tmp_path / "b", "jax", "0.1"),
-        "a worker cannot say its versions: No module named 'diffabs'": without(tmp_path / "c", "diffabs"),
+        'diffabs is "9.9" there, ': pretended(tmp_path / "a", "diffabs", "9.9"),
+        'jax is "0.1" there, ': pretended(tmp_path / "b", "jax", "0.1"),
+        "a worker cannot say its versions: ModuleNotFoundError(\"No module named 'diffabs'\")": without(
+            tmp_path / "c", "diffabs"
+        ),
     }
     for needed, folder in there.items():
         with Processes(folder) as processes:
             processes.worker(folder)
             with Client(processes.address, timeout=60) as client:
                 client.wait_for_workers(1, timeout=60)
-            result = by_command(scenario, tmp_path / "out", processes.address, status=2)
+            result = by_command(scenario, folder / "out", processes.address, status=2)
         assert_one_error_line(result)
         assert needed in result.stderr, result.stderr
         assert "cannot say" in needed or result.stderr.endswith("; results would not be those of one run\n")
