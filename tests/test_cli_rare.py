@@ -74,8 +74,8 @@ def test_runs_that_diverge_are_an_answer_that_cannot_be_had(scenario):
 
 
 def conditioned(words, count=2048):
-    """P[stop_time >= 2.2] another way: given speed, mass and peak, it is that of a normal w4 below what the bisection of
-    runs finds; a mean over speeds, stratified above 52 km/h, below which w4 would have to be 9 deviations away."""
+    """P[stop_time >= 2.2] another way: given speed, mass and peak, it is that of a normal w4 below what a bisection of
+    runs finds; a mean over speeds above 52 km/h, below which w4 would have to be more than 8 deviations away."""
     rig = load(words[1], [word for word in words if "solver" in word])
     rng = np.random.default_rng(1)
     speed = (52 + 8 * (np.arange(count) + rng.random(count)) / count) / 3.6
