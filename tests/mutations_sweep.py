@@ -267,7 +267,14 @@ SWEEP = [
         CLUSTER,
         "if where is self.scheduler:",
         "if False:",
-        "test_cluster.py::test_what_listens_but_is_no_scheduler_leaves_nothing_behind",
+        "test_cluster.py::test_a_scheduler_that_is_gone_leaves_nothing_behind",
+    ),
+    (
+        "sweep: a scheduler that says nothing is waited for",
+        CLUSTER,
+        "await asyncio.wait_for(call(), TIMEOUT + 1)",
+        "await call()",
+        "test_cluster.py::test_what_listens_but_is_no_scheduler",
     ),
     (
         "sweep: workers of any version",

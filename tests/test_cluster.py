@@ -288,15 +288,27 @@ def test_a_scheduler_that_cannot_be_reached(scenario, tmp_path, impatient, where
     assert f"the scheduler at {where} cannot be reached: " in result.stderr
 
 
-def test_what_listens_but_is_no_scheduler_leaves_nothing_behind(study, alone, inside, tmp_path, impatient):
+def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tmp_path, impatient):
     """No thread of a client that would block the next one."""
     before = set(threading.enumerate())
-    with socket.create_server(("127.0.0.1", 0)) as mute:
-        where = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
-        with pytest.raises(SweepError, match=f"the scheduler at {where} cannot be reached: no answer within 1 s"):
-            sweep(study, tmp_path / "none", engine=Dask(where))
+    with pytest.raises(SweepError, match="cannot be reached: Timed out trying to connect"):
+        sweep(study, tmp_path / "none", engine=Dask("tcp://127.0.0.1:1"))
     assert set(threading.enumerate()) == before
     assert sweep(study, tmp_path / "out", engine=Dask(inside)).digest == alone.digest
+
+
+def test_what_listens_but_is_no_scheduler(study, tmp_path, impatient):
+    """It never says a word; so that nobody waits for ever if we did, it is gone after a while."""
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        end = threading.Timer(20.0, mute.close)
+        end.start()
+        where = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+        try:
+            with pytest.raises(SweepError, match=f"the scheduler at {where} cannot be reached: no answer within 1 s"):
+                sweep(study, tmp_path / "none", engine=Dask(where))
+            assert end.is_alive()
+        finally:
+            end.cancel()
 
 
 @pytest.mark.slow
