@@ -33,6 +33,7 @@ from diffabs.sweep.proposals import Estimate, Gradient, Importance, Runs, Score,
 ACCEPTANCE, SPREAD = 0.44, 0.6  # aimed at, and the s of the first step: Papaioannou et al.
 KEPT = 100  # failures in a result
 RULE = 3.0  # 0/n with 95 % confidence: less than 3/n
+Rng = np.random.Generator
 
 
 class Reason(enum.Enum):
@@ -122,8 +123,7 @@ def subset_simulation(
     price: runs that a gradient counts as, in `cost`
     tolerated: share of a level's runs that may diverge
 
-    Raises:
-        ValueError: no such dimension, threshold or number of samples; a score of another shape; too many diverged runs.
+    Raises ValueError: no such dimension, threshold or number of samples; a score of another shape; too many diverged.
     """
     plan = _plan(dimension, threshold, samples, share, levels, draws)
     runs = Runs(score, gradient, tolerated)
@@ -179,9 +179,7 @@ class _Walked(NamedTuple):
     reason: Reason
 
 
-def _walk(
-    runs: Runs, dimension: int, plan: _Plan, rng: np.random.Generator, progress: Callable[[Progress], None] | None
-) -> _Walked:
+def _walk(runs: Runs, dimension: int, plan: _Plan, rng: Rng, progress: Callable[[Progress], None] | None) -> _Walked:
     z = rng.standard_normal((plan.samples, dimension))
     scores = runs(z)
     now = _Population(z, scores, np.arange(plan.samples), 1, 1.0, SPREAD, runs.since(0, 0))
@@ -215,9 +213,7 @@ def _aim(scores: np.ndarray, plan: _Plan) -> float | None:
     return float(reached) if share < 1 else None
 
 
-def _advanced(
-    runs: Runs, old: _Population, hits: np.ndarray, value: float, plan: _Plan, rng: np.random.Generator
-) -> _Population:
+def _advanced(runs: Runs, old: _Population, hits: np.ndarray, value: float, plan: _Plan, rng: Rng) -> _Population:
     """Chains from the samples that reached a level; some samples start several where there are fewer than chains."""
     before = runs.evaluations, runs.diverged
     seeds = np.resize(rng.permutation(np.flatnonzero(hits)), plan.chains)
@@ -254,9 +250,7 @@ def _subset(walked: _Walked, plan: _Plan) -> Estimate:
     return found if hits.any() else found._replace(interval=(0.0, _bound(levels[:-1], last, plan.samples)))
 
 
-def _importance(
-    runs: Runs, walked: _Walked, subset: Estimate, plan: _Plan, rng: np.random.Generator
-) -> tuple[Importance | None, str]:
+def _importance(runs: Runs, walked: _Walked, subset: Estimate, plan: _Plan, rng: Rng) -> tuple[Importance | None, str]:
     levels, last, hits, _ = walked
     if not hits.any() or plan.draws == 0 or len(levels) == 1:
         return None, "subset simulation: no importance sampling of what one level shows, or without failures or draws"
