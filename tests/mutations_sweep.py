@@ -277,6 +277,13 @@ SWEEP = [
         "test_cluster.py::test_what_listens_but_is_no_scheduler",
     ),
     (
+        "sweep: after Ctrl-C, workers that are gone are waited for",
+        CLUSTER,
+        "if stopping() and not client.nthreads():",
+        "if False:",
+        "test_cluster.py::test_interrupted_with_its_workers_it_does_not_wait_for_them",
+    ),
+    (
         "sweep: workers of any version",
         CLUSTER,
         "for line in differences(there, here):",

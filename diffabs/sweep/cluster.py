@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import logging
 import os
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
@@ -30,6 +31,7 @@ from diffabs.sweep.study import Study
 AHEAD = 2  # chunks in hand for each thread of the workers
 DEATHS = 5  # times that a chunk may be given up by the scheduler, each after four workers died with it in hand
 TIMEOUT = 10.0  # s for a scheduler to answer
+POLL = 0.05  # s between looks at what is finished; workers have their next chunk in hand meanwhile
 
 
 class Dask:
@@ -113,7 +115,7 @@ def _completed(client: Client, study: Study, chunks: Sequence[int], stopping: Ca
             give(chunk)
 
     fill()
-    while inside:
+    while inside and _somebody_finishes(client, finished, stopping):
         future = next(finished)
         chunk = inside.pop(future)
         try:
@@ -125,6 +127,16 @@ def _completed(client: Client, study: Study, chunks: Sequence[int], stopping: Ca
             give(chunk)
         if not stopping():
             fill()
+
+
+def _somebody_finishes(client: Client, finished: Any, stopping: Callable[[], bool]) -> bool:
+    """Wait for the next chunk. False where none will come: Ctrl-C in a terminal ends the workers, too, and not all of
+    them come back."""
+    while not finished.has_ready():
+        if stopping() and not client.nthreads():
+            return False
+        time.sleep(POLL)
+    return True
 
 
 def _portable(study: Study) -> Study:
