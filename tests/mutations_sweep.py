@@ -281,7 +281,7 @@ SWEEP = [
         CLUSTER,
         "if stopping() and not client.nthreads():",
         "if False:",
-        "test_cluster.py::test_interrupted_with_its_workers_it_does_not_wait_for_them",
+        "test_cluster.py::test_only_who_was_interrupted_and_has_no_worker_waits_for_nobody",
     ),
     (
         "sweep: workers of any version",

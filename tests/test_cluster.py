@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from types import SimpleNamespace
 
 import dask
 import jax
@@ -258,28 +259,14 @@ def test_the_command_is_killed_or_interrupted(scenario, tmp_path, how):
     assert document["digest"] == other["digest"]
 
 
-def test_interrupted_with_its_workers_it_does_not_wait_for_them(study, alone, tmp_path):
-    """As by Ctrl-C in a terminal, which they get, too."""
-    gone, found = threading.Event(), []
-
-    def end(at):
-        if at.here and not gone.is_set():
-            workers.scale(0)
-            gone.set()
-
-    def interrupted():
-        found.append(sweep(study, tmp_path / "out", engine=Dask(where), progress=end, stopping=gone.is_set))
-
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=":0", silence_logs=50
-    ) as workers:
-        where = workers.scheduler_address
-        thread = threading.Thread(target=interrupted, daemon=True)
-        thread.start()
-        thread.join(60)
-        assert not thread.is_alive()
-    assert not found[0].complete
-    assert sweep(study, tmp_path / "out", resume=True).digest == alone.digest
+@pytest.mark.parametrize(
+    ("threads", "stopped", "somebody"), [({}, True, False), ({}, False, True), ({"a": 1}, True, True)]
+)
+def test_only_who_was_interrupted_and_has_no_worker_waits_for_nobody(threads, stopped, somebody):
+    """Ctrl-C in a terminal ends the workers, too: sometimes none comes back."""
+    looks = iter([False, False, True])
+    client, finished = SimpleNamespace(nthreads=lambda: threads), SimpleNamespace(has_ready=lambda: next(looks))
+    assert cluster._somebody_finishes(client, finished, lambda: stopped) is somebody
 
 
 # No cluster to use

@@ -168,14 +168,14 @@ def test_what_a_kill_leaves_behind(copy, whole):
 # Ctrl-C, and another process
 
 
-@pytest.mark.slow  # on a busy machine it may be done before the key is pressed
+@pytest.mark.slow
 def test_control_c_says_how_to_go_on(whole, tmp_path):
     """And meanwhile nobody else may have the folder."""
-    folder = tmp_path / "out"
-    with started(*command(whole.scenario, folder)) as process:
+    folder, long = tmp_path / "out", ("--samples", "64000")  # so that it is not done before the key is pressed
+    with started(*command(whole.scenario, folder, *long)) as process:
         assert until(lambda: chunks(folder), process)
         process.send_signal(signal.SIGSTOP)
-        second = run("sweep", whole.scenario, "--out", folder, "--resume", status=2)
+        second = run("sweep", whole.scenario, "--out", folder, "--resume", *long, status=2)
         assert_one_error_line(second)
         assert second.stderr == f"error: {folder} is in use by another process\n"
         process.send_signal(signal.SIGINT)
@@ -186,10 +186,11 @@ def test_control_c_says_how_to_go_on(whole, tmp_path):
     assert "interrupted: finishing the chunks in hand (Ctrl-C again: at once)" in lines
     assert lines[-1].startswith(f"interrupted: finished chunks are in {folder}; go on with: diffabs sweep ")
     again = shlex.split(lines[-1].partition("go on with: diffabs ")[2])
-    assert again == [*command(whole.scenario, folder)[3:], "--resume"]
+    assert again == [*command(whole.scenario, folder, *long)[3:], "--resume"]
     there = chunks(folder)
-    assert 0 < len(there) < 100
-    assert json.loads(run(*again).stdout)["digest"] == whole.digest
+    assert 0 < len(there) < 1000
+    undisturbed = json.loads(run("sweep", whole.scenario, "--out", tmp_path / "other", *long, "--json").stdout)
+    assert json.loads(run(*again).stdout)["digest"] == undisturbed["digest"]
     assert there < chunks(folder)
 
 

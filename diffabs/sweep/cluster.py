@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import logging
 import os
+import signal
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -53,7 +54,11 @@ class Dask:
         with contextlib.ExitStack() as opened:
             if self.scheduler is None:
                 cluster = LocalCluster(
-                    n_workers=self.workers, threads_per_worker=1, dashboard_address=":0", silence_logs=logging.CRITICAL
+                    n_workers=self.workers,
+                    threads_per_worker=1,
+                    dashboard_address=":0",
+                    silence_logs=logging.CRITICAL,
+                    preload=[__name__],
                 )
                 where: Any = opened.enter_context(cluster)
             else:
@@ -66,6 +71,11 @@ class Dask:
                 why = str(error).splitlines()[0] if str(error) else f"no answer within {TIMEOUT:g} s"
                 raise SweepError(f"the scheduler at {where} cannot be reached: {why}") from None
             yield client
+
+
+def dask_setup(_: Any) -> None:
+    """What Dask runs in each worker that this process starts: Ctrl-C in a terminal is for this process alone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _call(scheduler: str) -> None:
