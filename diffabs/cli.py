@@ -17,6 +17,7 @@ from diffabs import (
     commands_compare,
     commands_design,
     commands_identify,
+    commands_rare,
     commands_sweep,
     commands_tune,
     console,
@@ -167,6 +168,7 @@ app.command()(commands_design.certify)
 app.command()(commands_tune.tune)
 app.command()(commands_identify.identify)
 app.command()(commands_sweep.sweep)
+app.command()(commands_rare.rare)
 app.command()(commands_compare.compare)
 
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 ENGINES = ("local", "dask")
 AGAIN = 10.0  # s between lines where there is no terminal
+AWAKE = 0.1  # s between looks for Ctrl-C
 SUMMARY, FIGURES = "summary.json", "figures"
 
 
@@ -175,7 +176,10 @@ def _aside(work: Callable[[], "Results"]) -> "Results":
         except BaseException as error:
             result.set_exception(error)
 
-    threading.Thread(target=run, name=console.WORKER, daemon=True).start()
+    thread = threading.Thread(target=run, name=console.WORKER, daemon=True)
+    thread.start()
+    while thread.is_alive():
+        thread.join(AWAKE)  # the system may give a signal to another thread; Python handles it when this one wakes
     return result.result()
 
 

@@ -85,14 +85,26 @@ def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = (), *, int
     a step that is not stable for the loop (not asked for a scenario that will not be integrated).
     """
     name, raw = _read(name_or_path)
-    return loads(raw, name, str(name_or_path), overrides, integrated=integrated)
+    folder = pathlib.Path() if str(name_or_path) in names() else pathlib.Path(name_or_path).parent
+    return loads(raw, name, str(name_or_path), overrides, folder=folder, integrated=integrated)
 
 
-def loads(raw: bytes, name: str, origin: str, overrides: Sequence[str] = (), *, integrated: bool = True) -> Scenario:
-    """The scenario in a text; `origin` is its name in messages. Raises ScenarioError, as `load`."""
+def loads(
+    raw: bytes,
+    name: str,
+    origin: str,
+    overrides: Sequence[str] = (),
+    *,
+    folder: pathlib.Path = pathlib.Path(),
+    integrated: bool = True,
+) -> Scenario:
+    """The scenario in a text; `origin` is its name in messages, `folder` where the files lie that it names. Raises
+    ScenarioError, as `load`."""
     table = _parsed(raw, origin)
     for override in overrides:
         _override(table, override)
+    if "sweep" in table:
+        table["sweep"] = variation.with_samples(table["sweep"], folder)
     scenario = _assembled(name, table)
     unfit = misfits(scenario.loop, scenario.objectives)
     unstable = _unstable(scenario) if integrated else ()

@@ -208,6 +208,29 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
     say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
 
 
+def rare(result: dict[str, Any], chosen: Scenario) -> None:
+    """A small probability, the levels that led to it, and the likeliest failures."""
+    levels = Table("level", "at least", "share", "coefficient of variation", "accepted", "diverged")
+    for i, row in enumerate(result["levels"], 1):
+        names = ("threshold", "share", "cov", "acceptance")
+        levels.add_row(str(i), *(f"{row[name]:.4g}" for name in names), str(row["diverged"]))
+    _print(f"{chosen.title or chosen.name}: {result['metric']} >= {result['bound']:g} {result['unit']}", levels)
+    estimates = Table("estimate", "probability", "low", "high", "coefficient of variation")
+    for name in ("subset simulation", "importance sampling"):
+        if row := result[name]:
+            estimates.add_row(name, *(f"{x:.4g}" for x in (row["probability"], *row["interval"], row["cov"])))
+    low, high = result["interval"]
+    _print(f"probability {result['probability']:.3g}, 95 % interval {low:.3g} to {high:.3g}", estimates)
+    count = len(next(iter(result["failures"].values()), ()))
+    failures = Table("likeliest failures", *map(str, range(1, count + 1)))
+    for path, column in result["failures"].items():
+        failures.add_row(path, *map(_brief, column))
+    if result["failures"]:
+        _print("", failures)
+    say(f"{result['note']}; {result['reason']}")
+    say(f"{result['runs']} runs and {result['gradients']} gradients; {result['diverged']} diverged")
+
+
 def compared(result: dict[str, Any]) -> None:
     """Means of two sweeps, and their difference sample by sample."""
     table = Table("metric", "first", "second", "second - first", "low", "high", "less in", "variance reduction")

@@ -9,6 +9,7 @@
     "road.scale" = { type = "normal", mean = 1.0, deviation = 0.1, low = 0.5, high = 1.5 }
     "initial.speed_kmh" = [20.0, 60.0]
     "controller.gain.0" = { type = "triangular", low = -13e3, mode = -12e3, high = -11e3 }
+    "road.w4" = { type = "empirical", file = "roads.csv", column = "w4" }    # or .parquet; beside the scenario
     road = ["dry-asphalt", "snow"]                            # parts: one of them, or a table with weights
     [sweep.correlation]
     paths = ["plant.mass", "road.scale"]                      # of the normal copula
@@ -19,6 +20,7 @@
 The distributions are those of `diffabs.sweep.distributions`. Reading needs no extra, running `diffabs[sweep]`."""
 
 import dataclasses
+import pathlib
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -101,6 +103,37 @@ def read(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Variati
         correlation=table.get("correlation", {}),
         failures=failures,
     )
+
+
+def with_samples(table: Any, folder: pathlib.Path) -> Any:
+    """The section with the numbers of files in the place of their names, which are relative to `folder`: a scenario
+    that was read no longer depends on them. Raises ScenarioError."""
+    over = table.get("over") if isinstance(table, dict) else None
+    if not isinstance(over, dict):
+        return table
+    return {**table, "over": {path: _sample(given, f"sweep.over.{path}", folder) for path, given in over.items()}}
+
+
+def _sample(given: Any, where: str, folder: pathlib.Path) -> Any:
+    if not isinstance(given, dict) or given.get("type") != "empirical" or "file" not in given:
+        return given
+    if "values" in given:
+        raise ScenarioError(f"{where} has values and a file; one of them is needed")
+    if "column" not in given:
+        raise ScenarioError(f"{where}.column is missing: which one of {shown(given['file'])}?")
+    for key in ("file", "column"):
+        if not isinstance(given[key], str):
+            raise wrong(f"{where}.{key}", given[key], "text")
+    try:
+        from diffabs.sweep import columns
+    except ImportError:
+        raise ScenarioError(f'{where}: reading a file needs pip install "diffabs[sweep]"') from None
+    try:
+        values = columns.read(folder / given["file"], given["column"])
+    except ValueError as error:
+        raise ScenarioError(f"{where}: {' '.join(str(error).split())}") from None
+    rest = {key: value for key, value in given.items() if key not in ("file", "column")}
+    return {**rest, "values": values.tolist()}
 
 
 def _entries(over: Mapping[str, Any], loop: Loop) -> Iterable[Entry]:

@@ -30,6 +30,17 @@ def any_step_is_stable():
         yield
 
 
+@pytest.fixture(scope="module")
+def without_load():
+    """No lines on stderr that depend on the machine's load."""
+    from diffabs import commands_sweep, console
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(console, "PATIENCE", np.inf)
+        patch.setattr(commands_sweep, "AGAIN", np.inf)
+        yield
+
+
 @pytest.fixture
 def file(tmp_path: pathlib.Path):
     """Write a scenario file."""

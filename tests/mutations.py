@@ -3,7 +3,8 @@
     python tests/mutations.py [part of a name ...]
 
 Exit status 1 if a mutation survives, if its text is no longer in the file, or if a named test fails without it. Not
-collected by pytest; run it weekly, and when a test is added: add a line to MUTATIONS.
+collected by pytest; run it weekly, and when a test is added: add a line to MUTATIONS (of
+sweeps: in mutations_sweep.py).
 """
 
 import os
@@ -13,6 +14,8 @@ import subprocess
 import sys
 import tempfile
 from typing import NamedTuple
+
+from mutations_sweep import SWEEP
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 
@@ -753,6 +756,7 @@ MUTATIONS = [
         "jnp.abs(sample.control - last)",
         "test_rollout.py::test_the_torque_rate_of_a_lag_is_that_of_its_exponential",
     ),
+    *(Mutation(*each) for each in SWEEP),
 ]
 
 
@@ -772,8 +776,8 @@ def passes(tests: list[str], folder: pathlib.Path) -> bool:
 
 
 def copied(folder: pathlib.Path) -> None:
-    """The package, its tests and experiments, and a proof that it is this copy that Python finds."""
-    for name in ("diffabs", "tests", "experiments"):
+    """The package, its tests, experiments and pages, and a proof that it is this copy that Python finds."""
+    for name in ("diffabs", "tests", "experiments", "docs"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", folder)
     command = [sys.executable, "-c", "import diffabs; print(diffabs.__file__)"]

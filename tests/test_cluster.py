@@ -2,14 +2,15 @@
 
 import dataclasses
 import json
-import math
 import os
 import pathlib
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from types import SimpleNamespace
 
 import dask
 import jax
@@ -18,55 +19,28 @@ import psutil
 import pytest
 from commands import assert_one_error_line, left_in, run
 from distributed import Client, LocalCluster
+from sweeping import PATIENCE, SCENARIO, chunks, command, described, environment, free_port, started, until
 
-from diffabs import console, variation
-from diffabs.scenario import loads
-from diffabs.sweep import cluster, sweep
+from diffabs.sweep import SweepError, cluster, sweep
 from diffabs.sweep.cluster import Dask
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("cluster")]  # they share two workers
-
-SCENARIO = """
-plant = "mirrored-rig"
-[initial]
-speed_kmh = 30.0
-[stop]
-type = "speed-reached"
-speed_kmh = 25.0
-[controller]
-type = "state-feedback"
-gain = [-4000.0, -40.0]
-[sensor]
-type = "noise"
-slip = 0.005
-period = 2e-3
-[solver]
-step = 1e-3
-duration = 0.25
-[sweep]
-samples = 3200
-chunk = 64
-seed = 3
-[sweep.over]
-"plant.mass" = [5.3, 6.2]
-"initial.speed_kmh" = [28.0, 34.0]
-"""
-PATIENCE = 300.0  # s for anything that takes seconds on an idle machine
+pytestmark = [
+    pytest.mark.xdist_group("cluster"),  # they share two workers
+    pytest.mark.usefixtures("without_load", "any_step_is_stable", "compiled_before"),
+]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick():
-    """No lines that depend on the machine's load; workers read what was compiled before."""
+@pytest.fixture(scope="module")
+def compiled_before():
+    """Workers read what was compiled."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr("diffabs.scenario.stable_step", lambda loop: math.inf)
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", jax.config.jax_compilation_cache_dir)
-        patch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "1e6")
+        for name, value in environment().items():
+            patch.setenv(name, value)
         yield
 
 
 @pytest.fixture(autouse=True, scope="module")
-def nobody_left_behind(quick):
+def nobody_left_behind():
     yield
     deadline = time.monotonic() + 30
     while there := [text for text in map(told, psutil.Process().children(recursive=True)) if "spawn_main" in text]:
@@ -81,12 +55,8 @@ def told(process):
         return ""
 
 
-def described(text):
-    return variation.study(loads(text.encode(), "small", "small.toml"))
-
-
 @pytest.fixture(scope="module")
-def study(quick):
+def study(any_step_is_stable):
     return described(SCENARIO)
 
 
@@ -97,12 +67,21 @@ def alone(study, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def address(quick):
+def address(compiled_before):
     """A scheduler with two workers, which gives up a chunk when a worker dies of it."""
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=50) as workers,
     ):
+        yield workers.scheduler_address
+
+
+@pytest.fixture(scope="module")
+def inside():
+    """A scheduler and a worker that are threads of this process: there at once."""
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=":0", silence_logs=50
+    ) as workers:
         yield workers.scheduler_address
 
 
@@ -114,7 +93,14 @@ def pids(address):
 # The same table
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(5, marks=pytest.mark.slow)])
+def test_a_worker_makes_the_same_table(study, alone, inside, tmp_path):
+    found = sweep(study, tmp_path / "out", engine=Dask(inside))
+    assert found.complete
+    assert found.digest == alone.digest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [1, 5])
 def test_workers_that_are_killed_change_no_bit(study, alone, address, tmp_path, kills):
     """Each with two chunks in hand, at equal distances."""
     due = [(k + 1) * study.samples // (kills + 2) for k in range(kills)]
@@ -134,6 +120,7 @@ def test_workers_that_are_killed_change_no_bit(study, alone, address, tmp_path, 
     assert sorted(left_in(tmp_path / "out" / "chunks")) == sorted(path.name for path in alone.files.values())
 
 
+@pytest.mark.slow
 def test_arrays_of_jax_reach_the_workers_whole(study, alone, address, tmp_path):
     """The default of their processes is float32."""
     loop = jax.tree.map(jnp.asarray, study.loop)
@@ -141,6 +128,7 @@ def test_arrays_of_jax_reach_the_workers_whole(study, alone, address, tmp_path):
     assert found.digest == alone.digest
 
 
+@pytest.mark.slow
 def test_two_sweeps_at_once_do_not_exchange_chunks(study, alone, address, tmp_path):
     other = Dask(address).run(dataclasses.replace(study, seed=4), range(50), lambda: False)
     next(other)  # it has chunks in hand, and some are done
@@ -149,6 +137,7 @@ def test_two_sweeps_at_once_do_not_exchange_chunks(study, alone, address, tmp_pa
     assert found.digest == alone.digest
 
 
+@pytest.mark.slow
 def test_stopped_and_continued_by_the_other_engine(study, alone, address, tmp_path):
     part = sweep(study, tmp_path / "out", engine=Dask(address), stopping=lambda: True)
     assert 0 < len(part.files) <= 4
@@ -167,12 +156,6 @@ def test_the_command_with_workers_of_its_own(scenario, alone, tmp_path):
     assert result.stderr == ""
 
 
-def free_port():
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
-
-
 class Processes:
     """A scheduler and workers as processes of their own, by their documented commands."""
 
@@ -182,14 +165,15 @@ class Processes:
         host, port = self.address.removeprefix("tcp://").split(":")
         self.start("scheduler", "--host", host, "--port", port, "--dashboard-address", ":0")
 
-    def start(self, *args):
-        log = (self.folder / f"{len(self.running)}.log").open("w")
-        command = [str(pathlib.Path(sys.executable).with_name("dask")), *args]
-        self.running.append(subprocess.Popen(command, stdout=log, stderr=log, cwd=self.folder))
-        log.close()
+    def start(self, *args, path=()):
+        with (self.folder / f"{len(self.running)}.log").open("w") as log:
+            words = [str(pathlib.Path(sys.executable).with_name("dask")), *args]
+            more = {"PYTHONPATH": os.pathsep.join([*map(str, path), *sys.path])}
+            self.running.append(subprocess.Popen(words, stdout=log, stderr=log, cwd=self.folder, env=os.environ | more))
 
-    def worker(self):
-        self.start("worker", self.address, "--nthreads", "1", "--no-dashboard")
+    def worker(self, *path):
+        """`path`: folders whose packages it finds first."""
+        self.start("worker", self.address, "--nthreads", "1", "--no-dashboard", path=path)
 
     def __enter__(self):
         return self
@@ -228,12 +212,9 @@ def test_a_scheduler_that_dies_ends_it_with_one_line(scenario, alone, tmp_path, 
     out = tmp_path / "out"
     with Processes(tmp_path) as processes:
         processes.worker()
-        command = [sys.executable, "-m", "diffabs", "sweep", scenario, "--out", out, "--engine", "dask", "--json"]
-        args = ["--scheduler", processes.address, "--samples", "64000"]
-        with subprocess.Popen(
-            [*map(str, command), *args], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as process:
-            until(lambda: list(out.glob("chunks/*.parquet")), process)
+        args = ["--engine", "dask", "--scheduler", processes.address, "--samples", "64000"]
+        with started(*command(scenario, out, *args)) as process:
+            assert until(lambda: chunks(out), process)
             processes.running[0].kill()
             stdout, stderr = process.communicate(timeout=PATIENCE)
     assert (process.returncode, stdout) == (1, "")
@@ -247,25 +228,11 @@ def test_a_scheduler_that_dies_ends_it_with_one_line(scenario, alone, tmp_path, 
 # Kills of the command itself
 
 
-def until(condition, process):
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert process.poll() is None
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def by_itself(scenario, out):
     """The command with two workers, in a session of its own, after its first chunk; and its workers."""
-    command = [sys.executable, "-m", "diffabs", "sweep", scenario, "--out", out, "--engine", "dask", "--workers", "2"]
-    process = subprocess.Popen(
-        [*map(str, command), "--json", "--samples", "32000"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    until(lambda: list(out.glob("chunks/*.parquet")), process)
+    args = ["--engine", "dask", "--workers", "2", "--samples", "32000"]
+    process = started(*command(scenario, out, *args), start_new_session=True)
+    assert until(lambda: chunks(out), process)
     children = psutil.Process(process.pid).children(recursive=True)
     assert sum("spawn_main" in told(child) for child in children) == 2
     return process, children
@@ -286,28 +253,114 @@ def test_the_command_is_killed_or_interrupted(scenario, tmp_path, how):
         assert stderr.splitlines()[-1].endswith("--resume")
         assert "Traceback" not in stderr
     assert not psutil.wait_procs(children, timeout=30)[1]
-    assert 0 < len(list(out.glob("chunks/*.parquet"))) < 500
+    assert 0 < len(chunks(out)) < 500
     document = json.loads(run("sweep", scenario, "--out", out, "--samples", "32000", "--resume", "--json").stdout)
     other = json.loads(run("sweep", scenario, "--out", tmp_path / "whole", "--samples", "32000", "--json").stdout)
     assert document["digest"] == other["digest"]
 
 
+@pytest.mark.parametrize(
+    ("threads", "stopped", "somebody"), [({}, True, False), ({}, False, True), ({"a": 1}, True, True)]
+)
+def test_only_who_was_interrupted_and_has_no_worker_waits_for_nobody(threads, stopped, somebody):
+    """Ctrl-C in a terminal ends the workers, too: sometimes none comes back."""
+    looks = iter([False, False, True])
+    client, finished = SimpleNamespace(nthreads=lambda: threads), SimpleNamespace(has_ready=lambda: next(looks))
+    assert cluster._somebody_finishes(client, finished, lambda: stopped) is somebody
+
+
 # No cluster to use
 
 
-@pytest.mark.parametrize(
-    "where", ["tcp://127.0.0.1:1", "tcp://127.0.0.1", "http://127.0.0.1:80", "nowhere.invalid:8786", "127.0.0.1"]
-)
-def test_a_scheduler_that_cannot_be_reached(scenario, tmp_path, monkeypatch, where):
+@pytest.fixture
+def impatient(monkeypatch):
     monkeypatch.setattr(cluster, "TIMEOUT", 1.0)
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "tcp://127.0.0.1:1",
+        *(
+            pytest.param(where, marks=pytest.mark.slow)
+            for where in (
+                "tcp://127.0.0.1",
+                "http://127.0.0.1:80",
+                "nowhere.invalid:8786",
+                "127.0.0.1",
+                "tls://[::1]:1",
+            )
+        ),
+    ],
+)
+def test_a_scheduler_that_cannot_be_reached(scenario, tmp_path, impatient, where):
     result = by_command(scenario, tmp_path / "out", where, status=2)
     assert_one_error_line(result)
     assert f"the scheduler at {where} cannot be reached: " in result.stderr
 
 
-def test_a_scheduler_without_workers(scenario, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "TIMEOUT", 1.0)
+def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tmp_path, impatient):
+    """No thread of a client that would block the next one."""
+    before = set(threading.enumerate())
+    with pytest.raises(SweepError, match="cannot be reached: Timed out trying to connect"):
+        sweep(study, tmp_path / "none", engine=Dask("tcp://127.0.0.1:1"))
+    assert set(threading.enumerate()) == before
+    assert sweep(study, tmp_path / "out", engine=Dask(inside)).digest == alone.digest
+
+
+def test_what_listens_but_is_no_scheduler(study, tmp_path, impatient):
+    """It never says a word; so that nobody waits for ever if we did, it is gone after a while."""
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        end = threading.Timer(20.0, mute.close)
+        end.start()
+        where = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+        try:
+            with pytest.raises(SweepError, match=f"the scheduler at {where} cannot be reached: no answer within 1 s"):
+                sweep(study, tmp_path / "none", engine=Dask(where))
+            assert end.is_alive()
+        finally:
+            end.cancel()
+
+
+@pytest.mark.slow
+def test_a_scheduler_without_workers(scenario, tmp_path, impatient):
     with LocalCluster(n_workers=0, dashboard_address=":0", silence_logs=50) as empty:
         result = by_command(scenario, tmp_path / "out", empty.scheduler_address, status=2)
     assert_one_error_line(result)
     assert "the scheduler has no worker within 1 s" in result.stderr
+
+
+def pretended(folder, name, version):
+    """A folder that makes a package look like another version of it."""
+    metadata = folder / f"{name}-{version}.dist-info" / "METADATA"
+    metadata.parent.mkdir(parents=True)
+    metadata.write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    return folder
+
+
+def without(folder, name):
+    """A folder that makes a package look as if it were not installed."""
+    (folder / f"{name}.py").parent.mkdir(parents=True)
+    (folder / f"{name}.py").write_text(f"raise ModuleNotFoundError(\"No module named '{name}'\")\n")
+    return folder
+
+
+@pytest.mark.slow
+def test_a_worker_with_other_versions(scenario, tmp_path):
+    """Of the package and of JAX; and one that has no diffabs at all."""
+    there = {
+        'diffabs is "9.9" there, ': pretended(tmp_path / "a", "diffabs", "9.9"),
+        'jax is "0.1" there, ': pretended(tmp_path / "b", "jax", "0.1"),
+        "a worker cannot say its versions: ModuleNotFoundError(\"No module named 'diffabs'\")": without(
+            tmp_path / "c", "diffabs"
+        ),
+    }
+    for needed, folder in there.items():
+        with Processes(folder) as processes:
+            processes.worker(folder)
+            with Client(processes.address, timeout=60) as client:
+                client.wait_for_workers(1, timeout=60)
+            result = by_command(scenario, folder / "out", processes.address, status=2)
+        assert_one_error_line(result)
+        assert needed in result.stderr, result.stderr
+        assert "cannot say" in needed or result.stderr.endswith("; results would not be those of one run\n")

@@ -58,7 +58,7 @@ def test_the_tuning_runs():
 
 
 def test_the_sweep_of_the_page_on_sweeps_runs(tmp_path, monkeypatch):
-    (code,) = re.findall(r"```python\n(.*?)```", SWEEPS, re.DOTALL)
+    code, _ = re.findall(r"```python\n(.*?)```", SWEEPS, re.DOTALL)  # the other: test_sweep_processes.py
     monkeypatch.chdir(tmp_path)
     names = {}
     exec(compile(code.replace("256", "64").replace("128", "32"), "sweeps.md", "exec"), names)

@@ -1,13 +1,17 @@
 """Rare failures of a study: against a count where they are not rare, and against a closed form where they are."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, stops
-from diffabs.sweep import Normal, Space, Study, Uniform
-from diffabs.sweep.reliability import _scores, failure_probability
+from diffabs.sweep import Normal, Space, Study, Triangular, Uniform
+from diffabs.sweep.proposals import design_points
+from diffabs.sweep.reliability import _gradient, _scores, failure_probability
+from diffabs.sweep.space import Correlation
 
 RIG = d.Loop(
     plant=plants.MirroredRig(),
@@ -33,6 +37,36 @@ def test_scores_are_runs():
         values = {path: column[i] for path, column in SPACE.normal(z).items()}
         alone = d.measure(d.replace(RIG, values), STUDY.solver, STUDY.objectives).metrics["stop_distance"]
         assert value == pytest.approx(float(alone), rel=1e-12)
+
+
+def test_slopes_are_differences_of_runs():
+    """Of a normal variable, a uniform one and a triangular one, two of which depend on each other."""
+    space = Space(
+        {**SPACE.variables, "controller.gain.0": Triangular(-13e3, -12e3, -11e3)},
+        Correlation(("plant.road.w4", "plant.mass"), [[1.0, 0.6], [0.6, 1.0]]),
+    )
+    study = dataclasses.replace(STUDY, space=space)
+    z = np.array([[0.0, 0.0, 0.3], [-2.0, 1.0, -1.0], [1.0, -1.0, 2.0]])
+    for metric in ("stop_distance", "max_slip"):
+        score, slope = _gradient(study, metric)(z)
+        np.testing.assert_allclose(score, _scores(study, metric, z), rtol=1e-10)
+        for j, offset in enumerate(1e-4 * np.eye(3)):
+            ends = _scores(study, metric, z + offset), _scores(study, metric, z - offset)
+            difference = (ends[0] - ends[1]) / 2e-4
+            # 1e-8 of the curvature, and the rounding of the metric in 1e-4
+            np.testing.assert_allclose(slope[:, j], difference, rtol=1e-5, atol=1e-9, err_msg=f"{metric}, z_{j}")
+
+
+@pytest.mark.slow
+def test_gradients_lead_to_the_design_point_of_a_slippery_road():
+    """Where the distance reaches the bound nearest to the mean: at w4 = 0.4 - 0.01 * 4, whatever the mass."""
+    bound = float(_scores(STUDY, "stop_distance", np.array([[-4.0, 0.0]]))[0])
+    found = failure_probability(STUDY, "stop_distance", bound, samples=400, draws=400, gradients=True)
+    assert found.interval[0] < norm.cdf(-4.0) < found.interval[1]
+    assert found.gradients > 0
+    assert found.cost == found.evaluations + 3 * found.gradients
+    points = design_points(_gradient(STUDY, "stop_distance"), found.failing[:8], bound)
+    np.testing.assert_allclose(points[0], [-4.0, 0.0], atol=0.05)
 
 
 @pytest.mark.slow

@@ -13,16 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from sweeping import described
 
 import diffabs as d
-from diffabs import console, roads, variation
+from diffabs import roads
 from diffabs.objectives import Effort
 from diffabs.rollout import measure, rollout
-from diffabs.scenario import loads
 from diffabs.sweep import Categorical, Local, Normal, Results, Space, SweepError, Uniform, sweep
 from diffabs.sweep.trajectories import keep
 
-pytestmark = [pytest.mark.xdist_group("sweep"), pytest.mark.usefixtures("any_step_is_stable")]
+pytestmark = [pytest.mark.xdist_group("sweep"), pytest.mark.usefixtures("any_step_is_stable", "without_load")]
 
 SMALL = """
 title = "small"
@@ -58,18 +58,6 @@ ROAD = 'road = ["rig", { type = "scaled", road = "rig-unrounded", scale = 0.9 }]
 ROADS = SMALL.replace("[sweep.failures]", ROAD)
 SINGLE = SMALL.replace("1e308", "3e38")  # diverges in float32
 TOLERANCE = {"rtol": 1e-9, "atol": 1e-12}  # the same operations, compiled apart: rounding, of runs of 125 steps
-
-
-@pytest.fixture(autouse=True, scope="module")
-def quick():
-    """No lines that depend on the machine's load."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(console, "PATIENCE", math.inf)
-        yield
-
-
-def described(text):
-    return variation.study(loads(text.encode(), "small", "small.toml"))
 
 
 @pytest.fixture(scope="module")

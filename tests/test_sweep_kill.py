@@ -4,7 +4,6 @@ table, to the bit, or is refused in one line."""
 import errno
 import hashlib
 import json
-import math
 import os
 import pathlib
 import random
@@ -16,43 +15,17 @@ import sys
 import time
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from sweeping import PATIENCE, SCENARIO, chunks, command, environment, started, until
 
-from diffabs import console
 from diffabs.sweep import Results
 from diffabs.sweep.store import NAME, Store
 
 pytestmark = pytest.mark.xdist_group("sweep-kill")  # what these share takes a whole run
 
-SCENARIO = """
-plant = "mirrored-rig"
-[initial]
-speed_kmh = 30.0
-[stop]
-type = "speed-reached"
-speed_kmh = 25.0
-[controller]
-type = "state-feedback"
-gain = [-4000.0, -40.0]
-[sensor]
-type = "noise"
-slip = 0.005
-period = 2e-3
-[solver]
-step = 5e-4
-duration = 0.25
-[sweep]
-samples = 6400
-chunk = 64
-seed = 3
-[sweep.over]
-"plant.mass" = [5.3, 6.2]
-"initial.speed_kmh" = [28.0, 34.0]
-"""
-PATIENCE = 300.0  # s for anything that takes seconds on an idle machine
+LONG = SCENARIO.replace("step = 1e-3", "step = 5e-4").replace("samples = 3200", "samples = 6400")
 LEFT = {".lock", "manifest.json", "chunks", "summary.json"}
 DAMAGE = {
     "emptied": lambda data: b"",
@@ -69,14 +42,6 @@ def flipped(data, place):
     return data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick():
-    """No lines that depend on the machine's load."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(console, "PATIENCE", math.inf)
-        yield
-
-
 class Whole(NamedTuple):
     """A run that nothing disturbed."""
 
@@ -87,51 +52,13 @@ class Whole(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, any_step_is_stable):
+def whole(tmp_path_factory, without_load, any_step_is_stable):
     folder = tmp_path_factory.mktemp("whole")
-    (folder / "small.toml").write_text(SCENARIO)
+    (folder / "small.toml").write_text(LONG)
     result = run("sweep", folder / "small.toml", "--out", folder / "out", "--json")
     times = [path.stat().st_mtime for path in (folder / "out/chunks").iterdir()]
     digest = json.loads(result.stdout)["digest"]
     return Whole(folder / "out", folder / "small.toml", digest, max(times) - min(times))
-
-
-def environment():
-    """What this process has compiled, others read; those that are killed must not write there."""
-    return os.environ | {
-        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "1e6",
-    }
-
-
-def command(scenario, folder, *args):
-    return [sys.executable, "-m", "diffabs", "sweep", str(scenario), "--out", str(folder), "--json", *args]
-
-
-def started(scenario, folder, *args):
-    return subprocess.Popen(
-        command(scenario, folder, *args),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment(),
-    )
-
-
-def chunks(folder):
-    """Names of the finished chunks."""
-    return {path.name for path in (folder / "chunks").glob("*.parquet")}
-
-
-def until(condition, process):
-    """Wait while the process runs. Whether the condition came true."""
-    end = time.monotonic() + PATIENCE
-    while process.poll() is None:
-        if condition():
-            return True
-        assert time.monotonic() < end
-        time.sleep(1e-3)
-    return False
 
 
 def went_on(scenario, folder):
@@ -163,7 +90,7 @@ def test_killed_again_and_again(whole, tmp_path, kills):
     folders = [tmp_path / "0"]
     while len(survived) < kills:
         before, begun = chunks(folders[-1]), time.monotonic()
-        with started(whole.scenario, folders[-1], "--resume") as process:
+        with started(*command(whole.scenario, folders[-1], "--resume")) as process:
             if len(survived) % 2 == 0:
                 until(lambda before=before: chunks(folders[-1]) > before, process)
                 start = start or time.monotonic() - begun
@@ -241,14 +168,14 @@ def test_what_a_kill_leaves_behind(copy, whole):
 # Ctrl-C, and another process
 
 
-@pytest.mark.slow  # on a busy machine it may be done before the key is pressed
+@pytest.mark.slow
 def test_control_c_says_how_to_go_on(whole, tmp_path):
     """And meanwhile nobody else may have the folder."""
-    folder = tmp_path / "out"
-    with started(whole.scenario, folder) as process:
+    folder, long = tmp_path / "out", ("--samples", "64000")  # so that it is not done before the key is pressed
+    with started(*command(whole.scenario, folder, *long)) as process:
         assert until(lambda: chunks(folder), process)
         process.send_signal(signal.SIGSTOP)
-        second = run("sweep", whole.scenario, "--out", folder, "--resume", status=2)
+        second = run("sweep", whole.scenario, "--out", folder, "--resume", *long, status=2)
         assert_one_error_line(second)
         assert second.stderr == f"error: {folder} is in use by another process\n"
         process.send_signal(signal.SIGINT)
@@ -259,10 +186,11 @@ def test_control_c_says_how_to_go_on(whole, tmp_path):
     assert "interrupted: finishing the chunks in hand (Ctrl-C again: at once)" in lines
     assert lines[-1].startswith(f"interrupted: finished chunks are in {folder}; go on with: diffabs sweep ")
     again = shlex.split(lines[-1].partition("go on with: diffabs ")[2])
-    assert again == [*command(whole.scenario, folder)[3:], "--resume"]
+    assert again == [*command(whole.scenario, folder, *long)[3:], "--resume"]
     there = chunks(folder)
-    assert 0 < len(there) < 100
-    assert json.loads(run(*again).stdout)["digest"] == whole.digest
+    assert 0 < len(there) < 1000
+    undisturbed = json.loads(run("sweep", whole.scenario, "--out", tmp_path / "other", *long, "--json").stdout)
+    assert json.loads(run(*again).stdout)["digest"] == undisturbed["digest"]
     assert there < chunks(folder)
 
 
@@ -271,7 +199,7 @@ def test_control_c_twice_does_not_wait(whole, tmp_path):
     """For a chunk that takes minutes. What it leaves can be continued."""
     folder = tmp_path / "out"
     endless = ("--set", "solver.step=1e-7", "--set", "sensor.period=1e-3", "--set", "sweep.chunk=4096")
-    with started(whole.scenario, folder, *endless) as process:
+    with started(*command(whole.scenario, folder, *endless)) as process:
         assert until((folder / "manifest.json").exists, process)
         time.sleep(1.0)
         process.send_signal(signal.SIGINT)

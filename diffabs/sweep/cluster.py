@@ -6,17 +6,22 @@ whose worker dies is given to another one.
 
 Dask sends programs, by pickle: its scheduler and workers must be machines that trust each other."""
 
+import asyncio
 import contextlib
 import dataclasses
 import logging
 import os
+import signal
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any
 
 import jax
 import numpy as np
-from distributed import Client, KilledWorker, LocalCluster, as_completed
+from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
+from distributed.comm.core import connect
 
 from diffabs import provenance
 from diffabs.sweep.engines import DECISIVE, Done, done
@@ -27,6 +32,7 @@ from diffabs.sweep.study import Study
 AHEAD = 2  # chunks in hand for each thread of the workers
 DEATHS = 5  # times that a chunk may be given up by the scheduler, each after four workers died with it in hand
 TIMEOUT = 10.0  # s for a scheduler to answer
+POLL = 0.05  # s between looks at what is finished; workers have their next chunk in hand meanwhile
 
 
 class Dask:
@@ -48,16 +54,43 @@ class Dask:
         with contextlib.ExitStack() as opened:
             if self.scheduler is None:
                 cluster = LocalCluster(
-                    n_workers=self.workers, threads_per_worker=1, dashboard_address=":0", silence_logs=logging.CRITICAL
+                    n_workers=self.workers,
+                    threads_per_worker=1,
+                    dashboard_address=":0",
+                    silence_logs=logging.CRITICAL,
+                    preload=[__name__],
                 )
                 where: Any = opened.enter_context(cluster)
             else:
                 where = self.scheduler
             try:
+                if where is self.scheduler:
+                    _call(where)
                 client = opened.enter_context(Client(where, timeout=TIMEOUT))
-            except (OSError, ValueError) as error:
-                raise SweepError(f"the scheduler at {where} cannot be reached: {str(error).splitlines()[0]}") from None
+            except (OSError, TypeError, ValueError) as error:  # TypeError: tls without certificates
+                why = str(error).splitlines()[0] if str(error) else f"no answer within {TIMEOUT:g} s"
+                raise SweepError(f"the scheduler at {where} cannot be reached: {why}") from None
             yield client
+
+
+def dask_setup(_: Any) -> None:
+    """What Dask runs in each worker that this process starts: Ctrl-C in a terminal is for this process alone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _call(scheduler: str) -> None:
+    """Connect, and no more: a client that does not reach its scheduler leaves a thread behind which can block the next.
+    Raises OSError, TypeError or ValueError; a TimeoutError also where something listens that is no scheduler."""
+
+    async def call() -> None:
+        comm = await connect(scheduler, timeout=TIMEOUT, **Security().get_connection_args("client"))
+        comm.abort()
+
+    async def patient() -> None:
+        await asyncio.wait_for(call(), TIMEOUT + 1)  # `connect` itself waits for ever for the first words
+
+    with ThreadPoolExecutor(1) as apart:  # a notebook's thread runs a loop already
+        apart.submit(lambda: asyncio.run(patient())).result()
 
 
 def _check(client: Client) -> None:
@@ -68,7 +101,7 @@ def _check(client: Client) -> None:
     here = provenance.versions(*DECISIVE)
     try:
         answers: Any = client.run(provenance.versions, *DECISIVE)
-    except (ImportError, OSError, ValueError) as error:
+    except Exception as error:  # that is all Dask says of a worker without diffabs
         raise SweepError(f"a worker cannot say its versions: {str(error).splitlines()[0]}") from None
     for worker, there in answers.items():
         for line in differences(there, here):
@@ -92,7 +125,7 @@ def _completed(client: Client, study: Study, chunks: Sequence[int], stopping: Ca
             give(chunk)
 
     fill()
-    while inside:
+    while inside and _somebody_finishes(client, finished, stopping):
         future = next(finished)
         chunk = inside.pop(future)
         try:
@@ -104,6 +137,16 @@ def _completed(client: Client, study: Study, chunks: Sequence[int], stopping: Ca
             give(chunk)
         if not stopping():
             fill()
+
+
+def _somebody_finishes(client: Client, finished: Any, stopping: Callable[[], bool]) -> bool:
+    """Wait for the next chunk. False where none will come: Ctrl-C in a terminal ends the workers, too, and not all of
+    them come back."""
+    while not finished.has_ready():
+        if stopping() and not client.nthreads():
+            return False
+        time.sleep(POLL)
+    return True
 
 
 def _portable(study: Study) -> Study:

@@ -38,6 +38,10 @@ Gradient = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 Fit = Callable[[np.ndarray], "Mixture"]
 
 
+class Diverged(ValueError):
+    """Too many runs diverged to tell a probability; one line."""
+
+
 class Estimate(NamedTuple):
     """A probability, its coefficient of variation, and an interval of 95 %."""
 
@@ -89,7 +93,7 @@ class Runs:
         """How many runs diverged, after that many before; too many are an error."""
         lost, of = self.diverged - diverged, self.evaluations - evaluations
         if lost > self.tolerated * of:
-            raise ValueError(f"{lost} of {of} runs diverged: make the score +inf or -inf there, or `tolerated` greater")
+            raise Diverged(f"{lost} of {of} runs diverged: make the score +inf or -inf there, or `tolerated` greater")
         return lost
 
 

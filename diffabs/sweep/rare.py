@@ -33,6 +33,7 @@ from diffabs.sweep.proposals import Estimate, Gradient, Importance, Runs, Score,
 ACCEPTANCE, SPREAD = 0.44, 0.6  # aimed at, and the s of the first step: Papaioannou et al.
 KEPT = 100  # failures in a result
 RULE = 3.0  # 0/n with 95 % confidence: less than 3/n
+Rng = np.random.Generator
 
 
 class Reason(enum.Enum):
@@ -122,38 +123,15 @@ def subset_simulation(
     price: runs that a gradient counts as, in `cost`
     tolerated: share of a level's runs that may diverge
 
-    Raises:
-        ValueError: no such dimension, threshold or number of samples; a score of another shape; too many diverged runs.
+    Raises ValueError: no such dimension, threshold or number of samples; a score of another shape; too many diverged.
     """
     plan = _plan(dimension, threshold, samples, share, levels, draws)
     runs = Runs(score, gradient, tolerated)
     first, second = (np.random.default_rng(each) for each in np.random.SeedSequence(seed).spawn(2))
-    levels_made, last, hits, reason = _walk(runs, dimension, plan, first, progress)
-    subset = _estimate(levels_made, last.family[hits])
-    if not hits.any():
-        subset = subset._replace(interval=(0.0, _bound(levels_made[:-1], last, samples)))
-    tried, note = (
-        None,
-        "subset simulation: no importance sampling of what one level shows, or without failures or draws",
-    )
-    if hits.any() and draws > 0 and len(levels_made) > 1:
-        chain = np.flatnonzero(hits) % plan.chains
-        tried, note = refined(runs, last.z[hits], chain, subset, threshold=threshold, draws=draws, rng=second)
-    best = tried.estimate if tried and pays(tried, subset) else subset
-    failing = np.unique(last.z[hits], axis=0)
-    return RareEvent(
-        *best,
-        reason=reason,
-        levels=levels_made,
-        subset=subset,
-        importance=tried,
-        note=note,
-        failing=failing[np.argsort(np.sum(failing**2, axis=1), kind="stable")][:KEPT],
-        evaluations=runs.evaluations,
-        gradients=runs.gradients,
-        diverged=runs.diverged,
-        price=price,
-    )
+    walked = _walk(runs, dimension, plan, first, progress)
+    subset = _subset(walked, plan)
+    tried, note = _importance(runs, walked, subset, plan, second)
+    return _event(runs, walked, subset, tried, note, price)
 
 
 class _Plan(NamedTuple):
@@ -192,10 +170,16 @@ class _Population(NamedTuple):
     diverged: int
 
 
-def _walk(
-    runs: Runs, dimension: int, plan: _Plan, rng: np.random.Generator, progress: Callable[[Progress], None] | None
-) -> tuple[list[Level], _Population, np.ndarray, Reason]:
-    """All levels; the last one's samples, and which of them fail."""
+class _Walked(NamedTuple):
+    """All levels; the last one's samples, and which of them fail (n,); why there is no further one."""
+
+    levels: list[Level]
+    last: _Population
+    hits: np.ndarray
+    reason: Reason
+
+
+def _walk(runs: Runs, dimension: int, plan: _Plan, rng: Rng, progress: Callable[[Progress], None] | None) -> _Walked:
     z = rng.standard_normal((plan.samples, dimension))
     scores = runs(z)
     now = _Population(z, scores, np.arange(plan.samples), 1, 1.0, SPREAD, runs.since(0, 0))
@@ -211,7 +195,7 @@ def _walk(
             progress(Progress(len(made), value, part, runs.evaluations))
         if ends:
             reached = Reason.REACHED if aim == plan.threshold else Reason.LEVELS
-            return made, now, hits, Reason.PLATEAU if aim is None else reached
+            return _Walked(made, now, hits, Reason.PLATEAU if aim is None else reached)
         now = _advanced(runs, now, hits, value, plan, rng)
 
 
@@ -229,9 +213,7 @@ def _aim(scores: np.ndarray, plan: _Plan) -> float | None:
     return float(reached) if share < 1 else None
 
 
-def _advanced(
-    runs: Runs, old: _Population, hits: np.ndarray, value: float, plan: _Plan, rng: np.random.Generator
-) -> _Population:
+def _advanced(runs: Runs, old: _Population, hits: np.ndarray, value: float, plan: _Plan, rng: Rng) -> _Population:
     """Chains from the samples that reached a level; some samples start several where there are fewer than chains."""
     before = runs.evaluations, runs.diverged
     seeds = np.resize(rng.permutation(np.flatnonzero(hits)), plan.chains)
@@ -259,6 +241,41 @@ def _cov(hits: np.ndarray) -> float:
     lags = [np.mean(hits[:-k] & hits[k:]) - p**2 for k in range(1, length)]
     excess = 2 * sum((1 - k / length) * lag for k, lag in enumerate(lags, 1)) / (p * (1 - p))
     return math.sqrt((1 - p) / (p * hits.size) * (1 + max(0.0, excess)))
+
+
+def _subset(walked: _Walked, plan: _Plan) -> Estimate:
+    """What the levels tell; an upper bound where nothing failed."""
+    levels, last, hits, _ = walked
+    found = _estimate(levels, last.family[hits])
+    return found if hits.any() else found._replace(interval=(0.0, _bound(levels[:-1], last, plan.samples)))
+
+
+def _importance(runs: Runs, walked: _Walked, subset: Estimate, plan: _Plan, rng: Rng) -> tuple[Importance | None, str]:
+    levels, last, hits, _ = walked
+    if not hits.any() or plan.draws == 0 or len(levels) == 1:
+        return None, "subset simulation: no importance sampling of what one level shows, or without failures or draws"
+    chain = np.flatnonzero(hits) % plan.chains
+    return refined(runs, last.z[hits], chain, subset, threshold=plan.threshold, draws=plan.draws, rng=rng)
+
+
+def _event(
+    runs: Runs, walked: _Walked, subset: Estimate, tried: Importance | None, note: str, price: float
+) -> RareEvent:
+    """The better estimate, and all that was seen."""
+    failing = np.unique(walked.last.z[walked.hits], axis=0)
+    return RareEvent(
+        *(tried.estimate if tried and pays(tried, subset) else subset),
+        reason=walked.reason,
+        levels=walked.levels,
+        subset=subset,
+        importance=tried,
+        note=note,
+        failing=failing[np.argsort(np.sum(failing**2, axis=1), kind="stable")][:KEPT],
+        evaluations=runs.evaluations,
+        gradients=runs.gradients,
+        diverged=runs.diverged,
+        price=price,
+    )
 
 
 def _estimate(levels: list[Level], family: np.ndarray) -> Estimate:

@@ -50,14 +50,15 @@ def sweep(
     """Compute every chunk that the folder does not have yet, and open it.
 
     Of several processes (`jax.distributed.initialize`) that all call this with the same study and a folder on a common
-    disk, the first has the lock and the manifest, each computes and writes its share, and all return the whole.
+    disk, the first has the lock and the manifest, each computes and writes its share, and all return the whole. One
+    that fails says so after the others have finished theirs.
 
     stopping: asked after every chunk; True ends the run, and `resume` goes on later
     source: put into the manifest, for whoever reads it
 
     Raises:
         ValueError: a study that cannot be run.
-        SweepError: a folder that holds something else, is in use, or cannot be written.
+        SweepError: a folder that holds something else, is in use, or cannot be written; another process died.
         OSError: a full disk; what is there stays, and `resume` goes on.
     """
     study.check()
@@ -88,12 +89,25 @@ def _begun(
                 whole, damaged = store.scan()
                 found[:] = np.where(np.isin(np.arange(study.chunks), list(whole)), HERE, MISSING)
         finally:  # whatever happened: the others wait for this
-            found = multihost_utils.broadcast_one_to_all(found)
+            found = _together(multihost_utils.broadcast_one_to_all, found)
         if UNKNOWN in found:
             raise SweepError(f"{store.folder}: the first process could not begin, and says why")
-        yield np.flatnonzero(found == MISSING).tolist(), damaged
-        if jax.process_count() > 1:
-            multihost_utils.sync_global_devices("chunks")
+        try:
+            yield np.flatnonzero(found == MISSING).tolist(), damaged
+        except Exception:  # a process that left at once would take those with it that still compute
+            _together(multihost_utils.sync_global_devices, "chunks")
+            raise
+        _together(multihost_utils.sync_global_devices, "chunks")
+
+
+def _together(meet: Callable[[Any], Any], what: Any) -> Any:
+    """What all processes do at the same time; nothing where there is but one. Raises SweepError if one has died."""
+    if jax.process_count() == 1:
+        return what
+    try:
+        return meet(what)
+    except jax.errors.JaxRuntimeError as error:
+        raise SweepError("another process died; finished chunks stay, and resume goes on") from error
 
 
 class _Tally:

@@ -1,0 +1,84 @@
+"""What the tests of sweeps share: a study of a quarter of a second, and processes that run it."""
+
+import os
+import socket
+import subprocess
+import sys
+import time
+
+import jax
+
+from diffabs import variation
+from diffabs.scenario import loads
+
+PATIENCE = 300.0  # s for anything that takes seconds on an idle machine
+SCENARIO = """
+plant = "mirrored-rig"
+[initial]
+speed_kmh = 30.0
+[stop]
+type = "speed-reached"
+speed_kmh = 25.0
+[controller]
+type = "state-feedback"
+gain = [-4000.0, -40.0]
+[sensor]
+type = "noise"
+slip = 0.005
+period = 2e-3
+[solver]
+step = 1e-3
+duration = 0.25
+[sweep]
+samples = 3200
+chunk = 64
+seed = 3
+[sweep.over]
+"plant.mass" = [5.3, 6.2]
+"initial.speed_kmh" = [28.0, 34.0]
+"""
+
+
+def described(text):
+    return variation.study(loads(text.encode(), "small", "small.toml"))
+
+
+def chunks(folder):
+    """Names of the finished chunks."""
+    return {path.name for path in (folder / "chunks").glob("*.parquet")}
+
+
+def command(scenario, folder, *args):
+    return [sys.executable, "-m", "diffabs", "sweep", str(scenario), "--out", str(folder), "--json", *map(str, args)]
+
+
+def environment():
+    """What this process has compiled, others read; those that are killed must not write there."""
+    return os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": jax.config.jax_compilation_cache_dir,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "1e6",
+    }
+
+
+def started(*words, **options):
+    """A process whose output can be read."""
+    return subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(), **options
+    )
+
+
+def until(condition, process):
+    """Wait while the process runs. Whether the condition came true."""
+    end = time.monotonic() + PATIENCE
+    while process.poll() is None:
+        if condition():
+            return True
+        assert time.monotonic() < end
+        time.sleep(1e-3)
+    return False
+
+
+def free_port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
