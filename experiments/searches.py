@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 
 from diffabs.tune.problem import Mode, Multipliers, Problem
 
-FORWARD = 8  # parameters beyond which forward mode is not timed: at 12 it took as long as reverse mode, or longer
+FORWARD = 6  # parameters beyond which forward mode is not timed: benchmarks/bench_gradient.py found it slower there
 REJECTED = 1e6  # the value of a run that failed, as the libraries want it
 NEAR = 0.05  # greatest component of a move in z after which the step is as stable as before
 OWN = 1e-6  # of the way from the start to its least value: there a search has reached its own optimum

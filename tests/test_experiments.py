@@ -153,7 +153,7 @@ def test_gradients_need_fewer_rollouts_than_searches_without(tmp_path, monkeypat
     assert found["L-BFGS"] <= found["Nelder-Mead"] * (1 + 1e-4)
     assert rows["0.0001"]["gradients"] < 15
     assert rows["0.0001"]["Nelder-Mead"] > 30
-    assert rows["Nelder-Mead's end"]["gradients"] < 20
+    assert next(row for name, row in rows.items() if name.startswith("Nelder-Mead"))["gradients"] < 20
 
 
 def test_what_searches_spent_is_counted(monkeypatch):
