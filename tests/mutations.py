@@ -743,6 +743,13 @@ MUTATIONS = [
         "test_tuning.py::TestStability::test_the_limit_of_a_real_and_of_an_imaginary_mode",
     ),
     Mutation(
+        "scheduled feedback: intervals below the speed left out",
+        "controllers/lookup.py",
+        "jnp.where(v >= nodes[1:], 1.0,",
+        "jnp.where(v >= nodes[1:], 0.0,",
+        "test_blocks.py::test_scheduled_feedback_interpolates_between_many_nodes",
+    ),
+    Mutation(
         "proportional feedback: the same gain at every speed",
         "controllers/lookup.py",
         "(signal.measured.speed / self.reference_speed)",

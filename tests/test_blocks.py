@@ -124,6 +124,16 @@ def test_scheduled_feedback_interpolates_its_gains():
         close(k.flow(0.0, Memory(0.3), signal), fixed.flow(0.0, Memory(0.3), signal))
 
 
+def test_scheduled_feedback_interpolates_between_many_nodes():
+    """Against NumPy: before the first node, at nodes, between, beyond the last; rounding only."""
+    nodes, values = np.array([2.0, 3.0, 5.0, 9.0]), np.array([-1.0, -5.0, -2.0, -7.0])
+    k = ScheduledFeedback(speeds=nodes, integral_gains=np.zeros(4), gains=values)
+    for speed in (1.0, 2.0, 2.25, 3.0, 4.5, 5.0, 8.0, 9.0, 20.0):
+        signal = tracking(0.1)
+        signal = signal._replace(measured=signal.measured._replace(speed=speed))
+        close(k.output(0.0, Memory(0.3), signal), -0.1 * np.interp(speed, nodes, values))
+
+
 def test_proportional_feedback_is_state_feedback_with_a_gain_that_goes_with_the_speed():
     k = ProportionalFeedback(gain=np.array([-30.0, -5.0]), reference_speed=4.0, torque_max=9.0)
     for speed, part in ((4.0, 1.0), (1.0, 0.25), (8.0, 2.0)):  # all beyond 9 N m with an integral of -3

@@ -1,6 +1,7 @@
 """The experiments run, small, and find what their docstrings say."""
 
 import importlib.util
+import json
 import pathlib
 import sys
 
@@ -143,10 +144,36 @@ def test_tuned_over_roads_no_wheel_locks_longer(tmp_path):
         assert (row["lanes locked longer"], row["not stopped"], row["diverged"]) == (0, 0, 0)
 
 
-def test_gradients_need_fewer_rollouts_than_searches_without(tmp_path):
+def test_gradients_need_fewer_rollouts_than_searches_without(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
     module = experiment("lq_weights")
-    config = module.Config(budgets=(120, 1), rig_step=1e-3, repeats=1, out=str(tmp_path))
-    (row,) = module.main(config, ("gain",))["table"]
-    assert row["L-BFGS found"] <= row["Nelder-Mead found"] * (1 + 1e-4)
-    assert row["L-BFGS to 0.0001"] / row["price of a gradient"] < 15
-    assert row["Nelder-Mead to 0.0001"] > 30
+    config = module.Config(budgets=((2, 120),), rig_step=1e-3, repeats=1, out=str(tmp_path))
+    rows = {row["accuracy"]: row for row in module.main(config, ("gain",))["table"]}
+    found = json.loads((tmp_path / "gain.json").read_text())["found"]
+    assert found["L-BFGS"] <= found["Nelder-Mead"] * (1 + 1e-4)
+    assert rows["0.0001"]["gradients"] < 15
+    assert rows["0.0001"]["Nelder-Mead"] > 30
+    assert next(row for name, row in rows.items() if name.startswith("Nelder-Mead"))["gradients"] < 20
+
+
+def test_what_searches_spent_is_counted(monkeypatch):
+    """By hand: a bound where no search without gradients arrives, and none where the gradients do not."""
+    monkeypatch.syspath_prepend(FOLDER)
+    module = experiment("lq_weights")
+    traces = {"L-BFGS": [[1, 9.0], [5, 1.0]], "Nelder-Mead": [[1, 9.0], [60, 2.0]], "CMA-ES": [[1, 9.0], [33, 1.5]]}
+    kept = {
+        "problem": "p",
+        "parameters": 3,
+        "price": 2.0,
+        "price, bare": 4.0,
+        "traces": traces,
+        "spent": {"L-BFGS": 5, "Nelder-Mead": 110, "CMA-ES": 220},
+    }
+    both = ["Nelder-Mead", "CMA-ES"]
+    row = module.line(kept, "2", 2.0, both)
+    assert (row["gradients"], row["rollouts"], row["Nelder-Mead"], row["CMA-ES"]) == (5, 11, 60, 33)
+    assert (row["times fewer"], row["times fewer, bare"]) == (33 / 11, 33 / 21)
+    row = module.line(kept, "1", 1.0, both)
+    assert (row["Nelder-Mead"], row["CMA-ES"], row["times fewer"]) == (None, None, 220 / 11)
+    row = module.line(kept, "0", 0.5, both)
+    assert (row["gradients"], row["rollouts"], row["times fewer"]) == (None, None, 0.0)

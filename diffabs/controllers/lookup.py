@@ -43,7 +43,8 @@ class ScheduledFeedback:
 
     def _here(self, signal: Tracking) -> StateFeedback:
         """The feedback at the measured speed."""
-        rows = (jnp.interp(signal.measured.speed, self.speeds, gains) for gains in (self.integral_gains, self.gains))
+        rise = _rise(signal.measured.speed, jnp.asarray(self.speeds))
+        rows = (_table(rise, jnp.asarray(gains)) for gains in (self.integral_gains, self.gains))
         limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
         return StateFeedback(gain=jnp.stack(list(rows)), **limits, antiwindup=self.antiwindup)
 
@@ -55,6 +56,18 @@ class ScheduledFeedback:
         elif not (np.diff(self.speeds) > 0).all():
             yield f"speeds = {np.asarray(self.speeds).tolist()} m/s do not increase"
         yield from limit_problems(self.torque_min, self.torque_max)
+
+
+def _rise(v: Any, nodes: Any) -> Any:
+    """How much of each interval between nodes lies below v, from 0 to 1. A table is a sum over it: no index to look up,
+    which derivatives would have to scatter to."""
+    inside = (v - nodes[:-1]) / jnp.diff(nodes)
+    return jnp.where(v >= nodes[1:], 1.0, jnp.where(v < nodes[:-1], 0.0, inside))
+
+
+def _table(rise: Any, values: Any) -> Any:
+    """Linear between nodes, constant beyond."""
+    return values[0] + jnp.sum(rise * jnp.diff(values))
 
 
 @pytree

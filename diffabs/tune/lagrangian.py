@@ -41,7 +41,9 @@ class Search:
         """Raises StartError if no start could be left."""
         problem, method = self.problem, self.method
         chosen = (
-            lbfgs() if method.optimiser is None else Optimiser(optax.with_extra_args_support(method.optimiser), False)
+            lbfgs(method.memory)
+            if method.optimiser is None
+            else Optimiser(optax.with_extra_args_support(method.optimiser), False)
         )
         loss = problem.loss(self.scale)
         descent = Descent(

@@ -22,6 +22,7 @@ class Method:
     mode: forward or reverse; None decides by the number of parameters
     stopping: of each descent; with constraints there is one per round
     rounds, tolerance: of the augmented Lagrangian; the greatest excess that counts as met, in units of its scale
+    memory: how many steps L-BFGS remembers; more than there are parameters is of little use
     """
 
     optimiser: optax.GradientTransformation | None = None
@@ -31,6 +32,7 @@ class Method:
     stopping: Stopping = dataclasses.field(default_factory=Stopping)
     rounds: int = 12
     tolerance: float = 1e-3
+    memory: int = 10
 
 
 class Progress(NamedTuple):
