@@ -9,7 +9,7 @@ import typer
 from diffabs import console, show, variation
 from diffabs.catalogue import ScenarioError, number, unit_of, unknown
 from diffabs.pytree import Spec
-from diffabs.scenario import Scenario, load
+from diffabs.scenario import Scenario
 from diffabs.toml import value
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def rare(
     with console.guarded():
         console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
         changes = [*(changes or ()), *([f"sweep.seed={seed}"] if seed is not None else [])]
-        chosen = console.waited(lambda: load(scenario, changes), "checking the scenario")
+        chosen = console.loaded(scenario, changes)
         metric, bound = _failure(failure, chosen)
         if samples < 20 or samples % 10:
             console.fail(f"--samples {samples} is no multiple of 10 from 20 on")
