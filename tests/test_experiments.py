@@ -177,3 +177,34 @@ def test_what_searches_spent_is_counted(monkeypatch):
     assert (row["Nelder-Mead"], row["CMA-ES"], row["times fewer"]) == (None, None, 220 / 11)
     row = module.line(kept, "0", 0.5, both)
     assert (row["gradients"], row["rollouts"], row["times fewer"]) == (None, None, 0.0)
+
+
+def test_weights_tuned_by_gradients_recover_more_starts_and_are_proved(tmp_path):
+    """24 x 24 starts know the share to some 2 %: the full run has 0.23, 0.46 and 0.48."""
+    module = experiment("arm_weights")
+    config = module.Config(starts=24, duration=6.0, proof_points=2, tuned_starts=(7, 13), out=str(tmp_path))
+    rows = {row["weights"]: row for row in module.main(config)["table"]}
+    assert rows["Q = I"]["share of the box"] < 0.27
+    assert rows["tuned"]["share of the box"] >= 0.46
+    assert rows["tuned"]["common P over the riders"] == "yes"
+    assert rows["Q = diag(1, 100, 1, 1, 1, 1)"]["common P over the riders"] == "none"
+
+
+def test_an_observer_recovers_nearly_what_the_whole_state_does(tmp_path):
+    module = experiment("arm_lqg")
+    config = module.Config(noises=((3e-3, 3e-3),), seeds=4, multiples=(0.06, 0.09, 16), duration=6.0, out=str(tmp_path))
+    full, observed = module.main(config)["table"]
+    assert abs(full["multiple"] - 0.08) < 0.0021
+    assert observed["of the full state's"] >= 0.9
+
+
+def test_a_stronger_motor_raises_the_bound_as_the_root_of_its_power(tmp_path):
+    """And the best machine for a bound is where the ranges end: long, heavy; the gear is inside."""
+    module = experiment("arm_codesign")
+    config = module.Config(hung=(0.01,))
+    hanging = module.load("arm-hanging").loop
+    found = [module.best_bound(config, module.Machine(loop=hanging, resistance=r, current=1e3)) for r in (3.0, 0.75)]
+    weak, strong = (float(np.min(module.bounds(config, machine))) for machine in found)
+    np.testing.assert_allclose(strong / weak, 2.0, rtol=0.05, atol=0)
+    assert float(found[0].arm_mass) > 39
+    assert 6 < float(found[0].gear) < 390
