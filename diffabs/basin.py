@@ -7,6 +7,8 @@ The share is a count and has no derivative. `SoftLoss` is its differentiable sur
 log |x(T)| over the same starts, at a time T so early that a run that will fall has not yet landed.
 """
 
+import concurrent.futures
+import os
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -20,6 +22,7 @@ from diffabs.rollout import FixedStep
 
 TOLERANCE = 1e-2
 MEASURED = {"fell": Fell(), "final_norm": FinalNorm()}
+FEWEST = 256  # lanes that a core is given on its own
 FINEST, POINTS = 1e-4, 33  # of a search for the greatest multiple: relative width of its last interval; runs at once
 
 
@@ -44,9 +47,22 @@ def recovered(
     Lanes of a noisy loop draw from fold_in(key, lane)."""
     count = len(next(iter(starts.values())))
     keys = None if key is None else jax.vmap(lambda i: jax.random.fold_in(key, i))(np.arange(count))
-    runs = jax.device_get(measure_lanes(loop, starts, solver, MEASURED, keys=keys))
-    fine = (runs.metrics["fell"] == 0) & (runs.metrics["final_norm"] < tolerance)  # NaN is not
-    return np.asarray(fine), np.asarray(runs.diverged)
+    parts = max(1, min(os.cpu_count() or 1, count // FEWEST))
+
+    def part(i: int) -> Any:
+        """Every so many lanes: neighbours take equally long."""
+        mine = {path: np.asarray(column)[i::parts] for path, column in starts.items()}
+        own = None if keys is None else keys[i::parts]
+        return jax.device_get(measure_lanes(loop, mine, solver, MEASURED, keys=own))
+
+    with concurrent.futures.ThreadPoolExecutor(parts) as pool:
+        runs = list(pool.map(part, range(parts)))
+    fine, diverged = np.zeros(count, bool), np.zeros(count, bool)
+    for i, run in enumerate(runs):
+        # NaN is not below anything
+        fine[i::parts] = (run.metrics["fell"] == 0) & (run.metrics["final_norm"] < tolerance)
+        diverged[i::parts] = run.diverged
+    return fine, diverged
 
 
 def attraction(

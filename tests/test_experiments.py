@@ -201,9 +201,11 @@ def test_an_observer_recovers_nearly_what_the_whole_state_does(tmp_path):
 def test_a_stronger_motor_raises_the_bound_as_the_root_of_its_power(tmp_path):
     """And the best machine for a bound is where the ranges end: long, heavy; the gear is inside."""
     module = experiment("arm_codesign")
-    config = module.Config(hung=(0.01,))
+    config = module.Config()
     hanging = module.load("arm-hanging").loop
-    found = [module.best_bound(config, module.Machine(loop=hanging, resistance=r, current=1e3)) for r in (3.0, 0.75)]
+    found = [
+        module.best_bound(config, module.Machine(loop=hanging, resistance=r, current=1e3), "rod") for r in (3.0, 0.75)
+    ]
     weak, strong = (float(np.min(module.bounds(config, machine))) for machine in found)
     np.testing.assert_allclose(strong / weak, 2.0, rtol=0.05, atol=0)
     assert float(found[0].arm_mass) > 39
