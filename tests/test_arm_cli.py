@@ -9,8 +9,9 @@ import pytest
 from commands import assert_one_error_line, left_in, run
 
 from diffabs import commands_sweep, console, scenario
-from diffabs.objectives import BALANCE
+from diffabs.objectives import BALANCE, BRAKING
 from diffabs.scenario import load
+from diffabs.sweep.engines import failing, missed
 
 pytestmark = pytest.mark.xdist_group("arm-cli")  # one worker makes what these share
 
@@ -20,7 +21,7 @@ SHORT = ("--set", "solver.duration=0.02")
 
 @pytest.fixture(autouse=True, scope="module")
 def quiet():
-    """No lines that depend on the machine's load, and no seconds for the step's stability, which is tested elsewhere."""
+    """No lines that depend on the machine's load, and no seconds for whether the step is stable."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
         patch.setattr(commands_sweep, "AGAIN", math.inf)
@@ -86,12 +87,10 @@ BAD = [
     ("plant.arm_inertia=-1", "plant.arm_inertia = -1 is outside (0, inf) kg m^2"),
     ("plant.resistance=0", "plant.resistance = 0 is outside (0, inf) ohm"),
     ("actuator.voltage_max=-48", "actuator.voltage_max = -48 is outside (0, inf) V"),
-    ("controller.gain=1,2", "controller.gain has shape (2,); it needs (6,)"),
     ("controller=pid", "pid needs slip"),
-    ("reference=fixed-slip", "fixed-slip needs"),
     ("stop=standstill", "standstill needs speed"),
     ("objective.overshoot=max-slip", "objective.overshoot: max-slip needs slip"),
-    ("initial=brake-start", "brake-start"),
+    ("initial=brake-start", "arm-balance needs theta, and here is only speed, slip"),
 ]
 
 
@@ -101,6 +100,13 @@ def test_what_does_not_fit_is_one_line(tmp_path, change, needed):
     assert_one_error_line(result)
     assert needed in result.stderr
     assert left_in(tmp_path) == set()
+
+
+def test_a_gain_of_the_wrong_length_is_one_line():
+    """Of arm-hanging it would be the ranges of [tune] that no longer fit."""
+    result = run("simulate", "arm-balance", "--set", "controller.gain=1,2", status=2)
+    assert_one_error_line(result)
+    assert "controller.gain has shape (2,); it needs (6,)" in result.stderr
 
 
 def test_an_arms_controller_on_a_wheel_is_one_line():
@@ -128,6 +134,14 @@ def test_certify_disproves_the_gain_for_one_rider():
     assert "quadratic stability is disproved" in result.stderr
 
 
+def test_a_stop_that_is_a_fall_is_not_missed():
+    stopped = np.array([True, False])
+    np.testing.assert_array_equal(missed(stopped, BALANCE), [False, False])
+    np.testing.assert_array_equal(missed(stopped, BRAKING), [False, True])
+    assert failing({"objectives": list(BALANCE), "failures": {"peak_lean": 0.3}}) == {"fell": 0.0, "peak_lean": 0.3}
+
+
+@pytest.mark.slow
 def test_a_sweep_counts_falls_and_nothing_else(tmp_path):
     """Lanes that are upright to the end have not reached their stop, and have not failed."""
     pandas = pytest.importorskip("pandas")
