@@ -817,7 +817,7 @@ MUTATIONS = [
         "design/lqg.py",
         "jnp.linalg.solve(spread, C @ found.P).T",
         "jnp.linalg.solve(spread, C @ found.P @ A.T).T",
-        "test_arm_control.py::test_poles_of_the_loop_are_those_of_regulator_and_filter",
+        "test_arm_control.py::test_regulator_and_filter_are_those_of_the_weights",
     ),
     Mutation(
         "balance: half of the bound",
@@ -831,14 +831,14 @@ MUTATIONS = [
         "design/gridded.py",
         "np.linspace(low[path], high[path], points)",
         "np.linspace(low[path], high[path], points, endpoint=False)",
-        "test_arm_control.py::test_the_vertices_are_the_systems_on_the_grid",
+        "test_arm_basin.py::test_the_vertices_are_the_systems_on_the_grid",
     ),
     Mutation(
         "balance: a fall that rises",
         "stops.py",
         "return -2 * output.theta * output.theta_rate",
         "return 2 * output.theta * output.theta_rate",
-        "test_arm_cli.py::test_the_papers_start_falls_and_that_is_said",
+        "test_arm_basin.py::test_the_slope_of_the_time_of_a_fall_is_a_difference",
     ),
     Mutation(
         "balance: upright lanes that missed their stop",
@@ -852,7 +852,7 @@ MUTATIONS = [
         "basin.py",
         '(runs.metrics["fell"] == 0) & (runs.metrics["final_norm"] < tolerance)',
         '(runs.metrics["fell"] == 0)',
-        "test_arm_control.py::test_a_region_is_what_its_runs_do",
+        "test_arm_basin.py::test_a_region_is_what_its_runs_do",
     ),
     *(Mutation(*each) for each in SWEEP),
 ]

@@ -1,4 +1,4 @@
-"""What a two-wheeler's controllers can do: bounds, filters, regions of attraction, robust gains."""
+"""What a two-wheeler's controllers can do: bounds, filters, output feedback."""
 
 import dataclasses
 
@@ -7,48 +7,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from oracles import arm_stays_up
+from balancing import EFFORT, HANGING, MULTIPLES, SOLVER, START, WEIGHTS, closed, model
 from scipy.integrate import solve_ivp
 
-from diffabs.balance_model import BalanceModel
-from diffabs.basin import MEASURED, attraction, recoverable
+from diffabs.basin import MEASURED
 from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
 from diffabs.controllers.balance import Estimate
-from diffabs.design import Spec, certify, design
-from diffabs.design.gridded import gridded
 from diffabs.design.lqg import SELECTION, kalman, lqg
 from diffabs.design.recovery import mode_bounds, recoverable_bound
-from diffabs.design.upright import upright
-from diffabs.loop import TYPICAL
 from diffabs.plants import ArmBalance
 from diffabs.protocols import BalanceOutput, Clock, Memory, Tracking
 from diffabs.pytree import check, replace
-from diffabs.rollout import FixedStep, measure
+from diffabs.rollout import measure
 from diffabs.sensors import AngleSensor
 
 pytestmark = pytest.mark.xdist_group("arm-control")  # one worker compiles what these share
-
-HANGING = ArmBalance(arm_length=-0.5)
-START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # of the paper's Fig. 3
-DIRECTION = {"initial.theta": 0.5, "initial.phi": 0.2}
-GAIN = np.array([3518.9528, -300.78828, 1397.0168, 1242.2936, -10.830832, 516.96042])  # LQR of the hanging arm
-WEIGHTS, EFFORT = np.diag([1.0, 100.0, 1.0, 1.0, 1.0, 1.0]), 0.01
-MULTIPLES = {24.0: 0.0454, 48.0: 0.0801, 100.0: 0.1146}  # of the start that this gain recovers
-SOLVER = FixedStep(step=1e-3, duration=10.0)
-SHORT = FixedStep(step=2e-3, duration=4.0)
-OVER = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "plant.damping": (70.0, 130.0)}
-
-
-def closed(multiple=0.0, voltage=48.0, **parts):
-    """The hanging arm from a multiple of the start."""
-    values = {path: multiple * value for path, value in DIRECTION.items()} | {"actuator.voltage_max": voltage}
-    loop = dataclasses.replace(TYPICAL["balance"], plant=HANGING, controller=BalanceFeedback(gain=GAIN))
-    return replace(dataclasses.replace(loop, **parts), values)
-
-
-def model(plant):
-    return BalanceModel(plant=plant).matrices()
-
 
 # What any control can do
 
@@ -147,6 +120,24 @@ def corrected(observer, last, x, k=1):
     return observer.jump(Clock(0.01 * k, 1e-3, 10 * k, None), Memory(held=last), seen(x)).memory.held
 
 
+def test_regulator_and_filter_are_those_of_the_weights():
+    """SciPy's, of unknown accelerations that are constant over a period of 20 ms; other weights than the defaults."""
+    a, b = (np.asarray(x) for x in model(HANGING))
+    whole = scipy.linalg.expm(0.02 * np.block([[a, b], [np.zeros((1, 7))]]))[:6]
+    a, b = whole[:, :6], whole[:, 6:]
+    found = lqg(HANGING, WEIGHTS, EFFORT, period=0.02, disturbance=(0.5, 2.0, 3.0), noise=(2e-3, 4e-3)).controller
+    p = scipy.linalg.solve_discrete_are(a, b, 0.02 * WEIGHTS, 0.02 * EFFORT * np.eye(1))
+    gain = -np.linalg.solve(0.02 * EFFORT + b.T @ p @ b, b.T @ p @ a)[0]
+    kicks = np.vstack([0.5 * 0.02**2 * np.eye(3), 0.02 * np.eye(3)]) @ np.diag([0.5, 2.0, 3.0])
+    c, v = np.eye(6)[:2], np.diag([2e-3, 4e-3]) ** 2
+    p = scipy.linalg.solve_discrete_are(a.T, c.T, kicks @ kicks.T, v)
+    correction = p @ c.T @ np.linalg.inv(c @ p @ c.T + v)
+    np.testing.assert_allclose(found.gain, gain, rtol=1e-6, atol=0)
+    np.testing.assert_allclose(found.correction, correction, rtol=0, atol=1e-7 * np.max(np.abs(correction)))
+    np.testing.assert_allclose(found.transition, a, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found.entry, b[:, 0], rtol=0, atol=1e-14)
+
+
 def test_poles_of_the_loop_are_those_of_regulator_and_filter(observer):
     """The loop's map is differentiated from the controller's own code; e^(AT), G(T)B are SciPy's."""
     a, b = (np.asarray(x) for x in model(HANGING))
@@ -214,112 +205,3 @@ def test_shapes_of_an_observer_are_said():
         (line,) = dataclasses.replace(ObserverFeedback(), **{name: wrong}).problems()
         assert line.startswith(f"{name} has shape {wrong.shape}; it needs ")
     assert list(ObserverFeedback().problems()) == []
-
-
-# Regions of attraction
-
-
-AXIS = np.linspace(-0.1, 0.1, 9)
-
-
-def test_a_region_is_what_its_runs_do():
-    """Not symmetric in the two axes, and neither empty nor full. One run after the other, compiled as one."""
-    first, second = AXIS, np.linspace(-0.08, 0.12, 5)
-    found = attraction(closed(), first, second, SHORT, tolerance=0.05)
-    one = closed()
-    runs = [
-        [measure(replace(one, {"initial.theta": x, "initial.phi": y}), SHORT, MEASURED) for y in second] for x in first
-    ]
-    fine = [[not bool(r.stopped) and float(r.metrics["final_norm"]) < 0.05 for r in row] for row in runs]
-    np.testing.assert_array_equal(found.recovered, fine)
-    assert found.diverged == 0
-    assert 0.2 < found.share < 0.8
-    assert found.share == np.mean(fine)
-    assert not np.array_equal(found.recovered[:5], found.recovered[:5][::-1])
-
-
-@pytest.mark.parametrize("voltage", MULTIPLES)
-def test_the_largest_multiple_that_is_recovered(voltage):
-    """REFERENCE has 0.080 at 48 V, and 0.046 and 0.116 at 24 and 100 V: there SciPy falls, and agrees with us."""
-    found = recoverable(closed(voltage=voltage), DIRECTION, SOLVER, most=0.12)
-    assert found == pytest.approx(MULTIPLES[voltage], abs=6e-5)
-    assert found < float(recoverable_bound(*model(HANGING), START, voltage))
-    assert arm_stays_up(HANGING, GAIN, (found - 1e-4) * START, voltage)
-    assert not arm_stays_up(HANGING, GAIN, (found + 1e-4) * START, voltage)
-
-
-def test_nothing_and_all_can_be_recovered():
-    assert recoverable(closed(), DIRECTION, SOLVER, most=0.01) == 0.01
-    assert recoverable(closed(controller=BalanceFeedback(gain=-GAIN)), DIRECTION, SOLVER, most=0.1) == 0.0
-
-
-@pytest.mark.slow
-def test_float32_and_float64_agree_on_the_region():
-    """At most 2 of 400 starts, at the border."""
-    axis = np.linspace(-0.1, 0.1, 20)
-    double = attraction(closed(), axis, axis, SHORT, tolerance=0.05)
-    loop = jax.tree.map(jnp.float32, closed())
-    single = attraction(loop, axis, axis, SHORT, tolerance=0.05)
-    assert np.sum(double.recovered != single.recovered) <= 2
-    assert 0.2 < double.share < 0.8
-
-
-# Over a box of riders
-
-
-@pytest.fixture(scope="module")
-def robust():
-    """A proved gain for riders of 40 to 100 kg, springs and dampers +-30 %, on a grid of three points."""
-    return design(gridded(BalanceModel(plant=HANGING), OVER), Spec(Q=np.diag(WEIGHTS), R=EFFORT))
-
-
-def test_the_vertices_are_the_systems_on_the_grid():
-    """Ends included; the last parameter runs first, as in the corners."""
-    over = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (1000.0, 1000.0), "plant.damping": (70.0, 130.0)}
-    found = gridded(BalanceModel(plant=HANGING), over)
-    values = [(m, d) for m in (40.0, 70.0, 100.0) for d in (70.0, 100.0, 130.0)]
-    assert [(x["plant.rider_mass"], x["plant.damping"]) for x in found.corners] == values
-    assert {x["plant.stiffness"] for x in found.corners} == {1000.0}
-    for place, (m, d) in enumerate(values):
-        a, b = model(ArmBalance(arm_length=-0.5, rider_mass=m, damping=d))
-        np.testing.assert_allclose(found.A[place], a, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(found.B[place], b, rtol=1e-12, atol=1e-12)
-
-
-def test_one_gain_for_all_riders_is_proved(robust):
-    """On the grid that it was designed on, and on one that has as many points between."""
-    assert robust.certificate.verified_exactly
-    assert robust.certificate.quadratically_stable
-    finer = gridded(BalanceModel(plant=HANGING), OVER, 5)
-    assert len(finer.A) == 125
-    proof = certify(robust.gain, finer)
-    assert proof.quadratically_stable
-    assert proof.verified_exactly
-    assert all(np.linalg.eigvals(a + b @ robust.gain).real.max() < 0 for a, b in zip(finer.A, finer.B, strict=True))
-
-
-def test_the_gain_for_one_rider_is_disproved():
-    system = gridded(BalanceModel(plant=HANGING), OVER)
-    proof = certify(GAIN, system)
-    assert proof.verified_exactly
-    assert not proof.quadratically_stable
-    assert [claim.kind for claim in proof.claims] == ["infeasible"]
-    assert max(np.linalg.eigvals(a + b @ GAIN[None]).real.max() for a, b in zip(system.A, system.B, strict=True)) > 0.9
-
-
-def test_a_grid_has_two_points_at_least_and_not_too_many_systems():
-    with pytest.raises(ValueError, match=r"points = 1 is outside \[2, inf\)"):
-        gridded(BalanceModel(plant=HANGING), OVER, 1)
-    with pytest.raises(ValueError, match=r"a grid of 4913 systems is more than 4096"):
-        gridded(BalanceModel(plant=HANGING), OVER, 17)
-
-
-def test_a_loop_becomes_the_model_that_it_is():
-    plain, gain, exact, neglected = upright(closed())
-    assert (plain.period, exact) == (None, True)
-    np.testing.assert_array_equal(gain, GAIN)
-    assert any("voltage limit of 48 V" in line for line in neglected)
-    sampled = upright(closed(controller=Sampled(controller=BalanceFeedback(gain=GAIN), period=0.01)))[0]
-    assert sampled.period == 0.01
-    with pytest.raises(ValueError, match="ObserverFeedback is not feedback of the whole state"):
-        upright(closed(controller=ObserverFeedback()))

@@ -193,7 +193,7 @@ def test_numbers_of_the_arm(arm, name):
 
 @pytest.mark.slow
 def test_what_the_arm_recovers(arm):
-    """Of multiples 0.001 apart; at 24 and 100 V less than the reference, as SciPy says too (test_arm_control.py)."""
+    """Of multiples 0.001 apart; at 24 and 100 V less than the reference, as SciPy says too (test_arm_basin.py)."""
     rows = {row["quantity"]: row for row in _rows(arm, "hanging arm, LQR")}
     for volts, ours, reference in ((24, 0.045, 0.046), (48, 0.080, 0.080), (100, 0.114, 0.116)):
         row = rows[f"recovered multiple at {volts} V"]
