@@ -136,3 +136,48 @@ def brake(plant, torque, *, speed, stop, slip=0.0, memory=0, rates=None, duratio
             break
         z[1] = 0.0
     return {"stop_time": t, "stop_distance": z[2], "max_slip": peak, "iae": z[4]}
+
+
+def arm_rates(p, torque):
+    """x' of the two-wheeler `p` under torque(t, x) [N m]: M q'' = forces - h - G, one 3 by 3 system, written out from
+    the equations and not from the code."""
+    upper = p.arm_mass + p.rider_mass
+    a = p.body_inertia + p.body_mass * p.body_height**2 + upper * p.mount_height**2
+    p2, p3 = p.arm_inertia + p.arm_mass * p.arm_length**2, p.rider_inertia + p.rider_mass * p.rider_height**2
+    c2 = p.arm_mass * p.mount_height * p.arm_length
+    c3 = p.rider_mass * p.mount_height * p.rider_height
+    b1 = p.body_mass * p.body_height + upper * p.mount_height
+    b2, b3 = p.arm_mass * p.arm_length, p.rider_mass * p.rider_height
+
+    def rates(t, x):
+        q1, q2, q3, v1, v2, v3 = x
+        m12, m13 = p2 + c2 * np.cos(q2), p3 + c3 * np.cos(q3)
+        first = a + p2 + p3 + 2 * c2 * np.cos(q2) + 2 * c3 * np.cos(q3)
+        mass = [[first, m12, m13], [m12, p2, 0], [m13, 0, p3]]
+        turning = [
+            -c2 * np.sin(q2) * (2 * v1 * v2 + v2**2) - c3 * np.sin(q3) * (2 * v1 * v3 + v3**2),
+            c2 * np.sin(q2) * v1**2,
+            c3 * np.sin(q3) * v1**2,
+        ]
+        arm, rider = b2 * np.sin(q1 + q2), b3 * np.sin(q1 + q3)
+        weight = -p.gravity * np.array([b1 * np.sin(q1) + arm + rider, arm, rider])
+        forces = np.array([0, torque(t, x), -p.stiffness * q3 - p.damping * v3])
+        return np.concatenate([x[3:], np.linalg.solve(mass, forces - turning - weight)])
+
+    return rates
+
+
+def arm_stays_up(p, gain, start, voltage, duration=10.0):
+    """Whether u = clip(K x) brings the two-wheeler back from `start`: DOP853, tolerance 1e-10, ended on the ground."""
+
+    def torque(t, x):
+        u = np.clip(gain @ x, -voltage, voltage)
+        return p.torque_constant * (u - p.back_emf * x[4]) / p.resistance - p.friction * x[4]
+
+    def landed(t, x):
+        return abs(x[0]) - np.pi / 2
+
+    landed.terminal = True
+    rates = arm_rates(p, torque)
+    run = solve_ivp(rates, (0, duration), start, "DOP853", events=landed, rtol=1e-10, atol=1e-12)
+    return run.status == 0 and bool(np.linalg.norm(run.y[:, -1]) < 1e-2)
