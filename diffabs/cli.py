@@ -4,6 +4,7 @@ Results go to stdout, as tables or with --json as one JSON document; everything 
 
 import contextlib
 import dataclasses
+import importlib
 import math
 import pathlib
 from typing import Annotated, Any, NoReturn
@@ -103,9 +104,7 @@ def simulate(
             if csv_file and run.trajectory:
                 show.write_csv(run.trajectory, getattr(chosen.loop.plant, "control_unit", "N m"), csv_file)
             if picture:
-                from diffabs import plot as figures
-
-                draw = getattr(figures, task(chosen.loop.plant))
+                draw = getattr(importlib.import_module("diffabs.plot"), task(chosen.loop.plant))
                 draw(run, title=chosen.title or chosen.name).savefig(picture)
         result = _result(chosen, run, {"csv": csv, "plot": plot})
         show.as_json(result) if as_json else show.run(result, chosen)

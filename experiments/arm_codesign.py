@@ -265,7 +265,7 @@ def figure(found: dict[str, dict[str, Any]]) -> Any:
         ax.plot(riders, multiples, "o" + plot.DASHES[i], color=plot.COLOURS[i], label=name)
     ax.plot([50.0], [HANGING], "k*", markersize=11, label="the paper's machine with its arm hanging, LQR")
     plot.label(ax, "rider [kg]", "multiple of (0.5, 0, 0.2) rad")
-    ax.set_ylim(0, None)
+    ax.set_ylim(0, 1.6 * max(max(row["recovered by rider"].values()) for row in found.values()))
     return drawn
 
 
