@@ -11,7 +11,7 @@ import pytest
 import diffabs as d
 from diffabs import actuators, blocks, controllers, objectives, plants, references, roads, sensors
 from diffabs.pytree import get, parameters, replace, strong
-from diffabs.stops import SpeedReached, Standstill
+from diffabs.stops import Fallen, SpeedReached, Standstill
 
 OBJECTIVES = {
     **objectives.BRAKING,
@@ -19,6 +19,11 @@ OBJECTIVES = {
     "effort": objectives.Effort(),
     "variation": objectives.Variation(),
     "cost": objectives.QuadraticCost(),
+}
+OF_BALANCE = {
+    **objectives.BALANCE,
+    "balance cost": objectives.BalanceCost(r=1e-4),
+    "soft loss": objectives.SoftLoss(),
 }
 KEY = jax.random.key(3)
 
@@ -90,6 +95,32 @@ LOOPS = {
             )
         ),
     ),
+    "arm": d.Loop(
+        plant=plants.ArmBalance(arm_length=-0.5, gear=1.1, rotor_inertia=0.3),
+        initial=plants.BalanceStart(theta=0.004, psi=0.01, phi=0.001, theta_rate=-0.001, psi_rate=0.02, phi_rate=0.002),
+        reference=references.Upright(),
+        controller=controllers.BalanceFeedback(gain=np.array([3519.0, -301.0, 1397.0, 1242.0, -11.0, 517.0])),
+        actuator=actuators.VoltageLimit(),
+        stop=Fallen(),
+    ),
+    "arm, observed": d.Loop(
+        plant=plants.PrintedArm(),
+        initial=plants.BalanceStart(theta=0.1, psi=0.05, phi=0.03),
+        reference=references.Upright(),
+        sensor=sensors.AngleSensor(theta=1e-4, psi=1e-4, period=5e-3),
+        controller=controllers.Sampled(
+            controller=controllers.ObserverFeedback(
+                gain=np.array([90.0, -4.0, 30.0, 25.0, -3.0, 10.0]),
+                transition=0.9 * np.eye(6) + 0.01 * np.eye(6, k=3),
+                entry=np.array([0.0, 0.0, 0.0, -0.01, 0.03, 0.02]),
+                correction=np.linspace(0.05, 0.6, 12).reshape(6, 2),
+            ),
+            period=5e-3,
+            delay=1.3e-3,
+        ),
+        actuator=actuators.VoltageLimit(),
+        stop=Fallen(),
+    ),
     "delay": d.Loop(
         **CAR,
         controller=controllers.PID(kp=300.0, kd=1.0, torque_max=250.0),
@@ -97,7 +128,11 @@ LOOPS = {
         actuator=actuators.Delay(time=0.0123, capacity=64),
     ),
 }
-SOLVERS = dict.fromkeys(LOOPS, d.FixedStep(5e-4, 0.8)) | {"feedback": d.FixedStep(2.5e-4, 0.4)}
+SOLVERS = dict.fromkeys(LOOPS, d.FixedStep(5e-4, 0.8)) | {
+    "feedback": d.FixedStep(2.5e-4, 0.4),
+    "arm": d.FixedStep(1e-3, 0.3),
+    "arm, observed": d.FixedStep(1e-3, 0.1),
+}
 # Step of the differences and what they may miss: their own truncation (an oscillating end wants a smaller step), and a
 # kink that moves inside an integration step, where the derivative of the numerical run jumps by O(h).
 ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {"feedback": (3e-6, 1e-6), "computer": (1e-5, 5e-5)}
@@ -110,15 +145,16 @@ def flat(name):
     """(names, values, objectives as a function of the values) of the tunable parameters of a loop."""
     loop = strong(LOOPS[name])
     paths = [p for p, spec, v in parameters(loop) if spec.tunable and np.all(np.isfinite(v))]
+    measures = OF_BALANCE if name.startswith("arm") else OBJECTIVES
     values, unravel = jax.flatten_util.ravel_pytree([get(loop, p) for p in paths])
     names = [f"{p}[{i}]" for p in paths for i in range(np.size(get(loop, p)))]
 
     @jax.jit
     def measured(x):
-        run = d.measure(replace(loop, dict(zip(paths, unravel(x), strict=True))), SOLVERS[name], OBJECTIVES, key=KEY)
-        return jnp.stack([run.metrics[name] for name in OBJECTIVES])
+        run = d.measure(replace(loop, dict(zip(paths, unravel(x), strict=True))), SOLVERS[name], measures, key=KEY)
+        return jnp.stack([run.metrics[one] for one in measures])
 
-    return names, values, measured
+    return names, values, measured, list(measures)
 
 
 def differences(measured, x, step):
@@ -131,12 +167,12 @@ def differences(measured, x, step):
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in LOOPS])
 def test_gradient_of_every_objective_in_every_parameter(name):
-    names, x, measured = flat(name)
+    names, x, measured, measures = flat(name)
     jacobian = np.asarray(jax.jit(jax.jacfwd(measured))(x))
     assert np.all(np.isfinite(jacobian)), [names[j] for j in np.argwhere(~np.isfinite(jacobian))[:, 1]]
     step, tolerance = ACCURACY[name]
     expected, scale = differences(measured, x, step)
-    for i, objective in enumerate(OBJECTIVES):
+    for i, objective in enumerate(measures):
         largest = np.max(np.abs(expected[i]))
         error = np.abs(jacobian[i] * scale - expected[i])
         worst = int(np.argmax(error))
@@ -145,7 +181,7 @@ def test_gradient_of_every_objective_in_every_parameter(name):
 
 @pytest.mark.parametrize("name", ["feedback", pytest.param("latch", marks=pytest.mark.slow)])
 def test_reverse_mode_equals_forward_mode(name):
-    _, x, measured = flat(name)
+    _, x, measured, _ = flat(name)
     weights = jnp.array(np.random.default_rng(0).normal(size=len(OBJECTIVES)))
     value, pull = jax.vjp(measured, x)
     reverse = jax.jit(pull)(weights / (1 + jnp.abs(value)))[0]
