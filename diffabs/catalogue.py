@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from diffabs import actuators, blocks, controllers, objectives, plants, protocols, references, roads, sensors, stops
+from diffabs.loop import TYPICAL, Loop, task
 from diffabs.pytree import Spec
 
 KMH = 3.6  # km/h in a m/s
@@ -175,6 +176,15 @@ def filled(template: Any, table: dict[str, Any], family: str, path: str) -> Any:
         else:
             values[field.name] = _value(given, field, getattr(template, key), family, where)
     return dataclasses.replace(template, **values) if values else template
+
+
+def loop_of(sections: dict[str, Any]) -> Loop:
+    """The loop of the sections of a scenario; what is left out is usual for the plant's task. Raises ScenarioError."""
+    usual = Loop()
+    if "plant" in sections:
+        plant = filled(usual, {"plant": sections["plant"]}, "", "").plant
+        usual = TYPICAL[task(plant)]
+    return filled(usual, sections, "", "")
 
 
 # What a scenario has besides the fields of a loop.

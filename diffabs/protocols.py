@@ -53,8 +53,6 @@ class BalanceOutput(NamedTuple):
     current_max: Scalar  # [A]
 
 
-Output = BrakeOutput | BalanceOutput
-
 UNITS = {  # of every output
     **{"slip": "1", "speed": "m/s", "wheel_speed": "m/s", "deceleration": "m/s^2", "distance": "m"},
     **{"theta": "rad", "psi": "rad", "phi": "rad", "theta_rate": "rad/s", "psi_rate": "rad/s", "phi_rate": "rad/s"},

@@ -23,9 +23,9 @@ import jax
 import numpy as np
 
 from diffabs import goal, ranges, robust, toml, variation
-from diffabs.catalogue import OTHERS, build, filled, joined, number, shown, unknown, whole, wrong
+from diffabs.catalogue import OTHERS, build, joined, loop_of, number, shown, unknown, whole, wrong
 from diffabs.catalogue import ScenarioError as ScenarioError
-from diffabs.loop import TYPICAL, Loop, task
+from diffabs.loop import Loop, task
 from diffabs.misfits import misfits
 from diffabs.objectives import BRAKING, REPORTS
 from diffabs.protocols import Objective
@@ -209,7 +209,7 @@ def _assembled(name: str, table: dict[str, Any]) -> Scenario:
     given = table.get("objective", {})
     if not isinstance(given, dict):
         raise wrong("objective", given, "a table of objectives")
-    loop = _loop(sections)
+    loop = loop_of(sections)
     report = REPORTS[task(loop.plant)]
     measured = {
         key: build("objective", value, report.get(key), joined("objective", key)) for key, value in given.items()
@@ -226,15 +226,6 @@ def _assembled(name: str, table: dict[str, Any]) -> Scenario:
         tune=goal.read(table.get("tune", {}), loop, objectives),
         sweep=variation.read(table.get("sweep", {}), loop, objectives),
     )
-
-
-def _loop(sections: dict[str, Any]) -> Loop:
-    """What is left out is as usual for the plant's task."""
-    usual = Loop()
-    if "plant" in sections:
-        plant = filled(usual, {"plant": sections["plant"]}, "", "").plant
-        usual = TYPICAL[task(plant)]
-    return filled(usual, sections, "", "")
 
 
 def _text(value: Any, path: str) -> str:

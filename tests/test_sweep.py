@@ -236,7 +236,7 @@ def test_every_device_is_used(study, monkeypatch):
             return [{"diverged": np.zeros(2, bool), "stopped": np.ones(2, bool), "iae": np.ones(2)} for _ in chunks]
 
     monkeypatch.setattr(engines, "Runner", Runner)
-    few = dataclasses.replace(study, objectives={}, failures={})
+    few = dataclasses.replace(study, objectives={"iae": study.objectives["iae"]}, failures={})
     found = [one.chunk for one in Local(["a", "b"]).run(few, [0, 3, 4, 6, 7], lambda: False)]
     assert asked == [["a", "b"], [0, 3], [4, 6], [7]]
     assert found == [0, 3, 4, 6, 7]

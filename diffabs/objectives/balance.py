@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.numerics import clamp
-from diffabs.objectives.accuracy import integral, nothing, unchanged
+from diffabs.objectives.accuracy import FinalSlipError, integral, nothing, unchanged
 from diffabs.protocols import BalanceOutput, Ending, Memory, Sample
 from diffabs.pytree import Scalar, Vector, param, pytree
 
@@ -28,12 +28,7 @@ def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Any:
 class Fell:
     """1 if the run ended before its time, by a fall; else 0 [1]."""
 
-    flow, update = nothing, unchanged
-
-    def start(self, sample: Sample) -> Memory:
-        """Nothing to remember."""
-        del sample
-        return Memory()
+    start, flow, update = FinalSlipError.start, nothing, unchanged
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Whether the stop was reached."""

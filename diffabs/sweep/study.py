@@ -13,8 +13,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.loop import Loop
-from diffabs.objectives import BRAKING
+from diffabs.loop import Loop, task
+from diffabs.objectives import REPORTS
 from diffabs.protocols import Objective
 from diffabs.pytree import elements, get, problems, replace
 from diffabs.rollout import FixedStep
@@ -33,7 +33,8 @@ class Study:
 
     space: distributions by dotted path, `plant.mass` or `controller.gain.0`, and the design that draws from them
     parts: for a path drawn by a `Categorical` of names, the part that each name stands for
-    failures: metrics whose excess over a bound counts as a failure; not stopping, locking and diverging always count
+    objectives: what is measured; without any, the report of the plant's task
+    failures: metrics whose excess over a bound counts as a failure; not stopping, locking, falling, diverging always do
     chunk: lanes that are computed and stored together; results are the same to the bit for the same chunk
     """
 
@@ -41,12 +42,17 @@ class Study:
     space: Space
     samples: int
     solver: FixedStep
-    objectives: Mapping[str, Objective] = dataclasses.field(default_factory=lambda: dict(BRAKING))
+    objectives: Mapping[str, Objective] = dataclasses.field(default_factory=dict)
     seed: int = 0
     chunk: int = 4096
     dtype: str = "float64"
     parts: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Without objectives, the report of the plant's task."""
+        if not self.objectives:
+            object.__setattr__(self, "objectives", dict(REPORTS[task(self.loop.plant)]))
 
     @property
     def chunks(self) -> int:

@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.objectives import BRAKING
+from diffabs.loop import task
+from diffabs.objectives import REPORTS
 from diffabs.protocols import Objective
 from diffabs.pytree import check
 from diffabs.rollout import FixedStep
@@ -25,7 +26,7 @@ def tune(
     objective: Mapping[str, float],
     over: Batch | None = None,
     solver: FixedStep,
-    measured: Mapping[str, Objective] = BRAKING,
+    measured: Mapping[str, Objective] | None = None,
     aggregate: Aggregate | None = None,
     constraints: Sequence[Constraint] = (),
     method: Method | None = None,
@@ -35,6 +36,7 @@ def tune(
 
     subject: a Loop, or a part with a method `closed()`
     free: dotted paths of its parameters, with ranges in which they stay (declared ones where None)
+    measured: objectives by metric; None is the report of the plant's task
     objective: weight of each metric of `measured`, `{"stop_distance": 1.0, "effort": 1e-4}`
     over: the runs, parameters of the loop by path; none is the loop itself
 
@@ -64,14 +66,16 @@ def posed(
     objective: Mapping[str, float],
     over: Batch | None = None,
     solver: FixedStep,
-    measured: Mapping[str, Objective] = BRAKING,
+    measured: Mapping[str, Objective] | None = None,
     aggregate: Aggregate | None = None,
     constraints: Sequence[Constraint] = (),
     mode: Mode | None = None,
 ) -> Problem:
     """The problem that `tune` solves, for those who bring their own search. Raises ValueError as `tune` does."""
     check(subject)
-    batch = (over or Batch()).check(built(subject))
+    loop = built(subject)
+    measured = REPORTS[task(loop.plant)] if measured is None else measured
+    batch = (over or Batch()).check(loop)
     _check_metrics(objective, measured, constraints)
     free_space = space(subject, free)
     return Problem(

@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
-from diffabs.objectives import BRAKING
+from diffabs.loop import task
+from diffabs.objectives import REPORTS
 from diffabs.protocols import Objective
 from diffabs.pytree import check, replace
 from diffabs.rollout import FixedStep, Run, measure
@@ -82,7 +83,7 @@ def worst_case(
     over: Mapping[str, Range],
     metric: str,
     solver: FixedStep,
-    measured: Mapping[str, Objective] = BRAKING,
+    measured: Mapping[str, Objective] | None = None,
     bound: float | None = None,
     screen: int = 64,
     starts: int = 6,
@@ -93,6 +94,7 @@ def worst_case(
 ) -> WorstCase:
     """Look for the greatest value of a metric over a box {path: (low, high)}.
 
+    measured: objectives by metric; None is the report of the plant's task
     screen: points of a scrambled Sobol sequence that are run first, besides the corners (up to 64)
     starts: how many of the worst of them are ascended from, together
     price: rollouts that a gradient counts as; None is 1 + 1.5 p in forward mode and 6 in reverse
@@ -101,6 +103,7 @@ def worst_case(
         ValueError: a path or range that does not fit, an unknown metric.
     """
     check(loop)
+    measured = REPORTS[task(loop.plant)] if measured is None else measured
     if metric not in measured:
         raise ValueError(f"{metric} is not measured; there is {', '.join(measured)}")
     middle = replace(loop, {path: 0.5 * (np.asarray(a, float) + np.asarray(b, float)) for path, (a, b) in over.items()})
