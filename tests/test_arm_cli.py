@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
 
-from diffabs import commands_sweep, console, scenario
+from diffabs import FixedStep, commands_sweep, console, scenario
 from diffabs.objectives import BALANCE, BRAKING
 from diffabs.scenario import load
+from diffabs.sweep import Space, Study, Uniform
 from diffabs.sweep.engines import failing, missed
+from diffabs.tune import worst_case
+from diffabs.tune.tuning import posed
 
 pytestmark = pytest.mark.xdist_group("arm-cli")  # one worker makes what these share
 
@@ -139,6 +142,17 @@ def test_a_stop_that_is_a_fall_is_not_missed():
     np.testing.assert_array_equal(missed(stopped, BALANCE), [False, False])
     np.testing.assert_array_equal(missed(stopped, BRAKING), [False, True])
     assert failing({"objectives": list(BALANCE), "failures": {"peak_lean": 0.3}}) == {"fell": 0.0, "peak_lean": 0.3}
+
+
+def test_without_objectives_an_arm_is_measured_as_one():
+    """Those of braking have no `fell`, and ask an arm for its slip."""
+    loop, solver = load("arm-hanging").loop, FixedStep(step=1e-3, duration=0.02)
+    free = {"controller.gain": (-1e5, 1e5)}
+    assert posed(loop, free=free, objective={"fell": 1.0}, solver=solver).measured == BALANCE
+    space = Space({"plant.rider_mass": Uniform(40.0, 100.0)})
+    assert Study(loop, space, samples=2, solver=solver).objectives == BALANCE
+    with pytest.raises(ValueError, match=r"stop_distance is not measured; there is .*fell"):
+        worst_case(loop, over={"initial.theta": (0.0, 0.01)}, metric="stop_distance", solver=solver)
 
 
 @pytest.mark.slow
