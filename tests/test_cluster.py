@@ -300,12 +300,12 @@ def test_a_scheduler_that_cannot_be_reached(scenario, tmp_path, impatient, where
 
 
 def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tmp_path, impatient):
-    """No thread of a client that would block the next one."""
+    """No thread of a client that would block the next one, and no folder that only `resume` would take."""
     before = set(threading.enumerate())
     with pytest.raises(SweepError, match="cannot be reached: Timed out trying to connect"):
-        sweep(study, tmp_path / "none", engine=Dask("tcp://127.0.0.1:1"))
+        sweep(study, tmp_path, engine=Dask("tcp://127.0.0.1:1"))
     assert set(threading.enumerate()) == before
-    assert sweep(study, tmp_path / "out", engine=Dask(inside)).digest == alone.digest
+    assert sweep(study, tmp_path, engine=Dask(inside)).digest == alone.digest
 
 
 def test_what_listens_but_is_no_scheduler(study, tmp_path, impatient):

@@ -392,6 +392,25 @@ def test_a_sweep_is_not_begun_again_over_another(file, swept):
     assert before == {path.name: path.read_bytes() for path in swept.folder.iterdir() if path.is_file()}
 
 
+def test_a_manifest_of_something_else_is_left_alone(study, tmp_path):
+    (tmp_path / "manifest.json").write_text("{}")
+    with pytest.raises(SweepError, match="is no sweep that can be read"):
+        sweep(study, tmp_path)
+    assert (tmp_path / "manifest.json").read_text() == "{}"
+
+
+def test_a_sweep_without_a_chunk_is_begun_anew(study, tmp_path):
+    """Also with another configuration: there is nothing to lose."""
+
+    class Absent:
+        def run(self, *_):
+            raise SweepError("nobody computes")
+
+    with pytest.raises(SweepError, match="nobody computes"):
+        sweep(dataclasses.replace(study, seed=study.seed + 1), tmp_path, engine=Absent())
+    assert sweep(study, tmp_path).manifest["study"]["seed"] == study.seed
+
+
 @pytest.mark.parametrize(
     ("args", "needed"),
     [

@@ -69,16 +69,20 @@ class Store:
 
     def begin(self, manifest: Mapping[str, Any], *, resume: bool) -> None:
         """Write the manifest, or compare it with the one that is there. Raises SweepError for a folder that holds
-        another configuration (naming the first differences), a sweep although `resume` is not set, or other files."""
+        another configuration (naming the first differences), finished chunks although `resume` is not set, or other
+        files. A sweep that never finished a chunk (its scheduler did not answer, say) is begun anew."""
         wanted = {"format": FORMAT, **manifest}
         for leftover in (self.folder / f"{MANIFEST}.tmp", *self.chunks.glob("part-*.parquet.tmp")):
             leftover.unlink(missing_ok=True)
         if not (self.folder / MANIFEST).exists():
             self._begin_new(wanted)
             return
-        if not resume:
-            raise SweepError(f"{self.folder} already holds a sweep; --resume continues it")
         there = read_manifest(self.folder)
+        if not resume:
+            if self.chunks.is_dir() and any(self.chunks.iterdir()):
+                raise SweepError(f"{self.folder} already holds a sweep; --resume continues it")
+            self._begin_new(wanted)
+            return
         found = list(differences(_decisive(there), _decisive(wanted)))
         if found:
             more = f", and {len(found) - 3} more" if len(found) > 3 else ""
@@ -89,7 +93,7 @@ class Store:
         if self.chunks.is_dir() and any(self.chunks.iterdir()):
             raise SweepError(f"{self.folder} has chunks but no {MANIFEST}; it cannot be continued")
         names = (path.name for path in self.folder.iterdir())
-        others = sorted(name for name in names if name != CHUNKS and not name.startswith("."))
+        others = sorted(name for name in names if name not in (CHUNKS, MANIFEST) and not name.startswith("."))
         if others:
             raise SweepError(f"{self.folder} is no sweep, but holds {others[0]}; choose a folder that is new or empty")
         self.chunks.mkdir(exist_ok=True)
