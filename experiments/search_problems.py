@@ -66,15 +66,9 @@ class Config:
     car_duration: float = 6.0
     car_stop: float = 2.0  # m/s
     near: tuple[float, ...] = (1e-2, 1e-4, 1e-6)  # of the way from the start to the best
-    budgets: tuple[tuple[int, int], ...] = (
-        (2, 400),
-        (8, 2000),
-        (15, 4000),
-        (24, 12000),
-        (48, 30000),
-    )  # up to so many parameters:
-    # evaluations of a derivative-free search
-    iterations: tuple[int, int] = (30, 400)  # of L-BFGS
+    # up to so many parameters: evaluations of a derivative-free search
+    budgets: tuple[tuple[int, int], ...] = ((2, 400), (8, 2000), (15, 4000), (24, 12000), (48, 30000))
+    iterations: tuple[int, int] = (30, 400)  # of L-BFGS, for 2 parameters and for more
     memory: int = 100  # of L-BFGS
     repeats: int = 11  # of every timing
     seed: int = 3
