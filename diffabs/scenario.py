@@ -16,7 +16,7 @@ import math
 import pathlib
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -106,13 +106,16 @@ def loads(
     if "sweep" in table:
         table["sweep"] = variation.with_samples(table["sweep"], folder)
     scenario = _assembled(name, table)
-    unfit = misfits(scenario.loop, scenario.objectives)
-    unstable = _unstable(scenario) if integrated else ()
-    for lines in (_wrong_values(scenario), unfit, _wrong_together(scenario), unstable):
+    _refuse(_wrong_together(scenario), _unstable(scenario) if integrated else ())
+    return scenario
+
+
+def _refuse(*objections: Iterable[str]) -> None:
+    """Raises ScenarioError with the lines of the first who objects; the later ones are not asked then."""
+    for lines in objections:
         found = [re.sub(r"^plant\.road\b", "road", line) for line in lines]
         if found:
             raise ScenarioError("; ".join(found))
-    return scenario
 
 
 def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
@@ -215,6 +218,7 @@ def _assembled(name: str, table: dict[str, Any]) -> Scenario:
         key: build("objective", value, report.get(key), joined("objective", key)) for key, value in given.items()
     }
     objectives = {**report, **measured}
+    _refuse(_wrong_values(loop, objectives), misfits(loop, objectives))  # before what is said of their parameters
     return Scenario(
         name=name,
         **text,
@@ -249,10 +253,10 @@ def _solver(table: Any) -> tuple[FixedStep, int]:
     return FixedStep(**times, every=every), whole(table.get("seed", 0), 0, 2**32 - 1, "solver.seed")
 
 
-def _wrong_values(scenario: Scenario) -> Iterator[str]:
+def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
     """What the parts object to."""
-    yield from problems(scenario.loop)
-    for name, objective in scenario.objectives.items():
+    yield from problems(loop)
+    for name, objective in objectives.items():
         yield from problems(objective, f"{joined('objective', name)}.")
 
 

@@ -60,6 +60,7 @@ class Config:
     tuned: tuple[tuple[int, str], ...] = ((0, "flywheel"), (2, "rod"), (2, "flywheel"), (3, "flywheel"))  # by rollouts
     voltage: float = 48.0
     riders: tuple[float, ...] = (40.0, 55.0, 70.0, 85.0, 100.0)  # kg
+    designed_for: tuple[float, float] = (40.0, 120.0)  # kg, the rider of the LQR
     mount: tuple[float, float] = (0.4, 1.0)  # m
     reach: tuple[float, float] = (0.2, 1.0)  # of the way from the mount to the ground, less the clearance
     rod: tuple[float, float] = (0.3, 0.5)  # of the rod's centre below the mount, relative to the rod's reach
@@ -195,7 +196,7 @@ def tuned(config: Config, machine: Machine, shape: str) -> Machine:
         multiples = np.linspace(0.1, 1.0, config.multiples) * top
         riders, multiples = (x.ravel() for x in np.meshgrid(config.riders, multiples, indexing="ij"))
         over = {"plant.rider_mass": riders, "initial.theta": START[0] * multiples, "initial.phi": START[2] * multiples}
-        rest = {"rider": (min(config.riders), 1.2 * max(config.riders)), "log_q": (-8.0, 12.0), "log_r": (-9.0, 4.0)}
+        rest = {"rider": config.designed_for, "log_q": (-8.0, 12.0), "log_r": (-9.0, 4.0)}
         machine = tune(
             machine,
             free={**ranges, **rest},

@@ -106,8 +106,8 @@ def test_what_does_not_fit_is_one_line(tmp_path, change, needed):
 
 
 def test_a_gain_of_the_wrong_length_is_one_line():
-    """Of arm-hanging it would be the ranges of [tune] that no longer fit."""
-    result = run("simulate", "arm-balance", "--set", "controller.gain=1,2", status=2)
+    """The ranges of [tune] do not fit it either, but that is not what is wrong."""
+    result = run("simulate", "arm-hanging", "--set", "controller.gain=1,2", status=2)
     assert_one_error_line(result)
     assert "controller.gain has shape (2,); it needs (6,)" in result.stderr
 
