@@ -1,0 +1,80 @@
+"""The last step of a co-design, without gradients: designs drawn around the best, judged by what they recover.
+
+What a surrogate is least at is not quite where most is recovered, and the count itself has no gradient. So designs are
+drawn from a normal law around the best one, in coordinates that go from 0 to 1 over each range (in logarithms where a
+range is of positive numbers), and the best of them is the next centre; the law narrows from round to round."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffabs import FixedStep, Loop
+from diffabs.basin import recovered
+
+Values = dict[str, np.ndarray]  # by name, with a leading axis of designs
+
+
+@dataclasses.dataclass(frozen=True)
+class Draws:
+    """How many designs, in how many rounds, and how far from the best in the first round."""
+
+    rounds: int = 6
+    designs: int = 200
+    spread: float = 0.1
+    reach: float = 1.2  # the greatest multiple that is tried, over the best so far
+    multiples: int = 9
+    seed: int = 0
+
+
+def improved(
+    draws: Draws,
+    centre: dict[str, Any],
+    ranges: dict[str, tuple[float, float]],
+    judge: Callable[[Values, np.ndarray], np.ndarray],
+    least: float,
+) -> tuple[dict[str, Any], float]:
+    """The best design found and its multiple, from a design that recovers `least`.
+
+    judge: designs and multiples -> whether each is recovered (designs, multiples)
+    """
+    rng, best = np.random.default_rng(draws.seed), least
+    for turn in range(draws.rounds):
+        spread = draws.spread / (1 + turn)
+        drawn = {name: _around(rng, draws.designs, spread, centre[name], *ends) for name, ends in ranges.items()}
+        multiples = best * np.linspace(1.0, draws.reach, draws.multiples)
+        fine = np.cumprod(judge(drawn, multiples), axis=1).sum(axis=1)
+        first = int(np.argmax(fine))
+        if fine[first] > 1:
+            best, centre = multiples[fine[first] - 1], {name: column[first] for name, column in drawn.items()}
+    return centre, best
+
+
+def _around(rng: np.random.Generator, count: int, spread: float, at: Any, low: float, high: float) -> np.ndarray:
+    there, back = (np.log, np.exp) if low > 0 else (np.asarray, np.asarray)
+    a, b = there(low), there(high)
+    place = (there(np.asarray(at, float)) - a) / (b - a)
+    place = np.clip(place + spread * rng.standard_normal((count, *np.shape(place))), 0.0, 1.0)
+    return back(a + (b - a) * place)
+
+
+def runs(
+    closed: Callable[[Any], Loop], rider: float, start: np.ndarray, solver: FixedStep, tolerance: float
+) -> Callable[[Values, np.ndarray], np.ndarray]:
+    """A judge: the nonlinear loops `closed(design)` with this rider, from multiples of a start of frame and rider."""
+    many = jax.jit(jax.vmap(closed))
+
+    def judge(designs: Values, multiples: np.ndarray) -> np.ndarray:
+        loops = many(designs)
+        columns = {f"plant.{field.name}": getattr(loops.plant, field.name) for field in dataclasses.fields(loops.plant)}
+        columns["controller.gain"] = loops.controller.gain
+        columns["plant.rider_mass"] = np.full(loops.controller.gain.shape[0], rider)
+        lanes = {path: np.repeat(np.asarray(column), len(multiples), axis=0) for path, column in columns.items()}
+        each = np.tile(multiples, len(columns["plant.rider_mass"]))
+        lanes |= {"initial.theta": start[0] * each, "initial.phi": start[2] * each}
+        one = jax.tree.map(lambda x: x[0], loops)
+        return recovered(one, lanes, solver, tolerance=tolerance)[0].reshape(-1, len(multiples))
+
+    return judge
