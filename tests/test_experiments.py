@@ -8,6 +8,10 @@ import sys
 import numpy as np
 import pytest
 
+from diffabs import FixedStep
+from diffabs.pytree import replace
+from diffabs.scenario import load
+
 pytest.importorskip("matplotlib")
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("experiments")]
 FOLDER = pathlib.Path(__file__).parent.parent / "experiments"
@@ -198,8 +202,9 @@ def test_an_observer_recovers_nearly_what_the_whole_state_does(tmp_path):
     assert observed["of the full state's"] >= 0.9
 
 
-def test_a_stronger_motor_raises_the_bound_as_the_root_of_its_power(tmp_path):
+def test_a_stronger_motor_raises_the_bound_as_the_root_of_its_power(monkeypatch):
     """And the best machine for a bound is where the ranges end: long, heavy; the gear is inside."""
+    monkeypatch.syspath_prepend(FOLDER)
     module = experiment("arm_codesign")
     config = module.Config()
     hanging = module.load("arm-hanging").loop
@@ -210,3 +215,34 @@ def test_a_stronger_motor_raises_the_bound_as_the_root_of_its_power(tmp_path):
     np.testing.assert_allclose(strong / weak, 2.0, rtol=0.05, atol=0)
     assert float(found[0].arm_mass) > 39
     assert 6 < float(found[0].gear) < 390
+
+
+def test_drawn_designs_climb_to_where_most_is_recovered():
+    """A known top, 0.5 at x = 0.7 and y = 100, where x is counted in its range and y in logarithms of its own."""
+    module = experiment("arm_draws")
+    ranges = {"x": (0.0, 1.0), "y": (1.0, 1e3)}
+
+    def judge(designs, multiples):
+        top = 0.5 - np.abs(designs["x"] - 0.7) - np.abs(np.log10(designs["y"]) - 2.0)
+        return multiples <= top[:, None]
+
+    found, most = module.improved(module.Draws(), {"x": 0.6, "y": 80.0}, ranges, judge, 0.3)
+    assert 0.47 < most <= 0.5
+    assert abs(found["x"] - 0.7) < 0.02
+    assert abs(np.log10(found["y"]) - 2.0) < 0.02
+    kept, same = module.improved(module.Draws(), {"x": 0.7, "y": 100.0}, ranges, judge, 0.5)
+    assert (kept, same) == ({"x": 0.7, "y": 100.0}, 0.5)
+
+
+def test_a_design_is_judged_as_its_own_loop_would_be():
+    """Two machines and two multiples in one call, and each of them alone."""
+    module, scenario = experiment("arm_draws"), load("arm-hanging")
+    gain = np.asarray(scenario.loop.controller.gain)
+    solver, start = FixedStep(step=1e-3, duration=6.0), np.array([0.5, 0.0, 0.2])
+
+    def closed(design):
+        return replace(scenario.loop, {"controller.gain": design["gain"], "plant.arm_mass": design["mass"]})
+
+    designs = {"gain": np.stack([gain, 0.0 * gain]), "mass": np.array([30.0, 30.0])}
+    judge = module.runs(closed, 50.0, start, solver, tolerance=0.05)
+    assert judge(designs, np.array([0.03, 0.2])).tolist() == [[True, False], [False, False]]
