@@ -133,6 +133,7 @@ def test_overshoot_under_other_gains(lmi):
     assert round(gentle["ours"], 4) == 0.0049
 
 
+@pytest.mark.slow
 def test_all_twenty_numbers_round_to_the_printed_ones(estimator):
     rows = [row for row in _rows(estimator, "Table") if "Magic" not in row["name"]]
     assert len(rows) == 20

@@ -256,6 +256,7 @@ mount -o remount,size=64m "${OUT%/*}"
 """
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_really_full(whole, tmp_path):
     """A small one, in a name space of its own; then it grows."""
     allowed = ["unshare", "-rm", "mount", "-t", "tmpfs", "none", str(tmp_path)]
