@@ -49,9 +49,8 @@ CLEAR = 0.05  # m, between the hanging arm and the ground
 ROTOR = 2e-4  # kg m^2
 SHARP = 40.0  # of the smooth minimum over riders
 TOLERANCE = 0.05  # of |x| at the end, so that a flywheel need not yet have come to rest
-HANGING = (
-    0.0801  # the multiple that the paper's machine with a hanging arm recovers under its LQR: `reproduce arm-balance`
-)
+# The multiple that the paper's machine with a hanging arm recovers under its LQR: `reproduce arm-balance`.
+HANGING = 0.0801
 
 
 @dataclasses.dataclass(frozen=True)

@@ -138,15 +138,8 @@ SOLVERS = dict.fromkeys(LOOPS, d.FixedStep(5e-4, 0.8)) | {
 ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {"feedback": (3e-6, 1e-6), "computer": (1e-5, 5e-5)}
 
 
-SLOW = (
-    "filtered reference",
-    "arm",
-    "proportional",
-    "computer",
-    "noisy",
-    "relay",
-    "delay",
-)  # the largest programs to compile
+# The largest programs to compile.
+SLOW = ("filtered reference", "arm, observed", "proportional", "computer", "noisy", "relay", "delay")
 
 
 def flat(name):
