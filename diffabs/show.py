@@ -146,7 +146,7 @@ def tuned(result: dict[str, Any], chosen: Scenario) -> None:
         limits = Table("constraint", "bound", "before", "after", "met")
         for row in result["constraints"]:
             numbers = ("" if row[key] is None else _brief(row[key]) for key in ("bound", "before", "after"))
-            limits.add_row(row["name"], *numbers, "yes" if row["met"] else "NO")
+            limits.add_row(row["name"], *numbers, "yes" if row["met"] else f"NO, {missed(row)}")
         _print("constraints, worst lane or vertex", limits)
     how = Table("tuning", "")
     for name in ("before", "after"):
@@ -158,6 +158,14 @@ def tuned(result: dict[str, Any], chosen: Scenario) -> None:
     _print("", how)
     for name, path in result["files"].items():
         say(f"{name}: {path}")
+
+
+def missed(row: dict[str, Any]) -> str:
+    """By how much a constraint is not met."""
+    if row["missed"] is None:
+        return "not known"
+    part = f" ({100 * row['missed'] / abs(row['bound']):.2g} %)" if row["bound"] else ""
+    return f"by {row['missed']:.3g}{part}"
 
 
 def identified(result: dict[str, Any]) -> None:

@@ -577,9 +577,30 @@ MUTATIONS = [
     Mutation(
         "command line: unmet limits pass",
         "commands_tune.py",
-        "met = after <= bound + tolerance * (abs(bound) or 1.0)",
-        "met = True",
+        '"met": beyond <= 0',
+        '"met": True',
         "test_cli_tune.py::test_a_constraint_that_is_not_met_could_not_be_done",
+    ),
+    Mutation(
+        "command line: limits are met within a tolerance",
+        "commands_tune.py",
+        '"met": beyond <= 0',
+        '"met": beyond <= 1e-3 * abs(bound)',
+        "test_cli_tune.py::test_met_is_met_without_a_tolerance",
+    ),
+    Mutation(
+        "tuning: aims at the bound itself",
+        "tune/problem.py",
+        "aimed = excess if m.margin is None else excess + m.margin",
+        "aimed = excess",
+        "test_tune.py::TestConstraints::test_what_is_met_is_met_without_a_tolerance",
+    ),
+    Mutation(
+        "tuning: a step that meets the constraints is forgotten",
+        "tune/descent.py",
+        "        if worst <= 0:",
+        "        if False:",
+        "test_tune.py::TestConstraints::test_a_step_that_meets_them_is_returned_where_the_end_does_not",
     ),
     Mutation(
         "command line: no start is bad input",

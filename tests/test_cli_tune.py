@@ -299,8 +299,8 @@ def test_a_decay_that_is_asked_for_is_certified(tmp_path):
     document = json.loads(run("tune", "slip-cured", "--json", "--out", tmp_path / "c.toml", *sets).stdout)
     rows = {row["name"]: row for row in document["constraints"]}
     assert set(rows) == {"certified decay", "damping"}
-    assert rows["certified decay"]["after"] == document["certificate"]["decay_rate"] >= 20 * 0.999
-    assert rows["damping"]["after"] >= 0.7 * 0.999
+    assert rows["certified decay"]["after"] == document["certificate"]["decay_rate"] >= 20
+    assert rows["damping"]["after"] >= 0.7
     assert document["certificate"]["verified_exactly"] is True
     assert set(document["versions"]) == {"diffabs", "jax", "python", "optax", "scipy", "cvxpy", "clarabel"}
     after = json.loads(run("certify", tmp_path / "c.toml", "--json").stdout)
@@ -326,18 +326,59 @@ def test_a_constraint_that_is_not_met_could_not_be_done(small, invented, tmp_pat
     result = run("tune", small, "--json", "--set", "tune.limits.overshoot=0.199", *out, status=1)
     document = json.loads(result.stdout)
     assert document["met"] is False
-    unmet = {"name": "overshoot", "bound": 0.199, "before": 0.3, "after": 0.2, "met": False}
-    assert document["constraints"] == [unmet]
+    (row,) = document["constraints"]
+    assert row.pop("missed") == pytest.approx(0.001)
+    assert row == {"name": "overshoot", "bound": 0.199, "before": 0.3, "after": 0.2, "met": False}
     assert document["files"] == {}
-    assert result.stderr.splitlines()[-1] == f"error: small: not met: overshoot; {Reason.CHANGE.value}"
+    assert result.stderr.splitlines()[-1] == (
+        f"error: small: not met: overshoot by 0.001 (0.5 %); {Reason.CHANGE.value}"
+    )
     assert left_in(tmp_path) == {"small.toml", "old.toml"}
     assert (tmp_path / "old.toml").read_text() == "old"
 
 
-def test_within_the_tolerance_is_met(small, invented):
-    """0.2 is 0.05 % above the bound; the method stops at 0.1 %."""
-    document = json.loads(run("tune", small, "--json", "--set", "tune.limits.overshoot=0.1999001").stdout)
+@pytest.mark.parametrize(("bound", "met"), [("0.2", True), ("0.19999999999999998", False), ("0.1999001", False)])
+def test_met_is_met_without_a_tolerance(small, invented, bound, met):
+    """0.2 was reached. The float below it is not met, and the table says by how much."""
+    limit = ("--set", f"tune.limits.overshoot={bound}")
+    status = 0 if met else 1
+    document = json.loads(run("tune", small, "--json", *limit, status=status).stdout)
+    assert document["met"] is met
+    assert document["constraints"][0]["missed"] == (0.0 if met else 0.2 - float(bound))
+    line = next(line for line in run("tune", small, *limit, status=status).stdout.splitlines() if "NO" in line or met)
+    assert met or f"NO, by {0.2 - float(bound):.3g}" in line
+
+
+def test_a_limit_on_what_is_no_number_is_not_met():
+    judged = commands_tune._judged("overshoot", 0.2, 0.3, math.nan, at_most=True)
+    assert (judged["met"], judged["missed"]) == (False, None)
+    judged = commands_tune._judged("certified decay", 5.0, None, None, at_most=False)
+    assert (judged["met"], judged["missed"]) == (False, None)
+
+
+# No lanes, a fifth of a second: 2,000 steps less than the packaged one, for the same controller, model and polytope.
+SHORT = (
+    *("tune.over={}", "solver.duration=0.2", "stop.speed_kmh=15", "solver.step=5e-4"),
+    *("tune.limits={}", "tune.decay=0", "tune.damping=0.75"),
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("changes", [("reference.time_constant=0.03",), SHORT], ids=["whole", "damping"])
+def test_what_the_packaged_cure_says_is_met_is_met(tmp_path, changes):
+    """With a tolerance of 0.1 % these ended at an overshoot of 0.00800476 (0.008 allowed) and at dampings of 0.699484
+    (0.7 asked) and 0.749981 (0.75 asked). The poles are NumPy's, of the certificate's own closed loops."""
+    sets = [word for change in changes for word in ("--set", change)]
+    document = json.loads(run("tune", "slip-cured", "--json", "--out", tmp_path / "c.toml", *sets).stdout)
     assert document["met"] is True
+    for row in document["constraints"]:
+        assert row["after"] <= row["bound"] if row["name"] == "overshoot" else row["after"] >= row["bound"]
+        assert row["missed"] == 0.0
+    after = load(tmp_path / "c.toml")
+    asked = proof.task(after)
+    z = np.linalg.eigvals(asked.polytope.closed(asked.gain)).astype(complex)
+    poles = np.log(z[np.abs(z) > 1e-9]) / asked.polytope.period  # the rest decays at once
+    assert (-poles.real / np.abs(poles)).min() >= after.tune.damping
 
 
 def test_no_start_that_can_be_used_could_not_be_done(small, monkeypatch):

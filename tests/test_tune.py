@@ -310,11 +310,40 @@ class Constrained:
 class TestConstraints:
     def test_the_multipliers_find_the_constrained_minimum(self):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1], z[0] - 5.0]))
-        found = Search(problem, Method(tolerance=1e-7, rounds=20), None).result()
+        found = Search(problem, Method(margin=1e-7, rounds=20), None).result()
         np.testing.assert_allclose([found.values["x"], found.values["y"]], [2 / 3, 1 / 3], rtol=0, atol=1e-5)
         np.testing.assert_allclose(found.objective[1], 2 / 3, rtol=0, atol=1e-5)
         assert found.met
-        assert found.violation[1] <= 1e-7
+        assert found.violation[1] == 0
+
+    @pytest.mark.parametrize("start", [(2.0, 2.0), (0.1, 0.1), (0.7, 0.7)])
+    def test_what_is_met_is_met_without_a_tolerance(self, start):
+        """Multipliers come to a bound from outside; the bound stated, not one beside it, holds where they end."""
+        problem = Constrained(start, lambda z: jnp.array([1 - z[0] - z[1]]))
+        found = Search(problem, Method(), None).result()
+        assert found.met
+        assert found.values["x"] + found.values["y"] >= 1
+        assert found.objective[1] == pytest.approx(2 / 3, rel=5e-3)  # a margin of 1e-3 costs 2e-3 of it
+
+    def test_a_step_that_meets_them_is_returned_where_the_end_does_not(self):
+        """Two iterations and no multipliers raised: from inside, the penalty alone ends outside of the bound."""
+        problem = Constrained([1.0, 1.0], lambda z: jnp.array([1 - z[0] - z[1]]))
+        few = Method(rounds=0, stopping=Stopping(iterations=20))
+        found = Search(problem, few, None).result()
+        assert found.met
+        assert found.reason is Reason.KEPT
+        assert found.values["x"] + found.values["y"] >= 1
+        assert 2 / 3 <= found.objective[1] <= 3.0
+        last = found.history[-1]
+        assert (last.objective, last.violation) == (found.objective[1], 0.0)
+        assert last.evaluations == max(point.evaluations for point in found.history)
+
+    def test_a_bound_that_leaves_no_room_for_the_margin_can_still_be_met(self):
+        """x <= 0 and -x <= 0: only x = 0, where the descent starts."""
+        problem = Constrained([0.0, 2.0], lambda z: jnp.array([z[0], -z[0]]))
+        found = Search(problem, Method(), None).result()
+        assert found.met
+        assert found.values["x"] == 0
 
     def test_it_says_when_they_cannot_be_met(self):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0], z[0] + 1.0]))
@@ -325,7 +354,7 @@ class TestConstraints:
     def test_the_best_of_many_starts_meets_them(self):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))
         told = []
-        found = Search(problem, Method(starts=4, seed=3, tolerance=1e-6, rounds=20), told.append).result()
+        found = Search(problem, Method(starts=4, seed=3, margin=1e-6, rounds=20), told.append).result()
         assert len(found.starts) == 4
         np.testing.assert_allclose(found.objective[1], 2 / 3, rtol=0, atol=1e-4)
         assert told[-1].starts == 0

@@ -1,5 +1,5 @@
 """What a tuned loop must satisfy. Each constraint is an array of excesses, positive where it is violated, in units of
-its own scale; the augmented Lagrangian (`tuning`) has a multiplier for each."""
+its own scale; the augmented Lagrangian (`lagrangian`) has a multiplier for each. Met is met: no excess above zero."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -54,16 +54,22 @@ class Poles:
     def excess(self, loop: Loop, metrics: Mapping[str, Any]) -> Any:
         """(decay + Re s)/decay, and damping + Re s/|s|, for each vertex and pole."""
         del metrics
+        real, ratios = self._modes(loop)
+        rates = (self.decay + real) / (self.decay or 1.0)
+        return jnp.concatenate([rates.ravel(), (self.damping - ratios).ravel() if self.damping else jnp.zeros(0)])
+
+    def least_damping(self, loop: Loop) -> Any:
+        """The least -Re s/|s| of the poles s of all vertices."""
+        return jnp.min(self._modes(loop)[1])
+
+    def _modes(self, loop: Loop) -> tuple[Any, Any]:
+        """Re s and -Re s/|s| of the poles (V, n)."""
         modes = jnp.linalg.eigvals(_closed(self.system, loop))
         if self.system.period is not None:
             alive = jnp.abs(modes) > DEAD  # the rest decays at once
             modes = jnp.log(jnp.where(alive, modes, DEAD)) / self.system.period
         real = modes.real
-        magnitude = jnp.sqrt(real**2 + modes.imag**2)
-        rates = (self.decay + real) / (self.decay or 1.0)
-        return jnp.concatenate(
-            [rates.ravel(), (self.damping + real / magnitude).ravel() if self.damping else jnp.zeros(0)]
-        )
+        return real, -real / jnp.sqrt(real**2 + modes.imag**2)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -39,6 +39,7 @@ class Reason(enum.Enum):
     JUMP = "the loss jumps up just beyond, twice in a row"
     LIMIT = "the limit of iterations was reached"
     START = "the start diverged, or the integration step is not stable there"
+    KEPT = "where it ended a constraint is not met; the best of its steps that meets all of them is returned"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,6 +63,14 @@ class Point(NamedTuple):
     evaluations: int  # so far, rejected ones included
 
 
+class Kept(NamedTuple):
+    """A step that meets every constraint."""
+
+    z: np.ndarray
+    seen: Any
+    point: Point
+
+
 @dataclasses.dataclass
 class Lane:
     """One start on its way."""
@@ -82,9 +91,10 @@ class Lane:
     iterations: int = 0
     reason: Reason | None = None
     history: list[Point] = dataclasses.field(default_factory=list)
+    kept: Kept | None = None  # the best step so far that meets every constraint
 
     def note(self) -> None:
-        """Add the present point to the history."""
+        """Add the present point to the history, and keep it if it is the best that meets the constraints."""
         worst = float(np.max(self.seen.excess, initial=0.0))
         self.history.append(
             Point(
@@ -96,6 +106,21 @@ class Lane:
                 self.evaluations,
             )
         )
+        if worst <= 0:
+            self.keep(Kept(self.z, self.seen, self.history[-1]))
+
+    def keep(self, other: Kept | None) -> None:
+        """The better of two."""
+        if other and not (self.kept and self.kept.point.objective <= other.point.objective):
+            self.kept = other
+
+    def go_back(self) -> None:
+        """To the step that was kept, if the present point does not meet the constraints."""
+        last = self.history[-1]
+        if self.kept and not last.violation <= 0:
+            self.z, self.seen, self.reason = self.kept.z, self.kept.seen, Reason.KEPT
+            point = self.kept.point._replace(iteration=last.iteration, evaluations=last.evaluations)
+            self.history.append(point)
 
 
 class Optimiser(NamedTuple):

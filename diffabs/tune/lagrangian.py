@@ -1,6 +1,6 @@
 """Descents under multipliers that are raised until the constraints hold: the method of multipliers.
 
-    m <- max(0, m + c g) after each descent; c grows where the violation has not become much smaller
+    m <- max(0, m + c (g + d)) after each descent; c grows where the violation has not become much smaller
 
 J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., sec. 17.4.
 """
@@ -58,17 +58,19 @@ class Search:
         usable = [lane for lane in lanes if lane.reason is not Reason.START]
         if not usable:
             raise StartError(f"{Reason.START.value}: {self._unusable()}")
+        for lane in usable:
+            lane.go_back()
         best = min(usable, key=lambda lane: self._rank(lane.history[-1]))
         return self._tuned(best, lanes)
 
     def _rounds(self, descent: Descent) -> list[Lane]:
         k, count = len(self.before.excess), len(self.starts)
-        m = Multipliers(np.zeros((count, k)), np.full(count, PENALTY))
+        m = Multipliers(np.zeros((count, k)), np.full(count, PENALTY), np.full(count, self.method.margin))
         lanes = descent.run(self.starts, m)
         if not k:
             return lanes
         worst = _violations(lanes)
-        while self.round < self.method.rounds and not all(w <= self.method.tolerance for w in worst):
+        while self.round < self.method.rounds and not all(w <= 0 for w in worst):
             self.round += 1
             m = _raised(m, lanes)
             last, lanes = lanes, descent.run(np.stack([lane.z for lane in lanes]), m)
@@ -79,7 +81,7 @@ class Search:
 
     def _rank(self, point: Point) -> tuple[bool, float]:
         """Those that meet the constraints first."""
-        met = point.violation <= self.method.tolerance
+        met = point.violation <= 0
         return not met, point.objective if met else point.violation
 
     def _told(self, lanes: list[Lane]) -> None:
@@ -112,7 +114,7 @@ class Search:
             objective=(float(self.before.objective), last.objective),
             violation=(float(np.max(self.before.excess, initial=0.0)), last.violation),
             metrics=(self.before.metrics, best.seen.metrics),
-            met=last.violation <= self.method.tolerance,
+            met=last.violation <= 0,
             reason=best.reason or Reason.LIMIT,
             history=best.history,
             starts=[start(lane) for lane in lanes],
@@ -133,8 +135,8 @@ def _violations(lanes: list[Lane]) -> np.ndarray:
 
 
 def _raised(m: Multipliers, lanes: list[Lane]) -> Multipliers:
-    """m <- max(0, m + c g)."""
-    excess = np.stack([lane.seen.excess for lane in lanes])
+    """m <- max(0, m + c (g + d))."""
+    excess = np.stack([lane.seen.excess for lane in lanes]) + m.margin[:, None]
     return m._replace(values=np.maximum(0.0, m.values + m.penalty[:, None] * np.nan_to_num(excess)))
 
 
@@ -152,3 +154,4 @@ def _continued(lane: Lane, before: Lane) -> None:
         for p in lane.history
     ]
     lane.history = [*before.history, *moved]
+    lane.keep(before.kept)

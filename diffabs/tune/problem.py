@@ -1,10 +1,11 @@
 """What is tuned, as a function of the unbounded vector z: loss, gradient, and what is needed to judge a step.
 
     J(z) = aggregate over the lanes of (sum of weight * metric)
-    L(z) = J/s + sum over the constraints of [max(0, m + c g)^2 - m^2]/(2 c)
+    L(z) = J/s + sum over the constraints of [max(0, m + c (g + d))^2 - m^2]/(2 c)
 
-L is the augmented Lagrangian of Powell, Hestenes and Rockafellar for g <= 0 with multipliers m and penalty c; s is the
-objective's size at the start, so that L is of the order of one.
+L is the augmented Lagrangian of Powell, Hestenes and Rockafellar for g + d <= 0 with multipliers m and penalty c; s is
+the objective's size at the start, so that L is of the order of one. d is a margin: multipliers come to a bound from
+outside and never quite reach it, so what is aimed at lies a little inside, and g <= 0 holds where a search ends.
 """
 
 import dataclasses
@@ -55,10 +56,11 @@ class Evaluation(NamedTuple):
 
 
 class Multipliers(NamedTuple):
-    """Multipliers (k,) and penalty of the augmented Lagrangian."""
+    """Multipliers (k,), penalty and margin of the augmented Lagrangian; None is no margin."""
 
     values: Any
     penalty: Any
+    margin: Any = None
 
 
 def built(subject: Any) -> Loop:
@@ -154,5 +156,6 @@ def automatic(space: Space) -> Mode:
 
 
 def _penalty(excess: Any, m: Multipliers) -> Any:
-    """[max(0, m + c g)^2 - m^2]/(2 c), summed."""
-    return jnp.sum(jnp.maximum(0.0, m.values + m.penalty * excess) ** 2 - m.values**2) / (2 * m.penalty)
+    """[max(0, m + c (g + d))^2 - m^2]/(2 c), summed."""
+    aimed = excess if m.margin is None else excess + m.margin
+    return jnp.sum(jnp.maximum(0.0, m.values + m.penalty * aimed) ** 2 - m.values**2) / (2 * m.penalty)

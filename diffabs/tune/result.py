@@ -21,7 +21,9 @@ class Method:
     starts: the first is the part itself, the others are drawn from the ranges with `seed`
     mode: forward or reverse; None decides by the number of parameters
     stopping: of each descent; with constraints there is one per round
-    rounds, tolerance: of the augmented Lagrangian; the greatest excess that counts as met, in units of its scale
+    rounds: of the augmented Lagrangian, at most
+    margin: how far inside of every constraint it aims, in units of the constraint's scale (of a bound, relative to it),
+        so that what was asked for holds where it ends, without a tolerance
     memory: how many steps L-BFGS remembers; more than there are parameters is of little use
     """
 
@@ -31,7 +33,7 @@ class Method:
     mode: Mode | None = None
     stopping: Stopping = dataclasses.field(default_factory=Stopping)
     rounds: int = 12
-    tolerance: float = 1e-3
+    margin: float = 1e-3
     memory: int = 10
 
 
@@ -60,7 +62,7 @@ class Tuned:
     part: the given one with its free parameters changed; `loop` is what it stands for
     values: the free parameters by path
     objective: J before and after; violation: the greatest excess before and after; metrics (lanes,) before and after
-    met: whether every constraint holds within the tolerance
+    met: whether every constraint holds, without a tolerance
     reason: why the descent of the best start ended, in its last round
     history: of the best start; `starts` has all of them
     evaluations: gradients that were computed for the best start, rejected trials included

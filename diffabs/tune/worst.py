@@ -40,6 +40,7 @@ class WorstCase:
     value: the metric there; screened: the greatest among the points that were run first
     rollouts: what it cost, a gradient counted as `price` rollouts
     met: whether `bound` holds even there (None without a bound); diverged: a screened point at which the run diverges
+        or the metric is no number
     """
 
     metric: str
@@ -67,7 +68,7 @@ class WorstCase:
             return f"COUNTEREXAMPLE: the run diverges at {at}."
         found = f"{self.metric} = {self.value:.6g} at {at}"
         if self.met is False:
-            return f"COUNTEREXAMPLE: {found}, beyond {self.bound:g}."
+            return f"COUNTEREXAMPLE: {found}, beyond {self.bound:g} by {self.value - (self.bound or 0.0):.3g}."
         proof = {
             True: "The linear loop is proved stable over the box by a certificate.",
             False: "No certificate covers the box.",
@@ -185,7 +186,7 @@ def _found(
         if -float(lane.seen.objective) > value:
             place, value = free.values(jnp.asarray(lane.z)), -float(lane.seen.objective)
             metrics = {name: x[0] for name, x in lane.seen.metrics.items()}
-    bad = np.flatnonzero(screened.diverged)
+    bad = np.flatnonzero(screened.diverged | np.isnan(screened.metrics[metric]))
     place = {path: np.asarray(x) for path, x in place.items()}
     return WorstCase(
         metric=metric,
