@@ -8,7 +8,6 @@ BIN := $(VENV)/bin
 
 demo: $(VENV)/.installed
 	$(BIN)/diffabs reproduce all --out out
-	@echo "The figures and summary.json of the three papers are in out/slip-lmi, out/slip-estimator and out/arm-balance."
 
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"

@@ -7,7 +7,8 @@ import dataclasses
 import importlib
 import math
 import pathlib
-from typing import Annotated, Any, NoReturn
+import time
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import jax
 import typer
@@ -27,6 +28,9 @@ from diffabs import (
 from diffabs.loop import task
 from diffabs.rollout import Run, measure, rollout
 from diffabs.scenario import Scenario, header, names
+
+if TYPE_CHECKING:
+    from diffabs.papers import Reproduction
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -214,20 +218,33 @@ def reproduce(
     ),
     as_json: console.Json = False,
 ) -> None:
-    """A paper's whole result: figures, summary.json, and a table of ours against the published numbers."""
+    """A paper's whole result: figures, summary.json, and in short what agrees with it and what is refuted."""
     with console.guarded():
         console.need_matplotlib()
-        from diffabs.papers import PAPERS
+        from diffabs.papers import PAPERS, compact
 
         if name != "all" and name not in PAPERS:
             raise catalogue.unknown(f"there is no paper {catalogue.shown(name)}", name, (*PAPERS, "all"))
         results = {}
         for paper in PAPERS if name == "all" else (name,):
             with console.new_folder(out / paper) as folder:
-                results[paper] = console.waited(
-                    lambda paper=paper, folder=folder: PAPERS[paper](folder, console.say), f"reproducing {paper}"
-                )
+                results[paper] = _reproduced(paper, PAPERS[paper], folder)
             if not as_json:
-                show.paper(results[paper], out / paper)
+                show.paper(compact(results[paper]), out / paper)
         if as_json:
             show.as_json({"out": str(out), "papers": results, "versions": show.versions()})
+
+
+def _reproduced(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> dict[str, Any]:
+    """The summary of a paper. Its steps are told beside the spinner, or in a line each where there is none."""
+    spins, steps, begun = console.animated(), ["starting"], time.monotonic()
+
+    def step(sentence: str) -> None:
+        steps.append(sentence.removeprefix(f"{name}: "))
+        if not spins:
+            console.say(sentence)
+
+    def detail() -> str:
+        return f"{steps[-1]}, {time.monotonic() - begun:.0f} s"
+
+    return console.waited(lambda: reproduction(folder, step), f"reproducing {name}", detail if spins else None)

@@ -46,6 +46,12 @@ def fail(line: str, status: int = BAD_INPUT) -> NoReturn:
     raise typer.Exit(status)
 
 
+def animated() -> bool:
+    """Whether stderr shows a spinner: a terminal that can write over a line."""
+    console = Console(stderr=True)
+    return console.is_terminal and not console.is_dumb_terminal
+
+
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
     """Bad input, a full disk, and Ctrl-C end a command with one line and their exit status."""

@@ -10,12 +10,14 @@ from typing import Any
 
 import jax
 import typer
-from rich.console import Console
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, Group
 from rich.table import Table
 
 from diffabs import __version__
 from diffabs.catalogue import unit_of
 from diffabs.console import say
+from diffabs.papers.digest import Digest
 from diffabs.protocols import UNITS
 from diffabs.rollout import Trajectory
 from diffabs.scenario import Scenario
@@ -91,19 +93,24 @@ def family(name: str, members: dict[str, Any]) -> None:
     _print(name, table)
 
 
-def paper(summary: dict[str, Any], folder: pathlib.Path) -> None:
-    """Our numbers against the published ones, and where the figures are."""
-    independent = any(row.get("reference") is not None for row in summary["rows"])
-    numbers = ("ours", "published", *(("reference",) if independent else ()), "difference")
-    table = Table("", "quantity", *numbers, "unit")
-    for row in summary["rows"]:
-        texts = (row.get("name"), row.get("quantity"), *(row.get(key) for key in numbers), row.get("unit"))
-        table.add_row(*("" if value is None else _brief(value) for value in texts))
-    _print(summary["title"], table)
-    notes = summary.get("notes") or []
-    for note in [notes] if isinstance(notes, str) else notes:
-        say(f"note: {note}")
-    say(f"figures and summary.json: {folder} ({', '.join(summary['figures'])})")
+def paper(digest: Digest, folder: pathlib.Path) -> None:
+    """The compact result of a paper, and where everything else is."""
+    _console().print(compact(digest))
+    say(f"{digest.figures} figures, every number and note (summary.json): {folder}\n")
+
+
+def compact(digest: Digest) -> Group:
+    """Title, table, how many numbers agree, what is refuted: fits 80 columns."""
+    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    for heading, *cells in zip(digest.headings, *digest.lines, strict=True):
+        words = heading == digest.headings[0] or any(cell[:1].isalpha() for cell in cells)
+        table.add_column(heading, justify="left" if words else "right", overflow="fold")
+    for line in digest.lines:
+        table.add_row(*line)
+    verdicts = Table.grid(padding=(0, 2, 0, 0))
+    for word, sentence in digest.verdicts:
+        verdicts.add_row(word, sentence)
+    return Group(digest.title, table, *digest.agreement, verdicts)
 
 
 def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict: str) -> None:
@@ -263,7 +270,11 @@ def _brief(value: Any) -> str:
 def _print(title: str, table: Table) -> None:
     for column in table.columns:
         column.overflow = "fold"  # a pipe has no width: nothing may be cut off
+    _console().print(*([title] if title else []), table, sep="\n")
+
+
+def _console() -> Console:
     console = Console(markup=False, emoji=False, highlight=False)  # `[N m]` is a unit here, not a style
     if not console.is_terminal:
         console.width = PIPE_WIDTH
-    console.print(*([title] if title else []), table, sep="\n")
+    return console

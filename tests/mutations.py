@@ -582,6 +582,20 @@ MUTATIONS = [
         "test_cli_tune.py::test_a_constraint_that_is_not_met_could_not_be_done",
     ),
     Mutation(
+        "papers: every published number counts as reproduced",
+        "papers/digest.py",
+        'return row["matches"] if "matches" in row else',
+        'return True if "matches" in row else',
+        "test_digest.py::test_published_numbers_are_counted_from_the_record",
+    ),
+    Mutation(
+        "papers: a claim is refuted whatever the number",
+        "papers/digest.py",
+        "if claim.false(*values)",
+        "if True",
+        "test_digest.py::test_a_claim_is_refuted_by_the_number_or_holds",
+    ),
+    Mutation(
         "command line: limits are met within a tolerance",
         "commands_tune.py",
         '"met": beyond <= 0',

@@ -1,5 +1,6 @@
 """The papers' numbers: to the printed digit where they print any, to 1e-6 of an independent solution where not."""
 
+import io
 import json
 import math
 import struct
@@ -10,9 +11,11 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from diffabs import FixedStep, Loop, measure, plot, rollout
+from rich.console import Console
+
+from diffabs import FixedStep, Loop, measure, plot, rollout, show
 from diffabs.objectives import BRAKING
-from diffabs.papers import PAPERS, lmi_design, record, slip_lmi
+from diffabs.papers import PAPERS, arm_balance, compact, lmi_design, record, slip_estimator, slip_lmi
 from diffabs.references import FixedSlip
 
 pytestmark = pytest.mark.xdist_group("papers")  # one worker makes what these share
@@ -239,6 +242,21 @@ def test_summary_is_finite_json_with_provenance(paper):
     assert {"paper", "title", "rows", "figures", "notes", "solver", "versions"} <= set(paper)
     assert {"diffabs", "jax", "numpy", "python"} <= set(paper["versions"])
     assert len(paper.said) >= 3
+    assert len(set(paper.said)) == len(paper.said)
+
+
+def test_what_a_person_is_shown_fits_and_counts(paper):
+    """Of the real record: every claim has its numbers in it, and one paper takes a third of 60 lines."""
+    digest = compact(paper)
+    claims = {"slip-lmi": lmi_design.CLAIMS, "slip-estimator": slip_estimator.CLAIMS, "arm-balance": arm_balance.CLAIMS}
+    assert [word for word, _ in digest.verdicts] == ["refuted"] * len(claims[paper["paper"]])
+    console = Console(file=(file := io.StringIO()), width=80)
+    console.print(show.compact(digest))
+    lines = file.getvalue().splitlines()
+    assert len(lines) <= 20
+    assert max(map(len, lines)) <= 80
+    if paper["paper"] == "slip-estimator":
+        assert "20 of 20 published numbers reproduced (Tables 1, 2: to the printed digit)." in lines
 
 
 def test_figures_are_pictures(paper):

@@ -14,6 +14,7 @@ from diffabs.design import Certificate, Design, Polytope, Spec, certify, design
 from diffabs.design.box import polytope, schedule
 from diffabs.linearize import SlipModel
 from diffabs.papers import record
+from diffabs.papers.digest import Refuted
 from diffabs.plants import MirroredRig
 from diffabs.rollout import Run
 
@@ -52,6 +53,34 @@ NOTES = [
     "triples k2 and overshoots by 20 % instead of 54 %; a hundredth of k1 removes it, as the filter does. The slope of "
     "mu has nothing to do with it.",
 ]
+
+
+CLAIMS = (
+    Refuted(
+        "slip 0.2 has the greatest friction",
+        "eq. (13) peaks at {0:.4f}",
+        [("friction curve, local peak", "slip")],
+        lambda slip: abs(slip - 0.2) > 0.005,
+    ),
+    Refuted(
+        "eqs. (30)-(32) give its gain",
+        "no Q, R do; they need |k2| > {1:.2f}",
+        [("K = [-11753, -48], 5..50 km/h", "common Lyapunov matrix"), ("k1 = -11753", "least |k2| with a common one")],
+        lambda common, least: common == 0.0 and least > -PUBLISHED[1],
+    ),
+    Refuted(
+        "eq. (31) has the rig's vertices",
+        "it mixes speeds, cost {0:.3g} not {1:.3g}",
+        [("LMI, Q = diag(1, 1), (31) as printed", "trace Z"), ("LMI, Q = diag(1, 1)", "trace Z")],
+        lambda printed, right: printed > 1.01 * right,
+    ),
+    Refuted(
+        "eq. (9) is the car of eq. (8)",
+        "it brakes in {0:.2f} s, the car in {1:.2f} s",
+        [("5.3 kg, torque unlimited", "stop_time"), ("5.3 kg, J2 = m r2^2", "stop_time")],
+        lambda disk, car: car > 1.5 * disk,
+    ),
+)
 
 
 class Designed:

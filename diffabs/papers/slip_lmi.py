@@ -18,6 +18,7 @@ from diffabs.controllers import HoldingInput, StateFeedback
 from diffabs.loop import Loop
 from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_design, record
+from diffabs.papers.digest import Digest, digest
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip
 from diffabs.roads import RIG, peak
@@ -227,6 +228,21 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
         "versions": record.versions(),
     }
     return record.write(folder, summary)
+
+
+def compact(summary: Mapping[str, Any]) -> Digest:
+    """The braking runs, and how far the worst of each is from the independent solution."""
+    rows, columns = summary["rows"], ("max_slip", "settling_time", "stop_time", "stop_distance")
+    lines = []
+    for name in (*REFERENCE, *REFERENCE_CAR):
+        found = {row["quantity"]: row for row in rows if row["name"] == name}
+        cells = (f"{found[column]['ours']:.4f}" if column in found else "" for column in columns)
+        worst = max(abs(row["difference"] / row["reference"]) for row in found.values())
+        lines.append((name, *cells, f"{worst:.0e}"))
+    independent = [row for row in rows if row["reference"] is not None and "order of the step" not in row["name"]]
+    headings = ("published gain", "slip", "settled [s]", "time [s]", "distance [m]", "off by")
+    words = "it tells its result in words"
+    return digest(summary, headings, lines, lmi_design.CLAIMS, (words, []), independent)
 
 
 def _designed(runs: Mapping[str, Run], filtered: Run) -> tuple[list[dict[str, Any]], dict[str, Any], dict[str, Any]]:
