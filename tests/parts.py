@@ -122,6 +122,7 @@ SENSORS: dict[str, Any] = {
     "quantisation": sensors.Quantisation(slip=0.013, wheel_speed=0.1),
     "wheel speed": sensors.WheelSpeed(),
     "angles": sensors.AngleSensor(theta=0.01, psi=0.02, period=2e-3),
+    "speed scale": sensors.SpeedScale(factor=0.95),
     "accelerometer": sensors.IntegratedAccelerometer(bias=0.05),
     "series": blocks.Series(blocks=(sensors.Noise(deceleration=0.05), sensors.WheelSpeed())),
 }

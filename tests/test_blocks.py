@@ -26,7 +26,7 @@ from diffabs.controllers.pid import PIDMemory
 from diffabs.integrate import rk4_step
 from diffabs.protocols import BrakeOutput, Clock, Memory, Sample, Tracking
 from diffabs.references import FilteredSlip, PeakLatch, PeakLiteral, PeakRobust
-from diffabs.sensors import Bias, IntegratedAccelerometer, Noise, Quantisation, WheelSpeed
+from diffabs.sensors import Bias, IntegratedAccelerometer, Noise, Quantisation, SpeedScale, WheelSpeed
 from diffabs.stops import SpeedReached, Standstill
 
 H = 1e-3
@@ -357,6 +357,17 @@ def test_integrated_accelerometer():
     close(y.speed, 20.0 - 7.5 * t)
     close(y.slip, 1 - 15.0 / (20.0 - 7.5 * t))
     close(y.deceleration, 7.5)
+
+
+def test_a_speed_seen_low_hides_slip():
+    """At 20 m/s with the rim at 16: seen as 19, slip 3/19 instead of 0.2; a wheel that rolls seems to be driven. The
+    floor stands in for the speed below it, the accelerometer and the distance are as they are."""
+    y = BrakeOutput(0.2, 20.0, 16.0, 8.76, 5.0)
+    close(SpeedScale(factor=0.95).output(0.0, Memory(), y), (3 / 19, 19.0, 16.0, 8.76, 5.0))
+    rolling = BrakeOutput(0.0, 20.0, 20.0, 0.0, 5.0)
+    close(SpeedScale(factor=0.95).output(0.0, Memory(), rolling).slip, -1 / 19)
+    close(SpeedScale(factor=0.95, floor=38.0).output(0.0, Memory(), y).slip, 3 / 38)
+    close(SpeedScale().output(0.0, Memory(), y), y)
 
 
 # Stops

@@ -55,6 +55,7 @@ LOOPS = {
     ),
     "proportional": d.Loop(
         **RIG,
+        sensor=sensors.SpeedScale(factor=0.98),
         controller=controllers.ProportionalFeedback(gain=np.array([-8000.0, -200.0])),
         feedforward=controllers.HoldingInput(),
     ),

@@ -19,7 +19,7 @@ from diffabs.objectives import BRAKING
 from diffabs.pytree import strong
 from diffabs.stability import stable_step, stable_steps
 from diffabs.stops import SpeedReached
-from diffabs.tune import AtMost, Batch, CertifiedDecay, Method, Mode, Poles, Stopping, grid, tune, worst_case
+from diffabs.tune import AtMost, Batch, CertifiedDecay, Method, Mode, Poles, Stopping, WorstCase, grid, tune, worst_case
 from diffabs.tune.problem import Multipliers
 from diffabs.tune.tuning import posed
 from diffabs.tune.weights import lq_weights, regulator
@@ -284,6 +284,24 @@ class TestSpeedScaled:
 BOX = {"plant.mass": (4.0, 8.0), "plant.road.w4": (0.3, 0.5), "actuator.time_constant": (5e-4, 4e-3)}
 
 
+@pytest.mark.parametrize(
+    ("corner", "screened", "words"),
+    [
+        (0.3, 0.3, "That is a corner of the box: running its 4 corners finds it."),
+        (0.2, 0.3, "That is one of the points that were run first (worst corner 0.2)."),
+        (0.2, 0.25, "Gradients found it from 0.25, the worst of the points that were run first (worst corner 0.2)."),
+    ],
+)
+def test_a_worst_case_says_what_found_it(corner, screened, words):
+    """A worst case at a corner is no merit of gradients."""
+    found = WorstCase(
+        metric="overshoot", values={"a": 1.0, "b": 2.0}, value=0.3, corners=4, corner=corner, screened=screened,
+        metrics={}, loop=None, rollouts=40.0, bound=0.1, diverged=None, reasons=[],
+    )  # fmt: skip
+    assert found.report() == f"COUNTEREXAMPLE: overshoot = 0.3 at a = 1.0, b = 2.0, beyond 0.1. {words}"
+    assert words in dataclasses.replace(found, bound=None).report()
+
+
 @pytest.mark.slow
 class TestWorstCase:
     def test_it_is_at_least_as_bad_as_thousands_of_samples(self):
@@ -297,6 +315,10 @@ class TestWorstCase:
         assert found.rollouts < 400
         np.testing.assert_allclose(d.measure(found.loop, SOLVER, BRAKING).metrics["max_slip"], found.value, rtol=1e-9)
         assert found.met is (found.value <= 0.25)
+        corners = np.array(list(itertools.product(*BOX.values())))
+        assert found.corners == len(corners) == 8
+        np.testing.assert_allclose(found.corner, np.max(run(corners)["max_slip"]), rtol=1e-9)
+        assert found.corner <= found.screened <= found.value
         assert found.report().startswith("COUNTEREXAMPLE: max_slip" if not found.met else "No counterexample in")
 
     def test_the_report_says_what_is_known(self):

@@ -23,7 +23,7 @@ from diffabs.design.regulator import lqr
 from diffabs.linearize import StateSpace
 from diffabs.loop import TYPICAL, Loop
 from diffabs.objectives import BALANCE
-from diffabs.papers import arm_figures, record
+from diffabs.papers import arm_equations, arm_figures, record
 from diffabs.papers.digest import Digest, Refuted, digest
 from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
 from diffabs.pytree import replace
@@ -225,6 +225,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
         "paper": "arm-balance",
         "title": TITLE,
         "rows": rows,
+        "judged": arm_equations.judged(ArmBalance()),
         "figures": [name.name for name in arm_figures.saved(drawn, folder)],
         "notes": NOTES,
         "gains": {name: np.asarray(gain).tolist() for name, (gain, _) in over_riders.items()},

@@ -17,7 +17,7 @@ from diffabs import plot
 from diffabs.controllers import PID, ConstantTorque
 from diffabs.loop import Loop
 from diffabs.objectives import BRAKING
-from diffabs.papers import record
+from diffabs.papers import estimator_claims, record
 from diffabs.papers.digest import Digest, Refuted, digest
 from diffabs.plants import GRAVITY, QuarterCar
 from diffabs.protocols import Block, Reference
@@ -201,6 +201,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
         "title": TITLE,
         "rows": rows + extra_rows(results),
         "matches": {"of": len(rows), "to the printed digit": sum(row["matches"] for row in rows)},
+        "judged": estimator_claims.judged(results.runs["spline B"], {name: car.road for name, car in CARS.items()}),
         "figures": names,
         "notes": [*NOTES, _step_note(results)],
         "solver": record.solver(SOLVER, speed_at_which_integration_ends=0.05),

@@ -17,7 +17,7 @@ from diffabs import plot
 from diffabs.controllers import HoldingInput, StateFeedback
 from diffabs.loop import Loop
 from diffabs.objectives import BRAKING
-from diffabs.papers import lmi_design, record
+from diffabs.papers import lmi_claims, lmi_design, record
 from diffabs.papers.digest import Digest, digest
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip
@@ -223,6 +223,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
         "figures": names,
         "notes": NOTES + more["notes"],
         "design": more["design"],
+        "judged": more["judged"],
         "solver": record.solver(SOLVER),
         "convergence": {"steps": HALVINGS, "relative_error": errors},
         "versions": record.versions(),
@@ -250,10 +251,12 @@ def _designed(runs: Mapping[str, Run], filtered: Run) -> tuple[list[dict[str, An
     try:
         found = lmi_design.Designed()
     except ModuleNotFoundError as error:
-        return [], {}, {"notes": [f"Section 4, the design, is left out: {error}"], "design": None}
+        return [], {}, {"notes": [f"Section 4, the design, is left out: {error}"], "design": None, "judged": []}
     shown = {"published": runs[CASES[0].name], **{case.name: runs[case.name] for case in GAINS}}
     shown["published, reference filtered"] = filtered
-    more = {"notes": lmi_design.NOTES, "design": lmi_design.summary(found)}
+    gains = {weights: answer.gain[0] for weights, answer in found.designs.items()}
+    judged = lmi_claims.judged(found.system, gains)
+    more = {"notes": lmi_design.NOTES, "design": lmi_design.summary(found), "judged": judged}
     return lmi_design.table(found, runs), lmi_design.figures(found, shown), more
 
 

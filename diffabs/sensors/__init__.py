@@ -5,4 +5,5 @@ from diffabs.sensors.disturbance import Bias as Bias
 from diffabs.sensors.disturbance import Noise as Noise
 from diffabs.sensors.disturbance import Quantisation as Quantisation
 from diffabs.sensors.speed import IntegratedAccelerometer as IntegratedAccelerometer
+from diffabs.sensors.speed import SpeedScale as SpeedScale
 from diffabs.sensors.speed import WheelSpeed as WheelSpeed

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from diffabs.protocols import BrakeOutput, Memory, no_jump
+from diffabs.protocols import BrakeOutput, Memory, no_flow, no_jump, no_memory
 from diffabs.pytree import Scalar, param, pytree
 
 
@@ -59,3 +59,24 @@ class IntegratedAccelerometer:
         v = memory.flow
         slip = (v - signal.wheel_speed) / jnp.maximum(v, self.floor)
         return signal._replace(slip=slip, speed=v, deceleration=signal.deceleration - self.bias)
+
+
+@pytree
+class SpeedScale:
+    """A vehicle speed that is off by a factor, v = factor * true, and the slip computed with it, (v - w)/v.
+
+    What a wrong rolling radius does to a speed that is estimated from another wheel. A speed seen low hides slip: held
+    at a slip s as measured, the wheel slips by 1 - factor (1 - s)."""
+
+    factor: Scalar = param(default=1.0, unit="1", above=0.0)
+    floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
+
+    start = no_memory
+    flow = no_flow
+    jump = no_jump
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
+        """Scaled speed, and the slip computed with it and the true wheel's speed."""
+        del t, memory
+        v = self.factor * signal.speed
+        return signal._replace(slip=(v - signal.wheel_speed) / jnp.maximum(v, self.floor), speed=v)

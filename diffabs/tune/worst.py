@@ -3,8 +3,9 @@
     maximise metric(p),  p in [low, high]
 
 by gradient ascent from the worst of the box's corners and of random points, screened in one batch. A local method: what
-it finds is a counterexample for sure, and the worst with no more certainty than its starts give. Where a certificate
-covers the box the two belong together: `report` says which of them speaks.
+it finds is a counterexample for sure, and the worst with no more certainty than its starts give. Often it is a corner,
+which a run of all corners finds without a gradient: `report` says what found it. Where a certificate covers the box the
+two belong together: `report` says which of them speaks.
 """
 
 import dataclasses
@@ -29,6 +30,7 @@ from diffabs.tune.problem import Mode, Multipliers, Problem, automatic
 from diffabs.tune.space import Range, Space, space
 
 MOST_CORNERS = 64
+SAME = 1e-6  # of a value: no more than a corner's, which an ascent approaches and does not reach
 EDGE = 0.01  # of a range: as near to its ends as an ascent starts; it may end nearer
 
 
@@ -37,7 +39,8 @@ class WorstCase:
     """The greatest value found of a metric.
 
     values: the parameters by path; loop: the loop there; metrics: all that were measured there
-    value: the metric there; screened: the greatest among the points that were run first
+    value: the metric there; screened: the greatest among the points that were run first; corner: the greatest among
+        the corners of the box that were, `corners` in number
     rollouts: what it cost, a gradient counted as `price` rollouts
     met: whether `bound` holds even there (None without a bound); diverged: a screened point at which the run diverges
         or the metric is no number
@@ -46,6 +49,8 @@ class WorstCase:
     metric: str
     values: dict[str, Any]
     value: float
+    corners: int
+    corner: float
     screened: float
     metrics: dict[str, float]
     loop: Any
@@ -68,14 +73,25 @@ class WorstCase:
             return f"COUNTEREXAMPLE: the run diverges at {at}."
         found = f"{self.metric} = {self.value:.6g} at {at}"
         if self.met is False:
-            return f"COUNTEREXAMPLE: {found}, beyond {self.bound:g} by {self.value - (self.bound or 0.0):.3g}."
+            return f"COUNTEREXAMPLE: {found}, beyond {self.bound:g} by {self.value - (self.bound or 0.0):.3g}. {self._finder()}"
         proof = {
             True: "The linear loop is proved stable over the box by a certificate.",
             False: "No certificate covers the box.",
             None: "Nothing was asked of a certificate.",
         }[proved]
         within = f", within {self.bound:g}" if self.bound is not None else ""
-        return f"No counterexample in {self.rollouts:.0f} rollouts: the worst is {found}{within}. {proof}"
+        return (
+            f"No counterexample in {self.rollouts:.0f} rollouts: the worst is {found}{within}. {self._finder()} {proof}"
+        )
+
+    def _finder(self) -> str:
+        """What found it."""
+        if self.value <= self.corner * (1 + SAME):
+            return f"That is a corner of the box: running its {self.corners} corners finds it."
+        if self.value <= self.screened:
+            return f"That is one of the points that were run first (worst corner {self.corner:.6g})."
+        first = f"{self.screened:.6g}, the worst of the points that were run first"
+        return f"Gradients found it from {first} (worst corner {self.corner:.6g})."
 
 
 def worst_case(
@@ -109,7 +125,8 @@ def worst_case(
         raise ValueError(f"{metric} is not measured; there is {', '.join(measured)}")
     middle = replace(loop, {path: 0.5 * (np.asarray(a, float) + np.asarray(b, float)) for path, (a, b) in over.items()})
     free, key = space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
-    points = _points(np.array(free.ranges), screen, seed)
+    corners = _corners(np.array(free.ranges))
+    points = np.concatenate([corners, _drawn(np.array(free.ranges), screen, seed)])
     screened = _screened(loop, free, points, solver, measured, seed_of_noise)
     values = screened.metrics[metric]
     mode = automatic(free)
@@ -117,15 +134,18 @@ def worst_case(
     lanes = _ascent(problem, points[np.argsort(-np.nan_to_num(values, nan=-np.inf))[:starts]], iterations)
     each = price or (1 + 1.5 * free.size if mode is Mode.FORWARD else 6.0)
     gradients = sum(lane.evaluations for lane in lanes)
-    return _found(loop, free, metric, bound, points, screened, lanes, len(points) + each * gradients)
+    return _found(loop, free, metric, bound, points, len(corners), screened, lanes, len(points) + each * gradients)
 
 
-def _points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
-    """Corners, and random points (k, p)."""
+def _corners(ranges: np.ndarray) -> np.ndarray:
+    """Corners (k, p), the first of them if there are too many."""
+    return np.array(list(itertools.islice(itertools.product(*ranges), MOST_CORNERS)))
+
+
+def _drawn(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
+    """Points spread over the box (screen, p)."""
     low, high = ranges.T
-    corners = list(itertools.islice(itertools.product(*ranges), MOST_CORNERS))
-    drawn = qmc.Sobol(len(low), rng=np.random.default_rng(seed)).random(screen)
-    return np.concatenate([np.array(corners), low + (high - low) * drawn])
+    return low + (high - low) * qmc.Sobol(len(low), rng=np.random.default_rng(seed)).random(screen)
 
 
 def _at(free: Space, point: Any) -> dict[str, Any]:
@@ -175,6 +195,7 @@ def _found(
     metric: str,
     bound: float | None,
     points: np.ndarray,
+    corners: int,
     screened: Run,
     lanes: list[Lane],
     rollouts: float,
@@ -192,6 +213,8 @@ def _found(
         metric=metric,
         values=place,
         value=value,
+        corners=corners,
+        corner=float(np.max(values[:corners])),
         screened=float(values[i]),
         metrics={name: float(x) for name, x in metrics.items()},
         loop=replace(loop, place),

@@ -1,0 +1,101 @@
+"""Fumita's equations (1)-(10) as printed, each as a function of angles q, rates v and accelerations a (3,), and what
+Lagrange's equations make of the printed Lagrangian (7).
+
+So every misprint is a difference of two functions, and not a matter of reading.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.papers import record
+from diffabs.plants import ArmBalance
+
+Energy = Callable[[ArmBalance, Any, Any], Any]
+RODS = {"body": "body_height", "arm": "arm_length", "rider": "rider_height"}  # half the length of a rod of that inertia
+
+
+def kinetic(p: ArmBalance, q: Any, v: Any) -> Any:
+    """Eqs. (1), (3), (5) [J]."""
+    _, t2, t3 = q
+    v1, v2, v3 = v
+    l, lg, hg, m2, m3 = p.mount_height, p.arm_length, p.rider_height, p.arm_mass, p.rider_mass
+    k1 = 0.5 * (p.body_inertia + p.body_mass * p.body_height**2) * v1**2
+    k2 = 0.5 * (p.arm_inertia + m2 * (l**2 + lg**2) + 2 * m2 * l * lg * jnp.cos(t2)) * v1**2
+    k2 = (
+        k2
+        + 0.5 * (p.arm_inertia + m2 * lg**2) * v2**2
+        + (p.arm_inertia + m2 * (lg**2 + l * lg * jnp.cos(t2))) * v1 * v2
+    )
+    k3 = 0.5 * (p.rider_inertia + m3 * (l**2 + hg**2) + 2 * m3 * l * hg * jnp.cos(t3)) * v1**2
+    k3 = k3 + 0.5 * (p.rider_inertia + m3 * hg**2) * v3**2
+    return k1 + k2 + k3 + (p.rider_inertia + m3 * (hg**2 + l * hg * jnp.cos(t3))) * v1 * v3
+
+
+def potentials(p: ArmBalance, q: Any) -> Any:
+    """Eqs. (2), (4), (6) as printed (3,); the second and third add kg m to J."""
+    t1, t2, t3 = q
+    u1 = p.body_mass * p.body_height * p.gravity * jnp.cos(t1)
+    u2 = p.arm_mass * p.mount_height * jnp.cos(t1) + p.arm_mass * p.arm_length * p.gravity * jnp.cos(t1 - t2)
+    u3 = p.rider_mass * p.mount_height * jnp.cos(t1) + p.rider_mass * p.rider_height * p.gravity * jnp.cos(t1 - t3)
+    return jnp.stack([u1, u2, u3])
+
+
+def lagrangian(p: ArmBalance, q: Any, v: Any) -> Any:
+    """Eq. (7) [J]: the kinetic energy of the sums theta1 + theta2, a potential of the differences."""
+    t1, t2, t3 = q
+    b1 = p.body_mass * p.body_height + (p.arm_mass + p.rider_mass) * p.mount_height
+    heights = b1 * jnp.cos(t1) + p.arm_mass * p.arm_length * jnp.cos(t1 - t2)
+    return kinetic(p, q, v) - p.gravity * (heights + p.rider_mass * p.rider_height * jnp.cos(t1 - t3))
+
+
+def derived(energy: Energy, p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
+    """d/dt(dL/dv) - dL/dq (3,), by automatic differentiation."""
+    by_rate = jax.grad(energy, 2)
+    return jax.jvp(lambda q, v: by_rate(p, q, v), (q, v), (v, a))[1] - jax.grad(energy, 1)(p, q, v)
+
+
+def printed(p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
+    """Left sides of eqs. (8), (9), (10) (3,)."""
+    (t1, t2, t3), (v1, v2, v3) = q, v
+    sin2, sin3 = jnp.sin(t2), jnp.sin(t3)
+    l, lg, hg, m2, m3, g = p.mount_height, p.arm_length, p.rider_height, p.arm_mass, p.rider_mass, p.gravity
+    arm, rider = p.arm_inertia + m2 * lg**2, p.rider_inertia + m3 * hg**2
+    by2, by3 = arm + m2 * l * lg * jnp.cos(t2), rider + m3 * l * hg * jnp.cos(t3)
+    frame = p.body_inertia + p.body_mass * p.body_height**2 + m2 * l**2 + m3 * l**2 + arm + rider
+    frame = frame + 2 * m2 * l * lg * jnp.cos(t2) + 2 * m3 * l * hg * jnp.cos(t3)
+    gravity2, gravity3 = m2 * lg * g * jnp.sin(t1 - t2), m3 * hg * g * jnp.sin(t1 - t3)
+    eighth = frame * a[0] + by2 * a[1] + by3 * a[2]
+    eighth = eighth - 2 * m2 * l * lg * sin2 * v1 * v2 - 2 * m3 * l * hg * sin3 * v1 * v3
+    eighth = eighth - m2 * lg * sin2 * v2**2 - m3 * l * hg * sin3 * v3**2
+    eighth = eighth - (p.body_mass * p.body_height + (m2 + m3) * l) * g * jnp.sin(t1) - gravity2 - gravity3
+    ninth = by2 * a[0] + arm * a[1] - m2 * l * lg * sin2 * v1**2 - gravity2
+    tenth = by3 * a[0] + rider * a[2] - m3 * l * hg * sin3 * v1**2 - gravity3
+    return jnp.stack([eighth, ninth, tenth])
+
+
+def gravity_stiffness(p: ArmBalance) -> np.ndarray:
+    """d(left sides of (8)-(10))/dq at rest (3, 3) [N m/rad]: symmetric for any potential."""
+    zero = jnp.zeros(3)
+    return np.asarray(jax.jacfwd(lambda q: printed(p, q, zero, zero))(zero))
+
+
+def judged(p: ArmBalance) -> list[dict[str, Any]]:
+    """A row for each number."""
+    upright = np.asarray(potentials(p, jnp.zeros(3)))
+    height = p.arm_mass * p.gravity * (p.mount_height + p.arm_length)
+    rows = [record.row("eq. (4), everything upright", "potential energy", "J", upright[1], reference=height)]
+    stiffness = gravity_stiffness(p)
+    for i, name in ((1, "arm"), (2, "rider")):
+        of_frame = f"gravity of eq. ({8 + i}) by the frame less that of (8) by the {name}"
+        rows.append(record.row(of_frame, "asymmetry", "N m/rad", stiffness[i, 0] - stiffness[0, i], reference=0.0))
+    for name, half in RODS.items():
+        mass, inertia = getattr(p, f"{name}_mass"), getattr(p, f"{name}_inertia")
+        rod = mass * (2 * getattr(p, half)) ** 2 / 12
+        rows.append(record.row(f"a uniform rod as the {name}", "inertia", "kg m^2", rod, published=inertia))
+    rows.append(record.row("motor, stalled at 48 V", "torque", "N m", p.torque_constant * 48.0 / p.resistance))
+    rows.append(record.row("motor, most at 48 V", "mechanical power", "W", 48.0**2 / (4 * p.resistance)))
+    return rows

@@ -1,0 +1,95 @@
+"""Aoki and Nakamura, what the text says of its figures: which controllers brake abruptly, where friction is gained, at
+which slip it is greatest.
+
+The paper gives no number for any of it. These are numbers of the identified car, from the runs of its tables.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffabs.papers import record
+from diffabs.roads import peak
+from diffabs.rollout import Run
+
+KMH = 3.6
+LATE = 0.45  # s, after which the torque has been built up in every run
+SLOW = 20 / KMH  # m/s, for "even when the vehicle is slow"
+CONTROLLERS = ("P", "PD", "PI", "PID")
+METHODS = ("conventional", "proposed")
+
+
+def seen(run: Run) -> dict[str, np.ndarray]:
+    """Columns of a trajectory while it ran: time, torque, and what the plant shows."""
+    if run.trajectory is None:
+        raise ValueError("a run without a trajectory, as `measure` returns it: use `rollout`")
+    sample = run.trajectory.sample
+    t = np.asarray(sample.t)
+    fresh = np.concatenate([[True], np.diff(t) > 0])
+    columns = {"t": t, "torque": sample.control, **sample.output._asdict()}
+    return {name: np.asarray(column)[fresh] for name, column in columns.items()}
+
+
+def variation(run: Run) -> float:
+    """Total variation of the torque between the samples that were kept [N m]."""
+    return float(np.sum(np.abs(np.diff(seen(run)["torque"]))))
+
+
+def jerk(run: Run, after: float = LATE) -> float:
+    """Greatest |da/dt| of the vehicle between samples later than `after` [m/s^3]."""
+    one = seen(run)
+    t = one["t"]
+    rates = np.abs(np.diff(one["deceleration"]) / np.diff(t))
+    return float(np.max(rates[t[:-1] >= after]))
+
+
+def rebounds(run: Run, begin: float = 0.3, end: float = 1.0) -> int:
+    """How often the wheel changes between slowing down and speeding up in this time."""
+    one = seen(run)
+    rate = np.diff(one["wheel_speed"])[(one["t"][:-1] >= begin) & (one["t"][:-1] < end)]
+    return int(np.sum(np.diff(np.sign(rate)) != 0))
+
+
+def slow_deceleration(run: Run) -> float:
+    """Mean deceleration from `SLOW` down to the last sample, over the distance [m/s^2]."""
+    one = seen(run)
+    slow = one["speed"] <= SLOW
+    v, x = one["speed"][slow], one["distance"][slow]
+    return float((v[0] ** 2 - v[-1] ** 2) / (2 * (x[-1] - x[0])))
+
+
+def gained(slower: Run, faster: Run) -> tuple[float, float]:
+    """What one run brakes shorter than another, and the part of it that is gained below `SLOW` [m].
+
+    Distance is the integral of v dv/a(v), which tells at what speeds it is gained."""
+    one, other = seen(slower), seen(faster)
+    v = np.linspace(one["speed"][-1], one["speed"][1], 20_001)  # at the very first there is no friction yet
+    shorter = v * (1 / _at(v, one) - 1 / _at(v, other))
+    return float(np.trapezoid(shorter, v)), float(np.trapezoid(np.where(v <= SLOW, shorter, 0.0), v))
+
+
+def _at(v: np.ndarray, one: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Deceleration at these speeds; the speed only falls."""
+    return np.interp(v, one["speed"][::-1], one["deceleration"][::-1])
+
+
+def judged(runs: Mapping[str, Run], roads: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """A row for each number, of the runs of Tables 1 and 2 on one car, and of the friction curves by name."""
+    rows = []
+    for name in (f"{method} {controller}" for method in METHODS for controller in CONTROLLERS):
+        rows.append(record.row(name, "variation of the torque", "N m", variation(runs[name])))
+        rows.append(record.row(name, f"largest jerk after {LATE:g} s", "m/s^3", jerk(runs[name])))
+        rows.append(record.row(name, "turns of the wheel's speed, 0.3 to 1 s", "1", rebounds(runs[name])))
+    for method in METHODS:
+        distances = [float(runs[f"{method} {controller}"].metrics["stop_distance"]) for controller in CONTROLLERS]
+        rows.append(record.row(method, "distance, between the four controllers", "m", np.ptp(distances)))
+        name = f"{method} PI"
+        rows.append(record.row(name, "deceleration below 20 km/h", "m/s^2", slow_deceleration(runs[name])))
+    whole, slow = gained(runs["conventional PI"], runs["proposed PI"])
+    rows.append(record.row("proposed PI", "shorter than conventional", "m", whole))
+    rows.append(record.row("proposed PI", "of that below 20 km/h", "m", slow))
+    for name, road in roads.items():
+        rows.append(record.row(f"friction curve, {name}", "slip of greatest friction", "1", jax.jit(peak)(road).slip))
+    return rows
