@@ -1,5 +1,9 @@
 """Simulate, differentiate, tune and certify controllers for braking wheels."""
 
+from diffabs import interrupt as _interrupt
+
+_interrupt.early()  # before JAX, whose import takes seconds
+
 from diffabs.loop import Loop as Loop
 from diffabs.plants import BrakeStart as BrakeStart
 from diffabs.pytree import check as check

@@ -10,7 +10,7 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -259,3 +259,18 @@ def described(family: str, part: Any) -> dict[str, dict[str, Any]]:
             default = np.asarray(value, float).tolist()
             rows[field.name] = {"default": default, "unit": spec.unit, "range": spec.interval(), **ends}
     return rows
+
+
+def choices(part: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Every part below this one by its path: its type, and its fields that are no parameters."""
+    if isinstance(part, tuple):
+        for i, item in enumerate(part):
+            yield from choices(item, f"{path}.{i}")
+        return
+    fields = dataclasses.fields(part)
+    if path:
+        fixed = {field.name: getattr(part, field.name) for field in fields if "static" in field.metadata}
+        yield path, {"type": kebab(type(part).__name__), **fixed}
+    for field in fields:
+        if "part" in field.metadata:
+            yield from choices(getattr(part, field.name), f"{path}.{field.name}" if path else field.name)

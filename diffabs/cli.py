@@ -11,6 +11,7 @@ import time
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import jax
+import numpy as np
 import typer
 
 from diffabs import (
@@ -23,19 +24,23 @@ from diffabs import (
     commands_sweep,
     commands_tune,
     console,
+    interrupt,
     show,
+    usage,
 )
 from diffabs.loop import task
+from diffabs.pytree import parameters
 from diffabs.rollout import Run, measure, rollout
-from diffabs.scenario import Scenario, header, names
+from diffabs.scenario import Scenario, dump, header, names
 
 if TYPE_CHECKING:
     from diffabs.papers import Reproduction
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode=None,  # plain usage errors: one line that scripts and people can read
+    cls=usage.Group,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode=None,  # plain help, that scripts and people can read
     pretty_exceptions_enable=False,
     help="Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers.",
 )
@@ -48,14 +53,13 @@ PLURALS |= {"stops": "stop", "objectives": "objective"}
 
 def main() -> NoReturn:
     """The executable: run the command line, and leave."""
+    interrupt.begin()
     try:
         app()
         status: Any = 0
     except SystemExit as left:
         status = left.code
-    except KeyboardInterrupt:
-        console.say("interrupted")
-        status = console.INTERRUPTED
+    interrupt.finish()
     console.leave(status)
 
 
@@ -76,10 +80,14 @@ def setup(
     jax.config.update("jax_enable_x64", True)
 
 
-@app.command()
 def simulate(
     scenario: Annotated[
-        str | None, typer.Argument(help="A TOML file, or the name of a packaged scenario.", show_default=False)
+        str | None,
+        typer.Argument(
+            autocompletion=console.scenarios_like,
+            help="A TOML file, or the name of a packaged scenario.",
+            show_default=False,
+        ),
     ] = None,
     changes: console.Changes = None,
     as_json: console.Json = False,
@@ -108,8 +116,7 @@ def simulate(
             if csv_file and run.trajectory:
                 show.write_csv(run.trajectory, getattr(chosen.loop.plant, "control_unit", "N m"), csv_file)
             if picture:
-                draw = getattr(importlib.import_module("diffabs.plot"), task(chosen.loop.plant))
-                draw(run, title=chosen.title or chosen.name).savefig(picture)
+                console.waited(lambda: _draw(chosen, run, picture), "drawing")
         result = _result(chosen, run, {"csv": csv, "plot": plot})
         show.as_json(result) if as_json else show.run(result, chosen)
         if result["diverged"]:
@@ -154,28 +161,26 @@ def _run(chosen: Scenario, key: Any, keep: bool) -> Run:
     return jax.device_get(rollout(chosen.loop, solver, chosen.objectives, key=key))
 
 
+def _draw(chosen: Scenario, run: Run, picture: pathlib.Path) -> None:
+    draw = getattr(importlib.import_module("diffabs.plot"), task(chosen.loop.plant))
+    draw(run, title=chosen.title or chosen.name).savefig(picture)
+
+
 def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -> dict[str, Any]:
     return {
         "scenario": chosen.name,
         "metrics": {name: float(run.metrics[name]) for name in chosen.objectives},
         "stopped": bool(run.stopped),
         "diverged": bool(run.diverged),
+        "title": chosen.title,
+        "parts": _parts(chosen),
+        "parameters": _parameters(chosen),
         "solver": {"step": chosen.solver.step, "duration": chosen.solver.duration, "seed": chosen.seed},
         "versions": show.versions(),
         "files": {name: str(path) for name, path in files.items() if path},
     }
 
 
-app.command()(commands_design.design)
-app.command()(commands_design.certify)
-app.command()(commands_tune.tune)
-app.command()(commands_identify.identify)
-app.command()(commands_sweep.sweep)
-app.command()(commands_rare.rare)
-app.command()(commands_compare.compare)
-
-
-@app.command("list")
 def list_parts(
     family: Annotated[
         str | None, typer.Argument(metavar="[FAMILY]", help=f"{', '.join(PLURALS)} or scenarios.")
@@ -195,6 +200,24 @@ def list_parts(
     return None
 
 
+def show_scenario(
+    scenario: console.ScenarioName,
+    changes: console.Changes = None,
+    out: Annotated[
+        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write to this file; default: stdout.")
+    ] = None,
+) -> None:
+    """A scenario as TOML with every field, to start one's own from."""
+    with console.guarded():
+        console.check_scenario_file(out)
+        text = dump(console.loaded(scenario, changes, integrated=False))
+        if out is None:
+            return typer.echo(text, nl=False)
+        with console.new_file(out, "--out") as file:
+            file.write_text(text, encoding="utf-8")
+    return None
+
+
 def _listed(plural: str) -> dict[str, Any]:
     """The members of a family as plain values."""
     if plural == "scenarios":
@@ -210,7 +233,6 @@ def _listed(plural: str) -> dict[str, Any]:
     }
 
 
-@app.command()
 def reproduce(
     name: Annotated[str, typer.Argument(help="slip-lmi, slip-estimator, arm-balance, or all.")] = "all",
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the results, one folder per paper.")] = pathlib.Path(
@@ -225,12 +247,18 @@ def reproduce(
 
         if name != "all" and name not in PAPERS:
             raise catalogue.unknown(f"there is no paper {catalogue.shown(name)}", name, (*PAPERS, "all"))
-        results = {}
-        for paper in PAPERS if name == "all" else (name,):
-            with console.new_folder(out / paper) as folder:
-                results[paper] = _reproduced(paper, PAPERS[paper], folder)
-            if not as_json:
-                show.paper(compact(results[paper]), out / paper)
+        results: dict[str, Any] = {}
+        try:
+            for paper in PAPERS if name == "all" else (name,):
+                with console.new_folder(out / paper) as folder:
+                    results[paper] = _reproduced(paper, PAPERS[paper], folder)
+                if not as_json:
+                    show.paper(compact(results[paper]), out / paper)
+        except KeyboardInterrupt:
+            if not results:
+                raise
+            console.say(f"interrupted: whole are {', '.join(str(out / paper) for paper in results)}")
+            raise typer.Exit(console.INTERRUPTED) from None
         if as_json:
             show.as_json({"out": str(out), "papers": results, "versions": show.versions()})
 
@@ -248,3 +276,42 @@ def _reproduced(name: str, reproduction: "Reproduction", folder: pathlib.Path) -
         return f"{steps[-1]}, {time.monotonic() - begun:.0f} s"
 
     return console.waited(lambda: reproduction(folder, step), f"reproducing {name}", detail if spins else None)
+
+
+def _parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
+    """Every part by its path: its type, and what it has beside parameters."""
+    objectives = {f"objective.{name}": one for name, one in chosen.objectives.items()}
+    found = dict(catalogue.choices(chosen.loop))
+    for path, one in objectives.items():
+        found |= catalogue.choices(one, path)
+    return found
+
+
+def _parameters(chosen: Scenario) -> dict[str, dict[str, Any]]:
+    """Every number by its path, in SI; what JSON has no number for is a text that an override understands."""
+
+    def plain(value: Any) -> Any:
+        return value if math.isfinite(value) else str(value)
+
+    objectives = (
+        (f"objective.{name}.{path}", spec, value)
+        for name, one in chosen.objectives.items()
+        for path, spec, value in parameters(one)
+    )
+    return {
+        path: {"value": np.vectorize(plain, otypes=[object])(np.asarray(value, float)).tolist(), "unit": spec.unit}
+        for path, spec, value in (*parameters(chosen.loop), *objectives)
+    }
+
+
+usage.add(app, simulate, "simulate slip-lmi --set plant.mass=6.2 --plot run.png")
+usage.add(app, commands_design.design, "design slip-lmi --set design.decay=80 --out gain.json")
+usage.add(app, commands_design.certify, "certify slip-lmi --gain=-11753,-76.7")
+usage.add(app, commands_tune.tune, "tune slip-cured --set reference.time_constant=0.03 --out tuned.toml")
+usage.add(app, commands_identify.identify, "identify slip-lmi --data run.csv --free plant.mass=4:8")
+usage.add(app, commands_sweep.sweep, "sweep slip-lmi --samples 10000 --set solver.step=1e-3 --figures")
+usage.add(app, commands_rare.rare, "rare slip-lmi stop_time=2.2 --set solver.step=1e-3")
+usage.add(app, commands_compare.compare, "compare out/sweep-slip-lmi out/sweep-mine --metric iae")
+usage.add(app, list_parts, "list roads", "list")
+usage.add(app, show_scenario, "show slip-lmi --set plant.mass=6.2 --out mine.toml", "show")
+usage.add(app, reproduce, "reproduce slip-estimator")

@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import math
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -63,15 +63,18 @@ def identify(
             noise = _noise(sigma or (), readings)
             chosen = console.loaded(scenario, changes)
             ranges = _ranges(free, chosen)
-            message = f"identifying {chosen.name}"
-            found, noise = console.waited(lambda: _identified(chosen, readings, ranges, noise), message)
-            result = _result(chosen, readings, ranges, found, noise)
+            found, noise, interrupted = _watched(chosen, readings, ranges, noise)
+            result = {**_result(chosen, readings, ranges, found, noise), "interrupted": interrupted}
+            if interrupted:
+                show.as_json(result) if as_json else show.identified(result)
+                console.say("interrupted: these are the values so far, not the best ones; no file is written")
+                raise typer.Exit(console.INTERRUPTED)
             if result["undetermined"]:  # inside, so that no file is written
                 show.as_json(result) if as_json else show.identified(result)
                 missing = "; ".join(row["direction"] for row in result["undetermined"])
                 console.fail(f"{chosen.name}: not identifiable from these data: {missing}", console.FAILED)
             if file:
-                file.write_text(dump(dataclasses.replace(chosen, loop=found.part)), encoding="utf-8")
+                file.write_text(dump(chosen.with_loop(found.part, "identified")), encoding="utf-8")
         result["files"] = {"out": str(out)} if out else {}
         show.as_json(result) if as_json else show.identified(result)
 
@@ -125,8 +128,32 @@ def _ranges(given: Sequence[str], chosen: Scenario) -> dict[str, goal.Ends]:
     return found
 
 
-def _identified(
+def _watched(
     chosen: Scenario, readings: Readings, ranges: Mapping[str, goal.Ends], given: Mapping[str, float]
+) -> tuple["Identified", dict[str, float], bool]:
+    """The fit, the standard deviations it was made with, and whether Ctrl-C ended it."""
+    far: list[str] = []
+
+    def told(evaluations: int, cost: float) -> None:
+        far.append(f"{evaluations} evaluations, cost {cost:.6g}")
+
+    ending = console.Ending("the evaluation in hand", nothing=lambda: not far)
+    found, noise = console.waited(
+        lambda: _identified(chosen, readings, ranges, given, told, ending),
+        f"identifying {chosen.name}",
+        lambda: far[-1] if far else "compiling",
+        ending,
+    )
+    return found, noise, ending.asked
+
+
+def _identified(
+    chosen: Scenario,
+    readings: Readings,
+    ranges: Mapping[str, goal.Ends],
+    given: Mapping[str, float],
+    told: Callable[[int, float], None],
+    stopping: Callable[[], bool],
 ) -> tuple["Identified", dict[str, float]]:
     """The fit, and the standard deviations it was made with. What is not given is first the spread of a column, then
     that of its residuals, until it hardly changes. Raises ValueError."""
@@ -137,7 +164,8 @@ def _identified(
 
     def fitted(noise: Mapping[str, float], starts: Sequence[Any] = ()) -> tuple["Identified", dict[str, np.ndarray]]:
         traces = Traces(t=readings.t, columns=columns, sigma=noise)
-        found = identify(chosen.loop, traces, dict(ranges), solver=solver, absolute=bool(given), starts=starts)
+        options = {"solver": solver, "absolute": bool(given), "starts": starts}
+        found = identify(chosen.loop, traces, dict(ranges), **options, progress=told, stopping=stopping)
         return found, traces.residuals(found)
 
     spread = {name: float(np.std(values)) or 1.0 for name, values in columns.items()}
@@ -145,6 +173,8 @@ def _identified(
     found, residuals = fitted(noise)
     evaluations = found.evaluations
     for _ in range(0 if len(given) == len(columns) else ROUNDS - 1):
+        if stopping():
+            break
         noise = {name: given.get(name) or max(_rms(residuals[name]), LEAST * spread[name]) for name in columns}
         found, residuals = fitted(noise, [found.values])
         evaluations += found.evaluations

@@ -2,6 +2,7 @@
 
 It needs the extra `diffabs[sweep]`, which is imported when it runs."""
 
+import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -59,23 +60,36 @@ def _estimated(study: "Study", metric: str, bound: float, samples: int, gradient
     from diffabs.sweep.proposals import Diverged
     from diffabs.sweep.reliability import failure_probability
 
-    line = ["level 1"]
+    levels: list[Progress] = []
 
-    def told(at: "Progress") -> None:
-        line[0] = f"level {at.level + 1}, {at.evaluations:,} runs, {metric} up to {at.threshold:.4g}"
+    def far() -> str:
+        if not levels:
+            return "level 1"
+        return f"level {len(levels) + 1}, {levels[-1].evaluations:,} runs, {metric} up to {levels[-1].threshold:.4g}"
 
     try:
         return console.waited(
             lambda: failure_probability(
-                study, metric, bound, gradients=gradients, samples=samples, seed=study.seed, progress=told
+                study, metric, bound, gradients=gradients, samples=samples, seed=study.seed, progress=levels.append
             ),
             "looking for failures",
-            lambda: line[0],
+            far,
         )
+    except KeyboardInterrupt:
+        if not levels:
+            raise
+        console.say(f"interrupted: {_reached(levels, metric)}, by {levels[-1].evaluations:,} runs; no further")
+        raise typer.Exit(console.INTERRUPTED) from None
     except Diverged as error:
         console.fail(str(error), console.FAILED)
     except ValueError as error:
         raise ScenarioError(str(error)) from None
+
+
+def _reached(levels: "list[Progress]", metric: str) -> str:
+    """What the levels tell that are finished."""
+    probability = math.prod(level.share for level in levels)
+    return f"{metric} >= {levels[-1].threshold:.4g} has a probability of about {probability:.2g}"
 
 
 def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str, bound: float) -> dict[str, Any]:

@@ -6,22 +6,15 @@ import contextlib
 import dataclasses
 import json
 import pathlib
-import shlex
-import signal
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import jax.numpy as jnp
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from diffabs import console, show, variation
+from diffabs import console, progress, show, variation
 from diffabs.catalogue import ScenarioError, unit_of, unknown
 from diffabs.pytree import elements
 from diffabs.scenario import Scenario, dump, loads
@@ -31,14 +24,14 @@ if TYPE_CHECKING:
     from diffabs.sweep import Results, Study
 
 ENGINES = ("local", "dask")
-AGAIN = 10.0  # s between lines where there is no terminal
-AWAKE = 0.1  # s between looks for Ctrl-C
 SUMMARY, FIGURES = "summary.json", "figures"
 
 
 def sweep(
     scenario: console.ScenarioName,
-    out: Annotated[pathlib.Path, typer.Option(metavar="DIR", help="Folder of the sweep.")],
+    out: Annotated[
+        pathlib.Path | None, typer.Option(metavar="DIR", help="Folder of the sweep; default: out/sweep-NAME.")
+    ] = None,
     changes: console.Changes = None,
     samples: Annotated[int | None, typer.Option(help="The same as --set sweep.samples=N.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as --set sweep.seed=N.")] = None,
@@ -47,8 +40,8 @@ def sweep(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port.")
     ] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Dask workers on this machine.")] = None,
-    devices: Annotated[int | None, typer.Option(min=1, help="CPU devices of this process.")] = None,
+    workers: Annotated[int | None, typer.Option(help="Dask workers on this machine.")] = None,
+    devices: Annotated[int | None, typer.Option(help="CPU devices of this process.")] = None,
     keep: Annotated[
         str | None, typer.Option(metavar="N,N,...", help="Samples whose trajectories are kept (zarr).")
     ] = None,
@@ -65,14 +58,13 @@ def sweep(
         given = {"samples": samples, "seed": seed}
         changes = [*(changes or ()), *(f"sweep.{k}={v}" for k, v in given.items() if v is not None)]
         chosen = console.loaded(scenario, changes)
+        out = out or pathlib.Path("out") / f"sweep-{chosen.name}"
         study = variation.study(chosen)
         kept = _numbers(keep, study.samples)
-        with _continued():
-            found = _run(study, chosen, out, resume, _engine(engine, scheduler, workers))
+        with _continued(out, resume):
+            found = _run(study, chosen, out, resume, lambda: _engine(engine, scheduler, workers))
             if not found.complete:
-                again = shlex.join([*sys.argv[1:], *([] if resume else ["--resume"])])
-                console.say(f"interrupted: finished chunks are in {out}; go on with: diffabs {again}")
-                raise typer.Exit(console.INTERRUPTED)
+                raise KeyboardInterrupt
             result = console.waited(lambda: _result(found, study, out, kept, figures), "computing statistics")
         show.as_json(result) if as_json else show.swept(result, chosen)
 
@@ -106,12 +98,18 @@ def reported() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _continued() -> Iterator[None]:
-    """A full disk says how to go on."""
+def _continued(out: pathlib.Path, resume: bool) -> Iterator[None]:
+    """A full disk and Ctrl-C say how to go on."""
     try:
         yield
     except OSError as error:
         console.fail(f"{' '.join(str(error).split())}; finished chunks stay, --resume goes on", console.FAILED)
+    except KeyboardInterrupt:
+        if not any((out / "chunks").glob("*.parquet")):
+            raise
+        line = f"interrupted: finished chunks are in {out}; go on with:"
+        console.say_command(line, ["diffabs", *sys.argv[1:], *([] if resume else ["--resume"])])
+        raise typer.Exit(console.INTERRUPTED) from None
 
 
 def _check_options(engine: str, scheduler: str | None, workers: int | None, devices: int | None, figures: bool) -> None:
@@ -127,6 +125,9 @@ def _check_options(engine: str, scheduler: str | None, workers: int | None, devi
     ):
         if value is not None and engine != needed:
             console.fail(f"{option} {value} needs --engine {needed}")
+    for option, value in (("--workers", workers), ("--devices", devices)):
+        if value is not None and value < 1:
+            console.fail(f"{option} {value} is outside [1, inf)")
     if scheduler and workers:
         console.fail(f"--workers {workers}: the scheduler at {scheduler} has its own workers")
     if figures:
@@ -155,77 +156,32 @@ def _engine(name: str, scheduler: str | None, workers: int | None) -> Any:
     return Dask(scheduler, workers)
 
 
-def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, engine: Any) -> "Results":
-    from diffabs.sweep import sweep as run
+def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, engine: Callable[[], Any]) -> "Results":
+    """Raises KeyboardInterrupt, after the chunks in hand or at once."""
+    far = [progress.Far("compiling")]
+    ending = console.Ending("the chunks in hand")
 
-    source = {"scenario": dump(chosen), "name": chosen.name}
-    with _interruptible() as stopping, _watched() as told:
-        return _aside(
-            lambda: run(study, out, resume=resume, engine=engine, progress=told, stopping=stopping, source=source)
-        )
+    def told(at: "Told") -> None:
+        if at.damaged and not at.here:
+            console.say(f"damaged, computed again: chunk{'s' if len(at.damaged) > 1 else ''} {_listed(at.damaged)}")
+        far[0] = _far(at)
 
+    def run() -> "Results":
+        from diffabs.sweep import sweep as run
 
-def _aside(work: Callable[[], "Results"]) -> "Results":
-    """The result of `work` in a thread of its own, because Ctrl-C cannot interrupt compiled code in the main one.
-    Raises what it raises."""
-    result: Future[Results] = Future()
+        source = {"scenario": dump(chosen), "name": chosen.name}
+        return run(study, out, resume=resume, engine=engine(), progress=told, stopping=ending, source=source)
 
-    def run() -> None:
-        try:
-            result.set_result(work())
-        except BaseException as error:
-            result.set_exception(error)
-
-    thread = threading.Thread(target=run, name=console.WORKER, daemon=True)
-    thread.start()
-    while thread.is_alive():
-        thread.join(AWAKE)  # the system may give a signal to another thread; Python handles it when this one wakes
-    return result.result()
+    return console.waited(run, f"sweeping {chosen.name}", lambda: far[0], ending)
 
 
-@contextlib.contextmanager
-def _interruptible() -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C was pressed: once finishes the chunks in hand, twice interrupts."""
-    pressed = []
-
-    def press(*_: Any) -> None:
-        pressed.append(True)
-        signal.signal(signal.SIGINT, before)
-        console.say("interrupted: finishing the chunks in hand (Ctrl-C again: at once)")
-
-    before = signal.signal(signal.SIGINT, press)
-    try:
-        yield lambda: bool(pressed)
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextlib.contextmanager
-def _watched() -> Iterator[Callable[["Told"], None]]:
-    """A bar on a terminal; elsewhere a line every few seconds."""
-    error = Console(stderr=True)
-    bar = Progress(
-        BarColumn(),
-        TextColumn("{task.completed:,.0f} of {task.total:,.0f}  {task.fields[line]}"),
-        TimeRemainingColumn(),
-        console=error,
-        disable=not error.is_terminal,
-    )
-    due = [time.monotonic() + AGAIN]
-    with bar:
-        task = bar.add_task("", total=None, line="")
-
-        def told(at: "Told") -> None:
-            if at.damaged and not at.here:
-                console.say(f"damaged, computed again: chunk{'s' if len(at.damaged) > 1 else ''} {_listed(at.damaged)}")
-            line = f"{at.rate:,.0f}/s, {at.failed:,} failed, {at.diverged:,} diverged"
-            bar.update(task, completed=at.samples, total=at.total, line=line)
-            if not error.is_terminal and time.monotonic() > due[0]:
-                left = (at.total - at.samples) / at.rate if at.rate else float("inf")
-                console.say(f"{at.samples:,} of {at.total:,}: {line}, {left:,.0f} s left")
-                due[0] = time.monotonic() + AGAIN
-
-        yield told
+def _far(at: "Told") -> progress.Far:
+    """How far a sweep is."""
+    if not at.here:
+        return progress.Far(f"{at.samples:,} of {at.total:,}", at.samples, at.total)
+    left = progress.left((at.total - at.samples) / at.rate)
+    words = f"{at.samples:,} of {at.total:,}: {at.rate:,.0f}/s, {at.failed:,} failed, {at.diverged:,} diverged{left}"
+    return progress.Far(words, at.samples, at.total)
 
 
 def _listed(numbers: tuple[int, ...]) -> str:

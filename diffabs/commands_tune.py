@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import math
 import pathlib
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import jax
@@ -67,12 +68,24 @@ def tune(
             result, told = _tuned(chosen, out_file, picture)
             if not result["met"]:  # inside, so that no file is written
                 _show(result, told, chosen, as_json)
-                unmet = ", ".join(
-                    f"{row['name']} {show.missed(row)}" for row in result["constraints"] if not row["met"]
-                )
-                console.fail(f"{chosen.name}: not met: {unmet}; {result['reason']}", console.FAILED)
-        result["files"] = {name: str(path) for name, path in (("out", out), ("plot", plot)) if path}
+                _leave_if_interrupted(result)
+                console.fail(f"{chosen.name}: not met: {_unmet(result)}; {result['reason']}", console.FAILED)
+            drawn = plot if picture and picture.exists() else None
+        result["files"] = {name: str(path) for name, path in (("out", out), ("plot", drawn)) if path}
         _show(result, told, chosen, as_json)
+        _leave_if_interrupted(result)
+
+
+def _leave_if_interrupted(result: dict[str, Any]) -> None:
+    """Raises typer.Exit: what was shown is the best so far."""
+    if result["interrupted"]:
+        met = "" if result["met"] else f"; not met: {_unmet(result)}, so that no file is written"
+        console.say(f"interrupted: this is the best so far, not a minimum{met}")
+        raise typer.Exit(console.INTERRUPTED)
+
+
+def _unmet(result: dict[str, Any]) -> str:
+    return ", ".join(f"{row['name']} {show.missed(row)}" for row in result["constraints"] if not row["met"])
 
 
 def _show(result: dict[str, Any], told: str, chosen: Scenario, as_json: bool) -> None:
@@ -81,17 +94,45 @@ def _show(result: dict[str, Any], told: str, chosen: Scenario, as_json: bool) ->
 
 
 def _tuned(chosen: Scenario, out: pathlib.Path | None, picture: pathlib.Path | None) -> tuple[dict[str, Any], str]:
-    """The JSON document and a sentence about the certificate. The files are written if all constraints are met."""
+    """The JSON document and a sentence about the certificate. The files are written if all constraints are met. Ctrl-C
+    leaves out what is not there yet, once there is something to show."""
     work = console.waited(lambda: _work(chosen), "computing the lanes")
-    found = _watched(work)
-    after = dataclasses.replace(chosen, loop=found.loop)
-    proved = console.waited(lambda: _proved(after), "certifying the result")
-    result = _result(work, found, proved)
+    found, interrupted = _watched(work)
+    after = chosen.with_loop(found.loop, "tuned")
+    try:
+        proved = console.waited(lambda: _proved(after), "certifying the result")
+        result = console.waited(lambda: _result(work, found, proved), "comparing with what there was before")
+    except KeyboardInterrupt:
+        interrupted, proved = True, _unproved("interrupted")
+        result = _without_proof(work, _result(work._replace(task=None), found, proved))
     if out and result["met"]:
         out.write_text(dump(after), encoding="utf-8")
     if picture and result["met"]:
-        _drawn(work, found, picture)
-    return result, proved.sentence
+        interrupted |= not _finished(lambda: _drawn(work, found, picture), picture)
+    return {**result, "interrupted": interrupted}, proved.sentence
+
+
+def _finished(draw: Callable[[], None], picture: pathlib.Path) -> bool:
+    """Whether a picture could be drawn before Ctrl-C; else there is none."""
+    try:
+        console.waited(draw, "drawing")
+    except KeyboardInterrupt:
+        picture.unlink()
+        return False
+    return True
+
+
+def _without_proof(work: _Work, result: dict[str, Any]) -> dict[str, Any]:
+    """With the constraints that nobody has looked at, which are therefore not met."""
+    seen = [row["name"] for row in result["constraints"]]
+    goal = work.chosen.tune
+    bounds = {"certified decay": goal.decay, "damping": goal.damping}
+    unseen = [
+        {"name": name, "bound": bounds[name], "before": None, "after": None, "met": False}
+        for name in work.constraints
+        if name not in seen
+    ]
+    return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
 
 
 def _work(chosen: Scenario) -> _Work:
@@ -109,12 +150,13 @@ def _work(chosen: Scenario) -> _Work:
     return _Work(chosen, batch, constraints, task)
 
 
-def _watched(work: _Work) -> "Tuned":
-    """Tune, and say how far it is. Raises typer.Exit where no start can be used."""
+def _watched(work: _Work) -> tuple["Tuned", bool]:
+    """Tune, and say how far it is; whether Ctrl-C ended it. Raises typer.Exit where no start can be used."""
     from diffabs import tune
     from diffabs.tune import Method, StartError, Stopping
 
     goal, told = work.chosen.tune, list["Progress"]()
+    ending = console.Ending("the evaluation in hand", nothing=lambda: not told)
     method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
 
     def tuned() -> "Tuned":
@@ -129,10 +171,11 @@ def _watched(work: _Work) -> "Tuned":
             constraints=list(work.constraints.values()),
             method=method,
             progress=told.append,
+            stopping=ending,
         )
 
     try:
-        return console.waited(tuned, f"tuning {work.chosen.name}", lambda: _said(told))
+        return console.waited(tuned, f"tuning {work.chosen.name}", lambda: _said(told), ending), ending.asked
     except StartError as error:
         console.fail(f"{work.chosen.name}: no start can be used: {error}", console.FAILED)
 
@@ -151,7 +194,7 @@ def _said(told: "list[Progress]") -> str:
 def _proved(after: Scenario) -> _Proved:
     """A certificate over the ranges of [design], if there can be one, of the decay that is asked for, if that can be
     proved."""
-    empty, decay = dict.fromkeys(proof.FROM_PROOF), after.tune.decay
+    decay = after.tune.decay
     try:
         task = proof.task(after)
         found = proof.certified(task)
@@ -159,8 +202,7 @@ def _proved(after: Scenario) -> _Proved:
             asked = proof.certified(task._replace(spec=dataclasses.replace(task.spec, decay=decay * (1 + ROUNDING))))
             found = asked if (asked.decay_rate or 0.0) >= decay else found
     except (ModuleNotFoundError, ValueError, np.linalg.LinAlgError) as error:
-        why = " ".join(str(error).split())
-        return _Proved({**empty, "reason": why}, f"no certificate: {why}")
+        return _unproved(" ".join(str(error).split()))
     reason = proof.unproved(found, task.spec) or None
     document = proof.document(task, found, reason=reason)
     document = {key: value for key, value in document.items() if key not in ("scenario", "versions", "files")}
@@ -168,6 +210,10 @@ def _proved(after: Scenario) -> _Proved:
     over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
     said = reason or f"quadratically stable over {over}, decay rate {rate:.4g} 1/s"
     return _Proved(document, f"certificate: {said}", task, certified=True)
+
+
+def _unproved(why: str) -> _Proved:
+    return _Proved({**dict.fromkeys(proof.FROM_PROOF), "reason": why}, f"no certificate: {why}")
 
 
 def _result(work: _Work, found: "Tuned", proved: _Proved) -> dict[str, Any]:

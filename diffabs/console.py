@@ -2,42 +2,92 @@
 
 import contextlib
 import importlib.util
-import math
 import os
 import pathlib
+import shlex
 import shutil
 import sys
 import tempfile
+import textwrap
 import threading
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, NoReturn, TypeVar
 
 import typer
 from rich.console import Console
 
+from diffabs import interrupt, progress
 from diffabs.catalogue import ScenarioError
-from diffabs.scenario import Scenario, load
+from diffabs.scenario import Scenario, load, names
 
 T = TypeVar("T")
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
-PATIENCE = 2.0  # s without a sign of life
-AGAIN = 5.0  # s between lines about how far work is
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, interrupt.INTERRUPTED
+PATIENCE, AGAIN = progress.PATIENCE, progress.AGAIN
+AWAKE = 0.1  # s between looks for Ctrl-C
+LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
+CONTINUED = " \\"  # a line of a shell that goes on in the next
 WORKER = "diffabs worker"
 PICTURES = (".png", ".pdf", ".svg")
 
+
 # What commands take.
-ScenarioName = Annotated[str, typer.Argument(help="A TOML file, or the name of a packaged scenario.")]
+def scenarios_like(incomplete: str) -> list[str]:
+    """Completions; where there is none the shell offers files."""
+    return [name for name in names() if name.startswith(incomplete)]
+
+
+ScenarioName = Annotated[
+    str, typer.Argument(help="A TOML file, or the name of a packaged scenario.", autocompletion=scenarios_like)
+]
 Changes = Annotated[
     list[str] | None, typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Override a field; may be repeated.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout, nothing else there.")]
 
 
+_quiet = False
+
+
+def quieten(wanted: bool) -> None:
+    """Say no more than errors, warnings, and what was interrupted; or everything."""
+    global _quiet
+    _quiet = wanted
+
+
 def say(line: str) -> None:
-    """A line for a person: on stderr, never wrapped."""
-    typer.echo(line, err=True)
+    """A line for a person, on stderr; on a terminal folded between words."""
+    if not _quiet or line.startswith(LOUD):
+        typer.echo("\n".join(_folded(line)), err=True)
+
+
+def say_command(line: str, words: Sequence[str]) -> None:
+    """A line that ends in a command; on a terminal too narrow for both the command has its own lines, to copy."""
+    width, command = _width(), [shlex.quote(word) for word in words]
+    if width is None or len(" ".join([line, *command])) <= width:
+        say(" ".join([line, *command]))
+        return
+    say(line)
+    rows = [command[0]]
+    for word in command[1:]:
+        if len(rows[-1]) + len(word) + len(" ") + len(CONTINUED) <= width:
+            rows[-1] += f" {word}"
+        else:
+            rows.append(f"    {word}")
+    typer.echo(f"{CONTINUED}\n".join(rows), err=True)
+
+
+def _folded(line: str) -> list[str]:
+    width = _width()
+    if width is None or len(line) <= width:
+        return [line]
+    return textwrap.wrap(line, width, break_long_words=False, break_on_hyphens=False)
+
+
+def _width() -> int | None:
+    """Columns of the terminal that stderr is; None where it is none."""
+    console = Console(stderr=True)
+    return console.width if console.is_terminal else None
 
 
 def fail(line: str, status: int = BAD_INPUT) -> NoReturn:
@@ -70,12 +120,35 @@ def guarded() -> Iterator[None]:
         raise typer.Exit(INTERRUPTED) from None
 
 
-def waited(work: Callable[[], T], message: str, detail: Callable[[], str] | None = None) -> T:
+class Ending:
+    """What Ctrl-C asks of work that can end early and has then something to show: to finish `what` it has in hand. The
+    work asks this object whether it shall. The second time Ctrl-C interrupts, and the first, too, while `nothing()` is
+    reached yet."""
+
+    def __init__(self, what: str, nothing: Callable[[], bool] = lambda: False):
+        """Nobody has asked yet."""
+        self.what, self.nothing, self.asked = what, nothing, False
+
+    def __call__(self) -> bool:
+        """Whether Ctrl-C was pressed."""
+        return self.asked
+
+    def ask(self) -> None:
+        """Ctrl-C was pressed. Raises KeyboardInterrupt if the work is not to be waited for."""
+        if self.asked or self.nothing():
+            raise KeyboardInterrupt
+        self.asked = True
+        say(f"interrupted: finishing {self.what} (Ctrl-C again: at once)")
+
+
+def waited(
+    work: Callable[[], T], message: str, detail: progress.Detail | None = None, ending: Ending | None = None
+) -> T:
     """The result of `work`, with a spinner on a terminal, or a line if it takes long elsewhere. `detail` says how far
     the work is: beside the spinner, or in a line every few seconds.
 
     The work has a thread of its own, because Ctrl-C cannot interrupt compiled code in the main one. Raises what it
-    raises.
+    raises, and KeyboardInterrupt at once, or with an `ending` when there is nothing to wait for.
     """
     result: list[T] = []
     errors: list[BaseException] = []
@@ -87,25 +160,25 @@ def waited(work: Callable[[], T], message: str, detail: Callable[[], str] | None
             errors.append(error)
 
     thread = threading.Thread(target=run, name=WORKER, daemon=True)
-    console = Console(stderr=True)
-
-    def line() -> str:
-        return f"{message} ... {detail() if detail else ''}".strip()
-
-    tell, due, told = say, time.monotonic() + PATIENCE, ""
-    with console.status(line()) if console.is_terminal else contextlib.nullcontext() as status:
-        if status:
-            tell, due = status.update, 0.0
+    told = contextlib.nullcontext(lambda: None) if _quiet else progress.shown(message, detail, say, (PATIENCE, AGAIN))
+    with told as tell:
         thread.start()
         while thread.is_alive():
-            thread.join(0.1)
-            if time.monotonic() > due:
-                if told != (told := line()):
-                    tell(told)
-                due = (0.0 if status else time.monotonic() + AGAIN) if detail else math.inf
+            if _pressed_while(thread):
+                (ending or Ending("", nothing=lambda: True)).ask()
+            tell()
     if errors:
         raise errors[0]
     return result[0]
+
+
+def _pressed_while(thread: threading.Thread) -> bool:
+    """Wait a moment for a thread. Whether Ctrl-C was pressed; an exception where this is not the command's process."""
+    try:
+        thread.join(AWAKE)
+    except KeyboardInterrupt:
+        return True
+    return interrupt.pressed()
 
 
 def loaded(scenario: str, changes: Sequence[str] | None, *, integrated: bool = True) -> Scenario:
@@ -155,7 +228,8 @@ def check_scenario_file(out: pathlib.Path | None) -> None:
 
 @contextlib.contextmanager
 def new_file(target: pathlib.Path, option: str) -> Iterator[pathlib.Path]:
-    """A temporary file beside `target` that takes its place at the end, or vanishes if anything goes wrong.
+    """A temporary file beside `target` that takes its place at the end, or vanishes if anything goes wrong. Whoever
+    removes it leaves `target` as it was.
 
     Raises typer.Exit where no file can be written.
     """
@@ -170,8 +244,9 @@ def new_file(target: pathlib.Path, option: str) -> Iterator[pathlib.Path]:
     temporary = pathlib.Path(name)
     try:
         yield temporary
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(target)
+        if temporary.exists():
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -7,6 +7,7 @@ Speeds are drawn in km/h, everything else in SI units. Colours are those of M. O
 import os
 import pathlib
 import tempfile
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -28,6 +29,7 @@ DASHES = ("-", "--", "-.", ":", "-", "--", "-.")
 GREY = "#767676"
 KMH = 3.6  # km/h per m/s
 DPI = 150
+TITLE = 9  # characters per inch, with room to spare
 
 
 def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float, float] = (5.4, 3.4), **kwargs: Any):
@@ -41,7 +43,8 @@ def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float
         ax.grid(color="#DDDDDD", linewidth=0.7)
         ax.set_axisbelow(True)
     if title:
-        figure.suptitle(title, fontsize=12.5, fontweight="bold")
+        lines = textwrap.fill(title, int(TITLE * size[0] * columns), max_lines=4)
+        figure.suptitle(lines, fontsize=12.5, fontweight="bold")
     return figure, axes
 
 

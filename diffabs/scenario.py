@@ -60,6 +60,10 @@ class Scenario:
         """The random key of a run."""
         return jax.random.key(self.seed)
 
+    def with_loop(self, loop: Loop, how: str) -> "Scenario":
+        """The same with another loop, of which the old title may not be true: it says `how` that came about."""
+        return dataclasses.replace(self, loop=loop, title=f"{self.name}, {how}", description="")
+
     def cautions(self) -> list[str]:
         """What is allowed but hardly meant, a line each."""
         return list(cautions(self.loop))
@@ -103,11 +107,20 @@ def loads(
     table = _parsed(raw, origin)
     for override in overrides:
         _override(table, override)
+    if overrides:
+        table |= _titled(name, overrides)
     if "sweep" in table:
         table["sweep"] = variation.with_samples(table["sweep"], folder)
     scenario = _assembled(name, table)
     _refuse(_wrong_together(scenario), _unstable(scenario) if integrated else ())
     return scenario
+
+
+def _titled(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Title and description of what is no longer what the file says, but for what the overrides say themselves."""
+    said = {override.partition("=")[0].strip() for override in overrides}
+    new = {"title": f"{name} with {', '.join(overrides)}", "description": ""}
+    return {key: text for key, text in new.items() if key not in said}
 
 
 def _refuse(*objections: Iterable[str]) -> None:

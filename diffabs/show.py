@@ -21,6 +21,7 @@ from diffabs.papers.digest import Digest
 from diffabs.protocols import UNITS
 from diffabs.rollout import Trajectory
 from diffabs.scenario import Scenario
+from diffabs.tables import fitted
 
 PIPE_WIDTH = 140  # columns of a table that goes to a file
 PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
@@ -270,7 +271,8 @@ def _brief(value: Any) -> str:
 def _print(title: str, table: Table) -> None:
     for column in table.columns:
         column.overflow = "fold"  # a pipe has no width: nothing may be cut off
-    _console().print(*([title] if title else []), table, sep="\n")
+    console = _console()
+    console.print(*([title] if title else []), *fitted(table, console.width), sep="\n")
 
 
 def _console() -> Console:

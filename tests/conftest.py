@@ -33,11 +33,10 @@ def any_step_is_stable():
 @pytest.fixture(scope="module")
 def without_load():
     """No lines on stderr that depend on the machine's load."""
-    from diffabs import commands_sweep, console
+    from diffabs import console
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", np.inf)
-        patch.setattr(commands_sweep, "AGAIN", np.inf)
         yield
 
 

@@ -4,18 +4,23 @@ import json
 import math
 import os
 import pathlib
+import re
+import shlex
 import signal
 import subprocess
 import sys
+import tomllib
 import types
 
 import numpy as np
 import pytest
+import typer
 from commands import assert_one_error_line, left_in, run
 
 import diffabs
 from diffabs import catalogue, cli, console, scenario
 from diffabs.objectives import BRAKING
+from diffabs.pytree import parameters
 from diffabs.stability import stable_step
 
 pytestmark = pytest.mark.xdist_group("cli")  # one worker makes what these share
@@ -66,7 +71,8 @@ def whole(tmp_path_factory, runs):
 
 def test_json_has_what_scripts_rely_on(whole):
     folder, document = whole
-    assert set(document) == {"scenario", "metrics", "stopped", "diverged", "solver", "versions", "files"}
+    old = {"scenario", "metrics", "stopped", "diverged", "solver", "versions", "files"}
+    assert set(document) == old | {"title", "parts", "parameters"}
     assert document["scenario"] == "slip-lmi"
     assert list(document["metrics"]) == list(BRAKING)
     assert document["stopped"] is True
@@ -246,7 +252,139 @@ def test_failure_at_the_end_leaves_old_files_as_they_were(tmp_path, monkeypatch,
     assert left_in(tmp_path) == {"a.csv"}
 
 
+# What was run
+
+
+def test_json_says_all_that_it_ran_with(whole):
+    document = whole[1]
+    loop = scenario.load("slip-lmi").loop
+    assert {path for path, _, _ in parameters(loop)} <= set(document["parameters"])
+    for path, spec, value in parameters(loop):
+        row = document["parameters"][path]
+        assert row["unit"] == spec.unit
+        np.testing.assert_array_equal(np.asarray(row["value"], float), value)
+    assert document["parameters"]["controller.torque_min"] == {"value": "-inf", "unit": "N m"}
+    assert document["parameters"]["objective.settling_time.band"] == {"value": 0.01, "unit": "1"}
+    assert document["parts"]["controller"] == {"type": "state-feedback"}
+    assert document["parts"]["plant.road"] == {"type": "rational-curve"}
+    assert document["title"] == "State feedback on the mirrored rig, published gain"
+
+
+@pytest.mark.parametrize("name", scenario.names())
+def test_parts_and_parameters_of_the_json_make_the_same_loop(name):
+    chosen = scenario.load(name, integrated=False)
+    parts = [f"{path}={{type='{row['type']}'}}" for path, row in cli._parts(chosen).items()]
+    fixed = [f"{p}.{k}={v}" for p, row in cli._parts(chosen).items() for k, v in row.items() if k != "type"]
+    numbers = cli._parameters(chosen)
+    values = [f"{path}={json.dumps(row['value'])}".replace('"', "") for path, row in numbers.items()]
+    again = scenario.loads(b"", name, name, [*parts, *fixed, *values], integrated=False)
+    assert cli._parameters(again) == numbers
+
+
+def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
+    """Seen at least once: "published gain" over a run with another gain."""
+    titles = []
+    draw = types.SimpleNamespace(braking=lambda run, *, title="": titles.append(title) or Figure(title))
+    monkeypatch.setitem(sys.modules, "diffabs.plot", draw)
+    monkeypatch.setattr(cli, "_run", lambda chosen, key, keep: runs[0])
+    gain = ("--set", "controller.gain=-4000,-40")
+    tables = [run("simulate", "slip-lmi", *more, "--plot", tmp_path / "a.png").stdout for more in ((), gain)]
+    named = ("--set", "title=mine")
+    run("simulate", "slip-lmi", *gain, *named, "--plot", tmp_path / "a.png")
+    assert titles == [
+        "State feedback on the mirrored rig, published gain",
+        "slip-lmi with controller.gain=-4000,-40",
+        "mine",
+    ]
+    assert [table.splitlines()[0] for table in tables] == titles[:2]
+
+
+def test_a_long_title_stays_on_its_figure():
+    pytest.importorskip("matplotlib")
+    from diffabs.plot import sheet
+
+    figure, _ = sheet(2, 2, title=f"slip-lmi with {', '.join(f'plant.mass={n}' for n in range(300))}")
+    figure.draw_without_rendering()
+    box = figure._suptitle.get_window_extent()
+    assert 0 <= box.x0 < box.x1 <= figure.bbox.width
+    assert box.height < figure.bbox.height / 4
+
+
 # The program
+
+
+COMMANDS = list(typer.main.get_command(cli.app).commands)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_help_has_an_example_that_is_right(command, monkeypatch):
+    """Its words are parsed; nothing is run."""
+    example = re.search(r"Example:\n\n +diffabs (.*)\n", run(command, "-h").stdout)[1]
+    group = typer.main.get_command(cli.app)
+    name, *args = shlex.split(example)
+    assert name == command
+    given = group.commands[name].make_context(name, list(args)).params
+    if "changes" in given:
+        scenario.load(given["scenario"], given["changes"] or (), integrated=False)
+
+
+USAGE = [
+    (("sweep", "slip-lmi", "--workers", "0", "--engine", "dask"), "--workers 0 is outside [1, inf)"),
+    (("sweep", "slip-lmi", "--devices", "0"), "--devices 0 is outside [1, inf)"),
+    (("rare", "slip-lmi", "iae", "--samples", "many"), "--samples: "),
+    (("simulate", "--nonsense"), "no such option: --nonsense"),
+    (("design",), "missing argument"),
+    (("simulat",), "Did you mean 'simulate'?"),
+    (("simulate", "a", "b\nc"), "unexpected extra argument"),
+]
+
+
+@pytest.mark.parametrize(("args", "needed"), USAGE, ids=[" ".join(args) for args, _ in USAGE])
+def test_wrong_usage_is_one_line(args, needed):
+    result = run(*args, status=2)
+    assert_one_error_line(result)
+    assert needed.lower() in result.stderr.lower()
+
+
+def test_quiet_says_results_and_warnings_only(monkeypatch):
+    noise = ("--set", "sensor=noise", "--set", "solver.seed=3")
+    monkeypatch.setattr(console, "PATIENCE", 0.0)
+    loud, quiet = (run("simulate", "slip-lmi", *SHORT, *noise, *more) for more in ((), ("-q",)))
+    assert "simulating" in loud.stderr
+    assert [line.partition(":")[0] for line in quiet.stderr.splitlines()] == ["warning"]
+    assert quiet.stdout == loud.stdout
+    assert "simulating" in run("simulate", "slip-lmi", *SHORT).stderr  # the next one is loud again
+
+
+def test_show_prints_a_scenario_to_start_from(tmp_path):
+    """What is printed is the same scenario, so its run is the same to the last bit."""
+    text = run("show", "slip-lmi", "--set", "plant.mass=6.2", *SHORT).stdout
+    (tmp_path / "mine.toml").write_text(text)
+    assert run("show", "slip-lmi", "--set", "plant.mass=6.2", *SHORT, "--out", tmp_path / "other.toml").stdout == ""
+    assert (tmp_path / "other.toml").read_text() == text
+    given, shown = (("slip-lmi", "--set", "plant.mass=6.2", *SHORT), (tmp_path / "mine.toml",))
+    first, second = (json.loads(run("simulate", *words, "--json").stdout) for words in (given, shown))
+    assert first["metrics"] == second["metrics"]
+    assert first["parameters"] == second["parameters"]
+    assert first["title"] == second["title"] == "slip-lmi with plant.mass=6.2, " + ", ".join(SHORT[1::2])
+
+
+def test_completion_offers_commands_and_scenarios():
+    def offered(words: str) -> str:
+        env = os.environ | {"_DIFFABS_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": "1"}
+        env["COMP_CWORD"] = str(words.count(" "))
+        code = "import sys; sys.argv[0] = 'diffabs'; from diffabs.cli import main; main()"
+        return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False).stdout
+
+    assert offered("diffabs id").split() == ["identify"]
+    assert set(offered("diffabs simulate slip-").split()) == {"slip-cured", "slip-estimator", "slip-lmi"}
+
+
+def test_the_extra_all_is_all_of_them():
+    root = pathlib.Path(__file__).parent.parent
+    extras = tomllib.loads((root / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    (named,) = extras.pop("all")
+    assert set(re.fullmatch(r"diffabs\[(.*)\]", named)[1].split(",")) == set(extras)
 
 
 def test_version_and_usage():

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.xdist_group("cli-identify")  # one worker compiles what
 
 KEYS = [
     *("scenario", "data", "values", "correlations", "undetermined", "residuals", "chi2", "degrees", "scale", "reason"),
-    *("evaluations", "parameters", "versions", "files"),
+    *("evaluations", "parameters", "versions", "files", "interrupted"),
 ]
 HEADER = "t [s],wheel_speed [m/s],slip [1],command [N m]"
 ROWS = ["0,13.8,0.0,1", "0.1,12.9,0.05,1", "0.3,11.0,0.1,2"]

@@ -1,9 +1,11 @@
 """`diffabs tune`: what scripts read, what is written, and how it fails."""
 
+import dataclasses
 import json
 import math
 import pathlib
 import sys
+import time
 import types
 
 import jax
@@ -12,7 +14,7 @@ import pytest
 from commands import assert_one_error_line, left_in, run
 
 import diffabs.tune as library
-from diffabs import commands_tune, console, proof, scenario
+from diffabs import commands_tune, console, interrupt, proof, scenario
 from diffabs.design import lmi
 from diffabs.pytree import parameters, replace
 from diffabs.rollout import measure
@@ -50,7 +52,7 @@ overshoot = 0.5
 """
 KEYS = [
     *("scenario", "lanes", "free", "objective", "metrics", "constraints", "met", "reason", "gradient_norm"),
-    *("evaluations", "mode", "history", "starts", "parameters", "certificate", "versions", "files"),
+    *("evaluations", "mode", "history", "starts", "parameters", "certificate", "versions", "files", "interrupted"),
 ]
 HISTORY = [Point(0, 2.0, 1.0, 0.5, 0.1, 1), Point(1, 1.5, 0.75, 0.01, 0.0, 3)]
 
@@ -254,8 +256,6 @@ def test_progress_is_told_again_when_it_changes(monkeypatch, capsys):
         last[0] = next(steps, last[0])
         return last[0]
 
-    import time
-
     console.waited(lambda: time.sleep(1.0), "working", detail)
     assert capsys.readouterr().err == "working ... one\nworking ... two\n"
 
@@ -407,6 +407,69 @@ def test_interrupted_it_leaves_nothing_half_written(small, tmp_path, monkeypatch
     result = run("tune", small, "--out", tmp_path / "out.toml", "--plot", tmp_path / "a.png", status=130)
     assert result.stderr == "interrupted\n"
     assert left_in(tmp_path) == {"small.toml"}
+
+
+@pytest.fixture
+def endless(invented, monkeypatch):
+    """A tuning that goes on until it is asked to end, and a person who presses Ctrl-C once it has begun."""
+    told = []
+
+    def tune(loop, *, progress, stopping, **what):
+        progress(library.Progress(0, 1, HISTORY[0]))
+        told.append(True)
+        end = time.monotonic() + 60
+        while not stopping() and time.monotonic() < end:
+            time.sleep(0.01)
+        return dataclasses.replace(found(loop, **what), reason=Reason.INTERRUPTED)
+
+    found = library.tune
+    monkeypatch.setattr(library, "tune", tune)
+    monkeypatch.setattr(interrupt, "pressed", lambda: bool(told) and bool(told.pop()))
+
+
+def test_interrupted_it_shows_and_writes_the_best_so_far(small, endless, tmp_path):
+    out, picture = tmp_path / "out.toml", tmp_path / "a.png"
+    result = run("tune", small, "--json", "--out", out, "--plot", picture, status=130)
+    document = json.loads(result.stdout)
+    assert document["interrupted"] is True
+    assert document["reason"] == Reason.INTERRUPTED.value
+    assert document["free"]["controller.gain"]["after"] == pytest.approx([-4400, -44])
+    assert document["files"] == {"out": str(out), "plot": str(picture)}
+    assert np.allclose(load(out).loop.controller.gain, [-4400, -44])
+    assert result.stderr.splitlines() == [
+        "interrupted: finishing the evaluation in hand (Ctrl-C again: at once)",
+        "no certificate: no proof was asked for",
+        "interrupted: this is the best so far, not a minimum",
+    ]
+
+
+def test_interrupted_where_a_limit_is_not_met_it_writes_nothing(small, endless, tmp_path):
+    result = run("tune", small, "--set", "tune.limits.overshoot=0.1", "--out", tmp_path / "out.toml", status=130)
+    assert "it was interrupted" in result.stdout
+    assert result.stderr.splitlines()[-1].endswith("not met: overshoot, so that no file is written")
+    assert left_in(tmp_path) == {"small.toml"}
+
+
+def test_interrupted_while_it_certifies_it_shows_what_was_found(small, invented, tmp_path, monkeypatch):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands_tune, "_proved", interrupted)
+    document = json.loads(run("tune", small, "--json", "--out", tmp_path / "out.toml", status=130).stdout)
+    assert (document["interrupted"], document["met"]) == (True, True)
+    assert document["certificate"]["reason"] == "interrupted"
+    assert (tmp_path / "out.toml").exists()
+
+
+def test_interrupted_while_it_draws_there_is_no_picture(small, invented, tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands_tune, "_drawn", interrupted)
+    files = ("--out", tmp_path / "out.toml", "--plot", tmp_path / "a.png")
+    document = json.loads(run("tune", small, "--json", *files, status=130).stdout)
+    assert document["files"] == {"out": str(tmp_path / "out.toml")}
+    assert left_in(tmp_path) == {"small.toml", "out.toml"}
 
 
 # Bad input

@@ -49,6 +49,28 @@ LINE = (X, 0.7 + 0.4 * X + SIGMA * NOISE)
 
 
 class TestFit:
+    @pytest.mark.parametrize("after", [1, 2, 4])
+    def test_interrupted_it_keeps_the_last_accepted_point(self, after):
+        told = []
+        starts = [{"k": 0.5}, {"k": 5.0}]
+        found = fit(
+            Decay(),
+            ["a", "k", "c"],
+            decay_residuals,
+            data=DATA,
+            sigma=SIGMA,
+            starts=starts,
+            progress=lambda evaluations, cost: told.append((evaluations, cost)),
+            stopping=lambda: len(told) >= after,
+        )
+        assert found.reason is Reason.INTERRUPTED
+        assert len(told) == after
+        assert len(found.starts) == 1
+        values = {name: float(value) for name, value in found.values.items()}
+        cost = np.sum(((decay(X, **values) - DATA[1]) / SIGMA) ** 2)
+        np.testing.assert_allclose([found.cost, told[-1][1]], cost, rtol=1e-9, atol=0)
+        assert told[-1][0] >= after
+
     @pytest.mark.parametrize("absolute", [True, False])
     def test_a_line_has_the_closed_form_and_its_covariance(self, absolute):
         found = fit(Decay(), ["a", "c"], line_residuals, data=LINE, sigma=SIGMA, absolute=absolute)

@@ -359,3 +359,42 @@ class TestConstraints:
         np.testing.assert_allclose(found.objective[1], 2 / 3, rtol=0, atol=1e-4)
         assert told[-1].starts == 0
         assert found.history[-1].evaluations == max(p.evaluations for p in found.history)
+
+
+class TestInterruption:
+    """What is kept is the best that was met, whatever the search was busy with."""
+
+    @pytest.mark.parametrize("after", [1, 2, 5, 12, 30])
+    def test_it_is_the_best_so_far(self, after):
+        problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))
+        told = []
+        method = Method(starts=3, seed=1, tolerance=1e-6, rounds=20)
+        found = Search(problem, method, told.append, lambda: len(told) >= after).result()
+        assert len(told) == after  # the evaluation in hand is the last
+        assert found.reason is Reason.INTERRUPTED
+
+        def rank(point):
+            met = point.violation <= 1e-6
+            return not met, point.objective if met else point.violation
+
+        best = min((progress.point for progress in told), key=rank)
+        x, y = found.values["x"], found.values["y"]
+        np.testing.assert_allclose([x**2 + 2 * y**2, max(0, 1 - x - y)], [best.objective, best.violation], atol=1e-12)
+        assert found.objective[1] == found.history[-1].objective == best.objective
+        assert found.met == (best.violation <= 1e-6)
+        iterations = [point.iteration for point in found.history]
+        assert iterations == sorted(iterations)
+
+    def test_a_round_that_spoils_what_was_met_does_not_count(self):
+        """The first start meets the constraint from the beginning and is then pulled over its edge."""
+        problem = Constrained([0.9, 0.9], lambda z: jnp.array([1 - z[0] - z[1]]))
+        told = []
+        found = Search(problem, Method(tolerance=1e-6), told.append, lambda: told[1:] and told[-1].round == 0).result()
+        assert told[-1].point.violation > 1e-3
+        assert found.met
+        assert 1 - found.values["x"] - found.values["y"] <= 1e-6
+
+    def test_without_it_nothing_changes(self):
+        problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))
+        found = Search(problem, Method(tolerance=1e-6, rounds=20), None).result()
+        assert found.reason is not Reason.INTERRUPTED

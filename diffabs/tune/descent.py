@@ -40,6 +40,7 @@ class Reason(enum.Enum):
     LIMIT = "the limit of iterations was reached"
     START = "the start diverged, or the integration step is not stable there"
     KEPT = "where it ended a constraint is not met; the best of its steps that meets all of them is returned"
+    INTERRUPTED = "it was interrupted, before it was at a minimum"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,10 +151,12 @@ class Descent:
         optimiser: Optimiser,
         stopping: Stopping,
         told: Callable[[list[Lane]], None],
+        interrupted: Callable[[], bool] = lambda: False,
     ):
         """`loss` is that of one start, for optimisers that search on their own; `told` is called with all starts after
-        every evaluation."""
+        every evaluation, and then `interrupted`, which ends them all."""
         self.evaluate, self.steady, self.stopping, self.told = evaluate, steady, stopping, told
+        self.interrupted = interrupted
         self.searches = optimiser.searches
         self._init = jax.jit(jax.vmap(optimiser.transformation.init))
 
@@ -177,9 +180,11 @@ class Descent:
         self.states = self._init(jnp.asarray(starts))
         self._propose(lanes, [lane.reason is None for lane in lanes])
         self.told(lanes)
-        while any(lane.reason is None for lane in lanes):
+        while any(lane.reason is None for lane in lanes) and not self.interrupted():
             self._round(lanes)
             self.told(lanes)
+        for lane in lanes:
+            lane.reason = lane.reason or Reason.INTERRUPTED
         return lanes
 
     def _round(self, lanes: list[Lane]) -> None:

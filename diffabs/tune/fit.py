@@ -78,6 +78,8 @@ def fit(
     norm: float = 2.0,
     tolerances: Tolerances | None = None,
     usable: Callable[[Any], bool] | None = None,
+    progress: Callable[[int, float], None] | None = None,
+    stopping: Callable[[], bool] = lambda: False,
 ) -> Identified:
     """Fit the free parameters of a part to residuals(part, *data), a JAX function that returns (n,).
 
@@ -89,6 +91,8 @@ def fit(
         `gaussian` makes one; a penalty on roughness is another. Arguments in a `jax.tree_util.Partial` are traced
     starts: values by path to begin at, instead of the part's own; the best fit is returned
     usable: says on the host whether a part may be evaluated
+    progress: told the evaluations so far, of all starts, and the cost at each accepted point
+    stopping: asked before every evaluation; True ends the fit at the last accepted point, and no further start is tried
 
     Raises:
         ValueError: a path or range that does not fit, sigma <= 0, norm < 2, fewer residuals than parameters without a
@@ -102,12 +106,29 @@ def fit(
     _check(where.size, n, k, sigma, norm, absolute)
     deviations = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, float), (n,))
     estimated = sigma is None or not absolute
-    fits = [_fitted(problem, z, deviations, estimated, tolerances or Tolerances()) for z in points]
+    watch = _Watch(progress or (lambda _, __: None), stopping)
+    fits: list[Identified | None] = []
+    for z in points:
+        if not (any(fits) and stopping()):
+            fits.append(_fitted(problem, z, deviations, estimated, tolerances or Tolerances(), watch))
     done = tuple(one for one in fits if one is not None)
     if not done:
         raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
-    diverged = tuple(_values(where, z) for z, one in zip(points, fits, strict=True) if one is None)
+    diverged = tuple(_values(where, z) for z, one in zip(points, fits, strict=False) if one is None)
     return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
+
+
+class _Stopped(Exception):
+    """Somebody has had enough."""
+
+
+@dataclasses.dataclass
+class _Watch:
+    """Who is told, who is asked, and the evaluations of the starts before."""
+
+    progress: Callable[[int, float], None]
+    stopping: Callable[[], bool]
+    before: int = 0
 
 
 def _check(p: int, n: int, k: int, sigma: Any, norm: float, absolute: bool) -> None:
@@ -128,50 +149,66 @@ def _check(p: int, n: int, k: int, sigma: Any, norm: float, absolute: bool) -> N
 
 
 def _fitted(
-    problem: Problem, start: np.ndarray, sigma: np.ndarray, estimated: bool, tolerances: Tolerances
+    problem: Problem, start: np.ndarray, sigma: np.ndarray, estimated: bool, tolerances: Tolerances, watch: _Watch
 ) -> Identified | None:
     """From one start; None if it cannot be used."""
-    problem.evaluations, problem.last, history = 0, None, []
-    first = problem.at(start)
-    if first is None:
+    problem.evaluations, problem.last = 0, None
+    if problem.at(start) is None:
         return None
-    rejected = np.full(len(problem.vector(first, sigma)), np.nan)  # SciPy then shrinks the trust region
+    end, reason, history = _descended(problem, start, sigma, tolerances, watch)
+    evaluations = problem.evaluations  # the point found may have to be computed once more, which was not SciPy's wish
+    watch.before += evaluations
+    seen = _known(problem, end)
+    return Identified(
+        part=jax.tree.map(np.asarray, problem.space.at(problem.part, jnp.asarray(end))),
+        values=_values(problem.space, end),
+        residuals=seen.residuals,
+        sigma=sigma,
+        chi2=float(np.sum((seen.residuals / sigma) ** 2)),
+        cost=float(np.sum(problem.vector(seen, sigma) ** 2)),
+        uncertainty=_uncertainty(problem.space, end, seen, sigma, estimated),
+        history=history,
+        evaluations=evaluations,
+        reason=reason,
+        start=_values(problem.space, start),
+    )
+
+
+def _descended(
+    problem: Problem, start: np.ndarray, sigma: np.ndarray, tolerances: Tolerances, watch: _Watch
+) -> tuple[np.ndarray, Reason, list[float]]:
+    """Where it ended and why, and the cost at every accepted point."""
+    rejected = np.full(len(problem.vector(_known(problem, start), sigma)), np.nan)  # SciPy then shrinks the region
+    history, accepted = [], [start]
 
     def value(z: np.ndarray) -> np.ndarray:
+        if watch.stopping():
+            raise _Stopped
         seen = problem.at(z)
         return rejected if seen is None else problem.vector(seen, sigma)
 
     def jacobian(z: np.ndarray) -> np.ndarray:
         seen = _known(problem, z)
         history.append(float(np.sum(problem.vector(seen, sigma) ** 2)))
+        accepted.append(z.copy())
+        watch.progress(watch.before + problem.evaluations, history[-1])
         return problem.jacobian(seen, sigma)
 
-    found = least_squares(
-        value,
-        start,
-        jacobian,  # pyright: ignore[reportArgumentType]  # a function, whatever SciPy's default suggests
-        method="trf",
-        x_scale="jac",
-        ftol=tolerances.cost,
-        xtol=tolerances.step,
-        gtol=tolerances.gradient,
-        max_nfev=tolerances.evaluations,
-    )
-    evaluations = problem.evaluations  # the point found may have to be computed once more, which was not SciPy's wish
-    seen = _known(problem, found.x)
-    return Identified(
-        part=jax.tree.map(np.asarray, problem.space.at(problem.part, jnp.asarray(found.x))),
-        values=_values(problem.space, found.x),
-        residuals=seen.residuals,
-        sigma=sigma,
-        chi2=float(np.sum((seen.residuals / sigma) ** 2)),
-        cost=float(2 * found.cost),
-        uncertainty=_uncertainty(problem.space, found.x, seen, sigma, estimated),
-        history=history,
-        evaluations=evaluations,
-        reason=REASONS[found.status],
-        start=_values(problem.space, start),
-    )
+    try:
+        found = least_squares(
+            value,
+            start,
+            jacobian,  # pyright: ignore[reportArgumentType]  # a function, whatever SciPy's default suggests
+            method="trf",
+            x_scale="jac",
+            ftol=tolerances.cost,
+            xtol=tolerances.step,
+            gtol=tolerances.gradient,
+            max_nfev=tolerances.evaluations,
+        )
+    except _Stopped:
+        return accepted[-1], Reason.INTERRUPTED, history
+    return found.x, REASONS[found.status], history
 
 
 def _known(problem: Problem, z: np.ndarray) -> Seen:

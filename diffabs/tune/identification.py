@@ -6,7 +6,7 @@
 The data are compared with the loop's measured outputs, behind its sensor; nothing is drawn at random. What is fitted,
 and how, is in `fit`; what is known afterwards, and what is not, in `uncertainty`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from diffabs.loop import Loop
@@ -30,6 +30,8 @@ def identify(
     starts: Sequence[Mapping[str, Any]] = (),
     norm: float = 2.0,
     tolerances: Tolerances | None = None,
+    progress: Callable[[int, float], None] | None = None,
+    stopping: Callable[[], bool] = lambda: False,
 ) -> Identified:
     """Fit free parameters of a loop, by dotted path, to data. The other arguments are those of `fit`.
 
@@ -60,4 +62,6 @@ def identify(
         norm=norm,
         tolerances=tolerances,
         usable=lambda part: limit(part) >= solver.step,
+        progress=progress,
+        stopping=stopping,
     )

@@ -5,6 +5,7 @@
 J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., sec. 17.4.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -26,9 +27,15 @@ HARDEST = 1e7
 class Search:
     """Descents under multipliers that are raised until the constraints hold."""
 
-    def __init__(self, problem: Problem, method: Method, progress: Callable[[Progress], None] | None):
+    def __init__(
+        self,
+        problem: Problem,
+        method: Method,
+        progress: Callable[[Progress], None] | None,
+        stopping: Callable[[], bool] = lambda: False,
+    ):
         """Starts: the subject itself, and as many random ones as the method asks for."""
-        self.problem, self.method, self.progress = problem, method, progress
+        self.problem, self.method, self.progress, self.stopping = problem, method, progress, stopping
         own = problem.space.place(problem.subject)[None]
         drawn = problem.space.spread(jax.random.key(method.seed), method.starts - 1)
         self.starts = np.concatenate([own, drawn])
@@ -36,6 +43,8 @@ class Search:
         size = abs(float(self.before.objective))
         self.scale = size if np.isfinite(size) and size > 0 else 1.0
         self.round = 0
+        self.earlier: list[list[Point]] = [[] for _ in self.starts]  # points of the rounds before
+        self.best: Lane | None = None  # so far, as it was when it was met
 
     def result(self) -> Tuned:
         """Raises StartError if no start could be left."""
@@ -53,6 +62,7 @@ class Search:
             chosen,
             method.stopping,
             self._told,
+            self.stopping,
         )
         lanes = self._rounds(descent)
         usable = [lane for lane in lanes if lane.reason is not Reason.START]
@@ -61,6 +71,8 @@ class Search:
         for lane in usable:
             lane.go_back()
         best = min(usable, key=lambda lane: self._rank(lane.history[-1]))
+        if self.stopping() and self.best:
+            best = dataclasses.replace(self.best, reason=Reason.INTERRUPTED)
         return self._tuned(best, lanes)
 
     def _rounds(self, descent: Descent) -> list[Lane]:
@@ -71,11 +83,15 @@ class Search:
             return lanes
         worst = _violations(lanes)
         while self.round < self.method.rounds and not all(w <= 0 for w in worst):
+            if self.stopping():
+                break
             self.round += 1
             m = _raised(m, lanes)
+            self.earlier = [lane.history for lane in lanes]
             last, lanes = lanes, descent.run(np.stack([lane.z for lane in lanes]), m)
             for before, lane in zip(last, lanes, strict=True):
-                _continued(lane, before)
+                lane.history = _continued(before.history, lane.history)
+                lane.keep(before.kept)
             m, worst = _harder(m, worst, _violations(lanes)), _violations(lanes)
         return lanes
 
@@ -85,6 +101,10 @@ class Search:
         return not met, point.objective if met else point.violation
 
     def _told(self, lanes: list[Lane]) -> None:
+        for before, lane in zip(self.earlier, lanes, strict=True):
+            better = self.best is None or self._rank(lane.history[-1]) < self._rank(self.best.history[-1])
+            if better and lane.reason is not Reason.START:
+                self.best = dataclasses.replace(lane, history=_continued(before, lane.history))
         if self.progress:
             best = min((lane.history[-1] for lane in lanes), key=lambda p: (not np.isfinite(p.loss), *self._rank(p)))
             self.progress(Progress(self.round, sum(lane.reason is None for lane in lanes), best))
@@ -146,12 +166,13 @@ def _harder(m: Multipliers, before: np.ndarray, after: np.ndarray) -> Multiplier
     return m._replace(penalty=np.minimum(np.where(slow, HARDER * m.penalty, m.penalty), HARDEST))
 
 
-def _continued(lane: Lane, before: Lane) -> None:
+def _continued(before: list[Point], history: list[Point]) -> list[Point]:
     """The history of a start over its rounds."""
-    shift = before.history[-1]
+    if not before:
+        return list(history)
+    shift = before[-1]
     moved = [
         p._replace(iteration=p.iteration + shift.iteration, evaluations=p.evaluations + shift.evaluations)
-        for p in lane.history
+        for p in history
     ]
-    lane.history = [*before.history, *moved]
-    lane.keep(before.kept)
+    return [*before, *moved]

@@ -31,6 +31,7 @@ def tune(
     constraints: Sequence[Constraint] = (),
     method: Method | None = None,
     progress: Callable[[Progress], None] | None = None,
+    stopping: Callable[[], bool] = lambda: False,
 ) -> Tuned:
     """Minimise an aggregate, over a batch of runs, of a weighted sum of metrics.
 
@@ -39,6 +40,7 @@ def tune(
     measured: objectives by metric; None is the report of the plant's task
     objective: weight of each metric of `measured`, `{"stop_distance": 1.0, "effort": 1e-4}`
     over: the runs, parameters of the loop by path; none is the loop itself
+    stopping: asked after every evaluation; True ends the search with the best that it has met so far
 
     Raises:
         ValueError: a path, range, metric or batch that does not fit.
@@ -56,7 +58,7 @@ def tune(
         constraints=constraints,
         mode=method.mode,
     )
-    return Search(problem, method, progress).result()
+    return Search(problem, method, progress, stopping).result()
 
 
 def posed(

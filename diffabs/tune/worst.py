@@ -73,7 +73,8 @@ class WorstCase:
             return f"COUNTEREXAMPLE: the run diverges at {at}."
         found = f"{self.metric} = {self.value:.6g} at {at}"
         if self.met is False:
-            return f"COUNTEREXAMPLE: {found}, beyond {self.bound:g} by {self.value - (self.bound or 0.0):.3g}. {self._finder()}"
+            beyond = f"beyond {self.bound:g} by {self.value - (self.bound or 0.0):.3g}"
+            return f"COUNTEREXAMPLE: {found}, {beyond}. {self._finder()}"
         proof = {
             True: "The linear loop is proved stable over the box by a certificate.",
             False: "No certificate covers the box.",

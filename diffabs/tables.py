@@ -1,0 +1,51 @@
+"""Tables that fit a terminal: cells are folded between words, and a table too wide for that becomes several."""
+
+import copy
+
+from rich.table import Column, Table
+
+FRAME, PER_COLUMN = 1, 3  # columns of the frame, and of it and the padding for each column
+
+
+def fitted(table: Table, width: int) -> list[Table]:
+    """The table as one or more, each no wider than `width` where its longest words allow that. The first column, which
+    says what a row is about, comes again in each."""
+    groups: list[list[Column]] = []
+    first, *others = table.columns
+    for column in others:
+        if groups and _least([*groups[-1], column]) <= width:
+            groups[-1].append(column)
+        else:
+            groups.append([first, column])
+    return [_laid_out(table, group, width) for group in groups or [[first]]]
+
+
+def _laid_out(table: Table, columns: list[Column], width: int) -> Table:
+    """These columns of a table: each as wide as its longest word, and what is left goes to those that need it."""
+    new = copy.copy(table)
+    new.columns = [copy.copy(column) for column in columns]
+    spare = width - _least(columns)
+    needs = {i: _line(column) - _word(column) for i, column in enumerate(columns)}
+    for place, i in enumerate(sorted(needs, key=lambda i: needs[i])):
+        more = max(0, min(needs[i], spare // (len(columns) - place)))
+        spare -= more
+        if spare >= 0:
+            new.columns[i].width = _word(columns[i]) + more
+    return new
+
+
+def _least(columns: list[Column]) -> int:
+    return FRAME + sum(PER_COLUMN + _word(column) for column in columns)
+
+
+def _texts(column: Column) -> list[str]:
+    return [str(column.header), *map(str, column.cells)]
+
+
+def _word(column: Column) -> int:
+    """Of the longest word."""
+    return max((len(word) for text in _texts(column) for word in text.split()), default=1)
+
+
+def _line(column: Column) -> int:
+    return max(map(len, _texts(column)), default=1)
