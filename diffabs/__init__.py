@@ -6,8 +6,8 @@ _interrupt.early()  # before JAX, whose import takes seconds
 
 from diffabs.loop import Loop as Loop
 from diffabs.plants import BrakeStart as BrakeStart
-from diffabs.pytree import check as check
 from diffabs.pytree import replace as replace
+from diffabs.refusals import check as check
 from diffabs.rollout import FixedStep as FixedStep
 from diffabs.rollout import Run as Run
 from diffabs.rollout import measure as measure

@@ -61,9 +61,3 @@ class Series:
 
     def _pairs(self, memory: Memory) -> Any:
         return [(b, Memory(f, h)) for b, f, h in zip(self.blocks, memory.flow, memory.held, strict=True)]
-
-    def grid_problems(self, step: float):
-        """Those of the blocks."""
-        for i, block in enumerate(self.blocks):
-            if hasattr(block, "grid_problems"):
-                yield from (f"blocks.{i}.{line}" for line in block.grid_problems(step))  # pyright: ignore

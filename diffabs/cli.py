@@ -120,7 +120,7 @@ def simulate(
         result = _result(chosen, run, {"csv": csv, "plot": plot})
         show.as_json(result) if as_json else show.run(result, chosen)
         if result["diverged"]:
-            console.fail(f"{chosen.name} diverged: a number became infinite or NaN, so there are no metrics", 1)
+            console.fail(f"{chosen.name} diverged: a number became infinite or impossible: there are no metrics", 1)
         if warning := _warning(chosen, result):
             console.say(f"warning: {warning}")
 

@@ -54,11 +54,11 @@ def _metrics(a: "Results", b: "Results", wanted: list[str] | None) -> list[str]:
 
 
 def _compared(a: "Results", b: "Results", metrics: list[str]) -> dict[str, Any]:
-    """Paired statistics of second minus first, over samples that diverged in neither."""
+    """Paired statistics of second minus first, over samples that diverged or were refused in neither."""
     from diffabs.sweep.comparison import paired
     from diffabs.sweep.statistics import Moments
 
-    lost = a.column("diverged") | b.column("diverged")
+    lost = a.column("diverged") | b.column("diverged") | ~a.accepted | ~b.accepted
     rows = {}
     for name in metrics:
         before, after = a.column(name)[~lost], b.column(name)[~lost]

@@ -17,6 +17,7 @@ import typer
 from diffabs import console, progress, show, variation
 from diffabs.catalogue import ScenarioError, unit_of, unknown
 from diffabs.pytree import elements
+from diffabs.refusals import first_line
 from diffabs.scenario import Scenario, dump, loads
 
 if TYPE_CHECKING:
@@ -61,12 +62,17 @@ def sweep(
         out = out or pathlib.Path("out") / f"sweep-{chosen.name}"
         study = variation.study(chosen)
         kept = _numbers(keep, study.samples)
+        for number in kept:
+            _check_runnable(study, number)
         with _continued(out, resume):
             found = _run(study, chosen, out, resume, lambda: _engine(engine, scheduler, workers))
             if not found.complete:
                 raise KeyboardInterrupt
             result = console.waited(lambda: _result(found, study, out, kept, figures), "computing statistics")
         show.as_json(result) if as_json else show.swept(result, chosen)
+        if result["refused"]["count"] == result["samples"]:
+            why = next(iter(result["refused"]["reasons"]))
+            console.fail(f"{chosen.name}: no sample could be run: {why}", console.FAILED)
 
 
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
@@ -81,9 +87,17 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     study = variation.study(chosen)
     if not 0 <= number < study.samples:
         console.fail(f"--sample {number} is outside [0, {study.samples - 1}]")
-    loop, key = study.lane(number)
+    loop, key = _check_runnable(study, number)
     loop = jax.tree.map(lambda x: jnp.asarray(x, study.dtype), loop)
     return dataclasses.replace(chosen, name=f"{chosen.name}, sample {number}", title="", loop=loop), key
+
+
+def _check_runnable(study: "Study", number: int) -> tuple[Any, jax.Array]:
+    """Loop and key of a sample. Raises ScenarioError for one that must not be run."""
+    loop, key = study.lane(number)
+    if line := first_line(loop, {}, study.solver):
+        raise ScenarioError(f"sample {number} was refused: {line}")
+    return loop, key
 
 
 @contextlib.contextmanager
@@ -180,7 +194,8 @@ def _far(at: "Told") -> progress.Far:
     if not at.here:
         return progress.Far(f"{at.samples:,} of {at.total:,}", at.samples, at.total)
     left = progress.left((at.total - at.samples) / at.rate)
-    words = f"{at.samples:,} of {at.total:,}: {at.rate:,.0f}/s, {at.failed:,} failed, {at.diverged:,} diverged{left}"
+    bad = f"{at.failed:,} failed, {at.diverged:,} diverged" + (f", {at.refused:,} refused" if at.refused else "")
+    words = f"{at.samples:,} of {at.total:,}: {at.rate:,.0f}/s, {bad}{left}"
     return progress.Far(words, at.samples, at.total)
 
 

@@ -14,7 +14,9 @@ import numpy as np
 import typer
 
 from diffabs import console, proof, show
+from diffabs.catalogue import ScenarioError
 from diffabs.pytree import get, parameters
+from diffabs.refusals import first_line
 from diffabs.rollout import Trajectory, rollout
 from diffabs.scenario import Scenario, dump
 
@@ -141,6 +143,8 @@ def _work(chosen: Scenario) -> _Work:
 
     goal = chosen.tune.check(chosen.loop)
     batch = goal.batch(chosen.seed).check(chosen.loop)
+    if line := first_line(chosen.loop, batch.values, chosen.solver):
+        raise ScenarioError(f"tune.over: {line}")
     constraints: dict[str, Any] = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
     task = proof.task(chosen) if goal.decay or goal.damping else None
     if task and goal.decay:

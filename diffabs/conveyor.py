@@ -12,8 +12,9 @@ import jax.numpy as jnp
 
 from diffabs.loop import Loop
 from diffabs.protocols import Objective
-from diffabs.pytree import prepared, replace, separated, strong
-from diffabs.rollout import Carry, FixedStep, Run, arguments, judged, started, step
+from diffabs.pytree import replace, separated, strong
+from diffabs.refusals import refusals, traced
+from diffabs.rollout import Carry, FixedStep, Run, arguments, judged, ready, started, step
 
 WIDTH = 1024  # lanes whose state stays in a processor's cache
 ROUND = 64  # steps
@@ -27,16 +28,28 @@ def measure_lanes(
     *,
     keys: Any = None,
     width: int = WIDTH,
+    accepted: Any = None,
 ) -> Run:
     """What `jax.vmap` of `measure` computes for lanes that differ in the values (lanes,) at these paths, and in their
     keys. Compiled once for a number of lanes and paths; not differentiable in reverse mode.
 
+    accepted (lanes,): lanes that are run; the others are flagged as diverged. None is those that `refusals` accepts,
+        which are asked for unless the call is itself traced: then say it
+
     Raises ValueError without values, and for what `measure` objects to."""
     if not values:
         raise ValueError("no value differs between the lanes")
+    if accepted is None:
+        accepted = _accepted(loop, values, solver)
     loop, objectives, h = arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, h.dtype), dict(values)))
-    return _run(loop, values, objectives, h, keys, steps=solver.steps, width=width)
+    return _run(loop, values, objectives, h, keys, jnp.asarray(accepted, bool), steps=solver.steps, width=width)
+
+
+def _accepted(loop: Loop, values: Mapping[str, Any], solver: FixedStep) -> Any:
+    if traced(loop, dict(values)):
+        return jnp.ones(len(next(iter(values.values()))), bool)
+    return refusals(loop, values, solver).accepted
 
 
 class _Belt(NamedTuple):
@@ -53,19 +66,33 @@ class _Belt(NamedTuple):
 
 @partial(jax.jit, static_argnames=("steps", "width"))
 def _run(
-    loop: Loop, values: dict[str, Any], objectives: dict[str, Objective], h: Any, keys: Any, *, steps: int, width: int
+    loop: Loop,
+    values: dict[str, Any],
+    objectives: dict[str, Objective],
+    h: Any,
+    keys: Any,
+    accepted: Any,
+    *,
+    steps: int,
+    width: int,
 ) -> Run:
     count = len(next(iter(values.values())))
-    leaves, built = separated(lambda v: prepared(replace(loop, v)), values)
-    step_all = jax.vmap(lambda mine, key, carry: step(built(mine), objectives, h, key, steps, carry))
-    start = jax.vmap(lambda mine: started(built(mine), objectives, h))
-    judge = jax.vmap(lambda mine, carry: judged(built(mine), objectives, h, carry)[0])
+    leaves, whole = separated(lambda v: ready(replace(loop, v)), values)
+
+    def built(mine: Any) -> tuple[Loop, dict[str, Objective]]:
+        one, audit = whole(mine)
+        return one, objectives | audit
+
+    step_all = jax.vmap(lambda mine, key, carry: step(*built(mine), h, key, steps, carry))
+    start = jax.vmap(lambda mine: started(*built(mine), h))
+    judge = jax.vmap(lambda mine, carry: judged(*built(mine), h, carry)[0])
 
     def taken(number: Any) -> tuple[Any, Any, Carry]:
         """Lanes at their start; beyond the last one a copy of it that does not run."""
-        mine, key = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys))
+        mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
         carry = start(mine)
-        return mine, key, carry._replace(running=carry.running & (number < count))
+        running, diverged = carry.running & run & (number < count), carry.diverged | ~run
+        return mine, key, carry._replace(running=running, diverged=diverged)
 
     def round_(belt: _Belt) -> _Belt:
         def some(carry: Carry, _: Any) -> tuple[Carry, None]:

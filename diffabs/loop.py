@@ -6,7 +6,6 @@
 A `Loop` is one pytree: every parameter of every part is a leaf with a dotted path, `loop.plant.road.scale`.
 """
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from diffabs.actuators import VoltageLimit
@@ -27,8 +26,6 @@ from diffabs.protocols import (
 from diffabs.pytree import Scalar, part, pytree
 from diffabs.references import FixedSlip, Upright
 from diffabs.stops import Fallen, Standstill
-
-BLOCKS = ("sensor", "reference", "controller", "actuator")
 
 
 class LoopState(NamedTuple):
@@ -132,13 +129,6 @@ class Loop:
         command = self.controller.output(t, jumped("controller", tracking), tracking)
         jumped("actuator", command)
         return state, events
-
-    def grid_problems(self, step: float) -> Iterator[str]:
-        """What the blocks object to in an integration step [s]."""
-        for name in BLOCKS:
-            block = getattr(self, name)
-            if hasattr(block, "grid_problems"):
-                yield from (f"{name}.{line}" for line in block.grid_problems(step))
 
     def _tracking(self, t: Scalar, reference: Memory, measured: Any) -> Tracking:
         target = self.reference.output(t, reference, measured)

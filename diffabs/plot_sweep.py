@@ -139,8 +139,8 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     view = _View(found, units)
     late = missed(found.column("stopped"), found.study["objectives"])
     rules = [~view.good, late, *(found.column(name) > view.bounds[name] for name in view.bounds)]
-    failed = np.any(rules, axis=0)
-    rows, result = (every := np.full(len(failed), True)), failed
+    failed = np.any(rules, axis=0)[every := view.accepted]
+    rows, result = every, failed
     if view.leading and min(np.sum(failed), np.sum(~failed)) < FEW:
         rows, result = view.good, found.column(view.leading)[view.good]
     if not (ones := [view.variable(path, every) for path in view.influential(rows, result)]):
@@ -175,6 +175,8 @@ class _View:
     def __init__(self, found: Results, units: Mapping[str, str] = {}):
         self.found, self.units, self.bounds = found, units, failing(found.study)
         self.design, self.good = found.study["space"]["design"]["type"], ~found.column("diverged")
+        self.accepted = found.accepted
+        self.good &= self.accepted
         period = len(found.study["space"]["variables"]) + 2 if self.design == "saltelli" else 1
         self.rows = self.good & (found.column("sample") % period == 0)  # those in the statistics: A of (A, B, AB)
         least = ROUNDING * np.finfo(found.study["dtype"]).eps
@@ -191,8 +193,10 @@ class _View:
 
     def title(self, what: str, rows: np.ndarray) -> str:
         """With the scenario's name, if it has one, and how many runs are behind the figure."""
-        name, bad = self.found.manifest.get("source", {}).get("name"), np.sum(~self.good)
+        name, bad = self.found.manifest.get("source", {}).get("name"), np.sum(self.accepted & ~self.good)
+        refused = np.sum(~self.accepted)
         runs = f"{np.sum(rows):,} runs" + (f" ({bad:,} diverged)" if bad else "")
+        runs += f" ({refused:,} refused)" if refused else ""
         return f"{name}: {what} {runs}" if name else f"{what} {runs}"
 
     def variable(self, path: str, rows: np.ndarray) -> _Variable:

@@ -115,7 +115,10 @@ class Road(Protocol):
 
 
 class Plant(Protocol):
-    """dx/dt = derivative(t, x, u), y = output(x)."""
+    """dx/dt = derivative(t, x, u), y = output(x).
+
+    A plant may also offer `audit()`, an Objective that watches every run of it. Its value is at most 1 for a run that
+    is physically possible; a run of another value has `diverged`, although all its numbers are finite."""
 
     def start(self, initial: Any) -> Any:
         """The state at t = 0."""
@@ -200,7 +203,10 @@ class Stop(Protocol):
 
 
 class Objective(Protocol):
-    """What is measured on a run, streamed: a sweep stores no trajectories."""
+    """What is measured on a run, streamed: a sweep stores no trajectories.
+
+    `physical = (low, high)`, if the class has it, is the range in which the value of any real run lies: a run with a
+    value outside, or none, has `diverged`."""
 
     def start(self, sample: Sample) -> Memory:
         """The accumulator before the first step."""

@@ -21,6 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from diffabs.rules import Rule, array
+
 Scalar = Any  # a float, a NumPy or JAX scalar, a tracer; a batch of them under vmap
 Vector = Any  # the same with one axis
 Matrix = Any  # with two
@@ -48,12 +50,16 @@ class Spec:
         unit = "" if self.unit == "1" else f" {self.unit}"
         return f"{left}{self.low:g}, {self.high:g}{right}{unit}"
 
+    def within(self, value: Any) -> Any:
+        """Whether every element lies in the range, also of traced numbers. Written so that NaN does not."""
+        x = array(value)
+        above = x > self.low if self.open_low else x >= self.low
+        below = x < self.high if self.open_high else x <= self.high
+        return (above & below & ((abs(x) < math.inf) | self.infinite)).all()
+
     def holds(self, value: ArrayLike) -> bool:
-        """Whether every element lies in the range. Written so that NaN does not."""
-        array = np.asarray(value, float)
-        above = array > self.low if self.open_low else array >= self.low
-        below = array < self.high if self.open_high else array <= self.high
-        return bool(np.all(above & below & (np.isfinite(array) | (self.infinite & ~np.isnan(array)))))
+        """The same of concrete numbers."""
+        return bool(self.within(np.asarray(value, float)))
 
 
 def param(
@@ -102,7 +108,7 @@ def static(*, default: Any = dataclasses.MISSING) -> Any:
 def pytree(cls: type[T]) -> type[T]:
     """Make a class a part. Raises TypeError for `__post_init__`, which JAX would call with tracers and None."""
     if "__post_init__" in cls.__dict__:
-        raise TypeError(f"{cls.__name__}: no __post_init__ on a part; write problems(self) for check() instead")
+        raise TypeError(f"{cls.__name__}: no __post_init__ on a part; write rules(self) for check() instead")
     new = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
     fields = dataclasses.fields(new)  # pyright: ignore[reportArgumentType]  # just made a dataclass
     unknown = [f.name for f in fields if not {"spec", "part", "static"} & set(f.metadata)]
@@ -153,8 +159,8 @@ def _children(part: Any, prefix: str) -> Iterator[tuple[str, dataclasses.Field[A
 
 
 def problems(part: Any, prefix: str = "") -> Iterator[str]:
-    """One line for each field that is out of range, and whatever the parts themselves object to."""
-    own = getattr(part, "problems", None)
+    """One line for each field that is out of range, then what the parts themselves object to: the shapes of their
+    fields (a method `problems`), and if these are right, the rules between their numbers (`rules`)."""
     found = False
     for name, field, value in _children(part, prefix):
         if field is not None and "spec" in field.metadata:
@@ -164,8 +170,41 @@ def problems(part: Any, prefix: str = "") -> Iterator[str]:
                 yield f"{name} = {_show(value)} is outside {spec.interval()}"
         else:
             yield from problems(value, f"{name}.")
-    if own is not None and not found:
-        yield from (prefix + line for line in own())
+    if not found:
+        shapes = list(part.problems()) if hasattr(part, "problems") else []
+        yield from (prefix + line for line in shapes or broken(_own(part, "rules")))
+
+
+def rules(part: Any, prefix: str = "") -> Iterator[Rule]:
+    """Every rule of a part and the parts in it, ranges of fields first: `problems` as arrays, for lanes whose values
+    differ. The shapes are taken to be right."""
+    for name, spec, value in parameters(part, prefix):
+        outside = f"is outside {spec.interval()}"
+        line = f"{name} = {{}} {outside}"
+        yield Rule(spec.within(value), f"{name} {outside}", lambda line=line, value=value: line.format(_show(value)))
+    yield from _below(part, prefix, "rules")
+
+
+def grid_rules(part: Any, step: float, prefix: str = "") -> Iterator[Rule]:
+    """What the parts demand of an integration step [s]."""
+    yield from _below(part, prefix, "grid_rules", step)
+
+
+def broken(rules: Iterable[Rule]) -> Iterator[str]:
+    """A line for each rule of concrete numbers that does not hold."""
+    yield from (rule.says() for rule in rules if not bool(rule.holds))
+
+
+def _own(part: Any, hook: str, *args: Any) -> Iterator[Rule]:
+    if hasattr(part, hook):
+        yield from getattr(part, hook)(*args)
+
+
+def _below(part: Any, prefix: str, hook: str, *args: Any) -> Iterator[Rule]:
+    for name, field, value in _children(part, prefix):
+        if field is None or "spec" not in field.metadata:
+            yield from _below(value, f"{name}.", hook, *args)
+    yield from (rule.under(prefix) for rule in _own(part, hook, *args))
 
 
 def cautions(part: Any, prefix: str = "") -> Iterator[str]:

@@ -5,7 +5,10 @@
     at the end:  the objectives' last update, after the state was moved onto the crossing
 
 A step that crosses the stop is tried again, shorter, until it ends on the crossing. Stopping time, distance and every
-objective are thus exact to the order of the method and differentiable, wherever the crossing falls."""
+objective are thus exact to the order of the method and differentiable, wherever the crossing falls.
+
+An unstable step may leave every number finite. So a run has `diverged`, too, if its landing did not come to rest on the
+crossing, if a metric is outside of its physical range, or if the plant's own audit says that it cannot have been."""
 
 import dataclasses
 import math
@@ -23,6 +26,9 @@ from diffabs.protocols import Clock, Ending, Memory, Objective, Sample
 from diffabs.pytree import prepared, strong
 
 LANDINGS = 4  # Newton iterations for the length of the last step; quadratic from an error below one step
+MISSED = 0.1  # of the last step, by which a landing may miss the crossing: the state is still moved onto it
+ROUNDING = 1e-9  # of a metric beyond its physical range
+AUDIT = ""  # the name of a plant's audit among the objectives; no metric is called so
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +63,7 @@ class Run(NamedTuple):
 
     metrics: dict[str, Any]
     stopped: Any  # bool: the stop was reached in time
-    diverged: Any  # bool: a number became infinite or NaN
+    diverged: Any  # bool: its numbers mean nothing: one became infinite, NaN or impossible, or it began beyond its stop
     ending: Ending
     trajectory: Trajectory | None
 
@@ -110,7 +116,8 @@ class Carry(NamedTuple):
 
 @partial(jax.jit, static_argnames=("steps", "every"))
 def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, steps: int, every: int) -> Run:
-    loop = prepared(loop)
+    loop, audit = ready(loop)
+    objectives = objectives | audit
     carry = started(loop, objectives, h)
     stepped = partial(step, loop, objectives, h, key, steps)
     first = _seen(loop, carry)
@@ -122,14 +129,42 @@ def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, step
     return done._replace(trajectory=_assembled(first, seen, last, -(-steps // every))) if every else done
 
 
+def ready(loop: Loop) -> tuple[Loop, dict[str, Objective]]:
+    """The loop with everything worked out that does not change during a run, and what its plant watches it by."""
+    loop = prepared(loop)
+    return loop, {AUDIT: loop.plant.audit()} if hasattr(loop.plant, "audit") else {}  # pyright: ignore
+
+
 def judged(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) -> tuple[Run, Trajectory]:
-    """The result of a run that is over, and its last instant."""
+    """The result of a run that is over, and its last instant. `objectives` with the plant's audit."""
+    missed = carry.stopped & ~_landed(loop, h, carry)
     carry = _ended(loop, objectives, h, carry)
     last = _seen(loop, carry)
     ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample, carry.stopped))
     metrics = {name: o.value(carry.tally[name], ending) for name, o in objectives.items()}
-    metrics = {name: jnp.where(carry.diverged, jnp.nan, value) for name, value in metrics.items()}
-    return Run(metrics, carry.stopped, carry.diverged, ending, None), last
+    wrong = [_impossible(name, objectives[name], value) for name, value in metrics.items()]
+    diverged = jnp.any(jnp.stack([carry.diverged, missed, *wrong]))
+    metrics = {n: jnp.where(diverged, jnp.nan, value) for n, value in metrics.items() if n != AUDIT}
+    return Run(metrics, carry.stopped & ~diverged, diverged, ending, None), last
+
+
+def _impossible(name: str, objective: Objective, value: Any) -> Any:
+    """Whether no real run has this value: of an audit more than 1, of a metric one outside its range, or no number."""
+    if name == AUDIT:
+        return ~(value <= 1)
+    low, high = getattr(objective, "physical", (-math.inf, math.inf))
+    if math.isinf(low) and math.isinf(high):
+        return jnp.asarray(False)
+    return ~((value >= low - ROUNDING) & (value <= high + ROUNDING) & jnp.isfinite(value))
+
+
+def _landed(loop: Loop, h: Any, carry: Carry) -> Any:
+    """Whether the last step ended near the crossing, in units of the margin at its beginning and of its change in h."""
+    y = loop.plant.output(carry.state.plant)
+    left, ahead = loop.stop.margin(y), loop.stop.margin(carry.before.output)
+    first = loop.stop.margin(loop.plant.output(loop.plant.start(loop.initial)))
+    rounding = 16 * jnp.finfo(h.dtype).eps * jnp.abs(first)
+    return jnp.abs(left) <= MISSED * (jnp.abs(ahead) + h * jnp.abs(loop.stop.rate(y))) + rounding
 
 
 def started(loop: Loop, objectives: dict[str, Objective], h: Any) -> Carry:
@@ -139,7 +174,7 @@ def started(loop: Loop, objectives: dict[str, Objective], h: Any) -> Carry:
     tally = {name: objective.start(sample) for name, objective in objectives.items()}
     no, zero = jnp.asarray(False), jnp.asarray(0)
     running = loop.stop.margin(sample.output) > 0
-    return _typed(Carry(state, tally, sample, zero, 0.0 * h, h, zero, running, no, no), h.dtype)
+    return _typed(Carry(state, tally, sample, zero, 0.0 * h, h, zero, running, no, ~running), h.dtype)
 
 
 def _segments(step: Any, seen: Any, carry: Carry, every: int, steps: int) -> tuple[Carry, Any]:

@@ -12,7 +12,6 @@ What is left out has its default, for the task of the plant, braking or balance.
 
 import dataclasses
 import importlib.resources
-import math
 import pathlib
 import re
 import tomllib
@@ -20,7 +19,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
-import numpy as np
 
 from diffabs import goal, ranges, robust, toml, variation
 from diffabs.catalogue import OTHERS, build, joined, loop_of, number, shown, unknown, whole, wrong
@@ -30,12 +28,11 @@ from diffabs.misfits import misfits
 from diffabs.objectives import BRAKING, REPORTS
 from diffabs.protocols import Objective
 from diffabs.pytree import Spec, cautions, problems
+from diffabs.refusals import MOST_STEPS, together, unstable
 from diffabs.rollout import FixedStep
-from diffabs.stability import stable_step
 
 LARGEST_FILE = 1_000_000  # bytes
 LONGEST_PATH = 4096  # characters of it in a message
-MOST_STEPS = 1e8
 TEXTS = ("title", "description")
 TIME = Spec("s", low=0.0, open_low=True)
 
@@ -112,7 +109,8 @@ def loads(
     if "sweep" in table:
         table["sweep"] = variation.with_samples(table["sweep"], folder)
     scenario = _assembled(name, table)
-    _refuse(_wrong_together(scenario), _unstable(scenario) if integrated else ())
+    asked = (scenario.loop, scenario.solver)
+    _refuse(together(*asked), unstable(*asked) if integrated else ())
     return scenario
 
 
@@ -271,36 +269,6 @@ def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[s
     yield from problems(loop)
     for name, objective in objectives.items():
         yield from problems(objective, f"{joined('objective', name)}.")
-
-
-def _wrong_together(scenario: Scenario) -> Iterator[str]:
-    """What does not go together: parts and step."""
-    loop, solver = scenario.loop, scenario.solver
-    start, end = getattr(loop.initial, "speed", np.inf), getattr(loop.stop, "speed", 0.0)
-    if not start > end:
-        yield f"initial.speed = {start:g} m/s is not above stop.speed = {end:g} m/s: the run would end before it starts"
-        return
-    if solver.step > solver.duration:
-        yield f"solver.step = {solver.step:g} s is outside (0, {solver.duration:g}] s: longer than solver.duration"
-        return
-    if solver.duration / solver.step > MOST_STEPS:
-        least = solver.duration / MOST_STEPS
-        yield f"solver.step = {solver.step:g} s is outside [{least:g}, {solver.duration:g}] s: too many steps"
-        return
-    yield from loop.grid_problems(solver.step)
-
-
-def _unstable(scenario: Scenario) -> Iterator[str]:
-    """A step too long for the loop. The dearest question, so it comes last."""
-    loop, solver = scenario.loop, scenario.solver
-    largest, end = stable_step(loop), getattr(loop.stop, "speed", 0.0)
-    if solver.step > largest:
-        digit = 10.0 ** (math.floor(math.log10(largest)) - 2)
-        largest = math.floor(largest / digit) * digit  # what is printed must be stable too
-        yield (
-            f"solver.step = {solver.step:g} s is not stable: RK4 follows the fastest mode of this loop, between the "
-            f"initial speed and {end:g} m/s, only with steps in (0, {largest:.3g}] s"
-        )
 
 
 def dump(scenario: Scenario) -> str:

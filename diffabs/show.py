@@ -218,6 +218,12 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
                 name, *("" if row[p][kind]["value"] is None else f"{row[p][kind]['value']:.3f}" for p in paths)
             )
         _print({"spearman": "rank correlations", "total": "total Sobol' indices"}[kind], moves)
+    if (refused := result["refused"])["count"]:
+        why = "; ".join(f"{reason} ({count})" for reason, count in refused["reasons"].items())
+        say(
+            f"refused: {refused['count']} of {result['samples']} samples were not run and are in no number here, the"
+            f" first sample {refused['samples'][0]}: {why}"
+        )
     for name, rows in result["worst"].items():
         if rows:
             say(f"greatest {name}: {_brief(rows[0]['value'])} in sample {rows[0]['sample']}")

@@ -1,12 +1,12 @@
 """Periods on the integration grid."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from diffabs.pytree import Scalar
+from diffabs.rules import Rule, array
 
 
 def steps(period: Scalar, h: Scalar) -> Any:
@@ -14,8 +14,11 @@ def steps(period: Scalar, h: Scalar) -> Any:
     return jnp.maximum(jnp.round(jax.lax.stop_gradient(period / h)), 1).astype(int)
 
 
-def period_problems(name: str, period: Scalar, step: float) -> Iterator[str]:
-    """Objects to a period that is no whole multiple of the step."""
-    count = float(period) / step
-    if count < 0.5 or abs(count - round(count)) > 1e-6 * count:
-        yield f"{name} = {float(period):g} s is not a multiple of solver.step = {step:g} s"
+def whole_steps(name: str, period: Scalar, step: float) -> Rule:
+    """A period is a whole multiple of the step."""
+    count = array(period) / step
+    return Rule(
+        (count >= 0.5) & (abs(count - count.round()) <= 1e-6 * count),
+        f"{name} is not a multiple of solver.step = {step:g} s",
+        lambda: f"{name} = {float(period):g} s is not a multiple of solver.step = {step:g} s",
+    )

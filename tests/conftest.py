@@ -23,10 +23,10 @@ def _float64():
 @pytest.fixture(scope="module")
 def any_step_is_stable():
     """Loading a scenario without the seconds of the stability check, which has tests of its own."""
-    from diffabs import scenario
+    from diffabs import refusals
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        patch.setattr(refusals, "stable_step", lambda loop: np.inf)
         yield
 
 

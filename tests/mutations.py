@@ -228,6 +228,34 @@ MUTATIONS = [
         "test_blocks.py::test_integrated_accelerometer",
     ),
     Mutation(
+        "a speed seen low, its slip that of the true speed",
+        "sensors/speed.py",
+        "slip=(v - signal.wheel_speed) / jnp.maximum(v, self.floor), speed=v)",
+        "speed=v)",
+        "test_blocks.py::test_a_speed_seen_low_hides_slip",
+    ),
+    Mutation(
+        "papers: eq. (8) of the arm with the l that it lacks",
+        "papers/arm_equations.py",
+        "eighth - m2 * lg * sin2",
+        "eighth - m2 * l * lg * sin2",
+        "test_papers_verdicts.py::test_what_the_printed_equations_of_motion_miss_of_their_own_lagrangian",
+    ),
+    Mutation(
+        "papers: the variation of a torque without its falls",
+        "papers/estimator_claims.py",
+        'np.sum(np.abs(np.diff(seen(run)["torque"])))',
+        'np.sum(np.maximum(np.diff(seen(run)["torque"]), 0))',
+        "test_papers_verdicts.py::test_how_abruptly_each_controller_brakes",
+    ),
+    Mutation(
+        "papers: a cost without that of the torque",
+        "papers/lmi_claims.py",
+        "-(Q + K.T @ K)",
+        "-Q",
+        "test_papers_verdicts.py::test_the_nearest_explanation_of_the_gain",
+    ),
+    Mutation(
         "IAE without abs",
         "objectives/accuracy.py",
         "jnp.abs(whole))",
@@ -748,6 +776,13 @@ MUTATIONS = [
         "if self.system.period is not None:",
         "if False:",
         "test_tuning.py::TestPoles::test_discrete_poles_are_those_of_continuous_time",
+    ),
+    Mutation(
+        "tune: a worst case at a corner that gradients are said to have found",
+        "tune/worst.py",
+        "if self.value <= self.corner * (1 + SAME):",
+        "if False:",
+        "test_tuning.py::test_a_worst_case_says_what_found_it",
     ),
     Mutation(
         "tune: the worst case is only screened",

@@ -9,7 +9,7 @@ import pytest
 from commands import assert_one_error_line, left_in, run
 
 import diffabs.tune.identification as library
-from diffabs import commands_identify, console, scenario
+from diffabs import commands_identify, console, refusals
 from diffabs.readings import read
 from diffabs.scenario import ScenarioError, load
 from diffabs.tune import Reason
@@ -45,7 +45,7 @@ def quick():
     """No lines that depend on the machine's load, and no seconds for what has tests of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        patch.setattr(refusals, "stable_step", lambda loop: np.inf)
         yield
 
 

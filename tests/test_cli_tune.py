@@ -14,7 +14,7 @@ import pytest
 from commands import assert_one_error_line, left_in, run
 
 import diffabs.tune as library
-from diffabs import commands_tune, console, interrupt, proof, scenario
+from diffabs import commands_tune, console, interrupt, proof, refusals
 from diffabs.design import lmi
 from diffabs.pytree import parameters, replace
 from diffabs.rollout import measure
@@ -76,7 +76,7 @@ def quick():
     """No lines that depend on the machine's load, and no seconds for what has tests of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        patch.setattr(refusals, "stable_step", lambda loop: np.inf)
         patch.setitem(sys.modules, "diffabs.plot_tuning", types.SimpleNamespace(tuning=drawn))
         yield
 

@@ -171,6 +171,15 @@ def test_physical_bounds_of_the_distance(estimator):
     assert best > max(row["ours"] for row in _rows(estimator, "bound"))
 
 
+def test_passing_remarks_are_judged_in_the_summary(lmi, estimator):
+    """What they are worth: test_papers_verdicts.py. Here: that they are written down."""
+    abrupt = {r["name"]: r["ours"] for r in estimator["judged"] if r["quantity"] == "variation of the torque"}
+    assert len(abrupt) == 8
+    assert abrupt["proposed P"] > 3 * abrupt["proposed PI"]
+    (nearest,) = [r["ours"] for r in lmi["judged"] if r["name"] == "speed whose LQ gain is the published one"]
+    assert nearest == pytest.approx(4.54, abs=5e-3)
+
+
 def test_what_does_not_agree_is_said(estimator):
     (row,) = _rows(estimator, "no ABS, from lock to stop")
     assert row["ours"] == pytest.approx(1.224, abs=1e-3)
@@ -238,7 +247,7 @@ def test_what_is_wrong_in_the_arms_paper_is_said(arm):
 def test_summary_is_finite_json_with_provenance(paper):
     text = (paper.folder / "summary.json").read_text(encoding="utf-8")
     assert json.loads(text, parse_constant=pytest.fail) == paper
-    assert all(math.isfinite(row["ours"]) for row in paper["rows"])
+    assert all(math.isfinite(row["ours"]) for row in paper["rows"] + paper["judged"])
     assert {"paper", "title", "rows", "figures", "notes", "solver", "versions"} <= set(paper)
     assert {"diffabs", "jax", "numpy", "python"} <= set(paper["versions"])
     assert len(paper.said) >= 3

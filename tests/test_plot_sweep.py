@@ -26,7 +26,7 @@ def made(tmp_path):
 
     def write(variables, metrics, *, design="random", failures=None, stopped=True, diverged=False, name="", **study):
         n = len(next(iter(variables.values())))
-        flags = {"stopped": np.full(n, stopped), "diverged": np.full(n, diverged)}
+        flags = {"stopped": np.full(n, stopped), "diverged": np.full(n, diverged), "refused": np.full(n, "", object)}
         metrics = {key: np.where(flags["diverged"], np.nan, column) for key, column in metrics.items()}
         columns = {"sample": np.arange(n), **variables, **metrics, **flags}
         store, size = Store(tmp_path / str(len(list(tmp_path.iterdir())))), -(-n // 2)

@@ -243,7 +243,7 @@ def test_sharp_patches():
 def test_patches_object_to_bad_edges():
     assert list(problems(Patches(edges=np.array([1.0, 2.0])))) == ["edges has shape (2,); 2 roads need (1,)"]
     road = Patches(roads=(ICE, SNOW, ICE), edges=np.array([2.0, 1.0]))
-    assert list(problems(road)) == ["edges = [2. 1.] m is not increasing"]
+    assert list(problems(road)) == ["edges = [2.0, 1.0] m is not increasing"]
 
 
 # The best slip

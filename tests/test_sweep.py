@@ -233,7 +233,8 @@ def test_every_device_is_used(study, monkeypatch):
 
         def run(self, chunks):
             asked.append(chunks)
-            return [{"diverged": np.zeros(2, bool), "stopped": np.ones(2, bool), "iae": np.ones(2)} for _ in chunks]
+            none = {"diverged": np.zeros(2, bool), "refused": np.full(2, "", object)}
+            return [none | {"stopped": np.ones(2, bool), "iae": np.ones(2)} for _ in chunks]
 
     monkeypatch.setattr(engines, "Runner", Runner)
     few = dataclasses.replace(study, objectives={"iae": study.objectives["iae"]}, failures={})

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from diffabs.numerics import clamp, quotient
 from diffabs.protocols import Memory, no_flow, no_jump, no_memory
 from diffabs.pytree import Scalar, param, pytree
+from diffabs.rules import Rule, ordered
 
 
 @pytree
@@ -23,10 +24,9 @@ class Limits:
         del t, memory
         return clamp(signal, self.low, self.high)
 
-    def problems(self) -> Iterator[str]:
-        """Limits that exclude each other."""
-        if not self.low <= self.high:
-            yield f"low = {self.low:g} N m exceeds high = {self.high:g} N m"
+    def rules(self) -> Iterator[Rule]:
+        """Limits that do not exclude each other."""
+        yield ordered(("low", self.low), ("high", self.high), "N m")
 
 
 @pytree

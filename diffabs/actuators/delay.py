@@ -12,6 +12,9 @@ import jax.numpy as jnp
 from diffabs.numerics import clamp
 from diffabs.protocols import Clock, Jump, Memory, no_flow
 from diffabs.pytree import Scalar, param, pytree, static
+from diffabs.rules import Rule, array
+
+ROUNDING = 1e-6  # relative
 
 
 class DelayMemory(NamedTuple):
@@ -58,8 +61,12 @@ class Delay:
         second = jnp.minimum(first + 1, clock.k - 1)  # with a delay of one step, part is 0 and so is its share
         return Jump(Memory(held=DelayMemory(ring, line(first, part, 1.0) + line(second, 0.0, part))))
 
-    def grid_problems(self, step: float) -> Iterator[str]:
-        """A delay that the ring cannot hold."""
-        if not step <= self.time * (1 + 1e-9) <= (self.capacity - 2) * step:
-            most = (self.capacity - 2) * step
-            yield f"time = {float(self.time):g} s is outside [{step:g}, {most:g}] s, one step to capacity - 2 steps"
+    def grid_rules(self, step: float) -> Iterator[Rule]:
+        """The ring holds the delay, to the rounding of single precision."""
+        most, time = (self.capacity - 2) * step, array(self.time)
+        outside = f"outside [{step:g}, {most:g}] s, one step to capacity - 2 steps"
+        yield Rule(
+            (step <= time * (1 + ROUNDING)) & (time * (1 - ROUNDING) <= most),
+            f"time is {outside}",
+            lambda: f"time = {float(self.time):g} s is {outside}",
+        )

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from diffabs.controllers.antiwindup import NoAntiWindup
-from diffabs.controllers.pid import limit_problems
 from diffabs.numerics import clamp
 from diffabs.protocols import Memory, Tracking, no_jump
 from diffabs.pytree import Scalar, Vector, param, part, pytree
+from diffabs.rules import Rule, ordered
 
 
 @pytree
@@ -48,7 +48,10 @@ class StateFeedback:
         return raw, clamp(raw, self.torque_min, self.torque_max)
 
     def problems(self) -> Iterator[str]:
-        """A gain of the wrong length, limits that exclude each other."""
+        """A gain of the wrong length."""
         if np.shape(self.gain) != (2,):
             yield f"gain has shape {np.shape(self.gain)}; it needs (2,): integral and proportional"
-        yield from limit_problems(self.torque_min, self.torque_max)
+
+    def rules(self) -> Iterator[Rule]:
+        """Limits that do not exclude each other."""
+        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "N m")

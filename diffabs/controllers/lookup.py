@@ -14,9 +14,9 @@ import numpy as np
 
 from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.controllers.feedback import StateFeedback
-from diffabs.controllers.pid import limit_problems
 from diffabs.protocols import Memory, Tracking, no_jump
 from diffabs.pytree import Scalar, Vector, param, part, pytree
+from diffabs.rules import Rule, increasing
 
 
 @pytree
@@ -49,13 +49,15 @@ class ScheduledFeedback:
         return StateFeedback(gain=jnp.stack(list(rows)), **limits, antiwindup=self.antiwindup)
 
     def problems(self) -> Iterator[str]:
-        """Lists of different lengths, speeds that do not increase, limits that exclude each other."""
+        """Lists of different lengths."""
         shapes = {name: np.shape(getattr(self, name)) for name in ("speeds", "integral_gains", "gains")}
         if len(set(shapes.values())) != 1 or len(shapes["speeds"]) != 1 or not shapes["speeds"][0]:
             yield f"speeds, integral_gains and gains have shapes {', '.join(map(str, shapes.values()))}; they need one"
-        elif not (np.diff(self.speeds) > 0).all():
-            yield f"speeds = {np.asarray(self.speeds).tolist()} m/s do not increase"
-        yield from limit_problems(self.torque_min, self.torque_max)
+
+    def rules(self) -> Iterator[Rule]:
+        """Speeds that increase, limits that do not exclude each other."""
+        yield increasing("speeds", self.speeds, "do not increase", "m/s")
+        yield from StateFeedback.rules(self)  # pyright: ignore[reportArgumentType]  # has the same limits
 
 
 def _rise(v: Any, nodes: Any) -> Any:
@@ -84,7 +86,7 @@ class ProportionalFeedback:
     torque_max: Scalar = param(default=np.inf, unit="N m", infinite=True)
     antiwindup: Any = part(default=NoAntiWindup)
 
-    start, problems = StateFeedback.start, StateFeedback.problems
+    start, problems, rules = StateFeedback.start, StateFeedback.problems, StateFeedback.rules
     flow, output = ScheduledFeedback.flow, ScheduledFeedback.output
     jump = no_jump
 

@@ -6,12 +6,14 @@ Aoki and Nakamura, eq. (13): C(s) = kp + kI/s + kD s wc/(s + wc). Their u is the
 positive. P, PI and PD are this with gains of zero.
 """
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.numerics import clamp
 from diffabs.protocols import Memory, Tracking, no_jump
 from diffabs.pytree import Scalar, param, part, pytree
+from diffabs.rules import Rule, ordered
 
 
 class PIDMemory(NamedTuple):
@@ -57,12 +59,6 @@ class PID:
         raw = signal.feedforward + self.kp * error + self.ki * memory.flow.integral + self.kd * derivative
         return raw, clamp(raw, self.torque_min, self.torque_max)
 
-    def problems(self):
-        """Limits that exclude each other."""
-        return limit_problems(self.torque_min, self.torque_max)
-
-
-def limit_problems(low: Scalar, high: Scalar):
-    """Objects to a lower limit above the upper one."""
-    if not low <= high:
-        yield f"torque_min = {low:g} N m exceeds torque_max = {high:g} N m"
+    def rules(self) -> Iterator[Rule]:
+        """Limits that do not exclude each other."""
+        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "N m")

@@ -17,7 +17,8 @@ from diffabs.integrate import axpy
 from diffabs.numerics import clamp
 from diffabs.protocols import Block, Clock, Jump, Memory, Tracking, no_flow
 from diffabs.pytree import Scalar, param, part, pytree
-from diffabs.timing import period_problems, steps
+from diffabs.rules import Rule, array
+from diffabs.timing import steps, whole_steps
 
 
 class SampledMemory(NamedTuple):
@@ -62,11 +63,14 @@ class Sampled:
         waiting = clamp((m.change - clock.t) / clock.h, 0.0, 1.0)
         return Jump(Memory(held=m._replace(applied=waiting * m.before + (1 - waiting) * m.after)))
 
-    def problems(self) -> Iterator[str]:
-        """A computation that takes longer than the period."""
-        if not self.delay <= self.period:
-            yield f"delay = {self.delay:g} s exceeds the period of {self.period:g} s"
+    def rules(self) -> Iterator[Rule]:
+        """A computation takes no longer than the period."""
+        yield Rule(
+            array(self.delay) <= array(self.period),
+            "delay exceeds the period",
+            lambda: f"delay = {self.delay:g} s exceeds the period of {self.period:g} s",
+        )
 
-    def grid_problems(self, step: float) -> Iterator[str]:
-        """A period off the integration grid."""
-        yield from period_problems("period", self.period, step)
+    def grid_rules(self, step: float) -> Iterator[Rule]:
+        """The period is on the integration grid."""
+        yield whole_steps("period", self.period, step)

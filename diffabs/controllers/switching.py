@@ -1,5 +1,6 @@
 """Controllers without memory of the plant: constant torque, relay with hysteresis, sliding mode."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 from diffabs.numerics import clamp, ratio
 from diffabs.protocols import Clock, Jump, Memory, Tracking, no_flow, no_jump, no_memory
 from diffabs.pytree import Scalar, param, pytree
+from diffabs.rules import Rule, ordered
 
 
 @pytree
@@ -69,10 +71,9 @@ class Relay:
         now = jnp.where(release, 0.0, jnp.where(apply, 1.0, applied))
         return Jump(Memory(held=RelayMemory(now, excess)), elapsed)
 
-    def problems(self):
-        """A release torque above the applied one."""
-        if not self.torque_min < self.torque_max:
-            yield f"torque_min = {self.torque_min:g} N m is not below torque_max = {self.torque_max:g} N m"
+    def rules(self) -> Iterator[Rule]:
+        """A release torque below the applied one."""
+        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "N m", equal=False)
 
 
 @pytree
@@ -97,7 +98,6 @@ class SlidingMode:
         inside = clamp((signal.target - signal.measured.slip) / self.boundary, -1.0, 1.0)
         return clamp(signal.feedforward + self.gain * inside, self.torque_min, self.torque_max)
 
-    def problems(self):
-        """Limits that exclude each other."""
-        if not self.torque_min < self.torque_max:
-            yield f"torque_min = {self.torque_min:g} N m is not below torque_max = {self.torque_max:g} N m"
+    def rules(self) -> Iterator[Rule]:
+        """Limits that do not exclude each other."""
+        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "N m", equal=False)

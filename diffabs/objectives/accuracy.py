@@ -3,6 +3,7 @@
 The error e = slip - setpoint is against where the reference will settle, not against a filtered target on its way
 there."""
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -68,6 +69,8 @@ class IAE:
     is put together step by step, with the crossings of zero interpolated linearly.
     """
 
+    physical = (0.0, math.inf)
+
     def start(self, sample: Sample) -> Memory:
         """Zero."""
         zero = 0.0 * sample.output.slip
@@ -93,6 +96,8 @@ class IAE:
 @pytree
 class ITAE:
     """Integral of t |e| dt [s^2], by the method of IAE."""
+
+    physical = (0.0, math.inf)
 
     start, value = IAE.start, IAE.value
 
@@ -123,6 +128,8 @@ class Peak(NamedTuple):
 class MaxSlip:
     """Greatest slip of the run [1]: the vertex of the parabola through the three samples around it, at most 1."""
 
+    physical = (-1.0, 1.0)
+
     flow = nothing
 
     def start(self, sample: Sample) -> Memory:
@@ -148,6 +155,8 @@ class MaxSlip:
 class Overshoot:
     """max(0, max slip/setpoint - 1), a fraction of the final setpoint [1]. Zero derivative where there is none."""
 
+    physical = (0.0, math.inf)
+
     flow = nothing
     start = MaxSlip.start
     update = MaxSlip.update
@@ -164,6 +173,8 @@ class SettlingTime:
 
     The entry is interpolated linearly between samples.
     """
+
+    physical = (0.0, math.inf)
 
     band: Scalar = param(default=0.01, unit="1", above=0.0)
 
@@ -188,6 +199,8 @@ class SettlingTime:
 @pytree
 class FinalSlipError:
     """|slip - setpoint| at the end [1]."""
+
+    physical = (0.0, math.inf)
 
     flow, update = nothing, unchanged
 
@@ -216,6 +229,8 @@ class QuadraticCost:
 
     u is the torque that the actuator delivers.
     """
+
+    physical = (0.0, math.inf)
 
     q: Vector = param(default=(1.0, 1.0), unit="1", low=0.0)
     r: Scalar = param(default=1.0, unit="1", above=0.0)

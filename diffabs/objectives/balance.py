@@ -1,5 +1,6 @@
 """What is measured of a balance: whether it fell, how soon it rests, what the arm and the motor had to do."""
 
+import math
 from typing import Any
 
 import jax
@@ -28,6 +29,8 @@ def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Any:
 class Fell:
     """1 if the run ended before its time, by a fall; else 0 [1]."""
 
+    physical = (0.0, 1.0)
+
     start, flow, update = FinalSlipError.start, nothing, unchanged
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
@@ -39,6 +42,8 @@ class Fell:
 @pytree
 class FinalNorm:
     """sqrt(x'x) at the end [1], x = (theta, psi, phi, theta', psi', phi') in rad and rad/s."""
+
+    physical = (0.0, math.inf)
 
     start, flow, update = Fell.start, nothing, unchanged
 
@@ -73,6 +78,8 @@ def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
 class PeakLean:
     """Greatest |theta| of the frame [rad], at the instants of the integration."""
 
+    physical = (0.0, math.inf)
+
     start, flow, update, value = _peak(lambda sample: jnp.abs(sample.output.theta))
 
 
@@ -80,12 +87,16 @@ class PeakLean:
 class PeakArmAngle:
     """Greatest |psi| of the arm [rad], at the instants of the integration."""
 
+    physical = (0.0, math.inf)
+
     start, flow, update, value = _peak(lambda sample: jnp.abs(sample.output.psi))
 
 
 @pytree
 class PeakVoltage:
     """Greatest |u| that the motor gets [V]."""
+
+    physical = (0.0, math.inf)
 
     start, flow, update, value = _peak(lambda sample: jnp.abs(sample.control))
 
@@ -100,6 +111,8 @@ def motor_torque(sample: Sample) -> Any:
 class PeakTorque:
     """Greatest torque of the motor [N m], in absolute value and without its friction."""
 
+    physical = (0.0, math.inf)
+
     start, flow, update, value = _peak(lambda sample: jnp.abs(motor_torque(sample)))
 
 
@@ -108,6 +121,8 @@ class SoftLoss:
     """1/(1 + (radius/|x|)^(1/softness)) of the last state [1], |x|^2 = sum of weight x^2 in rad and rad/s: near 0 for a
     run that comes to rest, near 1 for one that runs away, and smooth between. Its mean over starts is one minus a soft
     share of the region of attraction; see `basin`."""
+
+    physical = (0.0, 1.0)
 
     weight: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
     radius: Scalar = param(default=0.1, unit="1", above=0.0)
@@ -125,6 +140,8 @@ class SoftLoss:
 @pytree
 class RestTime:
     """Since when every angle has stayed within `band` of upright [s]; the end of the run if the last did not."""
+
+    physical = (0.0, math.inf)
 
     band: Scalar = param(default=0.01, unit="rad", above=0.0)
 
@@ -155,6 +172,8 @@ class RestTime:
 @pytree
 class BalanceCost:
     """Integral of x'diag(q) x + r u^2 dt [rad^2 s], u the voltage that the motor gets [V]."""
+
+    physical = (0.0, math.inf)
 
     q: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
     r: Scalar = param(default=0.0, unit="rad^2/V^2", low=0.0)

@@ -1,5 +1,6 @@
 """What a braking run costs: time, distance, locked wheel, effort of the brake."""
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -14,6 +15,8 @@ from diffabs.pytree import Scalar, param, pytree
 class StopTime:
     """Time to the stop [s]. A run that did not stop gets t + v/a with its last deceleration."""
 
+    physical = (0.0, math.inf)
+
     start, flow, update = FinalSlipError.start, nothing, unchanged
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
@@ -26,6 +29,8 @@ class StopTime:
 class StopDistance:
     """Distance to the stop [m]. A run that did not stop gets x + v^2/(2 a), so that rolling on is never the best."""
 
+    physical = (0.0, math.inf)
+
     start, flow, update = FinalSlipError.start, nothing, unchanged
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
@@ -37,6 +42,8 @@ class StopDistance:
 @pytree
 class LockedTime:
     """Time [s] during which the slip exceeds `threshold`. Crossings are interpolated linearly inside a step."""
+
+    physical = (0.0, math.inf)
 
     threshold: Scalar = param(default=0.99, unit="1", above=0.0, below=1.0)
 
@@ -63,6 +70,8 @@ class LockedTime:
 class Effort:
     """Integral of u^2 dt [N^2 m^2 s], u the torque that the actuator delivers."""
 
+    physical = (0.0, math.inf)
+
     start, update, value = from_zero, unchanged, integral
 
     def flow(self, memory: Memory, sample: Sample) -> Scalar:
@@ -81,6 +90,8 @@ class Varied(NamedTuple):
 @pytree
 class Variation:
     """Total variation of the torque, sum of |u_(k+1) - u_k| [N m]: what chattering costs."""
+
+    physical = (0.0, math.inf)
 
     flow = nothing
 
@@ -115,6 +126,8 @@ class TorqueRate:
     A shorter last step, which lands on the end of the run, does not count. Behind a lag the rate is finite; of a
     controller's own jumps the quotient says no more than jump/step.
     """
+
+    physical = (0.0, math.inf)
 
     flow = nothing
 

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.numerics import clamp, quotient
+from diffabs.plants.audit import BalanceAudit
 from diffabs.protocols import BalanceOutput
 from diffabs.pytree import Scalar, param, pytree
 
@@ -176,6 +177,11 @@ class ArmBalance:
     def energy(self, state: ArmState) -> Scalar:
         """Kinetic and potential energy [J]. energy' = tau psi' - d phi'^2."""
         return self.kinetic_energy(state) + self.potential_energy(state)
+
+    def audit(self) -> BalanceAudit:
+        """A run that gains energy without the motor was not integrated stably."""
+        lumps = self.lumps()
+        return BalanceAudit(plant=self, scale=self.gravity * (lumps.b1 + abs(lumps.b2) + abs(lumps.b3)))
 
     def power(self, state: ArmState, control: Scalar) -> tuple[Scalar, Scalar]:
         """What the motor puts in, tau psi', and what the rider's damper takes out, d phi'^2 [W]."""

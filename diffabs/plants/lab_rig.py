@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.numerics import clamp, quotient, smaller
+from diffabs.numerics import clamp, larger, quotient, smaller
+from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import BrakeStart, forward, halted, slip_ratio
 from diffabs.protocols import BrakeOutput, Road
 from diffabs.pytree import Scalar, param, part, pytree
@@ -113,6 +114,12 @@ class LabRig:
         drag = k * (self.drum_friction * drum + self.drum_stiction)
         brake = (pull * self.weight_torque + drag) / (1 - pull) - self.wheel_stiction - self.wheel_friction * spin
         return (brake - self.brake_offset) / self.brake_gain
+
+    def audit(self) -> BrakeAudit:
+        """A run that gains energy was not integrated stably: this brake never drives, unless its offset makes it."""
+        car, wheel = self.drum_inertia / self.drum_radius**2, self.wheel_inertia / self.wheel_radius**2
+        drive = larger(-(self.brake_gain * self.brake_threshold + self.brake_offset), 0.0)
+        return BrakeAudit(car=car, wheel=wheel, radius=self.wheel_radius, drive=drive)
 
     def energy(self, state: LabRigState) -> Scalar:
         """Kinetic energy of both wheels [J]."""

@@ -12,6 +12,7 @@ is the default. Eq. (12) is for omega2 r2 >= omega1 r1 only; beyond it the slip 
 from typing import NamedTuple
 
 from diffabs.numerics import quotient
+from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import GRAVITY, BrakeStart, forward, halted, slip_ratio
 from diffabs.protocols import BrakeOutput, Road
 from diffabs.pytree import Scalar, param, part, pytree
@@ -68,6 +69,11 @@ class MirroredRig:
         mu = self.road.friction(target, output.speed, output.distance)
         wheel = (1 - target) * self.wheel_inertia / (self.inertia_factor * self.wheel_radius)
         return mu * GRAVITY * (self.mass * self.wheel_radius + wheel)
+
+    def audit(self) -> BrakeAudit:
+        """A run that gains energy without a negative torque was not integrated stably."""
+        wheel = self.wheel_inertia / self.wheel_radius**2
+        return BrakeAudit(car=self.inertia_factor * self.mass, wheel=wheel, radius=self.wheel_radius)
 
     def energy(self, state: RigState) -> Scalar:
         """Kinetic energy [J]."""

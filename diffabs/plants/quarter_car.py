@@ -10,6 +10,7 @@ neglected."""
 from typing import NamedTuple
 
 from diffabs.numerics import quotient
+from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import GRAVITY, BrakeStart, forward, halted, slip_ratio
 from diffabs.protocols import BrakeOutput, Road
 from diffabs.pytree import Scalar, param, part, pytree
@@ -61,6 +62,10 @@ class QuarterCar:
         """tau* = mu (m g r + (1 - slip) J g/r): brakes the car and the wheel together at a constant slip."""
         mu = self.road.friction(target, output.speed, output.distance)
         return mu * GRAVITY * (self.mass * self.radius + (1 - target) * self.inertia / self.radius)
+
+    def audit(self) -> BrakeAudit:
+        """A run that gains energy without a negative torque was not integrated stably."""
+        return BrakeAudit(car=self.mass, wheel=self.inertia / self.radius**2, radius=self.radius)
 
     def energy(self, state: QuarterCarState) -> Scalar:
         """Kinetic energy [J]."""

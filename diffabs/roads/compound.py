@@ -10,6 +10,7 @@ from diffabs.numerics import clamp
 from diffabs.protocols import Road
 from diffabs.pytree import Scalar, Vector, param, part, pytree
 from diffabs.roads.burckhardt import DRY_ASPHALT, SNOW
+from diffabs.rules import Rule, increasing
 
 
 @pytree
@@ -52,9 +53,11 @@ class Patches:
         return total
 
     def problems(self) -> Iterator[str]:
-        """Objections that concern roads and edges together."""
+        """More or fewer edges than between the roads."""
         edges = np.asarray(self.edges)
         if edges.shape != (len(self.roads) - 1,):
             yield f"edges has shape {edges.shape}; {len(self.roads)} roads need ({len(self.roads) - 1},)"
-        elif not np.all(np.diff(edges) > 0):
-            yield f"edges = {edges} m is not increasing"
+
+    def rules(self) -> Iterator[Rule]:
+        """Edges that increase."""
+        yield increasing("edges", self.edges, "is not increasing", "m")

@@ -14,6 +14,7 @@ import numpy as np
 
 from diffabs.numerics import odd, ratio
 from diffabs.pytree import Scalar, Vector, param, pytree
+from diffabs.rules import Rule, array, increasing
 
 
 @pytree
@@ -80,14 +81,20 @@ class Tabulated:
         return PiecewiseCubic(knots=x, rows=jnp.stack([x[:-1], y[:-1], d[:-1], c2, c3], axis=1))
 
     def problems(self) -> Iterator[str]:
-        """Objections that concern both columns."""
+        """Columns of different lengths, or too short."""
         x, y = np.asarray(self.slip), np.asarray(self.mu)
         if x.shape != y.shape or x.ndim != 1 or x.size < 3:
             yield f"slip and mu have shapes {x.shape} and {y.shape}; both need the same length of at least 3"
-        elif not np.all(np.diff(x) > 0):
-            yield "slip is not increasing"
-        elif x[0] != 0 or y[0] != 0 or x[-1] != 1:
-            yield f"the knots run from ({x[0]:g}, {y[0]:g}) to slip {x[-1]:g}; they must run from (0, 0) to slip 1"
+
+    def rules(self) -> Iterator[Rule]:
+        """Knots that increase from (0, 0) to slip 1."""
+        x, y = array(self.slip), array(self.mu)
+        yield increasing("slip", self.slip, "is not increasing", "1")
+        yield Rule(
+            (x[0] == 0) & (y[0] == 0) & (x[-1] == 1),
+            "the knots do not run from (0, 0) to slip 1",
+            lambda: f"the knots run from ({x[0]:g}, {y[0]:g}) to slip {x[-1]:g}; they must run from (0, 0) to slip 1",
+        )
 
 
 @pytree

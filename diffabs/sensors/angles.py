@@ -7,8 +7,9 @@ import jax.numpy as jnp
 
 from diffabs.protocols import BalanceOutput, Clock, Jump, Memory, no_flow
 from diffabs.pytree import Scalar, param, pytree
+from diffabs.rules import Rule
 from diffabs.sensors.disturbance import drawn
-from diffabs.timing import period_problems, steps
+from diffabs.timing import steps, whole_steps
 
 
 @pytree
@@ -46,6 +47,6 @@ class AngleSensor:
         )
         return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(number * n == clock.k, a, b), held, memory.held)))
 
-    def grid_problems(self, step: float) -> Iterator[str]:
-        """A period off the integration grid."""
-        yield from period_problems("period", self.period, step)
+    def grid_rules(self, step: float) -> Iterator[Rule]:
+        """The period is on the integration grid."""
+        yield whole_steps("period", self.period, step)

@@ -10,7 +10,8 @@ from jax.custom_derivatives import SymbolicZero
 from diffabs.integrate import axpy
 from diffabs.protocols import BrakeOutput, Clock, Jump, Memory, no_flow, no_jump, no_memory
 from diffabs.pytree import Scalar, param, pytree
-from diffabs.timing import period_problems, steps
+from diffabs.rules import Rule
+from diffabs.timing import steps, whole_steps
 
 
 @pytree
@@ -49,9 +50,9 @@ class Noise:
         held = BrakeOutput(noise[0], noise[1], noise[2], noise[3], 0.0 * signal.distance)
         return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(draw * n == clock.k, a, b), held, memory.held)))
 
-    def grid_problems(self, step: float) -> Iterator[str]:
-        """A period off the integration grid."""
-        yield from period_problems("period", self.period, step)
+    def grid_rules(self, step: float) -> Iterator[Rule]:
+        """The period is on the integration grid."""
+        yield whole_steps("period", self.period, step)
 
 
 @jax.custom_jvp

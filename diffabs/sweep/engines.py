@@ -15,13 +15,14 @@ DECISIVE = ("jax", "jaxlib", "numpy", "scipy", "pyarrow")  # packages that can c
 
 
 class Done(NamedTuple):
-    """A chunk: the bytes of its file, how many lanes it has, and how many of them failed and diverged."""
+    """A chunk: the bytes of its file, how many lanes it has, and how many of them failed, diverged and were refused."""
 
     chunk: int
     data: bytes
     lanes: int
     failed: int
     diverged: int
+    refused: int = 0
 
 
 class Engine(Protocol):
@@ -53,14 +54,26 @@ class Local:
 def done(study: Study, chunk: int, columns: Columns) -> Done:
     """A chunk's columns, counted and encoded."""
     failed = failures(study, columns)
-    return Done(chunk, encoded(columns), len(failed), int(failed.sum()), int(columns["diverged"].sum()))
+    counts = (
+        len(failed),
+        int(failed.sum()),
+        int(np.sum(columns["diverged"] & accepted(columns["refused"]))),
+        int(np.sum(~accepted(columns["refused"]))),
+    )
+    return Done(chunk, encoded(columns), *counts)
+
+
+def accepted(refused: Any) -> np.ndarray:
+    """Lanes that were run, of the reasons why not (lanes,)."""
+    return np.asarray(refused).astype(str) == ""
 
 
 def failures(study: Study, columns: Any) -> np.ndarray:
-    """Lanes that diverged, did not stop, locked, or left a bound of the study (lanes,)."""
+    """Lanes that were run and diverged, did not stop, locked, or left a bound of the study (lanes,)."""
     failed = np.asarray(columns["diverged"]) | missed(columns["stopped"], columns)
     bounds = failing({"objectives": study.objectives, "failures": study.failures})
-    return np.any([failed, *(np.asarray(columns[name]) > bound for name, bound in bounds.items())], axis=0)
+    failed = np.any([failed, *(np.asarray(columns[name]) > bound for name, bound in bounds.items())], axis=0)
+    return failed & accepted(columns["refused"])
 
 
 def failing(study: Mapping[str, Any]) -> dict[str, float]:

@@ -2,7 +2,8 @@
 
 Standard normal coordinates z are mapped to the parameters v by `Space.normal`, and the metric m of the run is the score
 of `rare.subset_simulation`. All runs share one sequence of sensor noise: the probability is that over the parameters,
-given this noise. If asked for, design points are found by
+given this noise. It is of the whole space: where `simulate` would refuse a point there is no answer, since no run says
+on which side of the bound it lies. If asked for, design points are found by
 
     dm/dz_j = sum_i dm/dv_i dv_i/dz_j
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from diffabs.conveyor import measure_lanes
 from diffabs.pytree import replace
+from diffabs.refusals import refusals
 from diffabs.rollout import measure
 from diffabs.sweep.proposals import STARTS, Gradient
 from diffabs.sweep.rare import RareEvent, subset_simulation
@@ -33,7 +35,7 @@ def failure_probability(
     options: those of `subset_simulation`; runs that diverge do not count as failures and are reported
 
     Raises ValueError for a metric that is not measured, for a study that draws parts, for a bound that is not finite,
-    and (`proposals.Diverged`) where too many runs diverge.
+    for a point that is drawn and cannot be run, and (`proposals.Diverged`) where too many runs diverge.
     """
     study.check()
     if metric not in study.objectives:
@@ -52,11 +54,24 @@ def _scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
     """The metric at z (n, dimension), NaN where the run diverges. n is filled up to a power of two: few programs."""
     values = study.space.normal(_filled(z, 1 << (len(z) - 1).bit_length()))
     size = len(next(iter(values.values())))
+    _check_runnable(study, values, len(z))
     with precision(study.dtype):
         keys = jax.vmap(lambda _: noise_key(study.seed, 0))(np.arange(size))
         loop, objective = _typed(study, metric)
-        done = jax.device_get(measure_lanes(loop, values, study.solver, objective, keys=keys))
+        done = jax.device_get(
+            measure_lanes(loop, values, study.solver, objective, keys=keys, accepted=np.ones(size, bool))
+        )
     return np.asarray(done.metrics[metric], float)[: len(z)]
+
+
+def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) -> None:
+    """Raises ValueError, in a line, for points of which the first `count` cannot all be run."""
+    refused = refusals(study.loop, values, study.solver)
+    bad = np.flatnonzero(refused.codes[:count])
+    if len(bad):
+        at = ", ".join(f"{path} = {column[bad[0]]:.6g}" for path, column in values.items())
+        why = f"{refused.texts[bad[0]]} (at {at})"
+        raise ValueError(f"no probability: {len(bad)} of {count} points cannot be run: {why}; narrow the ranges")
 
 
 def _gradient(study: Study, metric: str) -> Gradient:
@@ -64,7 +79,9 @@ def _gradient(study: Study, metric: str) -> Gradient:
     slopes = _slopes(study, metric)
 
     def gradient(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        values = {path: column.astype(study.dtype) for path, column in study.space.normal(_filled(z, STARTS)).items()}
+        values = study.space.normal(_filled(z, STARTS))
+        _check_runnable(study, values, len(z))
+        values = {path: column.astype(study.dtype) for path, column in values.items()}
         with precision(study.dtype):
             score, by_value = jax.device_get(slopes(values))
         chain = [by_value[path][: len(z), None] * column for path, column in _steepness(study, z).items()]

@@ -9,11 +9,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from diffabs.sweep.engines import accepted
 from diffabs.sweep.store import CHUNKS, NAME, SweepError, read_manifest
+from diffabs.sweep.study import FLAGS
 
 
 class Results:
-    """The chunks that are there. One row for each sample: parameters, metrics, `stopped`, `diverged`.
+    """The chunks that are there. One row for each sample: parameters, metrics, `stopped`, `diverged`, `refused`.
+
+    A sample that `simulate` would refuse was not run: `refused` says why, its metrics are NaN, `diverged` is set
+    lest it enter a mean, and it is in no statistic.
 
     The folder `chunks` is a Parquet data set, for `pandas.read_parquet`, `polars.scan_parquet` and DuckDB as it is.
     """
@@ -45,7 +50,7 @@ class Results:
     @property
     def variables(self) -> list[str]:
         """Paths of what varies."""
-        known = {"sample", "stopped", "diverged", *self.metrics}
+        known = {"sample", *FLAGS, *self.metrics}
         return [name for name in self._schema().names if name not in known]
 
     def is_number(self, name: str) -> bool:
@@ -88,10 +93,14 @@ class Results:
         """An xarray.Dataset over the dimension `sample`."""
         return self.pandas().to_xarray()
 
+    @property
+    def accepted(self) -> np.ndarray:
+        """Which samples were run, in their order."""
+        return accepted(self.column("refused"))
+
     def diverged(self) -> pa.Table:
-        """The rows of lanes that diverged: they are in no statistic."""
-        table = self.table()
-        return table.filter(table.column("diverged"))
+        """The rows of lanes that were run and diverged: they are in no statistic."""
+        return self.table().filter(pa.array(self.column("diverged") & self.accepted))
 
     def worst(self, metric: str, count: int = 10) -> pa.Table:
         """The rows with the greatest values of a metric, the worst first."""

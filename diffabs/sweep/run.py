@@ -21,7 +21,7 @@ HERE, MISSING, UNKNOWN = 0, 1, 2  # a chunk
 
 class Progress(NamedTuple):
     """How far a sweep is: samples that are done, of how many, those that this run has done in how many seconds, and
-    how many of these failed and diverged; `damaged`: chunks that were found damaged and are computed again."""
+    how many of these failed, diverged and were refused; `damaged`: chunks found damaged that are computed again."""
 
     samples: int
     total: int
@@ -30,6 +30,7 @@ class Progress(NamedTuple):
     failed: int
     diverged: int
     damaged: tuple[int, ...]
+    refused: int = 0
 
     @property
     def rate(self) -> float:
@@ -116,7 +117,7 @@ class _Tally:
     def __init__(self, study: Study, missing: list[int], damaged: tuple[int, ...], told: Any):
         self.total, self.told, self.damaged = study.samples, told, damaged
         self.before = study.samples - sum(b - a for a, b in map(study.bounds, missing))
-        self.here = self.failed = self.diverged = 0
+        self.here = self.failed = self.diverged = self.refused = 0
         self.begun = time.monotonic()
         self.tell()
 
@@ -124,10 +125,11 @@ class _Tally:
         self.here += done.lanes
         self.failed += done.failed
         self.diverged += done.diverged
+        self.refused += done.refused
         self.tell()
 
     def tell(self) -> None:
         if self.told:
             seconds = time.monotonic() - self.begun
             counts = (self.before + self.here, self.total, self.here, seconds, self.failed, self.diverged)
-            self.told(Progress(*counts, self.damaged))
+            self.told(Progress(*counts, self.damaged, self.refused))

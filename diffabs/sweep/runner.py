@@ -1,4 +1,4 @@
-"""Chunks of lanes in one compiled function.
+"""Chunks of lanes in one compiled function. A lane that `simulate` would refuse does not run: its row says why.
 
 A block is a number of lanes of one structure, always as many. On D devices D blocks run at once, each in a program of
 its own. A program sharded over the devices (`shard_map`) is another one for each D, and rounds otherwise; this one is
@@ -8,12 +8,14 @@ them a chunk is sorted into blocks of an eighth, the last of each structure fill
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from diffabs.conveyor import measure_lanes
+from diffabs.refusals import refusals
 from diffabs.sweep.study import FLAGS, Study, noise_key, numbers, precision
 
 PARTS_OF_A_CHUNK = 8
@@ -42,11 +44,12 @@ class Runner:
         self._pool = ThreadPoolExecutor(len(self.devices))
 
     def run(self, chunks: Sequence[int]) -> list[Columns]:
-        """The columns of each chunk: sample, one per variable, metrics, stopped, diverged."""
+        """The columns of each chunk: sample, one per variable, metrics, stopped, diverged, refused (why, or '')."""
         drawn = [self._drawn(c) for c in chunks]
         for columns in drawn:
             columns |= {name: np.zeros(len(columns["sample"]), self.study.dtype) for name in self.study.objectives}
-            columns |= {name: np.zeros(len(columns["sample"]), bool) for name in FLAGS}
+            columns |= {name: np.zeros(len(columns["sample"]), bool) for name in FLAGS[:-1]}
+            columns |= {FLAGS[-1]: np.full(len(columns["sample"]), "", object)}
         for names, blocks in self._sorted(drawn).items():
             for k in range(0, len(blocks), len(self.devices)):
                 together = blocks[k : k + len(self.devices)]
@@ -77,27 +80,33 @@ class Runner:
 
     def _together(self, names: tuple[str, ...], blocks: list[_Block]) -> Iterator[Columns]:
         """One block on each device, or fewer."""
-        program = self._program(names)
-        return self._pool.map(lambda block, device: self._alone(program, block, device), blocks, self.devices)
+        loop, program = self._variant(names), self._program(names)
+        return self._pool.map(lambda block, device: self._alone(loop, program, block, device), blocks, self.devices)
 
-    def _alone(self, program: Any, block: _Block, device: Any) -> Columns:
+    def _alone(self, loop: Any, program: Any, block: _Block, device: Any) -> Columns:
+        with jax.default_device(device):
+            asked = refusals(loop, block.values, self.study.solver)
         with precision(self.study.dtype):
             values = {path: column.astype(self.study.dtype) for path, column in block.values.items()}
-            return jax.device_get(program(*jax.device_put((values, block.samples.astype(np.uint32)), device)))
+            given = (values, block.samples.astype(np.uint32), asked.accepted)
+            found = jax.device_get(program(*jax.device_put(given, device)))
+        return found | {"refused": asked.texts.astype(object)}
+
+    def _variant(self, names: tuple[str, ...]) -> Any:
+        return self.study.variant(dict(zip(self.study.parts, names, strict=True)))
 
     def _program(self, names: tuple[str, ...]) -> Any:
         if names not in self._programs:
-            loop = self.study.variant(dict(zip(self.study.parts, names, strict=True)))
             loop, objectives = jax.tree.map(
-                lambda x: np.asarray(x, self.study.dtype), (loop, dict(self.study.objectives))
+                lambda x: np.asarray(x, self.study.dtype), (self._variant(names), dict(self.study.objectives))
             )
             study = dataclasses.replace(self.study, objectives=objectives)
-            self._programs[names] = jax.jit(lambda values, samples: _block(study, loop, values, samples))
+            self._programs[names] = jax.jit(partial(_block, study, loop))
         return self._programs[names]
 
 
-def _block(study: Study, loop: Any, values: Mapping[str, Any], samples: Any) -> dict[str, Any]:
-    """Metrics and flags of a block of lanes."""
+def _block(study: Study, loop: Any, values: Mapping[str, Any], samples: Any, accepted: Any) -> dict[str, Any]:
+    """Metrics and flags of a block of lanes, of which those run that are accepted."""
     keys = jax.vmap(lambda sample: noise_key(study.seed, sample))(samples)
-    done = measure_lanes(loop, values, study.solver, study.objectives, keys=keys)
+    done = measure_lanes(loop, values, study.solver, study.objectives, keys=keys, accepted=accepted)
     return done.metrics | {"stopped": done.stopped, "diverged": done.diverged}

@@ -17,6 +17,7 @@ from diffabs.loop import Loop, task
 from diffabs.objectives import REPORTS
 from diffabs.protocols import Objective
 from diffabs.pytree import elements, get, problems, replace
+from diffabs.refusals import ill
 from diffabs.rollout import FixedStep
 from diffabs.sweep.discrete import Categorical
 from diffabs.sweep.space import Space
@@ -24,7 +25,7 @@ from diffabs.sweep.space import Space
 DTYPES = ("float32", "float64")
 RANGES = (("samples", 1, 2**32 - 1), ("chunk", 1, 2**20), ("seed", 0, 2**32 - 1))  # keys are folded with 32 bits
 NOISE = 2**32 - 1  # of the stream of keys, folded into the seed where the random design folds the number of a sample
-FLAGS = ("stopped", "diverged")
+FLAGS = ("stopped", "diverged", "refused")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -117,6 +118,8 @@ class Study:
         for name in ("step", "duration"):
             if not 0 < getattr(self.solver, name) < np.inf:
                 yield f"solver.{name} = {getattr(self.solver, name)} is not positive and finite"
+                return
+        yield from ill(self.solver)
         for name in {"sample", *FLAGS, *self.space.paths} & self.objectives.keys():
             yield f"objectives.{name}: another column of the table has this name"
         for name, bound in self.failures.items():

@@ -37,15 +37,18 @@ NOTES = {
 
 
 def summary(found: Results, confidence: float = 0.95) -> dict[str, Any]:
-    """Of the chunks that are there. Lanes that diverged are counted, and in no statistic but the failures."""
-    diverged = found.column("diverged")
-    view = _View(found, ~diverged)
+    """Of the chunks that are there. Lanes that diverged are counted, and in no statistic but the failures; lanes that
+    were refused are counted, and in none."""
+    accepted = found.accepted
+    diverged = found.column("diverged") & accepted
+    view = _View(found, accepted & ~diverged, accepted)
     kind = found.study["space"]["design"]["type"]
     note = NOTES["one sobol" if kind == "sobol" and view.replicates == 1 else kind]
     return {
         "samples": len(diverged),
         "complete": found.complete,
         "diverged": {"count": int(diverged.sum()), "samples": found.column("sample")[diverged][:WORST].tolist()},
+        "refused": _refused(found, accepted),
         "confidence": confidence,
         "intervals": note,
         "failures": dict(_failures(found, view, confidence)),
@@ -56,12 +59,22 @@ def summary(found: Results, confidence: float = 0.95) -> dict[str, Any]:
     }
 
 
+def _refused(found: Results, accepted: np.ndarray) -> dict[str, Any]:
+    """How many samples were not run, the first of them, and how often for which reason."""
+    reasons, counts = np.unique(found.column("refused")[~accepted].astype(str), return_counts=True)
+    return {
+        "count": int(np.sum(~accepted)),
+        "samples": found.column("sample")[~accepted][:WORST].tolist(),
+        "reasons": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
+    }
+
+
 class _View:
     """The rows that are in the statistics, and how they are grouped."""
 
-    def __init__(self, found: Results, good: np.ndarray):
+    def __init__(self, found: Results, good: np.ndarray, accepted: np.ndarray):
         design = found.study["space"]["design"]
-        self.found, self.good = found, good
+        self.found, self.good, self.accepted = found, good, accepted
         self.random = design["type"] not in ("grid", "corners")
         self.replicates = design.get("replicates", 1) if found.complete else 1
         self.period = len(found.study["space"]["variables"]) + 2 if design["type"] == "saltelli" else 1
@@ -78,14 +91,22 @@ class _View:
 
 def _failures(found: Results, view: _View, confidence: float) -> Iterator[tuple[str, Any]]:
     columns = {name: found.column(name) for name in failing(found.study) | {"stopped": 0, "diverged": 0}}
-    kinds = {"diverged": columns["diverged"], "not stopped": missed(columns["stopped"], found.study["objectives"])}
+    kinds = {
+        "diverged": columns["diverged"] & view.accepted,
+        "not stopped": missed(columns["stopped"], found.study["objectives"]),
+    }
     kinds |= {f"{name} > {bound:g}": columns[name] > bound for name, bound in failing(found.study).items()}
     kinds["any"] = np.any(list(kinds.values()), axis=0)
+    asked = view.rows & view.accepted
+    if not asked.any():
+        return
+    parts = np.split(view.accepted, view.replicates)
     for name, failed in kinds.items():
-        count = Count(int(failed[view.rows].sum()), int(view.rows.sum()))
+        count = Count(int(failed[asked].sum()), int(asked.sum()))
         one = count.probability(confidence=confidence).table()
-        if view.replicates > 1:
-            shares = [float(block.mean()) for block in np.split(failed, view.replicates)]
+        if view.replicates > 1 and all(part.any() for part in parts):
+            blocks = zip(np.split(failed, view.replicates), parts, strict=True)
+            shares = [float(block[part].mean()) for block, part in blocks]
             one = replicated(shares, confidence=confidence).table() | {"value": count.failures / count.samples}
         yield name, {"count": count.failures, **_plain(one, view.random)}
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from diffabs.protocols import Objective
 from diffabs.pytree import get, parameters, replace
+from diffabs.refusals import first_line, traced
 from diffabs.rollout import FixedStep, Run, measure
 
 LONGER = 2.0  # lanes that run together differ by less than this factor in length
@@ -80,8 +81,18 @@ class Batch:
         return replace(loop, {path: np.asarray(column)[i] for path, column in self.values.items()})
 
 
+def check_lanes(loop: Any, batch: Batch, solver: FixedStep) -> None:
+    """Raises ValueError, one line, for the first lane that must not be run: see `refusals`."""
+    if line := first_line(loop, batch.values, solver):
+        raise ValueError(line)
+
+
 def run(loop: Any, batch: Batch, solver: FixedStep, measured: Mapping[str, Objective]) -> Run:
-    """Every lane of a batch, in order, without trajectories: metrics (lanes,). Pure; differentiable in the loop."""
+    """Every lane of a batch, in order, without trajectories: metrics (lanes,). Pure; differentiable in the loop.
+
+    Raises ValueError for a lane that must not be run, unless the call is traced: then ask `check_lanes` before."""
+    if not traced(loop, dict(batch.values)):
+        check_lanes(loop, batch, solver)
     columns = batch.arrays()
     if not jax.tree.leaves(columns):
         return jax.tree.map(lambda x: x[None], measure(loop, solver, measured))

@@ -9,8 +9,11 @@ and how, is in `fit`; what is known afterwards, and what is not, in `uncertainty
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
+
 from diffabs.loop import Loop
 from diffabs.pytree import check, replace, strong
+from diffabs.refusals import refusals
 from diffabs.rollout import FixedStep
 from diffabs.stability import stable_steps
 from diffabs.tune.comparison import Data
@@ -35,21 +38,23 @@ def identify(
 ) -> Identified:
     """Fit free parameters of a loop, by dotted path, to data. The other arguments are those of `fit`.
 
-    A point is rejected where the run diverges and where `solver.step` is not stable.
+    A point is rejected where a run diverges, or must not be run: see `refusals`.
 
     Raises:
-        ValueError: what `fit` and the data object to; a step that is not stable at the start.
+        ValueError: what `fit` and the data object to; a run that must not be run at the start.
     """
     check(loop)
     against = data.against(loop, list(free), solver)
 
-    def limit(part: Any) -> float:
-        return min(float(stable_steps(strong(batch)).min()) for batch in against.loops(part))
+    def refused(part: Any) -> str | None:
+        """Why the first run that must not be run must not."""
+        asked = (refusals(None, jax.device_get(strong(batch)), solver) for batch in against.loops(part))
+        return next((next(filter(None, found.texts)) for found in asked if found.number), None)
 
     for start in starts or ({},):
-        if limit(replace(loop, dict(start))) < solver.step:
-            most = limit(replace(loop, dict(start)))
-            raise ValueError(f"solver.step = {solver.step:g} s is not stable at the start; at most {most:.2g} s is")
+        if why := refused(first := replace(loop, dict(start))):
+            most = min(float(stable_steps(strong(batch)).min()) for batch in against.loops(first))
+            raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
     return fit(
         loop,
         free,
@@ -61,7 +66,7 @@ def identify(
         starts=starts,
         norm=norm,
         tolerances=tolerances,
-        usable=lambda part: limit(part) >= solver.step,
+        usable=lambda part: refused(part) is None,
         progress=progress,
         stopping=stopping,
     )

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from diffabs.refusals import first_line
 from diffabs.tune.descent import Descent, Lane, Optimiser, Point, Reason, lbfgs
-from diffabs.tune.problem import Multipliers, Problem, Seen
+from diffabs.tune.problem import Multipliers, Problem, Seen, built
 from diffabs.tune.result import Method, Progress, Start, StartError, Tuned
 
 PENALTY = 10.0  # at first; the loss is of the order of one
@@ -34,12 +35,18 @@ class Search:
         progress: Callable[[Progress], None] | None,
         stopping: Callable[[], bool] = lambda: False,
     ):
-        """Starts: the subject itself, and as many random ones as the method asks for."""
+        """Starts: the subject itself, and as many random ones as the method asks for. Raises StartError if the subject
+        must not be run as it is, and there is no other start."""
         self.problem, self.method, self.progress, self.stopping = problem, method, progress, stopping
+        self.refused = first_line(built(problem.subject), problem.batch.values, problem.solver)
+        if self.refused and method.starts == 1:
+            raise StartError(f"{Reason.START.value}: {self.refused}")
         own = problem.space.place(problem.subject)[None]
         drawn = problem.space.spread(jax.random.key(method.seed), method.starts - 1)
         self.starts = np.concatenate([own, drawn])
         self.before: Seen = jax.device_get(_first(problem.valuer()(jnp.asarray(own))))
+        if self.refused:  # its numbers mean nothing
+            self.before = jax.tree.map(lambda x: np.full(np.shape(x), np.nan), self.before)._replace(diverged=0)
         size = abs(float(self.before.objective))
         self.scale = size if np.isfinite(size) and size > 0 else 1.0
         self.round = 0
@@ -114,7 +121,7 @@ class Search:
         return (
             f"{worst} of {self.problem.batch.size} lanes diverge there"
             if worst
-            else f"solver.step = {self.problem.solver.step:g} s"
+            else self.refused or f"solver.step = {self.problem.solver.step:g} s"
         )
 
     def _tuned(self, best: Lane, lanes: list[Lane]) -> Tuned:

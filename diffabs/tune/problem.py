@@ -20,15 +20,14 @@ import numpy as np
 from diffabs.loop import Loop
 from diffabs.protocols import Objective
 from diffabs.pytree import replace, strong
+from diffabs.refusals import refusals
 from diffabs.rollout import FixedStep, Run
-from diffabs.stability import stable_steps
 from diffabs.tune.aggregate import Aggregate
 from diffabs.tune.batch import Batch, run
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.space import Space
 
 FEW = 6  # parameters up to which forward mode is the cheaper one (benchmarks/bench_gradient.py)
-STIFFEST = 6  # lanes that are asked about the stability of the step at every trial
 
 
 class Mode(enum.Enum):
@@ -122,18 +121,9 @@ class Problem:
         return jax.jit(jax.vmap(self.seen))
 
     def steady(self) -> Callable[[np.ndarray], np.ndarray]:
-        """(starts, p) -> whether the step is stable for the loop there (starts,). Asked of the lanes that are the
-        stiffest at the start."""
+        """(starts, p) -> whether every lane may be run there (starts,): the parts' rules, and a stable step. Compiled
+        once."""
         values = self.batch.arrays()[0]
-        if self.batch.size > STIFFEST and values:
-            start = np.asarray(self._loops(values)(self.space.place(self.subject)[None]))
-            stiffest = np.argsort(start[0])[:STIFFEST]
-            values = {path: column[stiffest] for path, column in values.items()}
-        limits = self._loops(values)
-        return lambda z: limits(z).min(axis=1) >= self.solver.step
-
-    def _loops(self, values: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray]:
-        """z (starts, p) -> the largest stable steps (starts, lanes) of the loops with these values; compiled once."""
 
         def loops(z: Any) -> Loop:
             loop = strong(built(self.space.at(self.subject, z)))
@@ -143,11 +133,11 @@ class Problem:
 
         compiled = jax.jit(jax.vmap(loops))
 
-        def limits(z: np.ndarray) -> np.ndarray:
-            flat = jax.tree.map(lambda x: jnp.reshape(x, (-1, *x.shape[2:])), compiled(jnp.asarray(z)))
-            return stable_steps(flat).reshape(len(z), -1)
+        def accepted(z: np.ndarray) -> np.ndarray:
+            flat = jax.tree.map(lambda x: np.reshape(x, (-1, *x.shape[2:])), jax.device_get(compiled(jnp.asarray(z))))
+            return refusals(None, flat, self.solver).accepted.reshape(len(z), -1).min(axis=1)
 
-        return limits
+        return accepted
 
 
 def automatic(space: Space) -> Mode:

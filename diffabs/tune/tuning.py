@@ -43,7 +43,7 @@ def tune(
     stopping: asked after every evaluation; True ends the search with the best that it has met so far
 
     Raises:
-        ValueError: a path, range, metric or batch that does not fit.
+        ValueError: a path, range, metric or batch that does not fit; a lane that must not be run whatever is tuned.
         StartError: a start that diverges, or at which the integration step is not stable, if there is no other.
     """
     method = method or Method()

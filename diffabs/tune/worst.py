@@ -22,6 +22,7 @@ from diffabs.loop import task
 from diffabs.objectives import REPORTS
 from diffabs.protocols import Objective
 from diffabs.pytree import check, replace
+from diffabs.refusals import first_line
 from diffabs.rollout import FixedStep, Run, measure
 from diffabs.tune.aggregate import Mean
 from diffabs.tune.batch import Batch
@@ -118,7 +119,8 @@ def worst_case(
     price: rollouts that a gradient counts as; None is 1 + 1.5 p in forward mode and 6 in reverse
 
     Raises:
-        ValueError: a path or range that does not fit, an unknown metric.
+        ValueError: a path or range that does not fit, an unknown metric, a corner or another point of the box that
+            cannot be run.
     """
     check(loop)
     measured = REPORTS[task(loop.plant)] if measured is None else measured
@@ -128,6 +130,8 @@ def worst_case(
     free, key = space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
     corners = _corners(np.array(free.ranges))
     points = np.concatenate([corners, _drawn(np.array(free.ranges), screen, seed)])
+    if line := first_line(loop, _at(free, points, points.shape[:1]), solver):
+        raise ValueError(f"the box has points that cannot be run; {line}")
     screened = _screened(loop, free, points, solver, measured, seed_of_noise)
     values = screened.metrics[metric]
     mode = automatic(free)
@@ -149,12 +153,12 @@ def _drawn(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
     return low + (high - low) * qmc.Sobol(len(low), rng=np.random.default_rng(seed)).random(screen)
 
 
-def _at(free: Space, point: Any) -> dict[str, Any]:
-    """Parameters by path from their numbers in a row."""
+def _at(free: Space, point: Any, lanes: tuple[int, ...] = ()) -> dict[str, Any]:
+    """Parameters by path from their numbers in a row, or in the rows of so many lanes."""
     found, first = {}, 0
     for entry in free.entries:
         n = len(entry.maps)
-        found[entry.path] = point[first : first + n].reshape(entry.shape)
+        found[entry.path] = point[..., first : first + n].reshape(*lanes, *entry.shape)
         first += n
     return found
 
@@ -182,7 +186,7 @@ def _ascent(problem: Problem, points: np.ndarray, iterations: int) -> list[Lane]
     descent = Descent(
         problem.evaluator(scale),
         lambda z, m: loss(z, m)[0],
-        lambda z: np.ones(len(z), bool),
+        problem.steady(),
         lbfgs(),
         Stopping(iterations=iterations),
         lambda lanes: None,
@@ -205,7 +209,7 @@ def _found(
     i = int(np.argmax(values))
     place, value, metrics = _at(free, points[i]), float(values[i]), {n: x[i] for n, x in screened.metrics.items()}
     for lane in lanes:
-        if -float(lane.seen.objective) > value:
+        if lane.reason is not Reason.START and -float(lane.seen.objective) > value:
             place, value = free.values(jnp.asarray(lane.z)), -float(lane.seen.objective)
             metrics = {name: x[0] for name, x in lane.seen.metrics.items()}
     bad = np.flatnonzero(screened.diverged | np.isnan(screened.metrics[metric]))

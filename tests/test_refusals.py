@@ -1,0 +1,309 @@
+"""Nothing that one run would refuse is run in a batch, and a run whose numbers cannot be says so."""
+
+import dataclasses
+import json
+
+import commands
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sweeping import described
+
+import diffabs as d
+from diffabs import actuators, controllers, objectives, plants, references, refusals, roads, sensors, stability
+from diffabs.basin import recovered
+from diffabs.conveyor import measure_lanes
+from diffabs.objectives import BALANCE, BRAKING
+from diffabs.plants.audit import BrakeAudit
+from diffabs.protocols import BrakeOutput, Ending, Sample
+from diffabs.pytree import replace, strong
+from diffabs.rollout import _impossible
+from diffabs.stops import Fallen, SpeedReached
+from diffabs.sweep import Results, sweep
+from diffabs.sweep.reliability import failure_probability
+from diffabs.sweep.summary import summary
+from diffabs.tune import Batch, Method, StartError, Traces, identify, posed, run, tune, worst_case
+
+RIG = d.Loop(
+    plant=plants.MirroredRig(),
+    initial=d.BrakeStart(speed=50 / 3.6),
+    sensor=sensors.WheelSpeed(),
+    feedforward=controllers.HoldingInput(),
+    controller=controllers.StateFeedback(),
+    stop=SpeedReached(),
+)  # `sensor=wheel-speed` of slip-lmi
+SOLVER = d.FixedStep(1e-3, 0.25)
+FEEDBACK = controllers.ScheduledFeedback(speeds=np.array([2.0, 9.0]))
+ROAD = roads.Patches(roads=(roads.RIG, roads.SNOW, roads.RIG), edges=np.array([3.0, 5.0]))
+BAD = {  # a loop, values by lane of which the first is fine, and what is said of the others
+    "limits": (
+        replace(RIG, {"controller.torque_min": 0.0, "controller.torque_max": 9.0}),
+        {"controller.torque_min": [0.0, 9.5, np.nan], "controller.torque_max": [9.0, 9.0, 9.0]},
+        ["controller.torque_min exceeds torque_max", "controller.torque_min is outside (-inf, inf) N m"],
+    ),
+    "period": (
+        dataclasses.replace(RIG, sensor=sensors.Noise()),
+        {"sensor.period": [2e-3, 1.5e-3, 4e-4]},
+        ["sensor.period is not a multiple of solver.step = 0.001 s"],
+    ),
+    "computing": (
+        dataclasses.replace(RIG, controller=controllers.Sampled(controller=controllers.StateFeedback())),
+        {"controller.delay": [1e-3, 1.2e-3, 0.0], "controller.period": [2e-3, 1e-3, 2.5e-3]},
+        ["controller.delay exceeds the period", "controller.period is not a multiple of solver.step = 0.001 s"],
+    ),
+    "ring": (
+        dataclasses.replace(RIG, actuator=actuators.Delay(capacity=16)),
+        {"actuator.time": [14e-3, 15e-3, 9e-4]},
+        ["actuator.time is outside [0.001, 0.014] s, one step to capacity - 2 steps"],
+    ),
+    "edges": (
+        replace(RIG, {"plant.road": ROAD}),
+        {"plant.road.edges.0": [3.0, 5.5, 5.0]},
+        ["plant.road.edges is not increasing"],
+    ),
+    "schedule": (
+        dataclasses.replace(RIG, controller=FEEDBACK),
+        {"controller.speeds.1": [9.0, 1.0, 2.0]},
+        ["controller.speeds do not increase"],
+    ),
+    "start": (
+        RIG,
+        {"initial.speed": [9.0, 1.3, 1.388]},
+        ["initial.speed is not above stop.speed: the run would end before it starts"],
+    ),
+    "fallen": (
+        dataclasses.replace(d.loop.TYPICAL["balance"], stop=Fallen(angle=0.5)),
+        {"initial.theta": [0.1, 0.6, -0.5]},
+        ["initial is at the stop or beyond: the run would end before it starts"],
+    ),
+}
+
+
+@pytest.fixture
+def any_step(monkeypatch):
+    """Without the seconds that the stability takes to compile."""
+    monkeypatch.setattr(refusals, "stable", lambda loop, values, step: np.ones(len(jax.tree.leaves(values)[0]), bool))
+    monkeypatch.setattr(refusals, "stable_step", lambda loop: np.inf)
+
+
+class TestBeforeARun:
+    @pytest.mark.parametrize("name", BAD)
+    def test_a_lane_is_refused_where_its_loop_alone_would_be(self, any_step, name):
+        """In single precision as well: the check is in double, like that of one loop."""
+        loop, values, reasons = BAD[name]
+        values = {path: np.array(column) for path, column in values.items()}
+        for given in (loop, jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), loop)):
+            found = refusals.refusals(given, values, SOLVER)
+            assert found.accepted.tolist() == [True, False, False]
+            assert set(found.texts[1:]) == set(reasons)
+            assert found.number == 2
+        for i, fine in enumerate(found.accepted):
+            lane = replace(loop, {path: column[i] for path, column in values.items()})
+            if fine:
+                assert d.check(lane, SOLVER) is lane
+            else:
+                with pytest.raises(ValueError, match=next(iter(values)).split(".")[0]):
+                    d.check(lane, SOLVER)
+
+    def test_a_solver_that_fits_nothing_is_named(self, any_step):
+        for solver, message in (
+            (d.FixedStep(0.3, 0.25), "longer than solver.duration"),
+            (d.FixedStep(1e-9, 1.0), "too many steps"),
+        ):
+            with pytest.raises(ValueError, match=message):
+                refusals.refusals(RIG, {"plant.mass": np.array([5.0])}, solver)
+            with pytest.raises(ValueError, match=message):
+                d.check(RIG, solver)
+
+    def test_the_step_is_judged_as_by_the_eigenvalues(self):
+        """Whatever a lane is decided by: the first bound, the squared one, or its eigenvalues; the last are NumPy's."""
+        rng = np.random.default_rng(0)
+        n = 600
+        values = {
+            "sensor.time_constant": 10 ** rng.uniform(-4.5, -2, n),
+            "plant.mass": rng.uniform(4, 8, n),
+            "controller.gain.1": -(10 ** rng.uniform(1, 4, n)),
+        }
+        steps = stability.stable_steps(
+            jax.vmap(lambda v: replace(strong(RIG), v))({path: jnp.asarray(x) for path, x in values.items()})
+        )
+        for h in (1e-4, 1e-3, float(np.median(steps)), float(steps[7]), float(steps[8]) * (1 + 1e-6)):
+            np.testing.assert_array_equal(stability.stable(RIG, values, h), steps >= h)
+        quick = 1e-4 * np.asarray(stability._bounds(RIG, values, squarings=0)) <= stability.WITHIN
+        assert np.mean(quick) > 0.7 * np.mean(steps >= 1e-4)  # few are left to the eigenvalues
+        alike = {"initial.slip": np.linspace(0.0, 0.5, 5)}  # moves no matrix
+        assert stability.stable(RIG, alike, 1e-4).all()
+        assert not stability.stable(RIG, alike, 2e-2).any()
+
+
+class TestAfterARun:
+    @pytest.mark.parametrize("step", [1e-4, 1e-3])
+    def test_an_unstable_step_is_seen_although_every_number_is_finite(self, step):
+        """At 1e-6 s the run ends after three steps at -1e13 m: it has not stopped, and there is no mean to enter."""
+
+        def one(T):
+            return d.measure(replace(RIG, {"sensor.time_constant": T}), d.FixedStep(step, 2500 * step), BRAKING)
+
+        many = jax.jit(jax.vmap(one))(jnp.array([1e-6, 3e-6, 1e-5, 2e-5, 3e-5]))
+        assert np.asarray(many.diverged).all()
+        assert not np.asarray(many.stopped).any()
+        assert all(np.isnan(x).all() for x in many.metrics.values())
+
+    def test_a_start_beyond_the_stop_is_no_run(self):
+        for start in (1.0, 5 / 3.6):
+            found = d.measure(replace(RIG, {"initial.speed": start}), SOLVER, BRAKING)
+            assert found.diverged
+            assert np.isnan(found.metrics["stop_time"])
+        fallen = replace(d.loop.TYPICAL["balance"], {"initial.theta": 2.0})
+        assert d.measure(fallen, SOLVER, BALANCE).diverged
+
+    def test_a_metric_outside_its_range_is_a_run_that_diverged(self):
+        for part in (*BRAKING.values(), *BALANCE.values()):
+            assert type(part).physical[0] <= 0
+        for name, part, value, bad in (
+            ("time", objectives.StopTime(), -1e-6, True),
+            ("time", objectives.StopTime(), 0.0, False),
+            ("time", objectives.StopTime(), np.nan, True),
+            ("slip", objectives.MaxSlip(), 1.1, True),
+            ("slip", objectives.MaxSlip(), -1.0, False),
+            ("", objectives.StopTime(), 1.5, True),
+            ("", objectives.StopTime(), 0.5, False),
+            ("own", object(), -5.0, False),
+        ):
+            assert bool(_impossible(name, part, jnp.asarray(value))) is bad, (name, value)
+
+    def test_a_torque_that_drives_the_wheel_is_no_alarm(self):
+        """The car speeds up, its energy grows with the torque's work: physical, if hardly a brake."""
+        for plant in (plants.MirroredRig(), plants.QuarterCar()):
+            loop = d.Loop(
+                plant=plant, initial=d.BrakeStart(speed=8.0), controller=controllers.ConstantTorque(torque=-3.0),
+                reference=references.FixedSlip(), stop=SpeedReached(speed=1.0),
+            )  # fmt: skip
+            found = d.measure(loop, SOLVER, BRAKING)
+            assert found.ending.sample.output.speed > 8.02
+            assert not found.diverged
+
+
+def sample(speed, wheel, distance, control=0.0, deceleration=0.0):
+    y = BrakeOutput(0.0, *(jnp.asarray(x, float) for x in (speed, wheel, deceleration, distance)))
+    return Sample(0.0, y, 0.2, 0.2, 0.0, control, control)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "fine"),
+    [
+        ((10, 10, 0), (9.99, 9.98, 0.01), True),
+        ((10, 10, 0), (9.99, 9.98, -0.01), False),  # backwards
+        ((10, 10, 0), (9.99, 9.98, 0.05), False),  # five times as far as its speed
+        ((10, 10, 0), (3.0, 9.98, 0.01), False),  # 7,000 m/s^2 without friction
+        ((10, 10, 0), (9.99, 12.0, 0.01), False),  # a wheel that nothing drives
+        ((10, 10, 0, -500.0), (9.99, 12.0, 0.01, -500.0), True),  # a torque drives it
+        ((10, 2, 0, 500.0, 8.0), (9.99, 4.0, 0.01, 500.0, 8.0), True),  # the road does
+    ],
+)
+def test_what_no_braked_car_does(before, after, fine):
+    audit = BrakeAudit(car=jnp.asarray(10.0), wheel=jnp.asarray(1.0), radius=jnp.asarray(0.2))
+    a, b = sample(*before), sample(*after)
+    memory = audit.start(a)
+    value = audit.value(memory._replace(held=audit.update(memory, a, b, 1e-3)), Ending(b, False, 0.0, 0.0))
+    assert bool(value <= 1) is fine
+
+
+SMALL = """
+plant = "mirrored-rig"
+initial = { speed_kmh = 30.0 }
+stop = { type = "speed-reached", speed_kmh = 25.0 }
+controller = { type = "pid", kp = 40.0, torque_max = 9.0 }
+solver = { step = 1e-3, duration = 0.25 }
+[sweep]
+samples = 48
+chunk = 16
+[sweep.over]
+"initial.speed_kmh" = [20.0, 34.0]
+[sweep.failures]
+iae = 1.0
+"""
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    return sweep(described(SMALL), tmp_path_factory.mktemp("refused") / "s")
+
+
+class TestWhoeverRuns:
+    def test_a_refused_lane_is_a_row_with_a_reason_and_in_no_number(self, swept):
+        below = swept.column("initial.speed") <= 25 / 3.6
+        assert 8 < below.sum() < 40
+        np.testing.assert_array_equal(swept.accepted, ~below)
+        assert set(swept.column("refused")[below]) == {
+            "initial.speed is not above stop.speed: the run would end before it starts"
+        }
+        np.testing.assert_array_equal(swept.column("diverged"), below)  # lest somebody's mean over the table take them
+        assert swept.diverged().num_rows == 0
+        assert not swept.column("stopped")[below].any()
+        found = summary(Results(swept.folder))
+        for name in swept.metrics:
+            x = swept.column(name)
+            assert np.isnan(x[below]).all()
+            np.testing.assert_allclose(found["metrics"][name]["mean"]["value"], x[~below].mean(), rtol=1e-12)
+        assert found["refused"]["count"] == below.sum()
+        assert found["refused"]["samples"][0] == np.flatnonzero(below)[0]
+        assert sum(found["refused"]["reasons"].values()) == below.sum()
+        assert found["failures"]["diverged"]["count"] == 0
+        assert found["failures"]["not stopped"]["value"] < 0.5
+        assert found["failures"]["any"]["high"] < 1 / 2
+
+    def test_a_batch_does_not_run_them(self, any_step):
+        values = {"initial.speed": np.array([8.0, 1.0, 9.0])}
+        done = measure_lanes(RIG, values, SOLVER, BRAKING)
+        np.testing.assert_array_equal(done.diverged, [False, True, False])
+        assert np.isnan(done.metrics["stop_time"]).tolist() == [False, True, False]
+        with pytest.raises(ValueError, match=r"lane 1: initial.speed = 1 m/s is not above stop.speed"):
+            run(RIG, Batch(values), SOLVER, BRAKING)
+        arm = dataclasses.replace(d.loop.TYPICAL["balance"], stop=Fallen(angle=0.5))
+        starts = {"initial.theta": np.array([0.0, 0.6])}
+        fine, lost = recovered(arm, starts, d.FixedStep(1e-3, 0.05))
+        assert (fine.tolist(), lost.tolist()) == ([True, False], [False, True])
+
+    def test_a_probability_is_of_the_whole_space_or_none(self, any_step):
+        study = described(SMALL)
+        with pytest.raises(ValueError, match=r"\d+ of 40 points cannot be run: initial.speed is not above"):
+            failure_probability(study, "iae", 1.0, samples=40)
+
+    def test_worst_case_tune_and_identify_refuse_at_the_start(self, any_step):
+        ask = {"solver": SOLVER, "measured": BRAKING}
+        with pytest.raises(ValueError, match=r"the box has points that cannot be run; lane 0: initial.speed = 1 m/s"):
+            worst_case(RIG, over={"initial.speed": (1.0, 9.0)}, metric="iae", **ask)
+        over = Batch({"initial.speed": [9.0, 1.0]})
+        with pytest.raises(StartError, match=r"lane 1: initial.speed = 1 m/s is not above stop.speed"):
+            tune(
+                RIG, free={"controller.gain": ((-2e4, -60.0), (-9e3, -30.0))}, objective={"iae": 1.0}, over=over, **ask
+            )
+        t = np.array([0.0, 0.1])
+        data = Traces(t=t, columns={"speed": np.ones((2, 2))}, over={"initial.speed": np.array([9.0, 1.0])})
+        with pytest.raises(ValueError, match=r"initial.speed is not above stop.speed"):
+            identify(RIG, data, {"plant.mass": (4.0, 8.0)}, solver=SOLVER)
+
+    def test_a_trial_that_breaks_a_rule_is_a_failed_evaluation(self, any_step):
+        """Limits may cross on the way: such a point is too far, whatever its loss."""
+        limited = replace(RIG, {"controller.torque_min": 0.0, "controller.torque_max": 9.0})
+        free = {"controller.torque_min": (-5.0, 20.0), "controller.torque_max": (5.0, 15.0)}
+        problem = posed(limited, free=free, objective={"iae": 1.0}, solver=SOLVER)
+        crossed = replace(limited, {"controller.torque_min": 12.0, "controller.torque_max": 8.0})
+        z = np.stack([problem.space.place(part) for part in (limited, crossed)])
+        assert problem.steady()(z).tolist() == [True, False]
+        assert Method().starts == 1
+
+
+def test_the_sweep_of_the_report(tmp_path):
+    """0 diverged, 0 not stopped, a mean stopping time of 0.002 s and a mean distance of -2.6e11 m, once."""
+    over = 'sweep.over={"sensor.time_constant"=[1e-6,1e-5]}'
+    words = ("sweep", "slip-lmi", "--set", "sensor=wheel-speed", "--set", over, "--samples", 8, "--json")
+    result = commands.run(*words, "--out", tmp_path / "s", status=1)
+    document = json.loads(result.stdout)
+    assert document["refused"]["reasons"] == {"solver.step = 0.0001 s is not stable": 8}
+    assert document["metrics"] == {name: {} for name in document["metrics"]}
+    assert document["failures"] == {}
+    assert "no sample could be run: solver.step = 0.0001 s is not stable" in result.stderr
+    assert not (set(document["metrics"]) - set(BRAKING))
