@@ -307,6 +307,7 @@ def _parameters(chosen: Scenario) -> dict[str, dict[str, Any]]:
 usage.add(app, simulate, "simulate slip-lmi --set plant.mass=6.2 --plot run.png")
 usage.add(app, commands_design.design, "design slip-lmi --set design.decay=80 --out gain.json")
 usage.add(app, commands_design.certify, "certify slip-lmi --gain=-11753,-76.7")
+usage.add(app, commands_design.verify, "verify gain.json")
 usage.add(app, commands_tune.tune, "tune slip-cured --set reference.time_constant=0.03 --out tuned.toml")
 usage.add(app, commands_identify.identify, "identify slip-lmi --data run.csv --free plant.mass=4:8")
 usage.add(app, commands_sweep.sweep, "sweep slip-lmi --samples 10000 --set solver.step=1e-3 --figures")

@@ -13,7 +13,7 @@ import typer
 from diffabs import console, proof, show
 from diffabs.pytree import parameters
 
-CHECK = "check it with: python experiments/check_certificate.py"
+CHECK = "check it with: diffabs verify"
 
 Out = Annotated[pathlib.Path | None, typer.Option(metavar="FILE.json", help="Write the certificate to this file.")]
 
@@ -60,10 +60,36 @@ def certify(
             found = console.waited(lambda: proof.certified(task), f"certifying {task.chosen.name}")
             if file:
                 found.save(file)
-        reason = proof.unproved(found, task.spec)
-        _show(proof.document(task, found, out, reason=reason or None), task, as_json)
+        known = console.waited(lambda: proof.besides(task, found), "looking at what is known besides")
+        reason = proof.unproved(found, task.spec, known)
+        _show(proof.document(task, found, out, reason=reason or None, known=known), task, as_json)
         if reason:
             console.fail(f"{task.chosen.name}: {reason}", console.FAILED)
+
+
+def verify(
+    file: Annotated[pathlib.Path, typer.Argument(metavar="FILE.json", help="What design or certify wrote.")],
+    as_json: console.Json = False,
+) -> None:
+    """Prove a saved certificate again, in fractions, by code that shares nothing with what made it. Exit status 0
+    proved, 1 not proved, 2 no certificate."""
+    from diffabs.design.verify import verify as verified
+
+    with console.guarded():
+        try:
+            verdicts = console.waited(lambda: verified(file), f"verifying {file}")
+        except ValueError as error:
+            console.fail(f"{file}: {' '.join(str(error).split())}")
+        proved = bool(verdicts) and not any(verdict.reason for verdict in verdicts)
+        show.verified({
+            "file": str(file),
+            "proved": proved,
+            "claims": [{**verdict._asdict(), "proved": not verdict.reason} for verdict in verdicts],
+            "versions": show.versions(),
+        }, as_json)  # fmt: skip
+        if not proved:
+            why = "; ".join(f"{verdict.kind}: {verdict.reason}" for verdict in verdicts if verdict.reason)
+            console.fail(f"{file}: not proved: {why or 'the file claims nothing'}", console.FAILED)
 
 
 def _file(out: pathlib.Path | None) -> contextlib.AbstractContextManager[pathlib.Path | None]:

@@ -207,8 +207,9 @@ def _proved(after: Scenario) -> _Proved:
             found = asked if (asked.decay_rate or 0.0) >= decay else found
     except (ModuleNotFoundError, ValueError, np.linalg.LinAlgError) as error:
         return _unproved(" ".join(str(error).split()))
-    reason = proof.unproved(found, task.spec) or None
-    document = proof.document(task, found, reason=reason)
+    known = proof.besides(task, found)
+    reason = proof.unproved(found, task.spec, known) or None
+    document = proof.document(task, found, reason=reason, known=known)
     document = {key: value for key, value in document.items() if key not in ("scenario", "versions", "files")}
     rate = document["decay_rate"]
     over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())

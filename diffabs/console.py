@@ -58,7 +58,7 @@ def quieten(wanted: bool) -> None:
 def say(line: str) -> None:
     """A line for a person, on stderr; on a terminal folded between words."""
     if not _quiet or line.startswith(LOUD):
-        typer.echo("\n".join(_folded(line)), err=True)
+        _write("\n".join(_folded(line)))
 
 
 def say_command(line: str, words: Sequence[str]) -> None:
@@ -74,7 +74,13 @@ def say_command(line: str, words: Sequence[str]) -> None:
             rows[-1] += f" {word}"
         else:
             rows.append(f"    {word}")
-    typer.echo(f"{CONTINUED}\n".join(rows), err=True)
+    _write(f"{CONTINUED}\n".join(rows))
+
+
+def _write(text: str) -> None:
+    """Not with `typer.echo`, which writes past what has taken the place of stderr: the display of how far work is,
+    which moves out of the way."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def _folded(line: str) -> list[str]:

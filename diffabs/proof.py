@@ -25,12 +25,14 @@ from diffabs.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.design import Certificate, Polytope, Spec
+    from diffabs.design.frozen import Frozen
     from diffabs.design.reduction import Reduced
 
 # Of the JSON document. Without a certificate most are null.
 FROM_PROOF = ("quadratically_stable", "stable", "verified_exactly", "decay_rate", "damping", "trace_cost",
               "guaranteed_cost", "worst_vertex", "margins", "claims")  # fmt: skip
 FROM_DESIGN = ("lower_bound", "gap", "residual")
+CELLS = 8  # in which a Lyapunov matrix that follows the speed is linear
 SLIPS, MARGIN = 2001, 1.01  # where friction is asked for its greatest value, and how much more is allowed for
 VERDICTS = {True: "proved", False: "disproved", None: "undecided"}
 
@@ -123,11 +125,49 @@ def _gain(text: str, states: Sequence[str]) -> np.ndarray:
     return values
 
 
+class Besides(NamedTuple):
+    """What is known of a gain that no common Lyapunov matrix proves: its loops at fixed parameters, and the fall of the
+    speed [m/s^2] up to which a Lyapunov matrix that follows the speed proves it; None if that was not asked or does not
+    succeed."""
+
+    frozen: "Frozen"
+    fall: float | None
+
+    def document(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"frozen": self.frozen._asdict(), "proved_for_a_speed_falling_by": self.fall}
+
+
+def besides(task: Task, proof: "Certificate") -> Besides | None:
+    """What is known besides; None where a common Lyapunov matrix says more."""
+    from diffabs.design.frozen import frozen
+
+    if proof.quadratically_stable:
+        return None
+    loops = frozen(task.gain, task.model, task.over)
+    return Besides(loops, _following(task) if loops.stable == loops.systems else None)
+
+
+def _following(task: Task) -> float | None:
+    """The greatest fall of the speed that friction allows, if a Lyapunov matrix piecewise linear in the speed proves
+    stability up to it."""
+    from diffabs.design import Spec, analysis
+    from diffabs.design.box import schedule
+
+    low, high = task.over.get("speed", (0.0, 0.0))
+    if not 0 < low < high or task.polytope.period is not None:
+        return None
+    fall = _hardest(task.chosen.loop.plant, task.over, low)
+    cells = schedule(task.model, task.over, along="speed", nodes=CELLS)
+    return fall if analysis.certify(task.gain, cells, Spec(rates=(-fall, 0.0))).stable else None
+
+
 def document(
     task: Task,
     proof: "Certificate | None" = None,
     out: pathlib.Path | None = None,
     reason: str | None = None,
+    known: Besides | None = None,
     **numbers: float | None,
 ) -> dict[str, Any]:
     """The JSON document. Parameters have the names of the linear model, in SI."""
@@ -143,6 +183,7 @@ def document(
         **dict.fromkeys(FROM_DESIGN),
         **numbers,
         "reason": reason,
+        "besides": known.document() if known else None,
         "period": task.polytope.period,
         "over": {path: list(ends) for path, ends in task.over.items()},
         "vertices": task.polytope.vertices,
@@ -165,8 +206,8 @@ def slowest(proof: "Certificate") -> dict[str, Any]:
     return {"index": index, "cell": 0, "corner": corner, "claim": "poles", "margin": margin}
 
 
-def unproved(proof: "Certificate", spec: "Spec") -> str:
-    """What was asked for and is not proved, in words; empty if all is."""
+def unproved(proof: "Certificate", spec: "Spec", known: Besides | None = None) -> str:
+    """What was asked for and is not proved, in words, and what is known besides; empty if all is proved."""
     stable, refuted = proof.quadratically_stable, any(proof.proved("infeasible"))
     asked = {
         "decay": (spec.decay > 0, f"decay = {spec.decay:g} 1/s", not refuted),
@@ -176,16 +217,33 @@ def unproved(proof: "Certificate", spec: "Spec") -> str:
     found = [] if stable else [f"quadratic stability is {VERDICTS[stable]}"]
     if stable is False:
         found[0] += f": no common Lyapunov matrix exists for the {proof.cells[0].vertices} vertices"
+        found[0] += ", so no design by one over these ranges, whatever Q and R, gives this gain"
     else:
         for kind, (wanted, words, still_open) in asked.items():
             if wanted and not any(proof.proved(kind)):
                 found.append(f"{words} is {VERDICTS[None if still_open else False]}")
     if not found:
         return ""
+    if known and known.frozen.stable == known.frozen.systems:
+        return f"{', '.join(found)}; that is not instability: {stable_besides(known)}"
     worst = slowest(proof)
     where = ", ".join(f"{name} {value:.6g}" for name, value in (worst["corner"] or {}).items())
     kind = "is unstable even if it is fixed" if worst["margin"] <= 0 else "has the slowest pole"
     return f"{', '.join(found)}; vertex {worst['index']}{f' ({where})' if where else ''} {kind}"
+
+
+def stable_besides(known: Besides) -> str:
+    """In words, of a gain whose frozen loops are all stable."""
+    loops = known.frozen
+    where = ", ".join(f"{name} {value:.6g}" for name, value in loops.at.items())
+    said = f"each of {loops.systems} frozen systems is stable by its poles"
+    said += f", the slowest decays at {loops.slowest:.4g} 1/s{f' ({where})' if where else ''}"
+    if known.fall is None:
+        return said
+    return (
+        f"{said}, and a Lyapunov matrix that follows the speed proves stability while that falls by no more than"
+        f" {known.fall:.4g} m/s^2, all that friction allows"
+    )
 
 
 @contextlib.contextmanager

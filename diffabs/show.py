@@ -121,7 +121,13 @@ def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict:
         gains.add_row(state, f"{value:.8g}")
     _print(title, gains)
     numbers = Table("quantity", "value", "unit")
-    numbers.add_row("quadratically stable", verdict, "")
+    numbers.add_row("common Lyapunov matrix" if result["besides"] else "quadratically stable", verdict, "")
+    if known := result["besides"]:
+        loops, fall = known["frozen"], known["proved_for_a_speed_falling_by"]
+        numbers.add_row("systems of the ranges, each fixed", f"{loops['stable']} of {loops['systems']} stable", "")
+        numbers.add_row("slowest of them decays at", f"{loops['slowest']:.6g}", "1/s")
+        if fall is not None:
+            numbers.add_row("proved stable for a speed falling by no more than", f"{fall:.4g}", "m/s^2")
     numbers.add_row("verified exactly", "yes" if result["verified_exactly"] else "no", "")
     for name, unit in PROOF.items():
         if result[name] is not None:
@@ -137,6 +143,15 @@ def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict:
         result["coverage"] and f"; their hull covers {result['coverage']['checked']} systems checked within the ranges"
     )
     _print(f"{result['vertices']} vertices{covered or ', the systems on a grid of the ranges'}", vertices)
+
+
+def verified(result: dict[str, Any], json_wanted: bool) -> None:
+    """A line for each claim."""
+    if json_wanted:
+        return as_json(result)
+    for claim in result["claims"]:
+        typer.echo(f"{'proved' if claim['proved'] else 'NOT PROVED'}  {claim['kind']}: {claim['says']}")
+    return None
 
 
 def tuned(result: dict[str, Any], chosen: Scenario) -> None:

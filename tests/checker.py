@@ -9,8 +9,13 @@ import json
 import sys
 from fractions import Fraction
 
-FIELDS = {"decay": "P rate factor", "cost": "P Q R x0", "damping": "P cot zeta", "l2": "P gamma Bw C D"}
-FIELDS |= {"input": "P limit points", "infeasible": "W rate factor", "scheduled": "P rates rate Q R"}
+# a letter for each axis: n states, m inputs, V vertices, N nodes, 2 itself; "?" need not be there
+FIELDS = {"decay": "P:nn rate?: factor?:", "cost": "P:nn Q:nn R:mm x0?:n", "damping": "P:nn cot: zeta:"}
+FIELDS |= {"l2": "P:nn gamma: Bw:nw|Vnw C:zn D:zm", "input": "P:nn limit:m points:kn"}
+FIELDS |= {"infeasible": "W:Vnn rate?: factor?:", "scheduled": "P:Nnn rates:2 rate?: Q?:nn R?:mm"}
+RANGES = {"rate": lambda x: x >= 0, "factor": lambda x: 0 < x <= 1, "zeta": lambda x: 0 <= x < 1}
+RANGES |= {"cot": lambda x: x >= 0, "gamma": lambda x: x > 0, "limit": lambda x: min(x) > 0}
+RANGES |= {"rates": lambda x: x[0] <= x[1]}
 
 
 class Matrix(list):
@@ -136,17 +141,59 @@ def of_schedule(cells, nodes, gains, d):
                     yield positive(moved) and positive(moved - (b - a) / 2 * (states + inputs))
 
 
+def fits(value, letters, sizes):
+    """Whether nested lists have an axis, not empty, for each letter, of the size that the letter has or now gets."""
+    if not letters or not isinstance(value, list):
+        return not letters and isinstance(value, Fraction)
+    same = 0 < len(value) == sizes.setdefault(letters[0], len(value))
+    return same and all(fits(each, letters[1:], sizes) for each in value)
+
+
+def checked(kind, data, sizes, discrete):
+    """The numbers of a claim, which has all that its kind must have and nothing else. Raises ValueError."""
+    fields = (each.split(":") for each in FIELDS[kind].split())
+    known = {name.rstrip("?"): (shape, "?" in name) for name, shape in fields}
+    known.pop("rate" if discrete else "factor", None)
+    missing = {name for name, (_, optional) in known.items() if not optional} - set(data)
+    if missing or set(data) - set(known):
+        raise ValueError(f"{kind} lacks {sorted(missing)} or has what it must not: {sorted(set(data) - set(known))}")
+    d = {name: numbers(value) for name, value in data.items()}
+    for name, value in d.items():
+        if not any(fits(value, letters, dict(sizes)) for letters in known[name][0].split("|")):
+            raise ValueError(f"{kind}.{name} has another shape than {known[name][0]!r} of {sizes}")
+        growth = kind == "infeasible" and (name == "rate" or (name == "factor" and value > 0))
+        if name in RANGES and not growth and not RANGES[name](value):
+            raise ValueError(f"{kind}.{name} is out of its range")
+    return d
+
+
+def measured(system, gain):
+    """The cells as pairs A, B of numbers, the gain, and sizes by letter. Raises ValueError for what does not fit."""
+    parts, K, sizes = system.get("cells", [system]), numbers(gain), {"2": 2}
+    cells = [(numbers(part["A"]), numbers(part["B"])) for part in parts]
+    if not cells or not all(fits(A, "Vnn", at) and fits(B, "Vnm", at) for A, B in cells for at in [sizes | {}]):
+        raise ValueError("A and B of a system are not (V, n, n) and (V, n, m)")
+    (A, B), *others = cells
+    sizes |= {"n": len(A[0]), "m": len(B[0][0])} | ({"N": len(cells) + 1} if "cells" in system else {"V": len(A)})
+    if any((len(a[0]), len(b[0][0])) != (sizes["n"], sizes["m"]) for a, b in others):
+        raise ValueError("the cells differ in order or inputs")
+    if not fits(K, "mn", dict(sizes)) and not ("cells" in system and fits(K, "Nmn", dict(sizes))):
+        raise ValueError("the gain does not fit the system")
+    return cells, K, sizes
+
+
 def proved(system, gain, kind, data):
     """Whether a claim is. Raises ValueError and others for what does not fit."""
     parts = system.get("cells", [system])
-    discrete = any(part["period"] is not None for part in parts)
-    unfit = set(data) - set(FIELDS[kind].split()) | set(data) & {"rate" if discrete else "factor"}
-    if unfit or (discrete and kind in ("damping", "scheduled")) or (kind == "scheduled") != ("cells" in system):
-        raise ValueError(f"a claim of kind {kind} does not fit {', '.join(unfit) or 'the system'}")
-    d, K = {name: numbers(value) for name, value in data.items()}, numbers(gain)
-    cells = [[[matrix(M, Fraction(1, 2**40)) for M in numbers(part[name])] for name in "AB"] for part in parts]
-    if not all(A for A, _ in cells):
-        raise ValueError("no vertices")
+    periods = {part["period"] for part in parts}
+    if len(periods) != 1 or any(x is not None and not (isinstance(x, float) and x > 0) for x in periods):
+        raise ValueError("a period is neither null nor positive, or the cells differ in it")
+    discrete = periods != {None}
+    if (discrete and kind in ("damping", "scheduled")) or (kind == "scheduled") != ("cells" in system):
+        raise ValueError(f"a claim of kind {kind} does not fit the system")
+    cells, K, sizes = measured(system, gain)
+    d = checked(kind, data, sizes, discrete)
+    cells = [[[matrix(M, Fraction(1, 2**40)) for M in part] for part in pair] for pair in cells]
     if kind == "scheduled":
         nodes, K = numbers(system["nodes"]), K if isinstance(K[0][0], list) else [K] * (len(cells) + 1)
         return all(of_schedule(cells, nodes, map(matrix, K), d))
@@ -159,6 +206,8 @@ def main(path):
     try:
         with open(path, encoding="utf-8") as file:
             stored, good = json.load(file, parse_int=float), []
+        if (stored["format"], stored["version"]) != ("diffabs certificate", 1):
+            raise ValueError("format and version are not 'diffabs certificate' and 1")
         for claim in stored["claims"]:
             good.append(proved(stored["system"], stored["gain"], claim["kind"], claim["data"]))
             said = [f"{name} {value!r}" for name, value in claim["data"].items() if isinstance(value, float)]

@@ -18,12 +18,17 @@ COLUMNS, ROWS = 80, 24
 PATIENCE = 300.0  # s for anything that takes seconds on an idle machine
 CONTROL_C = b"\x03"
 ESCAPES = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]")
+MOVEMENTS = re.compile(r"\x1b\[[0-9;]*[A-HJKf]")  # of the cursor, and erased lines
 FRAMES = re.compile("[─━│┃┌┐└┘├┤┬┴┼┏┓┗┛┡┩┢┪┣┫┳┻╇╈╋┠┨╶╺╸]")
 SPINNER = re.compile("[⠋⠙⠹⠸⠼⠴⠦⠧⠇⠏]")
-# The terminal becomes the controlling one, whose Ctrl-C is a signal, before the command takes the process over.
-CONTROLLED = (
-    "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.executable, sys.argv[1:])"
-)
+# The terminal becomes the controlling one, whose Ctrl-C is a signal, before the command takes the process over; and the
+# signal is not ignored, as it would be where the tests run behind a shell.
+CONTROLLED = """
+import fcntl, os, signal, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+os.execv(sys.executable, sys.argv[1:])
+"""
 
 
 class Terminal:
@@ -117,7 +122,7 @@ def words(text: str) -> set[str]:
 
 def assert_fits(terminal: Terminal) -> None:
     """No line is longer than the terminal is wide, which would break it in the middle of a word."""
-    for line in re.split(r"[\r\n]", terminal.text):
+    for line in re.split(r"[\r\n]", ESCAPES.sub("", MOVEMENTS.sub("\n", terminal.raw))):
         assert len(line) <= COLUMNS, line
 
 

@@ -1,6 +1,10 @@
 """Claims about matrices are proved exactly, by the package and by the checker that shares no code with it."""
 
+import contextlib
+import copy
+import importlib.util
 import json
+import math
 import pathlib
 import subprocess
 import sys
@@ -14,6 +18,11 @@ import pytest
 from diffabs.design import exact
 from diffabs.design.certificate import Certificate, Claim
 from diffabs.design.polytope import Polytope, Schedule
+
+OUTSIDERS = pathlib.Path(__file__).parent.parent / "experiments" / "check_certificate.py"
+spec = importlib.util.spec_from_file_location("check_certificate", OUTSIDERS)
+outsiders = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(outsiders)
 
 KINDS = ("decay", "cost", "damping", "l2", "input", "infeasible", "scheduled")
 
@@ -32,10 +41,9 @@ def both(system, gain, kind, **data):
 
 
 def short(certificate, folder):
-    """The verdict of the checker of forty lines."""
+    """The verdict of the checker for outsiders."""
     certificate.save(folder / "short.json")
-    file = pathlib.Path(__file__).parent.parent / "experiments" / "check_certificate.py"
-    return subprocess.run([sys.executable, file, folder / "short.json"], capture_output=True, text=True)
+    return subprocess.run([sys.executable, OUTSIDERS, folder / "short.json"], capture_output=True, text=True)
 
 
 def plain(certificate):
@@ -346,7 +354,7 @@ def test_a_changed_digit_is_found_out(kind, tmp_path, capsys):
 
 @pytest.mark.parametrize("kind", ["decay", "cost", "infeasible"])
 @pytest.mark.parametrize("seed", [3, 4])
-def test_the_checker_of_forty_lines(kind, seed, tmp_path):
+def test_the_checker_for_outsiders(kind, seed, tmp_path):
     certificate = example(kind, seed=seed)
     assert certificate.verified_exactly
     assert short(certificate, tmp_path).returncode == 0
@@ -358,8 +366,198 @@ def test_the_checker_of_forty_lines(kind, seed, tmp_path):
     assert "NOT PROVED" in refused.stdout
 
 
-def test_the_checker_of_forty_lines_refuses_what_it_does_not_know(tmp_path):
+def test_the_checker_for_outsiders_refuses_what_it_does_not_know(tmp_path):
     assert short(example("damping", seed=3), tmp_path).returncode == 1
+
+
+def verdicts(document, file, capsys):
+    """Whether the package, the tests' checker and the one for outsiders say that all is proved of a file."""
+    file.write_text(json.dumps(document))
+    found = [False]
+    with contextlib.suppress(ValueError):
+        found = [Certificate.load(file).verified_exactly]
+    for check in (checker.main, outsiders.main):
+        status = check(file)
+        said = capsys.readouterr()
+        assert len(said.err.splitlines()) == (status == 2)
+        found.append(status == 0)
+    return found
+
+
+def unstable(period=None):
+    """A certificate's file that claims the stability of x' = x (x+ = 2 x)."""
+    system = {"A": [[[2.0 if period else 1.0]]], "B": [[[0.0]]], "period": period, "states": [], "corners": []}
+    claim = {"kind": "decay", "data": {"P": [[1.0]]}}
+    return {"format": "diffabs certificate", "version": 1, "system": system, "gain": [[0.0]], "claims": [claim]}
+
+
+@pytest.mark.parametrize(
+    ("period", "kind", "data"),
+    [
+        (None, "decay", {"P": [[1.0]], "rate": -1e9}),
+        (None, "decay", {"P": [[1.0]], "rate": -2.0}),
+        (None, "decay", {"P": [[-1.0]], "rate": 0.0}),
+        (None, "decay", {"P": [[1.0]], "factor": 100.0}),
+        (0.1, "decay", {"P": [[1.0]], "factor": 100.0}),
+        (0.1, "decay", {"P": [[1.0]], "factor": -100.0}),
+        (0.1, "decay", {"P": [[1.0]], "rate": 0.0}),
+        (None, "cost", {"P": [[1.0]], "Q": [[-100.0]], "R": [[1.0]]}),
+        (0.1, "cost", {"P": [[1.0]], "Q": [[-100.0]], "R": [[1.0]]}),
+        (None, "cost", {"P": [[1.0]], "Q": [[-100.0]], "R": [[1.0]], "rate": -9.0}),
+        (None, "damping", {"P": [[1.0]], "zeta": -1.0, "cot": 0.0}),
+        (None, "input", {"P": [[1.0]], "limit": [-1.0], "points": [[0.0]]}),
+        (None, "l2", {"P": [[1.0]], "gamma": -1.0, "Bw": [[0.0]], "C": [[0.0]], "D": [[0.0]]}),
+        (None, "decay", {}),
+        (None, "decay", {"P": []}),
+        (None, "decay", {"P": [[]]}),
+        (None, "stable", {}),
+        (None, "infeasible", {"W": []}),
+        (0.1, "infeasible", {"W": [[[1.0]]], "factor": -1.0}),
+        (0.1, "infeasible", {"W": [[[1.0]]], "factor": 0.0}),
+    ],
+)
+def test_an_unstable_loop_is_not_called_proved(period, kind, data, tmp_path, capsys):
+    document = unstable(period)
+    document["claims"] = [{"kind": kind, "data": data}]
+    assert verdicts(document, tmp_path / "x.json", capsys) == [False] * 3
+
+
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("system",), {}),
+        (("system",), []),
+        (("system",), {"A": [], "B": [], "period": None, "states": [], "corners": []}),
+        (("system", "A"), []),
+        (("system", "A"), [[]]),
+        (("system", "A"), [[[]]]),
+        (("system", "B"), []),
+        (("system", "period"), 0.0),
+        (("system", "period"), "none"),
+        (("system", "cells"), []),
+        (("system",), {"parameter": "v", "nodes": [0.0], "cells": []}),
+        (("gain",), []),
+        (("gain",), [[]]),
+        (("gain",), [[0.0], [0.0]]),
+        (("claims",), []),
+        (("claims",), {}),
+        (("claims", 0), {}),
+        (("claims", 0), []),
+        (("claims", 0, "data"), []),
+        (("format",), "none"),
+        (("version",), 2),
+    ],
+)
+def test_a_claim_about_nothing_is_not_called_proved(keys, value, tmp_path, capsys):
+    document = unstable()
+    document["system"]["A"] = [[[-1.0]]]
+    assert verdicts(document, tmp_path / "x.json", capsys) == [True] * 3
+    node = document
+    for key in keys[:-1]:
+        node = node[key]
+    node[keys[-1]] = value
+    assert verdicts(document, tmp_path / "x.json", capsys) == [False] * 3
+
+
+def test_a_cost_may_have_any_sign_where_the_loop_is_stable(tmp_path, capsys):
+    document = unstable()
+    document["system"]["A"] = [[[-1.0]]]
+    document["claims"] = [{"kind": "cost", "data": {"P": [[1.0]], "Q": [[-100.0]], "R": [[1.0]]}}]
+    assert verdicts(document, tmp_path / "x.json", capsys) == [True] * 3
+
+
+def places(node):
+    """Every (container, key) of a document."""
+    for key, value in list(node.items()) if isinstance(node, dict) else list(enumerate(node)):
+        yield node, key
+        if isinstance(value, dict | list):
+            yield from places(value)
+
+
+STRANGE = (0.0, -0.0, 1.0, -1.0, 1e-9, 2.0, 100.0, -100.0, -1e9, 1e300, 5e-324, math.inf, math.nan, 10**400, None,
+           True, "1.0", "", [], [[]], [[[]]], {}, [1.0], [[1.0]], "decay", "cost", "infeasible", 0.1)  # fmt: skip
+
+
+def mutated(document, rng):
+    """A copy with one to three places changed: another number, sign or size, something strange, or nothing there."""
+    document = copy.deepcopy(document)
+    for _ in range(rng.integers(1, 4)):
+        found = list(places(document))
+        weights = np.array([0.2 if isinstance(key, int) else 1 for _, key in found])  # entries of arrays are many
+        node, key = found[rng.choice(len(found), p=weights / weights.sum())]
+        value = node[key]
+        choice = rng.integers(6)
+        if isinstance(value, float) and choice < 4:
+            node[key] = (-value, value * 10.0 ** rng.integers(-9, 10), value + rng.normal(), -1e9 * value)[choice]
+        elif isinstance(value, list) and choice < 3 and value:
+            node[key] = (value[:-1], value + value[-1:], value[::-1])[choice]
+        elif choice == 5:
+            del node[key]
+        else:
+            node[key] = STRANGE[rng.integers(len(STRANGE))]
+    return document
+
+
+def proved_document(kind, discrete, rng):
+    """A file whose claim is proved."""
+    while True:
+        system, gain, data = random_claim(rng, kind, discrete, 0.2)
+        certificate = Certificate(system, gain, (Claim(kind, data),))
+        if certificate.verified_exactly:
+            return plain(certificate)
+
+
+def slowest(system, gain):
+    """The spectral abscissa (radius) over vertices and points between them, with each gain of a schedule's cell."""
+    K, found = np.array(gain), []
+    for c, cell in enumerate(system.get("cells", [system])):
+        A, B = np.array(cell["A"]), np.array(cell["B"])
+        for k in K[c : c + 2] if K.ndim == 3 else [K]:
+            loops = A + B @ k
+            loops = np.concatenate([loops, (loops[:, None] + loops[None]).reshape(-1, *loops.shape[1:]) / 2])
+            modes = np.linalg.eigvals(loops)
+            found.append((np.abs(modes) if cell["period"] is not None else modes.real).max())
+    return max(found)
+
+
+def is_true(document):
+    """Whether what a file claims, which somebody called proved, is true as far as poles can tell, in floats."""
+    worst, discrete = slowest(document["system"], document["gain"]), document["system"].get("period") is not None
+    for claim in document["claims"]:
+        data = claim["data"]
+        if claim["kind"] != "infeasible":
+            most = data.get("factor", 1.0) if discrete else -data.get("rate", 0.0)
+            if worst > most + 1e-6 * abs(worst):
+                return False
+            continue
+        A, B, K = (np.array(each) for each in (document["system"]["A"], document["system"]["B"], document["gain"]))
+        A = A + B @ K  # were one stable and alone, it would have a P
+        if len(A) == 1 and not discrete and worst < -data.get("rate", 0.0) - 1e-6 * abs(worst):
+            return False
+        if len(A) == 1 and discrete and worst < data.get("factor", 1.0) - 1e-6 * abs(worst):
+            return False
+    return True
+
+
+@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3, 40))])
+def test_no_mutation_of_a_certificate_is_a_false_proof(seed, tmp_path, capsys):
+    rng, called, refused = np.random.default_rng([17, seed]), 0, 0
+    for kind in KINDS:
+        discrete = kind not in ("damping", "scheduled") and bool(rng.integers(2))
+        document = proved_document(kind, discrete, rng)
+        assert verdicts(document, tmp_path / "x.json", capsys)[:2] == [True] * 2
+        for _ in range(12):
+            other = mutated(document, rng)
+            package, ours, theirs = verdicts(other, tmp_path / "x.json", capsys)
+            assert ours or not package, other  # which asks for labels too
+            assert theirs or not package or other["claims"][0]["kind"] not in outsiders.SHAPES, other
+            if theirs or ours:
+                called += 1
+                assert is_true(other), other
+            else:
+                refused += 1
+    assert called > 0
+    assert refused > 30
 
 
 def test_a_proof_holds_for_vertices_that_are_off(monkeypatch):
@@ -475,6 +673,7 @@ def edited(path, *keys, to):
         (("system", "corners"), [{"a": 1.0}], "system.corners"),
         (("system", "coverage"), 1.0, "coverage"),
         (("gain",), [[1.0]], "gain"),
+        (("gain",), [-1.0, -9.0], "gain must be a list of rows"),
         (("gain",), [[1.0, float("nan")]], "finite"),
         (("gain",), [[1.0, float("inf")]], "finite"),
         (("gain",), [[1.0, 10**400]], "gain"),
@@ -500,6 +699,22 @@ def test_a_malformed_file_is_refused_in_one_line(tmp_path, keys, to, field):
         Certificate.load(edited(tmp_path / "x.json", *keys, to=to))
     assert field in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_labels_of_a_file_are_not_shown_beside_its_proof(tmp_path, capsys):
+    system, k1 = rig(), -20.0
+    P, _ = lyapunov(k1, k2 := -4 * (np.sqrt(B * abs(k1)) * (np.sqrt(W_HIGH) - np.sqrt(W_LOW)) + A_HIGH) / B)
+    certificate = Certificate(system, [[k1, k2]], (Claim("decay", {"P": P}),))
+    assert set(certificate.worst_vertex["corner"]) == {"a", "w"}  # where they come from the model
+    document = plain(certificate)
+    document["system"]["corners"] = [{"mass": 999.0}] * 4
+    assert verdicts(document, tmp_path / "x.json", capsys) == [True] * 3
+    loaded = Certificate.load(tmp_path / "x.json")
+    assert loaded.worst_vertex["corner"] is None
+    assert "999" not in str(loaded) + json.dumps(loaded.summary())
+    for check in (checker, outsiders):
+        check.main(tmp_path / "x.json")
+        assert "999" not in capsys.readouterr().out
 
 
 def test_a_name_that_comes_twice_is_refused(tmp_path):

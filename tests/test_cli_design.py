@@ -6,12 +6,16 @@ import pathlib
 import subprocess
 import sys
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
 
 from diffabs import console, scenario
 from diffabs.design import Certificate, DesignError, analysis, box, lmi, synthesis
+from diffabs.design.frozen import frozen
+from diffabs.linearize import StateSpace
+from diffabs.pytree import Scalar, param, pytree
 
 pytestmark = pytest.mark.xdist_group("cli-design")  # one worker compiles what these share
 
@@ -19,8 +23,34 @@ CHECKER = pathlib.Path(__file__).parent.parent / "experiments" / "check_certific
 KEYS = [
     *("scenario", "gain", "states", "quadratically_stable", "stable", "verified_exactly", "decay_rate", "damping"),
     *("trace_cost", "guaranteed_cost", "worst_vertex", "margins", "claims", "lower_bound", "gap", "residual", "reason"),
-    *("period", "over", "vertices", "corners", "poles", "coverage", "exact", "neglected", "versions", "files"),
+    *(
+        "besides",
+        "period",
+        "over",
+        "vertices",
+        "corners",
+        "poles",
+        "coverage",
+        "exact",
+        "neglected",
+        "versions",
+        "files",
+    ),
 ]
+
+
+@pytree
+class Spring:
+    """x'' = -stiffness x - x' + u."""
+
+    period = None
+    states = ("x", "x'")
+    stiffness: Scalar = param(default=1.0, unit="1/s^2")
+
+    def matrices(self):
+        return StateSpace(jnp.array([[0.0, 1.0], [-self.stiffness, -1.0]]), jnp.array([[0.0], [1.0]]))
+
+
 CORNERS = [{"plant.mass": m, "speed": v / 3.6} for m in (5.3, 6.2) for v in (5.0, 50.0)]
 
 
@@ -77,7 +107,7 @@ def test_design_has_what_scripts_rely_on(designed):
     assert document["files"] == {"out": str(folder / "c.json")}
     assert result.stderr.splitlines() == [
         "neglected: The fall of the speed: it is frozen.",
-        f"certificate: {folder}/c.json; check it with: python experiments/check_certificate.py {folder}/c.json",
+        f"certificate: {folder}/c.json; check it with: diffabs verify {folder}/c.json",
     ]
 
 
@@ -92,6 +122,7 @@ def test_certificate_is_proved_by_who_shares_nothing(designed):
     folder, _, document = designed
     assert left_in(folder) == {"c.json"}
     assert checked(folder / "c.json").returncode == 0
+    assert run("verify", folder / "c.json").stdout.count("proved  ") == 2
     assert Certificate.load(folder / "c.json").gain.ravel().tolist() == document["gain"]
 
 
@@ -104,6 +135,7 @@ def test_changes_reach_the_design():
 
 def test_table_for_people():
     result = run("design", "slip-lmi")
+    assert "common Lyapunov" not in result.stdout
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in result.stdout.splitlines() if "│" in line]
     found = {row[0]: row[1] for row in rows}
     assert float(found["slip error"]) == pytest.approx(-158.17, abs=0.01)
@@ -166,10 +198,39 @@ def test_published_gain_has_no_common_lyapunov_matrix(tmp_path):
     assert document["worst_vertex"]["claim"] == "poles"
     assert document["worst_vertex"]["margin"] == pytest.approx(22.53, abs=0.01)
     assert "quadratic stability is disproved: no common Lyapunov matrix exists for the 4 vertices" in document["reason"]
-    assert "vertex 3 (plant.mass 6.2, speed 13.8889) has the slowest pole" in document["reason"]
+    assert "whatever Q and R, gives this gain" in document["reason"]
     assert result.stderr.splitlines()[-1] == f"error: slip-lmi: {document['reason']}"
     assert left_in(tmp_path) == {"c.json"}
     assert checked(tmp_path / "c.json").returncode == 0
+    assert run("verify", tmp_path / "c.json").stdout == "proved  infeasible: no common Lyapunov matrix exists\n"
+
+
+def test_what_is_known_besides_of_the_published_gain():
+    """Not unstable: poles of every frozen loop in closed form, s^2 = ..., and the proof that follows the speed."""
+    result = run("certify", "slip-lmi", "--json", status=1)
+    besides, reason = (json.loads(result.stdout)[name] for name in ("besides", "reason"))
+    frozen = besides["frozen"]
+    assert frozen["systems"] == frozen["stable"] == 17**2
+    assert frozen["slowest"] == pytest.approx(22.5318, abs=1e-4)  # REFERENCE: 22.5345 at 5.3 kg, and 6.2 kg is slower
+    assert frozen["at"] == {"plant.mass": 6.2, "speed": pytest.approx(50 / 3.6)}
+    friction = 2 * 0.399595428169 * 9.81  # of a locked wheel, and of a disk whose inertia is half of its mass
+    assert friction < besides["proved_for_a_speed_falling_by"] < 1.011 * friction
+    assert "that is not instability: each of 289 frozen systems is stable by its poles" in reason
+    assert "proves stability while that falls by no more than 7.918 m/s^2, all that friction allows" in reason
+    table = run("certify", "slip-lmi", status=1).stdout
+    assert "quadratically stable" not in table
+    rows = {r[0]: r[1] for line in table.splitlines() if len(r := [c.strip() for c in line.split("│")[1:-1]]) == 3}
+    assert rows["common Lyapunov matrix"] == "disproved"
+    assert rows["systems of the ranges, each fixed"] == "289 of 289 stable"
+    assert rows["proved stable for a speed falling by no more than"] == "7.918"
+
+
+def test_frozen_loops_are_counted_at_their_poles():
+    """x'' = u, u = -a x - x' with a between -1 and 3: stable for a > 0, 4 of 17 points and the one at 0 are not."""
+    found = frozen([0.0, 0.0], Spring(), {"stiffness": (-1.0, 3.0)})
+    assert (found.systems, found.stable) == (17, 12)
+    assert found.slowest == pytest.approx(-(np.sqrt(5) - 1) / 2)  # s^2 + s - 1
+    assert found.at == {"stiffness": -1.0}
 
 
 @pytest.mark.parametrize(
@@ -180,6 +241,16 @@ def test_published_gain_has_no_common_lyapunov_matrix(tmp_path):
 def test_threshold_of_quadratic_stability(gain, proved):
     document = json.loads(run("certify", "slip-lmi", *gain, "--json", status=0 if proved else 1).stdout)
     assert document["quadratically_stable"] is proved
+
+
+def test_where_two_vertices_refute_at_once(tmp_path):
+    """The solver's best P is 0 with a margin of +1e-14; the product of two closed loops has a negative eigenvalue."""
+    ranges = ("design.over.plant.mass=[5.11,5.87]", "design.over.initial.speed_kmh=[3.9,50.4]")
+    changes = [word for change in ranges for word in ("--set", change)]
+    changes += ["--gain=-1162,-5.922", "--json", "--out", tmp_path / "c.json"]
+    document = json.loads(run("certify", "slip-lmi", *changes, status=1).stdout)
+    assert document["quadratically_stable"] is False
+    assert checked(tmp_path / "c.json").returncode == 0
 
 
 def test_fastest_decay_and_least_cost_of_a_gain():
@@ -220,7 +291,7 @@ def test_undecided_is_not_proved(tmp_path, monkeypatch):
     document = json.loads(result.stdout)
     assert document["quadratically_stable"] is None
     assert document["verified_exactly"] is False
-    assert "quadratic stability is undecided, a guaranteed cost is undecided; vertex 3" in result.stderr
+    assert "quadratic stability is undecided, a guaranteed cost is undecided; that is not instability" in result.stderr
     assert checked(tmp_path / "c.json").returncode == 1
 
 

@@ -185,6 +185,63 @@ def test_verdicts_agree_with_the_closed_form():
         assert proof.quadratically_stable is has_common_lyapunov(k1, k2), (k1, k2)
 
 
+# Shorten and Narendra: two stable matrices of order 2 have a common P exactly if neither C1 C2 nor C1 C2^-1 has a
+# negative eigenvalue; of any order, a negative one leaves none
+
+
+def two_stable(random, n, discrete=False):
+    loops = random.normal(size=(2, n, n))
+    modes, near = np.linalg.eigvals(loops), 10.0 ** random.uniform(-2, 0, 2)
+    if discrete:
+        return loops * ((1 - 0.9 * near) / np.abs(modes).max(axis=1))[:, None, None]
+    return loops - (modes.real.max(axis=1) + near)[:, None, None] * np.eye(n)
+
+
+def refute_each_other(loops, discrete=False, nearly=1e-9):
+    """Whether a product has a negative eigenvalue; None where one is about to have."""
+    if discrete:
+        loops = (loops - np.eye(len(loops[0]))) @ np.linalg.inv(loops + np.eye(len(loops[0])))
+    modes = np.concatenate([np.linalg.eigvals(loops[0] @ other) for other in (loops[1], np.linalg.inv(loops[1]))])
+    angles = np.pi - np.abs(np.angle(modes))
+    return bool((angles == 0).any()) if not ((angles > 0) & (angles < nearly)).any() else None
+
+
+@pytest.mark.parametrize(("order", "discrete"), [(2, False), (2, True), (3, False)])
+def test_two_vertices_refute_where_their_product_has_a_negative_eigenvalue(order, discrete):
+    random, refuted = np.random.default_rng(order), 0
+    for _ in range(60):
+        loops = two_stable(random, order, discrete)
+        system = Polytope(loops, np.zeros((2, order, 1)), 0.1 if discrete else None)
+        truth = refute_each_other(loops, discrete)
+        for factor in (1.0, 1e-3):  # a vertex of another time scale, in the middle of the two, changes nothing
+            middle = Polytope([*loops, loops.mean(axis=0)], np.zeros((3, order, 1)), system.period)
+            found = certify(np.zeros(order), system if factor == 1 else middle)
+            if truth:
+                refuted += 1
+                assert found.quadratically_stable is False
+                assert found.verified_exactly
+            elif order == 2 and truth is False:
+                assert found.quadratically_stable is True
+    assert 20 < refuted < 110
+
+
+@pytest.mark.parametrize("lie", [lambda y: y + np.nan, lambda y: 0 * y + 1e-14], ids=["no answer", "zero, rounded"])
+def test_what_two_vertices_refute_needs_no_solver(monkeypatch, lie):
+    monkeypatch.setattr(lmi, "solve", tampered(lie))
+    for k2 in (-48.0, -76.0):
+        assert certify((-11753.0, k2), RIG).quadratically_stable is False
+        assert certify((-11753.0, k2), RIG, Spec(decay=1.0)).verified_exactly
+    assert certify((-11753.0, -158.17), RIG).quadratically_stable is not False
+    random = np.random.default_rng(0)
+    refuted = 0
+    for _ in range(40):
+        loops = two_stable(random, 2, discrete=True)
+        found = certify((0.0, 0.0), Polytope([*loops, loops.mean(axis=0)], np.zeros((3, 2, 1)), 0.1))
+        refuted += refute_each_other(loops, discrete=True)
+        assert not refute_each_other(loops, discrete=True) or found.quadratically_stable is False
+    assert refuted > 5
+
+
 def test_fastest_decay_of_one_system_is_that_of_its_poles():
     gain = (-1000.0, -30.0)
     slowest = -np.linalg.eigvals(ONE.closed(gain)).real.max()

@@ -31,7 +31,7 @@ iae = 1.0
 [tune.limits]
 overshoot = 1.0
 """
-SPREAD = "sweep.over.initial.speed={type='normal',mean=8.3,deviation=0.3,low=7.2,high=11.0}"
+SPREAD = "sweep.over.initial.speed={ type = 'normal', mean = 8.3, deviation = 0.3, low = 7.2, high = 11.0 }"
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def measured(folder):
     path = folder / "run.csv"
-    words = ["-m", "diffabs", "simulate", folder / "small.toml", "--csv", path]
+    words = ["-m", "diffabs", "simulate", folder / "small.toml", "--set", "sensor=direct", "--csv", path]
     subprocess.run([sys.executable, *map(str, words)], check=True, capture_output=True, env=environment())
     return path
 
@@ -58,7 +58,7 @@ def long_commands(folder, out):
         "sweep": ["sweep", small, "--out", out / "sweep", "--samples", 640],
         "rare": ["rare", small, "stop_distance=2.5", "--samples", 200, "--set", SPREAD],
         "tune": ["tune", small, "--set", "tune.iterations=2"],
-        "identify": ["identify", small, "--data", folder / "run.csv", *free],
+        "identify": ["identify", small, "--data", folder / "run.csv", "--set", "sensor=direct", *free],
         "design": ["design", "slip-lmi"],
         "reproduce": ["reproduce", "slip-estimator", "--out", out],
     }
@@ -178,7 +178,7 @@ def test_a_dumb_terminal_gets_lines(folder, tmp_path, command):
 
 @pytest.fixture
 def signals():
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 

@@ -6,7 +6,8 @@
     ...        see `certificate` for the others, for discrete time, and for schedules
 
 P is found by a solver in floating point and then proved in exact arithmetic (`certificate`). Where no common P exists
-the multipliers of the same programme are the proof of that: W_i >= 0 with sum He[C_i W_i] > 0.
+the multipliers of the same programme are the proof of that: W_i >= 0 with sum He[C_i W_i] > 0; where it has no answer,
+those of two vertices that refute at once (`pairs`).
 """
 
 import math
@@ -15,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.design import exact, lmi
+from diffabs.design import exact, lmi, pairs
 from diffabs.design.bounds import ROOM, Bounds, decrease
 from diffabs.design.certificate import Certificate, Claim
 from diffabs.design.frame import analysis_frame, frame
@@ -78,17 +79,30 @@ class _Analysis:
         for _ in range(TRIES):
             p, margin, w = self._common(asked)
             if p is None:
-                return None
+                break
             if margin > 0:
                 found = self._decaying(p, asked)
                 if found is not None:
                     return self._fastest(found) if fastest else found
+            # whatever the sign of the margin: where there is no P the best is P = 0, whose margin is 0 but for rounding
             claim = self._claim("infeasible", W=w, **self._rate(asked))
-            if margin <= 0 and self._proved(claim):
+            if np.isfinite(w).all() and self._proved(claim):
                 return claim
-            if np.linalg.eigvalsh(p)[0] <= 0:
-                return None
-            self.frame = frame(p, self.closed, np.eye(1), discrete=self.discrete)
+            try:
+                self.frame = frame(p, self.closed, np.eye(1), discrete=self.discrete)
+            except np.linalg.LinAlgError:
+                break
+        return self._refuted_by_two(asked)
+
+    def _refuted_by_two(self, asked: float) -> Claim | None:
+        """Two vertices without a common P, whose multipliers need no solver."""
+        rate, scaled = self._rate(asked), self.frame.states(self.closed) * self.frame.tau
+        t, factor = self.frame.T, rate.get("factor")
+        for w in pairs.witnesses(scaled + rate.get("rate", 0.0) * np.eye(self.system.order), factor):
+            w = he(t @ w @ t.T)
+            claim = self._claim("infeasible", W=w / np.abs(w).max(), **rate)
+            if self._proved(claim):
+                return claim
         return None
 
     def _common(self, rate: float) -> tuple[np.ndarray | None, float, np.ndarray]:

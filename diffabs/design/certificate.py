@@ -1,7 +1,7 @@
 """A robust design with its proofs: what is claimed about which matrices, kept in a file anyone can check again.
 
 A verdict is never stored: `Certificate.load` reads matrices and claims, `verify` proves them exactly (`exact`), and so
-does `experiments/check_certificate.py`, which shares no code with this package. Claims and their data, by kind:
+does `verify`, which shares no code with the rest of this package. Claims and their data, by kind:
 
     decay       P, rate (factor in discrete time)   V = x' P x falls like exp(-2 rate t), by factor^2 a period
     cost        P, Q, R, maybe x0                   the cost from x0 is at most x0' P x0; trace P on average

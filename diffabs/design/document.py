@@ -92,6 +92,8 @@ def read_parts(value: Any) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[
         if not isinstance(name, str) or not isinstance(data, dict):
             raise ValueError(f"claims[{i}] needs a kind that is a string and data that is an object")
         found.append((name, {key: number(each, f"claims[{i}].data.{key}") for key, each in data.items()}))
+    if number(gain, "gain").ndim < 2:
+        raise ValueError("gain must be a list of rows, or one of these for each node")
     return read_system(system), number(gain, "gain"), found
 
 
@@ -107,7 +109,10 @@ def read_system(value: Any) -> Polytope | Schedule:
 
 
 def read_polytope(value: Any, where: str) -> Polytope:
-    """A polytope from JSON. Raises ValueError that names the field."""
+    """A polytope from JSON. Raises ValueError that names the field.
+
+    Its corners stay behind: nothing ties the labels of a file to its matrices, so they are not shown beside a proof.
+    """
     A, B, period, states, corners = fields(value, where, "A", "B", "period", "states", "corners")
     if period is not None and not (isinstance(period, float) and 0 < period < math.inf):
         raise ValueError(f"{where}.period must be null or positive [s]")
@@ -115,7 +120,7 @@ def read_polytope(value: Any, where: str) -> Polytope:
         items(list(corner.values()), f"values of {where}.corners", float)
         number(list(corner.values()), f"{where}.corners")
     states = tuple(items(states, f"{where}.states", str))
-    system = Polytope(number(A, f"{where}.A"), number(B, f"{where}.B"), period, states, tuple(corners))
+    system = Polytope(number(A, f"{where}.A"), number(B, f"{where}.B"), period, states)
     if len(corners) not in (0, system.vertices) or len(states) not in (0, system.order):
         raise ValueError(f"{where}.corners and {where}.states must be empty or one for each vertex and each state")
     if system.order + system.inputs > LARGEST_ORDER:

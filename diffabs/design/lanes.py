@@ -18,6 +18,7 @@ from diffabs.design.lyapunov import cholesky, eye, relative, size, smith, solve,
 LANES = 128  # that advance together: their matrices stay in the cache, and a hard one delays no more than these
 SWEEPS, DOUBLINGS, SIGNS, STEPS = 12, 40, 40, 16  # at most: of balancing, doubling, the sign iteration, Newton-Kleinman
 ERROR = 1e-7  # largest admitted estimate of the relative error of P in balanced coordinates
+ROUNDING = 1e-12  # of R: pivots below are taken for 0
 RESIDUAL = 1e-9  # largest admitted relative residual in the given coordinates
 
 
@@ -65,7 +66,11 @@ def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
 
 @_lanes
 def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Any:
-    """The same in discrete time."""
+    """The same in discrete time, where R may be singular."""
+    p = _singular(A, B, Q, R)
+    shift = p[:, None] * eye(len(A), A)
+    moved, T = times(transpose(A), shift), transpose(B)
+    Q, R, S = Q + times(moved, A) - shift, R + times(T, shift, B), S + times(moved, B)
     B, S, a, b, q, d = _prepared(A, B, Q, R, S)
     I, G = eye(len(a), a), times(b, transpose(b))
 
@@ -76,7 +81,10 @@ def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
 
     P, found = _doubled(a, G, q)
     P = _unless(found, P, by_sign)
-    return _given(_refined(partial(_hewer, a, b, q), P), d, partial(_discrete_terms, A, B, Q, S))
+    P = _refined(partial(_hewer, a, b, q), P, shift * d * d[:, None])
+    P, residual = _given(P, d, partial(_discrete_terms, A, B, Q, S))
+    curved = jnp.isfinite(size(cholesky(eye(B.shape[1], B) + times(transpose(B), P, B))))
+    return jnp.where(curved | ~jnp.any(p > 0, 0), P + shift, jnp.nan), residual
 
 
 def _blocks(*blocks: jax.Array) -> jax.Array:
@@ -93,6 +101,29 @@ def _prepared(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
     a, q = A - times(B, transpose(S)), Q - times(S, transpose(S))
     d = _balance(a, times(B, transpose(B)), q)
     return B, S, a * d / d[:, None], B / d[:, None], q * d * d[:, None], d
+
+
+def _singular(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array) -> jax.Array:
+    """The diagonal p (n, lanes) of a matrix that P is replaced by the excess over, 0 where R > 0, NaN where R is not
+    even semidefinite.
+
+    The discrete equation for P - diag p is one with R + B' diag(p) B, definite if any R + B' P B is. In balanced
+    coordinates p is as large as Q.
+    """
+    one, diagonal = eye(len(R), R), jnp.sum(R * eye(len(R), R), 1)
+    pivots = jnp.sum(cholesky(R) * one, 1) ** 2
+    definite = jnp.all(pivots > ROUNDING * diagonal, 0)
+    weight = size(R)
+    spare = jnp.where(weight > 0, ROUNDING * weight, 1.0)
+    semidefinite = jnp.isfinite(size(cholesky(R + spare * one)))
+
+    def needed() -> jax.Array:
+        d = _balance(A, times(B, transpose(B)), Q)
+        level = size(Q * d * d[:, None])
+        p = jnp.where(level > 0, level, 1.0) / (d * d)
+        return jnp.where(definite, 0.0, jnp.where(semidefinite, p, jnp.nan))
+
+    return lax.cond(jnp.all(definite), lambda: jnp.zeros_like(A[0]), needed)
 
 
 def _balance(A: jax.Array, G: jax.Array, Q: jax.Array) -> jax.Array:
@@ -178,8 +209,11 @@ def _graph(Z: jax.Array) -> jax.Array:
 # Steps 3 and 4
 
 
-def _refined(newton: Callable, P: jax.Array) -> jax.Array:
-    """Newton-Kleinman until P moves by less than 1e-7, then the last step and its proof; NaN where there is none."""
+def _refined(newton: Callable, P: jax.Array, shift: Any = 0.0) -> jax.Array:
+    """Newton-Kleinman until P moves by less than 1e-7, then the last step and its proof; NaN where there is none.
+
+    Errors are relative to P + shift.
+    """
 
     def going(carry: Any) -> jax.Array:
         k, _, moved = carry
@@ -193,8 +227,8 @@ def _refined(newton: Callable, P: jax.Array) -> jax.Array:
     P = lax.while_loop(going, step, (0, P, jnp.ones_like(P[0, 0])))[1]
     terms, D, X = newton(P, eye(len(P), P))
     P = P + D
-    error = jnp.finfo(P.dtype).eps * size(X) * terms
-    return jnp.where((error <= ERROR * size(P)) & (size(D) <= ERROR * size(P)), P, jnp.nan)
+    error, limit = jnp.finfo(P.dtype).eps * size(X) * terms, ERROR * size(P + shift)
+    return jnp.where((error <= limit) & (size(D) <= limit), P, jnp.nan)
 
 
 def _given(P: jax.Array, d: jax.Array, terms: Callable) -> tuple[jax.Array, jax.Array]:

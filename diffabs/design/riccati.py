@@ -32,8 +32,8 @@ class Riccati(NamedTuple):
     stabilising: P is finite and symmetric; the residual is at most 1e-9; the closed loop Ac is stable, and by enough:
     in balanced coordinates X of Ac' X + X Ac + I = 0 exists and eps |X| (sum of the norms of the terms) <= 1e-7 |P|,
     which bounds to first order the relative error of P. It is false for a pair that cannot be stabilised, for a
-    Hamiltonian with eigenvalues on the imaginary axis (unit circle), for R that is not positive definite, for input
-    that is not finite, and for what is too close to one of these to tell.
+    Hamiltonian with eigenvalues on the imaginary axis (unit circle), for R that is not positive definite (of `dare`:
+    semidefinite), for input that is not finite, and for what is too close to one of these to tell.
     """
 
     P: Any
@@ -52,7 +52,8 @@ def care(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
 
 
 def dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
-    """The stabilising P of A' P A - P - (A' P B + S) (R + B' P B)^-1 (A' P B + S)' + Q = 0. As `care`, R > 0 too.
+    """The stabilising P of A' P A - P - (A' P B + S) (R + B' P B)^-1 (A' P B + S)' + Q = 0. As `care`, but R may be
+    singular, R >= 0, where R + B' P B > 0.
 
     The feedback is u = -(R + B' P B)^-1 (B' P A + S') x.
     """
@@ -62,6 +63,8 @@ def dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
 def _riccati(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Riccati:
     A, B, Q, R = matrices(A, B, Q, R)
     S = jnp.zeros_like(B) if S is None else matrices(S)[0].astype(B.dtype)
+    if jnp.iscomplexobj(B) or jnp.iscomplexobj(S):
+        raise ValueError("A, B, Q, R, S must be real; [[Re, -Im], [Im, Re]] of each is the same equation, real")
     n, m = B.shape
     shapes = (A.shape, Q.shape, R.shape, S.shape)
     if shapes != ((n, n), (n, n), (m, m), (n, m)):

@@ -25,6 +25,7 @@ RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "limit": ("be positive", lambda value: value > 0),
     "rates": ("increase", lambda value: value[0] <= value[1]),
 }
+GROWTH = {"factor": ("be positive", RANGES["gamma"][1])}  # that nothing proves a rate may be said of growth, too
 
 
 def check(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Mapping[str, Any]) -> None:
@@ -50,8 +51,8 @@ def check(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Mappin
             raise ValueError(f"{kind}.{name} has shape {np.shape(data[name])}; needed: {shape or 'a number'}, {sizes}")
         if not np.isfinite(data[name]).all():
             raise ValueError(f"{kind}.{name} has an entry that is not finite")
-        says, holds = RANGES.get(name, ("be finite", np.isfinite))
-        if kind != "infeasible" and not np.all(holds(data[name])):
+        says, holds = (GROWTH if kind == "infeasible" else RANGES).get(name, ("be finite", np.isfinite))
+        if not np.all(holds(data[name])):
             raise ValueError(f"{kind}.{name} must {says}; got {data[name]}")
 
 

@@ -1,0 +1,214 @@
+"""`diffabs verify`: proves what is true, in fractions, and nothing that is false or no claim at all."""
+
+import copy
+import json
+import os
+import subprocess
+import sys
+
+import checker
+import numpy as np
+import pytest
+from commands import assert_one_error_line, run
+from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+
+from diffabs import console
+from diffabs.design import verify
+from diffabs.design.certificate import Certificate, Claim
+from diffabs.design.polytope import Polytope, Schedule
+
+C = np.array([[-1.0, 2.0], [-2.0, -1.0]])  # poles -1 +- 2j, damping 1/sqrt(5) = 0.447
+STEP = np.array([[0.5, 0.2], [-0.2, 0.5]])  # radius sqrt(0.29) = 0.5385
+K = np.zeros((1, 2))
+B = np.array([[0.0], [1.0]])
+
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch):
+    monkeypatch.setattr(console, "PATIENCE", np.inf)
+
+
+def certificate(kind, a=C, period=None, gain=K, **data):
+    return Certificate(Polytope([a], [B], period), gain, (Claim(kind, data),))
+
+
+def lyapunov(a, q=1.0):
+    return solve_continuous_lyapunov(a.T, -q * np.eye(2))
+
+
+def cases():
+    """Of each kind a true claim, and the same just beyond the truth."""
+    p, one = lyapunov(C), np.eye(2)
+    weights = {"Q": 0.9 * one, "R": np.eye(1)}
+    zeta = 1 / np.sqrt(5)
+    cone = {"P": one, "zeta": 0.44, "cot": 0.44 / np.sqrt(1 - 0.44**2) * 1.001}
+    outside = {"P": one, "zeta": 0.46, "cot": 0.46 / np.sqrt(1 - 0.46**2) * 1.001}
+    assert cone["zeta"] < zeta < outside["zeta"]
+    gain = {"P": 2 * one, "Bw": B, "C": one[:1], "D": np.zeros((1, 1))}
+    points = {"P": one, "points": [[0.5, 0.5]]}
+    k = np.array([[0.3, 0.4]])
+    yield certificate("decay", P=one, rate=0.999), certificate("decay", P=one, rate=1.0)
+    yield certificate("decay", STEP, 0.1, P=one, factor=0.539), certificate("decay", STEP, 0.1, P=one, factor=0.538)
+    yield certificate("cost", P=p, **weights), certificate("cost", P=p, Q=1.01 * one, R=np.eye(1))
+    yield certificate("damping", **cone), certificate("damping", **outside)
+    yield certificate("l2", gamma=2.5, **gain), certificate("l2", gamma=0.05, **gain)
+    held = {"gain": k, "a": C - B @ k, **points}
+    yield certificate("input", limit=[0.51], **held), certificate("input", limit=[0.49], **held)
+    yield certificate("infeasible", -C, W=[one]), certificate("infeasible", C, W=[one])
+    yield certificate("infeasible", 2 * STEP, 0.1, W=[one]), certificate("infeasible", STEP, 0.1, W=[one])
+    yield chain(rates=(-0.5, 0.5)), chain(rates=(-50.0, 50.0))
+
+
+def chain(rates):
+    cells = tuple(Polytope([s * C], [B]) for s in (1.0, 1.1))
+    forms = np.array([np.eye(2), 1.1 * np.eye(2), 1.2 * np.eye(2)])
+    return Certificate(
+        Schedule("speed", [1.0, 2.0, 3.0], cells), K, (Claim("scheduled", {"P": forms, "rates": rates}),)
+    )
+
+
+IDS = ["decay", "decay in steps", "cost", "damping", "l2", "input", "infeasible", "infeasible in steps", "scheduled"]
+
+
+def saved(proof, folder):
+    proof.save(folder / "c.json")
+    return folder / "c.json"
+
+
+@pytest.mark.parametrize("pair", list(cases()), ids=IDS)
+def test_each_kind_is_proved_if_it_is_true_and_only_then(tmp_path, pair):
+    for proof, true in zip(pair, (True, False), strict=True):
+        (verdict,) = verify.verify(saved(proof, tmp_path))
+        stored = json.loads((tmp_path / "c.json").read_text(), parse_int=float)
+        claim = stored["claims"][0]
+        assert (not verdict.reason) is true
+        assert checker.proved(stored["system"], stored["gain"], claim["kind"], claim["data"]) is true
+        assert verdict.says
+
+
+def test_it_agrees_with_the_checker_of_the_tests(tmp_path):
+    """Random P, from SciPy's Lyapunov equation and beside it, in continuous time and in steps."""
+    rng, seen = np.random.default_rng(0), []
+    for _ in range(60):
+        a, period = rng.standard_normal((2, 2)), rng.choice([None, 0.1])
+        off = rng.standard_normal((2, 2)) * rng.choice([0.0, 0.05, 0.5])
+        try:
+            p = lyapunov(a) if period is None else solve_discrete_lyapunov(a.T, np.eye(2))
+        except np.linalg.LinAlgError:
+            continue
+        proof = certificate("decay", a, period, P=(p + p.T + off + off.T) / 2)
+        (verdict,) = verify.verify(saved(proof, tmp_path))
+        stored = json.loads((tmp_path / "c.json").read_text(), parse_int=float)
+        claim = stored["claims"][0]
+        seen.append(not verdict.reason)
+        assert seen[-1] is checker.proved(stored["system"], stored["gain"], claim["kind"], claim["data"])
+    assert 10 < sum(seen) < len(seen) - 10
+
+
+# What a claim must contain: an unstable gain, x' = +x
+
+
+UNSTABLE = {"A": [[[1.0]]], "B": [[[1.0]]], "period": None, "states": [], "corners": []}
+
+
+def document(kind="decay", system=UNSTABLE, gain=((0.0,),), **data):
+    claims = [{"kind": kind, "data": data}]
+    return {"format": "diffabs certificate", "version": 1, "system": system, "gain": gain, "claims": claims}
+
+
+def stepping(radius):
+    return {**UNSTABLE, "A": [[[radius]]], "period": 0.1}
+
+
+FALSE = [
+    (document("cost", P=[[1.0]], Q=[[-10.0]], R=[[1.0]]), 2, "claims[0].data.Q is outside a weight"),
+    (document("cost", P=[[1.0]], Q=[[0.0]], R=[[1.0]]), 1, "vertex 0: what V falls by is not positive definite"),
+    (document(P=[[1.0]], rate=-1e9), 2, "claims[0].data.rate is outside [0, inf)"),
+    (document(P=[[1.0]], system=stepping(2.0), factor=100.0), 2, "claims[0].data.factor is outside (0, 1]"),
+    (document(P=[[1.0]], system=stepping(2.0), factor=-100.0), 2, "claims[0].data.factor is outside (0, 1]"),
+    (document(P=[[1.0]], system=stepping(2.0), rate=1.0), 2, "claims[0].data.rate is not a field"),
+    (document(P=[[1.0]], system={**UNSTABLE, "A": [], "B": []}), 2, "system.A must be a list of 1 to 4096"),
+    (document(P=[[1.0]], system={}), 2, "system must have the members A, B, period, states, corners and no other"),
+    (document(P=[[-1.0]]), 1, "P is not positive definite"),
+    (document(P=[[0.0]], system={**UNSTABLE, "A": [[[-1.0]]]}), 1, "P is not positive definite"),
+    (document(P=[]), 2, "claims[0].data.P must be a list of 1 to 4096"),
+    (document(P=[[1.0, 0.0]]), 2, "claims[0].data.P[0] has 2 entries; 1 are needed"),
+    (document(P=[[True]]), 2, "claims[0].data.P[0][0] must be a finite number"),
+    (document(P=[[1e999]]), 2, "Infinity is not a number"),
+    (document(), 2, "claims[0].data.P is missing in a claim of kind decay"),
+    (document("stable", P=[[1.0]]), 2, "claims[0] needs a kind, one of decay, cost"),
+    (document("infeasible", W=[]), 2, "claims[0].data.W must be a list"),
+    (document("infeasible", W=[[[0.0]]]), 1, "the sum over the vertices is not positive definite"),
+    (document("infeasible", system={**UNSTABLE, "A": [[[-1.0]]]}, W=[[[-1.0]]]), 1, "W is not positive definite"),
+    (document("scheduled", P=[[[1.0]]], rates=[0.0, 1.0]), 2, "a claim of kind scheduled does not fit the system"),
+    (document("damping", P=[[1.0]], system=stepping(0.5), zeta=0.1, cot=1.0), 2, "does not fit the system"),
+    ({**document(), "claims": []}, 1, "the file claims nothing"),
+    ({}, 2, "the file must have the members format, version, system, gain, claims and no other"),
+    ([], 2, "the file must have the members"),
+    ({**document(), "version": 2}, 2, "format and version"),
+]
+
+
+@pytest.mark.parametrize(("content", "status", "needed"), FALSE, ids=[needed for *_, needed in FALSE])
+def test_nothing_false_and_no_nonsense_is_proved(tmp_path, content, status, needed):
+    (tmp_path / "c.json").write_text(json.dumps(content))
+    result = run("verify", tmp_path / "c.json", status=status)
+    assert needed in result.stderr
+    assert result.stderr.startswith("error: ")
+    assert result.stderr.count("\n") == 1
+    assert not any(line.startswith("proved") for line in result.stdout.splitlines())
+
+
+def test_no_file_and_no_json(tmp_path):
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
+    (tmp_path / "twice.json").write_text('{"format": 1, "format": 2}')
+    (tmp_path / "digits.json").write_text("[" + "1" * 5000 + "]")
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for name in ("none.json", "deep.json", "binary.json", "twice.json", "digits.json", "fifo", "loop", "."):
+        assert_one_error_line(run("verify", tmp_path / name, status=2))
+
+
+def test_one_bit_of_a_proof_matters_or_leaves_it_true(tmp_path):
+    """No change of any one number is proved but where the checker of the tests proves it too."""
+    stored = json.loads(saved(certificate("cost", P=lyapunov(C), Q=0.9 * np.eye(2), R=np.eye(1)), tmp_path).read_text())
+    for factor in (0.0, -1.0, 0.5, 1.2, 1e9):
+        for path in [("system", "A", 0, 0, 0), ("system", "A", 0, 0, 1), ("gain", 0, 0), *(
+                ("claims", 0, "data", name, 0, 0) for name in "PQR")]:  # fmt: skip
+            changed = copy.deepcopy(stored)
+            place = changed
+            for key in path[:-1]:
+                place = place[key]
+            place[path[-1]] = float(place[path[-1]] * factor if path[0] != "gain" else factor)
+            (tmp_path / "changed.json").write_text(json.dumps(changed))
+            try:
+                (verdict,) = verify.verify(tmp_path / "changed.json")
+            except ValueError:
+                continue
+            claim = json.loads(json.dumps(changed), parse_int=float)
+            first = claim["claims"][0]
+            assert (not verdict.reason) is checker.proved(claim["system"], claim["gain"], "cost", first["data"])
+
+
+# The command
+
+
+def test_what_it_says(tmp_path):
+    path = saved(certificate("decay", P=np.eye(2), rate=0.5), tmp_path)
+    result = run("verify", path)
+    assert result.stdout == "proved  decay: stable, with a decay of at least 0.5 1/s, however the system varies\n"
+    found = json.loads(run("verify", path, "--json").stdout)
+    assert (found["proved"], found["claims"][0]["proved"], found["claims"][0]["reason"]) == (True, True, "")
+
+
+def test_it_needs_no_solver_and_the_checker_nothing_of_the_package(tmp_path):
+    path = saved(certificate("decay", P=np.eye(2), rate=0.5), tmp_path)
+    code = "import sys; sys.modules.update(dict.fromkeys(['cvxpy', 'scipy', 'clarabel', 'optax'])); "
+    code += f"import diffabs.cli as c; c.app(['verify', {str(path)!r}])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split(":")[0]) == (0, "proved  decay"), done.stderr
+    alone = f"import sys; sys.modules.update(jax=None, numpy=None, diffabs=None); import runpy; "\
+            f"m = runpy.run_path({verify.__file__!r}); assert not m['verify']({str(path)!r})[0].reason"  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", alone], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
