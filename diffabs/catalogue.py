@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from diffabs import actuators, blocks, controllers, objectives, plants, protocols, references, roads, sensors, stops
-from diffabs.loop import TYPICAL, Loop, task
+from diffabs.loop import TYPICAL, Loop, control_unit, task
 from diffabs.pytree import Spec
 
 KMH = 3.6  # km/h in a m/s
@@ -87,17 +87,26 @@ def summary(part: Any) -> str:
     return " ".join((inspect.getdoc(type(part)) or "").split("\n\n")[0].split())
 
 
-def unit_of(objective: Any) -> str:
-    """The unit of what an objective measures: the first bracket of its docstring, as in `[N m]`; else empty."""
+def unit_of(objective: Any, plant: Any = None) -> str:
+    """The unit of what an objective measures: the first bracket of its docstring, as in `[N m]`; else empty. With a
+    brake whose control is no torque, that of its control in the place of N m."""
     bracket = re.search(r"\[(.+?)\]", inspect.getdoc(type(objective)) or "")
-    return bracket.group(1) if bracket else ""
+    unit = bracket.group(1) if bracket else ""
+    control = "N m" if plant is None or task(plant) != "braking" else control_unit(plant)
+    if control == "N m":
+        return unit
+    unit = unit.replace("N^2 m^2", "1" if control == "1" else f"{control}^2").replace("N m", control)
+    return re.sub(r"\b1 (?=\S)", "", unit)
 
 
 def shown(value: Any, most: int = 60) -> str:
     """A value of a scenario as it may stand in a message: on one line, of bounded length."""
     if isinstance(value, float) or (isinstance(value, int) and abs(value) < 10**15):
         return f"{value:.15g}" if not isinstance(value, bool) else str(value).lower()
-    text = json.dumps(value, ensure_ascii=True) if isinstance(value, str) else repr(value)
+    try:
+        text = json.dumps(value, ensure_ascii=True) if isinstance(value, str) else repr(value)
+    except (ValueError, RecursionError):  # more digits than Python writes, more levels than it descends
+        text = "a number of thousands of digits" if isinstance(value, int) else "something nested too deeply"
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 

@@ -28,7 +28,7 @@ from diffabs import (
     show,
     usage,
 )
-from diffabs.loop import task
+from diffabs.loop import control_unit, task
 from diffabs.pytree import parameters
 from diffabs.rollout import Run, measure, rollout
 from diffabs.scenario import Scenario, dump, header, names
@@ -114,7 +114,7 @@ def simulate(
                 key = chosen.key()
             run = console.waited(lambda: _run(chosen, key, keep=bool(csv or plot)), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
-                show.write_csv(run.trajectory, getattr(chosen.loop.plant, "control_unit", "N m"), csv_file)
+                show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
             if picture:
                 console.waited(lambda: _draw(chosen, run, picture), "drawing")
         result = _result(chosen, run, {"csv": csv, "plot": plot})
@@ -147,7 +147,7 @@ def _check_source(scenario: Any, from_sweep: Any, sample: int | None, changes: A
 
 def _check_targets(csv: pathlib.Path | None, plot: pathlib.Path | None) -> None:
     console.check_picture(plot)
-    if csv and plot and csv.resolve() == plot.resolve():
+    if csv and plot and console.resolved(csv, "--csv") == console.resolved(plot, "--plot"):
         console.fail(f"--csv and --plot are the same file, {csv}")
 
 
@@ -163,7 +163,7 @@ def _run(chosen: Scenario, key: Any, keep: bool) -> Run:
 
 def _draw(chosen: Scenario, run: Run, picture: pathlib.Path) -> None:
     draw = getattr(importlib.import_module("diffabs.plot"), task(chosen.loop.plant))
-    draw(run, title=chosen.title or chosen.name).savefig(picture)
+    draw(run, title=chosen.title or chosen.name, unit=control_unit(chosen.loop.plant)).savefig(picture)
 
 
 def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import typer
 
 from diffabs import console, show
 from diffabs.catalogue import ScenarioError, unknown
-from diffabs.commands_sweep import reported
+from diffabs.commands_sweep import reported, warn_of_strays
 
 if TYPE_CHECKING:
     from diffabs.sweep import Results
@@ -37,6 +37,7 @@ def _check_same(a: "Results", b: "Results") -> None:
     from diffabs.sweep.store import differences
 
     for found in (a, b):
+        warn_of_strays(found)
         if not found.complete:
             raise ScenarioError(f"{found.folder} is not complete; --resume goes on with it")
     for line in differences({k: a.study[k] for k in SAME}, {k: b.study[k] for k in SAME}):

@@ -49,7 +49,7 @@ def _failure(text: str, chosen: Scenario) -> tuple[str, float]:
     if metric not in chosen.objectives:
         raise unknown(f"{metric} is not measured", metric, chosen.objectives)
     if equals:
-        return metric, number(value(bound.strip()), Spec(unit_of(chosen.objectives[metric])), metric)
+        return metric, number(value(bound.strip()), Spec(unit_of(chosen.objectives[metric], chosen.loop.plant)), metric)
     if metric not in chosen.sweep.failures:
         raise ScenarioError(f"{metric} has no bound in [sweep.failures]: say {metric}=BOUND")
     return metric, chosen.sweep.failures[metric]
@@ -99,7 +99,7 @@ def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str,
         "scenario": chosen.name,
         "metric": metric,
         "bound": bound,
-        "unit": unit_of(chosen.objectives[metric]),
+        "unit": unit_of(chosen.objectives[metric], chosen.loop.plant),
         "probability": found.probability,
         "cov": found.cov,
         "interval": list(found.interval),

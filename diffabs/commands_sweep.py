@@ -5,6 +5,7 @@ It needs the extra `diffabs[sweep]`, and for Dask `diffabs[cluster]`; what needs
 import contextlib
 import dataclasses
 import json
+import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterator
@@ -66,6 +67,7 @@ def sweep(
             _check_runnable(study, number)
         with _continued(out, resume):
             found = _run(study, chosen, out, resume, lambda: _engine(engine, scheduler, workers))
+            warn_of_strays(found)
             if not found.complete:
                 raise KeyboardInterrupt
             result = console.waited(lambda: _result(found, study, out, kept, figures), "computing statistics")
@@ -78,13 +80,16 @@ def sweep(
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     """A sample of a sweep as a scenario, and the key of its noise. Raises SweepError or ValueError."""
     console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
-    from diffabs.sweep.store import SweepError, read_manifest
+    from diffabs.sweep.store import SweepError, differences, read_manifest
 
-    source = read_manifest(folder)["source"]
+    manifest = read_manifest(folder)
+    source = manifest["source"]
     if "scenario" not in source:
         raise SweepError(f"{folder} was not swept from a scenario; Study.lane({number}) is this sample")
-    chosen = loads(source["scenario"].encode(), source["name"], f"{folder}", integrated=False)
+    chosen = loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
     study = variation.study(chosen)
+    for line in differences(manifest["study"], study.table(), "study"):
+        raise SweepError(f"{folder}: the scenario in its manifest is not what was swept: {line}")
     if not 0 <= number < study.samples:
         console.fail(f"--sample {number} is outside [0, {study.samples - 1}]")
     loop, key = _check_runnable(study, number)
@@ -100,13 +105,20 @@ def _check_runnable(study: "Study", number: int) -> tuple[Any, jax.Array]:
     return loop, key
 
 
+def warn_of_strays(found: "Results") -> None:
+    """Files among the chunks that are not read, but would be by others."""
+    if found.strays:
+        more = f" (and {len(found.strays) - 1} more)" if found.strays[1:] else ""
+        console.say(f"warning: {found.strays[0]}{more} is no chunk of this sweep; other readers would take it in")
+
+
 @contextlib.contextmanager
 def reported() -> Iterator[None]:
     """A sweep that cannot be started or read is bad input."""
     try:
         yield
     except ValueError as error:
-        if isinstance(error, ScenarioError) or type(error).__name__ != "SweepError":
+        if "SweepError" not in (cls.__name__ for cls in type(error).__mro__):  # its module needs the extra
             raise
         console.fail(str(error))
 
@@ -139,9 +151,11 @@ def _check_options(engine: str, scheduler: str | None, workers: int | None, devi
     ):
         if value is not None and engine != needed:
             console.fail(f"{option} {value} needs --engine {needed}")
+    most = max(8, 2 * (os.cpu_count() or 1))
     for option, value in (("--workers", workers), ("--devices", devices)):
-        if value is not None and value < 1:
-            console.fail(f"{option} {value} is outside [1, inf)")
+        if value is not None and not 1 <= value <= most:
+            why = ": more than twice the processors only cost memory" if value > most else ""
+            console.fail(f"{option} {value} is outside [1, {most}]{why}")
     if scheduler and workers:
         console.fail(f"--workers {workers}: the scheduler at {scheduler} has its own workers")
     if figures:
@@ -218,7 +232,7 @@ def _result(found: "Results", study: "Study", out: pathlib.Path, kept: list[int]
         folder = out / FIGURES
         folder.mkdir(exist_ok=True)
         units = {path: spec.unit for path, spec in elements(study.loop).items()}
-        units |= {name: unit_of(objective) for name, objective in study.objectives.items()}
+        units |= {name: unit_of(objective, study.loop.plant) for name, objective in study.objectives.items()}
         result["files"]["figures"] = [str(path) for path in draw(found, result, folder, units)]
     document = json.dumps(show.finite(result), indent=1, allow_nan=False)
     write_whole(out / SUMMARY, document.encode())

@@ -15,6 +15,7 @@ import typer
 
 from diffabs import console, proof, show
 from diffabs.catalogue import ScenarioError
+from diffabs.loop import control_unit
 from diffabs.pytree import get, parameters
 from diffabs.refusals import first_line
 from diffabs.rollout import Trajectory, rollout
@@ -313,7 +314,7 @@ def _drawn(work: _Work, found: "Tuned", path: pathlib.Path) -> None:
     runs = {"before": seen(chosen.loop), "after": seen(found.loop)}
     where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
     title = chosen.title or chosen.name
-    tuning(found.history, runs, title=title, lane=where).savefig(path)
+    tuning(found.history, runs, title=title, lane=where, unit=control_unit(chosen.loop.plant)).savefig(path)
 
 
 def _plain(value: Any) -> Any:

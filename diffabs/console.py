@@ -2,10 +2,10 @@
 
 import contextlib
 import importlib.util
+import multiprocessing
 import os
 import pathlib
 import shlex
-import shutil
 import sys
 import tempfile
 import textwrap
@@ -16,13 +16,13 @@ from typing import Annotated, Any, NoReturn, TypeVar
 import typer
 from rich.console import Console
 
-from diffabs import interrupt, progress
+from diffabs import files, interrupt, progress
 from diffabs.catalogue import ScenarioError
 from diffabs.scenario import Scenario, load, names
 
 T = TypeVar("T")
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, interrupt.INTERRUPTED
+FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, interrupt.INTERRUPTED, interrupt.TERMINATED
 PATIENCE, AGAIN = progress.PATIENCE, progress.AGAIN
 AWAKE = 0.1  # s between looks for Ctrl-C
 LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
@@ -196,8 +196,13 @@ def loaded(scenario: str, changes: Sequence[str] | None, *, integrated: bool = T
 
 
 def leave(status: Any) -> NoReturn:
-    """Exit at once where interrupted work still runs: the interpreter would wait for it. Raises SystemExit else."""
+    """Exit at once where interrupted work still runs: the interpreter would wait for it; what that work has begun to
+    write and its processes go with it. Raises SystemExit else."""
+    status = TERMINATED if status == INTERRUPTED and interrupt.terminated() else status
     if any(thread.name == WORKER for thread in threading.enumerate()):
+        for child in multiprocessing.active_children():
+            child.kill()
+        files.clear()
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status if isinstance(status, int) else FAILED)
@@ -232,6 +237,18 @@ def check_scenario_file(out: pathlib.Path | None) -> None:
         fail(f"--out {out}: the name must end in .toml")
 
 
+def resolved(path: pathlib.Path, option: str) -> pathlib.Path:
+    """A path without links. Raises typer.Exit for links that only lead to each other."""
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            path.stat()  # some versions of Python resolve a loop
+        return path.resolve()
+    except OSError as error:
+        fail(f"{option} {path}: cannot be written, {error.strerror}")
+    except ValueError:
+        fail(f"{option} {path}: is no name of a file")
+
+
 @contextlib.contextmanager
 def new_file(target: pathlib.Path, option: str) -> Iterator[pathlib.Path]:
     """A temporary file beside `target` that takes its place at the end, or vanishes if anything goes wrong. Whoever
@@ -239,7 +256,7 @@ def new_file(target: pathlib.Path, option: str) -> Iterator[pathlib.Path]:
 
     Raises typer.Exit where no file can be written.
     """
-    target = target.resolve()
+    target = resolved(target, option)
     if target.exists() and not target.is_file():
         fail(f"{option} {target}: is not a regular file")
     try:
@@ -247,14 +264,11 @@ def new_file(target: pathlib.Path, option: str) -> Iterator[pathlib.Path]:
     except OSError as error:
         fail(f"{option} {target}: cannot be written, {error.strerror}")
     os.close(handle)
-    temporary = pathlib.Path(name)
-    try:
+    with files.unfinished(pathlib.Path(name)) as temporary:
         yield temporary
         if temporary.exists():
             temporary.chmod(0o666 & ~_umask())
             temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -264,7 +278,7 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     An older result (it has a summary.json) is replaced; any other content is left alone. Raises typer.Exit where the
     folder cannot be made or replaced.
     """
-    target = target.resolve()
+    target = resolved(target, "--out")
     if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "summary.json").exists())):
         fail(f"--out {target}: exists and is no earlier result; move it away")
     try:
@@ -272,8 +286,8 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
         room = pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
     except OSError as error:
         fail(f"--out {target}: cannot be written, {error.strerror}")
-    new, old = room / "new", room / "old"
-    try:
+    with files.unfinished(room):
+        new, old = room / "new", room / "old"
         new.mkdir()
         yield new
         if target.exists():
@@ -284,8 +298,6 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
             if old.exists():
                 old.rename(target)
             raise
-    finally:
-        shutil.rmtree(room, ignore_errors=True)
 
 
 def _umask() -> int:

@@ -15,12 +15,13 @@ import sys
 import threading
 from typing import Any
 
-INTERRUPTED = 130  # exit status
+INTERRUPTED, TERMINATED = 130, 143  # exit status after Ctrl-C, after SIGTERM
 UNHEARD = 3
 SHOW_CURSOR = b"\x1b[?25h"
 PROGRAMS = ("diffabs", "-m")  # `python -m diffabs` is called -m until the package is imported
 
 _pending = 0
+_terminated = False
 
 
 def early() -> None:
@@ -30,16 +31,23 @@ def early() -> None:
 
 
 def begin() -> None:
-    """From now on Ctrl-C is heard where `pressed()` is asked, if the process does not ignore it."""
+    """From now on Ctrl-C and SIGTERM are heard where `pressed()` is asked, if the process does not ignore them."""
     global _pending
     _pending = 0
     _answer(_press)
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _terminate)
 
 
 def finish() -> None:
     """From now on the process ends, and cannot be interrupted in that."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def terminated() -> bool:
+    """Whether SIGTERM was among the signals."""
+    return _terminated
 
 
 def pressed() -> bool:
@@ -72,7 +80,13 @@ def _press(*_: Any) -> None:
         _leave()
 
 
+def _terminate(*_: Any) -> None:
+    global _terminated
+    _terminated = True
+    _press()
+
+
 def _leave(*_: Any) -> None:
     with contextlib.suppress(OSError):
         os.write(2, (SHOW_CURSOR + b"\n" if _pending and os.isatty(2) else b"") + b"interrupted\n")
-    os._exit(INTERRUPTED)
+    os._exit(TERMINATED if _terminated else INTERRUPTED)

@@ -13,6 +13,7 @@ from diffabs.blocks import Direct
 from diffabs.controllers import PID, BalanceFeedback, NoFeedforward
 from diffabs.plants import ArmBalance, BalanceStart, BrakeStart, QuarterCar
 from diffabs.protocols import (
+    UNITS,
     Block,
     Clock,
     Feedforward,
@@ -139,6 +140,19 @@ class Loop:
 def task(plant: Plant) -> str:
     """What a plant is controlled for: braking, or balance."""
     return getattr(plant, "task", "braking")
+
+
+def control_unit(plant: Plant) -> str:
+    """The unit of what a plant is controlled by, which commands and controls have in files and figures."""
+    return getattr(plant, "control_unit", "N m")
+
+
+def signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, Any]]:
+    """Unit and values of what is kept of a run, by name: time, all that the plant shows, target, command, control."""
+    shown = {name: (UNITS[name], values) for name, values in sample.output._asdict().items()}
+    asked = {"target": (UNITS[sample.output._fields[0]], sample.target)}
+    given = {name: (control_unit(plant), getattr(sample, name)) for name in ("command", "control")}
+    return {"t": ("s", sample.t), **shown, **asked, **given}
 
 
 TYPICAL = {  # of each task

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from diffabs import files
 from diffabs.objectives.balance import motor_torque
 from diffabs.protocols import Road
 from diffabs.rollout import Run, Trajectory
@@ -62,20 +63,22 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
     """Write a figure in the format of the path's suffix, atomically: readers see the old file or the whole new one."""
     path = pathlib.Path(path)
     handle, name = tempfile.mkstemp(suffix=path.suffix, prefix=f".{path.stem}-", dir=path.parent)
-    try:
+    with files.unfinished(pathlib.Path(name)):
         with os.fdopen(handle, "wb") as file:
             figure.savefig(file, format=path.suffix.lstrip(".") or "png", dpi=DPI)
         os.chmod(name, 0o644)
         os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
     return path
 
 
-def braking(run: Run, *, title: str = "") -> Figure:
-    """A run at a glance: slip with target and setpoint, speeds, torque, deceleration. Raises ValueError for a run
-    without a trajectory, as `measure` returns it."""
+def controlled(unit: str) -> str:
+    """What an axis says of a plant's control in this unit."""
+    return {"N m": "brake torque [N m]", "V": "voltage [V]"}.get(unit, f"control [{unit}]")
+
+
+def braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
+    """A run at a glance: slip with target and setpoint, speeds, control in its `unit`, deceleration. Raises ValueError
+    for a run without a trajectory, as `measure` returns it."""
     seen = _trajectory(run)
     figure, (top, speed, torque, brake) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
     t, sample = np.asarray(seen.sample.t), seen.sample
@@ -87,15 +90,15 @@ def braking(run: Run, *, title: str = "") -> Figure:
     label(speed, "", "speed [km/h]")
     torque.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
     torque.plot(t, sample.control, color=COLOURS[0], label="control")
-    label(torque, "time [s]", "brake torque [N m]")
+    label(torque, "time [s]", controlled(unit))
     brake.plot(t, sample.output.deceleration, color=COLOURS[0])
     label(brake, "time [s]", "deceleration [m/s²]")
     return figure
 
 
-def balance(run: Run, *, title: str = "") -> Figure:
-    """A run of a two-wheeler at a glance: angles, rates, voltage, torque. Raises ValueError for a run without a
-    trajectory, as `measure` returns it."""
+def balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
+    """A run of a two-wheeler at a glance: angles, rates, control in its `unit`, torque. Raises ValueError for a run
+    without a trajectory, as `measure` returns it."""
     seen = _trajectory(run)
     figure, (angles, rates, voltage, torque) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
     t, sample = np.asarray(seen.sample.t), seen.sample
@@ -107,7 +110,7 @@ def balance(run: Run, *, title: str = "") -> Figure:
     voltage.plot(t, sample.control, color=COLOURS[0], label="control")
     most = np.max(np.abs(sample.control))
     voltage.set_ylim(-1.5 * most - 1e-9, 1.5 * most + 1e-9)  # a command far beyond the supply says no more
-    label(voltage, "time [s]", "voltage [V]")
+    label(voltage, "time [s]", controlled(unit))
     torque.plot(t, motor_torque(sample), color=COLOURS[0])
     label(torque, "time [s]", "motor torque [N m]")
     return figure

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.plot import COLOURS, DASHES, GREY, Axes, Figure, label, sheet
+from diffabs.plot import COLOURS, DASHES, GREY, Axes, Figure, controlled, label, sheet
 from diffabs.rollout import Trajectory
 
 MARKS = "osD^v"
@@ -22,12 +22,14 @@ def history(points: Sequence[Any], *, title: str = "") -> Figure:
     return figure
 
 
-def tuning(points: Sequence[Any], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "") -> Figure:
-    """History above, the runs of one lane below: all that `diffabs tune` draws."""
+def tuning(
+    points: Sequence[Any], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "", unit: str = "N m"
+) -> Figure:
+    """History above, the runs of one lane below, their control in its `unit`: all that `diffabs tune` draws."""
     figure, (objective, gradient, slip, torque) = sheet(2, 2, title=title, size=(5.8, 3.1))
     _objective(objective, points)
     _gradient(gradient, points)
-    _runs(slip, torque, runs, lane and f"worst lane: {lane}")
+    _runs(slip, torque, runs, lane and f"worst lane: {lane}", unit)
     return figure
 
 
@@ -113,7 +115,7 @@ def _gradient(ax: Axes, points: Sequence[Any]) -> None:
     label(ax, "gradients computed", "gradient, greatest component")
 
 
-def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str = "") -> None:
+def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str = "", unit: str = "N m") -> None:
     """Slip with its setpoint, and torque."""
     for i, (name, seen) in enumerate(runs.items()):
         t = np.asarray(seen.sample.t)
@@ -122,7 +124,7 @@ def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str =
     first = next(iter(runs.values())).sample
     slip.plot(np.asarray(first.t), first.setpoint, color=GREY, linewidth=0.9, linestyle=":", label="setpoint")
     label(slip, "time [s]", "slip [1]", title)
-    label(torque, "time [s]", "brake torque [N m]", legend=False)
+    label(torque, "time [s]", controlled(unit), legend=False)
     for ax in (slip, torque):
         ax.set_xlim(0, _until(runs))
         ax.locator_params(axis="x", nbins=6)

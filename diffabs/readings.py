@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from diffabs import files
 from diffabs.catalogue import ScenarioError, shown
 from diffabs.protocols import UNITS as UNITS
 
@@ -28,8 +29,7 @@ class Readings(NamedTuple):
 def read(path: pathlib.Path) -> Readings:
     """The readings in a file. Raises ScenarioError, one line, with the line of the file, for whatever is wrong."""
     try:
-        with path.open("rb") as file:
-            raw = file.read(LARGEST + 1)
+        raw = files.content(path, LARGEST + 1)
     except OSError as error:
         raise ScenarioError(f"--data {path}: cannot be read, {error.strerror}") from None
     if len(raw) > LARGEST:

@@ -14,13 +14,12 @@ import dataclasses
 import importlib.resources
 import pathlib
 import re
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
 
-from diffabs import goal, ranges, robust, toml, variation
+from diffabs import files, goal, ranges, robust, toml, variation
 from diffabs.catalogue import OTHERS, build, joined, loop_of, number, shown, unknown, whole, wrong
 from diffabs.catalogue import ScenarioError as ScenarioError
 from diffabs.loop import Loop, task
@@ -137,8 +136,7 @@ def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
     try:
         if len(path.parts) == 1 and not path.suffix and not path.exists():
             raise unknown(f"no scenario and no file is called {quoted}", str(path), names())
-        with path.open("rb") as file:
-            raw = file.read(LARGEST_FILE + 1)
+        raw = files.content(path, LARGEST_FILE + 1)
     except (OSError, ValueError) as error:
         if isinstance(error, ScenarioError):
             raise
@@ -152,14 +150,12 @@ def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
 def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
     quoted = shown(origin, LONGEST_PATH)
     try:
-        return _lifted(tomllib.loads(raw.decode()))
+        return _lifted(toml.parsed(raw.decode()))
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         raise ScenarioError(f"{quoted} is not UTF-8 text (at line {line})") from None
-    except ScenarioError:
-        raise
-    except RecursionError:
-        raise ScenarioError(f"{quoted} is not a scenario: its values are nested too deeply") from None
+    except ScenarioError as error:
+        raise ScenarioError(f"{quoted} is not a scenario: {error}") from None
     except ValueError as error:
         raise ScenarioError(f"{quoted} is not TOML: {error}") from None
 
@@ -180,6 +176,10 @@ def _override(table: dict[str, Any], override: str) -> None:
     keys = path.strip().split(".")
     if not equals or not all(keys):
         raise ScenarioError(f"override {shown(override)} is not of the form section.field=value")
+    if len(keys) > toml.MOST_LEVELS:
+        raise ScenarioError(f"override {shown(override)} is nested more than {toml.MOST_LEVELS} deep")
+    if any("\ud800" <= letter <= "\udfff" for letter in override):
+        raise ScenarioError(f"override {shown(override)} is not UTF-8 text")
     if keys[:2] == ["plant", "road"]:
         keys = keys[1:]
     keys = ranges.joined_keys(keys)
@@ -196,7 +196,10 @@ def _override(table: dict[str, Any], override: str) -> None:
     if isinstance(place, str):
         other = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
         node.pop(other, None)
-    node[place] = toml.value(text.strip())
+    try:
+        node[place] = toml.value(text.strip())
+    except ScenarioError as error:
+        raise ScenarioError(f"override {shown(override)}: {error}") from None
     _lifted(table)
     new = node[place]
     if isinstance(new, str) or (isinstance(new, dict) and "type" in new):

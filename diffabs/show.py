@@ -17,8 +17,8 @@ from rich.table import Table
 from diffabs import __version__
 from diffabs.catalogue import unit_of
 from diffabs.console import say
+from diffabs.loop import signals
 from diffabs.papers.digest import Digest
-from diffabs.protocols import UNITS
 from diffabs.rollout import Trajectory
 from diffabs.scenario import Scenario
 from diffabs.tables import fitted
@@ -47,16 +47,9 @@ def versions(*others: str) -> dict[str, str]:
     return always | {name: importlib.metadata.version(name) for name in others}
 
 
-def write_csv(trajectory: Trajectory, control_unit: str, path: pathlib.Path) -> None:
+def write_csv(trajectory: Trajectory, plant: Any, path: pathlib.Path) -> None:
     """The instants up to the end of the run, with units in the header."""
-    sample, y = trajectory.sample, trajectory.sample.output
-    columns = {
-        "t [s]": sample.t,
-        **{f"{name} [{UNITS[name]}]": column for name, column in y._asdict().items()},
-        f"target [{UNITS[y._fields[0]]}]": sample.target,
-        f"command [{control_unit}]": sample.command,
-        f"control [{control_unit}]": sample.control,
-    }
+    columns = {f"{name} [{unit}]": values for name, (unit, values) in signals(trajectory.sample, plant).items()}
     rows = int(trajectory.running.sum()) + 1  # after the end the last sample is repeated
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write(",".join(columns) + "\n")
@@ -68,7 +61,7 @@ def run(result: dict[str, Any], chosen: Scenario) -> None:
     """Metrics with their units, and what was written."""
     table = Table("metric", "value", "unit")
     for name, value in result["metrics"].items():
-        table.add_row(name, f"{value:.6g}", unit_of(chosen.objectives[name]))
+        table.add_row(name, f"{value:.6g}", unit_of(chosen.objectives[name], chosen.loop.plant))
     _print(chosen.title or chosen.name, table)
     for name, path in result["files"].items():
         say(f"{name}: {path}")
@@ -163,7 +156,7 @@ def tuned(result: dict[str, Any], chosen: Scenario) -> None:
     metrics = Table("metric", "mean before", "mean after", "worst before", "worst after", "unit")
     for name in result["metrics"]["before"]["mean"]:
         numbers = (result["metrics"][when][of][name] for of in ("mean", "worst") for when in ("before", "after"))
-        metrics.add_row(name, *map(_brief, numbers), unit_of(chosen.objectives[name]))
+        metrics.add_row(name, *map(_brief, numbers), unit_of(chosen.objectives[name], chosen.loop.plant))
     _print(f"over {result['lanes']} lane{'s' if result['lanes'] > 1 else ''}", metrics)
     if result["constraints"]:
         limits = Table("constraint", "bound", "before", "after", "met")
@@ -220,7 +213,7 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
     metrics = Table("metric", "unit", "", "value", "low", "high")
     for name, row in result["metrics"].items():
         for i, kind in enumerate(kinds):
-            first = (name, unit_of(chosen.objectives[name])) if i == 0 else ("", "")
+            first = (name, unit_of(chosen.objectives[name], chosen.loop.plant)) if i == 0 else ("", "")
             metrics.add_row(*first, kind, *_estimate(row[kind]))
         metrics.add_section()
     _print("statistics of the lanes that did not diverge", metrics)

@@ -8,15 +8,44 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.catalogue import family_of, kebab
+from diffabs.catalogue import ScenarioError, family_of, kebab, shown
+
+MOST_LEVELS = 50  # of tables and lists; no scenario has a tenth of that
+LARGEST = 2**63  # of a whole number, as TOML has it
+
+
+def parsed(text: str) -> dict[str, Any]:
+    """The table that a text is. Raises ValueError for what is no TOML, and ScenarioError for values nested too deeply
+    and for whole numbers of more than 64 bits, which no message could show."""
+    try:
+        table = tomllib.loads(text)
+    except RecursionError:
+        raise ScenarioError("its values are nested too deeply") from None
+    _refuse_extremes(table)
+    return table
+
+
+def _refuse_extremes(table: dict[str, Any]) -> None:
+    pending: list[tuple[str, int, Any]] = [(key, 1, item) for key, item in table.items()]
+    while pending:
+        where, level, item = pending.pop()
+        if level > MOST_LEVELS:
+            raise ScenarioError(f"{shown(where.split('.')[0])} is nested more than {MOST_LEVELS} deep")
+        if isinstance(item, dict | list):
+            inside = item.items() if isinstance(item, dict) else enumerate(item)
+            pending += [(f"{where}.{key}", level + 1, each) for key, each in inside]
+        elif isinstance(item, int) and not -LARGEST <= item < LARGEST:
+            raise ScenarioError(f"{shown(where)} is a whole number outside [-2^63, 2^63)")
 
 
 def value(text: str) -> Any:
-    """The value that a text on the command line means."""
+    """The value that a text on the command line means. Raises ScenarioError, as `parsed`."""
     for candidate in (f"v = {text}", f"v = [{text}]"):
         try:
-            read = tomllib.loads(candidate)
-        except (ValueError, RecursionError):
+            read = parsed(candidate)
+        except ScenarioError as error:
+            raise ScenarioError(str(error).replace('"v"', "its value").replace("its values are", "is")) from None
+        except ValueError:
             continue
         plain = candidate == f"v = {text}" or all(isinstance(x, int | float) for x in read["v"])
         if read.keys() == {"v"} and plain and text:

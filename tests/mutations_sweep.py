@@ -7,6 +7,7 @@ DISTRIBUTIONS, DESIGNS, SPACE, DISCRETE = (
 STATISTICS, SENSITIVITY, COMPARISON = (f"sweep/{name}.py" for name in ("statistics", "sensitivity", "comparison"))
 RARE, PROPOSALS, RELIABILITY = (f"sweep/{name}.py" for name in ("rare", "proposals", "reliability"))
 STORE, RUNNER, CLUSTER, RUN = (f"sweep/{name}.py" for name in ("store", "runner", "cluster", "run"))
+SEAL, MANIFEST, RESULTS = (f"sweep/{name}.py" for name in ("seal", "manifest", "results"))
 FIGURES = "plot_sweep.py"
 
 SWEEP = [
@@ -257,10 +258,38 @@ SWEEP = [
     ),
     (
         "sweep: a chunk is believed whatever it holds",
-        STORE,
-        ".hexdigest().startswith(name[2])",
-        ".hexdigest()",
-        "test_sweep_kill.py::test_a_damaged_chunk_is_found",
+        SEAL,
+        "if name(seal.chunk, data) != path.name:",
+        "if False:",
+        "test_sealed.py::test_every_flipped_bit_of_a_chunk_is_seen",
+    ),
+    (
+        "sweep: a chunk's number is not asked",
+        SEAL,
+        "for key, value in seal.metadata().items()",
+        "for key, value in list(seal.metadata().items())[::2]",
+        "test_sealed.py::test_chunks_that_exchanged_their_numbers",
+    ),
+    (
+        "sweep: a chunk's owner is not asked",
+        SEAL,
+        "for key, value in seal.metadata().items()",
+        "for key, value in list(seal.metadata().items())[1:2]",
+        "test_sealed.py::test_a_chunk_of_another_sweep",
+    ),
+    (
+        "sweep: a manifest is believed whatever it says",
+        MANIFEST,
+        'if given.get("digest") != digest(manifest):',
+        "if False:",
+        "test_sealed.py::test_a_scenario_that_was_edited_in_the_manifest_is_seen",
+    ),
+    (
+        "sweep: a chunk once verified is so for ever",
+        RESULTS,
+        "self._seen.get(chunk) == state",
+        "chunk in self._seen",
+        "test_sealed.py::test_a_file_that_changes_while_it_is_open_is_verified_again",
     ),
     (
         "sweep: a client without a call to its scheduler",

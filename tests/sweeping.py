@@ -10,6 +10,7 @@ import jax
 
 from diffabs import variation
 from diffabs.scenario import loads
+from diffabs.sweep.manifest import FORMAT
 
 PATIENCE = 300.0  # s for anything that takes seconds on an idle machine
 SCENARIO = """
@@ -41,6 +42,15 @@ seed = 3
 
 def described(text):
     return variation.study(loads(text.encode(), "small", "small.toml"))
+
+
+def manifest(samples, chunk, variables=("plant.mass",), objectives=("iae",), **study):
+    """Of a sweep that was never run."""
+    space = {"variables": {path: {"type": "uniform", "low": 0.0, "high": 1.0} for path in variables}}
+    table = {"samples": samples, "chunk": chunk, "seed": 0, "dtype": "float64", "failures": {}, "loop": {}, "parts": {}}
+    table |= {"solver": {"step": 1e-3, "duration": 1.0}, "space": {**space, "design": {"type": "random"}}}
+    table["objectives"] = {name: {} for name in objectives}
+    return {"format": FORMAT, "study": table | study, "versions": {}, "source": {}}
 
 
 def chunks(folder):

@@ -183,3 +183,15 @@ def test_the_packaged_gain_is_the_designs(name):
     q, r = np.diag(s.design.Q), np.atleast_2d(s.design.R)
     gain = -np.linalg.solve(r, b.T @ scipy.linalg.solve_continuous_are(a, b, q, r))[0]
     np.testing.assert_allclose(s.loop.controller.gain, gain, rtol=1e-6, atol=0)
+
+
+def test_a_sweep_keeps_trajectories_of_whatever_its_plant_shows(tmp_path):
+    """An arm has no slip, and its control is a voltage."""
+    import zarr
+
+    small = ("--samples", "4", "--set", "solver.step=0.01", "--set", "solver.duration=0.1")
+    run("sweep", "arm-hanging", *small, "--keep", "3", "--out", tmp_path / "out")
+    group = zarr.open_group(tmp_path / "out" / "trajectories.zarr", mode="r")
+    units = {"theta": "rad", "phi_rate": "rad/s", "target": "rad", "command": "V", "control": "V", "time": "s"}
+    assert {name: group[name].attrs["units"] for name in units} == units
+    assert group["theta"].shape == (1, 11)

@@ -269,6 +269,49 @@ def test_only_who_was_interrupted_and_has_no_worker_waits_for_nobody(threads, st
     assert cluster._somebody_finishes(client, finished, lambda: stopped) is somebody
 
 
+# Workers of its own
+
+
+def family():
+    me = psutil.Process()
+    return [me, *me.children(recursive=True)]
+
+
+def listening():
+    """Interfaces and ports of this process and its children."""
+    inside = [c for process in family() for c in process.net_connections(kind="inet")]
+    return {(c.laddr.ip, c.laddr.port) for c in inside if c.status == psutil.CONN_LISTEN}
+
+
+def test_nobody_else_reaches_scheduler_workers_and_their_pages():
+    before = listening()
+    with Dask(workers=1)._client() as client:
+        there = listening() - before
+        assert client.cluster.dashboard_link.startswith("http://127.0.0.1:")
+    assert len(there) >= 4  # scheduler, worker, nanny, and at least one page
+    assert {ip for ip, _ in there} == {"127.0.0.1"}
+
+
+def test_a_worker_that_is_killed_while_it_starts_is_one_line(scenario, tmp_path):
+    ended = threading.Event()
+
+    def kill():
+        while not ended.wait(0.02):
+            for process in family()[1:]:
+                if "spawn_main" in told(process):
+                    process.kill()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    try:
+        result = run("sweep", scenario, "--out", tmp_path / "o", "--engine", "dask", "--workers", "2", status=2)
+    finally:
+        ended.set()
+        killer.join()
+    assert_one_error_line(result)
+    assert "the workers could not be started on this machine: " in result.stderr
+
+
 # No cluster to use
 
 

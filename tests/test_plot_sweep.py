@@ -1,17 +1,18 @@
 """Figures of sweeps: what is drawn are the columns. The sweeps are made up, a manifest and chunks without any run."""
 
 import itertools
-import json
 
 import numpy as np
 import pytest
 from matplotlib.text import Text
 from scipy.stats import beta
+from sweeping import manifest
 
 from diffabs import plot_sweep as plots
 from diffabs.sweep import Results
-from diffabs.sweep.store import MANIFEST, Store
-from diffabs.sweep.store import encoded as chunk
+from diffabs.sweep.manifest import Seals
+from diffabs.sweep.seal import encoded as chunk
+from diffabs.sweep.store import Store
 from diffabs.sweep.summary import summary
 
 N = 1200
@@ -30,13 +31,14 @@ def made(tmp_path):
         metrics = {key: np.where(flags["diverged"], np.nan, column) for key, column in metrics.items()}
         columns = {"sample": np.arange(n), **variables, **metrics, **flags}
         store, size = Store(tmp_path / str(len(list(tmp_path.iterdir())))), -(-n // 2)
-        store.chunks.mkdir(parents=True)
-        space = {"variables": {key: {} for key in variables}, "design": {"type": design}}
-        table = {"samples": n, "chunk": size, "dtype": "float64", "failures": failures or {}, "space": space, **study}
-        table["objectives"] = {key: {} for key in metrics}
-        (store.folder / MANIFEST).write_text(json.dumps({"format": 1, "study": table, "source": {"name": name}}))
+        store.folder.mkdir()
+        table = manifest(n, size, variables, metrics, failures=failures or {}, **study)
+        table["source"] = {"name": name}
+        table["study"]["space"]["design"] = {"type": design, **({"levels": n} if design == "grid" else {})}
+        store.begin(table, resume=False)
         for i in range(-(-n // size)):
-            store.write(i, chunk({key: column[i * size : (i + 1) * size] for key, column in columns.items()}))
+            part = {key: column[i * size : (i + 1) * size] for key, column in columns.items()}
+            store.write(i, chunk(part, Seals(table).of(i)))
         return Results(store.folder)
 
     return write

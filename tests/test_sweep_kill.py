@@ -18,10 +18,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
-from sweeping import PATIENCE, SCENARIO, chunks, command, environment, started, until
+from sweeping import PATIENCE, SCENARIO, chunks, command, environment, manifest, started, until
 
 from diffabs.sweep import Results
-from diffabs.sweep.store import NAME, Store
+from diffabs.sweep.manifest import Seals, sealed
+from diffabs.sweep.seal import NAME, encoded
+from diffabs.sweep.store import Store
 
 pytestmark = pytest.mark.xdist_group("sweep-kill")  # what these share takes a whole run
 
@@ -113,8 +115,10 @@ def test_killed_again_and_again(whole, tmp_path, kills):
 
 
 WRITING = """
-import os, pathlib, signal, sys
+import json, os, pathlib, signal, sys
 from diffabs.sweep.store import Store
+
+folder, manifest, *data = sys.argv[1:]
 
 def killed_before(name, calls):
     real = getattr(os, name)
@@ -124,15 +128,15 @@ def killed_before(name, calls):
     setattr(os, name, call)
 
 for LAST in range(1, 8):
-    store = Store(pathlib.Path(sys.argv[1]) / str(LAST))
+    store = Store(pathlib.Path(folder) / str(LAST))
     with store.locked():
         if (child := os.fork()) == 0:
             calls = []
             for name in ("fsync", "replace", "rename"):
                 killed_before(name, calls)
-            store.begin({"study": {"samples": 2, "chunk": 1}, "source": {}}, resume=True)
+            store.begin(json.loads(manifest), resume=True)
             for chunk in range(2):
-                store.write(chunk, b"data of chunk %d" % chunk)
+                store.write(chunk, bytes.fromhex(data[chunk]))
             os._exit(0)
         print(os.waitpid(child, 0)[1])
 """
@@ -140,15 +144,19 @@ for LAST in range(1, 8):
 
 def test_killed_at_each_step_of_writing(tmp_path):
     """Manifest and two chunks: each is written, flushed (1), renamed (2), and its folder flushed (3)."""
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", WRITING, tmp_path], capture_output=True, check=True)
+    table, seals = manifest(2, 1), Seals(manifest(2, 1))
+    values = {name: np.zeros(1, bool if name in ("stopped", "diverged") else float) for name in seals.columns}
+    data = [encoded({**values, "sample": np.array([chunk])}, seals.of(chunk)).hex() for chunk in range(2)]
+    words = [sys.executable, "-W", "ignore", "-c", WRITING, tmp_path, json.dumps(table), *data]
+    done = subprocess.run(words, capture_output=True, check=True)
     assert [int(line) for line in done.stdout.split()] == [signal.SIGKILL] * 7
     for last in range(1, 8):
         store = Store(tmp_path / str(last))
         renamed = [k for k in (2, 5, 8) if k < last]
         with store.locked():
             assert (store.folder / "manifest.json").exists() == (len(renamed) > 0)
-            store.begin({"study": {"samples": 2, "chunk": 1}, "source": {}}, resume=True)
-            there, damaged = store.scan()
+            store.begin(table, resume=True)
+            there, damaged = store.scan(seals)
         assert (sorted(there), damaged) == (list(range(len(renamed) - 1)), [])
         assert not list(store.folder.rglob("*.tmp"))
 
@@ -304,7 +312,7 @@ def test_a_damaged_chunk_is_found(copy, how):
     data = path.read_bytes()
     path.write_bytes(DAMAGE[how](data))
     assert path.read_bytes() != data
-    there, damaged = Store(copy).scan()
+    there, damaged = Store(copy).scan(Seals(json.loads((copy / "manifest.json").read_text())))
     assert (sorted(there), damaged) == ([0, *range(2, 100)], [1])
     assert not path.exists()
 
@@ -328,7 +336,8 @@ def test_chunks_that_are_gone_or_damaged_together(copy, whole):
     (copy / "chunks" / "merged.parquet").write_bytes(b"mine")
     result = run("sweep", whole.scenario, "--out", copy, "--resume", "--json")
     assert json.loads(result.stdout)["digest"] == whole.digest
-    assert result.stderr == f"damaged, computed again: chunks 2, {len(names) - 1}\n"
+    assert f"damaged, computed again: chunks 2, {len(names) - 1}\n" in result.stderr
+    assert f"warning: {copy / 'chunks' / 'merged.parquet'} is no chunk of this sweep" in result.stderr
     assert (copy / "chunks" / "merged.parquet").read_bytes() == b"mine"
 
 
@@ -359,16 +368,17 @@ def test_another_configuration_is_refused(whole, changes, needed):
     assert contents(whole.folder) == before
 
 
-def changed(manifest, change):
+def changed(written, change):
     """A manifest after one change."""
-    there = json.loads(manifest)
+    there = json.loads(written)
     if change == "versions":
         there["versions"]["jax"] = "0.1"
     elif change == "mass":
         there["study"]["loop"]["plant"]["wheel_radius"] = 0.1
     elif change == "commit":
         there["commit"] = "0123456789ab"
-    return json.dumps(there)
+    del there["digest"]
+    return sealed(there).decode()
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,12 @@
 import json
 import math
 import os
-import pathlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
+from diffabs import files
 from diffabs.design.polytope import Polytope, Schedule
 
 FORMAT, VERSION = "diffabs certificate", 1
@@ -75,9 +75,10 @@ def text(system: Polytope | Schedule, gain: np.ndarray, claims: Iterable[tuple[s
 
 def read(path: str | os.PathLike[str]) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, Any]]]]:
     """System, gain, and (kind, data) of the claims in a file. Raises OSError, or ValueError that names the field."""
-    if os.path.getsize(path) > LARGEST_FILE:
+    raw = files.content(path, LARGEST_FILE + 1)
+    if len(raw) > LARGEST_FILE:
         raise ValueError(f"the file is larger than {LARGEST_FILE} bytes")
-    content = pathlib.Path(path).read_text(encoding="utf-8")
+    content = raw.decode()
     return read_parts(json.loads(content, parse_int=float, parse_constant=number, object_pairs_hook=members))
 
 

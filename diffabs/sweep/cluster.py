@@ -11,7 +11,9 @@ import contextlib
 import dataclasses
 import logging
 import os
+import pathlib
 import signal
+import tempfile
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -23,8 +25,9 @@ import numpy as np
 from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
 from distributed.comm.core import connect
 
-from diffabs import provenance
+from diffabs import files, provenance
 from diffabs.sweep.engines import DECISIVE, Done, done
+from diffabs.sweep.manifest import Seals, described
 from diffabs.sweep.runner import Runner
 from diffabs.sweep.store import SweepError, differences
 from diffabs.sweep.study import Study
@@ -32,6 +35,8 @@ from diffabs.sweep.study import Study
 AHEAD = 2  # chunks in hand for each thread of the workers
 DEATHS = 5  # times that a chunk may be given up by the scheduler, each after four workers died with it in hand
 TIMEOUT = 10.0  # s for a scheduler to answer
+LOOPBACK = "127.0.0.1"
+LONGEST = 200  # characters of what Dask says
 POLL = 0.05  # s between looks at what is finished; workers have their next chunk in hand meanwhile
 
 
@@ -53,14 +58,7 @@ class Dask:
     def _client(self) -> Iterator[Client]:
         with contextlib.ExitStack() as opened:
             if self.scheduler is None:
-                cluster = LocalCluster(
-                    n_workers=self.workers,
-                    threads_per_worker=1,
-                    dashboard_address=":0",
-                    silence_logs=logging.CRITICAL,
-                    preload=[__name__],
-                )
-                where: Any = opened.enter_context(cluster)
+                where: Any = opened.enter_context(_started(self.workers))
             else:
                 where = self.scheduler
             try:
@@ -71,6 +69,30 @@ class Dask:
                 why = str(error).splitlines()[0] if str(error) else f"no answer within {TIMEOUT:g} s"
                 raise SweepError(f"the scheduler at {where} cannot be reached: {why}") from None
             yield client
+
+
+@contextlib.contextmanager
+def _started(workers: int) -> Iterator[Any]:
+    """Workers on this machine, whom nobody else reaches: pages and ports of all of them are on the loopback interface.
+    Raises SweepError where they do not start."""
+    with contextlib.ExitStack() as opened:
+        scratch = pathlib.Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="diffabs-dask-")))
+        opened.enter_context(files.unfinished(scratch))
+        try:
+            cluster = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                host=LOOPBACK,
+                dashboard_address=f"{LOOPBACK}:0",
+                worker_dashboard_address=f"{LOOPBACK}:0",
+                local_directory=str(scratch),
+                silence_logs=logging.CRITICAL,
+                preload=[__name__],
+            )
+        except Exception as error:  # Dask says so in several ways
+            why = " ".join(str(error).split())[:LONGEST] or type(error).__name__
+            raise SweepError(f"the workers could not be started on this machine: {why}") from None
+        yield opened.enter_context(cluster)
 
 
 def dask_setup(_: Any) -> None:
@@ -163,7 +185,8 @@ def _portable(study: Study) -> Study:
 
 def compute(study: Study, chunk: int) -> Done:
     """A chunk, on a worker."""
-    return done(study, chunk, _runner(_Same(study)).run([chunk])[0])
+    runner, seals = _prepared(_Same(study))
+    return done(study, seals.of(chunk), runner.run([chunk])[0])
 
 
 class _Same:
@@ -180,5 +203,5 @@ class _Same:
 
 
 @lru_cache(maxsize=2)
-def _runner(same: _Same) -> Runner:
-    return Runner(same.study, jax.local_devices()[:1])
+def _prepared(same: _Same) -> tuple[Runner, Seals]:
+    return Runner(same.study, jax.local_devices()[:1]), Seals(described(same.study))

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
+from diffabs import files
 from diffabs.sweep.tables import unknown
 
 READERS = {".csv": pc.read_csv, ".parquet": pq.read_table}
@@ -18,7 +19,7 @@ def read(path: pathlib.Path, column: str) -> np.ndarray:
     if path.suffix.lower() not in READERS:
         raise ValueError(f"{path} is neither {' nor '.join(READERS)}")
     try:
-        with path.open("rb") as file:
+        with files.opened(path) as file:
             table = READERS[path.suffix.lower()](file)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or str(error).splitlines()[0]}") from None

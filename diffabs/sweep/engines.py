@@ -7,11 +7,11 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
+from diffabs.sweep.manifest import DECISIVE as DECISIVE
+from diffabs.sweep.manifest import Seals, described
 from diffabs.sweep.runner import Columns, Runner
-from diffabs.sweep.store import encoded
+from diffabs.sweep.seal import Seal, encoded
 from diffabs.sweep.study import Study
-
-DECISIVE = ("jax", "jaxlib", "numpy", "scipy", "pyarrow")  # packages that can change a bit of the result
 
 
 class Done(NamedTuple):
@@ -43,15 +43,15 @@ class Local:
 
     def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Generator[Done, None, None]:
         """In order."""
-        runner = Runner(study, self.devices)
+        runner, seals = Runner(study, self.devices), Seals(described(study))
         for together in batched(chunks[jax.process_index() :: jax.process_count()], len(self.devices)):
             for chunk, columns in zip(together, runner.run(together), strict=True):
-                yield done(study, chunk, columns)
+                yield done(study, seals.of(chunk), columns)
             if stopping():
                 return
 
 
-def done(study: Study, chunk: int, columns: Columns) -> Done:
+def done(study: Study, seal: Seal, columns: Columns) -> Done:
     """A chunk's columns, counted and encoded."""
     failed = failures(study, columns)
     counts = (
@@ -60,7 +60,7 @@ def done(study: Study, chunk: int, columns: Columns) -> Done:
         int(np.sum(columns["diverged"] & accepted(columns["refused"]))),
         int(np.sum(~accepted(columns["refused"]))),
     )
-    return Done(chunk, encoded(columns), *counts)
+    return Done(seal.chunk, encoded(columns, seal), *counts)
 
 
 def accepted(refused: Any) -> np.ndarray:

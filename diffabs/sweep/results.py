@@ -1,16 +1,21 @@
 """A sweep's folder, opened to be read."""
 
-import hashlib
+import contextlib
+import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from diffabs import files
+from diffabs.sweep import seal
 from diffabs.sweep.engines import accepted
-from diffabs.sweep.store import CHUNKS, NAME, SweepError, read_manifest
+from diffabs.sweep.manifest import Seals, read_manifest
+from diffabs.sweep.seal import SweepError
+from diffabs.sweep.store import listing, read_chunk
 from diffabs.sweep.study import FLAGS
 
 
@@ -20,15 +25,20 @@ class Results:
     A sample that `simulate` would refuse was not run: `refused` says why, its metrics are NaN, `diverged` is set
     lest it enter a mean, and it is in no statistic.
 
-    The folder `chunks` is a Parquet data set, for `pandas.read_parquet`, `polars.scan_parquet` and DuckDB as it is.
+    Every file is verified before the first number of it is used, and again if it was changed since. The folder `chunks`
+    is a Parquet data set, for `pandas.read_parquet`, `polars.scan_parquet` and DuckDB as it is; these verify nothing.
     """
 
     def __init__(self, folder: str | pathlib.Path):
-        """Raises SweepError for a folder that is no sweep."""
+        """Raises SweepError for a folder that is no sweep, as all that reads chunks does for one that is damaged."""
         self.folder = pathlib.Path(folder)
         self.manifest = read_manifest(self.folder)
-        named = ((NAME.fullmatch(p.name), p) for p in sorted((self.folder / CHUNKS).glob("*.parquet")))
-        self.files = {int(name[1]): path for name, path in named if name}
+        self._seals = Seals(self.manifest)
+        named, self.strays = listing(self.folder, self._seals.count)
+        if twice := next((paths for paths in named.values() if len(paths) > 1), None):
+            raise SweepError(f"{twice[0]} and {twice[1].name} are the same chunk; --resume finds out which is damaged")
+        self.files = {chunk: paths[0] for chunk, paths in named.items()}
+        self._seen: dict[int, tuple[int, ...]] = {}
         if not self.files:
             raise SweepError(f"{self.folder} has no finished chunk yet; --resume continues it")
 
@@ -40,7 +50,7 @@ class Results:
     @property
     def complete(self) -> bool:
         """Whether every chunk is there."""
-        return len(self.files) == -(-self.study["samples"] // self.study["chunk"])
+        return len(self.files) == self._seals.count
 
     @property
     def metrics(self) -> list[str]:
@@ -59,21 +69,36 @@ class Results:
         return pa.types.is_floating(kind) or pa.types.is_integer(kind)
 
     def _schema(self) -> pa.Schema:
-        return pq.read_schema(next(iter(self.files.values())))
+        with self._opened(min(self.files)) as file:
+            return file.schema_arrow
+
+    @contextlib.contextmanager
+    def _opened(self, chunk: int) -> Iterator[pq.ParquetFile]:
+        """A chunk, verified unless its file is as it was then."""
+        path = self.files[chunk]
+        state = _state(path)
+        if state is not None and self._seen.get(chunk) == state:
+            with files.opened(path) as file:
+                yield pq.ParquetFile(file)
+            return
+        found = seal.verified(read_chunk(path), path, self._seals.of(chunk))
+        if state is not None:
+            self._seen[chunk] = state
+        yield found
+
+    def _read(self, chunk: int, names: list[str] | None) -> pa.Table:
+        with self._opened(chunk) as file:
+            return file.read(columns=names).replace_schema_metadata()
 
     @property
     def digest(self) -> str:
-        """SHA-256 over the contents of all chunks in order: equal for equal tables."""
-        whole = hashlib.sha256()
-        for chunk in sorted(self.files):
-            whole.update(hashlib.sha256(self.files[chunk].read_bytes()).digest())
-        return whole.hexdigest()
+        """SHA-256 over the contents of all chunks in order: equal for equal tables in chunks of one size."""
+        return seal.contents(self._read(chunk, None) for chunk in sorted(self.files))
 
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows in the order of the samples; some columns, or all."""
-        files = [self.files[chunk] for chunk in sorted(self.files)]
         names = list(columns) if columns is not None else None
-        return pa.concat_tables([pq.ParquetFile(file).read(columns=names) for file in files]).unify_dictionaries()
+        return pa.concat_tables([self._read(chunk, names) for chunk in sorted(self.files)]).unify_dictionaries()
 
     def column(self, name: str) -> np.ndarray:
         """A column in the order of the samples. Raises KeyError."""
@@ -107,3 +132,12 @@ class Results:
         values = self.column(metric)
         order = np.argsort(np.where(np.isnan(values), -np.inf, values), kind="stable")[::-1][:count]
         return self.table().take(order)
+
+
+def _state(path: pathlib.Path) -> tuple[int, ...] | None:
+    """By which a file that was changed is told; None where nothing can be said of it."""
+    try:
+        there = os.stat(path)
+    except OSError:
+        return None
+    return there.st_dev, there.st_ino, there.st_size, there.st_mtime_ns, there.st_ctime_ns

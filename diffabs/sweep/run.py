@@ -11,7 +11,8 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from diffabs import provenance
-from diffabs.sweep.engines import DECISIVE, Engine, Local
+from diffabs.sweep.engines import Engine, Local
+from diffabs.sweep.manifest import Seals, described
 from diffabs.sweep.results import Results
 from diffabs.sweep.store import Store, SweepError
 from diffabs.sweep.study import Study
@@ -85,9 +86,9 @@ def _begun(
         try:
             if jax.process_index() == 0:
                 held.enter_context(store.locked())
-                described = {"study": study.table(), "versions": provenance.versions(*DECISIVE), **provenance.commit()}
-                store.begin({**described, "source": dict(source)}, resume=resume)
-                whole, damaged = store.scan()
+                manifest = {**described(study), **provenance.commit(), "source": dict(source)}
+                store.begin(manifest, resume=resume)
+                whole, damaged = store.scan(Seals(manifest))
                 found[:] = np.where(np.isin(np.arange(study.chunks), list(whole)), HERE, MISSING)
         finally:  # whatever happened: the others wait for this
             found = _together(multihost_utils.broadcast_one_to_all, found)

@@ -7,40 +7,25 @@ A file is written beside its place, flushed to the disk, and renamed, so that wh
 what must be in it: no index to keep, nothing to repair after a kill. One process at a time has the lock."""
 
 import contextlib
-import hashlib
-import io
 import json
 import os
 import pathlib
-import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import filelock
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-FORMAT = 1
-NAME = re.compile(r"part-(\d{8})-([0-9a-f]{16})\.parquet")
-MANIFEST, CHUNKS, LOCK = "manifest.json", "chunks", ".lock"
+from diffabs import files
+from diffabs.sweep import seal
+from diffabs.sweep.manifest import MANIFEST as MANIFEST
+from diffabs.sweep.manifest import Seals, sealed
+from diffabs.sweep.manifest import read_manifest as read_manifest
+from diffabs.sweep.seal import DamagedError
+from diffabs.sweep.seal import SweepError as SweepError
+
+CHUNKS, LOCK = "chunks", ".lock"
 MOST_SHOWN = 60
-
-
-class SweepError(ValueError):
-    """A sweep that cannot be started, continued or read; one line."""
-
-
-def encoded(columns: Mapping[str, np.ndarray]) -> bytes:
-    """A chunk as the bytes of its Parquet file: the same columns give the same bytes."""
-    table = pa.table({name: _array(column) for name, column in columns.items()})
-    buffer = io.BytesIO()
-    pq.write_table(table, buffer, compression="zstd")
-    return buffer.getvalue()
-
-
-def _array(column: np.ndarray) -> pa.Array:
-    return pa.array(column.astype(str)).dictionary_encode() if column.dtype.kind in "OU" else pa.array(column)
+PASSING = (".", "_")  # beginnings of names that no reader of data sets takes for a part of one
 
 
 class Store:
@@ -71,19 +56,18 @@ class Store:
         """Write the manifest, or compare it with the one that is there. Raises SweepError for a folder that holds
         another configuration (naming the first differences), finished chunks although `resume` is not set, or other
         files. A sweep that never finished a chunk (its scheduler did not answer, say) is begun anew."""
-        wanted = {"format": FORMAT, **manifest}
         for leftover in (self.folder / f"{MANIFEST}.tmp", *self.chunks.glob("part-*.parquet.tmp")):
             leftover.unlink(missing_ok=True)
         if not (self.folder / MANIFEST).exists():
-            self._begin_new(wanted)
+            self._begin_new(manifest)
             return
         there = read_manifest(self.folder)
         if not resume:
             if self.chunks.is_dir() and any(self.chunks.iterdir()):
                 raise SweepError(f"{self.folder} already holds a sweep; --resume continues it")
-            self._begin_new(wanted)
+            self._begin_new(manifest)
             return
-        found = list(differences(_decisive(there), _decisive(wanted)))
+        found = list(differences(_decisive(there), _decisive(manifest)))
         if found:
             more = f", and {len(found) - 3} more" if len(found) > 3 else ""
             raise SweepError(f"{self.folder} holds another sweep: {'; '.join(found[:3])}{more}")
@@ -97,57 +81,56 @@ class Store:
         if others:
             raise SweepError(f"{self.folder} is no sweep, but holds {others[0]}; choose a folder that is new or empty")
         self.chunks.mkdir(exist_ok=True)
-        write_whole(self.folder / MANIFEST, json.dumps(manifest, indent=1).encode())
+        write_whole(self.folder / MANIFEST, sealed(manifest))
 
-    def scan(self) -> tuple[dict[int, pathlib.Path], list[int]]:
-        """Chunks that are there and whole, and those that are damaged. A damaged file is removed; one of another name
-        is left alone."""
+    def scan(self, seals: Seals) -> tuple[dict[int, pathlib.Path], list[int]]:
+        """Chunks of a sweep that are there and whole, and those that are damaged. A damaged file is removed; one of
+        another name is left alone. Raises SweepError for a chunk of another sweep, and for what is no file."""
         whole, damaged = {}, []
-        named = ((NAME.fullmatch(path.name), path) for path in sorted(self.chunks.glob("*.parquet")))
-        for name, path in named:
-            if name and hashlib.sha256(path.read_bytes()).hexdigest().startswith(name[2]):
-                whole[int(name[1])] = path
-            elif name:
-                damaged.append(int(name[1]))
-                path.unlink()
-        return whole, [chunk for chunk in damaged if chunk not in whole]
+        for chunk, paths in listing(self.folder, seals.count)[0].items():
+            for path in paths:
+                try:
+                    seal.verified(read_chunk(path), path, seals.of(chunk))
+                    whole[chunk] = path
+                except DamagedError:
+                    damaged.append(chunk)
+                    path.unlink()
+        return whole, [chunk for chunk in dict.fromkeys(damaged) if chunk not in whole]
 
     def write(self, chunk: int, data: bytes) -> pathlib.Path:
         """A chunk, whole or not at all."""
-        digest = hashlib.sha256(data).hexdigest()[:16]
-        return write_whole(self.chunks / f"part-{chunk:08d}-{digest}.parquet", data)
+        return write_whole(self.chunks / seal.name(chunk, data), data)
 
 
-def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
-    """The manifest. Raises SweepError if there is none, or none that this version reads."""
-    path = pathlib.Path(folder) / MANIFEST
+def listing(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathlib.Path]], list[pathlib.Path]]:
+    """Files with the name of one of `count` chunks, by number, and whatever else lies beside them that another reader
+    would take for a part of the data set."""
+    named, strays = {}, []
+    for path in sorted((folder / CHUNKS).glob("*")):
+        number = seal.NAME.fullmatch(path.name)
+        if number and int(number[1]) < count:
+            named.setdefault(int(number[1]), []).append(path)
+        elif not path.name.startswith(PASSING) and path.suffix != ".tmp":
+            strays.append(path)
+    return named, strays
+
+
+def read_chunk(path: pathlib.Path) -> bytes:
+    """The bytes of a chunk's file. Raises SweepError for what is no file or cannot be read."""
     try:
-        manifest = json.loads(path.read_bytes())
-        if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-            raise ValueError(f"format {manifest.get('format') if isinstance(manifest, dict) else None} is not {FORMAT}")
-        for name in ("study", "source"):
-            if not isinstance(manifest.get(name), dict):
-                raise ValueError(f"{name} is missing")
+        return files.content(path)
     except OSError as error:
-        raise SweepError(f"{folder} is no sweep: {MANIFEST}: {error.strerror}") from None
-    except ValueError as error:
-        raise SweepError(f"{folder} is no sweep that can be read: {MANIFEST}: {error}") from None
-    return manifest
+        raise SweepError(f"{path} cannot be read: {error.strerror}; move it away") from None
 
 
 def write_whole(path: pathlib.Path, data: bytes) -> pathlib.Path:
     """A file that is whole at every instant at which it is there, also after a power cut."""
-    temporary = path.with_name(f"{path.name}.tmp")
-    try:
+    with files.unfinished(path.with_name(f"{path.name}.tmp")) as temporary:
         with temporary.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise
     if hasattr(os, "O_DIRECTORY"):
         folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:

@@ -83,7 +83,7 @@ def described(kinds: Mapping[str, type], given: Any, where: str, **readers: Call
     if kind is None:
         raise ValueError(f"{where}.type is missing; there is {', '.join(kinds)}")
     if kind not in list(kinds):
-        raise unknown(f"{where}.type = {reprlib.repr(kind)} is unknown", kind, kinds)
+        raise unknown(f"{where}.type = {_brief(kind)} is unknown", kind, kinds)
     fields = {f.name: f for f in dataclasses.fields(kinds[kind])}
     values = {}
     for key, item in given.items():
@@ -110,7 +110,14 @@ def unknown(what: str, name: Any, there: Iterable[str]) -> ValueError:
 
 def wrong(where: str, given: Any, needed: str) -> ValueError:
     """An error for a value of the wrong kind."""
-    return ValueError(f"{where} = {reprlib.repr(given)} is not {needed}")
+    return ValueError(f"{where} = {_brief(given)} is not {needed}")
+
+
+def _brief(value: Any) -> str:
+    try:
+        return reprlib.repr(value)
+    except ValueError:  # more digits than Python writes
+        return "a number of thousands of digits"
 
 
 def number(given: Any, where: str) -> float:

@@ -12,22 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import zarr
 
+from diffabs import files
+from diffabs.loop import signals
 from diffabs.rollout import Trajectory, rollout
 from diffabs.sweep.study import Study, precision
 
 NAME = "trajectories.zarr"
 MOST_INSTANTS = 2000  # of a trajectory
-UNITS = {
-    "time": "s",
-    "slip": "1",
-    "target": "1",
-    "speed": "m/s",
-    "wheel_speed": "m/s",
-    "deceleration": "m/s^2",
-    "distance": "m",
-    "command": "N m",
-    "control": "N m",
-}
 
 
 def keep(study: Study, folder: str | pathlib.Path, samples: Sequence[int]) -> pathlib.Path:
@@ -35,19 +26,20 @@ def keep(study: Study, folder: str | pathlib.Path, samples: Sequence[int]) -> pa
 
     Raises ValueError for a sample that is not in the sweep."""
     path = pathlib.Path(folder) / NAME
-    seen = [_signals(trajectory(study, i)) for i in samples]
-    temporary = path.with_name(f"{NAME}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    group = zarr.open_group(temporary, mode="w")
-    numbers = {"sample": np.asarray(samples, np.int64)}
-    numbers |= {name: np.stack([signals[name] for signals in seen]) for name in UNITS}
-    for name, values in numbers.items():
-        dimensions = ("sample", "instant")[: values.ndim]
-        array = group.create_array(name, shape=values.shape, dtype=values.dtype, dimension_names=dimensions)
-        array[...] = values
-        array.attrs["units"] = UNITS.get(name, "")
-    shutil.rmtree(path, ignore_errors=True)
-    temporary.rename(path)
+    seen = [signals(trajectory(study, i).sample, study.loop.plant) for i in samples]
+    with files.unfinished(path.with_name(f"{NAME}.tmp")) as temporary:
+        shutil.rmtree(temporary, ignore_errors=True)
+        group = zarr.open_group(temporary, mode="w")
+        numbers = {"sample": ("", np.asarray(samples, np.int64))}
+        for name, (unit, _) in seen[0].items():
+            numbers["time" if name == "t" else name] = unit, np.stack([one[name][1] for one in seen])
+        for name, (unit, values) in numbers.items():
+            dimensions = ("sample", "instant")[: values.ndim]
+            array = group.create_array(name, shape=values.shape, dtype=values.dtype, dimension_names=dimensions)
+            array[...] = np.asarray(values)
+            array.attrs["units"] = unit
+        shutil.rmtree(path, ignore_errors=True)
+        temporary.rename(path)
     return path
 
 
@@ -60,11 +52,3 @@ def trajectory(study: Study, i: int) -> Trajectory:
         run = jax.device_get(rollout(loop, dataclasses.replace(study.solver, every=every), key=key))
     assert run.trajectory is not None
     return run.trajectory
-
-
-def _signals(seen: Trajectory) -> dict[str, np.ndarray]:
-    """By name (instants,)."""
-    sample, y = seen.sample, seen.sample.output
-    outputs = {name: getattr(y, name) for name in ("slip", "speed", "wheel_speed", "deceleration", "distance")}
-    others = {"time": sample.t, "target": sample.target, "command": sample.command, "control": sample.control}
-    return {name: np.asarray(values) for name, values in (outputs | others).items()}

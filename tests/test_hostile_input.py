@@ -1,0 +1,113 @@
+"""Files that are none, numbers and depths beyond all measure, bytes that are no text: one line each, and no waiting."""
+
+import os
+
+import pytest
+from commands import assert_one_error_line, left_in, run
+
+from diffabs.design.certificate import Certificate
+
+pytestmark = [pytest.mark.xdist_group("hostile"), pytest.mark.usefixtures("any_step_is_stable", "without_load")]
+
+HEX = "0x" + "f" * 3600  # 4,335 decimal digits: Python does not write so many
+DEEP = "[" * 5000 + "]" * 5000
+BYTES = os.fsdecode(b"title=\xff")
+
+
+def refused(*args):
+    result = run(*args, status=2)
+    assert_one_error_line(result)
+    assert len(result.stderr) < 1000
+    return result.stderr
+
+
+def strange(path, kind):
+    if kind == "a folder":
+        path.mkdir()
+    elif kind == "a pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(path.name)
+    return path
+
+
+KINDS = ["a folder", "a pipe", "a loop"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_no_file_is_not_read(tmp_path, kind):
+    scenario = strange(tmp_path / "x.toml", kind)
+    assert f'cannot read scenario "{scenario}": ' in refused("simulate", scenario)
+    data = strange(tmp_path / "x.csv", kind)
+    assert f"--data {data}: cannot be read, " in refused("identify", "slip-lmi", "--data", data, "--free", "plant.mass")
+    column = f'sweep.over.plant.mass={{type="empirical",file="{data}",column="m"}}'
+    assert f"cannot read {data}: " in refused("sweep", "slip-lmi", "--out", tmp_path / "o", "--set", column)
+    with pytest.raises(OSError, match=r"not a regular file|Is a directory|Too many levels"):
+        Certificate.load(strange(tmp_path / "x.json", kind))
+
+
+@pytest.mark.parametrize("option", ["--csv", "--plot"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_no_file_is_not_written(tmp_path, kind, option):
+    path = strange(tmp_path / "x.png", kind)
+    assert f"{option} {path}: " in refused("simulate", "slip-lmi", option, path)
+    assert left_in(tmp_path) == {"x.png"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"title = {HEX}",
+        f"solver.step = {HEX}",
+        f"[plant]\nmass = {HEX}",
+        f"[controller]\ngain = [1.0, {HEX}]",
+        f"[sweep]\nsamples = {HEX}",
+        f"[sweep.over]\nplant.mass = [1, -{HEX[:2]}{HEX[2:]}]".replace("-0x", "0x"),
+        f"title = {DEEP}",
+        f"title{'.a' * 5000} = 1",
+        f"[plant]\nmass = {'{a=' * 5000}1{'}' * 5000}",
+    ],
+)
+def test_a_number_or_depth_beyond_all_measure_in_a_file(file, text):
+    said = refused("simulate", file(text))
+    assert "is a whole number outside [-2^63, 2^63)" in said or "nested" in said
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        f"title={HEX}",
+        f"plant.mass={HEX}",
+        f"sweep.samples={HEX}",
+        f"controller.gain=1,{HEX}",
+        f"title={DEEP}",
+        f"title{'.a' * 5000}=1",
+        f"plant.mass={DEEP}",
+    ],
+)
+def test_a_number_or_depth_beyond_all_measure_on_the_command_line(change):
+    said = refused("simulate", "slip-lmi", "--set", change)
+    assert "is a whole number outside [-2^63, 2^63)" in said or "nested" in said
+
+
+@pytest.mark.parametrize("change", [BYTES, BYTES.replace("title", "plant.mass"), BYTES.replace("title", "\udcff")])
+def test_bytes_that_are_no_text(change):
+    assert refused("simulate", "slip-lmi", "--set", change).endswith("is not UTF-8 text\n")
+
+
+def test_a_certificate_with_numbers_and_depths_beyond_all_measure(tmp_path):
+    """JSON has no hexadecimal numbers; thousands of decimal digits are no finite float."""
+    for text in (HEX, "9" * 4400, DEEP, '{"format": ' * 5000):
+        path = tmp_path / "x.json"
+        path.write_text(text)
+        with pytest.raises(ValueError, match=r"x\.json: [^\n]*\Z") as error:
+            Certificate.load(path)
+        assert len(str(error.value)) < 1000
+
+
+@pytest.mark.parametrize("count", ["0", "-3", "1025", "100000", "9" * 5000])
+def test_a_number_of_devices_that_no_machine_has(tmp_path, count):
+    result = run("sweep", "slip-lmi", "--out", tmp_path / "out", "--devices", count, status=2)
+    assert "--devices" in result.stderr
+    assert "Traceback" not in result.output
+    assert left_in(tmp_path) == set()

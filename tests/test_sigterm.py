@@ -1,0 +1,72 @@
+"""SIGTERM is an orderly end: exit status 143, what is whole stays, nothing else does: no file, no process."""
+
+import signal
+import time
+
+import psutil
+import pytest
+from commands import left_in
+from sweeping import PATIENCE, SCENARIO, chunks, command, started, until
+
+pytestmark = pytest.mark.xdist_group("sigterm")
+
+LONG = ("--samples", "640000")
+
+
+@pytest.fixture
+def room(tmp_path, monkeypatch):
+    """Where a process keeps what is temporary."""
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    return tmp_path
+
+
+def ended(process, children=()):
+    out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 143, err
+    assert "Traceback" not in err
+    assert not psutil.wait_procs(children, timeout=30)[1]
+    return out, err
+
+
+def nothing_temporary(folder):
+    there = {path.name for path in (folder / "temporary").iterdir()}
+    return there <= {"dask-scratch-space"} and not list(folder.rglob("*.tmp"))
+
+
+def test_a_sweep_finishes_its_chunks_and_says_how_to_go_on(file, room):
+    out = room / "out"
+    with started(*command(file(SCENARIO), out, *LONG)) as process:
+        assert until(lambda: chunks(out), process)
+        process.send_signal(signal.SIGTERM)
+        stdout, stderr = ended(process)
+    assert stdout == ""
+    assert stderr.splitlines()[-1].startswith(f"interrupted: finished chunks are in {out}; go on with: ")
+    assert left_in(out) == {".lock", "manifest.json", "chunks"}
+    assert nothing_temporary(room)
+
+
+@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_workers_end_with_their_sweep(file, room, times):
+    """Sent once the chunks in hand are finished, sent twice nothing is waited for."""
+    out = room / "out"
+    with started(*command(file(SCENARIO), out, *LONG, "--engine", "dask", "--workers", "2")) as process:
+        assert until(lambda: chunks(out), process)
+        children = psutil.Process(process.pid).children(recursive=True)
+        assert len(children) >= 2
+        for _ in range(times):
+            process.send_signal(signal.SIGTERM)
+            time.sleep(0.3)
+        ended(process, children)
+    assert nothing_temporary(room)
+
+
+def test_a_run_leaves_no_half_file(room):
+    words = ("simulate", "slip-lmi", "--set", "solver.step=1e-7", "--csv", room / "run.csv", "--plot", room / "run.png")
+    with started(*command("x", "y")[:3], *map(str, words), cwd=room) as process:
+        assert until(lambda: len(left_in(room)) >= 3, process)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGTERM)
+        out, err = ended(process)
+    assert (out, err.splitlines()[-1]) == ("", "interrupted")
+    assert left_in(room) == {"temporary"}
