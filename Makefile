@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow lint bench mutations clean
+.PHONY: demo test test-slow versions lint bench mutations clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -31,6 +31,11 @@ bench: $(VENV)/.bench
 
 mutations: $(VENV)/.test
 	$(BIN)/python tests/mutations.py
+
+# the oldest and newest Python and JAX: VERSIONS="python3.11=0.10 ..."
+VERSIONS ?= python3.11=0.10 python3.12=0.11 python3.13=0.12
+versions:
+	$(PYTHON) tests/versions.py $(VERSIONS)
 
 clean:
 	rm -rf $(VENV) .jax_cache out

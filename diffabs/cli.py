@@ -28,6 +28,7 @@ from diffabs import (
     show,
     usage,
 )
+from diffabs.checking import checked, said
 from diffabs.loop import control_unit, task
 from diffabs.pytree import parameters
 from diffabs.rollout import Run, measure, rollout
@@ -98,6 +99,9 @@ def simulate(
         pathlib.Path | None, typer.Option(metavar="DIR", help="Run a sample of this sweep again.")
     ] = None,
     sample: Annotated[int | None, typer.Option(help="Which one, with --from-sweep.")] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Also run half and quarter steps, and say how accurate each metric is.")
+    ] = False,
 ) -> None:
     """Run a scenario once and show its metrics."""
     with console.guarded(), commands_sweep.reported():
@@ -117,8 +121,14 @@ def simulate(
                 show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
             if picture:
                 console.waited(lambda: _draw(chosen, run, picture), "drawing")
-        result = _result(chosen, run, {"csv": csv, "plot": plot})
+            found = console.waited(lambda: checked(chosen, key), "shortening the step") if check else None
+        result = _result(chosen, run, {"csv": csv, "plot": plot}) | ({"accuracy": found} if found else {})
         show.as_json(result) if as_json else show.run(result, chosen)
+        if found:
+            if not as_json:
+                show.accuracy(found)
+            for line in said(found):
+                console.say(f"warning: {line}")
         if result["diverged"]:
             console.fail(f"{chosen.name} diverged: a number became infinite or impossible: there are no metrics", 1)
         if warning := _warning(chosen, result):
@@ -273,7 +283,7 @@ def _reproduced(name: str, reproduction: "Reproduction", folder: pathlib.Path) -
             console.say(sentence)
 
     def detail() -> str:
-        return f"{steps[-1]}, {time.monotonic() - begun:.0f} s"
+        return f"{time.monotonic() - begun:.0f} s: {steps[-1]}"
 
     return console.waited(lambda: reproduction(folder, step), f"reproducing {name}", detail if spins else None)
 

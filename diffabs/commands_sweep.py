@@ -70,8 +70,10 @@ def sweep(
             warn_of_strays(found)
             if not found.complete:
                 raise KeyboardInterrupt
-            result = console.waited(lambda: _result(found, study, out, kept, figures), "computing statistics")
+            check = chosen.sweep.check
+            result = console.waited(lambda: _result(found, study, out, kept, figures, check), "computing statistics")
         show.as_json(result) if as_json else show.swept(result, chosen)
+        _warn(result["accuracy"])
         if result["refused"]["count"] == result["samples"]:
             why = next(iter(result["refused"]["reasons"]))
             console.fail(f"{chosen.name}: no sample could be run: {why}", console.FAILED)
@@ -217,13 +219,24 @@ def _listed(numbers: tuple[int, ...]) -> str:
     return ", ".join(map(str, numbers[:8])) + (f" and {len(numbers) - 8} more" if len(numbers) > 8 else "")
 
 
-def _result(found: "Results", study: "Study", out: pathlib.Path, kept: list[int], figures: bool) -> dict[str, Any]:
+def _warn(accuracy: dict[str, Any] | None) -> None:
+    from diffabs.sweep.checking import said
+
+    for line in said(accuracy) if accuracy else ():
+        console.say(f"warning: {line}")
+
+
+def _result(
+    found: "Results", study: "Study", out: pathlib.Path, kept: list[int], figures: bool, check: int
+) -> dict[str, Any]:
     """The JSON document, which is also written into the folder."""
+    from diffabs.sweep.checking import checked
     from diffabs.sweep.store import write_whole
     from diffabs.sweep.summary import summary
     from diffabs.sweep.trajectories import keep
 
-    result = {"out": str(out), **summary(found), "files": {}}
+    accuracy = checked(study, found, check) if check else None
+    result = {"out": str(out), **summary(found), "accuracy": accuracy, "files": {}}
     if kept:
         result["files"]["trajectories"] = str(keep(study, out, kept))
     if figures:

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.loop import Loop
 from diffabs.protocols import Objective
-from diffabs.pytree import replace, separated, strong
+from diffabs.pytree import misshapen, replace, separated, strong
 from diffabs.refusals import refusals, traced
 from diffabs.rollout import Carry, FixedStep, Run, arguments, judged, ready, started, step
 
@@ -39,6 +40,8 @@ def measure_lanes(
     Raises ValueError without values, and for what `measure` objects to."""
     if not values:
         raise ValueError("no value differs between the lanes")
+    if lines := list(misshapen(replace(loop, {path: x[0] for path, x in values.items() if np.ndim(x)}))):
+        raise ValueError("; ".join(lines))
     if accepted is None:
         accepted = _accepted(loop, values, solver)
     loop, objectives, h = arguments(loop, solver, objectives)

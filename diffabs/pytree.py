@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from diffabs import kinds
 from diffabs.rules import Rule, array
 
 Scalar = Any  # a float, a NumPy or JAX scalar, a tracer; a batch of them under vmap
@@ -33,7 +34,8 @@ T = TypeVar("T")
 @dataclasses.dataclass(frozen=True)
 class Spec:
     """What a parameter may be: its unit and the interval it lives in. `tunable` is False where the run does not depend
-    on the value smoothly (a sampling period, say), so that its derivative is zero or not defined."""
+    on the value smoothly (a sampling period, say), so that its derivative is zero or not defined. `shape` is that of a
+    part that is not batched; None where it is free."""
 
     unit: str
     low: float = -math.inf
@@ -42,6 +44,7 @@ class Spec:
     open_high: bool = False
     infinite: bool = False
     tunable: bool = True
+    shape: tuple[int, ...] | None = dataclasses.field(default=None, compare=False)
 
     def interval(self) -> str:
         """The range as a person writes it: `(0, 1] kg`."""
@@ -72,8 +75,10 @@ def param(
     below: float | None = None,
     infinite: bool = False,
     tunable: bool = True,
+    free: bool = False,
 ) -> Any:
-    """A parameter: one differentiable leaf. `low`/`high` belong to the range, `above`/`below` do not."""
+    """A parameter: one differentiable leaf. `low`/`high` belong to the range, `above`/`below` do not. Its shape is that
+    of its default, unless it is `free`."""
     spec = Spec(
         unit,
         low if above is None else above,
@@ -82,6 +87,7 @@ def param(
         below is not None,
         infinite,
         tunable,
+        None if free or default is dataclasses.MISSING else np.shape(default),
     )
     if isinstance(default, tuple | list | np.ndarray):
         values = np.array(default, float)
@@ -165,7 +171,10 @@ def problems(part: Any, prefix: str = "") -> Iterator[str]:
     for name, field, value in _children(part, prefix):
         if field is not None and "spec" in field.metadata:
             spec: Spec = field.metadata["spec"]
-            if not spec.holds(value):
+            if line := _unfit(name, spec, value):
+                found = True
+                yield line
+            elif not spec.holds(value):
                 found = True
                 yield f"{name} = {_show(value)} is outside {spec.interval()}"
         else:
@@ -205,6 +214,22 @@ def _below(part: Any, prefix: str, hook: str, *args: Any) -> Iterator[Rule]:
         if field is None or "spec" not in field.metadata:
             yield from _below(value, f"{name}.", hook, *args)
     yield from (rule.under(prefix) for rule in _own(part, hook, *args))
+
+
+def misshapen(part: Any, prefix: str = "") -> Iterator[str]:
+    """One line for each parameter of a single part that is no number, or has another shape than its field. It may be
+    traced: values are not looked at."""
+    for name, spec, value in parameters(part, prefix):
+        if line := _unfit(name, spec, value):
+            yield line
+        elif spec.shape is not None and kinds.shape(value) != spec.shape:
+            yield f"{name} = {kinds.shown(value)} has shape {kinds.shape(value)}; it needs {spec.shape}"
+
+
+def _unfit(name: str, spec: Spec, value: Any) -> str:
+    """A line for what is no number, or empty."""
+    line = kinds.objection(value)
+    return line and f"{name} = {kinds.shown(value)} {line}; a number in {spec.interval()} is needed"
 
 
 def cautions(part: Any, prefix: str = "") -> Iterator[str]:
@@ -281,11 +306,21 @@ def _replace(part: Any, names: list[str], value: Any) -> Any:
     return dataclasses.replace(part, **{head: new})  # pyright: ignore[reportArgumentType]  # an instance
 
 
+def arrayed(part: T) -> T:
+    """The same part with arrays where a parameter is a list or a tuple of numbers."""
+    listed = {path: value for path, _, value in parameters(part) if isinstance(value, list | tuple)}
+    return replace(part, {path: jnp.asarray(value) for path, value in listed.items()})
+
+
 def strong(tree: T) -> T:
     """Every leaf as a float array of one dtype: that of the arrays among the leaves, else JAX's default float.
 
     Python numbers are weakly typed: mixed with arrays they would cause a second compilation of the same function.
+    Raises ValueError for a leaf that is no real number, or a float of fewer than 32 bits.
     """
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if line := kinds.objection(leaf):
+            raise ValueError(f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.shown(leaf)} {line}")
     arrays = [
         x.dtype for x in jax.tree.leaves(tree) if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)
     ]
@@ -303,6 +338,18 @@ def prepared(part: Any) -> Any:
     inner = {f.name: prepared(getattr(part, f.name)) for f in dataclasses.fields(part) if "part" in f.metadata}
     part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
     return part.prepared() if hasattr(part, "prepared") else part
+
+
+def refined(part: Any, times: int) -> Any:
+    """The same parts for steps that are so many times shorter: a part whose memory is as long as so many steps has a
+    method `refined(times)`."""
+    if isinstance(part, tuple):
+        return tuple(refined(item, times) for item in part)
+    if not dataclasses.is_dataclass(part):
+        return part
+    inner = {f.name: refined(getattr(part, f.name), times) for f in dataclasses.fields(part) if "part" in f.metadata}
+    part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
+    return part.refined(times) if hasattr(part, "refined") else part
 
 
 def separated(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[Any], Any]]:

@@ -12,19 +12,21 @@ crossing, if a metric is outside of its physical range, or if the plant's own au
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from diffabs import kinds
 from diffabs.integrate import axpy, forgetful, repeated, rk4_step_and_rate
 from diffabs.loop import Loop, LoopState
 from diffabs.numerics import clamp
 from diffabs.protocols import Clock, Ending, Memory, Objective, Sample
-from diffabs.pytree import prepared, strong
+from diffabs.pytree import arrayed, misshapen, prepared, strong
 
+MOST_STEPS = 2**31 - 8  # that a counter in 32 bits holds, landing included
 LANDINGS = 4  # Newton iterations for the length of the last step; quadratic from an error below one step
 MISSED = 0.1  # of the last step, by which a landing may miss the crossing: the state is still moved onto it
 ROUNDING = 1e-9  # of a metric beyond its physical range
@@ -75,7 +77,8 @@ def rollout(
 
     Pure and jit-compiled; batch it with `jax.vmap`, differentiate it in any leaf of `loop`. It is compiled once per
     structure of the loop and number of steps: new values do not compile again. `key` seeds noisy sensors.
-    Raises ValueError for a step, duration or stride that is not positive.
+    Raises ValueError for a step, duration or stride that is not positive, a step longer than the duration, and
+    parameters that are no real numbers of 32 bits or more, or have another shape than they need.
     """
     return _call(loop, solver, objectives or {}, key, solver.every)
 
@@ -92,11 +95,32 @@ def _call(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], ke
 
 def arguments(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
     """Loop, objectives and step, of one data type. Raises ValueError."""
-    for name in ("step", "duration", "every"):
-        if not 0 < getattr(solver, name) < math.inf:
-            raise ValueError(f"solver.{name} = {getattr(solver, name)} is not positive and finite")
-    loop, objectives = strong((loop, dict(objectives)))
+    lines = [*_wrong_solver(solver), *misshapen(loop)]
+    lines += [line for name, part in objectives.items() for line in misshapen(part, f"objectives.{name}.")]
+    if lines:
+        raise ValueError("; ".join(lines))
+    loop, objectives = strong((arrayed(loop), {name: arrayed(part) for name, part in objectives.items()}))
     return loop, objectives, jnp.asarray(solver.step, jax.tree.leaves(loop)[0].dtype)
+
+
+def _wrong_solver(solver: FixedStep) -> Iterator[str]:
+    """One line for each field that no run can have."""
+    lines = [f"solver.{name} {line}" for name in ("step", "duration", "every") if (line := _wrong_number(solver, name))]
+    if lines:
+        yield from lines
+    elif solver.step > solver.duration:
+        yield f"solver.step = {solver.step} s is longer than solver.duration = {solver.duration} s"
+    elif solver.duration / solver.step > MOST_STEPS:
+        yield f"solver.step = {solver.step} s takes more than {MOST_STEPS} steps of {solver.duration} s"
+
+
+def _wrong_number(solver: FixedStep, name: str) -> str:
+    value = getattr(solver, name)
+    if line := kinds.objection(value) or (kinds.shape(value) and f"has shape {kinds.shape(value)}"):
+        return f"= {kinds.shown(value)} {line}; a number is needed"
+    if not 0 < value < math.inf:
+        return f"= {value} is not positive and finite"
+    return f"= {value} is no whole number" if name == "every" and value != int(value) else ""
 
 
 class Carry(NamedTuple):

@@ -67,6 +67,17 @@ def run(result: dict[str, Any], chosen: Scenario) -> None:
         say(f"{name}: {path}")
 
 
+def accuracy(found: dict[str, Any]) -> None:
+    """What shorter steps, and single precision, change."""
+    table = Table("metric", "half step", "relative", "order", "error", "float32")
+    for name, row in found["metrics"].items():
+        order = "none" if not row["converges"] else "" if math.isnan(row["order"]) else f"{row['order']:.1f}"
+        numbers = (row["difference"], row["relative"], row["error"], row["float32 difference"])
+        half, relative, error, single = ("" if x is None or math.isnan(x) else f"{x:.1e}" for x in numbers)
+        table.add_row(name, half, relative, order, error, single)
+    _print("what a half step changes, at which order, the error that is left at this step; float32", table)
+
+
 def family(name: str, members: dict[str, Any]) -> None:
     """The members of a family, field by field; or the scenarios."""
     if name == "scenarios":
@@ -232,6 +243,12 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
             f"refused: {refused['count']} of {result['samples']} samples were not run and are in no number here, the"
             f" first sample {refused['samples'][0]}: {why}"
         )
+    if result["accuracy"] and result["accuracy"]["metrics"]:
+        changes = Table("metric", "median change", "largest", "in sample")
+        for name, row in result["accuracy"]["metrics"].items():
+            changes.add_row(name, f"{row['median']:.1e}", f"{row['largest']:.1e}", str(row["sample"]))
+        count = len(result["accuracy"]["samples"])
+        _print(f"what a half step changes, relative, in {count} lane{'s' if count > 1 else ''} drawn from all", changes)
     for name, rows in result["worst"].items():
         if rows:
             say(f"greatest {name}: {_brief(rows[0]['value'])} in sample {rows[0]['sample']}")

@@ -2,6 +2,7 @@
 
     samples, seed            runs (0: as many as the design has, or 1,000)
     chunk                    runs that are computed and stored together
+    check                    runs, drawn from all, that are repeated with a half step to see how accurate they are
     dtype                    "float64" or "float32"
     design                   "random", "sobol", "latin-hypercube", "grid", "corners", "saltelli", or a table of one
     [sweep.over]
@@ -45,7 +46,7 @@ from diffabs.ranges import Entry, canonical, entries, flat
 if TYPE_CHECKING:
     from diffabs.sweep import Study
 
-WHOLE = {"samples": (0, 0, 2**32 - 1), "seed": (0, 0, 2**32 - 1), "chunk": (4096, 1, 2**20)}
+WHOLE = {"samples": (0, 0, 2**32 - 1), "seed": (0, 0, 2**32 - 1), "chunk": (4096, 1, 2**20), "check": (16, 0, 4096)}
 SAMPLES = 1000  # where the design does not say how many there are
 DTYPES = ("float64", "float32")
 FIELDS = (*WHOLE, "dtype", "design", "over", "correlation", "failures")
@@ -60,6 +61,7 @@ class Variation:
     samples: int = 0
     seed: int = 0
     chunk: int = 4096
+    check: int = 16
     dtype: str = "float64"
     design: Any = "random"
     over: Mapping[str, Any] = dataclasses.field(default_factory=dict)

@@ -34,6 +34,7 @@ duration = 0.25
 samples = 3200
 chunk = 64
 seed = 3
+check = 0
 [sweep.over]
 "plant.mass" = [5.3, 6.2]
 "initial.speed_kmh" = [28.0, 34.0]

@@ -226,6 +226,14 @@ def test_latch_follows_later_maxima():
     close(falling, [0.2, 0.5, 0.5])  # past the peak from the start: the best slip was the first one
 
 
+@pytest.mark.parametrize(("reference", "late"), [(PeakLatch(), 0), (PeakLiteral(), None)])
+def test_the_estimators_go_by_the_size_of_the_acceleration(reference, late):
+    """|a| = 0.3, 0.2, 0.1, 0.5: it falls at once, from the first sample, and exceeds it at the fourth."""
+    a = jnp.array([-0.3, -0.2, 0.1, -0.5])
+    target, _ = run(reference, lambda t: seen(0.1 + t, deceleration=a[jnp.round(t / H).astype(int)]), 4)
+    close(target, [0.2, 0.1, 0.1, 0.1] if late == 0 else [0.2, 0.2, 0.2, 0.1 + 3 * H])
+
+
 def test_latch_does_not_move_for_rounding():
     """A controller that holds the best slip keeps the deceleration at its maximum, to rounding."""
     a = jnp.array([1.0, 3.0, 2.0, 3.0 * (1 + 1e-7), 2.0])

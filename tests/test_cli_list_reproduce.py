@@ -106,7 +106,7 @@ def test_on_a_terminal_the_spinner_says_which_step(papers, tmp_path, monkeypatch
     monkeypatch.setattr(console, "animated", lambda: True)
     monkeypatch.setattr(console, "waited", waited)
     result = run("reproduce", "slip-lmi", "--out", tmp_path)
-    assert shown == ["reproducing slip-lmi ... drawing, 0 s"]
+    assert shown == ["reproducing slip-lmi ... 0 s: drawing"]
     assert "drawing" not in result.stderr
 
 

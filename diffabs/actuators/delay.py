@@ -4,6 +4,7 @@ The command is kept at the instants of the integration grid and joined by straig
 of the delayed command over the step. That is second order in the step, exact in the impulse of the first command, and
 differentiable in the delay."""
 
+import dataclasses
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -60,6 +61,10 @@ class Delay:
 
         second = jnp.minimum(first + 1, clock.k - 1)  # with a delay of one step, part is 0 and so is its share
         return Jump(Memory(held=DelayMemory(ring, line(first, part, 1.0) + line(second, 0.0, part))))
+
+    def refined(self, times: int) -> "Delay":
+        """The same delay in so many more steps."""
+        return dataclasses.replace(self, capacity=times * self.capacity)  # pyright: ignore[reportArgumentType]
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """The ring holds the delay, to the rounding of single precision."""

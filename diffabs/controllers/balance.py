@@ -68,6 +68,7 @@ class ObserverFeedback:
     correction: Matrix = param(default=np.eye(6)[:, :2], unit="1, 1/s")
     voltage_max: Scalar = param(default=np.inf, unit="V", above=0.0, infinite=True)
 
+    every_step = True
     flow = no_flow
 
     def start(self, signal: Tracking) -> Memory:

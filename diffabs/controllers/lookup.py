@@ -23,9 +23,9 @@ from diffabs.rules import Rule, increasing
 class ScheduledFeedback:
     """u = clamp(ff + k1(v) x1 + k2(v) x2, torque_min, torque_max); gains at increasing speeds."""
 
-    speeds: Vector = param(default=(5 / 3.6, 50 / 3.6), unit="m/s", low=0.0)
-    integral_gains: Vector = param(default=(-11753.0, -11753.0), unit="N m/s")
-    gains: Vector = param(default=(-58.0, -158.0), unit="N m")
+    speeds: Vector = param(default=(5 / 3.6, 50 / 3.6), unit="m/s", low=0.0, free=True)
+    integral_gains: Vector = param(default=(-11753.0, -11753.0), unit="N m/s", free=True)
+    gains: Vector = param(default=(-58.0, -158.0), unit="N m", free=True)
     torque_min: Scalar = param(default=-np.inf, unit="N m", infinite=True)
     torque_max: Scalar = param(default=np.inf, unit="N m", infinite=True)
     antiwindup: Any = part(default=NoAntiWindup)
@@ -42,7 +42,10 @@ class ScheduledFeedback:
         return self._here(signal).output(t, memory, signal)
 
     def _here(self, signal: Tracking) -> StateFeedback:
-        """The feedback at the measured speed."""
+        """The feedback at the measured speed. Raises ValueError for lists of different lengths."""
+        shapes = [np.shape(x) for x in (self.speeds, self.integral_gains, self.gains)]
+        if len(set(shapes)) != 1:
+            raise ValueError(f"speeds, integral_gains and gains have shapes {', '.join(map(str, shapes))}")
         rise = _rise(signal.measured.speed, jnp.asarray(self.speeds))
         rows = (_table(rise, jnp.asarray(gains)) for gains in (self.integral_gains, self.gains))
         limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}

@@ -67,10 +67,10 @@ def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
 @_lanes
 def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Any:
     """The same in discrete time, where R may be singular."""
-    p = _singular(A, B, Q, R)
-    shift = p[:, None] * eye(len(A), A)
-    moved, T = times(transpose(A), shift), transpose(B)
-    Q, R, S = Q + times(moved, A) - shift, R + times(T, shift, B), S + times(moved, B)
+    pivots, diagonal = (jnp.sum(x * eye(len(R), R), 1) for x in (cholesky(R), R))
+    definite = jnp.all(pivots**2 > ROUNDING * diagonal, 0)
+    regular, same = jnp.all(definite), (Q, R, S, jnp.zeros_like(A))
+    Q, R, S, shift = lax.cond(regular, lambda: same, lambda: _shifted(A, B, Q, R, S, definite))
     B, S, a, b, q, d = _prepared(A, B, Q, R, S)
     I, G = eye(len(a), a), times(b, transpose(b))
 
@@ -83,8 +83,13 @@ def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Ar
     P = _unless(found, P, by_sign)
     P = _refined(partial(_hewer, a, b, q), P, shift * d * d[:, None])
     P, residual = _given(P, d, partial(_discrete_terms, A, B, Q, S))
-    curved = jnp.isfinite(size(cholesky(eye(B.shape[1], B) + times(transpose(B), P, B))))
-    return jnp.where(curved | ~jnp.any(p > 0, 0), P + shift, jnp.nan), residual
+
+    def curved() -> jax.Array:
+        """P where R + B' P B > 0."""
+        minimum = jnp.isfinite(size(cholesky(eye(B.shape[1], B) + times(transpose(B), P, B))))
+        return jnp.where(definite | minimum, P + shift, jnp.nan)
+
+    return lax.cond(regular, lambda: P, curved), residual
 
 
 def _blocks(*blocks: jax.Array) -> jax.Array:
@@ -103,27 +108,21 @@ def _prepared(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
     return B, S, a * d / d[:, None], B / d[:, None], q * d * d[:, None], d
 
 
-def _singular(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array) -> jax.Array:
-    """The diagonal p (n, lanes) of a matrix that P is replaced by the excess over, 0 where R > 0, NaN where R is not
-    even semidefinite.
+def _shifted(A: Any, B: Any, Q: Any, R: Any, S: Any, definite: jax.Array) -> tuple[Any, ...]:
+    """Q, R, S of the discrete equation for P less a diagonal matrix, and that matrix: 0 in lanes where R is definite,
+    NaN where it is not even semidefinite.
 
-    The discrete equation for P - diag p is one with R + B' diag(p) B, definite if any R + B' P B is. In balanced
-    coordinates p is as large as Q.
+    The weight of the inputs then is R + B' shift B, definite if any R + B' P B is. In balanced coordinates the shift is
+    as large as Q.
     """
-    one, diagonal = eye(len(R), R), jnp.sum(R * eye(len(R), R), 1)
-    pivots = jnp.sum(cholesky(R) * one, 1) ** 2
-    definite = jnp.all(pivots > ROUNDING * diagonal, 0)
-    weight = size(R)
-    spare = jnp.where(weight > 0, ROUNDING * weight, 1.0)
-    semidefinite = jnp.isfinite(size(cholesky(R + spare * one)))
-
-    def needed() -> jax.Array:
-        d = _balance(A, times(B, transpose(B)), Q)
-        level = size(Q * d * d[:, None])
-        p = jnp.where(level > 0, level, 1.0) / (d * d)
-        return jnp.where(definite, 0.0, jnp.where(semidefinite, p, jnp.nan))
-
-    return lax.cond(jnp.all(definite), lambda: jnp.zeros_like(A[0]), needed)
+    weight, one = size(R), eye(len(R), R)
+    semidefinite = jnp.isfinite(size(cholesky(R + jnp.where(weight > 0, ROUNDING * weight, 1.0) * one)))
+    d = _balance(A, times(B, transpose(B)), Q)
+    level = size(Q * d * d[:, None])
+    p = jnp.where(semidefinite, jnp.where(level > 0, level, 1.0) / (d * d), jnp.nan)
+    shift = jnp.where(definite, 0.0, p)[:, None] * eye(len(A), A)
+    moved = times(transpose(A), shift)
+    return Q + times(moved, A) - shift, R + times(transpose(B), shift, B), S + times(moved, B), shift
 
 
 def _balance(A: jax.Array, G: jax.Array, Q: jax.Array) -> jax.Array:

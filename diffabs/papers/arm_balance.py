@@ -135,7 +135,7 @@ def maps(progress: Callable[[str], None]) -> dict[str, Basin]:
     axis = np.linspace(-BOX, BOX, POINTS)
     gains, found = {"LQR": regulated(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": TUNED}, {}
     for name, gain in gains.items():
-        progress(f"arm-balance: region of attraction, {name}: {POINTS**2} runs")
+        progress(f"arm-balance: {POINTS**2} starts, {name}")
         found[name] = attraction(loop(HANGING, gain), axis, axis, SOLVER)
     return found
 
@@ -143,7 +143,7 @@ def maps(progress: Callable[[str], None]) -> dict[str, Basin]:
 def robust(progress: Callable[[str], None]) -> dict[str, Any]:
     """Gains over riders of 40 to 100 kg: LQR of one rider, LMI of all, tuned."""
     gains = {"LQR for 50 kg": regulated(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": np.array(TUNED)}
-    progress("arm-balance: one gain for riders of 40 to 100 kg, by inequalities")
+    progress("arm-balance: a gain for 40 to 100 kg")
     try:
         from diffabs.design import Spec, design
         from diffabs.design.gridded import gridded
@@ -155,7 +155,7 @@ def robust(progress: Callable[[str], None]) -> dict[str, Any]:
         pass
     found = {}
     for name, gain in gains.items():
-        progress(f"arm-balance: {len(RIDERS)} riders, {name}: {len(RIDERS) * len(MULTIPLES)} runs")
+        progress(f"arm-balance: {len(RIDERS)} riders, {name}")
         found[name] = gain, largest(loop(HANGING, gain), {"plant.rider_mass": RIDERS})
     return found
 
@@ -212,7 +212,7 @@ def compact(summary: Mapping[str, Any]) -> Digest:
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str, Any]:
     """Write figures and `summary.json` into the folder; returns the summary."""
-    progress("arm-balance: Fig. 3 in the printed and in the correct equations")
+    progress("arm-balance: Fig. 3, printed and correct equations")
     seen = runs()
     basins = maps(progress)
     over_riders = robust(progress)

@@ -24,7 +24,7 @@ MARGIN = 1e-6
 
 
 class PeakMemory(NamedTuple):
-    """1 once latched; greatest deceleration [m/s^2] and the slip [1] there; target [1]; the last two samples."""
+    """1 once latched; greatest |a| [m/s^2] and the slip [1] there; target [1]; the last two samples."""
 
     latched: Scalar
     greatest: Scalar
@@ -32,6 +32,12 @@ class PeakMemory(NamedTuple):
     target: Scalar
     deceleration: tuple[Scalar, Scalar]
     slips: tuple[Scalar, Scalar]
+
+
+def _size(signal: BrakeOutput) -> Any:
+    """|a|, as the paper has it. It matters where the accelerometer has a forward bias: it shows an acceleration before
+    the wheel slips, whose size falls before it rises."""
+    return jnp.abs(signal.deceleration)
 
 
 def _fresh(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMemory:
@@ -46,12 +52,13 @@ class PeakLiteral:
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
 
+    every_step = True  # how little it brakes is the delay of one sample
     flow = no_flow
 
     def start(self, signal: BrakeOutput) -> Memory:
         """Maximum so far: the first sample."""
-        fresh = _fresh(self.slip, signal.deceleration, signal.slip)
-        return Memory(held=fresh._replace(greatest=signal.deceleration))
+        size = _size(signal)
+        return Memory(held=_fresh(self.slip, size, signal.slip)._replace(greatest=size))
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
         """Target slip [1]."""
@@ -63,11 +70,12 @@ class PeakLiteral:
         return memory.held.target
 
     def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
-        """Follow the slip while the deceleration rises."""
+        """Follow the slip while |a| rises."""
         del clock
         m: PeakMemory = memory.held
-        exceeds = signal.deceleration > m.greatest
-        greatest = jnp.where(exceeds, signal.deceleration, m.greatest)
+        size = _size(signal)
+        exceeds = size > m.greatest
+        greatest = jnp.where(exceeds, size, m.greatest)
         target = jnp.where(exceeds, signal.slip, m.target)
         return Jump(Memory(held=m._replace(greatest=greatest, target=target)))
 
@@ -76,7 +84,8 @@ class PeakLiteral:
 class PeakLatch:
     """target = slip until |a| first falls, then the slip at its maximum; a later, greater one moves the target there.
 
-    For an exact accelerometer: noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip.
+    For an exact accelerometer: noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip. So does a forward
+    bias, under which |a| falls through zero before it rises.
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
@@ -87,12 +96,12 @@ class PeakLatch:
 
     def start(self, signal: BrakeOutput) -> Memory:
         """No maximum yet."""
-        return Memory(held=_fresh(self.slip, signal.deceleration, signal.slip))
+        return Memory(held=_fresh(self.slip, _size(signal), signal.slip))
 
     def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
         """Latch at a maximum greater than all before."""
         m: PeakMemory = memory.held
-        place, higher, new = _tracked(m, signal.deceleration, signal.slip, clock.k == 0)
+        place, higher, new = _tracked(m, _size(signal), signal.slip, clock.k == 0)
         new = new._replace(
             latched=jnp.where(higher, 1.0, m.latched),
             target=jnp.where(higher, new.slip, m.target),
@@ -109,8 +118,9 @@ class FilterMemory(NamedTuple):
 
 @pytree
 class PeakRobust:
-    """The latch for noisy sensors: deceleration and slip pass the same low-pass (so their delays cancel), nothing
-    happens below `arming`, and the fall must exceed the fraction `threshold` of the maximum."""
+    """The latch for noisy and biased sensors: deceleration (with its sign: the size of noise has a mean) and slip pass
+    the same low-pass (so their delays cancel), nothing happens below `arming`, and the fall must exceed the fraction
+    `threshold` of the maximum."""
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
     time_constant: Scalar = param(default=0.02, unit="s", above=0.0)

@@ -36,11 +36,13 @@ class Patches:
     steps."""
 
     roads: tuple[Road, ...] = part(default=(DRY_ASPHALT, SNOW))
-    edges: Vector = param(default=(10.0,), unit="m", low=0.0)
+    edges: Vector = param(default=(10.0,), unit="m", low=0.0, free=True)
     width: Scalar = param(default=0.1, unit="m", low=0.0)
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
-        """mu [1] of the surface at this distance [m]."""
+        """mu [1] of the surface at this distance [m]. Raises ValueError where edges are missing or too many."""
+        if np.shape(self.edges) != (len(self.roads) - 1,):
+            raise ValueError(f"edges has shape {np.shape(self.edges)}; {len(self.roads)} roads need one less")
         mus = [road.friction(slip, speed, distance) for road in self.roads]
         smooth = jnp.greater(self.width, 0)
         width = jnp.where(smooth, self.width, 1.0)

@@ -45,6 +45,7 @@ class Tabulated:
         unit="1",
         low=0.0,
         high=1.0,
+        free=True,
     )
     mu: Vector = param(
         default=(
@@ -65,6 +66,7 @@ class Tabulated:
         + (0.85317, 0.81806, 0.79436, 0.75761),
         unit="1",
         low=0.0,
+        free=True,
     )
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
@@ -72,8 +74,11 @@ class Tabulated:
         return self.prepared().friction(slip, speed, distance)
 
     def prepared(self) -> "PiecewiseCubic":
-        """The same curve with the coefficients worked out, once for a whole run."""
+        """The same curve with the coefficients worked out, once for a whole run. Raises ValueError for columns of
+        different lengths, or shorter than 3."""
         x, y = jnp.asarray(self.slip), jnp.asarray(self.mu)
+        if x.shape != y.shape or x.ndim != 1 or x.size < 3:
+            raise ValueError(f"slip and mu have shapes {x.shape} and {y.shape}; both need one length of at least 3")
         d = slopes(x, y)
         h, m = jnp.diff(x), jnp.diff(y) / jnp.diff(x)
         c2 = (3 * m - 2 * d[:-1] - d[1:]) / h

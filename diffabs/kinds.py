@@ -1,0 +1,60 @@
+"""What can be a number of a run. JAX converts far more than that: text is parsed, an imaginary part dropped, truth
+becomes 1, and one leaf in 16 bits makes a whole run of 16 bits."""
+
+import math
+import numbers
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+FEWEST_BITS = 32  # of a float: in 16, the instants of a run are all the same after a second
+LONGEST = 60  # characters of a value in a message
+
+
+def objection(value: Any) -> str:
+    """What keeps a value from being a number of a run, or an array of them, such as `is text`; empty if nothing does.
+    Types alone are looked at, so it may be traced."""
+    if isinstance(value, list | tuple):
+        return next(filter(None, map(objection, value)), "")
+    if hasattr(value, "dtype"):
+        return _of_type(value.dtype)
+    if isinstance(value, str | bytes):
+        return "is text"
+    if isinstance(value, bool):
+        return "is a truth value"
+    if isinstance(value, numbers.Real):
+        return "is too large" if _overflows(value) else ""
+    return "is complex" if isinstance(value, complex) else f"is of type {type(value).__name__}"
+
+
+def _overflows(value: Any) -> bool:
+    return sys.float_info.max < abs(value) < math.inf
+
+
+def _of_type(dtype: Any) -> str:
+    if jnp.issubdtype(dtype, jax.dtypes.extended) or np.dtype(dtype).kind in "mM":  # keys, dates
+        return f"is of type {dtype}"
+    if jnp.issubdtype(dtype, np.floating):
+        few = np.dtype(dtype).itemsize * 8 < FEWEST_BITS
+        return f"is of type {dtype}, a float of fewer than {FEWEST_BITS} bits" if few else ""
+    kinds = {np.integer: "", np.complexfloating: "is complex", np.bool_: "is a truth value", np.character: "is text"}
+    return next((line for kind, line in kinds.items() if jnp.issubdtype(dtype, kind)), f"is of type {dtype}")
+
+
+def shape(value: Any) -> tuple[int, ...]:
+    """Of an array, a number, or a list of them; it may be traced."""
+    if isinstance(value, list | tuple):
+        return (len(value), *(shape(value[0]) if value else ()))
+    return np.shape(value)
+
+
+def shown(value: Any) -> str:
+    """A value as it may stand in a message: on one line, of bounded length."""
+    try:
+        text = " ".join(str(value).split()) if hasattr(value, "dtype") else repr(value)
+    except ValueError:  # a whole number of thousands of digits
+        text = "..."
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."

@@ -1,0 +1,104 @@
+"""How accurate a sweep's metrics are: a random sample of its lanes, run again with steps of half the length."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.accuracy import comparable, measure_finer, share
+from diffabs.rollout import Run
+from diffabs.sweep.results import Results
+from diffabs.sweep.study import Study, precision
+
+STREAM = 0x0ACC  # of random numbers, beside those of the designs
+EXCLUDED = ("diverged", "refused")  # flags of lanes whose metrics are none
+LOOSE = 0.01  # relative: a metric that a half step changes by more
+
+
+def checked(study: Study, found: Results, count: int) -> dict[str, Any]:
+    """Of at most `count` lanes that ran to their end, chosen by the seed: the median and the largest change of each
+    metric by a half step, relative to its value or, where that is less, to its median; the lane with the largest; how
+    many ended in another way, or draw other noise, and are left out."""
+    samples = _chosen(study, found, count)
+    half = {name: np.full(len(samples), np.nan) for name in found.metrics}
+    alike, fine = np.zeros(len(samples), bool), np.zeros(len(samples), bool)
+    stopped = found.column("stopped")[samples]
+    for places, run, known in _halved(study, samples):
+        for name, column in half.items():
+            column[places] = run.metrics[name]
+        fine[places] = known
+        alike[places] = ~np.asarray(run.diverged) & (np.asarray(run.stopped) == stopped[places])
+    rows = samples[fine & alike]
+    changes = {n: _changes(found.column(n)[rows], column[fine & alike], rows) for n, column in half.items()}
+    return {
+        "samples": rows.tolist(),
+        "step": study.solver.step / 2,
+        "ended otherwise": int((fine & ~alike).sum()),
+        "not comparable": int((~fine).sum()),
+        "metrics": {name: row for name, row in changes.items() if row},
+    }
+
+
+def said(result: dict[str, Any]) -> list[str]:
+    """What a reader of the statistics must know, a line each."""
+    lines = []
+    loose = {name: row for name, row in result["metrics"].items() if row["largest"] > LOOSE}
+    if loose:
+        each = (f"{name} by up to {100 * row['largest']:.3g} % (sample {row['sample']})" for name, row in loose.items())
+        lines.append(f"a half step changes {', '.join(each)}: shorten solver.step")
+    if result["ended otherwise"]:
+        lines.append(f"with a half step {result['ended otherwise']} of the lanes looked at ended in another way")
+    if result["not comparable"]:
+        lines.append("accuracy unknown: a half step draws other noise, or a block computes once in every step")
+    return lines
+
+
+def _chosen(study: Study, found: Results, count: int) -> np.ndarray:
+    """Numbers of lanes, which are also their rows."""
+    good = np.flatnonzero(~np.any([_flagged(found, flag) for flag in EXCLUDED], axis=0))
+    random = np.random.default_rng([study.seed, STREAM])
+    return np.sort(random.choice(good, min(count, len(good)), replace=False))
+
+
+def _flagged(found: Results, flag: str) -> np.ndarray:
+    """Which lanes have a flag, or a reason; none in a table without this column."""
+    try:
+        column = found.column(flag)
+    except KeyError:
+        return np.zeros(len(found.column("sample")), bool)
+    return column != "" if column.dtype.kind in "OU" else column.astype(bool)
+
+
+def _halved(study: Study, samples: np.ndarray) -> Iterator[tuple[list[int], Run, np.ndarray]]:
+    """Lanes of one structure at a time: their places among the samples, their runs, whether they can be compared."""
+    lanes: dict[Any, list[tuple[int, Any, Any]]] = {}
+    for place, i in enumerate(samples.tolist()):
+        loop, key = study.lane(i)
+        lanes.setdefault(jax.tree.structure(loop), []).append((place, loop, key))
+    for members in lanes.values():
+        places, loops, keys = zip(*members, strict=True)
+        with precision(study.dtype):
+            batch = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one, study.dtype) for one in x]), *loops)
+            both = jax.jit(jax.vmap(lambda loop, key: _run(study, loop, key)))(batch, jnp.stack(keys))
+            run, known = jax.device_get(both)
+        yield list(places), run, known
+
+
+def _run(study: Study, loop: Any, key: Any) -> tuple[Run, Any]:
+    return measure_finer(loop, study.solver, study.objectives, 2, key=key), comparable(loop, study.solver, key)
+
+
+def _changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> dict[str, Any]:
+    if not len(values):
+        return {}
+    typical = np.maximum(np.abs(values), np.median(np.abs(values)))
+    relative = np.asarray(share(half - values, typical))
+    worst = int(np.argmax(relative))
+    return {
+        "median": float(np.median(relative)),
+        "largest": float(relative[worst]),
+        "difference": float(abs(half - values)[worst]),
+        "sample": int(samples[worst]),
+    }

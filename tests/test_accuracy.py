@@ -1,0 +1,155 @@
+"""Estimates of a run's errors against SciPy's solution of the same loop, and against each other."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from oracles import brake
+
+import diffabs as d
+from diffabs import accuracy as acc
+from diffabs import actuators, blocks, controllers, plants, references, sensors, stops
+from diffabs.objectives import IAE, MaxSlip, StopDistance, StopTime
+
+OBJECTIVES = {"stop_time": StopTime(), "stop_distance": StopDistance(), "max_slip": MaxSlip(), "iae": IAE()}
+RIG = d.Loop(
+    plant=plants.MirroredRig(),
+    initial=d.BrakeStart(speed=10.0, slip=0.15),
+    stop=stops.SpeedReached(speed=4.0),
+    controller=controllers.StateFeedback(gain=np.array([-900.0, -60.0])),
+    feedforward=controllers.ConstantInput(value=7.0),
+)
+
+
+def feedback(low=-np.inf, high=np.inf):
+    return (lambda t, s, m: np.clip(7.0 - 900.0 * m[0] - 60.0 * (s - 0.2), low, high)), (lambda t, s, m: [s - 0.2])
+
+
+def truth(low=-np.inf, high=np.inf):
+    torque, rates = feedback(low, high)
+    return brake(RIG.plant, torque, speed=10.0, stop=4.0, slip=0.15, memory=1, rates=rates)
+
+
+def test_the_error_of_a_smooth_loop_is_that_of_fourth_order():
+    """Sixteen fifteenths of what the half step changes; and the half step's own error is a fifteenth."""
+    found, exact = acc.accuracy(RIG, d.FixedStep(4e-3, 2.0), OBJECTIVES), truth()
+    assert found.comparable
+    assert found.alike
+    for name in ("stop_time", "stop_distance"):
+        one = found.estimates[name]
+        error = abs(float(one.value) - exact[name])
+        assert error > 1e-9, (name, error)
+        assert float(one.order) == pytest.approx(4.0, abs=0.1)
+        assert float(one.error) == pytest.approx(error, rel=0.01)
+        assert float(one.error) == pytest.approx(16 / 15 * abs(float(one.difference)), rel=0.01)
+        assert abs(float(one.value + one.difference) - exact[name]) == pytest.approx(error / 16, rel=0.1)
+        assert one.converges
+
+
+def test_a_torque_limit_costs_the_order_and_the_estimate_says_so():
+    loop = d.replace(RIG, {"controller.torque_min": 0.0, "controller.torque_max": 8.0})
+    exact = truth(0.0, 8.0)
+    found = acc.accuracy(loop, d.FixedStep(2e-3, 2.0), OBJECTIVES)
+    for name, one in found.estimates.items():
+        error = abs(float(one.value) - exact[name])
+        assert error <= 4 * float(one.error) + 1e-9, (name, error, one)
+        assert float(one.error) <= 300 * error + 1e-7, (name, error, one)
+
+
+def relay():
+    return dataclasses.replace(RIG, controller=controllers.Relay(torque_max=12.0, band=0.05))
+
+
+def delayed(time=0.0061):
+    controller = controllers.StateFeedback(gain=np.array([-100.0, -10.0]))
+    return dataclasses.replace(RIG, actuator=actuators.Delay(time=time, capacity=16), controller=controller)
+
+
+@pytest.mark.parametrize(("make", "step"), [(relay, 1e-3), (delayed, 1e-3)])
+def test_events_and_delays_are_estimated_to_their_size(make, step):
+    """Against the same loop with steps 32 times shorter; within a factor of ten."""
+    found = acc.accuracy(make(), d.FixedStep(step, 2.0), OBJECTIVES)
+    exact = acc.measure_finer(make(), d.FixedStep(step, 2.0), OBJECTIVES, 32).metrics
+    for name, one in found.estimates.items():
+        error = abs(float(one.value - exact[name]))
+        assert error <= 10 * float(one.error) + 1e-9, (name, error, one)
+        assert float(one.error) <= 30 * error + 1e-5 * abs(float(one.value)), (name, error, one)
+
+
+def test_a_delay_keeps_its_time_at_a_shorter_step():
+    """A ring of 16 steps of 1 ms holds 6.1 ms, one of 16 steps of 0.25 ms does not."""
+    finer = acc.measure_finer(delayed(), d.FixedStep(1e-3, 2.0), OBJECTIVES, 4).metrics
+    longer = dataclasses.replace(delayed(), actuator=actuators.Delay(time=0.0061, capacity=256))
+    expected = d.measure(longer, d.FixedStep(2.5e-4, 2.0), OBJECTIVES).metrics
+    for name, value in expected.items():
+        assert finer[name] == pytest.approx(float(value), rel=1e-12), name
+
+
+def noisy(period):
+    return dataclasses.replace(RIG, sensor=sensors.Noise(slip=0.01, period=period))
+
+
+def test_noise_with_its_own_clock_is_the_same_at_every_step():
+    key, solver = jax.random.key(4), d.FixedStep(1e-3, 2.0)
+    found = acc.accuracy(noisy(2e-3), solver, OBJECTIVES, key=key)
+    assert found.comparable
+    assert acc.reasons(noisy(2e-3), solver, key) == []
+    for name, one in found.estimates.items():
+        assert float(one.relative) < 1e-3, name
+    other = d.measure(noisy(2e-3), solver, OBJECTIVES, key=jax.random.key(5)).metrics
+    assert abs(other["iae"] / found.estimates["iae"].value - 1) > 1e-2  # what another realisation would do
+
+
+@pytest.mark.parametrize("period", [2.5e-4, 1.5e-3])
+def test_other_noise_is_not_compared(period):
+    key, solver = jax.random.key(4), d.FixedStep(1e-3, 2.0)
+    found = acc.accuracy(noisy(period), solver, OBJECTIVES, key=key)
+    assert not found.comparable
+    assert all(np.isnan(float(one.error)) and not one.converges for one in found.estimates.values())
+    assert "other noise" in acc.reasons(noisy(period), solver, key)[0]
+
+
+def test_what_computes_in_every_step_is_not_compared():
+    solver = d.FixedStep(1e-3, 2.0)
+    for reference, paced in ((references.PeakLiteral(), True), (references.PeakLatch(), False)):
+        loop = dataclasses.replace(RIG, reference=reference)
+        assert bool(acc.reasons(loop, solver)) == paced
+        assert bool(acc.comparable(loop, solver)) != paced
+    observer = controllers.ObserverFeedback()
+    assert list(acc.paced(dataclasses.replace(RIG, controller=observer))) == ["controller"]
+    assert list(acc.paced(dataclasses.replace(RIG, controller=controllers.Sampled(controller=observer)))) == []
+    series = blocks.Series(blocks=(sensors.Bias(), sensors.Noise()))
+    assert list(acc.paced(dataclasses.replace(RIG, sensor=series))) == []
+    assert acc.needs_key(dataclasses.replace(RIG, sensor=series))
+    assert not acc.needs_key(RIG)
+
+
+def test_lanes_are_estimated_together():
+    def one(mass):
+        return acc.accuracy(d.replace(RIG, {"plant.mass": mass}), d.FixedStep(4e-3, 2.0), OBJECTIVES)
+
+    masses = jnp.array([5.3, 6.2])
+    both = jax.vmap(one)(masses)
+    for i, mass in enumerate(masses):
+        alone = one(mass)
+        for name in OBJECTIVES:
+            np.testing.assert_allclose(
+                both.estimates[name].error[i], alone.estimates[name].error, rtol=1e-3, atol=1e-12
+            )
+
+
+def test_a_run_that_diverges_at_a_shorter_step_is_not_alike():
+    runs = [
+        d.Run({}, jnp.asarray(stopped), jnp.asarray(diverged), None, None)  # pyright: ignore[reportArgumentType]
+        for stopped, diverged in ((True, False), (False, False), (False, True))
+    ]
+    assert acc.alike(runs[0], runs[0])
+    assert acc.alike(runs[1], runs[1])
+    assert not acc.alike(runs[0], runs[1])
+    assert not acc.alike(runs[1], runs[2])
+
+
+def test_share_of_nothing():
+    np.testing.assert_array_equal(acc.share(np.array([0.0, 1.0, -1.0]), np.array([0.0, 0.0, 4.0])), [0, np.inf, 0.25])

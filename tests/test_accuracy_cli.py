@@ -1,0 +1,124 @@
+"""`simulate --check`, and what a sweep says of its accuracy without being asked."""
+
+import json
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from commands import assert_one_error_line, run
+from sweeping import SCENARIO
+
+import diffabs as d
+from diffabs import variation
+from diffabs.scenario import load, loads
+from diffabs.sweep import Results, sweep
+from diffabs.sweep.checking import _chosen, checked, said
+
+RELAY = """
+plant = "mirrored-rig"
+initial.speed_kmh = 30.0
+stop = {type = "speed-reached", speed_kmh = 25.0}
+controller = {type = "relay", torque_max = 12.0}
+actuator = {type = "rate-limit", rate = 500.0}
+solver = {step = 2e-3, duration = 1.0}
+sweep = {samples = 40, chunk = 40, seed = 5, check = 6, over = {"plant.mass" = [5.3, 6.2]}}
+"""
+
+pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
+
+
+def test_simulate_check_says_how_accurate_each_metric_is(file):
+    path = file(RELAY)
+    result = json.loads(run("simulate", path, "--check", "--json").stdout)
+    found, chosen = result["accuracy"], load(path)
+    assert found["steps"] == [2e-3, 1e-3, 5e-4]
+    assert found["comparable"]
+    assert list(found["metrics"]) == list(chosen.objectives)
+    half = d.measure(chosen.loop, d.FixedStep(1e-3, 1.0), chosen.objectives).metrics
+    for name, row in found["metrics"].items():
+        assert row["value"] == result["metrics"][name]
+        assert row["value"] + row["difference"] == pytest.approx(float(half[name]), rel=1e-9, abs=1e-12), name
+        assert abs(row["float32 difference"]) < 1e-2 * abs(row["value"]) + 1e-4, name
+        assert row["error"] >= abs(row["difference"])
+    shown = run("simulate", path, "--check")
+    assert "half step" in shown.stdout
+    assert max(map(len, shown.stdout.splitlines())) <= 100
+
+
+def test_simulate_check_gives_no_numbers_where_there_is_nothing_to_compare(file):
+    result = run(
+        "simulate",
+        file(RELAY.replace('"mirrored-rig"', '"mirrored-rig"\nreference = "peak-literal"')),
+        "--check",
+        "--json",
+    )
+    found = json.loads(result.stdout)["accuracy"]
+    assert not found["comparable"]
+    assert all(row["difference"] is None and row["error"] is None for row in found["metrics"].values())
+    assert "warning: accuracy unknown: reference computes once in every step" in result.stderr
+
+
+def test_a_step_that_cannot_be_shortened(file):
+    long = RELAY.replace("step = 2e-3, duration = 1.0", "step = 2e-8, duration = 1.0")
+    assert_one_error_line(failed := run("simulate", file(long), "--check", status=2))
+    assert "a quarter of it takes too many steps for --check" in failed.stderr
+
+
+def test_a_sweep_says_how_accurate_it_is_without_being_asked(file, tmp_path):
+    path, out = file(RELAY), tmp_path / "out"
+    result = run("sweep", path, "--out", out, "--json")
+    found = json.loads(result.stdout)["accuracy"]
+    assert json.loads((out / "summary.json").read_text())["accuracy"] == found
+    study, table = variation.study(load(path)), Results(out)
+    assert len(found["samples"]) == 6
+    row = found["metrics"]["overshoot"]
+    loop, key = study.lane(row["sample"])
+    half = d.measure(loop, d.FixedStep(1e-3, 1.0), study.objectives, key=key).metrics["overshoot"]
+    assert row["difference"] == pytest.approx(abs(float(half) - table.column("overshoot")[row["sample"]]), rel=1e-6)
+    assert 0 <= row["median"] <= row["largest"]
+    loose = {name for name, one in found["metrics"].items() if one["largest"] > 0.01}
+    assert loose  # a relay behind a rate limit, at 2 ms
+    assert all(f"{name} by up to " in result.stderr for name in loose)
+    again = checked(study, table, 6)
+    assert again["samples"] == found["samples"]
+    assert checked(study, table, 0) == {**again, "samples": [], "metrics": {}}
+
+
+def test_a_sweep_is_not_checked_where_that_is_turned_off(file, tmp_path):
+    text = SCENARIO.replace("samples = 3200", "samples = 64")
+    assert json.loads(run("sweep", file(text), "--out", tmp_path / "out", "--json").stdout)["accuracy"] is None
+
+
+def test_noise_is_the_same_in_a_sweeps_half_steps(tmp_path):
+    """Of the noisy sweep of the tests: the half step changes a hundredth of what other noise does."""
+    study = variation.study(loads(SCENARIO.replace("samples = 3200", "samples = 64").encode(), "small", "small.toml"))
+    found = checked(study, sweep(study, tmp_path), 16)
+    assert found["not comparable"] == 0
+    assert found["metrics"]["iae"]["largest"] < 1e-3
+    loop, _ = study.lane(0)
+    two = [d.measure(loop, study.solver, study.objectives, key=jax.random.key(i)).metrics["iae"] for i in (1, 2)]
+    assert abs(two[0] / two[1] - 1) > 1e-2
+
+
+def test_lanes_that_are_no_result_are_not_drawn():
+    columns = {"sample": np.arange(8), "diverged": np.arange(8) < 3, "refused": np.array([""] * 6 + ["bad"] * 2)}
+    study = SimpleNamespace(seed=1)
+    table: Any = SimpleNamespace(column=columns.__getitem__)
+    assert _chosen(study, table, 100).tolist() == [3, 4, 5]
+    del columns["refused"]
+    assert _chosen(study, table, 100).tolist() == [3, 4, 5, 6, 7]
+    assert len(_chosen(study, table, 2)) == 2
+
+
+def test_what_is_said():
+    nothing = {"metrics": {}, "ended otherwise": 0, "not comparable": 0}
+    assert said(nothing) == []
+    loose = {
+        **nothing,
+        "metrics": {"iae": {"largest": 0.03, "sample": 7}, "stop_time": {"largest": 0.009, "sample": 8}},
+    }
+    assert said(loose) == ["a half step changes iae by up to 3 % (sample 7): shorten solver.step"]
+    assert "2 of the lanes" in said({**nothing, "ended otherwise": 2})[0]
+    assert "accuracy unknown" in said({**nothing, "not comparable": 1})[0]
