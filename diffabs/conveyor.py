@@ -5,7 +5,7 @@ ROUND steps what has ended is taken off and the next lanes are put in its place.
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,14 @@ WIDTH = 1024  # lanes whose state stays in a processor's cache
 ROUND = 64  # steps
 
 
+class Enough(Protocol):
+    """When a run may end before its stop and its time, because how it goes on is known; a pytree."""
+
+    def reached(self, number: Any, output: Any) -> Any:
+        """Whether lane `number`, of which this is seen now, is taken off the belt."""
+        ...
+
+
 def measure_lanes(
     loop: Loop,
     values: Mapping[str, Any],
@@ -30,9 +38,11 @@ def measure_lanes(
     keys: Any = None,
     width: int = WIDTH,
     accepted: Any = None,
+    enough: Enough | None = None,
 ) -> Run:
     """What `jax.vmap` of `measure` computes for lanes that differ in the values (lanes,) at these paths, and in their
-    keys. Compiled once for a number of lanes and paths; not differentiable in reverse mode.
+    keys. Compiled once for a number of lanes and paths; not differentiable in reverse mode. With `enough` a run ends
+    besides where that is reached, looked at every ROUND steps; it then has not stopped.
 
     accepted (lanes,): lanes that are run; the others are flagged as diverged. None is those that `refusals` accepts,
         which are asked for unless the call is itself traced: then say it
@@ -46,7 +56,7 @@ def measure_lanes(
         accepted = _accepted(loop, values, solver)
     loop, objectives, h = arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, h.dtype), dict(values)))
-    return _run(loop, values, objectives, h, keys, jnp.asarray(accepted, bool), steps=solver.steps, width=width)
+    return _run(loop, values, objectives, h, keys, jnp.asarray(accepted, bool), enough, steps=solver.steps, width=width)
 
 
 def _accepted(loop: Loop, values: Mapping[str, Any], solver: FixedStep) -> Any:
@@ -75,6 +85,7 @@ def _run(
     h: Any,
     keys: Any,
     accepted: Any,
+    enough: Enough | None = None,
     *,
     steps: int,
     width: int,
@@ -90,6 +101,13 @@ def _run(
     start = jax.vmap(lambda mine: started(*built(mine), h))
     judge = jax.vmap(lambda mine, carry: judged(*built(mine), h, carry)[0])
 
+    def early(number: Any, mine: Any, carry: Carry) -> Any:
+        """Lanes of which enough is seen."""
+        if enough is None:
+            return jnp.zeros_like(carry.running)
+        output = jax.vmap(lambda mine, carry: built(mine)[0].plant.output(carry.state.plant))(mine, carry)
+        return jax.vmap(enough.reached)(number, output)
+
     def taken(number: Any) -> tuple[Any, Any, Carry]:
         """Lanes at their start; beyond the last one a copy of it that does not run."""
         mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
@@ -102,7 +120,7 @@ def _run(
             return step_all(belt.leaves, belt.keys, carry), None
 
         carry = jax.lax.scan(some, belt.carry, length=ROUND)[0]
-        free = ~carry.running
+        free = ~carry.running | early(belt.number, belt.leaves, carry)
         place = jnp.where(free, belt.number, count)
         ended = jax.tree.map(lambda all, x: all.at[place].set(x, mode="drop"), belt.ended, judge(belt.leaves, carry))
         number = jnp.where(free, belt.next + jnp.cumsum(free) - 1, belt.number)

@@ -21,6 +21,7 @@ from diffabs.rollout import Run, Trajectory
 
 try:
     from matplotlib.axes import Axes
+    from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError('figures need matplotlib: pip install "diffabs[plot]"', name=error.name) from error
@@ -123,10 +124,12 @@ def angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
         ax.plot(np.asarray(seen.sample.t), values, DASHES[i], color=COLOURS[i], label=f"{words} {name}")
 
 
-def region(ax: Axes, first: Any, second: Any, inside: Any) -> None:
-    """Shade the cells of a grid, first axis to the right, whose value is true."""
-    levels, colours = [-0.5, 0.5, 1.5], ("#F3E3D7", COLOURS[0])
-    ax.contourf(np.asarray(first), np.asarray(second), np.asarray(inside, float).T, levels=levels, colors=colours)
+def region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> None:
+    """Shade the cells of a grid, given their centres, first axis to the right: those whose value is true, those that
+    are `unknown`, and the rest."""
+    colours = ListedColormap(["#F3E3D7", "#9A9A9A", COLOURS[0]])
+    value = np.where(inside, 2, 0 if unknown is None else np.where(unknown, 1, 0))
+    ax.pcolormesh(np.asarray(first), np.asarray(second), value.T, cmap=colours, vmin=0, vmax=2, rasterized=True)
 
 
 def slips(runs: Mapping[str, Trajectory], *, title: str = "", until: float | None = None) -> Figure:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from diffabs import FixedStep, Loop
-from diffabs.basin import recovered
+from diffabs.basin import outcomes
 
 Values = dict[str, np.ndarray]  # by name, with a leading axis of designs
 
@@ -61,7 +61,7 @@ def _around(rng: np.random.Generator, count: int, spread: float, at: Any, low: f
 
 
 def runs(
-    closed: Callable[[Any], Loop], rider: float, start: np.ndarray, solver: FixedStep, tolerance: float
+    closed: Callable[[Any], Loop], rider: float, start: np.ndarray, solver: FixedStep
 ) -> Callable[[Values, np.ndarray], np.ndarray]:
     """A judge: the nonlinear loops `closed(design)` with this rider, from multiples of a start of frame and rider."""
     many = jax.jit(jax.vmap(closed))
@@ -75,6 +75,6 @@ def runs(
         each = np.tile(multiples, len(columns["plant.rider_mass"]))
         lanes |= {"initial.theta": start[0] * each, "initial.phi": start[2] * each}
         one = jax.tree.map(lambda x: x[0], loops)
-        return recovered(one, lanes, solver, tolerance=tolerance)[0].reshape(-1, len(multiples))
+        return outcomes(one, lanes, solver).recovered.reshape(-1, len(multiples))
 
     return judge

@@ -17,7 +17,9 @@ DIRECTION = {"initial.theta": 0.5, "initial.phi": 0.2}
 GAIN = np.array([3518.9528, -300.78828, 1397.0168, 1242.2936, -10.830832, 516.96042])  # LQR of the hanging arm
 WEIGHTS, EFFORT = np.diag([1.0, 100.0, 1.0, 1.0, 1.0, 1.0]), 0.01
 MULTIPLES = {24.0: 0.0454, 48.0: 0.0801, 100.0: 0.1146}  # of the start that this gain recovers
-SOLVER = FixedStep(step=1e-3, duration=10.0)
+# LQR with Q = I, R = 0.01: a slow one, whose slowest pole is -0.47 /s
+SLOW = np.array([1929.4575697, -200.43085318, 765.68751921, 679.6082651, -7.45823428, 282.76552681])
+SOLVER = FixedStep(step=1e-3, duration=60.0)
 SHORT = FixedStep(step=2e-3, duration=4.0)
 
 

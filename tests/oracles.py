@@ -167,8 +167,9 @@ def arm_rates(p, torque):
     return rates
 
 
-def arm_stays_up(p, gain, start, voltage, duration=10.0):
-    """Whether u = clip(K x) brings the two-wheeler back from `start`: DOP853, tolerance 1e-10, ended on the ground."""
+def arm_stays_up(p, gain, start, voltage, duration=60.0, rest=1e-3):
+    """Whether u = clip(K x) brings the two-wheeler from `start` to |x| < rest: DOP853, tolerance 1e-10, ended there or
+    on the ground. Raises where it does neither."""
 
     def torque(t, x):
         u = np.clip(gain @ x, -voltage, voltage)
@@ -177,7 +178,12 @@ def arm_stays_up(p, gain, start, voltage, duration=10.0):
     def landed(t, x):
         return abs(x[0]) - np.pi / 2
 
-    landed.terminal = True
-    rates = arm_rates(p, torque)
-    run = solve_ivp(rates, (0, duration), start, "DOP853", events=landed, rtol=1e-10, atol=1e-12)
-    return run.status == 0 and bool(np.linalg.norm(run.y[:, -1]) < 1e-2)
+    def resting(t, x):
+        return np.linalg.norm(x) - rest
+
+    landed.terminal = resting.terminal = True
+    events = (landed, resting)
+    run = solve_ivp(arm_rates(p, torque), (0, duration), start, "DOP853", events=events, rtol=1e-10, atol=1e-12)
+    if run.status != 1:
+        raise AssertionError(f"neither at rest nor on the ground after {duration:g} s: {run.y[:, -1]}")
+    return bool(run.t_events[1].size)

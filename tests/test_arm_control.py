@@ -7,21 +7,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from balancing import EFFORT, HANGING, MULTIPLES, SOLVER, START, WEIGHTS, closed, model
+from balancing import EFFORT, HANGING, MULTIPLES, START, WEIGHTS, closed, model
 from scipy.integrate import solve_ivp
 
-from diffabs.basin import MEASURED
 from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
 from diffabs.controllers.balance import Estimate
 from diffabs.design.lqg import SELECTION, kalman, lqg
 from diffabs.design.recovery import mode_bounds, recoverable_bound
+from diffabs.objectives import FinalNorm
 from diffabs.plants import ArmBalance
 from diffabs.protocols import BalanceOutput, Clock, Memory, Tracking
 from diffabs.pytree import check, replace
-from diffabs.rollout import measure
+from diffabs.rollout import FixedStep, measure
 from diffabs.sensors import AngleSensor
 
 pytestmark = pytest.mark.xdist_group("arm-control")  # one worker compiles what these share
+
+SOLVER, MEASURED = FixedStep(step=1e-3, duration=10.0), {"final_norm": FinalNorm()}
 
 # What any control can do
 

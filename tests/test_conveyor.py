@@ -1,6 +1,9 @@
 """Lanes on the conveyor against `jax.vmap` of `measure`, whatever its width."""
 
+from typing import Any, NamedTuple
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -48,6 +51,32 @@ def same(found, expected):
     """The same operations, compiled apart: rounding only, of runs of up to 250 steps."""
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
+
+
+class Slow(NamedTuple):
+    """A lane is over below its own speed [m/s]."""
+
+    speeds: Any
+
+    def reached(self, number, output):
+        return output.speed < self.speeds[jnp.minimum(number, len(self.speeds) - 1)]
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_a_lane_of_which_enough_is_seen_is_taken_off(keys, expected, width):
+    """At the next look; it has not stopped, and the others are what they were."""
+    limits = np.zeros(len(SPEEDS))
+    limits[NEVER], limits[8], limits[SHORT] = 24.5, 7.5, 6.9
+    found = jax.device_get(
+        measure_lanes(LOOP, VALUES, SOLVER, MEASURED, keys=keys, width=width, enough=Slow(jnp.asarray(limits)))
+    )
+    early = np.isin(np.arange(len(SPEEDS)), [NEVER, 8])  # the other ends before it is that slow
+    assert not found.stopped[early].any()
+    assert np.all(found.ending.sample.output.speed[early] < limits[early])
+    taken = found.ending.sample.t[early] / SOLVER.step
+    np.testing.assert_allclose(taken, ROUND * np.round(taken / ROUND), rtol=1e-12)
+    assert np.all(taken < 0.9 * expected.ending.sample.t[early] / SOLVER.step)
+    same(*(jax.tree.map(lambda x: x[~early], run) for run in (found, expected)))
 
 
 def test_the_lanes_are_what_they_are_meant_to_be(expected):

@@ -194,12 +194,22 @@ def test_what_searches_spent_is_counted(monkeypatch):
 
 
 def test_weights_tuned_by_gradients_recover_more_starts_and_are_proved(tmp_path):
-    """24 x 24 starts know the share to some 2 %: the full run has 0.23, 0.46 and 0.48."""
+    """24 x 24 cells know the share to some 2 %: the full run has 0.294, 0.328, 0.464 and 0.487. What any control could
+    do is a strip, whose area is also counted."""
     module = experiment("arm_weights")
-    config = module.Config(starts=24, duration=6.0, proof_points=2, tuned_starts=(7, 13), out=str(tmp_path))
-    rows = {row["weights"]: row for row in module.main(config)["table"]}
-    assert rows["Q = I"]["share of the box"] < 0.27
-    assert rows["tuned"]["share of the box"] >= 0.46
+    config = module.Config(starts=24, proof_points=2, tuned_starts=(7, 13), out=str(tmp_path))
+    found = module.main(config)
+    rows = {row["weights"]: row for row in found["table"]}
+    shares = {"Q = I, R = 1": 0.294, "Q = I, R = 0.01": 0.328, "Q = diag(1, 100, 1, 1, 1, 1)": 0.464, "tuned": 0.48}
+    for name, share in shares.items():
+        assert rows[name]["share of the box"] == pytest.approx(share, abs=0.02), name
+        assert (rows[name]["undecided"], rows[name]["next multiple undecided"]) == (0, False)
+    assert rows["tuned"]["share of the box"] > rows["Q = diag(1, 100, 1, 1, 1, 1)"]["share of the box"]
+    assert rows["Q = I, R = 0.01"]["multiple of (.5, 0, .2)"] == pytest.approx(0.0565, abs=1e-4)
+    share, (theta, phi) = module.possible(config)
+    axis = module.Cells(-config.box, config.box, 1001).centres
+    assert share == pytest.approx(0.5407, abs=5e-5)
+    assert share == pytest.approx(np.mean(np.abs(np.add.outer(axis / theta, axis / phi)) <= 1), abs=1e-3)
     assert rows["tuned"]["common P over the riders"] == "yes"
     assert rows["Q = diag(1, 100, 1, 1, 1, 1)"]["common P over the riders"] == "none"
 
@@ -254,5 +264,5 @@ def test_a_design_is_judged_as_its_own_loop_would_be():
         return replace(scenario.loop, {"controller.gain": design["gain"], "plant.arm_mass": design["mass"]})
 
     designs = {"gain": np.stack([gain, 0.0 * gain]), "mass": np.array([30.0, 30.0])}
-    judge = module.runs(closed, 50.0, start, solver, tolerance=0.05)
+    judge = module.runs(closed, 50.0, start, solver)
     assert judge(designs, np.array([0.03, 0.2])).tolist() == [[True, False], [False, False]]

@@ -27,7 +27,8 @@ def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Any:
 
 @pytree
 class Fell:
-    """1 if the run ended before its time, by a fall; else 0 [1]."""
+    """1 if the run ended before its time, by a fall; else 0 [1], which does not say that it comes to rest: `basin`
+    tells when that is sure."""
 
     physical = (0.0, 1.0)
 

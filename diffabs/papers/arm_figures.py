@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from diffabs import plot
-from diffabs.basin import Basin
+from diffabs.basin import Basin, Reach
 from diffabs.design.recovery import mode_bounds
 from diffabs.rollout import Run
 
@@ -16,7 +16,7 @@ def figures(
     seen: Mapping[str, Run],
     basins: Mapping[str, Basin],
     riders: np.ndarray,
-    over_riders: Mapping[str, tuple[Any, np.ndarray]],
+    over_riders: Mapping[str, tuple[Any, list[Reach]]],
     limit: np.ndarray,
     start: np.ndarray,
     hanging: Any,
@@ -57,23 +57,30 @@ def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
     )
     (theta,), (phi,) = (mode_bounds(hanging.A, hanging.B, np.eye(6)[i], 48.0).values() for i in (0, 2))
     for i, (ax, (name, basin)) in enumerate(zip(axes, basins.items(), strict=True)):
-        plot.region(ax, basin.first, basin.second, basin.recovered)
+        plot.region(ax, basin.first.centres, basin.second.centres, basin.outcomes.recovered, basin.outcomes.undecided)
+        ends = np.array([basin.first.low, basin.first.high])
         for sign in (-1, 1):
             words = "no control beyond (linear)" if sign > 0 else None
-            ax.plot(basin.first, phi * (sign - basin.first / theta), color="black", linewidth=1.2, label=words)
-        ax.plot(basin.first, basin.first * start[2] / start[0], ":", color="black", label="multiples of Fig. 3's start")
-        ax.set_ylim(basin.second[0], basin.second[-1])
+            ax.plot(ends, phi * (sign - ends / theta), color="black", linewidth=1.2, label=words)
+        ax.plot(ends, ends * start[2] / start[0], ":", color="black", label="multiples of Fig. 3's start")
+        ax.set_xlim(*ends)
+        ax.set_ylim(basin.second.low, basin.second.high)
         ax.locator_params(axis="x", nbins=5)
         title = f"{name}: {100 * basin.share:.1f} % of the box"
+        title += f", {100 * basin.undecided:.1f} % undecided" if basin.undecided else ""
         plot.label(ax, "frame theta0 [rad]", "" if i else "rider phi0 [rad]", title, legend=i == 0)
     return figure
 
 
-def _riders(riders: np.ndarray, found: Mapping[str, tuple[Any, np.ndarray]], limit: np.ndarray) -> Any:
+def _riders(riders: np.ndarray, found: Mapping[str, tuple[Any, list[Reach]]], limit: np.ndarray) -> Any:
     figure, (ax,) = plot.sheet(title="One gain for every rider, hanging arm, 48 V", size=(6.6, 4.0))
     ax.plot(riders, limit, color="black", linewidth=1.2, label="no control beyond (linear)")
-    for i, (name, (_, multiples)) in enumerate(found.items()):
+    for i, (name, (_, reaches)) in enumerate(found.items()):
+        multiples = [reach.multiple for reach in reaches]
         ax.plot(riders, multiples, "o" + plot.DASHES[i], color=plot.COLOURS[i], markersize=4, label=name)
+        least = [(m, reach.multiple) for m, reach in zip(riders, reaches, strict=True) if reach.undecided]
+        if least:
+            ax.plot(*zip(*least, strict=True), "^", color=plot.COLOURS[i], label="at least")
     plot.label(ax, "rider [kg]", "recovered multiple of (0.5, 0, 0.2) rad")
     ax.set_ylim(0, None)
     return figure

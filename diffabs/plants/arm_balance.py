@@ -21,7 +21,7 @@ paper does not have, act as N Kt, N Kb and N^2 Jr about the arm's joint; what th
 left out.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -187,6 +187,47 @@ class ArmBalance:
         """What the motor puts in, tau psi', and what the rider's damper takes out, d phi'^2 [W]."""
         return self.torque(state.psi_rate, control) * state.psi_rate, self.damping * state.phi_rate**2
 
+    def limits(self, gain: Any) -> np.ndarray:
+        """Rows (..., 1, 6): under u = gain x the motor is linear, its current within the limit, where |row x| <= 1.
+        Parameters may be stacked (...), in NumPy."""
+        current = np.array(gain, float) / np.asarray(self.resistance)[..., None]
+        current[..., 4] -= self.gear * self.back_emf / self.resistance
+        return (current / np.asarray(self.current_max)[..., None])[..., None, :]
+
+    def remainder(self, linear: Any, extent: Callable[[Any], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """What the equations add to their linearisation x' = linear x (..., 6, 6) under a feedback: x' = linear x + D y
+        with |y| <= Y, wherever |row x| <= extent(row) for all rows. D (..., 6, 3), Y (..., 3); parameters may be
+        stacked (...), in NumPy. If all extents become smaller by a factor, Y becomes so at least.
+
+            y = -(M(q) - M(0)) q'' - h - (G - G'(0) q)      D = (0, M(0)^-1)
+
+        by 1 - cos z <= z^2/2, |sin z - z| <= |z|^3/6, and |q''| <= |linear x| + |M(0)^-1| |y|. Y is infinite where
+        that last inequality bounds nothing.
+        """
+        _, _, _, c2, c3, b1, b2, b3 = (np.abs(x) for x in self.lumps())
+        unit = np.eye(6)
+        theta, psi, phi, v1, v2, v3 = (extent(row) for row in unit)
+        arm = self.gravity * b2 * extent(unit[0] + unit[1]) ** 3 / 6
+        rider = self.gravity * b3 * extent(unit[0] + unit[2]) ** 3 / 6
+        turning = c2 * psi * v2 * extent(2 * unit[3] + unit[4]) + c3 * phi * v3 * extent(2 * unit[3] + unit[5])
+        forces = _columns(
+            turning + self.gravity * b1 * theta**3 / 6 + arm + rider, c2 * psi * v1**2 + arm, c3 * phi * v1**2 + rider
+        )
+        zero, by2, by3 = 0.0 * theta, c2 * psi**2 / 2, c3 * phi**2 / 2
+        changes = np.stack(
+            [_columns(2 * by2 + 2 * by3, by2, by3), _columns(by2, zero, zero), _columns(by3, zero, zero)], axis=-2
+        )
+        inverse = np.linalg.inv(_at_rest(self.lumps(), self.gear**2 * self.rotor_inertia))
+        inverse = np.broadcast_to(inverse, changes.shape)
+        loop = np.abs(inverse) @ changes
+        accelerations = _columns(*(extent(np.asarray(linear)[..., 3 + i, :]) for i in range(3)))
+        accelerations = accelerations + (np.abs(inverse) @ forces[..., None])[..., 0]
+        held = loop.sum(axis=-1).max(axis=-1) < 1  # then I - loop has a nonnegative inverse
+        safe = np.where(held[..., None, None], loop, 0.0)
+        most = np.linalg.solve(np.eye(3) - safe, accelerations[..., None])[..., 0]
+        amounts = forces + (changes @ most[..., None])[..., 0]
+        return np.concatenate([np.zeros_like(inverse), inverse], axis=-2), np.where(held[..., None], amounts, np.inf)
+
     def cautions(self) -> Iterator[str]:
         """A rider whom the spring cannot hold."""
         least = self.rider_mass * self.gravity * self.rider_height
@@ -202,6 +243,17 @@ def _mass(lumps: Lumps, cos2: Scalar, cos3: Scalar, rotor: Scalar) -> tuple[Any,
     m12, m13 = lumps.p2 + lumps.c2 * cos2, lumps.p3 + lumps.c3 * cos3
     m11 = lumps.a + m12 + m13 + lumps.c2 * cos2 + lumps.c3 * cos3
     return m11, m12, m13, lumps.p2 + rotor, lumps.p3
+
+
+def _at_rest(lumps: Lumps, rotor: Any) -> np.ndarray:
+    """The mass matrix (..., 3, 3) upright."""
+    m11, m12, m13, m22, m33 = _mass(lumps, 1.0, 1.0, rotor)
+    zero = 0.0 * m11
+    return np.stack([_columns(m11, m12, m13), _columns(m12, m22, zero), _columns(m13, zero, m33)], axis=-2)
+
+
+def _columns(*columns: Any) -> np.ndarray:
+    return np.stack(np.broadcast_arrays(*columns), axis=-1)
 
 
 ACROBOT = ArmBalance(

@@ -1,0 +1,151 @@
+"""From where a balance under u = clamp(K x) surely comes to rest: an ellipsoid x'Sx <= 1, for the nonlinear equations.
+
+    x' = A x + B u + D y(x),   S = P/c,   A'P + PA <= -2 g P  (A of the closed loop)
+
+On x'Px <= c the motor must be linear, |K x| <= U with its current within the limit, the frame must not lie on the
+ground, and the rest y of the nonlinear equations must be small: the plant bounds it, |y_k| <= Y_k(c), from how far each
+combination of angles and rates goes on the ellipsoid, |row x| <= sqrt(c row P^-1 row'). Then, with V = x'Px,
+
+    V' <= -2 V (g - sum_k sqrt((D'PD)_kk) Y_k(c)/sqrt(c))
+
+since Y_k falls at least as fast as sqrt(V). Where the bracket is positive, V falls to 0 from V <= c (H. K. Khalil,
+Nonlinear Systems, 3rd ed., sec. 8.2). Of several P the ellipsoid with the greatest volume is taken, and of its c 90 %,
+which leaves a tenth of g for rounding: this is floating point, with a margin, and not a proof in integers. It is about
+the differential equation; a run is its integration.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from diffabs.actuators import VoltageLimit
+from diffabs.balance_model import BalanceModel
+from diffabs.blocks import Direct
+from diffabs.controllers import BalanceFeedback
+from diffabs.loop import Loop
+from diffabs.pytree import replace
+from diffabs.stops import Fallen
+
+SAFE = 0.9  # of the level c that the bound allows
+HALVINGS = 50
+SURE = 1e-6  # 1/s, growth that is not rounding
+# Shapes that are tried: part of the slowest decay, and P's right side beside K'K/U^2, by its size and the arm's part.
+DECAYS, SIZES, ARMS = (0.5, 0.9), (1.0, 100.0), (1e-3, 1e-1)
+
+
+class _Systems(NamedTuple):
+    """Closed loops, stacked: the plant, A (n, 6, 6), K/U (n, 1, 6), rows (n, m, 6) with |row x| <= 1 where linear."""
+
+    plant: Any
+    closed: np.ndarray
+    gain: np.ndarray
+    limits: np.ndarray
+
+
+class Capture(NamedTuple):
+    """S (n, 6, 6), infinite where nothing can be said, so that x'Sx <= 1 holds nowhere; and (n,) whether the loop is
+    unstable about upright, so that almost no start comes to rest there."""
+
+    shapes: np.ndarray
+    unstable: np.ndarray
+
+
+def capture(loop: Loop, values: Mapping[str, Any]) -> Capture:
+    """What is sure of loops that differ in the values (n, ...) at these paths.
+
+    Raises ValueError for a loop of which this module can never say anything.
+    """
+    systems = _systems(loop, values)
+    found = Capture(np.full_like(systems.closed, np.inf), np.zeros(len(systems.closed), bool))
+    known = np.flatnonzero(np.isfinite(systems.closed).all(axis=(1, 2)))
+    if len(known):
+        slowest = -np.linalg.eigvals(systems.closed[known]).real.max(axis=-1)
+        found.unstable[known] = slowest < -SURE
+        found.shapes[known] = _best(jax.tree.map(lambda x: x[known], systems), slowest)
+    return found
+
+
+def _best(systems: _Systems, slowest: np.ndarray) -> np.ndarray:
+    """Of the shapes that are tried, the ellipsoid with the greatest volume; none where the slowest decay is not > 0."""
+    best = np.full_like(systems.closed, np.inf)
+    volume = np.full(len(best), np.inf)
+    for decay in DECAYS:
+        for size in SIZES:
+            for arm in ARMS:
+                side = np.diag([1.0, arm, 1.0, 1.0, arm, 1.0]) * size + _square(systems.gain)
+                found = _level(systems, _lyapunov(systems.closed, decay * slowest, side))
+                sure = (slowest > 0) & np.isfinite(found[:, 0, 0])
+                log = np.linalg.slogdet(np.where(sure[:, None, None], found, np.eye(6)))[1]
+                better = sure & (log < volume)
+                best[better], volume[better] = found[better], log[better]
+    return best
+
+
+def _systems(loop: Loop, values: Mapping[str, Any]) -> _Systems:
+    """In float64 whatever the loop is in."""
+    _supported(loop)
+    with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
+        values = {path: np.asarray(column, float) for path, column in values.items()}
+        exact = jax.tree.map(lambda x: np.asarray(x, float), loop)
+        many = jax.vmap(lambda v: replace(exact, v))(values)
+        a, b = jax.device_get(jax.vmap(lambda plant: BalanceModel(plant=plant).matrices())(many.plant))
+        many = jax.tree.map(np.asarray, jax.device_get(many))
+    gain = many.controller.gain
+    most = many.actuator.voltage_max if isinstance(loop.actuator, VoltageLimit) else np.full(len(a), np.inf)
+    asked = (gain / most[:, None])[:, None]
+    lean = (np.eye(6)[:1] / many.stop.angle[:, None])[:, None]
+    return _Systems(many.plant, a + b @ gain[:, None], asked, np.concatenate([asked, lean, many.plant.limits(gain)], 1))
+
+
+def _supported(loop: Loop) -> None:
+    known = {"controller": BalanceFeedback, "sensor": Direct, "actuator": Direct | VoltageLimit, "stop": Fallen}
+    for name, kind in known.items():
+        if not isinstance(getattr(loop, name), kind):
+            raise ValueError(f"no ellipsoid is known for the {name} {type(getattr(loop, name)).__name__}")
+    if not hasattr(loop.plant, "remainder"):
+        raise ValueError(f"no ellipsoid is known for the plant {type(loop.plant).__name__}")
+
+
+def _square(rows: np.ndarray) -> np.ndarray:
+    return np.swapaxes(rows, -1, -2) @ rows
+
+
+def _lyapunov(a: np.ndarray, shift: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """P of (A + shift I)'P + P (A + shift I) = -side, per system."""
+    eye = np.eye(6)
+    moved = np.swapaxes(a + shift[:, None, None] * eye, -1, -2)
+    operator = np.einsum("nij,kl->nikjl", moved, eye) + np.einsum("ij,nkl->nikjl", eye, moved)
+    p = np.linalg.solve(operator.reshape(-1, 36, 36), -side.reshape(-1, 36, 1)).reshape(a.shape)
+    return (p + np.swapaxes(p, -1, -2)) / 2
+
+
+def _level(systems: _Systems, p: np.ndarray) -> np.ndarray:
+    """S = P/c with the largest c that the bound allows; infinite where P is no Lyapunov matrix."""
+    usable = np.linalg.eigvalsh(p)[:, 0] > 0
+    p = np.where(usable[:, None, None], p, np.eye(6))
+    root = np.linalg.inv(np.linalg.cholesky(p))
+    falling = root @ (np.swapaxes(systems.closed, -1, -2) @ p + p @ systems.closed) @ np.swapaxes(root, -1, -2)
+    decay = -np.linalg.eigvalsh(falling)[:, -1] / 2
+    inverse = _square(root)
+    reach = np.einsum("nmi,nij,nmj->nm", systems.limits, inverse, systems.limits)
+    low, high = np.zeros(len(p)), 1 / reach.max(axis=1)
+    for tried in [high] + [None] * HALVINGS:
+        level = (low + high) / 2 if tried is None else tried
+        fine = _growth(systems, p, inverse, level) < decay
+        low, high = np.where(fine, level, low), np.where(fine, high, level)
+    usable &= (decay > 0) & (low > 0)
+    return np.where(usable[:, None, None], p / np.where(usable, SAFE * low, 1.0)[:, None, None], np.inf)
+
+
+def _growth(systems: _Systems, p: np.ndarray, inverse: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """The sum over k in V' <= -2 V (g - sum), per system."""
+
+    def extent(row: Any) -> np.ndarray:
+        row = np.broadcast_to(row, (len(p), 6))
+        return np.sqrt(level * np.einsum("ni,nij,nj->n", row, inverse, row))
+
+    directions, amounts = systems.plant.remainder(systems.closed, extent)
+    weights = np.sqrt(np.einsum("nik,nij,njk->nk", directions, p, directions))
+    return (weights * amounts).sum(axis=1) / np.sqrt(level)
