@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow versions lint bench mutations clean
+.PHONY: demo test test-slow versions lint bench mutations fuzz clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -36,6 +36,10 @@ mutations: $(VENV)/.test
 VERSIONS ?= python3.11=0.10 python3.12=0.11 python3.13=0.12
 versions:
 	$(PYTHON) tests/versions.py $(VERSIONS)
+
+fuzz: $(VENV)/.test
+	$(BIN)/python tests/fuzz_scenarios.py --count 20000 --seed 0
+	$(BIN)/python tests/fuzz_files.py --count 2000 --seed 0
 
 clean:
 	rm -rf $(VENV) .jax_cache out

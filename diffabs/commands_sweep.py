@@ -82,7 +82,7 @@ def sweep(
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     """A sample of a sweep as a scenario, and the key of its noise. Raises SweepError or ValueError."""
     console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
-    from diffabs.sweep.store import SweepError, differences, read_manifest
+    from diffabs.sweep.store import SweepError, check_owner, differences, read_manifest
 
     manifest = read_manifest(folder)
     source = manifest["source"]
@@ -94,6 +94,7 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
         raise SweepError(f"{folder}: the scenario in its manifest is not what was swept: {line}")
     if not 0 <= number < study.samples:
         console.fail(f"--sample {number} is outside [0, {study.samples - 1}]")
+    check_owner(folder, manifest, number)
     loop, key = _check_runnable(study, number)
     loop = jax.tree.map(lambda x: jnp.asarray(x, study.dtype), loop)
     return dataclasses.replace(chosen, name=f"{chosen.name}, sample {number}", title="", loop=loop), key

@@ -20,6 +20,8 @@ def opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A regular file, to be read. Raises OSError for one that cannot be, and for a folder, a pipe or a device."""
     handle = os.open(path, os.O_RDONLY | WAITING | getattr(os, "O_BINARY", 0))
     try:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise OSError(errno.EINVAL, "not a regular file", os.fspath(path))
         with open(handle, "rb", closefd=False) as file:

@@ -45,7 +45,8 @@ def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float
         ax.grid(color="#DDDDDD", linewidth=0.7)
         ax.set_axisbelow(True)
     if title:
-        lines = textwrap.fill(title, int(TITLE * size[0] * columns), max_lines=4)
+        width = int(TITLE * size[0] * columns)
+        lines = "\n".join(textwrap.fill(line, width, max_lines=4) for line in title.splitlines())
         figure.suptitle(lines, fontsize=12.5, fontweight="bold")
     return figure, axes
 

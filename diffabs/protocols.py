@@ -117,8 +117,8 @@ class Road(Protocol):
 class Plant(Protocol):
     """dx/dt = derivative(t, x, u), y = output(x).
 
-    A plant may also offer `audit()`, an Objective that watches every run of it. Its value is at most 1 for a run that
-    is physically possible; a run of another value has `diverged`, although all its numbers are finite."""
+    A plant may also offer `audit(initial)`, an Objective that watches every run of it. Its value is at most 1 for a run
+    that is physically possible; a run of another value has `diverged`, although all its numbers are finite."""
 
     def start(self, initial: Any) -> Any:
         """The state at t = 0."""

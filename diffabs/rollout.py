@@ -156,7 +156,8 @@ def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, step
 def ready(loop: Loop) -> tuple[Loop, dict[str, Objective]]:
     """The loop with everything worked out that does not change during a run, and what its plant watches it by."""
     loop = prepared(loop)
-    return loop, {AUDIT: loop.plant.audit()} if hasattr(loop.plant, "audit") else {}  # pyright: ignore
+    audit = getattr(loop.plant, "audit", None)
+    return loop, {AUDIT: audit(loop.initial)} if audit else {}
 
 
 def judged(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) -> tuple[Run, Trajectory]:

@@ -52,12 +52,17 @@ def stable(loop: Any, values: Any, step: float) -> np.ndarray:
     """Whether a step [s] is stable for each lane of a loop that differ in these values (lanes,) by path; without a loop
     (None) the values are loops, whose leaves have a leading axis. Returns bool (lanes,)."""
     with jax.enable_x64(False), np.errstate(over="ignore"):  # what single precision cannot hold is infinite
-        fine = step * np.asarray(_bounds(loop, values, squarings=0)) <= WITHIN
+        fine = step * np.asarray(_bounds(*_single(loop, values), squarings=0)) <= WITHIN
         for squarings in (SQUARINGS, None):
             left = np.flatnonzero(~fine)
             for lanes in np.split(left, range(TOGETHER, len(left), TOGETHER)) if len(left) else ():
                 fine[lanes] = _judged(loop, _at(values, np.resize(lanes, TOGETHER)), step, squarings)[: len(lanes)]
     return fine
+
+
+def _single(*trees: Any) -> Any:
+    """In single precision already here: several threads at once do not agree on what `enable_x64` makes of an array."""
+    return jax.tree.map(lambda x: np.asarray(x, np.float32), trees)
 
 
 def _at(values: Any, lanes: np.ndarray) -> Any:
@@ -67,7 +72,7 @@ def _at(values: Any, lanes: np.ndarray) -> Any:
 def _judged(loop: Any, values: Any, step: float, squarings: int | None) -> np.ndarray:
     """Whether the step is known to be stable; by the eigenvalues themselves if not by so many squarings."""
     if squarings is not None:
-        return step * np.asarray(_bounds(loop, values, squarings=squarings)) <= WITHIN
+        return step * np.asarray(_bounds(*_single(loop, values), squarings=squarings)) <= WITHIN
     with jax.enable_x64(True):
         return stable_steps(_built(loop, values)) >= step
 

@@ -27,12 +27,12 @@ def check(document):
     given = members(document, "the file", {"format", "version", "system", "gain", "claims"})
     if given["format"] != "diffabs certificate" or given["version"] != 1:
         raise ValueError("format and version are not 'diffabs certificate' and 1")
-    if not isinstance(given["claims"], list) or not given["claims"]:
-        raise ValueError("the file has no claims")
+    if not isinstance(given["claims"], list):
+        raise ValueError("the claims are not a list")
     if isinstance(given["system"], dict) and "cells" in given["system"]:
         return ["claims about a schedule: NOT PROVED here"]
     loops, gain, discrete, sizes = system(given["system"], given["gain"])
-    found = []
+    found = [] if given["claims"] else ["no claim: NOTHING PROVED"]
     for claim in given["claims"]:
         kind, data = members(claim, "a claim", {"kind", "data"}).values()
         if not isinstance(kind, str) or kind not in SHAPES:

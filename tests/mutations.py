@@ -76,7 +76,7 @@ MUTATIONS = [
     Mutation(
         "infinity inside every range",
         "pytree.py",
-        " & (np.isfinite(array) | (self.infinite & ~np.isnan(array)))",
+        " & ((abs(x) < math.inf) | self.infinite)",
         "",
         "test_pytree.py::test_check_returns_the_part_and_allows_declared_infinities",
     ),
@@ -350,7 +350,7 @@ MUTATIONS = [
     Mutation(
         "a diverged lane with metrics",
         "rollout.py",
-        "jnp.where(carry.diverged, jnp.nan, value)",
+        "jnp.where(diverged, jnp.nan, value)",
         "value",
         "test_rollout.py::test_a_diverging_lane_is_flagged_and_leaves_the_others_alone",
     ),
@@ -695,9 +695,9 @@ MUTATIONS = [
     ),
     Mutation(
         "tuning: aims at the bound itself",
-        "tune/problem.py",
-        "aimed = excess if m.margin is None else excess + m.margin",
-        "aimed = excess",
+        "tune/lagrangian.py",
+        "np.full(count, self.method.margin)",
+        "np.zeros(count)",
         "test_tune.py::TestConstraints::test_what_is_met_is_met_without_a_tolerance",
     ),
     Mutation(
@@ -850,7 +850,7 @@ MUTATIONS = [
     Mutation(
         "tune: the worst case is only screened",
         "tune/worst.py",
-        "if -float(lane.seen.objective) > value:",
+        "if lane.reason is not Reason.START and -float(lane.seen.objective) > value:",
         "if False:",
         "test_tuning.py::TestWorstCase::test_it_is_at_least_as_bad_as_thousands_of_samples",
     ),
@@ -1023,6 +1023,83 @@ MUTATIONS = [
         "test_conveyor.py::test_a_lane_of_which_enough_is_seen_is_taken_off",
     ),
     *(Mutation(*each) for each in SWEEP),
+    Mutation(
+        "lanes that one run would refuse are run",
+        "conveyor.py",
+        "running = carry.running & run & (number < count)",
+        "running = carry.running & (number < count)",
+        "test_refusals.py::TestWhoeverRuns::test_a_batch_does_not_run_them",
+    ),
+    Mutation(
+        "refused lanes are not told",
+        "conveyor.py",
+        "carry.diverged | ~run",
+        "carry.diverged",
+        "test_refusals.py::TestWhoeverRuns::test_a_batch_does_not_run_them",
+    ),
+    Mutation(
+        "the rules of the grid are not asked of lanes",
+        "refusals.py",
+        "    yield _begun(loop)\n    yield from grid_rules(loop, step)",
+        "    yield _begun(loop)",
+        "test_refusals.py::TestBeforeARun::test_a_lane_is_refused_where_its_loop_alone_would_be[ring]",
+    ),
+    Mutation(
+        "the rules between numbers are not asked",
+        "pytree.py",
+        '    yield from _below(part, prefix, "rules")',
+        "    yield from ()",
+        "test_refusals.py::TestBeforeARun::test_a_lane_is_refused_where_its_loop_alone_would_be[limits]",
+    ),
+    Mutation(
+        "a bound on the modes that is none",
+        "stability.py",
+        "bound = jnp.max(jnp.exp(log)",
+        "bound = 0.5 * jnp.max(jnp.exp(log)",
+        "test_refusals.py::TestBeforeARun::test_the_step_is_judged_as_by_the_eigenvalues",
+    ),
+    Mutation(
+        "a start beyond the stop is a run",
+        "rollout.py",
+        "zero, running, no, ~running), h.dtype)",
+        "zero, running, no, no), h.dtype)",
+        "test_refusals.py::TestAfterARun::test_a_start_beyond_the_stop_is_no_run",
+    ),
+    Mutation(
+        "no audit of a brake",
+        "rollout.py",
+        'audit = getattr(loop.plant, "audit", None)',
+        "audit = None",
+        "test_refusals.py::TestAfterARun::test_an_unstable_step_is_seen_although_every_number_is_finite",
+    ),
+    Mutation(
+        "metrics of whatever size",
+        "rollout.py",
+        "(value >= low - ROUNDING)",
+        "(value >= -jnp.inf)",
+        "test_refusals.py::TestAfterARun::test_a_metric_outside_its_range_is_a_run_that_diverged",
+    ),
+    Mutation(
+        "a torque that drives is an alarm",
+        "plants/audit.py",
+        "_driving(-before.control, -sample.control)",
+        "0.0",
+        "test_refusals.py::test_what_no_braked_car_does",
+    ),
+    Mutation(
+        "refused lanes are failures",
+        "sweep/summary.py",
+        "asked = view.rows & view.accepted",
+        "asked = view.rows",
+        "test_refusals.py::TestWhoeverRuns::test_a_refused_lane_is_a_row_with_a_reason_and_in_no_number",
+    ),
+    Mutation(
+        "a probability over points that were not run",
+        "sweep/reliability.py",
+        "    if len(bad):",
+        "    if False:",
+        "test_refusals.py::TestWhoeverRuns::test_a_probability_is_of_the_whole_space_or_none",
+    ),
 ]
 
 

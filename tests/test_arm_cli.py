@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
 
-from diffabs import FixedStep, console, scenario
+from diffabs import FixedStep, console
 from diffabs.objectives import BALANCE, BRAKING
 from diffabs.scenario import load
 from diffabs.sweep import Space, Study, Uniform
@@ -27,7 +27,7 @@ def quiet():
     """No lines that depend on the machine's load, and no seconds for whether the step is stable."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        patch.setattr("diffabs.refusals.stable_step", lambda loop: np.inf)
         yield
 
 

@@ -43,7 +43,7 @@ def stable():
     """Seconds saved in every run (the step has a test of its own), and no lines that depend on the machine's load."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli.console, "PATIENCE", math.inf)
-        patch.setattr(scenario, "stable_step", lambda loop: np.inf)
+        patch.setattr("diffabs.refusals.stable_step", lambda loop: np.inf)
         yield
 
 
@@ -60,7 +60,7 @@ def whole(tmp_path_factory, runs):
     simulated = cli._run
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cli, "_run", lambda *args, **more: runs.append(simulated(*args, **more)) or runs[-1])
-        plot = types.SimpleNamespace(braking=lambda run, *, title="": Figure(f"{title}: {bool(run.stopped)}"))
+        plot = types.SimpleNamespace(braking=lambda run, *, title="", unit="": Figure(f"{title}: {bool(run.stopped)}"))
         patch.setitem(sys.modules, "diffabs.plot", plot)
         result = run("simulate", "slip-lmi", "--json", "--csv", folder / "a.csv", "--plot", folder / "a.png")
     return folder, json.loads(result.stdout)
@@ -196,7 +196,7 @@ def test_bad_scenario_is_one_line_and_leaves_nothing(tmp_path, args, needed):
 
 
 def test_step_that_is_not_stable(monkeypatch):
-    monkeypatch.setattr(scenario, "stable_step", stable_step)
+    monkeypatch.setattr("diffabs.refusals.stable_step", stable_step)
     result = run("simulate", "slip-lmi", "--set", "solver.step=0.01", status=2)
     assert_one_error_line(result)
     assert "solver.step = 0.01 s is not stable" in result.stderr
@@ -240,7 +240,7 @@ def test_real_figure(tmp_path, simulated):
 
 
 def test_failure_at_the_end_leaves_old_files_as_they_were(tmp_path, monkeypatch, simulated):
-    def full(run, *, title=""):
+    def full(run, **_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(braking=full))
@@ -284,7 +284,7 @@ def test_parts_and_parameters_of_the_json_make_the_same_loop(name):
 def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
     """Seen at least once: "published gain" over a run with another gain."""
     titles = []
-    draw = types.SimpleNamespace(braking=lambda run, *, title="": titles.append(title) or Figure(title))
+    draw = types.SimpleNamespace(braking=lambda run, *, title="", unit="": titles.append(title) or Figure(title))
     monkeypatch.setitem(sys.modules, "diffabs.plot", draw)
     monkeypatch.setattr(cli, "_run", lambda chosen, key, keep: runs[0])
     gain = ("--set", "controller.gain=-4000,-40")

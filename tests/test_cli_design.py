@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
 
-from diffabs import console, scenario
+from diffabs import console
 from diffabs.design import Certificate, DesignError, analysis, box, lmi, synthesis
 from diffabs.design.frozen import frozen
 from diffabs.linearize import StateSpace
@@ -59,7 +59,7 @@ def quiet():
     """No lines that depend on the machine's load; and nothing is integrated, so no step need be stable."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr(scenario, "stable_step", lambda loop: pytest.fail("asked for a stable step"))
+        patch.setattr("diffabs.refusals.stable_step", lambda loop: pytest.fail("asked for a stable step"))
         yield
 
 

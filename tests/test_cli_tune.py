@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import pathlib
+import re
 import sys
 import time
 import types
@@ -67,8 +68,8 @@ class Figure:
         pathlib.Path(path).write_text(self.text)
 
 
-def drawn(history, runs, *, title, lane):
-    return Figure(f"{title}: {len(history)} points, {', '.join(runs)}, {lane}")
+def drawn(history, runs, *, title, lane, unit):
+    return Figure(f"{title}: {len(history)} points, {', '.join(runs)}, {lane} [{unit}]")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -192,7 +193,7 @@ def test_figure_and_file_and_nothing_else_are_left(tuned):
     folder, document, _ = tuned
     assert left_in(folder) == {"small.toml", "out.toml", "a.png"}
     points = len(document["history"])
-    assert (folder / "a.png").read_text() == f"small: {points} points, before, after, plant.mass = 5.3"
+    assert (folder / "a.png").read_text() == f"small: {points} points, before, after, plant.mass = 5.3 [N m]"
     assert (folder / "out.toml").stat().st_mode & 0o777 == 0o666 & ~console._umask()
 
 
@@ -446,7 +447,8 @@ def test_interrupted_it_shows_and_writes_the_best_so_far(small, endless, tmp_pat
 def test_interrupted_where_a_limit_is_not_met_it_writes_nothing(small, endless, tmp_path):
     result = run("tune", small, "--set", "tune.limits.overshoot=0.1", "--out", tmp_path / "out.toml", status=130)
     assert "it was interrupted" in result.stdout
-    assert result.stderr.splitlines()[-1].endswith("not met: overshoot, so that no file is written")
+    last = result.stderr.splitlines()[-1]
+    assert re.search(r"not met: overshoot by \S+ \(\S+ %\), so that no file is written$", last)
     assert left_in(tmp_path) == {"small.toml"}
 
 

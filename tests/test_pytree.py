@@ -31,7 +31,7 @@ class Pair:
 
 
 def test_refuses_post_init():
-    with pytest.raises(TypeError, match=r"Bad: no __post_init__.*problems\(self\)"):
+    with pytest.raises(TypeError, match=r"Bad: no __post_init__.*rules\(self\)"):
 
         @pytree
         class Bad:

@@ -12,7 +12,7 @@ from sweeping import described
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, refusals, roads, sensors, stability
-from diffabs.basin import recovered
+from diffabs.basin import outcomes
 from diffabs.conveyor import measure_lanes
 from diffabs.objectives import BALANCE, BRAKING
 from diffabs.plants.audit import BrakeAudit
@@ -203,7 +203,7 @@ def sample(speed, wheel, distance, control=0.0, deceleration=0.0):
     ],
 )
 def test_what_no_braked_car_does(before, after, fine):
-    audit = BrakeAudit(car=jnp.asarray(10.0), wheel=jnp.asarray(1.0), radius=jnp.asarray(0.2))
+    audit = BrakeAudit(car=jnp.asarray(10.0), wheel=jnp.asarray(1.0), radius=jnp.asarray(0.2), scale=550.0)
     a, b = sample(*before), sample(*after)
     memory = audit.start(a)
     value = audit.value(memory._replace(held=audit.update(memory, a, b, 1e-3)), Ending(b, False, 0.0, 0.0))
@@ -263,8 +263,8 @@ class TestWhoeverRuns:
             run(RIG, Batch(values), SOLVER, BRAKING)
         arm = dataclasses.replace(d.loop.TYPICAL["balance"], stop=Fallen(angle=0.5))
         starts = {"initial.theta": np.array([0.0, 0.6])}
-        fine, lost = recovered(arm, starts, d.FixedStep(1e-3, 0.05))
-        assert (fine.tolist(), lost.tolist()) == ([True, False], [False, True])
+        found = outcomes(arm, starts, d.FixedStep(1e-3, 0.05), band=0.1)
+        assert (found.recovered.tolist(), found.diverged.tolist()) == ([True, False], [False, True])
 
     def test_a_probability_is_of_the_whole_space_or_none(self, any_step):
         study = described(SMALL)

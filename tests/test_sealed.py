@@ -214,6 +214,16 @@ def test_a_scenario_that_was_edited_in_the_manifest_is_seen(copy, whole):
         shutil.copy(whole / "out" / "manifest.json", copy)
 
 
+def test_the_manifest_of_another_sweep_is_not_believed(copy, whole):
+    """Nor by who reads no number of a chunk."""
+    shutil.copy(whole / "other" / "manifest.json", copy)
+    with pytest.raises(SweepError, match="is a chunk of another sweep"):
+        as_read(copy)
+    result = run("simulate", "--from-sweep", copy, "--sample", "3", status=2)
+    assert_one_error_line(result)
+    assert "is a chunk of another sweep" in result.stderr
+
+
 def paths(value, at=()):
     """Of every value in a document."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()

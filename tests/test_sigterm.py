@@ -1,6 +1,7 @@
 """SIGTERM is an orderly end: exit status 143, what is whole stays, nothing else does: no file, no process."""
 
 import signal
+import sys
 import time
 
 import psutil
@@ -59,6 +60,35 @@ def test_workers_end_with_their_sweep(file, room, times):
             time.sleep(0.3)
         ended(process, children)
     assert nothing_temporary(room)
+
+
+LEAVING = """
+import pathlib, signal, sys, threading, time
+from diffabs import console, files
+
+def work():
+    with files.unfinished(pathlib.Path(sys.argv[1]) / "half.tmp") as path:
+        path.mkdir()
+        (path / "data").write_text("half")
+        print("begun", flush=True)
+        time.sleep(100)
+
+signal.signal(signal.SIGTERM, console.terminate)
+try:
+    threading.Thread(target=work, name=console.WORKER, daemon=True).start()
+    time.sleep(100)
+except KeyboardInterrupt:
+    console.leave(console.INTERRUPTED)
+"""
+
+
+def test_what_a_thread_was_writing_goes_with_it(tmp_path):
+    with started(sys.executable, "-c", LEAVING, str(tmp_path)) as process:
+        assert process.stdout.readline() == "begun\n"
+        assert left_in(tmp_path) == {"half.tmp"}
+        process.send_signal(signal.SIGTERM)
+        ended(process)
+    assert left_in(tmp_path) == set()
 
 
 def test_a_run_leaves_no_half_file(room):

@@ -303,6 +303,9 @@ class Constrained:
     def evaluator(self, scale):
         return self._evaluate
 
+    def refused(self):
+        return None
+
     def steady(self):
         return lambda z: np.ones(len(z), bool)
 
@@ -318,10 +321,12 @@ class TestConstraints:
 
     @pytest.mark.parametrize("start", [(2.0, 2.0), (0.1, 0.1), (0.7, 0.7)])
     def test_what_is_met_is_met_without_a_tolerance(self, start):
-        """Multipliers come to a bound from outside; the bound stated, not one beside it, holds where they end."""
+        """Multipliers come to a bound from outside; the bound stated, not one beside it, holds where they end. With the
+        margin that takes three rounds, aimed at the bound itself nine."""
         problem = Constrained(start, lambda z: jnp.array([1 - z[0] - z[1]]))
-        found = Search(problem, Method(), None).result()
+        found = Search(problem, Method(rounds=4), None).result()
         assert found.met
+        assert found.reason is not Reason.KEPT
         assert found.values["x"] + found.values["y"] >= 1
         assert found.objective[1] == pytest.approx(2 / 3, rel=5e-3)  # a margin of 1e-3 costs 2e-3 of it
 
@@ -368,7 +373,7 @@ class TestInterruption:
     def test_it_is_the_best_so_far(self, after):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))
         told = []
-        method = Method(starts=3, seed=1, tolerance=1e-6, rounds=20)
+        method = Method(starts=3, seed=1, margin=1e-6, rounds=20)
         found = Search(problem, method, told.append, lambda: len(told) >= after).result()
         assert len(told) == after  # the evaluation in hand is the last
         assert found.reason is Reason.INTERRUPTED
@@ -389,12 +394,12 @@ class TestInterruption:
         """The first start meets the constraint from the beginning and is then pulled over its edge."""
         problem = Constrained([0.9, 0.9], lambda z: jnp.array([1 - z[0] - z[1]]))
         told = []
-        found = Search(problem, Method(tolerance=1e-6), told.append, lambda: told[1:] and told[-1].round == 0).result()
+        found = Search(problem, Method(margin=1e-6), told.append, lambda: told[1:] and told[-1].round == 0).result()
         assert told[-1].point.violation > 1e-3
         assert found.met
         assert 1 - found.values["x"] - found.values["y"] <= 1e-6
 
     def test_without_it_nothing_changes(self):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))
-        found = Search(problem, Method(tolerance=1e-6, rounds=20), None).result()
+        found = Search(problem, Method(margin=1e-6, rounds=20), None).result()
         assert found.reason is not Reason.INTERRUPTED

@@ -298,7 +298,7 @@ def test_a_worst_case_says_what_found_it(corner, screened, words):
         metric="overshoot", values={"a": 1.0, "b": 2.0}, value=0.3, corners=4, corner=corner, screened=screened,
         metrics={}, loop=None, rollouts=40.0, bound=0.1, diverged=None, reasons=[],
     )  # fmt: skip
-    assert found.report() == f"COUNTEREXAMPLE: overshoot = 0.3 at a = 1.0, b = 2.0, beyond 0.1. {words}"
+    assert found.report() == f"COUNTEREXAMPLE: overshoot = 0.3 at a = 1.0, b = 2.0, beyond 0.1 by 0.2. {words}"
     assert words in dataclasses.replace(found, bound=None).report()
 
 

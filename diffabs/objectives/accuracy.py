@@ -14,6 +14,8 @@ from diffabs.numerics import clamp, larger, parabola, ratio, sign, smaller
 from diffabs.protocols import Ending, Memory, Sample
 from diffabs.pytree import Scalar, Vector, param, pytree
 
+LEAST = 0.01  # slip of which an overshoot is a fraction
+
 
 def nothing(self: Any, memory: Memory, sample: Sample) -> Any:
     """`flow` of an objective without an integral."""
@@ -153,7 +155,8 @@ class MaxSlip:
 
 @pytree
 class Overshoot:
-    """max(0, max slip/setpoint - 1), a fraction of the final setpoint [1]. Zero derivative where there is none."""
+    """max(0, max slip/setpoint - 1), a fraction of the final setpoint [1], or of a slip of 0.01 where that is more: an
+    estimator may end at 0. Zero derivative where there is none."""
 
     physical = (0.0, math.inf)
 
@@ -163,7 +166,10 @@ class Overshoot:
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Overshoot."""
-        excess = memory.held.greatest / ending.sample.setpoint - 1
+        setpoint = ending.sample.setpoint
+        usual = setpoint >= LEAST
+        fraction = memory.held.greatest / jnp.where(usual, setpoint, LEAST) - 1
+        excess = jnp.where(usual, fraction, (memory.held.greatest - setpoint) / LEAST)
         return jnp.where(excess > 0, excess, 0.0)
 
 

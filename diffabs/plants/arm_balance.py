@@ -178,10 +178,12 @@ class ArmBalance:
         """Kinetic and potential energy [J]. energy' = tau psi' - d phi'^2."""
         return self.kinetic_energy(state) + self.potential_energy(state)
 
-    def audit(self) -> BalanceAudit:
+    def audit(self, initial: BalanceStart) -> BalanceAudit:
         """A run that gains energy without the motor was not integrated stably."""
-        lumps = self.lumps()
-        return BalanceAudit(plant=self, scale=self.gravity * (lumps.b1 + abs(lumps.b2) + abs(lumps.b3)))
+        lumps, start = self.lumps(), self.start(initial)
+        fall = self.gravity * (lumps.b1 + abs(lumps.b2) + abs(lumps.b3))
+        scale = fall + self.kinetic_energy(start) + 0.5 * self.stiffness * start.phi**2
+        return BalanceAudit(plant=self, first=self.energy(start), scale=scale)
 
     def power(self, state: ArmState, control: Scalar) -> tuple[Scalar, Scalar]:
         """What the motor puts in, tau psi', and what the rider's damper takes out, d phi'^2 [W]."""

@@ -1,6 +1,6 @@
 """What no vehicle can do, watched while it runs: an integration step that is not stable may leave every number finite.
 
-    energy     E(t + h) - E(t) <= work that the control may have done on the vehicle in that step
+    energy     E(t + h) - E(t) <= work that the control may have done on the vehicle in that step; of a balance in all
     braked     distance does not fall, and grows no faster than the speed; friction alone changes the speed
 
 An audit is an objective whose value is at most 1 for a possible run: its unexplained gains of energy, in units of what
@@ -8,14 +8,13 @@ is forgiven, a hundredth of the energy of the start. Work is bounded from the co
 step, each at its greatest, and twice that: within the step both may be greater. A brake's torque that is not negative
 does none. So legitimate gains (a negative torque that drives the wheel, a motor that rights a vehicle) are no alarm."""
 
-import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from diffabs.protocols import BalanceOutput, BrakeOutput, Ending, Memory, Sample
-from diffabs.pytree import Scalar, param, part, pytree
+from diffabs.pytree import Scalar, param, part, pytree, static
 
 FORGIVEN = 0.01  # of the energy of the start, in the whole run
 ROUNDING = 1e-6  # of it in a step, 1e-5 of the distance: single precision
@@ -34,76 +33,75 @@ def _driving(before: Any, after: Any) -> Any:
     return jnp.maximum(jnp.maximum(before, after), 0.0)
 
 
+def _zero(self: Any, sample: Sample) -> Memory:
+    """No gain yet."""
+    del self
+    return Memory(held=0.0 * sample.t)
+
+
 def _excess(self: Any, memory: Memory, ending: Ending) -> Scalar:
     """Unexplained gains of energy in units of what is forgiven."""
-    del self, ending
-    return memory.held[1] / (FORGIVEN * memory.held[0])
+    del ending
+    return memory.held / (FORGIVEN * self.scale)
 
 
 @pytree
 class BrakeAudit:
-    """Of a braked vehicle: its kinetic energy is that of two masses, at the car's speed and at the wheel's rim. `drive`
-    is a torque that speeds the wheel up whatever the control; where it is NaN, a negative control is such a torque."""
+    """Of a braked vehicle: its kinetic energy is that of two masses, at the car's speed and at the wheel's rim, and of
+    `scale` [J] at the start. `drive` is a torque that speeds the wheel up whatever the control; unless `commanded`, a
+    negative control is such a torque, too."""
 
     car: Scalar = param(unit="kg", above=0.0)
     wheel: Scalar = param(unit="kg", above=0.0)
     radius: Scalar = param(unit="m", above=0.0)
-    drive: Scalar = param(default=math.nan, unit="N m")
+    scale: Scalar = param(unit="J", above=0.0)
+    drive: Scalar = param(default=0.0, unit="N m", low=0.0)
+    commanded: bool = static(default=False)
 
-    flow, value = _no_flow, _excess
-
-    def start(self, sample: Sample) -> Memory:
-        """Energy of the start [J], and no gain."""
-        energy = self._energy(sample.output)
-        return Memory(held=(energy, 0.0 * energy))
+    start, flow, value = _zero, _no_flow, _excess
 
     def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Any:
         """Add what a step gained without work; infinite for a step that no car makes."""
-        first, gained = memory.held
         before, sample = jax.lax.stop_gradient((before, sample))
         a, b = before.output, sample.output
-        torque = jnp.where(jnp.isnan(self.drive), _driving(-before.control, -sample.control), self.drive)
-        work = WITHIN * h * torque * jnp.maximum(a.wheel_speed, b.wheel_speed) / self.radius
-        gain = self._energy(b) - self._energy(a) - work - ROUNDING * first
-        return first, gained + jnp.where(_leaps(a, b, h), jnp.inf, jnp.maximum(gain, 0.0))
-
-    def _energy(self, y: BrakeOutput) -> Any:
-        return 0.5 * (self.car * y.speed**2 + self.wheel * y.wheel_speed**2)
+        drive = self.drive if self.commanded else _driving(-before.control, -sample.control)
+        work = WITHIN * h * drive * jnp.maximum(a.wheel_speed, b.wheel_speed) / self.radius
+        gain = 0.5 * (self.car * (b.speed**2 - a.speed**2) + self.wheel * (b.wheel_speed**2 - a.wheel_speed**2)) - work
+        return memory.held + jnp.where(_leaps(a, b, h), jnp.inf, jnp.maximum(gain - ROUNDING * self.scale, 0.0))
 
 
 def _leaps(a: BrakeOutput, b: BrakeOutput, h: Scalar) -> Any:
     """Whether no car goes from a to b in h: backwards, farther than its speed lets it, or with more deceleration than
     friction gives."""
-    top, way = jnp.maximum(a.speed, b.speed), b.distance - a.distance
-    rounding = 10 * ROUNDING * (1.0 + jnp.abs(b.distance))
+    top = jnp.maximum(a.speed, b.speed)
+    way = 0.5 * WITHIN * h * top  # give or take as much
+    far = jnp.abs(b.distance - a.distance - way) > way + 10 * ROUNDING * (1.0 + jnp.abs(b.distance))
     friction = SWING * (jnp.abs(a.deceleration) + jnp.abs(b.deceleration)) + LITTLE
-    leap = jnp.abs(b.speed - a.speed) > h * friction + 1e-3 * top
-    return leap | (way < -rounding) | (way > WITHIN * h * top + rounding)
+    return far | (jnp.abs(b.speed - a.speed) > h * friction + 1e-3 * top)
 
 
 @pytree
 class BalanceAudit:
-    """Of a two-wheeler with a motor at one joint: `plant` has the energy of a state, `scale` its size [J]."""
+    """Of a two-wheeler with a motor at one joint, whose torque and energy `plant` has: the energy at the end is at most
+    the `first`, of the size `scale`, and the motor's work. In between it would cost five cosines a step."""
 
     plant: Any = part()
+    first: Scalar = param(unit="J")
     scale: Scalar = param(unit="J", above=0.0)
 
-    flow, value = _no_flow, _excess
-
-    def start(self, sample: Sample) -> Memory:
-        """The energy's size [J], and no gain."""
-        scale = self.scale + 0.0 * sample.t
-        return Memory(held=(scale, 0.0 * scale))
+    start, flow = _zero, _no_flow
 
     def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Any:
-        """Add what a step gained without work: torque and rate of the joint, in the same direction."""
-        first, gained = memory.held
+        """Add the work that the motor may have done: of torques and rates in the same direction."""
         before, sample = jax.lax.stop_gradient((before, sample))
         w0, w1 = before.output.psi_rate, sample.output.psi_rate
         t0, t1 = self.plant.torque(w0, before.control), self.plant.torque(w1, sample.control)
-        work = WITHIN * h * (_driving(t0, t1) * _driving(w0, w1) + _driving(-t0, -t1) * _driving(-w0, -w1))
-        gain = self._energy(sample.output) - self._energy(before.output) - work - ROUNDING * first
-        return first, gained + jnp.maximum(gain, 0.0)
+        return memory.held + WITHIN * h * (
+            _driving(t0, t1) * _driving(w0, w1) + _driving(-t0, -t1) * _driving(-w0, -w1)
+        )
 
-    def _energy(self, y: BalanceOutput) -> Any:
-        return self.plant.energy(self.plant.start(y))
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """Unexplained gain of energy in units of what is forgiven."""
+        y: BalanceOutput = ending.sample.output
+        gain = self.plant.energy(self.plant.start(y)) - self.first - memory.held
+        return gain / (FORGIVEN * self.scale)

@@ -115,11 +115,12 @@ class LabRig:
         brake = (pull * self.weight_torque + drag) / (1 - pull) - self.wheel_stiction - self.wheel_friction * spin
         return (brake - self.brake_offset) / self.brake_gain
 
-    def audit(self) -> BrakeAudit:
+    def audit(self, initial: BrakeStart) -> BrakeAudit:
         """A run that gains energy was not integrated stably: this brake never drives, unless its offset makes it."""
         car, wheel = self.drum_inertia / self.drum_radius**2, self.wheel_inertia / self.wheel_radius**2
         drive = larger(-(self.brake_gain * self.brake_threshold + self.brake_offset), 0.0)
-        return BrakeAudit(car=car, wheel=wheel, radius=self.wheel_radius, drive=drive)
+        scale = self.energy(self.start(initial))
+        return BrakeAudit(car=car, wheel=wheel, radius=self.wheel_radius, scale=scale, drive=drive, commanded=True)
 
     def energy(self, state: LabRigState) -> Scalar:
         """Kinetic energy of both wheels [J]."""

@@ -70,10 +70,10 @@ class MirroredRig:
         wheel = (1 - target) * self.wheel_inertia / (self.inertia_factor * self.wheel_radius)
         return mu * GRAVITY * (self.mass * self.wheel_radius + wheel)
 
-    def audit(self) -> BrakeAudit:
+    def audit(self, initial: BrakeStart) -> BrakeAudit:
         """A run that gains energy without a negative torque was not integrated stably."""
-        wheel = self.wheel_inertia / self.wheel_radius**2
-        return BrakeAudit(car=self.inertia_factor * self.mass, wheel=wheel, radius=self.wheel_radius)
+        car, wheel = self.inertia_factor * self.mass, self.wheel_inertia / self.wheel_radius**2
+        return BrakeAudit(car=car, wheel=wheel, radius=self.wheel_radius, scale=self.energy(self.start(initial)))
 
     def energy(self, state: RigState) -> Scalar:
         """Kinetic energy [J]."""

@@ -63,9 +63,10 @@ class QuarterCar:
         mu = self.road.friction(target, output.speed, output.distance)
         return mu * GRAVITY * (self.mass * self.radius + (1 - target) * self.inertia / self.radius)
 
-    def audit(self) -> BrakeAudit:
+    def audit(self, initial: BrakeStart) -> BrakeAudit:
         """A run that gains energy without a negative torque was not integrated stably."""
-        return BrakeAudit(car=self.mass, wheel=self.inertia / self.radius**2, radius=self.radius)
+        wheel, scale = self.inertia / self.radius**2, self.energy(self.start(initial))
+        return BrakeAudit(car=self.mass, wheel=wheel, radius=self.radius, scale=scale)
 
     def energy(self, state: QuarterCarState) -> Scalar:
         """Kinetic energy [J]."""

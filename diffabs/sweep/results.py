@@ -87,8 +87,11 @@ class Results:
         yield found
 
     def _read(self, chunk: int, names: list[str] | None) -> pa.Table:
-        with self._opened(chunk) as file:
-            return file.read(columns=names).replace_schema_metadata()
+        try:
+            with self._opened(chunk) as file:
+                return file.read(columns=names).replace_schema_metadata()
+        except (pa.ArrowException, OSError) as error:
+            raise SweepError(f"{self.files[chunk]} cannot be read: {' '.join(str(error).split())}") from None
 
     @property
     def digest(self) -> str:

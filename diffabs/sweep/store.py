@@ -115,6 +115,19 @@ def listing(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathlib.Pa
     return named, strays
 
 
+def check_owner(folder: pathlib.Path, manifest: Mapping[str, Any], sample: int) -> None:
+    """Whether the manifest is that of the chunks: of the one with this sample, or, while it is not there, of the first.
+    Raises SweepError."""
+    seals = Seals(manifest)
+    named = listing(folder, seals.count)[0]
+    if not named:
+        raise SweepError(f"{folder} has no finished chunk yet; --resume continues it")
+    wanted = sample // manifest["study"]["chunk"]
+    chunk = wanted if wanted in named else min(named)
+    for path in named[chunk]:
+        seal.verified(read_chunk(path), path, seals.of(chunk))
+
+
 def read_chunk(path: pathlib.Path) -> bytes:
     """The bytes of a chunk's file. Raises SweepError for what is no file or cannot be read."""
     try:

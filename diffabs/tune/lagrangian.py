@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from diffabs.refusals import first_line
 from diffabs.tune.descent import Descent, Lane, Optimiser, Point, Reason, lbfgs
-from diffabs.tune.problem import Multipliers, Problem, Seen, built
+from diffabs.tune.problem import Multipliers, Problem, Seen
 from diffabs.tune.result import Method, Progress, Start, StartError, Tuned
 
 PENALTY = 10.0  # at first; the loss is of the order of one
@@ -38,7 +37,7 @@ class Search:
         """Starts: the subject itself, and as many random ones as the method asks for. Raises StartError if the subject
         must not be run as it is, and there is no other start."""
         self.problem, self.method, self.progress, self.stopping = problem, method, progress, stopping
-        self.refused = first_line(built(problem.subject), problem.batch.values, problem.solver)
+        self.refused = problem.refused()
         if self.refused and method.starts == 1:
             raise StartError(f"{Reason.START.value}: {self.refused}")
         own = problem.space.place(problem.subject)[None]

@@ -20,7 +20,7 @@ import numpy as np
 from diffabs.loop import Loop
 from diffabs.protocols import Objective
 from diffabs.pytree import replace, strong
-from diffabs.refusals import refusals
+from diffabs.refusals import first_line, refusals
 from diffabs.rollout import FixedStep, Run
 from diffabs.tune.aggregate import Aggregate
 from diffabs.tune.batch import Batch, run
@@ -119,6 +119,10 @@ class Problem:
     def valuer(self) -> Callable[[Any], Seen]:
         """(starts, p) -> Seen: without a gradient."""
         return jax.jit(jax.vmap(self.seen))
+
+    def refused(self) -> str | None:
+        """The first lane of the part as it is that must not be run, and why, in a line; None if all may."""
+        return first_line(built(self.subject), self.batch.values, self.solver)
 
     def steady(self) -> Callable[[np.ndarray], np.ndarray]:
         """(starts, p) -> whether every lane may be run there (starts,): the parts' rules, and a stable step. Compiled

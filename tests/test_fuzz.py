@@ -1,0 +1,79 @@
+"""A few scenarios of the fuzzer, and that it would see what it looks for."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import fuzz_scenarios as fuzz
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from diffabs.objectives import Overshoot
+from diffabs.scenario import ScenarioError, load
+
+
+def test_some_scenarios_are_refused_in_a_line_or_run_to_numbers_that_can_be():
+    tally = fuzz.fuzz(30, seed=4, per_structure=15)
+    assert tally.findings == []
+    assert tally.counts["accepted"] + tally.counts["refused"] == 30
+    assert tally.counts["accepted"] >= 10
+    assert tally.counts["ran"] + tally.counts["diverged"] == tally.counts["accepted"]
+
+
+def test_the_same_seed_makes_the_same_scenarios():
+    made = []
+    for _ in range(2):
+        rng = np.random.default_rng([9, 0])
+        text, base = fuzz.structure(rng)
+        made.append((text, [fuzz.overrides(rng, base) for _ in range(5)]))
+    assert made[0] == made[1]
+
+
+@pytest.mark.parametrize(
+    ("error", "counted"), [(KeyError("mass"), "crashed"), (ScenarioError(""), "refused"), (TypeError("x"), "crashed")]
+)
+def test_the_fuzzer_sees_a_traceback_and_an_empty_refusal(monkeypatch, error, counted):
+    def failing(*_, **__):
+        raise error
+
+    monkeypatch.setattr(fuzz, "loads", failing)
+    tally = fuzz.Tally()
+    assert fuzz.loaded("", ["plant.mass=1"], tally, again=False) is None
+    assert tally.counts[counted] == 1
+    assert len(tally.findings) == 1
+    assert "plant.mass=1" in tally.findings[0]
+
+
+def test_the_fuzzer_sees_numbers_that_cannot_be():
+    chosen = load("slip-estimator", integrated=False)
+
+    def lines(metrics, speed=1.0):
+        run = SimpleNamespace(
+            metrics=metrics, ending=SimpleNamespace(sample=SimpleNamespace(output=SimpleNamespace(speed=speed)))
+        )
+        return list(fuzz.wrong(chosen, run))
+
+    assert lines({"iae": 0.1, "max_slip": 1.0, "stop_time": 3.0}) == []
+    assert lines({"iae": -0.1, "stop_time": float("inf"), "max_slip": 1.01}) == [
+        "iae = -0.1 cannot be",
+        "stop_time = inf is not finite",
+        "max_slip = 1.01 cannot be",
+    ]
+    assert "it rose" in lines({}, speed=30.0)[0]
+
+
+@pytest.mark.parametrize(
+    ("setpoint", "overshoot"), [(0.2, 0.5), (0.01, 29.0), (0.005, 29.5), (0.0, 30.0), (-0.1, 40.0)]
+)
+def test_an_overshoot_over_a_setpoint_of_nothing_is_finite(setpoint, overshoot):
+    """Found by the fuzzer: an estimator under noise took the slip 0, or a negative one, for the best."""
+    ending: Any = SimpleNamespace(sample=SimpleNamespace(setpoint=jnp.asarray(setpoint)))
+
+    def measured(greatest: Any) -> Any:
+        memory: Any = SimpleNamespace(held=SimpleNamespace(greatest=greatest))
+        return Overshoot().value(memory, ending)
+
+    value, slope = jax.value_and_grad(measured)(0.3)
+    assert value == pytest.approx(overshoot)
+    assert slope == pytest.approx(1 / max(setpoint, 0.01))
