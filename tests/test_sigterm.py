@@ -63,8 +63,8 @@ def test_workers_end_with_their_sweep(file, room, times):
 
 
 LEAVING = """
-import pathlib, signal, sys, threading, time
-from diffabs import console, files
+import pathlib, sys, time
+from diffabs import console, files, interrupt
 
 def work():
     with files.unfinished(pathlib.Path(sys.argv[1]) / "half.tmp") as path:
@@ -73,10 +73,9 @@ def work():
         print("begun", flush=True)
         time.sleep(100)
 
-signal.signal(signal.SIGTERM, console.terminate)
+interrupt.begin()
 try:
-    threading.Thread(target=work, name=console.WORKER, daemon=True).start()
-    time.sleep(100)
+    console.waited(work, "working")
 except KeyboardInterrupt:
     console.leave(console.INTERRUPTED)
 """

@@ -158,7 +158,7 @@ def _at(free: Space, point: Any, lanes: tuple[int, ...] = ()) -> dict[str, Any]:
     found, first = {}, 0
     for entry in free.entries:
         n = len(entry.maps)
-        found[entry.path] = point[..., first : first + n].reshape(*lanes, *entry.shape)
+        found[entry.path] = point[..., first : first + n].reshape((*lanes, *entry.shape))
         first += n
     return found
 
