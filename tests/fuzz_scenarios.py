@@ -90,6 +90,7 @@ LEAST = {  # what a metric of a run that ended well cannot be less than; all are
 } | {"max_slip": -1.0}
 MOST = {"max_slip": 1.0, "fell": 1.0, "soft-loss": 1.0}
 ROUNDING = 1e-9
+SHOWN = 20  # findings, as they come
 
 
 @dataclasses.dataclass
@@ -102,9 +103,10 @@ class Tally:
 
     def found(self, what: str, text: str, changes: Sequence[str]) -> None:
         """A finding."""
-        self.findings.append(
-            f"{what}\n    overrides: {list(changes)}\n    {text.strip().replace(chr(10), chr(10) + '    ')}"
-        )
+        lines = text.strip().replace("\n", "\n    ")
+        self.findings.append(f"{what}\n    overrides: {list(changes)}\n    {lines}")
+        if len(self.findings) <= SHOWN:
+            print(f"\nFOUND: {self.findings[-1]}\n", flush=True)
 
 
 def structure(rng: np.random.Generator) -> tuple[str, Scenario]:
@@ -309,8 +311,6 @@ def main() -> int:
         )
 
     tally = fuzz(asked.count, asked.seed, asked.per_structure, told)
-    for finding in tally.findings[:20]:
-        print(f"\nFOUND: {finding}")
     print(f"\nrefused for: {dict(tally.refusals)}")
     print(f"{len(tally.findings)} findings in {asked.count} scenarios of seed {asked.seed}: {dict(tally.counts)}")
     return min(len(tally.findings), 1)

@@ -138,6 +138,13 @@ def test_lab_rig_brake_characteristic(command, torque):
     np.testing.assert_allclose(rate.brake, 20.37 * (torque - 0.5), rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.parametrize("command", [0.5, 0.9, 1.0])
+def test_the_brake_of_the_lab_rig_does_not_drive(command):
+    """With an offset of -14 N m, b1 u + b2 is negative up to u = 0.92: the brake is then released."""
+    rate = LabRig(brake_offset=-14.0).derivative(0.0, LabRigState(100.0, 140.0, 0.5, 0.0), command)
+    np.testing.assert_allclose(rate.brake, 20.37 * (max(15.24 * command - 14.0, 0.0) - 0.5), rtol=1e-12)
+
+
 def test_stuck_lab_wheel_carries_what_the_road_asks():
     """While stuck, the force on the lever includes the brake's reaction: T = r1 mu Fn, Fn = (Mg + T)/arm, iterated
     here to its fixed point."""

@@ -48,14 +48,12 @@ def _excess(self: Any, memory: Memory, ending: Ending) -> Scalar:
 @pytree
 class BrakeAudit:
     """Of a braked vehicle: its kinetic energy is that of two masses, at the car's speed and at the wheel's rim, and of
-    `scale` [J] at the start. `drive` is a torque that speeds the wheel up whatever the control; unless `commanded`, a
-    negative control is such a torque, too."""
+    `scale` [J] at the start. A negative control speeds the wheel up, unless it is a brake's command (`commanded`)."""
 
     car: Scalar = param(unit="kg", above=0.0)
     wheel: Scalar = param(unit="kg", above=0.0)
     radius: Scalar = param(unit="m", above=0.0)
     scale: Scalar = param(unit="J", above=0.0)
-    drive: Scalar = param(default=0.0, unit="N m", low=0.0)
     commanded: bool = static(default=False)
 
     start, flow, value = _zero, _no_flow, _excess
@@ -64,7 +62,7 @@ class BrakeAudit:
         """Add what a step gained without work; infinite for a step that no car makes."""
         before, sample = jax.lax.stop_gradient((before, sample))
         a, b = before.output, sample.output
-        drive = self.drive if self.commanded else _driving(-before.control, -sample.control)
+        drive = 0.0 if self.commanded else _driving(-before.control, -sample.control)
         work = WITHIN * h * drive * jnp.maximum(a.wheel_speed, b.wheel_speed) / self.radius
         gain = 0.5 * (self.car * (b.speed**2 - a.speed**2) + self.wheel * (b.wheel_speed**2 - a.wheel_speed**2)) - work
         return memory.held + jnp.where(_leaps(a, b, h), jnp.inf, jnp.maximum(gain - ROUNDING * self.scale, 0.0))

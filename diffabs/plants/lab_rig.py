@@ -3,7 +3,7 @@
     Fn = (Mg + s1 (M1 + M10) + d1 omega1)/(L (sin phi - mu cos phi))
     J1 omega1' = Fn r1 mu - d1 omega1 - s1 (M1 + M10)
     J2 omega2' = -(Fn r2 mu + d2 omega2 + s2 M20)
-    M1' = c31 (b(u) - M1),   b(u) = b1 u + b2 for u >= u0, else 0
+    M1' = c31 (b(u) - M1),   b(u) = max(b1 u + b2, 0) for u >= u0, else 0
 
 The braked upper wheel hangs on a lever of length L and presses on the lower wheel, the "road", at the angle phi: its
 brake torque adds to the normal force. mu is odd in the slip, so the manual's sign s of the slip is inside it. Eq. (1)
@@ -73,7 +73,8 @@ class LabRig:
         wheel = quotient(normal * self.wheel_radius * mu - torque, self.wheel_inertia)
         drum = -quotient(self._drum_torque(state.drum, normal * mu), self.drum_inertia)
         u = clamp(control, 0.0, 1.0)
-        target = jnp.where(u >= self.brake_threshold, self.brake_gain * u + self.brake_offset, 0.0)
+        brake = larger(self.brake_gain * u + self.brake_offset, 0.0)  # a brake does not drive
+        target = jnp.where(u >= self.brake_threshold, brake, 0.0)
         return LabRigState(
             halted(state.wheel, wheel),
             halted(state.drum, drum),
@@ -116,11 +117,10 @@ class LabRig:
         return (brake - self.brake_offset) / self.brake_gain
 
     def audit(self, initial: BrakeStart) -> BrakeAudit:
-        """A run that gains energy was not integrated stably: this brake never drives, unless its offset makes it."""
+        """A run that gains energy was not integrated stably: this brake never drives."""
         car, wheel = self.drum_inertia / self.drum_radius**2, self.wheel_inertia / self.wheel_radius**2
-        drive = larger(-(self.brake_gain * self.brake_threshold + self.brake_offset), 0.0)
         scale = self.energy(self.start(initial))
-        return BrakeAudit(car=car, wheel=wheel, radius=self.wheel_radius, scale=scale, drive=drive, commanded=True)
+        return BrakeAudit(car=car, wheel=wheel, radius=self.wheel_radius, scale=scale, commanded=True)
 
     def energy(self, state: LabRigState) -> Scalar:
         """Kinetic energy of both wheels [J]."""
