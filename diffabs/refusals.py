@@ -175,7 +175,8 @@ def _codes(loop: Loop | None, values: Any, *, step: float) -> Any:
 def _begun(loop: Loop) -> Rule:
     """A run starts on this side of its stop."""
     after = ": the run would end before it starts"
-    margin = loop.stop.margin(loop.plant.output(loop.plant.start(loop.initial)))
+    arrays = strong(loop)  # numbers of Python raise OverflowError where arrays are infinite
+    margin = arrays.stop.margin(arrays.plant.output(arrays.plant.start(arrays.initial)))
     start, end = (getattr(part, "speed", None) for part in (loop.initial, loop.stop))
     if start is None or end is None:
         line = f"initial is at the stop or beyond{after}"

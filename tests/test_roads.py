@@ -16,9 +16,11 @@ from diffabs.roads import (
     RIG_UNROUNDED,
     SNOW,
     SPLINE_B,
+    WET_COBBLESTONE,
     Burckhardt,
     MagicFormula,
     Patches,
+    RationalCurve,
     Scaled,
     Tabulated,
     peak,
@@ -270,3 +272,27 @@ def test_peak_of_a_table_moves_with_its_knot():
     expected = np.zeros((34, 2))
     expected[6, 0] = expected[17 + 6, 1] = 1.0
     np.testing.assert_allclose(jacobian(found, SPLINE_B), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("road", "where"),
+    [
+        (Burckhardt(c1=0.0), "friction = -0.52 at slip 1 "),
+        (Burckhardt(c2=1e-300), "friction = -0.52 at slip 1 "),
+        (Burckhardt(c3=1.29), "friction = -0.0099 at slip 1 "),
+        (RationalCurve(w4=1e-9), "at slip 0.65 "),
+        (RationalCurve(a=1e300), "at slip 0.65 "),
+        (RationalCurve(w3=-0.37), "at slip 1 "),
+        (Scaled(road=Burckhardt(c1=0.0)), "road.friction = -0.52 "),
+        (Patches(roads=(ICE, Burckhardt(c1=0.0))), "roads.1.friction = -0.52 "),
+    ],
+)
+def test_a_road_that_drives_is_refused(road, where):
+    with pytest.raises(ValueError, match=f"{where}.*is negative: such a road drives"):
+        check(road)
+
+
+@pytest.mark.parametrize("road", [DRY_ASPHALT, SNOW, ICE, WET_COBBLESTONE, RIG, RIG_UNROUNDED, Burckhardt(c3=1.28)])
+def test_a_road_that_only_brakes_is_accepted(road):
+    """The rig's published polynomial dips to -3e-6 below slip 7e-5, which is forgiven."""
+    assert check(road) is road

@@ -270,3 +270,8 @@ def test_too_many_combinations(file):
     changes = (f"tune.over.plant.mass={values}", f"tune.over.plant.inertia={values}")
     assert "tune.over has 160000 combinations, outside [1, 100000]; set tune.samples" in message(file(""), *changes)
     load(file(""), [*changes, "tune.samples=5"])
+
+
+def test_a_start_that_overflows_is_refused_in_a_line():
+    with pytest.raises(ScenarioError, match="initial is at the stop or beyond"):
+        load("arm-balance", ["initial.theta=1e300"])

@@ -7,10 +7,14 @@ Automotive Control Systems, Springer 2005, ch. 8. They give c1..c3 for each surf
 c4 on all of them; the named roads carry c4 = 0.03 s/m, the middle of it. Set c4 = 0 for the curve at walking speed,
 which is the one usually plotted."""
 
+from collections.abc import Iterator
+
 import jax.numpy as jnp
 
 from diffabs.numerics import odd
 from diffabs.pytree import Scalar, param, pytree
+from diffabs.roads.sign import opposes
+from diffabs.rules import Rule
 
 
 @pytree
@@ -30,6 +34,10 @@ class Burckhardt:
             return (-self.c1 * jnp.expm1(-self.c2 * s) - self.c3 * s) * jnp.exp(-self.c4 * s * speed)
 
         return odd(curve, slip)
+
+    def rules(self) -> Iterator[Rule]:
+        """Friction that does not drive; the speed does not change its sign."""
+        yield opposes(lambda slip: self.friction(slip, 0.0))
 
 
 DRY_ASPHALT = Burckhardt()

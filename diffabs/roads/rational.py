@@ -6,10 +6,13 @@ Maeda and Sugiura, eq. (13), after INTECO, The Laboratory Anti-lock Braking Syst
 the slip of greatest friction" is not true of this curve: its local peak lies at slip 0.18754 and a locked wheel (slip
 1) has more friction than either. The printed equation is undefined for s < 0; the odd extension is ours."""
 
+from collections.abc import Iterator
 from typing import Any
 
 from diffabs.numerics import odd, power, quotient
 from diffabs.pytree import Scalar, param, pytree
+from diffabs.roads.sign import opposes
+from diffabs.rules import Rule
 
 
 @pytree
@@ -27,6 +30,10 @@ class RationalCurve:
         """mu [1]; does not depend on speed or distance."""
         del speed, distance
         return odd(self._curve, slip)
+
+    def rules(self) -> Iterator[Rule]:
+        """Friction that does not drive."""
+        yield opposes(self.friction)
 
     def _curve(self, s: Any) -> Any:
         p = power(s, self.q)

@@ -1,0 +1,21 @@
+"""A friction curve that a car can meet: it never drives."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from diffabs.rules import Rule
+
+SLIPS = np.linspace(0.05, 1.0, 20)  # below them a fitted polynomial may dip under 0 by a millionth, as the rig's does
+
+
+def opposes(friction: Callable[[Any], Any]) -> Rule:
+    """Return the rule that mu(s) >= 0 at slips of 0.05 to 1: friction of the other sign would speed the car up."""
+    mu = friction(SLIPS)
+
+    def says() -> str:
+        worst = int(np.argmin(mu))
+        return f"friction = {float(mu[worst]):.3g} at slip {SLIPS[worst]:g} is negative: such a road drives"
+
+    return Rule((mu >= 0).all(), "friction is negative at some slip: such a road drives", says)
