@@ -21,10 +21,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from diffabs import FixedStep, provenance
-from diffabs.basin import Cells, attraction
-from diffabs.pytree import replace
-from diffabs.scenario import load
+from diffabs import FixedStep
+from diffabs.core import provenance
+from diffabs.core.pytree import replace
+from diffabs.design.attraction import Cells, attraction
+from diffabs.scenario.scenario import load
 
 DTYPES = ("float64", "float32")
 SLOW = (1929.4576, -200.43085, 765.68752, 679.60827, -7.4582343, 282.76553)  # K of Q = I, R = 0.01

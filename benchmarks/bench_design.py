@@ -26,9 +26,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from diffabs.design import Polytope, Spec, certify, design, lmi
-from diffabs.design.frame import design_frames
-from diffabs.design.programme import Programme
+from diffabs.design import Polytope, Spec, certify, design
+from diffabs.design.sdp import solver
+from diffabs.design.sdp.program import Programme
+from diffabs.design.sdp.scaling import design_frames
 
 BETA, ALPHAS, SPEEDS = 133.472842636189, (83.8796606703, 84.6321445666), (140.291806958, 14.0291806958)
 PAIRS = [(alpha, speed) for alpha in ALPHAS for speed in SPEEDS]
@@ -42,7 +43,7 @@ def solved(spec):
     frame, _ = next(iter(design_frames(RIG, spec.Q, spec.R)))
     programme = Programme(RIG, RIG, spec, frame)
     c = programme.objective()
-    return float(c @ lmi.solve(c, programme.blocks(1.0)).y) * programme.scale
+    return float(c @ solver.solve(c, programme.blocks(1.0)).y) * programme.scale
 
 
 def by_hand(spec):
@@ -65,7 +66,7 @@ def by_hand(spec):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            problem.solve(solver="CLARABEL", **lmi.OPTIONS["CLARABEL"])
+            problem.solve(solver="CLARABEL", **solver.OPTIONS["CLARABEL"])
         except cp.SolverError:
             return float("nan")
     return float(problem.value) * cost * t

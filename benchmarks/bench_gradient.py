@@ -31,21 +31,22 @@ from rich.table import Table
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, references, roads, stops
-from diffabs.pytree import get
+from diffabs.core.pytree import get
+from diffabs.scenario.defaults import braking
 
 MEASURED = {"stop_distance": objectives.StopDistance(), "iae": objectives.IAE()}
 COUNTS = (1, 2, 4, 6, 8)
 MEMORY_STEPS = (1000, 2000, 4000, 8000, 16000)
 FORWARD_BOUND, REVERSE_BOUND, MEMORY_BOUND = 1.5, 6.0, 2.0  # 1 + 1.5 p; 6; 2
 
-LMI = d.Loop(
+LMI = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=50 / 3.6),
     stop=stops.SpeedReached(speed=5 / 3.6),
     controller=controllers.StateFeedback(torque_min=0.0, torque_max=9.03),
     feedforward=controllers.HoldingInput(),
 )
-EST = d.Loop(
+EST = braking(
     plant=plants.QuarterCar(road=roads.MagicFormula(), inertia=1.0539),
     controller=controllers.PID(ki=5000.0, kd=5.67),
     reference=references.FixedSlip(),

@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
 
-from diffabs.design.riccati import care
+from diffabs.linear.riccati import care
 
 REPEATS = 5
 Q, R = np.eye(6), np.eye(2)

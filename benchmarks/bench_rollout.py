@@ -28,11 +28,12 @@ from scipy.integrate import solve_ivp
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, stops
+from diffabs.scenario.defaults import braking
 
 REPEATS = 5
 ABSOLUTE = 1e-2  # absolute over relative tolerance of the peers: the IAE is small, 0.009 s
 STOP = 5 / 3.6
-LOOP = d.Loop(
+LOOP = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=50 / 3.6),
     stop=stops.SpeedReached(speed=STOP),

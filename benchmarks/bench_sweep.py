@@ -25,8 +25,9 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from diffabs import provenance, variation
-from diffabs.scenario import load
+from diffabs.core import provenance
+from diffabs.scenario import section_sweep
+from diffabs.scenario.scenario import load
 
 CASES = ("1 device", "2 devices", "2 Dask workers", "1 Dask worker")
 CHANGES = ("solver.step=1e-3", "solver.duration=4.0", "sensor=noise", "sensor.slip=0.005")
@@ -45,7 +46,7 @@ def child(options):
 
         engine = Dask(workers=count)
     sizes = (f"sweep.samples={options.samples}", f"sweep.chunk={options.chunk}", f'sweep.dtype="{options.dtype}"')
-    study = variation.study(load("slip-lmi", (*CHANGES, *sizes)))
+    study = section_sweep.study(load("slip-lmi", (*CHANGES, *sizes)))
     seen, begun = [], time.perf_counter()
     found = sweep(
         study,

@@ -1,16 +1,18 @@
 """Simulate, differentiate, tune and certify controllers for braking wheels."""
 
-from diffabs import interrupt as _interrupt
+from diffabs.core import interrupt as _interrupt
 
 _interrupt.early()  # before JAX, whose import takes seconds
 
-from diffabs.loop import Loop as Loop
+from diffabs.core.loop import Loop as Loop
+from diffabs.core.pytree import replace as replace
 from diffabs.plants import BrakeStart as BrakeStart
-from diffabs.pytree import replace as replace
-from diffabs.refusals import check as check
-from diffabs.rollout import FixedStep as FixedStep
-from diffabs.rollout import Run as Run
-from diffabs.rollout import measure as measure
-from diffabs.rollout import rollout as rollout
+from diffabs.scenario.defaults import balancing as balancing
+from diffabs.scenario.defaults import braking as braking
+from diffabs.simulate.refusals import check as check
+from diffabs.simulate.run import measure as measure
+from diffabs.simulate.run import rollout as rollout
+from diffabs.simulate.solution import FixedStep as FixedStep
+from diffabs.simulate.solution import Run as Run
 
 __version__ = "0.1.0"

@@ -1,6 +1,6 @@
 """`python -m diffabs`."""
 
-from diffabs.cli import main
+from diffabs.cli.main import main
 
 if __name__ == "__main__":
     main()

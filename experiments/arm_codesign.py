@@ -30,18 +30,18 @@ import numpy as np
 from scipy.optimize import minimize
 
 from diffabs import FixedStep, Loop, plot
-from diffabs.balance_model import BalanceModel
-from diffabs.basin import Reach, largest
+from diffabs.core.pytree import Scalar, Vector, param, part, pytree, replace, static
 from diffabs.design import certify
-from diffabs.design.gridded import gridded
-from diffabs.design.recovery import recoverable_bound
-from diffabs.design.regulator import lqr
+from diffabs.design.attraction import Reach, largest
+from diffabs.design.parameter_grid import gridded
+from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.recoverable import recoverable_bound
+from diffabs.linear.regulator import lqr
 from diffabs.objectives import BALANCE, SoftLoss
 from diffabs.papers import record
 from diffabs.plants import ArmBalance
-from diffabs.pytree import Scalar, Vector, param, part, pytree, replace, static
-from diffabs.rollout import rollout
-from diffabs.scenario import load
+from diffabs.scenario.scenario import load
+from diffabs.simulate.run import rollout
 from diffabs.tune import Batch, Method, Stopping, tune
 
 START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])

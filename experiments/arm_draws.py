@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from diffabs import FixedStep, Loop
-from diffabs.basin import outcomes
+from diffabs.design.attraction import outcomes
 
 Values = dict[str, np.ndarray]  # by name, with a leading axis of designs
 

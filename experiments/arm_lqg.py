@@ -16,13 +16,13 @@ import jax
 import numpy as np
 
 from diffabs import FixedStep, plot
-from diffabs.conveyor import measure_lanes
-from diffabs.design.lqg import lqg
-from diffabs.loop import Loop
+from diffabs.core.loop import Loop
+from diffabs.linear.gaussian import lqg
 from diffabs.objectives import SoftLoss
 from diffabs.papers import record
-from diffabs.scenario import load
+from diffabs.scenario.scenario import load
 from diffabs.sensors import AngleSensor
+from diffabs.simulate.refill import measure_lanes
 
 WEIGHTS, EFFORT = np.diag([1.0, 100.0, 1.0, 1.0, 1.0, 1.0]), 0.01
 FRAME = SoftLoss(weight=np.eye(6)[0], radius=1.0, softness=1.0)  # |theta|/(1 + |theta|): rises with the last lean

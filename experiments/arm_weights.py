@@ -18,15 +18,15 @@ import jax
 import numpy as np
 
 from diffabs import FixedStep, plot
-from diffabs.balance_model import BalanceModel
-from diffabs.basin import Basin, Cells, attraction, recoverable
+from diffabs.core.pytree import replace
 from diffabs.design import certify
-from diffabs.design.gridded import gridded
-from diffabs.design.recovery import mode_bounds
+from diffabs.design.attraction import Basin, Cells, attraction, recoverable
+from diffabs.design.parameter_grid import gridded
+from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.recoverable import mode_bounds
 from diffabs.objectives import SoftLoss
 from diffabs.papers import record
-from diffabs.pytree import replace
-from diffabs.scenario import load
+from diffabs.scenario.scenario import load
 from diffabs.tune import Method, Stopping, grid, tune
 from diffabs.tune.weights import lq_weights, regulator
 

@@ -25,17 +25,18 @@ from weak_spots import Box, torques, weak_spots
 from diffabs import BrakeStart, FixedStep, Loop, Run, plot, replace, rollout
 from diffabs.actuators import Lag
 from diffabs.controllers import ConstantInput, HoldingInput, ProportionalFeedback, Sampled, StateFeedback
+from diffabs.core.pytree import parameters
 from diffabs.design import Certificate, Polytope, Spec, certify, design
-from diffabs.design.box import polytope
-from diffabs.design.reduction import feedback
-from diffabs.design.scaled import SpeedScaled, fall
-from diffabs.linearize import Sampling, SlipModel
+from diffabs.design.parameter_box import polytope
+from diffabs.design.speed_scaled import SpeedScaled, fall
+from diffabs.design.state_feedback import feedback
+from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_design, record
 from diffabs.plants import MirroredRig
-from diffabs.pytree import parameters
 from diffabs.references import FilteredSlip, FixedSlip
-from diffabs.scenario import load
+from diffabs.scenario.defaults import braking
+from diffabs.scenario.scenario import load
 from diffabs.stops import SpeedReached
 from diffabs.tune import AtMost, Batch, CertifiedDecay, Method, Stopping, Tuned, grid, run, tune
 
@@ -88,7 +89,7 @@ def loop(config: Config, controller: Any, time_constant: float = 0.0, *, exact: 
     filtered = (
         FilteredSlip(slip=config.slip, time_constant=time_constant) if time_constant else FixedSlip(slip=config.slip)
     )
-    return Loop(
+    return braking(
         plant=MirroredRig(mass=config.known_mass),
         initial=BrakeStart(speed=config.proved_speeds[1] / KMH),
         reference=filtered,

@@ -22,17 +22,18 @@ from jax.tree_util import Partial
 
 from diffabs import FixedStep, Loop, plot
 from diffabs.controllers import PID, ConstantTorque
+from diffabs.core.pytree import Scalar, Vector, param, pytree, strong
+from diffabs.identify.fit import Identified, Tolerances
+from diffabs.identify.identification import identify
+from diffabs.identify.residuals import gaussian
+from diffabs.identify.table import Table
 from diffabs.papers import record, slip_estimator
 from diffabs.plants import QuarterCar
-from diffabs.pytree import Scalar, Vector, param, pytree, strong
 from diffabs.references import FixedSlip, PeakLatch
 from diffabs.roads import SPLINE_B, MagicFormula, Tabulated
 from diffabs.roads.tabulated import PiecewiseCubic
+from diffabs.scenario.defaults import braking
 from diffabs.stops import Standstill
-from diffabs.tune.fit import Identified, Tolerances
-from diffabs.tune.identification import identify
-from diffabs.tune.squares import gaussian
-from diffabs.tune.table import Table
 
 PATHS = ("plant.inertia", "plant.road.B", "plant.road.C", "plant.road.D", "plant.road.E")
 METRICS = ("stop_time", "stop_distance")
@@ -108,11 +109,11 @@ class Spline:
 def loops(car: QuarterCar, config: Config) -> dict[str, Loop]:
     """The nine runs of the tables."""
     stop = Standstill(speed=config.stop)
-    found = {"no ABS": Loop(plant=car, reference=FixedSlip(), controller=ConstantTorque(torque=90.0), stop=stop)}
+    found = {"no ABS": braking(plant=car, reference=FixedSlip(), controller=ConstantTorque(torque=90.0), stop=stop)}
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
         for name, (ki, kd) in slip_estimator.GAINS.items():
             controller = PID(kp=3893.0, ki=ki, kd=kd)
-            found[f"{method} {name}"] = Loop(plant=car, reference=reference, controller=controller, stop=stop)
+            found[f"{method} {name}"] = braking(plant=car, reference=reference, controller=controller, stop=stop)
     return found
 
 

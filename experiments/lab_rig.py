@@ -29,6 +29,7 @@ from diffabs.papers import record
 from diffabs.plants import GRAVITY, LabRig, MirroredRig
 from diffabs.plants.lab_rig import LabRigState
 from diffabs.references import FixedSlip
+from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached
 
 
@@ -73,7 +74,10 @@ def open_loop(config: Config) -> dict[str, Run]:
     """The rig at constant commands."""
     start, stop = BrakeStart(speed=config.start_kmh / 3.6), SpeedReached(speed=config.stop_kmh / 3.6)
     batch = record.stacked(
-        [Loop(plant=LabRig(), initial=start, controller=ConstantTorque(torque=u), stop=stop) for u in config.commands]
+        [
+            braking(plant=LabRig(), initial=start, controller=ConstantTorque(torque=u), stop=stop)
+            for u in config.commands
+        ]
     )
     solver = FixedStep(step=config.step, duration=config.duration, every=20)
     runs = jax.vmap(lambda loop: rollout(loop, solver, BRAKING))(batch)
@@ -136,7 +140,7 @@ def bisected(config: Config, omega: float) -> float:
 
 def lagged(config: Config, lag: float, low: float, high: float) -> Loop:
     """The paper's loop with a lag in the brake; the limits are those of the command."""
-    return Loop(
+    return braking(
         plant=MirroredRig(mass=config.mass),
         initial=BrakeStart(speed=config.start_kmh / 3.6),
         reference=FixedSlip(),

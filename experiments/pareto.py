@@ -15,13 +15,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import FixedStep, Loop, measure, plot_tuning, replace
+from diffabs import FixedStep, Loop, measure, replace
 from diffabs.controllers import PID, BackCalculation
 from diffabs.objectives import BRAKING, Effort
 from diffabs.papers import record
 from diffabs.plants import QuarterCar
+from diffabs.plot import tuning
 from diffabs.references import FixedSlip
 from diffabs.roads import MagicFormula
+from diffabs.scenario.defaults import braking
 from diffabs.stops import Standstill
 from diffabs.tune import Batch, Method, Stopping, latin, run, tune
 
@@ -48,7 +50,7 @@ class Config:
 
 def car(config: Config) -> Loop:
     """The paper's gains with an anti-windup."""
-    return Loop(
+    return braking(
         plant=QuarterCar(inertia=1.0539, road=MagicFormula()),
         reference=FixedSlip(slip=0.1),
         controller=PID(kp=3893.0, ki=5000.0, antiwindup=BackCalculation(tracking_time=0.05)),
@@ -105,7 +107,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
     points = np.array([row["effort [N2 m2 s]"] for row in rows]), np.array([row["distance [m]"] for row in rows])
     effort, distance = scattered(config)
     near = distance < 1.1 * points[1].max()
-    figure = plot_tuning.pareto(
+    figure = tuning.pareto(
         {"tuned by gradients": points, "random parameters": (effort[near], distance[near])},
         marks={"published conventional PI": published(config)},
         title="What a shorter stop costs",

@@ -24,13 +24,14 @@ from scipy.stats import qmc, t
 
 from diffabs import FixedStep, Loop, measure, plot, replace
 from diffabs.controllers import PID, BackCalculation
-from diffabs.conveyor import measure_lanes
 from diffabs.objectives import BRAKING, Effort
 from diffabs.papers import record, slip_estimator
 from diffabs.plants import GRAVITY, QuarterCar
 from diffabs.references import FixedSlip, PeakRobust
 from diffabs.roads import MagicFormula, Patches
+from diffabs.scenario.defaults import braking
 from diffabs.sensors import Noise
+from diffabs.simulate.refill import measure_lanes
 from diffabs.stops import Standstill
 from diffabs.tune import Batch, Method, Stopping, Tuned, tune
 
@@ -147,7 +148,7 @@ def loops(config: Config) -> dict[str, Loop]:
     car, pi = QuarterCar(inertia=1.0539, road=road), PID(ki=5000.0)
     stop = Standstill(speed=config.stop)
     references = {"conventional": FixedSlip(), "proposed": PeakRobust(arming=config.arming)}
-    return {name: Loop(plant=car, reference=r, controller=pi, stop=stop) for name, r in references.items()}
+    return {name: braking(plant=car, reference=r, controller=pi, stop=stop) for name, r in references.items()}
 
 
 def tuned(config: Config, known: Family, one: Loop, progress: Any = None) -> Tuned:

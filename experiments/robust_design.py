@@ -12,14 +12,15 @@ from typing import Any
 
 import jax
 
-from diffabs import BrakeStart, FixedStep, Loop, Run, plot, rollout
+from diffabs import BrakeStart, FixedStep, Run, plot, rollout
 from diffabs.controllers import HoldingInput, Sampled, ScheduledFeedback, StateFeedback
 from diffabs.design import Certificate, Design, InputLimit, L2Gain, Spec, certify, design
-from diffabs.design.box import polytope, schedule
-from diffabs.linearize import Sampling, SlipModel
+from diffabs.design.parameter_box import polytope, schedule
+from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
 from diffabs.papers import record
 from diffabs.plants import MirroredRig
+from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached
 
 
@@ -74,7 +75,7 @@ def brake(config: Config, found: dict[str, Design]) -> dict[str, Run]:
     """The nonlinear rig under each gain."""
     runs = {}
     for name, answer in found.items():
-        loop = Loop(
+        loop = braking(
             plant=MirroredRig(mass=config.mass[0]),
             initial=BrakeStart(speed=config.speed[1]),
             feedforward=HoldingInput(),

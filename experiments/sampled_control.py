@@ -24,6 +24,7 @@ from diffabs.papers import record
 from diffabs.plants import QuarterCar
 from diffabs.references import FixedSlip, PeakLatch
 from diffabs.roads import MagicFormula
+from diffabs.scenario.defaults import braking
 from diffabs.stops import Standstill
 
 
@@ -58,7 +59,7 @@ def loop(config: Config, controller: PID, period: float, delay: float, reference
     """The closed loop with a computer in it."""
     sampled = Sampled(controller=controller, period=period, delay=delay)
     stop = Standstill(speed=config.stop)
-    return Loop(plant=car(), reference=reference or FixedSlip(), controller=sampled, stop=stop)
+    return braking(plant=car(), reference=reference or FixedSlip(), controller=sampled, stop=stop)
 
 
 def slowest(config: Config, period: float, delay: float) -> float:

@@ -22,14 +22,15 @@ import numpy as np
 from diffabs import BrakeStart, FixedStep, Loop, plot
 from diffabs.actuators import Lag
 from diffabs.controllers import PID, BackCalculation, ConstantInput, HoldingInput, ScheduledFeedback, StateFeedback
-from diffabs.design.box import polytope
-from diffabs.design.regulator import lqr
-from diffabs.linearize import SlipModel
+from diffabs.core.pytree import Vector, param, part, pytree, replace
+from diffabs.design.parameter_box import polytope
+from diffabs.linear.regulator import lqr
+from diffabs.linear.slip_model import SlipModel
 from diffabs.objectives import BRAKING, Effort, QuadraticCost
 from diffabs.plants import MirroredRig, QuarterCar
-from diffabs.pytree import Vector, param, part, pytree, replace
 from diffabs.references import FilteredSlip, PeakRobust
 from diffabs.roads import MagicFormula
+from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached, Standstill
 from diffabs.tune import Batch, grid, latin
 from diffabs.tune.weights import lq_weights, regulator, robust
@@ -85,7 +86,7 @@ ALL_RANGES = {
 
 def rig(config: Config) -> Loop:
     """The rig with limits and a lag."""
-    return Loop(
+    return braking(
         plant=MirroredRig(),
         initial=BrakeStart(speed=config.speeds[-1] / plot.KMH),
         controller=StateFeedback(gain=np.array(config.gain), torque_min=0.0, torque_max=9.03),
@@ -103,7 +104,7 @@ def box(config: Config) -> Any:
 
 def car(config: Config) -> tuple[Loop, Batch]:
     """The quarter car under PID control at the estimated slip, and many roads, masses and speeds."""
-    loop = Loop(
+    loop = braking(
         plant=QuarterCar(inertia=1.0539, road=MagicFormula()),
         reference=PeakRobust(slip=0.2, arming=1.0),
         controller=PID(kp=1500.0, ki=3000.0, kd=5.0, antiwindup=BackCalculation(tracking_time=0.2)),

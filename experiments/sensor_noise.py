@@ -28,6 +28,7 @@ from diffabs.papers import record
 from diffabs.plants import QuarterCar
 from diffabs.references import FixedSlip, PeakLatch, PeakRobust
 from diffabs.roads import MagicFormula
+from diffabs.scenario.defaults import braking
 from diffabs.sensors import IntegratedAccelerometer, Noise
 from diffabs.stops import Standstill
 
@@ -60,7 +61,7 @@ OBJECTIVES = {"distance": StopDistance()}
 def noisy_loop(config: Config, car: QuarterCar, noise: float, reference: Any, ki: float = 0.0) -> Loop:
     """The closed loop with a noisy accelerometer."""
     stop, sensor = Standstill(speed=config.stop), Noise(deceleration=noise, period=config.step)
-    return Loop(plant=car, sensor=sensor, reference=reference, controller=PID(ki=ki), stop=stop)
+    return braking(plant=car, sensor=sensor, reference=reference, controller=PID(ki=ki), stop=stop)
 
 
 def noisy(config: Config, loops: list[Loop], duration: float) -> tuple[Any, Any]:
@@ -127,7 +128,7 @@ def biased(config: Config) -> list[dict[str, Any]]:
     rows = []
     for method, reference, ki in (("conventional P", FixedSlip(), 0.0), ("proposed P", PeakLatch(), 0.0)):
         loops = [
-            Loop(sensor=IntegratedAccelerometer(bias=b, floor=f), reference=reference, controller=PID(ki=ki))
+            braking(sensor=IntegratedAccelerometer(bias=b, floor=f), reference=reference, controller=PID(ki=ki))
             for f, b in cases
         ]
         run = jax.vmap(lambda loop: measure(loop, solver, OBJECTIVES))(record.stacked(loops))

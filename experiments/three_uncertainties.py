@@ -15,8 +15,8 @@ import numpy as np
 
 from diffabs import plot, replace
 from diffabs.design import Spec, certify, design
-from diffabs.design.box import polytope
-from diffabs.linearize import SlipModel
+from diffabs.design.parameter_box import polytope
+from diffabs.linear.slip_model import SlipModel
 from diffabs.papers import record
 from diffabs.plants import MirroredRig
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from diffabs import FixedStep, Loop, replace, rollout
 from diffabs.actuators import Limits
-from diffabs.blocks import Series
+from diffabs.core.blocks import Series
+from diffabs.core.pytree import get
 from diffabs.objectives import Overshoot
-from diffabs.pytree import get
 from diffabs.sensors import Noise, SpeedScale
 from diffabs.tune import Batch, run
 

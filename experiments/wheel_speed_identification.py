@@ -17,13 +17,14 @@ import numpy as np
 
 from diffabs import FixedStep, Loop, plot, rollout
 from diffabs.controllers import ConstantTorque
+from diffabs.identify.fit import Identified, Tolerances
+from diffabs.identify.identification import identify
+from diffabs.identify.traces import Traces
 from diffabs.papers import record
 from diffabs.plants import QuarterCar
 from diffabs.roads import MagicFormula
+from diffabs.scenario.defaults import braking
 from diffabs.stops import Standstill
-from diffabs.tune.fit import Identified, Tolerances
-from diffabs.tune.identification import identify
-from diffabs.tune.traces import Traces
 
 PATHS = ("plant.inertia", "plant.road.B", "plant.road.C", "plant.road.D", "plant.road.E")
 SHORT = ("J", "B", "C", "D", "E")
@@ -47,7 +48,7 @@ def truth(config: Config) -> tuple[Loop, FixedStep]:
     """The run whose parameters are known."""
     inertia, *coefficients = config.truth
     car = QuarterCar(inertia=inertia, road=MagicFormula(**dict(zip(SHORT[1:], coefficients, strict=True))))
-    loop = Loop(plant=car, controller=ConstantTorque(torque=config.torque), stop=Standstill(speed=0.5))
+    loop = braking(plant=car, controller=ConstantTorque(torque=config.torque), stop=Standstill(speed=0.5))
     return loop, FixedStep(step=config.step, duration=config.end)
 
 

@@ -20,14 +20,14 @@ from diffabs import FixedStep, Loop, Run, measure, plot, replace, rollout
 from diffabs.actuators import Lag
 from diffabs.controllers import StateFeedback
 from diffabs.design import Certificate, certify
-from diffabs.design.box import polytope
-from diffabs.design.reduction import feedback
-from diffabs.design.scaled import SpeedScaled, fall
-from diffabs.linearize import Sampling, SlipModel
+from diffabs.design.parameter_box import polytope
+from diffabs.design.speed_scaled import SpeedScaled, fall
+from diffabs.design.state_feedback import feedback
+from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_design, record
 from diffabs.references import FixedSlip
-from diffabs.scenario import load
+from diffabs.scenario.scenario import load
 from diffabs.tune import WorstCase, grid, run, worst_case
 
 

@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 
-from diffabs.balance_model import BalanceModel
 from diffabs.controllers import BalanceFeedback
-from diffabs.loop import TYPICAL
+from diffabs.core.pytree import replace
+from diffabs.linear.balance_model import BalanceModel
 from diffabs.plants import ArmBalance
-from diffabs.pytree import replace
-from diffabs.rollout import FixedStep
+from diffabs.scenario.defaults import balancing
+from diffabs.simulate.solution import FixedStep
 
 HANGING = ArmBalance(arm_length=-0.5)
 START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # of the paper's Fig. 3
@@ -26,7 +26,7 @@ SHORT = FixedStep(step=2e-3, duration=4.0)
 def closed(multiple=0.0, voltage=48.0, **parts):
     """The hanging arm from a multiple of the start."""
     values = {path: multiple * value for path, value in DIRECTION.items()} | {"actuator.voltage_max": voltage}
-    loop = dataclasses.replace(TYPICAL["balance"], plant=HANGING, controller=BalanceFeedback(gain=GAIN))
+    loop = dataclasses.replace(balancing(), plant=HANGING, controller=BalanceFeedback(gain=GAIN))
     return replace(dataclasses.replace(loop, **parts), values)
 
 

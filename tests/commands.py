@@ -4,11 +4,11 @@ import pathlib
 
 from typer.testing import CliRunner
 
-from diffabs import cli
+from diffabs.cli import main
 
 
 def run(*args: object, status: int = 0):
-    result = CliRunner().invoke(cli.app, [str(a) for a in args])
+    result = CliRunner().invoke(main.app, [str(a) for a in args])
     if result.exception and not isinstance(result.exception, SystemExit):
         raise result.exception
     assert result.exit_code == status, result.output

@@ -23,7 +23,7 @@ def _float64():
 @pytest.fixture(scope="module")
 def any_step_is_stable():
     """Loading a scenario without the seconds of the stability check, which has tests of its own."""
-    from diffabs import refusals
+    from diffabs.simulate import refusals
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(refusals, "stable_step", lambda loop: np.inf)
@@ -33,7 +33,7 @@ def any_step_is_stable():
 @pytest.fixture(scope="module")
 def without_load():
     """No lines on stderr that depend on the machine's load."""
-    from diffabs import console
+    from diffabs.cli import console
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", np.inf)

@@ -23,12 +23,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs import catalogue, toml
-from diffabs.loop import task
-from diffabs.pytree import elements, get
-from diffabs.rollout import FixedStep, Run, measure
-from diffabs.scenario import Scenario, ScenarioError, dump, loads
-from diffabs.stability import stable_step
+from diffabs.core.protocols import BrakeOutput
+from diffabs.core.pytree import elements, get
+from diffabs.scenario import registry, toml
+from diffabs.scenario.scenario import Scenario, ScenarioError, dump, loads
+from diffabs.simulate.run import measure
+from diffabs.simulate.solution import FixedStep, Run
+from diffabs.simulate.stable_step import stable_step
 
 PER_STRUCTURE = 200
 STEPS = 300
@@ -114,7 +115,7 @@ def structure(rng: np.random.Generator) -> tuple[str, Scenario]:
     family = BALANCES if rng.random() < 0.2 else BRAKES
     sections = {name: {"type": str(rng.choice(there))} for name, there in family.items()}
     if family is BRAKES:
-        sections["road"] = {"type": str(rng.choice(list(catalogue.types("road"))))}
+        sections["road"] = {"type": str(rng.choice(list(registry.types("road"))))}
     if sections["controller"]["type"] == "sampled":
         inner = [name for name in family["controller"] if name != "sampled"]
         sections["controller"]["controller"] = {"type": str(rng.choice(inner))}
@@ -265,7 +266,7 @@ def wrong(scenario: Scenario, run: Run) -> Iterator[str]:
         elif value < LEAST.get(name, -math.inf) - size or value > MOST.get(name, math.inf) + size:
             yield f"{name} = {value:g} cannot be"
     output = run.ending.sample.output
-    braking = task(scenario.loop.plant) == "braking" and not drives(scenario.loop)
+    braking = scenario.loop.plant.shows is BrakeOutput and not drives(scenario.loop)
     if braking and not output.speed <= scenario.loop.initial.speed * (1 + 1e-6):
         yield f"speed = {float(output.speed):g} m/s at the end, from {scenario.loop.initial.speed:g}: it rose"
 

@@ -14,11 +14,12 @@ from commands import run
 from fuzz_files import damaged, edited, in_a_line
 from sweeping import SCENARIO, described
 
-from diffabs import commands_sweep, scenario
+from diffabs.cli import sweep as commands_sweep
+from diffabs.scenario import scenario
 from diffabs.sweep import Results, SweepError, sweep
 from diffabs.sweep.engines import Done
 from diffabs.sweep.seal import NAME
-from diffabs.sweep.summary import summary
+from diffabs.sweep.statistics.summary import summary
 
 TEXT = SCENARIO.replace("samples = 3200", "samples = 290")
 SAMPLE = 7
@@ -99,9 +100,9 @@ class Folders:
     def compare(self, folder):
         from typer.testing import CliRunner
 
-        from diffabs import cli
+        from diffabs.cli import main
 
-        result = CliRunner().invoke(cli.app, ["compare", str(self.room / "out"), str(folder), "--json"])
+        result = CliRunner().invoke(main.app, ["compare", str(self.room / "out"), str(folder), "--json"])
         if result.exception and not isinstance(result.exception, SystemExit):
             raise result.exception
         if result.exit_code == 2:

@@ -14,10 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from diffabs import actuators, blocks, controllers, objectives, plants, references, roads, sensors, stops
-from diffabs.integrate import axpy, rk4_step
-from diffabs.protocols import BalanceOutput, BrakeOutput, Clock, Ending, Memory, Sample, Tracking
-from diffabs.pytree import strong
+from diffabs import actuators, controllers, objectives, plants, references, roads, sensors, stops
+from diffabs.core import blocks
+from diffabs.core.numerics import axpy
+from diffabs.core.protocols import BalanceOutput, BrakeOutput, Clock, Ending, Memory, Sample, Tracking
+from diffabs.core.pytree import strong
+from diffabs.simulate.rk4 import rk4_step
 
 FAMILIES = (roads, plants, controllers, references, actuators, sensors, objectives, stops, blocks)
 

@@ -8,8 +8,8 @@ import time
 
 import jax
 
-from diffabs import variation
-from diffabs.scenario import loads
+from diffabs.scenario import section_sweep
+from diffabs.scenario.scenario import loads
 from diffabs.sweep.manifest import FORMAT
 
 PATIENCE = 300.0  # s for anything that takes seconds on an idle machine
@@ -42,7 +42,7 @@ check = 0
 
 
 def described(text):
-    return variation.study(loads(text.encode(), "small", "small.toml"))
+    return section_sweep.study(loads(text.encode(), "small", "small.toml"))
 
 
 def manifest(samples, chunk, variables=("plant.mass",), objectives=("iae",), **study):

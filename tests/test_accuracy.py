@@ -9,12 +9,14 @@ import pytest
 from oracles import brake
 
 import diffabs as d
-from diffabs import accuracy as acc
-from diffabs import actuators, blocks, controllers, plants, references, sensors, stops
+from diffabs import actuators, controllers, plants, references, sensors, stops
+from diffabs.core import blocks
 from diffabs.objectives import IAE, MaxSlip, StopDistance, StopTime
+from diffabs.scenario.defaults import braking
+from diffabs.simulate import accuracy as acc
 
 OBJECTIVES = {"stop_time": StopTime(), "stop_distance": StopDistance(), "max_slip": MaxSlip(), "iae": IAE()}
-RIG = d.Loop(
+RIG = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=10.0, slip=0.15),
     stop=stops.SpeedReached(speed=4.0),

@@ -11,8 +11,8 @@ from commands import assert_one_error_line, run
 from sweeping import SCENARIO
 
 import diffabs as d
-from diffabs import variation
-from diffabs.scenario import load, loads
+from diffabs.scenario import section_sweep
+from diffabs.scenario.scenario import load, loads
 from diffabs.sweep import Results, sweep
 from diffabs.sweep.checking import _chosen, checked, said
 
@@ -71,7 +71,7 @@ def test_a_sweep_says_how_accurate_it_is_without_being_asked(file, tmp_path):
     result = run("sweep", path, "--out", out, "--json")
     found = json.loads(result.stdout)["accuracy"]
     assert json.loads((out / "summary.json").read_text())["accuracy"] == found
-    study, table = variation.study(load(path)), Results(out)
+    study, table = section_sweep.study(load(path)), Results(out)
     assert len(found["samples"]) == 6
     row = found["metrics"]["overshoot"]
     loop, key = study.lane(row["sample"])
@@ -93,7 +93,9 @@ def test_a_sweep_is_not_checked_where_that_is_turned_off(file, tmp_path):
 
 def test_noise_is_the_same_in_a_sweeps_half_steps(tmp_path):
     """Of the noisy sweep of the tests: the half step changes a hundredth of what other noise does."""
-    study = variation.study(loads(SCENARIO.replace("samples = 3200", "samples = 64").encode(), "small", "small.toml"))
+    study = section_sweep.study(
+        loads(SCENARIO.replace("samples = 3200", "samples = 64").encode(), "small", "small.toml")
+    )
     found = checked(study, sweep(study, tmp_path), 16)
     assert found["not comparable"] == 0
     assert found["metrics"]["iae"]["largest"] < 1e-3

@@ -10,17 +10,18 @@ import scipy.linalg
 from oracles import arm_rates
 from scipy.integrate import solve_ivp
 
-from diffabs.balance_model import BalanceModel
-from diffabs.design.recovery import zeros
-from diffabs.design.regulator import lqr
-from diffabs.integrate import rk4_step
-from diffabs.linearize import Sampling
-from diffabs.loop import TYPICAL
+from diffabs.core.pytree import replace, strong
+from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.recoverable import zeros
+from diffabs.linear.regulator import lqr
+from diffabs.linear.slip_model import Sampling
 from diffabs.objectives import PeakArmAngle, PeakVoltage
 from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
 from diffabs.plants.arm_balance import ArmState
-from diffabs.pytree import replace, strong
-from diffabs.rollout import FixedStep, measure
+from diffabs.scenario.defaults import balancing
+from diffabs.simulate.rk4 import rk4_step
+from diffabs.simulate.run import measure
+from diffabs.simulate.solution import FixedStep
 
 ARM, HANGING = ArmBalance(), ArmBalance(arm_length=-0.5)
 POINT = ArmState(0.5, 0.3, 0.2, 0.1, -0.4, 0.7)
@@ -203,7 +204,7 @@ def test_fig_3_is_that_of_the_printed_equations():
     plant = PrintedArm()
     gain = lqr(*model(plant), np.eye(6), np.eye(1)).gain[0]
     loop = dataclasses.replace(
-        replace(TYPICAL["balance"], {"actuator.voltage_max": 1e6, "controller.gain": np.asarray(gain)}),
+        replace(balancing(), {"actuator.voltage_max": 1e6, "controller.gain": np.asarray(gain)}),
         plant=plant,
         initial=BalanceStart(theta=0.5, phi=0.2),
     )

@@ -7,20 +7,21 @@ import pytest
 from balancing import DIRECTION, EFFORT, GAIN, HANGING, MULTIPLES, SHORT, SLOW, SOLVER, START, WEIGHTS, closed, model
 from oracles import arm_rates, arm_stays_up
 
-from diffabs.balance_model import BalanceModel
-from diffabs.basin import Basin, Cells, Outcomes, attraction, largest, outcomes, recoverable
 from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
+from diffabs.core.pytree import replace
 from diffabs.design import Spec, certify, design
+from diffabs.design.attraction import Basin, Cells, Outcomes, attraction, largest, outcomes, recoverable
 from diffabs.design.capture import capture
-from diffabs.design.gridded import gridded
-from diffabs.design.recovery import recoverable_bound
-from diffabs.design.upright import upright
+from diffabs.design.parameter_grid import gridded
+from diffabs.design.state_feedback_balance import upright
+from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.recoverable import recoverable_bound
 from diffabs.objectives import FinalNorm
 from diffabs.papers.arm_balance import TUNED, heaviest
 from diffabs.plants import ArmBalance, PrintedArm
 from diffabs.plants.arm_balance import ArmState
-from diffabs.pytree import replace
-from diffabs.rollout import FixedStep, measure
+from diffabs.simulate.run import measure
+from diffabs.simulate.solution import FixedStep
 
 pytestmark = pytest.mark.xdist_group("arm-basin")  # one worker compiles what these share
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
 
-from diffabs import FixedStep, console
+from diffabs import FixedStep
+from diffabs.cli import console
 from diffabs.objectives import BALANCE, BRAKING
-from diffabs.scenario import load
+from diffabs.scenario.scenario import load
 from diffabs.sweep import Space, Study, Uniform
 from diffabs.sweep.engines import failing, missed
 from diffabs.tune import worst_case
@@ -27,7 +28,7 @@ def quiet():
     """No lines that depend on the machine's load, and no seconds for whether the step is stable."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr("diffabs.refusals.stable_step", lambda loop: np.inf)
+        patch.setattr("diffabs.simulate.refusals.stable_step", lambda loop: np.inf)
         yield
 
 
@@ -176,7 +177,7 @@ def test_the_packaged_gain_is_the_designs(name):
     """LQR of the weights in its own [design], to the printed digits, by SciPy."""
     import scipy.linalg
 
-    from diffabs.balance_model import BalanceModel
+    from diffabs.linear.balance_model import BalanceModel
 
     s = load(name)
     a, b = (np.asarray(x) for x in BalanceModel(plant=s.loop.plant).matrices())

@@ -12,14 +12,15 @@ from scipy.integrate import solve_ivp
 
 from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
 from diffabs.controllers.balance import Estimate
-from diffabs.design.lqg import SELECTION, kalman, lqg
-from diffabs.design.recovery import mode_bounds, recoverable_bound
+from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking
+from diffabs.core.pytree import check, replace
+from diffabs.linear.gaussian import SELECTION, kalman, lqg
+from diffabs.linear.recoverable import mode_bounds, recoverable_bound
 from diffabs.objectives import FinalNorm
 from diffabs.plants import ArmBalance
-from diffabs.protocols import BalanceOutput, Clock, Memory, Tracking
-from diffabs.pytree import check, replace
-from diffabs.rollout import FixedStep, measure
 from diffabs.sensors import AngleSensor
+from diffabs.simulate.run import measure
+from diffabs.simulate.solution import FixedStep
 
 pytestmark = pytest.mark.xdist_group("arm-control")  # one worker compiles what these share
 

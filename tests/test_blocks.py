@@ -9,7 +9,6 @@ import pytest
 
 from diffabs import check
 from diffabs.actuators import Delay, Lag, Limits, RateLimit
-from diffabs.blocks import Series
 from diffabs.controllers import (
     PID,
     BackCalculation,
@@ -23,10 +22,11 @@ from diffabs.controllers import (
     StateFeedback,
 )
 from diffabs.controllers.pid import PIDMemory
-from diffabs.integrate import rk4_step
-from diffabs.protocols import BrakeOutput, Clock, Memory, Sample, Tracking
+from diffabs.core.blocks import Series
+from diffabs.core.protocols import BrakeOutput, Clock, Memory, Sample, Tracking
 from diffabs.references import FilteredSlip, PeakLatch, PeakLiteral, PeakRobust
 from diffabs.sensors import Bias, IntegratedAccelerometer, Noise, Quantisation, SpeedScale, WheelSpeed
+from diffabs.simulate.rk4 import rk4_step
 from diffabs.stops import SpeedReached, Standstill
 
 H = 1e-3

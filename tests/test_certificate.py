@@ -15,9 +15,9 @@ import checker
 import numpy as np
 import pytest
 
-from diffabs.design import exact
-from diffabs.design.certificate import Certificate, Claim
-from diffabs.design.polytope import Polytope, Schedule
+from diffabs.design.polytopes import Polytope, Schedule
+from diffabs.design.proof import exact
+from diffabs.design.proof.certificate import Certificate, Claim
 
 OUTSIDERS = pathlib.Path(__file__).parent.parent / "experiments" / "check_certificate.py"
 spec = importlib.util.spec_from_file_location("check_certificate", OUTSIDERS)

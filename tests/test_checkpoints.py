@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 import diffabs as d
-from diffabs import controllers, integrate, plants
-from diffabs.integrate import SLOTS, levels
+from diffabs import controllers, plants
+from diffabs.core.pytree import get
 from diffabs.objectives import IAE, StopDistance
-from diffabs.pytree import get
+from diffabs.scenario.defaults import braking
+from diffabs.simulate import rk4
+from diffabs.simulate.checkpoint import SLOTS, levels
 from diffabs.stops import SpeedReached
 
-LOOP = d.Loop(
+LOOP = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=50 / 3.6),
     controller=controllers.StateFeedback(torque_min=0.0, torque_max=9.03),
@@ -67,7 +69,7 @@ def test_nested_scans_make_enough_steps_and_keep_few_carries(count):
 
 @pytest.mark.slow
 def test_reverse_forward_and_differences_agree_in_nested_scans(monkeypatch):
-    monkeypatch.setattr(integrate, "SLOTS", 16)
+    monkeypatch.setattr(rk4, "SLOTS", 16)
     jax.clear_caches()
     assert len(levels(104)) == 2
     mean, zero = objective(100, lanes=2, step=2e-3), jnp.zeros(len(PATHS))

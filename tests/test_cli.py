@@ -18,10 +18,11 @@ import typer
 from commands import assert_one_error_line, left_in, run
 
 import diffabs
-from diffabs import catalogue, cli, console, scenario
+from diffabs.cli import console, main
+from diffabs.core.pytree import parameters
 from diffabs.objectives import BRAKING
-from diffabs.pytree import parameters
-from diffabs.stability import stable_step
+from diffabs.scenario import registry, scenario
+from diffabs.simulate.stable_step import stable_step
 
 pytestmark = pytest.mark.xdist_group("cli")  # one worker makes what these share
 
@@ -42,8 +43,8 @@ class Figure:
 def stable():
     """Seconds saved in every run (the step has a test of its own), and no lines that depend on the machine's load."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli.console, "PATIENCE", math.inf)
-        patch.setattr("diffabs.refusals.stable_step", lambda loop: np.inf)
+        patch.setattr(main.console, "PATIENCE", math.inf)
+        patch.setattr("diffabs.simulate.refusals.stable_step", lambda loop: np.inf)
         yield
 
 
@@ -57,9 +58,9 @@ def runs():
 def whole(tmp_path_factory, runs):
     """One whole run of slip-lmi with everything written."""
     folder = tmp_path_factory.mktemp("whole")
-    simulated = cli._run
+    simulated = main._run
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cli, "_run", lambda *args, **more: runs.append(simulated(*args, **more)) or runs[-1])
+        patch.setattr(main, "_run", lambda *args, **more: runs.append(simulated(*args, **more)) or runs[-1])
         plot = types.SimpleNamespace(braking=lambda run, *, title="", unit="": Figure(f"{title}: {bool(run.stopped)}"))
         patch.setitem(sys.modules, "diffabs.plot", plot)
         result = run("simulate", "slip-lmi", "--json", "--csv", folder / "a.csv", "--plot", folder / "a.png")
@@ -117,11 +118,11 @@ def test_figure_and_nothing_else_is_left(whole):
     folder, _ = whole
     assert (folder / "a.png").read_text() == "State feedback on the mirrored rig, published gain: True .png"
     assert left_in(folder) == {"a.csv", "a.png"}
-    assert (folder / "a.csv").stat().st_mode & 0o777 == 0o666 & ~cli.console._umask()
+    assert (folder / "a.csv").stat().st_mode & 0o777 == 0o666 & ~main.console._umask()
 
 
 def test_a_long_trajectory_is_thinned(tmp_path, monkeypatch):
-    monkeypatch.setattr(cli, "MOST_ROWS", 5)
+    monkeypatch.setattr(main, "MOST_ROWS", 5)
     (tmp_path / "a.csv").write_text("old")
     os.link(tmp_path / "a.csv", tmp_path / "reader.csv")  # stands for someone who has the old file open
     run("simulate", "slip-lmi", *SHORT, "--csv", tmp_path / "a.csv")
@@ -141,7 +142,7 @@ def test_not_stopped_is_done_but_said_loudly():
 def test_table_shows_units():
     lines = run("simulate", "slip-lmi", *SHORT).stdout.splitlines()
     units = {line.split("│")[1].strip(): line.split("│")[3].strip() for line in lines if line.startswith("│")}
-    assert units == {name: catalogue.unit_of(part) for name, part in BRAKING.items()}
+    assert units == {name: registry.unit_of(part) for name, part in BRAKING.items()}
 
 
 def test_diverged_could_not_be_done():
@@ -166,7 +167,7 @@ def test_seed_decides_the_noise():
 @pytest.fixture
 def simulated(whole, runs, monkeypatch):
     """Every simulation gives the run of slip-lmi."""
-    monkeypatch.setattr(cli, "_run", lambda chosen, key, keep: runs[0])
+    monkeypatch.setattr(main, "_run", lambda chosen, key, keep: runs[0])
 
 
 def test_lab_rig_commands_have_no_torque_unit(tmp_path, simulated):
@@ -196,7 +197,7 @@ def test_bad_scenario_is_one_line_and_leaves_nothing(tmp_path, args, needed):
 
 
 def test_step_that_is_not_stable(monkeypatch):
-    monkeypatch.setattr("diffabs.refusals.stable_step", stable_step)
+    monkeypatch.setattr("diffabs.simulate.refusals.stable_step", stable_step)
     result = run("simulate", "slip-lmi", "--set", "solver.step=0.01", status=2)
     assert_one_error_line(result)
     assert "solver.step = 0.01 s is not stable" in result.stderr
@@ -273,12 +274,12 @@ def test_json_says_all_that_it_ran_with(whole):
 @pytest.mark.parametrize("name", scenario.names())
 def test_parts_and_parameters_of_the_json_make_the_same_loop(name):
     chosen = scenario.load(name, integrated=False)
-    parts = [f"{path}={{type='{row['type']}'}}" for path, row in cli._parts(chosen).items()]
-    fixed = [f"{p}.{k}={v}" for p, row in cli._parts(chosen).items() for k, v in row.items() if k != "type"]
-    numbers = cli._parameters(chosen)
+    parts = [f"{path}={{type='{row['type']}'}}" for path, row in main._parts(chosen).items()]
+    fixed = [f"{p}.{k}={v}" for p, row in main._parts(chosen).items() for k, v in row.items() if k != "type"]
+    numbers = main._parameters(chosen)
     values = [f"{path}={json.dumps(row['value'])}".replace('"', "") for path, row in numbers.items()]
     again = scenario.loads(b"", name, name, [*parts, *fixed, *values], integrated=False)
-    assert cli._parameters(again) == numbers
+    assert main._parameters(again) == numbers
 
 
 def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
@@ -286,7 +287,7 @@ def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
     titles = []
     draw = types.SimpleNamespace(braking=lambda run, *, title="", unit="": titles.append(title) or Figure(title))
     monkeypatch.setitem(sys.modules, "diffabs.plot", draw)
-    monkeypatch.setattr(cli, "_run", lambda chosen, key, keep: runs[0])
+    monkeypatch.setattr(main, "_run", lambda chosen, key, keep: runs[0])
     gain = ("--set", "controller.gain=-4000,-40")
     tables = [run("simulate", "slip-lmi", *more, "--plot", tmp_path / "a.png").stdout for more in ((), gain)]
     named = ("--set", "title=mine")
@@ -313,14 +314,14 @@ def test_a_long_title_stays_on_its_figure():
 # The program
 
 
-COMMANDS = list(typer.main.get_command(cli.app).commands)
+COMMANDS = list(typer.main.get_command(main.app).commands)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_help_has_an_example_that_is_right(command, monkeypatch):
     """Its words are parsed; nothing is run."""
     example = re.search(r"Example:\n\n +diffabs (.*)\n", run(command, "-h").stdout)[1]
-    group = typer.main.get_command(cli.app)
+    group = typer.main.get_command(main.app)
     name, *args = shlex.split(example)
     assert name == command
     given = group.commands[name].make_context(name, list(args)).params
@@ -373,7 +374,7 @@ def test_completion_offers_commands_and_scenarios():
     def offered(words: str) -> str:
         env = os.environ | {"_DIFFABS_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": "1"}
         env["COMP_CWORD"] = str(words.count(" "))
-        code = "import sys; sys.argv[0] = 'diffabs'; from diffabs.cli import main; main()"
+        code = "import sys; sys.argv[0] = 'diffabs'; from diffabs.cli.main import main; main()"
         return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False).stdout
 
     assert offered("diffabs id").split() == ["identify"]
@@ -408,7 +409,7 @@ def test_as_a_module_with_double_precision():
 
 
 def test_help_imports_no_matplotlib():
-    code = "import sys, diffabs.cli; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, diffabs.cli.main; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
 
-from diffabs import console
-from diffabs.design import Certificate, DesignError, analysis, box, lmi, synthesis
+from diffabs.cli import console
+from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.design import Certificate, DesignError, analysis, parameter_box, synthesis
 from diffabs.design.frozen import frozen
-from diffabs.linearize import StateSpace
-from diffabs.pytree import Scalar, param, pytree
+from diffabs.design.sdp import solver
+from diffabs.linear.linearization import StateSpace
 
 pytestmark = pytest.mark.xdist_group("cli-design")  # one worker compiles what these share
 
@@ -59,14 +60,14 @@ def quiet():
     """No lines that depend on the machine's load; and nothing is integrated, so no step need be stable."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr("diffabs.refusals.stable_step", lambda loop: pytest.fail("asked for a stable step"))
+        patch.setattr("diffabs.simulate.refusals.stable_step", lambda loop: pytest.fail("asked for a stable step"))
         yield
 
 
 @pytest.fixture
 def no_polytope(monkeypatch):
     """What is wrong must be said before anything dear is computed."""
-    monkeypatch.setattr(box, "polytope", lambda *_: pytest.fail("computed a polytope first"))
+    monkeypatch.setattr(parameter_box, "polytope", lambda *_: pytest.fail("computed a polytope first"))
 
 
 def checked(path: pathlib.Path) -> subprocess.CompletedProcess:
@@ -366,7 +367,7 @@ def test_failure_of_the_linear_algebra_is_not_bad_input(monkeypatch):
 @pytest.mark.parametrize("command", ["design", "certify"])
 def test_without_the_extra(command, monkeypatch, no_polytope):
     monkeypatch.setitem(sys.modules, "cvxpy", None)
-    lmi.solvers.cache_clear()
+    solver.solvers.cache_clear()
     result = run(command, "slip-lmi", status=2)
     assert_one_error_line(result)
     assert 'pip install "diffabs[design]"' in result.stderr

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
 
-import diffabs.tune.identification as library
-from diffabs import commands_identify, console, refusals
-from diffabs.readings import read
-from diffabs.scenario import ScenarioError, load
+import diffabs.identify.identification as library
+from diffabs.cli import console
+from diffabs.cli import identify as commands_identify
+from diffabs.identify.fit import Identified
+from diffabs.identify.uncertainty import uncertainty
+from diffabs.scenario.measurements import read
+from diffabs.scenario.scenario import ScenarioError, load
+from diffabs.simulate import refusals
 from diffabs.tune import Reason
-from diffabs.tune.fit import Identified
-from diffabs.tune.uncertainty import uncertainty
 
 pytestmark = pytest.mark.xdist_group("cli-identify")  # one worker compiles what these share
 

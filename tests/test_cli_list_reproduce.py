@@ -9,17 +9,18 @@ import types
 import pytest
 from commands import assert_one_error_line, left_in, run
 
-from diffabs import catalogue, cli, console
+from diffabs.cli import console, main
 from diffabs.papers.digest import Digest
+from diffabs.scenario import registry
 
 # list
 
 
 def test_list_knows_every_part():
     document = json.loads(run("list", "--json").stdout)
-    assert set(document) == {*cli.PLURALS, "scenarios"}
-    for plural, family in cli.PLURALS.items():
-        assert set(document[plural]) == set(catalogue.types(family))
+    assert set(document) == {*main.PLURALS, "scenarios"}
+    for plural, family in main.PLURALS.items():
+        assert set(document[plural]) == set(registry.types(family))
     mass = document["plants"]["quarter-car"]["parameters"]["mass"]
     assert mass == {"default": 15.0, "unit": "kg", "range": "(0, inf) kg", "low": 0.0, "high": None}
     assert document["plants"]["quarter-car"]["parameters"]["road"]["default"] == "spline-b"
@@ -29,7 +30,7 @@ def test_list_knows_every_part():
     assert document["actuators"]["delay"]["parameters"]["capacity"]["default"] == 1024
     assert document["objectives"]["variation"]["unit"] == "N m"
     assert document["scenarios"]["slip-lmi"]["title"]
-    assert all(member["summary"] for family in cli.PLURALS for member in document[family].values())
+    assert all(member["summary"] for family in main.PLURALS for member in document[family].values())
 
 
 def test_list_table_shows_units_and_ranges():
@@ -91,7 +92,7 @@ def test_reproduce_everything(papers, tmp_path):
     assert lines.count(["refuted", "a", "claim:", "5"]) == 2
     assert result.stderr.count("drawing\n") == 2
     assert f"1 figures, every number and note (summary.json): {out / 'slip-lmi'}\n" in result.stderr
-    assert os.stat(out / "slip-lmi").st_mode & 0o777 == 0o777 & ~cli.console._umask()
+    assert os.stat(out / "slip-lmi").st_mode & 0o777 == 0o777 & ~main.console._umask()
 
 
 def test_on_a_terminal_the_spinner_says_which_step(papers, tmp_path, monkeypatch):

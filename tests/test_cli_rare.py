@@ -12,9 +12,9 @@ from commands import assert_one_error_line, run
 from scipy.stats import norm
 from sweeping import SCENARIO, described
 
-from diffabs.conveyor import measure_lanes
-from diffabs.scenario import load
-from diffabs.sweep.reliability import failure_probability
+from diffabs.reliability.failure import failure_probability
+from diffabs.scenario.scenario import load
+from diffabs.simulate.refill import measure_lanes
 
 pytestmark = [pytest.mark.usefixtures("any_step_is_stable", "without_load"), pytest.mark.xdist_group("rare")]
 

@@ -15,11 +15,14 @@ import pytest
 from commands import assert_one_error_line, left_in, run
 
 import diffabs.tune as library
-from diffabs import commands_tune, console, interrupt, proof, refusals
-from diffabs.design import lmi
-from diffabs.pytree import parameters, replace
-from diffabs.rollout import measure
-from diffabs.scenario import load
+from diffabs.cli import certificates, console
+from diffabs.cli import tune as commands_tune
+from diffabs.core import interrupt
+from diffabs.core.pytree import parameters, replace
+from diffabs.design.sdp import solver
+from diffabs.scenario.scenario import load
+from diffabs.simulate import refusals
+from diffabs.simulate.run import measure
 from diffabs.tune import Mode, Point, Reason, StartError, Tuned
 from diffabs.tune.result import Start
 
@@ -78,7 +81,7 @@ def quick():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
         patch.setattr(refusals, "stable_step", lambda loop: np.inf)
-        patch.setitem(sys.modules, "diffabs.plot_tuning", types.SimpleNamespace(tuning=drawn))
+        patch.setitem(sys.modules, "diffabs.plot.tuning", types.SimpleNamespace(tuning=drawn))
         yield
 
 
@@ -89,7 +92,7 @@ def unproved(monkeypatch):
     def none(chosen):
         raise ValueError("no proof was asked for")
 
-    monkeypatch.setattr(proof, "task", none)
+    monkeypatch.setattr(certificates, "task", none)
 
 
 @pytest.fixture
@@ -138,7 +141,7 @@ def tuned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tuned")
     (folder / "small.toml").write_text(SMALL)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(proof, "task", lambda chosen: pytest.fail("asked for a proof too early"))
+        patch.setattr(certificates, "task", lambda chosen: pytest.fail("asked for a proof too early"))
         patch.setattr(commands_tune, "_proved", lambda after: commands_tune._Proved({"decay_rate": None}, "no proof"))
         out = ("--out", folder / "out.toml", "--plot", folder / "a.png")
         result = run("tune", folder / "small.toml", "--json", *out)
@@ -269,7 +272,7 @@ def test_without_the_design_extra_there_is_no_certificate(small, invented, monke
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(library, "tune", lambda loop, **what: fake(loop, what))
         patch.setitem(sys.modules, "cvxpy", None)
-        lmi.solvers.cache_clear()
+        solver.solvers.cache_clear()
         result = run("tune", small, "--json")
     document = json.loads(result.stdout)
     assert document["certificate"]["quadratically_stable"] is None
@@ -376,7 +379,7 @@ def test_what_the_packaged_cure_says_is_met_is_met(tmp_path, changes):
         assert row["after"] <= row["bound"] if row["name"] == "overshoot" else row["after"] >= row["bound"]
         assert row["missed"] == 0.0
     after = load(tmp_path / "c.toml")
-    asked = proof.task(after)
+    asked = certificates.task(after)
     z = np.linalg.eigvals(asked.polytope.closed(asked.gain)).astype(complex)
     poles = np.log(z[np.abs(z) > 1e-9]) / asked.polytope.period  # the rest decays at once
     assert (-poles.real / np.abs(poles)).min() >= after.tune.damping

@@ -8,8 +8,8 @@ import pytest
 from commands import assert_one_error_line, run
 from sweeping import SCENARIO
 
-from diffabs import variation
-from diffabs.scenario import ScenarioError, dump, load, loads
+from diffabs.scenario import section_sweep
+from diffabs.scenario.scenario import ScenarioError, dump, load, loads
 from diffabs.sweep import Empirical, Results
 
 pytestmark = [pytest.mark.usefixtures("any_step_is_stable", "without_load"), pytest.mark.xdist_group("columns")]
@@ -31,12 +31,12 @@ def scenario(file, tmp_path):
 def test_a_file_is_its_numbers(scenario):
     """In the unit of the path, from the folder of the scenario; the dump holds the numbers themselves."""
     chosen = load(scenario)
-    study = variation.study(chosen)
+    study = section_sweep.study(chosen)
     mass, speed = study.space.variables.values()
     assert mass == Empirical(tuple(MASSES))
     np.testing.assert_allclose(speed.values, np.array(SPEEDS) / 3.6, rtol=1e-15)
     assert set(study.draw(0, 200)["plant.mass"]) == set(MASSES)
-    again = variation.study(loads(dump(chosen).encode(), "again", "again"))
+    again = section_sweep.study(loads(dump(chosen).encode(), "again", "again"))
     assert again.table() == study.table()
 
 
@@ -55,7 +55,7 @@ def test_another_file_is_another_sweep(scenario, tmp_path):
 
 def test_it_may_be_set_on_the_command_line_and_interpolated(scenario):
     change = 'sweep.over.plant.mass={type="empirical", file="day/masses.csv", column="mass [kg]", interpolated=true}'
-    chosen = variation.study(load(scenario, [change]))
+    chosen = section_sweep.study(load(scenario, [change]))
     assert chosen.space.variables["plant.mass"] == Empirical(tuple(MASSES), interpolated=True)
     assert not set(chosen.draw(0, 20)["plant.mass"]) <= set(MASSES)
 
@@ -102,6 +102,6 @@ def test_what_is_wrong_with_a_file_is_said(scenario, tmp_path, change, needed):
 )
 def test_what_is_wrong_with_the_table_is_said(scenario, given, needed):
     with pytest.raises(ScenarioError) as error:
-        variation.study(load(scenario, [f"sweep.over.plant.mass={given}"]))
+        section_sweep.study(load(scenario, [f"sweep.over.plant.mass={given}"]))
     assert needed in str(error.value)
     assert "\n" not in str(error.value)

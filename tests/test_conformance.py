@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 from parts import BLOCKS, PARTS, PLANTS, ROADS, differences, jacobian, leaves, struct, value
 
-from diffabs import protocols
+from diffabs.core import protocols
+from diffabs.core.protocols import BrakeOutput, Clock, Memory, Tracking
+from diffabs.core.pytree import check, get, parameters, replace, strong
 from diffabs.plants import BrakeStart
-from diffabs.protocols import BrakeOutput, Clock, Memory, Tracking
-from diffabs.pytree import check, get, parameters, replace, strong
 
 EVERY = [pytest.param(family, part, id=f"{family}: {name}") for family in PARTS for name, part in PARTS[family].items()]
 # of the families that have no Protocol

@@ -9,15 +9,16 @@ import pytest
 
 import diffabs as d
 from diffabs import controllers, plants
-from diffabs.conveyor import ROUND, _run, measure_lanes
+from diffabs.core.pytree import replace
 from diffabs.objectives import BRAKING
-from diffabs.pytree import replace
+from diffabs.scenario.defaults import braking
 from diffabs.sensors import Noise
+from diffabs.simulate.refill import ROUND, _run, measure_lanes
 from diffabs.stops import SpeedReached
 
 pytestmark = pytest.mark.xdist_group("conveyor")  # one worker compiles what these share
 
-LOOP = d.Loop(
+LOOP = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=30 / 3.6),
     controller=controllers.StateFeedback(gain=np.array([-4000.0, -40.0])),
@@ -96,7 +97,7 @@ def test_lanes_are_those_of_a_batch(keys, expected, width):
 
 
 def test_without_keys(keys, expected):
-    quiet = replace(LOOP, {"sensor": d.Loop(plant=LOOP.plant).sensor})
+    quiet = replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
     found = jax.device_get(measure_lanes(quiet, VALUES, SOLVER, MEASURED, width=4))
     one = jax.device_get(d.measure(replace(quiet, {"initial.speed": SPEEDS[3]}), SOLVER, MEASURED))
     same(jax.tree.map(lambda x: x[3], found), one)

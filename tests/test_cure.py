@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from diffabs import FixedStep
-from diffabs.scenario import load
+from diffabs.scenario.scenario import load
 
 ROOT = pathlib.Path(__file__).parent.parent
 STEP = 2.5e-4  # s

@@ -6,7 +6,8 @@ import re
 import pytest
 from rich.console import Console
 
-from diffabs import papers, show
+from diffabs import papers
+from diffabs.cli import show
 from diffabs.papers import arm_balance, lmi_design, record, slip_estimator, slip_lmi
 from diffabs.papers.digest import Refuted, close, computed, decimals, published, verdict
 

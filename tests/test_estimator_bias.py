@@ -8,6 +8,7 @@ import pytest
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, references, roads, sensors
+from diffabs.scenario.defaults import braking
 
 DURATION, STEP, STOP = 12.0, 1e-3, 0.05
 B, C, D, E = 13.00891, 1.47692, 0.98483, -1.08841
@@ -52,7 +53,7 @@ def paper(bias):
 
 
 def ours(bias):
-    loop = d.Loop(
+    loop = braking(
         plant=plants.QuarterCar(inertia=J, road=roads.MagicFormula(B=B, C=C, D=D, E=E)),
         sensor=sensors.IntegratedAccelerometer(bias=bias),
         reference=references.PeakLatch(),

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from diffabs import FixedStep
-from diffabs.pytree import replace
-from diffabs.scenario import load
+from diffabs.core.pytree import replace
+from diffabs.scenario.scenario import load
 
 pytest.importorskip("matplotlib")
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("experiments")]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from diffabs.objectives import Overshoot
-from diffabs.scenario import ScenarioError, load
+from diffabs.scenario.scenario import ScenarioError, load
 
 
 def test_some_scenarios_are_refused_in_a_line_or_run_to_numbers_that_can_be():

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import diffabs as d
-from diffabs import actuators, blocks, controllers, objectives, plants, references, roads, sensors
-from diffabs.pytree import get, parameters, replace, strong
+from diffabs import actuators, controllers, objectives, plants, references, roads, sensors
+from diffabs.core import blocks
+from diffabs.core.pytree import get, parameters, replace, strong
+from diffabs.scenario.defaults import braking
 from diffabs.stops import Fallen, SpeedReached, Standstill
 
 OBJECTIVES = {
@@ -38,8 +40,8 @@ PATCHES = roads.Patches(
 )
 # Together these hold every part that a loop can be made of; the last test of this file sees to it.
 LOOPS = {
-    "feedback": d.Loop(**RIG, controller=controllers.StateFeedback(), feedforward=controllers.HoldingInput()),
-    "filtered reference": d.Loop(
+    "feedback": braking(**RIG, controller=controllers.StateFeedback(), feedforward=controllers.HoldingInput()),
+    "filtered reference": braking(
         **RIG,
         controller=controllers.ScheduledFeedback(
             speeds=np.array([2.0, 20.0]),
@@ -53,27 +55,27 @@ LOOPS = {
         reference=references.FilteredSlip(time_constant=0.02),
         actuator=actuators.Lag(time_constant=0.002),
     ),
-    "proportional": d.Loop(
+    "proportional": braking(
         **RIG,
         sensor=sensors.SpeedScale(factor=0.98),
         controller=controllers.ProportionalFeedback(gain=np.array([-8000.0, -200.0])),
         feedforward=controllers.HoldingInput(),
     ),
-    "latch": d.Loop(
+    "latch": braking(
         **CAR | {"stop": Standstill(speed=5.5)},
         controller=controllers.PID(ki=5000.0, kd=5.67, torque_max=200.0),
         reference=references.PeakLatch(),
     ),
-    "lock": d.Loop(
+    "lock": braking(
         plant=plants.LabRig(),
         initial=d.BrakeStart(speed=8.0, slip=0.1),
         stop=SpeedReached(speed=5.5),
         controller=controllers.ConstantTorque(torque=0.95),
     ),
-    "relay": d.Loop(
+    "relay": braking(
         **CAR, controller=controllers.Relay(torque_max=250.0), actuator=actuators.Limits(low=5.0, high=190.0)
     ),
-    "computer": d.Loop(
+    "computer": braking(
         **CAR | {"plant": plants.QuarterCar(road=PATCHES)},
         controller=controllers.Sampled(
             controller=controllers.PID(kp=900.0, ki=2000.0, torque_max=120.0, antiwindup=controllers.Clamping()),
@@ -82,7 +84,7 @@ LOOPS = {
         ),
         actuator=blocks.Series(blocks=(actuators.RateLimit(rate=4137.0), actuators.Lag(time_constant=0.003))),
     ),
-    "noisy": d.Loop(
+    "noisy": braking(
         **CAR,
         controller=controllers.SlidingMode(gain=160.0, boundary=0.05, torque_max=150.0),
         reference=references.PeakRobust(time_constant=0.004, threshold=0.02),
@@ -96,7 +98,7 @@ LOOPS = {
             )
         ),
     ),
-    "arm": d.Loop(
+    "arm": braking(
         plant=plants.ArmBalance(arm_length=-0.5, gear=1.1, rotor_inertia=0.3),
         initial=plants.BalanceStart(theta=0.004, psi=0.01, phi=0.001, theta_rate=-0.001, psi_rate=0.02, phi_rate=0.002),
         reference=references.Upright(),
@@ -104,7 +106,7 @@ LOOPS = {
         actuator=actuators.VoltageLimit(),
         stop=Fallen(),
     ),
-    "arm, observed": d.Loop(
+    "arm, observed": braking(
         plant=plants.PrintedArm(),
         initial=plants.BalanceStart(theta=0.1, psi=0.05, phi=0.03),
         reference=references.Upright(),
@@ -122,7 +124,7 @@ LOOPS = {
         actuator=actuators.VoltageLimit(),
         stop=Fallen(),
     ),
-    "delay": d.Loop(
+    "delay": braking(
         **CAR,
         controller=controllers.PID(kp=300.0, kd=1.0, torque_max=250.0),
         reference=references.PeakLiteral(slip=0.15),
@@ -208,7 +210,7 @@ def _sensitivity(loop, paths, objective="stop_distance", step=1e-4, difference=N
     return np.asarray((many(moves) - many(-moves)) / (2 * difference))
 
 
-FULL = d.Loop(plant=plants.QuarterCar(road=roads.MagicFormula(), inertia=1.0539))
+FULL = braking(plant=plants.QuarterCar(road=roads.MagicFormula(), inertia=1.0539))
 
 
 def test_sensitivity_of_the_conventional_brake():

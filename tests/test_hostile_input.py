@@ -5,7 +5,7 @@ import os
 import pytest
 from commands import assert_one_error_line, left_in, run
 
-from diffabs.design.certificate import Certificate
+from diffabs.design.proof.certificate import Certificate
 
 pytestmark = [pytest.mark.xdist_group("hostile"), pytest.mark.usefixtures("any_step_is_stable", "without_load")]
 

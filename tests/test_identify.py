@@ -10,13 +10,14 @@ from scipy.optimize import curve_fit
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, references, roads, stops
-from diffabs.pytree import Scalar, param, pytree, replace
-from diffabs.tune.descent import Reason
-from diffabs.tune.fit import Tolerances, fit
-from diffabs.tune.identification import identify
-from diffabs.tune.squares import gaussian
-from diffabs.tune.table import Table
-from diffabs.tune.traces import Traces
+from diffabs.core.pytree import Scalar, param, pytree, replace
+from diffabs.core.reason import Reason
+from diffabs.identify.fit import Tolerances, fit
+from diffabs.identify.identification import identify
+from diffabs.identify.residuals import gaussian
+from diffabs.identify.table import Table
+from diffabs.identify.traces import Traces
+from diffabs.scenario.defaults import braking
 
 X = np.linspace(0.0, 3.0, 13)
 NOISE = np.random.default_rng(3).standard_normal(13)
@@ -222,7 +223,7 @@ class TestFit:
 
 
 ROAD = roads.Scaled(road=roads.MagicFormula(), scale=1.0)
-LOOP = d.Loop(
+LOOP = braking(
     plant=plants.QuarterCar(road=ROAD),
     reference=references.FixedSlip(),
     controller=controllers.ConstantTorque(torque=90.0),
@@ -355,7 +356,7 @@ class TestTable:
             ({"values": {"locked": {"stop_time": np.nan}}}, "row locked: stop_time = nan is not finite"),
             ({"sigma": {"stop_time": 0.0}}, r"sigma.stop_time = 0 is outside \(0, inf\)"),
             ({"sigma": {"iae": 1.0}}, "sigma: none for stop_time"),
-            ({"loops": {"locked": d.Loop()}}, "row locked: plant.road.scale is not a parameter of its loop"),
+            ({"loops": {"locked": braking()}}, "row locked: plant.road.scale is not a parameter of its loop"),
         ],
     )  # fmt: skip
     def test_tables_that_do_not_fit_are_named(self, changed, message):

@@ -6,7 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from diffabs.integrate import axpy, rk4_step
+from diffabs.core.numerics import axpy
+from diffabs.simulate.rk4 import rk4_step
 
 
 def integrate(derivative, x, end, steps):

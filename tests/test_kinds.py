@@ -13,11 +13,12 @@ import pytest
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, roads, stops
-from diffabs.conveyor import measure_lanes
-from diffabs.pytree import check, strong
+from diffabs.core.pytree import check, strong
+from diffabs.scenario.defaults import braking
+from diffabs.simulate.refill import measure_lanes
 
 SOLVER = d.FixedStep(1e-3, 0.25)
-RIG = d.Loop(
+RIG = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=30 / 3.6),
     stop=stops.SpeedReached(speed=29 / 3.6),

@@ -10,7 +10,6 @@ from jax.flatten_util import ravel_pytree
 from scipy.signal import cont2discrete
 
 from diffabs.actuators import Delay, Lag, Limits, RateLimit
-from diffabs.blocks import Direct, Series
 from diffabs.controllers import (
     PID,
     BackCalculation,
@@ -21,16 +20,18 @@ from diffabs.controllers import (
     SlidingMode,
     StateFeedback,
 )
-from diffabs.design.reduction import state_feedback
-from diffabs.integrate import rk4_step
-from diffabs.linearize import LowPass, Sampling, SlipModel, linearize, tracking
-from diffabs.loop import Loop
+from diffabs.core.blocks import Direct, Series
+from diffabs.core.protocols import BrakeOutput, Clock
+from diffabs.core.pytree import check, replace, strong
+from diffabs.design.state_feedback import state_feedback
+from diffabs.linear.linearization import linearize, tracking
+from diffabs.linear.slip_model import LowPass, Sampling, SlipModel
 from diffabs.plants import BrakeStart, LabRig, MirroredRig, QuarterCar
-from diffabs.protocols import BrakeOutput, Clock
-from diffabs.pytree import check, replace, strong
 from diffabs.references import FilteredSlip, FixedSlip
 from diffabs.roads import WET_ASPHALT, Burckhardt
+from diffabs.scenario.defaults import braking
 from diffabs.sensors import Bias, WheelSpeed
+from diffabs.simulate.rk4 import rk4_step
 
 K = 1 / 3.6
 R1, R2, J1, G = 0.0995, 0.099, 7.53e-3, 9.81
@@ -260,8 +261,8 @@ def test_sampled_loop_is_the_model(controller, delay):
         "actuator": Lag(),
         "initial": BrakeStart(speed=speed, slip=0.2),
     }
-    reduced = state_feedback(Loop(plant=MirroredRig(), reference=FixedSlip(slip=0.2), **parts))
-    loop = Loop(plant=FrozenRig(speed), reference=FixedSlip(slip=0.2), **parts)
+    reduced = state_feedback(braking(plant=MirroredRig(), reference=FixedSlip(slip=0.2), **parts))
+    loop = braking(plant=FrozenRig(speed), reference=FixedSlip(slip=0.2), **parts)
     tau = float(MirroredRig().holding(BrakeOutput(0.2, speed, 0.0, 0.0, 0.0), 0.2))
     pid = isinstance(controller, PID)
     z = jnp.array([0.0, 0.2, tau, tau] + [0.0] * pid)
@@ -297,7 +298,7 @@ def test_reduction_has_the_modes_of_the_loop(plant, name, actuator):
     if isinstance(plant, QuarterCar):
         controller = replace(controller, {"torque_max": np.inf})
     parts = {"reference": FixedSlip(slip=0.2), "feedforward": HoldingInput(), "controller": controller}
-    loop = Loop(plant=plant, initial=BrakeStart(speed=9.0, slip=0.2), actuator=actuator, **parts)
+    loop = braking(plant=plant, initial=BrakeStart(speed=9.0, slip=0.2), actuator=actuator, **parts)
     reduced = state_feedback(loop)
     a, b = reduced.model.matrices()
     state = loop.start()
@@ -324,7 +325,7 @@ def test_reduction_has_the_modes_of_the_loop(plant, name, actuator):
 
 def test_what_is_neglected():
     lag = Lag(time_constant=0.02)
-    loop = Loop(
+    loop = braking(
         plant=MirroredRig(),
         controller=PID(kp=30.0, ki=9.0, antiwindup=BackCalculation()),
         actuator=Series(blocks=(Delay(time=0.004), lag, Limits(), Direct())),
@@ -350,7 +351,7 @@ def test_what_is_neglected():
     assert plain.exact
     assert "The actuator's rate limit of 70 N m/s." in plain.neglected
     assert "The sensor's bias, a disturbance." in plain.neglected
-    assert state_feedback(Loop(controller=StateFeedback(), feedforward=HoldingInput())).neglected == (
+    assert state_feedback(braking(controller=StateFeedback(), feedforward=HoldingInput())).neglected == (
         "The fall of the speed: it is frozen.",
     )
 
@@ -370,7 +371,7 @@ def test_what_is_neglected():
 )
 def test_what_cannot_be_reduced(change, message):
     with pytest.raises(ValueError, match=message):
-        state_feedback(replace(Loop(), change))
+        state_feedback(replace(braking(), change))
 
 
 @pytest.mark.parametrize(

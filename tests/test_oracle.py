@@ -7,6 +7,7 @@ from oracles import brake
 import diffabs as d
 from diffabs import controllers, plants, roads
 from diffabs.objectives import IAE, MaxSlip, StopDistance, StopTime
+from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached
 
 OBJECTIVES = {"stop_time": StopTime(), "stop_distance": StopDistance(), "max_slip": MaxSlip(), "iae": IAE()}
@@ -33,7 +34,7 @@ def _case(seed):
     """A loop, and the same controller for the oracle: (loop, torque, rates, length of its memory)."""
     rng = np.random.default_rng(seed)
     plant = _plant(rng, _road(rng))
-    loop = d.Loop(
+    loop = braking(
         plant=plant, initial=d.BrakeStart(speed=rng.uniform(9, 14)), stop=SpeedReached(speed=rng.uniform(1.5, 2.5))
     )
     output = plant.output(plant.start(loop.initial))
@@ -43,7 +44,7 @@ def _case(seed):
     if kind == "smooth":
         k1, k2 = -3.0 * scale, -0.2 * scale
         controller = controllers.StateFeedback(gain=np.array([k1, k2]))
-        loop = d.Loop(**_fields(loop), controller=controller, feedforward=controllers.ConstantInput(value=hold))
+        loop = braking(**_fields(loop), controller=controller, feedforward=controllers.ConstantInput(value=hold))
         return loop, lambda t, s, m: hold + k1 * m[0] + k2 * (s - 0.2), lambda t, s, m: [s - 0.2], 1
     if kind == "pid":
         kp, ki, kd, wc, top = scale, 2 * scale, 0.002 * scale, 55.0, 1.5 * hold
@@ -54,13 +55,13 @@ def _case(seed):
             return np.clip(kp * e + ki * m[0] + kd * wc * (e - m[1]), 0, top)
 
         return (
-            d.Loop(**_fields(loop), controller=controller),
+            braking(**_fields(loop), controller=controller),
             torque,
             lambda t, s, m: [0.2 - s, wc * (0.2 - s - m[1])],
             2,
         )
     top = rng.uniform(1.2, 2.0) * hold  # locks the wheel
-    return d.Loop(**_fields(loop), controller=controllers.ConstantTorque(torque=top)), lambda t, s, m: top, None, 0
+    return braking(**_fields(loop), controller=controllers.ConstantTorque(torque=top)), lambda t, s, m: top, None, 0
 
 
 def _fields(loop):
@@ -82,7 +83,7 @@ def test_random_scenario_agrees_with_scipy(seed):
 
 def test_lab_rig_locks_and_stops_like_scipy():
     plant = plants.LabRig()
-    loop = d.Loop(
+    loop = braking(
         plant=plant,
         initial=d.BrakeStart(speed=12.0),
         controller=controllers.ConstantTorque(torque=0.8),

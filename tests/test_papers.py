@@ -13,10 +13,12 @@ pytest.importorskip("matplotlib")
 
 from rich.console import Console
 
-from diffabs import FixedStep, Loop, measure, plot, rollout, show
+from diffabs import FixedStep, measure, plot, rollout
+from diffabs.cli import show
 from diffabs.objectives import BRAKING
 from diffabs.papers import PAPERS, arm_balance, compact, lmi_design, record, slip_estimator, slip_lmi
 from diffabs.references import FixedSlip
+from diffabs.scenario.defaults import braking
 
 pytestmark = pytest.mark.xdist_group("papers")  # one worker makes what these share
 
@@ -298,7 +300,7 @@ def test_a_number_that_is_not_finite_is_not_written(tmp_path):
 
 def test_braking_draws_the_run(tmp_path):
     solver = FixedStep(step=1e-2, duration=0.1)
-    figure = plot.braking(rollout(Loop(reference=FixedSlip()), solver, BRAKING), title="a run")
+    figure = plot.braking(rollout(braking(reference=FixedSlip()), solver, BRAKING), title="a run")
     slip, speed, torque, deceleration = figure.axes
     assert [line.get_label() for line in slip.lines] == ["slip", "target", "setpoint"]
     assert speed.get_ylabel() == "speed [km/h]"
@@ -311,7 +313,7 @@ def test_braking_draws_the_run(tmp_path):
 
 def test_a_run_without_a_trajectory_cannot_be_drawn():
     with pytest.raises(ValueError, match="rollout"):
-        plot.braking(measure(Loop(), FixedStep(step=1e-2, duration=0.1), BRAKING))
+        plot.braking(measure(braking(), FixedStep(step=1e-2, duration=0.1), BRAKING))
 
 
 def test_a_figure_that_fails_leaves_nothing_behind(tmp_path):

@@ -8,9 +8,9 @@ import shlex
 import pytest
 import typer
 
-from diffabs.cli import app
+from diffabs.cli.main import app
 from diffabs.papers import PAPERS
-from diffabs.scenario import names
+from diffabs.scenario.scenario import names
 
 ROOT = pathlib.Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "papers.md").read_text(encoding="utf-8")

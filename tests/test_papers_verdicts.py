@@ -12,8 +12,8 @@ from scipy.interpolate import PchipInterpolator
 pytest.importorskip("matplotlib")
 
 from diffabs import FixedStep, roads
-from diffabs.design.box import polytope
-from diffabs.linearize import SlipModel
+from diffabs.design.parameter_box import polytope
+from diffabs.linear.slip_model import SlipModel
 from diffabs.papers import arm_equations, estimator_claims, lmi_claims, lmi_design, slip_estimator, slip_lmi
 from diffabs.plants import ArmBalance, BrakeStart, MirroredRig
 from diffabs.plants.arm_balance import ArmState

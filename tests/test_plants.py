@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from parts import PLANTS
 
+from diffabs.core.protocols import BrakeOutput
 from diffabs.plants import GRAVITY, BrakeStart, LabRig, MirroredRig, QuarterCar
 from diffabs.plants.lab_rig import LabRigState
-from diffabs.protocols import BrakeOutput
 from diffabs.roads import DRY_ASPHALT, RIG, SNOW, SPLINE_B, Burckhardt
 
 NO_FRICTION = Burckhardt(c1=0.0, c3=0.0)

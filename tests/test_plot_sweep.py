@@ -8,12 +8,12 @@ from matplotlib.text import Text
 from scipy.stats import beta
 from sweeping import manifest
 
-from diffabs import plot_sweep as plots
+from diffabs.plot import sweeps as plots
 from diffabs.sweep import Results
 from diffabs.sweep.manifest import Seals
 from diffabs.sweep.seal import encoded as chunk
+from diffabs.sweep.statistics.summary import summary
 from diffabs.sweep.store import Store
-from diffabs.sweep.summary import summary
 
 N = 1200
 A, B, C = np.random.default_rng(5).random((3, N))

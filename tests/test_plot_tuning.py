@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from diffabs import plot_tuning as plots
-from diffabs.protocols import BrakeOutput, Sample
-from diffabs.rollout import Trajectory
+from diffabs.core.protocols import BrakeOutput, Sample
+from diffabs.plot import tuning as plots
+from diffabs.simulate.solution import Trajectory
 from diffabs.tune import Point
 
 HISTORY = [Point(i, 10.0 ** (1 - i), 1.0, 10.0**-i, max(0.0, 0.2 - 0.1 * i), 2 * i + 1) for i in range(5)]

@@ -6,11 +6,12 @@ import pytest
 from scipy.optimize import linprog
 
 from diffabs.actuators import Lag
-from diffabs.design import box as boxes
-from diffabs.design.box import polytope, schedule
-from diffabs.linearize import Sampling, SlipModel, StateSpace
+from diffabs.core.pytree import param, pytree, replace
+from diffabs.design import parameter_box as boxes
+from diffabs.design.parameter_box import polytope, schedule
+from diffabs.linear.linearization import StateSpace
+from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.plants import MirroredRig
-from diffabs.pytree import param, pytree, replace
 from diffabs.roads import RIG, SPLINE_B, Scaled
 
 K = 1 / 3.6

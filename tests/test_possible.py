@@ -8,10 +8,12 @@ import parts
 import pytest
 
 import diffabs as d
-from diffabs import actuators, blocks, controllers, objectives
-from diffabs.misfits import misfits
+from diffabs import actuators, controllers, objectives
+from diffabs.core import blocks
+from diffabs.core.pytree import parameters, replace
 from diffabs.objectives import BALANCE, BRAKING
-from diffabs.pytree import parameters, replace
+from diffabs.scenario.compatibility import misfits
+from diffabs.scenario.defaults import braking
 
 MEASURED = {
     "braking": BRAKING
@@ -26,7 +28,7 @@ STEPS = (1e-4, 1e-3, 1e-2)
 def drawn(rng, task):
     """A loop of parts that fit, whatever they do together."""
     plant = rng.choice(list((parts.PLANTS if task == "braking" else parts.BALANCES).values()))
-    typical = d.loop.TYPICAL[task]
+    typical = {"braking": d.braking, "balance": d.balancing}[task]()
     choices = {"controller": parts.CONTROLLERS, "sensor": parts.SENSORS, "actuator": parts.ACTUATORS}
     choices |= {"reference": parts.REFERENCES, "stop": parts.PARTS["stop"], "feedforward": parts.PARTS["feedforward"]}
     loop = dataclasses.replace(typical, plant=plant)
@@ -80,7 +82,7 @@ def test_no_metric_without_a_flag_is_impossible(task, seed):
 def test_a_brake_never_speeds_the_car_up_without_a_flag():
     """A lag from well resolved to far beyond the step, around a brake with limits: the car is no faster at the end than
     at the start, or the run has diverged."""
-    loop = d.Loop(
+    loop = braking(
         controller=controllers.PID(kp=3893.0),
         actuator=blocks.Series(blocks=(actuators.Lag(), actuators.Limits(high=400.0))),
     )

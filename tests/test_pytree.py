@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import diffabs
-from diffabs.pytree import check, get, param, parameters, part, prepared, problems, pytree, replace, static, strong
+from diffabs.core.pytree import check, get, param, parameters, part, prepared, problems, pytree, replace, static, strong
 from diffabs.roads import DRY_ASPHALT, SPLINE_B, MagicFormula, Patches, Scaled
 
 

@@ -6,8 +6,25 @@ from scipy.integrate import quad
 from scipy.stats import chi2, norm
 from scipy.stats import t as student_t
 
-from diffabs.sweep.proposals import Estimate, Importance, Mixture, Runs, design_points, pays, proposal, student
-from diffabs.sweep.rare import Reason, _advanced, _cov, _estimate, _plan, _Population, subset_simulation
+from diffabs.reliability.importance_sampling import (
+    Estimate,
+    Importance,
+    Mixture,
+    Runs,
+    design_points,
+    pays,
+    proposal,
+    student,
+)
+from diffabs.reliability.subset_simulation import (
+    Reason,
+    _advanced,
+    _cov,
+    _estimate,
+    _plan,
+    _Population,
+    subset_simulation,
+)
 
 B6 = norm.isf(1e-6)
 

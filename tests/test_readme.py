@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from diffabs.cli import app
-from diffabs.scenario import load
+from diffabs.cli.main import app
+from diffabs.scenario.scenario import load
 
 TEXT = (pathlib.Path(__file__).parent.parent / "README.md").read_text()
 SWEEPS = (pathlib.Path(__file__).parent.parent / "docs" / "sweeps.md").read_text()

@@ -11,21 +11,24 @@ import pytest
 from sweeping import described
 
 import diffabs as d
-from diffabs import actuators, controllers, objectives, plants, references, refusals, roads, sensors, stability
-from diffabs.basin import outcomes
-from diffabs.conveyor import measure_lanes
+from diffabs import actuators, controllers, objectives, plants, references, roads, sensors
+from diffabs.core.protocols import BrakeOutput, Ending, Sample
+from diffabs.core.pytree import replace, strong
+from diffabs.design.attraction import outcomes
+from diffabs.identify import Traces, identify
 from diffabs.objectives import BALANCE, BRAKING
 from diffabs.plants.audit import BrakeAudit
-from diffabs.protocols import BrakeOutput, Ending, Sample
-from diffabs.pytree import replace, strong
-from diffabs.rollout import _impossible
+from diffabs.reliability.failure import failure_probability
+from diffabs.scenario.defaults import braking
+from diffabs.simulate import refusals, stable_step
+from diffabs.simulate.outcome import _impossible
+from diffabs.simulate.refill import measure_lanes
 from diffabs.stops import Fallen, SpeedReached
 from diffabs.sweep import Results, sweep
-from diffabs.sweep.reliability import failure_probability
-from diffabs.sweep.summary import summary
-from diffabs.tune import Batch, Method, StartError, Traces, identify, posed, run, tune, worst_case
+from diffabs.sweep.statistics.summary import summary
+from diffabs.tune import Batch, Method, StartError, posed, run, tune, worst_case
 
-RIG = d.Loop(
+RIG = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=50 / 3.6),
     sensor=sensors.WheelSpeed(),
@@ -73,7 +76,7 @@ BAD = {  # a loop, values by lane of which the first is fine, and what is said o
         ["initial.speed is not above stop.speed: the run would end before it starts"],
     ),
     "fallen": (
-        dataclasses.replace(d.loop.TYPICAL["balance"], stop=Fallen(angle=0.5)),
+        dataclasses.replace(d.balancing(), stop=Fallen(angle=0.5)),
         {"initial.theta": [0.1, 0.6, -0.5]},
         ["initial is at the stop or beyond: the run would end before it starts"],
     ),
@@ -125,16 +128,16 @@ class TestBeforeARun:
             "plant.mass": rng.uniform(4, 8, n),
             "controller.gain.1": -(10 ** rng.uniform(1, 4, n)),
         }
-        steps = stability.stable_steps(
+        steps = stable_step.stable_steps(
             jax.vmap(lambda v: replace(strong(RIG), v))({path: jnp.asarray(x) for path, x in values.items()})
         )
         for h in (1e-4, 1e-3, float(np.median(steps)), float(steps[7]), float(steps[8]) * (1 + 1e-6)):
-            np.testing.assert_array_equal(stability.stable(RIG, values, h), steps >= h)
-        quick = 1e-4 * np.asarray(stability._bounds(RIG, values, squarings=0)) <= stability.WITHIN
+            np.testing.assert_array_equal(stable_step.stable(RIG, values, h), steps >= h)
+        quick = 1e-4 * np.asarray(stable_step._bounds(RIG, values, squarings=0)) <= stable_step.WITHIN
         assert np.mean(quick) > 0.7 * np.mean(steps >= 1e-4)  # few are left to the eigenvalues
         alike = {"initial.slip": np.linspace(0.0, 0.5, 5)}  # moves no matrix
-        assert stability.stable(RIG, alike, 1e-4).all()
-        assert not stability.stable(RIG, alike, 2e-2).any()
+        assert stable_step.stable(RIG, alike, 1e-4).all()
+        assert not stable_step.stable(RIG, alike, 2e-2).any()
 
 
 class TestAfterARun:
@@ -155,7 +158,7 @@ class TestAfterARun:
             found = d.measure(replace(RIG, {"initial.speed": start}), SOLVER, BRAKING)
             assert found.diverged
             assert np.isnan(found.metrics["stop_time"])
-        fallen = replace(d.loop.TYPICAL["balance"], {"initial.theta": 2.0})
+        fallen = replace(d.balancing(), {"initial.theta": 2.0})
         assert d.measure(fallen, SOLVER, BALANCE).diverged
 
     def test_a_metric_outside_its_range_is_a_run_that_diverged(self):
@@ -176,7 +179,7 @@ class TestAfterARun:
     def test_a_torque_that_drives_the_wheel_is_no_alarm(self):
         """The car speeds up, its energy grows with the torque's work: physical, if hardly a brake."""
         for plant in (plants.MirroredRig(), plants.QuarterCar()):
-            loop = d.Loop(
+            loop = braking(
                 plant=plant, initial=d.BrakeStart(speed=8.0), controller=controllers.ConstantTorque(torque=-3.0),
                 reference=references.FixedSlip(), stop=SpeedReached(speed=1.0),
             )  # fmt: skip
@@ -261,7 +264,7 @@ class TestWhoeverRuns:
         assert np.isnan(done.metrics["stop_time"]).tolist() == [False, True, False]
         with pytest.raises(ValueError, match=r"lane 1: initial.speed = 1 m/s is not above stop.speed"):
             run(RIG, Batch(values), SOLVER, BRAKING)
-        arm = dataclasses.replace(d.loop.TYPICAL["balance"], stop=Fallen(angle=0.5))
+        arm = dataclasses.replace(d.balancing(), stop=Fallen(angle=0.5))
         starts = {"initial.theta": np.array([0.0, 0.6])}
         found = outcomes(arm, starts, d.FixedStep(1e-3, 0.05), band=0.1)
         assert (found.recovered.tolist(), found.diverged.tolist()) == ([True, False], [False, True])

@@ -8,12 +8,13 @@ from scipy.stats import norm
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, stops
+from diffabs.reliability.failure import _gradient, _scores, failure_probability
+from diffabs.reliability.importance_sampling import design_points
+from diffabs.scenario.defaults import braking
 from diffabs.sweep import Normal, Space, Study, Triangular, Uniform
-from diffabs.sweep.proposals import design_points
-from diffabs.sweep.reliability import _gradient, _scores, failure_probability
-from diffabs.sweep.space import Correlation
+from diffabs.sweep.variables import Correlation
 
-RIG = d.Loop(
+RIG = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=30 / 3.6),
     stop=stops.SpeedReached(speed=27 / 3.6),

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
-from diffabs.design.lyapunov import discrete_lyapunov, lyapunov
-from diffabs.design.regulator import dlqr, lqr, unstabilisable
-from diffabs.design.riccati import care, dare
+from diffabs.linear.lyapunov import discrete_lyapunov, lyapunov
+from diffabs.linear.regulator import dlqr, lqr, unstabilisable
+from diffabs.linear.riccati import care, dare
 
 ALPHA, BETA, FAST, SLOW = 83.8796606703, 133.472842636189, 140.291806958, 14.0291806958
 CARE, DARE = jax.jit(care), jax.jit(dare)

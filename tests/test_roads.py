@@ -8,7 +8,7 @@ from parts import ROADS, differences, jacobian
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import brentq
 
-from diffabs.pytree import check, problems, replace, strong
+from diffabs.core.pytree import check, problems, replace, strong
 from diffabs.roads import (
     DRY_ASPHALT,
     ICE,

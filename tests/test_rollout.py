@@ -11,18 +11,19 @@ import diffabs as d
 from diffabs import controllers, plants, references, roads
 from diffabs.actuators import Lag
 from diffabs.objectives import BRAKING, Effort, MaxSlip, TorqueRate, Variation
-from diffabs.rollout import _run
-from diffabs.stability import stable_step
+from diffabs.scenario.defaults import braking
+from diffabs.simulate.run import _run
+from diffabs.simulate.stable_step import stable_step
 from diffabs.stops import SpeedReached, Standstill
 
-RIG = d.Loop(
+RIG = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=50 / 3.6),
     controller=controllers.StateFeedback(),
     feedforward=controllers.HoldingInput(),
     stop=SpeedReached(speed=5 / 3.6),
 )
-SLIDING = d.Loop(  # a locked wheel decelerates at mu(1) g: everything about it is known in closed form
+SLIDING = braking(  # a locked wheel decelerates at mu(1) g: everything about it is known in closed form
     plant=plants.QuarterCar(),
     initial=d.BrakeStart(speed=10.0, slip=1.0),
     controller=controllers.ConstantTorque(torque=500.0),
@@ -88,7 +89,7 @@ def test_a_run_that_does_not_stop_is_charged_the_rest():
 
 
 def test_literal_estimator_does_not_brake():
-    loop = dataclasses.replace(d.Loop(), reference=references.PeakLiteral())
+    loop = dataclasses.replace(braking(), reference=references.PeakLiteral())
     run = d.measure(loop, d.FixedStep(1e-3, 10.0), BRAKING)
     assert not run.stopped
     assert run.ending.sample.output.distance > 270
@@ -173,7 +174,7 @@ def test_bad_solver_is_named(field, value):
 def test_stable_step_is_where_the_scalar_test_equation_says():
     # the P loop's slip rate is r kp/(J v), and RK4 leaves |R(-x)| <= 1 at x = 2.785293563405282
     slippery = plants.QuarterCar(road=roads.Scaled(road=roads.SPLINE_B, scale=1e-3))  # so that the road adds nothing
-    loop, r, kp, J, v = d.Loop(plant=slippery), 0.2, 3893.0, 1.04456, 0.05
+    loop, r, kp, J, v = braking(plant=slippery), 0.2, 3893.0, 1.04456, 0.05
     np.testing.assert_allclose(stable_step(loop), 2.785293563405282 * J * v / (r * kp), rtol=0.02)
     slower = dataclasses.replace(loop, stop=Standstill(speed=0.5))
     assert stable_step(slower) > 8 * stable_step(loop)
@@ -203,7 +204,7 @@ def test_energy_never_increases_down_to_standstill(plant):
     part, torque = PASSIVE[plant]
     solver = d.FixedStep(1e-4, 14.0, every=20)
     for name, road in ROADS.items():
-        loop = d.Loop(
+        loop = braking(
             plant=dataclasses.replace(part, road=road),
             initial=d.BrakeStart(speed=6.0),
             controller=controllers.ConstantTorque(torque=torque),

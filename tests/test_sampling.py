@@ -12,12 +12,13 @@ from scipy import stats
 from scipy.special import ndtri
 from scipy.stats import qmc
 
-from diffabs.pytree import Spec
-from diffabs.sweep import designs, distributions, space
-from diffabs.sweep.designs import Corners, Grid, LatinHypercube, Random, Saltelli, Sobol
+from diffabs.core.pytree import Spec
+from diffabs.scenario.toml import document
+from diffabs.sweep import distributions, sampling
+from diffabs.sweep import variables as space
 from diffabs.sweep.distributions import Categorical, Empirical, LogNormal, Normal, Triangular, Uniform, leaving
-from diffabs.sweep.space import Correlation, Rows, Space
-from diffabs.toml import document
+from diffabs.sweep.sampling import Corners, Grid, LatinHypercube, Random, Saltelli, Sobol
+from diffabs.sweep.variables import Correlation, Rows, Space
 
 MASS = Spec("kg", 0, open_low=True)
 HINT = "; truncate it with low and high"
@@ -203,7 +204,7 @@ def test_random_samples_are_keys_folded_with_their_number():
 @pytest.mark.parametrize("word", [0, 2**32 - 1])
 def test_random_numbers_stay_inside_the_open_interval(monkeypatch, word):
     """The extreme words, which nobody lives to see drawn."""
-    monkeypatch.setattr(designs, "_words", lambda *_: np.full((1, 2, 2), word, np.uint32))
+    monkeypatch.setattr(sampling, "_words", lambda *_: np.full((1, 2, 2), word, np.uint32))
     u = Random().unit(0, 0, 1, 2, 1)
     assert ((u > 0) & (u < 1)).all()
     np.testing.assert_array_equal(np.minimum(u, 1 - u), 2.0**-53)
@@ -214,10 +215,10 @@ def test_random_draws_do_not_depend_on_jaxs_precision_and_compile_once():
     expected = Random().unit(large, 4_000_000_000, 4_000_000_017, 2, large)
     with jax.enable_x64(False):
         np.testing.assert_array_equal(Random().unit(large, 4_000_000_000, 4_000_000_017, 2, large), expected)
-    compiled = designs._words._cache_size()
+    compiled = sampling._words._cache_size()
     Random().unit(3, 17, 34, 2, 100)
     Random().unit(4, 34, 51, 2, 200)
-    assert designs._words._cache_size() == compiled
+    assert sampling._words._cache_size() == compiled
 
 
 def test_sobol_replicates_are_scipys():
@@ -405,7 +406,7 @@ def test_tables_of_distributions_are_read_back(ours):
     ids=str,
 )
 def test_tables_of_designs_are_read_back(ours):
-    assert designs.read(json.loads(json.dumps(ours.table())), "x") == ours
+    assert sampling.read(json.loads(json.dumps(ours.table())), "x") == ours
     assert tomllib.loads(document({"x": ours.table()}, {}))["x"] == ours.table()
 
 
@@ -502,7 +503,7 @@ def test_what_is_wrong_with_a_table_is_said(given, line):
 )
 def test_what_is_wrong_with_the_table_of_a_design_is_said(given, line):
     with pytest.raises(ValueError, match="x") as caught:
-        designs.read(given, "x")
+        sampling.read(given, "x")
     assert line in str(caught.value)
 
 

@@ -6,13 +6,14 @@ import jax
 import numpy as np
 import pytest
 
-from diffabs import catalogue, controllers, roads, scenario
-from diffabs.goal import AGGREGATES, Goal
-from diffabs.loop import Loop
+from diffabs import controllers, roads
 from diffabs.objectives import BRAKING
-from diffabs.robust import Task
-from diffabs.rollout import FixedStep
-from diffabs.scenario import dump, load, names
+from diffabs.scenario import registry, scenario
+from diffabs.scenario.defaults import braking
+from diffabs.scenario.scenario import dump, load, names
+from diffabs.scenario.section_design import Task
+from diffabs.scenario.section_tune import AGGREGATES, Goal
+from diffabs.simulate.solution import FixedStep
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")
 
@@ -115,14 +116,14 @@ def test_everything_nested_survives_dump_and_load(file):
 
 def test_what_is_left_out_has_its_default(file):
     s = load(file(""))
-    assert_same(s, scenario.Scenario(name="mine", loop=Loop(), solver=FixedStep()))
+    assert_same(s, scenario.Scenario(name="mine", loop=braking(), solver=FixedStep()))
 
 
 # The catalogue
 
 
 def test_members_are_told_by_shape():
-    assert set(catalogue.types("plant")) == {
+    assert set(registry.types("plant")) == {
         "quarter-car",
         "mirrored-rig",
         "lab-rig",
@@ -130,24 +131,24 @@ def test_members_are_told_by_shape():
         "acrobot",
         "printed-arm",
     }
-    assert set(catalogue.types("initial")) == {"brake-start", "balance-start"}
-    assert {"burckhardt", "snow", "rig-unrounded", "spline-b"} <= set(catalogue.types("road"))
-    assert not {"peak", "piecewise-cubic"} & set(catalogue.types("road"))
-    assert "pid" in catalogue.types("controller")
-    assert set(catalogue.types("antiwindup")) == {"no-anti-windup", "clamping", "back-calculation"}
-    assert set(catalogue.types("feedforward")) == {"no-feedforward", "constant-input", "holding-input"}
-    assert not set(catalogue.types("controller")) & {*catalogue.types("antiwindup"), *catalogue.types("feedforward")}
-    assert {"direct", "series", "lag"} <= set(catalogue.types("actuator"))
-    assert {"direct", "series", "noise"} <= set(catalogue.types("sensor"))
-    assert set(catalogue.types("stop")) == {"standstill", "speed-reached", "fallen"}
-    assert catalogue.types("road")["snow"] is roads.SNOW
+    assert set(registry.types("initial")) == {"brake-start", "balance-start"}
+    assert {"burckhardt", "snow", "rig-unrounded", "spline-b"} <= set(registry.types("road"))
+    assert not {"peak", "piecewise-cubic"} & set(registry.types("road"))
+    assert "pid" in registry.types("controller")
+    assert set(registry.types("antiwindup")) == {"no-anti-windup", "clamping", "back-calculation"}
+    assert set(registry.types("feedforward")) == {"no-feedforward", "constant-input", "holding-input"}
+    assert not set(registry.types("controller")) & {*registry.types("antiwindup"), *registry.types("feedforward")}
+    assert {"direct", "series", "lag"} <= set(registry.types("actuator"))
+    assert {"direct", "series", "noise"} <= set(registry.types("sensor"))
+    assert set(registry.types("stop")) == {"standstill", "speed-reached", "fallen"}
+    assert registry.types("road")["snow"] is roads.SNOW
 
 
-@pytest.mark.parametrize("family", catalogue.FAMILIES)
+@pytest.mark.parametrize("family", registry.FAMILIES)
 def test_every_exported_part_is_in_one_family_or_another(family):
     """An exported part class that no family recognises could not be used in a scenario."""
-    modules, _ = catalogue.FAMILIES[family]
-    known = {type(part) for name in catalogue.FAMILIES for part in catalogue.types(name).values()}
+    modules, _ = registry.FAMILIES[family]
+    known = {type(part) for name in registry.FAMILIES for part in registry.types(name).values()}
     helpers = {"Peak"}
     for module in modules:
         classes = {x for x in vars(module).values() if isinstance(x, type) and dataclasses.is_dataclass(x)}
@@ -155,7 +156,7 @@ def test_every_exported_part_is_in_one_family_or_another(family):
 
 
 def test_every_objective_says_its_unit():
-    units = {name: catalogue.unit_of(part) for name, part in BRAKING.items()}
+    units = {name: registry.unit_of(part) for name, part in BRAKING.items()}
     assert units == {
         "stop_time": "s",
         "stop_distance": "m",
@@ -302,7 +303,7 @@ def test_ranges_by_the_names_of_the_linear_model(file):
 
 
 def test_no_stable_step_is_needed_for_what_is_not_integrated(monkeypatch):
-    monkeypatch.setattr("diffabs.refusals.stable_step", lambda loop: pytest.fail("asked"))
+    monkeypatch.setattr("diffabs.simulate.refusals.stable_step", lambda loop: pytest.fail("asked"))
     load("slip-lmi", integrated=False)
 
 
@@ -423,7 +424,7 @@ def test_lanes_are_every_combination_with_one_noise():
 def test_aggregates_are_those_of_the_library(kind):
     """The section is read without the extra; here the two are compared."""
     part = Goal(aggregate={"type": kind, **{name: value for name, (value, _) in AGGREGATES[kind].items()}}).aggregated()
-    assert catalogue.kebab(type(part).__name__).replace("cva-r", "cvar") == kind
+    assert registry.kebab(type(part).__name__).replace("cva-r", "cvar") == kind
     fields = {field.name: field.metadata["spec"] for field in dataclasses.fields(part)}
     assert fields == {name: spec for name, (_, spec) in AGGREGATES[kind].items()}
     assert {name: getattr(type(part)(), name) for name in fields} == {n: v for n, (v, _) in AGGREGATES[kind].items()}

@@ -2,7 +2,7 @@
 
 import pytest
 
-from diffabs.scenario import ScenarioError, load, names
+from diffabs.scenario.scenario import ScenarioError, load, names
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")
 
@@ -241,9 +241,9 @@ def test_nothing_is_evaluated(file):
 
 @pytest.fixture
 def checked_step(monkeypatch):
-    from diffabs.stability import stable_step
+    from diffabs.simulate.stable_step import stable_step
 
-    monkeypatch.setattr("diffabs.refusals.stable_step", stable_step)
+    monkeypatch.setattr("diffabs.simulate.refusals.stable_step", stable_step)
 
 
 def test_unstable_step(checked_step):

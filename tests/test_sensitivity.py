@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from diffabs.design import Polytope, Spec, analysis, certify, design, lmi
-from diffabs.design.decay import certified_decay
-from diffabs.design.frame import design_frames
-from diffabs.design.programme import Programme
-from diffabs.design.riccati import care
-from diffabs.design.sensitivity import robust_design, robust_gain
+from diffabs.design import Polytope, Spec, analysis, certify, design
+from diffabs.design.interior.decay_rate import certified_decay
+from diffabs.design.interior.differentiable import robust_design, robust_gain
+from diffabs.design.sdp import solver
+from diffabs.design.sdp.program import Programme
+from diffabs.design.sdp.scaling import design_frames
+from diffabs.linear.riccati import care
 
 BETA, ALPHAS = 133.472842636189, (83.8796606703, 84.6321445666)  # as in test_design
 FAST, SLOW = 140.291806958, 14.0291806958
@@ -108,7 +109,7 @@ def test_cost_obeys_the_envelope_theorem():
         frame = next(design_frames(RIG, spec.Q, spec.R))[0]
         programme = Programme(RIG, RIG, spec, frame)
         blocks = programme.blocks(1.0)
-        answer = lmi.solve(programme.objective(), blocks)
+        answer = solver.solve(programme.objective(), blocks)
         v = programme.unknowns.values(answer.y)
         sizes = [float(max(np.abs(b.G).max(), np.abs(b.h).max())) for b in programme.common[:4]]
         group = next(w for w, b in zip(answer.multipliers, blocks, strict=True) if b.h.shape[-1] == 5)

@@ -18,7 +18,7 @@ from sweeping import described
 import diffabs as d
 from diffabs import roads
 from diffabs.objectives import Effort
-from diffabs.rollout import measure, rollout
+from diffabs.simulate.run import measure, rollout
 from diffabs.sweep import Categorical, Local, Normal, Results, Space, SweepError, Uniform, sweep
 from diffabs.sweep.seal import contents
 from diffabs.sweep.trajectories import keep

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from diffabs.sweep import comparison, sensitivity, statistics
-from diffabs.sweep.statistics import Count, Moments, Tail
+from diffabs.sweep.statistics import estimates, paired, sensitivity
+from diffabs.sweep.statistics.estimates import Count, Moments, Tail
 
 REPETITIONS = 1000
 
@@ -42,15 +42,15 @@ class TestColumn:
         "function",
         [
             Moments.of,
-            statistics.replicated,
-            statistics.summary,
-            lambda x: statistics.quantile(x, 0.5),
-            lambda x: statistics.cvar(x, 0.5),
+            estimates.replicated,
+            estimates.summary,
+            lambda x: estimates.quantile(x, 0.5),
+            lambda x: estimates.cvar(x, 0.5),
             lambda x: Tail.of(x, np.arange(len(x)), 2),
             lambda x: sensitivity.correlations(x[:, None], np.arange(6.0)),
             lambda x: sensitivity.correlations(np.ones((6, 1)), x),
             lambda x: sensitivity.sobol_indices(np.ones(6), np.ones(6), x[None]),
-            lambda x: comparison.paired(np.ones(6), x),
+            lambda x: paired.paired(np.ones(6), x),
         ],
     )
     def test_what_is_not_finite_is_counted(self, function):
@@ -67,17 +67,17 @@ class TestColumn:
         with pytest.raises(ValueError, match="confidence = 1 is outside"):
             Count(1, 2).probability(confidence=1.0)
         with pytest.raises(ValueError, match=r"level = 1 is outside \(0, 1\)"):
-            statistics.quantile([1.0, 2.0], 1.0)
+            estimates.quantile([1.0, 2.0], 1.0)
         with pytest.raises(ValueError, match=r"level = 1 is outside \[0, 1\)"):
-            statistics.cvar([1.0, 2.0], 1.0)
+            estimates.cvar([1.0, 2.0], 1.0)
         with pytest.raises(ValueError, match=r"99 replicates are too few for confidence = 0\.99"):
-            statistics.cvar(np.arange(99.0), 0.5, confidence=0.99, replicates=99)
+            estimates.cvar(np.arange(99.0), 0.5, confidence=0.99, replicates=99)
         with pytest.raises(ValueError, match="99 replicates are too few"):
             sensitivity.sobol_indices(np.ones(6), np.ones(6), np.ones((2, 6)), confidence=0.99, replicates=99)
         with pytest.raises(ValueError, match="do not merge"):
             Tail.of([1.0], [0], 2).merge(Tail.of([1.0], [0], 3))
         with pytest.raises(ValueError, match="are not pairs"):
-            comparison.paired(np.ones(5), np.ones(6))
+            paired.paired(np.ones(5), np.ones(6))
         with pytest.raises(ValueError, match=r"\(5, 2\) do not fit 6 outputs"):
             sensitivity.correlations(np.ones((5, 2)), np.ones(6))
         with pytest.raises(ValueError, match="do not fit"):
@@ -140,15 +140,15 @@ class TestQuantile:
         x, below = np.arange(1.0, n + 1), np.cumsum(stats.binom.pmf(np.arange(n + 1), n, level))
         low = max((r for r in range(1, n + 1) if below[r - 1] <= 0.05), default=-math.inf)
         high = min((s for s in range(1, n + 1) if below[s - 1] >= 0.95), default=math.inf)
-        found = statistics.quantile(np.random.default_rng(2).permutation(x), level, confidence=0.9)
+        found = estimates.quantile(np.random.default_rng(2).permutation(x), level, confidence=0.9)
         assert ends(found) == [low, high]
         assert found.value == np.clip(np.quantile(x, level), low, high)
 
     def test_an_end_that_cannot_be_had_is_infinite(self):
         x = np.random.default_rng(3).random(100)
-        assert statistics.quantile(x, 0.999).high == math.inf
-        assert statistics.quantile(x, 0.999).low > x.mean()
-        assert statistics.quantile(x, 0.001).low == -math.inf
+        assert estimates.quantile(x, 0.999).high == math.inf
+        assert estimates.quantile(x, 0.999).low > x.mean()
+        assert estimates.quantile(x, 0.001).low == -math.inf
 
 
 def brute_cvar(x, level):
@@ -164,26 +164,26 @@ class TestCVaR:
     @pytest.mark.parametrize("level", [0.0, 0.3, 0.9, 0.95, 0.999])
     def test_is_rockafellar_and_uryasevs(self, level):
         np.testing.assert_allclose(
-            statistics.cvar(self.X, level).value, brute_cvar(self.X, level)[0], rtol=1e-12, atol=0
+            estimates.cvar(self.X, level).value, brute_cvar(self.X, level)[0], rtol=1e-12, atol=0
         )
 
     def test_the_sample_at_the_edge_counts_in_part(self):
-        assert statistics.cvar([1.0, 5.0, 2.0, 3.0], 0.625).value == pytest.approx((5 + 0.5 * 3) / 1.5, rel=1e-12)
+        assert estimates.cvar([1.0, 5.0, 2.0, 3.0], 0.625).value == pytest.approx((5 + 0.5 * 3) / 1.5, rel=1e-12)
 
     def test_the_interval_is_that_of_a_plain_studentised_bootstrap(self):
         """Both with 2,000 resamples of their own: an end has a standard error of 0.02 half-widths."""
         random, (value, error) = np.random.default_rng(5), brute_cvar(self.X, 0.8)
         resampled = [brute_cvar(random.choice(self.X, len(self.X)), 0.8) for _ in range(2000)]
         ratios = np.quantile([(v - value) / e for v, e in resampled], [0.95, 0.05])
-        found = statistics.cvar(self.X, 0.8, confidence=0.9, replicates=2000)
+        found = estimates.cvar(self.X, 0.8, confidence=0.9, replicates=2000)
         np.testing.assert_allclose(ends(found), value - ratios * error, rtol=0, atol=0.1 * 1.65 * error)
 
     def test_a_seed_is_an_interval_and_units_do_not_matter(self):
-        one = statistics.cvar(self.X, 0.9, seed=7)
-        assert statistics.cvar(self.X[::-1], 0.9, seed=7) == one
-        assert statistics.cvar(self.X, 0.9, seed=8).low != one.low
+        one = estimates.cvar(self.X, 0.9, seed=7)
+        assert estimates.cvar(self.X[::-1], 0.9, seed=7) == one
+        assert estimates.cvar(self.X, 0.9, seed=8).low != one.low
         np.testing.assert_allclose(
-            ends(statistics.cvar(1e3 * self.X - 40, 0.9, seed=7)), 1e3 * np.array(ends(one)) - 40, rtol=1e-10, atol=0
+            ends(estimates.cvar(1e3 * self.X - 40, 0.9, seed=7)), 1e3 * np.array(ends(one)) - 40, rtol=1e-10, atol=0
         )
 
     def test_a_long_tail_of_few_atoms_has_the_same_interval(self, monkeypatch):
@@ -191,8 +191,8 @@ class TestCVaR:
         x = np.random.default_rng(6).exponential(size=20_000)
         found = {}
         for atoms in (64, 1024, 10**6):
-            monkeypatch.setattr(statistics, "ATOMS", atoms)
-            found[atoms] = statistics.cvar(x, 0.8, replicates=799)
+            monkeypatch.setattr(estimates, "ATOMS", atoms)
+            found[atoms] = estimates.cvar(x, 0.8, replicates=799)
         half = 1.96 * np.std(np.maximum(x - np.quantile(x, 0.8), 0.0)) / 0.2 / math.sqrt(len(x))
         for atoms in (64, 1024):
             assert found[atoms].value == found[10**6].value
@@ -201,15 +201,15 @@ class TestCVaR:
     def test_zeros_and_ones_have_an_interval(self):
         """45 ones of 1,000 against a tail of 50: CVaR is the share of ones times 20, and 1 from 50 ones on. A resample
         of 50 ones has no spread, so that the lower end is the percentile, to one step of 0.02."""
-        found = statistics.cvar(np.arange(1000) < 45, 0.95, replicates=3999)
+        found = estimates.cvar(np.arange(1000) < 45, 0.95, replicates=3999)
         assert found.value == pytest.approx(0.9, rel=1e-12)
         assert found.low == pytest.approx(stats.binom.ppf(0.025, 1000, 0.045) / 50, abs=0.021)
         assert 1.0 < found.high < 1.3
 
     def test_too_few_in_the_tail_have_no_interval_and_equal_ones_no_width(self):
-        assert ends(statistics.cvar(self.X, 0.96)) == [-math.inf, math.inf]
-        assert math.isfinite(statistics.cvar(self.X, 0.95).high)
-        np.testing.assert_allclose(statistics.cvar(np.minimum(self.X, 1.1), 0.9)[:3], 1.1, rtol=1e-12, atol=0)
+        assert ends(estimates.cvar(self.X, 0.96)) == [-math.inf, math.inf]
+        assert math.isfinite(estimates.cvar(self.X, 0.95).high)
+        np.testing.assert_allclose(estimates.cvar(np.minimum(self.X, 1.1), 0.9)[:3], 1.1, rtol=1e-12, atol=0)
 
 
 class TestTail:
@@ -226,13 +226,13 @@ class TestTail:
 class TestSummary:
     def test_is_what_the_functions_say_as_plain_values(self):
         x = np.random.default_rng(10).exponential(size=500)
-        found = statistics.summary(x, 0.9, levels=(0.25, 0.5), tail=0.8)
+        found = estimates.summary(x, 0.9, levels=(0.25, 0.5), tail=0.8)
         assert found == {
             "mean": Moments.of(np.sort(x)).mean(confidence=0.9).table(),
             "deviation": Moments.of(np.sort(x)).deviation(confidence=0.9).table(),
-            "quantile 0.25": statistics.quantile(x, 0.25, confidence=0.9).table(),
-            "quantile 0.5": statistics.quantile(x, 0.5, confidence=0.9).table(),
-            "cvar 0.8": statistics.cvar(x, 0.8, confidence=0.9).table(),
+            "quantile 0.25": estimates.quantile(x, 0.25, confidence=0.9).table(),
+            "quantile 0.5": estimates.quantile(x, 0.5, confidence=0.9).table(),
+            "cvar 0.8": estimates.cvar(x, 0.8, confidence=0.9).table(),
         }
         assert json.loads(json.dumps(found)) == found
         assert set(found["mean"]) == {"value", "low", "high", "confidence", "samples"}
@@ -378,11 +378,11 @@ class TestPaired:
     B = A + np.round(np.random.default_rng(20).normal(0.3, 0.5, size=150), 1)
 
     def test_is_scipys_each_by_each(self):
-        found = comparison.paired(self.A, self.B, confidence=0.9)
+        found = paired.paired(self.A, self.B, confidence=0.9)
         theirs = stats.ttest_rel(self.A, self.B).confidence_interval(0.9)
         np.testing.assert_allclose(ends(found.mean), theirs, rtol=1e-10, atol=0)
         assert found.mean.value == pytest.approx(np.mean(self.A) - np.mean(self.B), rel=1e-12)
-        assert found.median == statistics.quantile(self.A - self.B, 0.5, confidence=0.9)
+        assert found.median == estimates.quantile(self.A - self.B, 0.5, confidence=0.9)
         less, ties = sum(self.A < self.B), sum(self.A == self.B)
         theirs = stats.binomtest(less, 150).proportion_ci(0.9)
         np.testing.assert_allclose([found.less.value, *ends(found.less)], [less / 150, *theirs], rtol=0, atol=1e-8)
@@ -400,10 +400,10 @@ class TestPaired:
         random = np.random.default_rng(21)
         a = random.normal(size=100_000)
         b = a + 0.5 * random.normal(size=100_000)
-        assert comparison.paired(a, b).reduction == pytest.approx(9.0, rel=0.03)
-        assert comparison.paired(a, b).correlation.value == pytest.approx(1 / math.sqrt(1.25), abs=0.003)
-        assert comparison.paired(a, a + 0.0).reduction == math.inf
-        assert math.isnan(comparison.paired(np.ones(5), np.zeros(5)).reduction)
+        assert paired.paired(a, b).reduction == pytest.approx(9.0, rel=0.03)
+        assert paired.paired(a, b).correlation.value == pytest.approx(1 / math.sqrt(1.25), abs=0.003)
+        assert paired.paired(a, a + 0.0).reduction == math.inf
+        assert math.isnan(paired.paired(np.ones(5), np.zeros(5)).reduction)
 
 
 def binormal(random, n, rho):
@@ -425,11 +425,11 @@ class TestCoverage:
 
     def test_quantile(self):
         n, level, random = 1000, 0.9, np.random.default_rng(32)
-        r, s = ends(statistics.quantile(np.arange(1.0, n + 1), level))
+        r, s = ends(estimates.quantile(np.arange(1.0, n + 1), level))
         exact = 100 * (stats.binom.cdf(s - 1, n, level) - stats.binom.cdf(r - 1, n, level))
         assert 95 <= exact < 96
         found = coverage(
-            lambda x: statistics.quantile(x, level), lambda: random.exponential(size=n), -math.log(1 - level)
+            lambda x: estimates.quantile(x, level), lambda: random.exponential(size=n), -math.log(1 - level)
         )
         assert abs(found - exact) < 2
 
@@ -440,7 +440,7 @@ class TestCoverage:
         """The truth by quadrature over the upper quantiles."""
         random, q = np.random.default_rng(33), level + (1 - level) * (np.arange(10**6) + 0.5) / 10**6
         found = coverage(
-            lambda x: statistics.cvar(x, level, replicates=299),
+            lambda x: estimates.cvar(x, level, replicates=299),
             lambda: law.rvs(n, random_state=random),
             law.ppf(q).mean(),
         )
@@ -450,7 +450,7 @@ class TestCoverage:
         """P(1) = 0.045 against a tail of 0.05: one sample in five has only ones in its tail, and none is sure of it."""
         random = np.random.default_rng(39)
         found = coverage(
-            lambda x: statistics.cvar(x, 0.95, replicates=199),
+            lambda x: estimates.cvar(x, 0.95, replicates=199),
             lambda: random.random(1000) < 0.045,
             0.9,
             repetitions=400,
@@ -492,7 +492,7 @@ class TestCoverage:
 
         def draw():
             b = random.exponential(size=400)
-            return comparison.paired(b + random.normal(0.2, 0.5, size=400), b)
+            return paired.paired(b + random.normal(0.2, 0.5, size=400), b)
 
         found = [draw() for _ in range(REPETITIONS)]
         for kind, truth in (("mean", 0.2), ("median", 0.2), ("less", stats.norm.cdf(-0.4))):
@@ -501,5 +501,5 @@ class TestCoverage:
 
     def test_replicated(self):
         random = np.random.default_rng(38)
-        found = coverage(statistics.replicated, lambda: random.normal(3.0, 2.0, size=8), 3.0)
+        found = coverage(estimates.replicated, lambda: random.normal(3.0, 2.0, size=8), 3.0)
         assert abs(found - 95) < 2

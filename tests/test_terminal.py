@@ -15,7 +15,8 @@ from rich.table import Table
 from sweeping import SCENARIO, chunks, environment
 from terminal import COLUMNS, SPINNER, Terminal, assert_fits, assert_orderly, words
 
-from diffabs import console, interrupt, tables
+from diffabs.cli import console, tables
+from diffabs.core import interrupt
 
 pytestmark = pytest.mark.xdist_group("terminal")
 

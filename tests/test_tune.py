@@ -11,16 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-import diffabs as d
 from diffabs import controllers, plants, references
+from diffabs.core.bijectors import Decades, HalfLine, Interval, Line, bijection, space
+from diffabs.scenario.defaults import braking
+from diffabs.simulate.batch import Batch
 from diffabs.tune import CVaR, Mean, Method, Mode, Quantile, Reason, SmoothWorst, Stopping, grid, latin
-from diffabs.tune.batch import Batch
+from diffabs.tune.augmented_lagrangian import Search
 from diffabs.tune.descent import Descent, Optimiser, lbfgs
-from diffabs.tune.lagrangian import Search
 from diffabs.tune.problem import Evaluation, Multipliers, Seen, _penalty
-from diffabs.tune.space import Decades, HalfLine, Interval, Line, bijection, space
 
-LOOP = d.Loop(
+LOOP = braking(
     plant=plants.MirroredRig(),
     reference=references.FilteredSlip(),
     controller=controllers.StateFeedback(gain=np.array([-1000.0, -40.0])),

@@ -12,19 +12,20 @@ from scipy.optimize import minimize
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, references
-from diffabs.design.polytope import Polytope
-from diffabs.design.scaled import SpeedScaled, fall
-from diffabs.linearize import Sampling, SlipModel
+from diffabs.core.pytree import strong
+from diffabs.design.polytopes import Polytope
+from diffabs.design.speed_scaled import SpeedScaled, fall
+from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
-from diffabs.pytree import strong
-from diffabs.stability import stable_step, stable_steps
+from diffabs.scenario.defaults import braking
+from diffabs.simulate.stable_step import stable_step, stable_steps
 from diffabs.stops import SpeedReached
 from diffabs.tune import AtMost, Batch, CertifiedDecay, Method, Mode, Poles, Stopping, WorstCase, grid, tune, worst_case
 from diffabs.tune.problem import Multipliers
 from diffabs.tune.tuning import posed
 from diffabs.tune.weights import lq_weights, regulator
 
-RIG = d.Loop(
+RIG = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=8.0, slip=0.02),
     stop=SpeedReached(speed=6.5),
@@ -84,7 +85,7 @@ def test_it_finds_what_nelder_mead_finds_and_stays_where_the_step_is_stable():
 @pytest.mark.slow
 def test_a_gain_that_the_step_cannot_follow_is_not_entered():
     """Speed is everything here, so kp goes up until RK4 with this step would no longer follow."""
-    car = d.Loop(
+    car = braking(
         plant=plants.QuarterCar(),
         initial=d.BrakeStart(speed=8.0, slip=0.02),
         stop=SpeedReached(speed=6.0),
@@ -145,7 +146,7 @@ class TestStability:
         np.testing.assert_allclose(stable_steps(batch), each, rtol=1e-12)
 
     def test_the_limit_of_a_real_and_of_an_imaginary_mode(self):
-        from diffabs.stability import _radius
+        from diffabs.simulate.stable_step import _radius
 
         np.testing.assert_allclose(_radius(np.array([-1.0 + 0j])), 2.785, atol=1.5e-3)  # the roots of |R(z)| = 1
         np.testing.assert_allclose(_radius(np.array([1j])), np.sqrt(8.0), atol=1.5e-3)

@@ -2,13 +2,14 @@
 
 import pytest
 from commands import run
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from diffabs import plants, plot, scenario
-from diffabs.catalogue import unit_of
-from diffabs.loop import control_unit
+from diffabs import plants, plot
 from diffabs.objectives import Effort, TorqueRate, Variation
-from diffabs.rollout import rollout
+from diffabs.scenario import scenario
+from diffabs.scenario.registry import unit_of
+from diffabs.simulate.run import rollout
 from diffabs.sweep.trajectories import keep
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
@@ -21,7 +22,7 @@ SHORT = ("--set", "solver.step=5e-5", "--set", "solver.duration=1e-3", "--set", 
     [(plants.QuarterCar(), "N m"), (plants.MirroredRig(), "N m"), (plants.LabRig(), "1"), (plants.ArmBalance(), "V")],
 )
 def test_a_plant_says_the_unit_of_its_control(plant, unit):
-    assert control_unit(plant) == unit
+    assert plant.control_unit == unit
 
 
 def test_the_csv_file_of_the_lab_rig(tmp_path):
@@ -33,16 +34,16 @@ def test_the_csv_file_of_the_lab_rig(tmp_path):
 def test_figure_and_trajectories_of_the_lab_rig(tmp_path, monkeypatch):
     import zarr
 
-    from diffabs import variation
+    from diffabs.scenario import section_sweep
 
     drawn = []
-    monkeypatch.setattr(plot.Figure, "savefig", lambda figure, path, **_: drawn.append(figure))
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: drawn.append(figure))
     run("simulate", "lab-rig", *SHORT, "--plot", tmp_path / "run.png")
     texts = {text.get_text() for text in drawn[0].findobj(Text)}
     assert "control [1]" in texts
     assert not any("N m" in text for text in texts)
     over = 'sweep.over={"plant.road.w4"=[0.3,0.4]}'
-    study = variation.study(scenario.load("lab-rig", [*SHORT[1::2], over]))
+    study = section_sweep.study(scenario.load("lab-rig", [*SHORT[1::2], over]))
     kept = zarr.open_group(keep(study, tmp_path, [0]), mode="r")
     assert (kept["control"].attrs["units"], kept["command"].attrs["units"]) == ("1", "1")
 

@@ -12,10 +12,10 @@ import pytest
 from commands import assert_one_error_line, run
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-from diffabs import console
+from diffabs.cli import console
 from diffabs.design import verify
-from diffabs.design.certificate import Certificate, Claim
-from diffabs.design.polytope import Polytope, Schedule
+from diffabs.design.polytopes import Polytope, Schedule
+from diffabs.design.proof.certificate import Certificate, Claim
 
 C = np.array([[-1.0, 2.0], [-2.0, -1.0]])  # poles -1 +- 2j, damping 1/sqrt(5) = 0.447
 STEP = np.array([[0.5, 0.2], [-0.2, 0.5]])  # radius sqrt(0.29) = 0.5385
@@ -205,7 +205,7 @@ def test_what_it_says(tmp_path):
 def test_it_needs_no_solver_and_the_checker_nothing_of_the_package(tmp_path):
     path = saved(certificate("decay", P=np.eye(2), rate=0.5), tmp_path)
     code = "import sys; sys.modules.update(dict.fromkeys(['cvxpy', 'scipy', 'clarabel', 'optax'])); "
-    code += f"import diffabs.cli as c; c.app(['verify', {str(path)!r}])"
+    code += f"import diffabs.cli.main as c; c.app(['verify', {str(path)!r}])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split(":")[0]) == (0, "proved  decay"), done.stderr
     alone = f"import sys; sys.modules.update(jax=None, numpy=None, diffabs=None); import runpy; "\

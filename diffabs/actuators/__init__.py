@@ -1,7 +1,7 @@
 """Actuators: command -> control."""
 
-from diffabs.actuators.analogue import Lag as Lag
-from diffabs.actuators.analogue import Limits as Limits
-from diffabs.actuators.analogue import RateLimit as RateLimit
 from diffabs.actuators.delay import Delay as Delay
+from diffabs.actuators.lag import Lag as Lag
+from diffabs.actuators.lag import Limits as Limits
+from diffabs.actuators.lag import RateLimit as RateLimit
 from diffabs.actuators.motor import VoltageLimit as VoltageLimit

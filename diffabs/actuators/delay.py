@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.numerics import clamp
-from diffabs.protocols import Clock, Jump, Memory, no_flow
-from diffabs.pytree import Scalar, param, pytree, static
-from diffabs.rules import Rule, array
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import Clock, Jump, Memory, no_flow
+from diffabs.core.pytree import Scalar, param, pytree, static
+from diffabs.core.rules import Rule, array
 
 ROUNDING = 1e-6  # relative
 

@@ -1,8 +1,8 @@
 """The supply of a motor: what voltage it can give."""
 
-from diffabs.numerics import clamp
-from diffabs.protocols import Memory, no_flow, no_jump, no_memory
-from diffabs.pytree import Scalar, param, pytree
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import Memory, no_flow, no_jump, no_memory
+from diffabs.core.pytree import Scalar, param, pytree
 
 
 @pytree

@@ -8,11 +8,11 @@ from diffabs.controllers.balance import ObserverFeedback as ObserverFeedback
 from diffabs.controllers.feedback import StateFeedback as StateFeedback
 from diffabs.controllers.feedforward import ConstantInput as ConstantInput
 from diffabs.controllers.feedforward import HoldingInput as HoldingInput
-from diffabs.controllers.feedforward import NoFeedforward as NoFeedforward
-from diffabs.controllers.lookup import ProportionalFeedback as ProportionalFeedback
-from diffabs.controllers.lookup import ScheduledFeedback as ScheduledFeedback
+from diffabs.controllers.gain_schedule import ProportionalFeedback as ProportionalFeedback
+from diffabs.controllers.gain_schedule import ScheduledFeedback as ScheduledFeedback
 from diffabs.controllers.pid import PID as PID
 from diffabs.controllers.sampled import Sampled as Sampled
 from diffabs.controllers.switching import ConstantTorque as ConstantTorque
 from diffabs.controllers.switching import Relay as Relay
 from diffabs.controllers.switching import SlidingMode as SlidingMode
+from diffabs.core.blocks import NoFeedforward as NoFeedforward

@@ -5,8 +5,8 @@ Each strategy gives I', the rate of the integral of the error, for a controller 
 
 import jax.numpy as jnp
 
-from diffabs.numerics import ratio
-from diffabs.pytree import Scalar, param, pytree
+from diffabs.core.numerics import ratio
+from diffabs.core.pytree import Scalar, param, pytree
 
 
 @pytree

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.numerics import clamp
-from diffabs.protocols import BalanceOutput, Clock, Jump, Memory, Tracking, no_flow, no_jump, no_memory
-from diffabs.pytree import Matrix, Scalar, Vector, param, pytree
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import BalanceOutput, Clock, Jump, Memory, Tracking, no_flow, no_jump, no_memory
+from diffabs.core.pytree import Matrix, Scalar, Vector, param, pytree
 
 STATES = ("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate")
 MEASURED = ("theta", "psi")

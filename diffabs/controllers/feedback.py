@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from diffabs.controllers.antiwindup import NoAntiWindup
-from diffabs.numerics import clamp
-from diffabs.protocols import Memory, Tracking, no_jump
-from diffabs.pytree import Scalar, Vector, param, part, pytree
-from diffabs.rules import Rule, ordered
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import Memory, Tracking, no_jump
+from diffabs.core.pytree import Scalar, Vector, param, part, pytree
+from diffabs.core.rules import Rule, ordered
 
 
 @pytree

@@ -2,18 +2,8 @@
 
 from typing import Any
 
-from diffabs.protocols import BrakeOutput, Plant
-from diffabs.pytree import Scalar, param, pytree
-
-
-@pytree
-class NoFeedforward:
-    """0."""
-
-    def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
-        """Zero."""
-        del plant, output
-        return 0.0 * target
+from diffabs.core.protocols import BrakeOutput, Plant
+from diffabs.core.pytree import Scalar, param, pytree
 
 
 @pytree

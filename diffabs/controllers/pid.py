@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from diffabs.controllers.antiwindup import NoAntiWindup
-from diffabs.numerics import clamp
-from diffabs.protocols import Memory, Tracking, no_jump
-from diffabs.pytree import Scalar, param, part, pytree
-from diffabs.rules import Rule, ordered
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import Memory, Tracking, no_jump
+from diffabs.core.pytree import Scalar, param, part, pytree
+from diffabs.core.rules import Rule, ordered
 
 
 class PIDMemory(NamedTuple):

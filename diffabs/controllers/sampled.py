@@ -13,12 +13,11 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.controllers.pid import PID
-from diffabs.integrate import axpy
-from diffabs.numerics import clamp
-from diffabs.protocols import Block, Clock, Jump, Memory, Tracking, no_flow
-from diffabs.pytree import Scalar, param, part, pytree
-from diffabs.rules import Rule, array
-from diffabs.timing import steps, whole_steps
+from diffabs.core.numerics import axpy, clamp
+from diffabs.core.protocols import Block, Clock, Jump, Memory, Tracking, no_flow
+from diffabs.core.pytree import Scalar, param, part, pytree
+from diffabs.core.rules import Rule, array
+from diffabs.core.timing import steps, whole_steps
 
 
 class SampledMemory(NamedTuple):

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.numerics import clamp, ratio
-from diffabs.protocols import Clock, Jump, Memory, Tracking, no_flow, no_jump, no_memory
-from diffabs.pytree import Scalar, param, pytree
-from diffabs.rules import Rule, ordered
+from diffabs.core.numerics import clamp, ratio
+from diffabs.core.protocols import Clock, Jump, Memory, Tracking, no_flow, no_jump, no_memory
+from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.rules import Rule, ordered
 
 
 @pytree

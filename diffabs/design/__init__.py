@@ -5,10 +5,10 @@ and Lyapunov equations are pure JAX and need nothing.
 """
 
 from diffabs.design.analysis import certify as certify
-from diffabs.design.certificate import Certificate as Certificate
-from diffabs.design.certificate import Claim as Claim
-from diffabs.design.polytope import Polytope as Polytope
-from diffabs.design.polytope import Schedule as Schedule
+from diffabs.design.polytopes import Polytope as Polytope
+from diffabs.design.polytopes import Schedule as Schedule
+from diffabs.design.proof.certificate import Certificate as Certificate
+from diffabs.design.proof.certificate import Claim as Claim
 from diffabs.design.spec import InputLimit as InputLimit
 from diffabs.design.spec import L2Gain as L2Gain
 from diffabs.design.spec import Spec as Spec

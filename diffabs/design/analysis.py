@@ -16,12 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.design import exact, lmi, pairs
+from diffabs.design import pairs
 from diffabs.design.bounds import ROOM, Bounds, decrease
-from diffabs.design.certificate import Certificate, Claim
-from diffabs.design.frame import analysis_frame, frame
-from diffabs.design.lmi import Answer, Unknowns, he
-from diffabs.design.polytope import Polytope, Schedule, checked_gain
+from diffabs.design.polytopes import Polytope, Schedule, checked_gain
+from diffabs.design.proof import exact
+from diffabs.design.proof.certificate import Certificate, Claim
+from diffabs.design.sdp import solver
+from diffabs.design.sdp.scaling import analysis_frame, frame
+from diffabs.design.sdp.solver import Answer, Unknowns, he
 from diffabs.design.spec import Spec
 
 TRIES = 4  # frames, each better than the one before
@@ -121,7 +123,7 @@ class _Analysis:
         ]
         positive = unknowns.affine(lambda v: v["P"] - v["t"] * one)
         total = unknowns.affine(lambda v: (1 - np.trace(v["P"], axis1=-2, axis2=-1) / n)[:, None, None])
-        answer = lmi.solve(unknowns.row(lambda v: -v["t"]), [lmi.joined([*decreases, positive]), total])
+        answer = solver.solve(unknowns.row(lambda v: -v["t"]), [solver.joined([*decreases, positive]), total])
         if not np.isfinite(answer.y).all():
             return None, math.nan, np.zeros((0, n, n))
         values = unknowns.values(answer.y)

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.design import exact, lmi
-from diffabs.design.certificate import Claim
-from diffabs.design.frame import Frame, analysis_frame, whitening
-from diffabs.design.lmi import Unknowns, grouped, he, symmetric
-from diffabs.design.polytope import Polytope
+from diffabs.design.polytopes import Polytope
+from diffabs.design.proof import exact
+from diffabs.design.proof.certificate import Claim
+from diffabs.design.sdp import solver
+from diffabs.design.sdp.scaling import Frame, analysis_frame, whitening
+from diffabs.design.sdp.solver import Unknowns, grouped, he, symmetric
 from diffabs.design.spec import Spec
 
 ROOM = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)  # relative: by how much a bound is loosened until its proof succeeds
@@ -141,7 +142,7 @@ class Bounds:
         blocks = unknowns.blocks(lambda v: [v["P"], *(once(v) if once else [])])
         for c, b in zip(at.states(self.closed), self.system.B, strict=True):
             blocks += unknowns.blocks(lambda v, c=c, b=b: everywhere(v, c, b))
-        answer = lmi.solve(unknowns.row(objective), grouped(blocks))
+        answer = solver.solve(unknowns.row(objective), grouped(blocks))
         if not np.isfinite(answer.y).all():
             return None
         values = unknowns.values(answer.y)

@@ -21,11 +21,11 @@ import jax
 import numpy as np
 
 from diffabs.actuators import VoltageLimit
-from diffabs.balance_model import BalanceModel
-from diffabs.blocks import Direct
 from diffabs.controllers import BalanceFeedback
-from diffabs.loop import Loop
-from diffabs.pytree import replace
+from diffabs.core.blocks import Direct
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import replace
+from diffabs.linear.balance_model import BalanceModel
 from diffabs.stops import Fallen
 
 SAFE = 0.9  # of the level c that the bound allows

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffabs.design.box import bounds, systems
-from diffabs.design.polytope import checked_gain
-from diffabs.pytree import replace
+from diffabs.core.pytree import replace
+from diffabs.design.parameter_box import bounds, systems
+from diffabs.design.polytopes import checked_gain
 
 POINTS, MOST = 17, 5000  # per parameter, and in all
 

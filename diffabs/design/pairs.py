@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.design.lmi import he
+from diffabs.design.sdp.solver import he
 
 LARGEST = 64  # vertices of which every pair is looked at
 BEYOND = 1e3  # how far past the last change of sign

@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.design import exact, lmi
-from diffabs.design.certificate import Certificate, Claim
-from diffabs.design.frame import Frame, analysis_frame
-from diffabs.design.lmi import Unknowns, grouped, he
-from diffabs.design.polytope import Schedule, checked_gain
+from diffabs.design.polytopes import Schedule, checked_gain
+from diffabs.design.proof import exact
+from diffabs.design.proof.certificate import Certificate, Claim
+from diffabs.design.sdp import solver
+from diffabs.design.sdp.scaling import Frame, analysis_frame
+from diffabs.design.sdp.solver import Unknowns, grouped, he
 from diffabs.design.spec import Spec
 
 NEAR = 0.01  # relative: how close the search for the fastest decay comes
@@ -86,7 +87,7 @@ def _proof(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
     else:
         weight = frame.trace_weight() / np.trace(frame.trace_weight())
         objective = unknowns.row(lambda v: sum(np.einsum("ij,dji->d", weight, v[f"P{i}"]) for i in nodes))
-    answer = lmi.solve(objective, grouped(blocks))
+    answer = solver.solve(objective, grouped(blocks))
     if not np.isfinite(answer.y).all():
         return None
     values = unknowns.values(answer.y)

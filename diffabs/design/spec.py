@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from diffabs.linear.weights import weight
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class InputLimit:
@@ -60,25 +62,6 @@ class Spec:
             raise ValueError(f"rates = {self.rates} are not a lower and an upper bound")
         limit, gain = self.input and _input(self.input, order, inputs), self.l2 and _l2(self.l2, order, inputs)
         return dataclasses.replace(self, **weights, input=limit, l2=gain)
-
-
-def weight(name: str, value: Any, size: int, *, definite: bool) -> np.ndarray:
-    """A weight as a symmetric matrix (size, size), from a matrix, a diagonal, or a number for size 1. Raises ValueError
-    for another shape, numbers that are not finite, asymmetry, or eigenvalues below 0 (at 0 where `definite`)."""
-    array = np.array(value, float)
-    if array.ndim < 2:
-        array = np.diag(np.atleast_1d(array))
-    if array.shape != (size, size):
-        raise ValueError(f"{name} has shape {np.shape(value)}; it needs ({size}, {size}), or its diagonal ({size},)")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} = {array.tolist()} has an entry that is not finite")
-    if not np.allclose(array, array.T, rtol=1e-12, atol=0):
-        raise ValueError(f"{name} = {array.tolist()} is not symmetric")
-    lowest, largest = np.linalg.eigvalsh(array)[[0, -1]]
-    if lowest < -1e-13 * max(largest, 0.0) or largest < 0 or (definite and lowest <= 0):
-        kind, allowed = ("definite", "(0, inf)") if definite else ("semidefinite", "[0, inf)")
-        raise ValueError(f"{name} is not positive {kind}: an eigenvalue is {lowest:g}, outside {allowed}")
-    return (array + array.T) / 2
 
 
 def _input(limit: InputLimit, order: int, inputs: int) -> InputLimit:

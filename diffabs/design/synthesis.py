@@ -18,13 +18,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from diffabs.design import lmi
 from diffabs.design.analysis import certify
-from diffabs.design.certificate import Certificate
-from diffabs.design.frame import Frame, design_frames
-from diffabs.design.lmi import he
-from diffabs.design.polytope import Polytope, Schedule
-from diffabs.design.programme import Programme
+from diffabs.design.polytopes import Polytope, Schedule
+from diffabs.design.proof.certificate import Certificate
+from diffabs.design.sdp import solver as lmi
+from diffabs.design.sdp.program import Programme
+from diffabs.design.sdp.scaling import Frame, design_frames
+from diffabs.design.sdp.solver import he
 from diffabs.design.spec import Spec
 
 GAP = 1e-6  # relative: how far from the optimum an answer may be

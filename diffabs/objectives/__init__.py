@@ -1,12 +1,7 @@
-"""Objectives: what is measured on a run, streamed. `BRAKING` and `BALANCE` are those of every report of a task."""
+"""Objectives: what is measured on a run, streamed. `BRAKING` and `BALANCE` are those of every report on a plant
+that shows a `BrakeOutput` or a `BalanceOutput`."""
 
-from diffabs.objectives.accuracy import IAE as IAE
-from diffabs.objectives.accuracy import ITAE as ITAE
-from diffabs.objectives.accuracy import FinalSlipError as FinalSlipError
-from diffabs.objectives.accuracy import MaxSlip as MaxSlip
-from diffabs.objectives.accuracy import Overshoot as Overshoot
-from diffabs.objectives.accuracy import QuadraticCost as QuadraticCost
-from diffabs.objectives.accuracy import SettlingTime as SettlingTime
+from diffabs.core.protocols import BalanceOutput, BrakeOutput, Objective, Plant
 from diffabs.objectives.balance import BalanceCost as BalanceCost
 from diffabs.objectives.balance import Fell as Fell
 from diffabs.objectives.balance import FinalNorm as FinalNorm
@@ -22,6 +17,13 @@ from diffabs.objectives.braking import StopDistance as StopDistance
 from diffabs.objectives.braking import StopTime as StopTime
 from diffabs.objectives.braking import TorqueRate as TorqueRate
 from diffabs.objectives.braking import Variation as Variation
+from diffabs.objectives.tracking import IAE as IAE
+from diffabs.objectives.tracking import ITAE as ITAE
+from diffabs.objectives.tracking import FinalSlipError as FinalSlipError
+from diffabs.objectives.tracking import MaxSlip as MaxSlip
+from diffabs.objectives.tracking import Overshoot as Overshoot
+from diffabs.objectives.tracking import QuadraticCost as QuadraticCost
+from diffabs.objectives.tracking import SettlingTime as SettlingTime
 
 BRAKING = {
     "stop_time": StopTime(),
@@ -44,4 +46,9 @@ BALANCE = {
     "fell": Fell(),
 }
 
-REPORTS = {"braking": BRAKING, "balance": BALANCE}  # by the task of the plant
+REPORTS = {BrakeOutput: BRAKING, BalanceOutput: BALANCE}
+
+
+def usual(plant: Plant) -> dict[str, Objective]:
+    """Return the objectives that are measured where none are named, by name: by what the plant shows, else none."""
+    return dict(REPORTS.get(plant.shows, {}))

@@ -6,10 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from diffabs.numerics import clamp
-from diffabs.objectives.accuracy import FinalSlipError, integral, nothing, unchanged
-from diffabs.protocols import BalanceOutput, Ending, Memory, Sample
-from diffabs.pytree import Scalar, Vector, param, pytree
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample
+from diffabs.core.pytree import Scalar, Vector, param, pytree
+from diffabs.objectives.tracking import FinalSlipError, integral, nothing, unchanged
 
 RATES = ("theta_rate", "psi_rate", "phi_rate")
 ANGLES = ("theta", "psi", "phi")

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.numerics import ratio
-from diffabs.objectives.accuracy import FinalSlipError, from_zero, integral, nothing, unchanged
-from diffabs.protocols import Ending, Memory, Sample
-from diffabs.pytree import Scalar, param, pytree
+from diffabs.core.numerics import ratio
+from diffabs.core.protocols import Ending, Memory, Sample
+from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.objectives.tracking import FinalSlipError, from_zero, integral, nothing, unchanged
 
 
 @pytree

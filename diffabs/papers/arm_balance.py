@@ -15,19 +15,21 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.balance_model import BalanceModel
-from diffabs.basin import Basin, Cells, Reach, attraction, largest
 from diffabs.controllers import BalanceFeedback
-from diffabs.design.recovery import mode_bounds, zeros
-from diffabs.design.regulator import lqr
-from diffabs.linearize import StateSpace
-from diffabs.loop import TYPICAL, Loop
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import replace
+from diffabs.design.attraction import Basin, Cells, Reach, attraction, largest
+from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.linearization import StateSpace
+from diffabs.linear.recoverable import mode_bounds, zeros
+from diffabs.linear.regulator import lqr
 from diffabs.objectives import BALANCE
 from diffabs.papers import arm_equations, arm_figures, record
 from diffabs.papers.digest import Digest, Refuted, digest
 from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
-from diffabs.pytree import replace
-from diffabs.rollout import FixedStep, Run, rollout
+from diffabs.scenario.defaults import balancing
+from diffabs.simulate.run import rollout
+from diffabs.simulate.solution import FixedStep, Run
 
 TITLE = "Fumita: a two-wheeler balanced by an arm"
 SOLVER = FixedStep(step=1e-3, duration=10.0)
@@ -95,7 +97,7 @@ def regulated(plant: Any, weights: Any = (1.0,) * 6, effort: float = 1.0) -> np.
 def loop(plant: Any, gain: Any, start: Any = START, voltage: float = 48.0) -> Loop:
     """The closed loop from a start (6,)."""
     return dataclasses.replace(
-        replace(TYPICAL["balance"], {"actuator.voltage_max": voltage}),
+        replace(balancing(), {"actuator.voltage_max": voltage}),
         plant=plant,
         initial=BalanceStart(theta=start[0], psi=start[1], phi=start[2]),
         controller=BalanceFeedback(gain=np.asarray(gain)),
@@ -160,7 +162,7 @@ def robust(progress: Callable[[str], None]) -> dict[str, Any]:
     progress("arm-balance: a gain for 40 to 100 kg")
     try:
         from diffabs.design import Spec, design
-        from diffabs.design.gridded import gridded
+        from diffabs.design.parameter_grid import gridded
 
         over = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "plant.damping": (70.0, 130.0)}
         found = design(gridded(BalanceModel(plant=HANGING), over), Spec(Q=WEIGHTS, R=EFFORT))

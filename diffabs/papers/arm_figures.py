@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from diffabs import plot
-from diffabs.basin import Basin, Reach
-from diffabs.design.recovery import mode_bounds
-from diffabs.rollout import Run
+from diffabs.design.attraction import Basin, Reach
+from diffabs.linear.recoverable import mode_bounds
+from diffabs.simulate.solution import Run
 
 
 def figures(

@@ -12,7 +12,7 @@ import numpy as np
 
 from diffabs.papers import record
 from diffabs.roads import peak
-from diffabs.rollout import Run
+from diffabs.simulate.solution import Run
 
 KMH = 3.6
 LATE = 0.45  # s, after which the torque has been built up in every run

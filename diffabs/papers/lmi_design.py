@@ -11,12 +11,12 @@ import numpy as np
 
 from diffabs import plot
 from diffabs.design import Certificate, Design, Polytope, Spec, certify, design
-from diffabs.design.box import polytope, schedule
-from diffabs.linearize import SlipModel
+from diffabs.design.parameter_box import polytope, schedule
+from diffabs.linear.slip_model import SlipModel
 from diffabs.papers import record
 from diffabs.papers.digest import Refuted
 from diffabs.plants import MirroredRig
-from diffabs.rollout import Run
+from diffabs.simulate.solution import Run
 
 K1 = 11753.0
 PUBLISHED = (-K1, -48.0)

@@ -13,8 +13,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from diffabs import plot, provenance
-from diffabs.rollout import FixedStep, Run
+from diffabs import plot
+from diffabs.core import provenance
+from diffabs.simulate.solution import FixedStep, Run
 
 
 def stacked(loops: Sequence[Any]) -> Any:

@@ -15,15 +15,17 @@ import numpy as np
 
 from diffabs import plot
 from diffabs.controllers import PID, ConstantTorque
-from diffabs.loop import Loop
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Block, Reference
 from diffabs.objectives import BRAKING
 from diffabs.papers import estimator_claims, record
 from diffabs.papers.digest import Digest, Refuted, digest
 from diffabs.plants import GRAVITY, QuarterCar
-from diffabs.protocols import Block, Reference
 from diffabs.references import FixedSlip, PeakLatch, PeakLiteral
 from diffabs.roads import MagicFormula, peak
-from diffabs.rollout import FixedStep, Run, rollout
+from diffabs.scenario.defaults import braking
+from diffabs.simulate.run import rollout
+from diffabs.simulate.solution import FixedStep, Run
 
 TITLE = "Aoki and Nakamura: anti-lock braking at the estimated best slip (quarter car, from 100 km/h)"
 SOLVER = FixedStep(step=5e-5, duration=3.6, every=20)
@@ -80,7 +82,7 @@ class Results(NamedTuple):
 
 def loop(car: QuarterCar, reference: Reference, controller: Block) -> Loop:
     """The closed loop of the paper's section 5."""
-    return Loop(plant=car, reference=reference, controller=controller)
+    return braking(plant=car, reference=reference, controller=controller)
 
 
 def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:

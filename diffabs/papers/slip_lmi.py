@@ -15,14 +15,16 @@ import numpy as np
 
 from diffabs import plot
 from diffabs.controllers import HoldingInput, StateFeedback
-from diffabs.loop import Loop
+from diffabs.core.loop import Loop
 from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_claims, lmi_design, record
 from diffabs.papers.digest import Digest, digest
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip
 from diffabs.roads import RIG, peak
-from diffabs.rollout import FixedStep, Run, Trajectory, measure, rollout
+from diffabs.scenario.defaults import braking
+from diffabs.simulate.run import measure, rollout
+from diffabs.simulate.solution import FixedStep, Run, Trajectory
 from diffabs.stops import SpeedReached
 
 TITLE = "Maeda and Sugiura: robust LQ control of an anti-lock brake (mirrored rig, 50 to 5 km/h)"
@@ -103,7 +105,7 @@ NOTES = [
 
 def loop(case: Case, reference: Any = None) -> Loop:
     """The closed loop of section 5."""
-    return Loop(
+    return braking(
         plant=MirroredRig(mass=case.mass, inertia_factor=case.inertia_factor),
         initial=BrakeStart(speed=50 / 3.6, slip=case.slip),
         reference=FixedSlip() if reference is None else reference,

@@ -27,10 +27,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.numerics import clamp, quotient
+from diffabs.core.numerics import clamp, quotient
+from diffabs.core.protocols import BalanceOutput
+from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.plants.audit import BalanceAudit
-from diffabs.protocols import BalanceOutput
-from diffabs.pytree import Scalar, param, pytree
 
 
 class ArmState(NamedTuple):
@@ -94,8 +94,8 @@ class ArmBalance:
     rotor_inertia: Scalar = param(default=0.0, unit="kg m^2", low=0.0)
     gravity: Scalar = param(default=9.81, unit="m/s^2", above=0.0)
 
+    shows = BalanceOutput
     control_unit = "V"
-    task = "balance"
 
     def lumps(self) -> Lumps:
         """Masses and lengths as they enter the equations."""

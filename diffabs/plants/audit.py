@@ -13,8 +13,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from diffabs.protocols import BalanceOutput, BrakeOutput, Ending, Memory, Sample
-from diffabs.pytree import Scalar, param, part, pytree, static
+from diffabs.core.protocols import BalanceOutput, BrakeOutput, Ending, Memory, Sample
+from diffabs.core.pytree import Scalar, param, part, pytree, static
 
 FORGIVEN = 0.01  # of the energy of the start, in the whole run
 ROUNDING = 1e-6  # of it in a step, 1e-5 of the distance: single precision

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.numerics import clamp, larger, quotient, smaller
+from diffabs.core.numerics import clamp, larger, quotient, smaller
+from diffabs.core.protocols import BrakeOutput, Road
+from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import BrakeStart, forward, halted, slip_ratio
-from diffabs.protocols import BrakeOutput, Road
-from diffabs.pytree import Scalar, param, part, pytree
 from diffabs.roads import RIG
 
 
@@ -58,6 +58,7 @@ class LabRig:
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
     road: Road = part(default=RIG)
 
+    shows = BrakeOutput
     control_unit = "1"  # a command, where other plants take a torque in N m
 
     def start(self, initial: BrakeStart) -> LabRigState:

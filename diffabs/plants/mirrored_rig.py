@@ -11,11 +11,11 @@ is the default. Eq. (12) is for omega2 r2 >= omega1 r1 only; beyond it the slip 
 
 from typing import NamedTuple
 
-from diffabs.numerics import quotient
+from diffabs.core.numerics import quotient
+from diffabs.core.protocols import BrakeOutput, Road
+from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import GRAVITY, BrakeStart, forward, halted, slip_ratio
-from diffabs.protocols import BrakeOutput, Road
-from diffabs.pytree import Scalar, param, part, pytree
 from diffabs.roads import RIG
 
 
@@ -38,6 +38,9 @@ class MirroredRig:
     inertia_factor: Scalar = param(default=0.5, unit="1", above=0.0, high=1.0)
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
     road: Road = part(default=RIG)
+
+    shows = BrakeOutput
+    control_unit = "N m"
 
     def start(self, initial: BrakeStart) -> RigState:
         """State for a speed and a slip."""

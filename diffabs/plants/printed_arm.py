@@ -9,10 +9,10 @@ Fumita, eqs. (8)-(10), for small angles. The matrix of gravity, d(right sides)/d
 from no potential, and no machine has them. In these equations the arm falls to the side that lifts the frame.
 """
 
-from diffabs.numerics import quotient
+from diffabs.core.numerics import quotient
+from diffabs.core.protocols import BalanceOutput
+from diffabs.core.pytree import Scalar, part, pytree
 from diffabs.plants.arm_balance import ArmBalance, ArmState, BalanceStart
-from diffabs.protocols import BalanceOutput
-from diffabs.pytree import Scalar, part, pytree
 
 
 @pytree
@@ -21,8 +21,8 @@ class PrintedArm:
 
     machine: ArmBalance = part(default=ArmBalance)
 
+    shows = BalanceOutput
     control_unit = "V"
-    task = "balance"
 
     def start(self, initial: BalanceStart) -> ArmState:
         """The state with these angles and rates."""

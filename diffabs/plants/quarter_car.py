@@ -9,11 +9,11 @@ neglected."""
 
 from typing import NamedTuple
 
-from diffabs.numerics import quotient
+from diffabs.core.numerics import quotient
+from diffabs.core.protocols import BrakeOutput, Road
+from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import GRAVITY, BrakeStart, forward, halted, slip_ratio
-from diffabs.protocols import BrakeOutput, Road
-from diffabs.pytree import Scalar, param, part, pytree
 from diffabs.roads import SPLINE_B
 
 
@@ -34,6 +34,9 @@ class QuarterCar:
     inertia: Scalar = param(default=1.04456, unit="kg m^2", above=0.0)
     crawl_speed: Scalar = param(default=0.01, unit="m/s", above=0.0)
     road: Road = part(default=SPLINE_B)
+
+    shows = BrakeOutput
+    control_unit = "N m"
 
     def start(self, initial: BrakeStart) -> QuarterCarState:
         """State for a speed and a slip."""

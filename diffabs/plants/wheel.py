@@ -4,8 +4,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from diffabs.numerics import larger, quotient
-from diffabs.pytree import Scalar, param, pytree
+from diffabs.core.numerics import larger, quotient
+from diffabs.core.pytree import Scalar, param, pytree
 
 GRAVITY = 9.81  # m/s^2, the value behind every number of the papers
 

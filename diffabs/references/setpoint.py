@@ -1,7 +1,7 @@
 """Slip references that know their target: fixed, and first-order filtered."""
 
-from diffabs.protocols import BrakeOutput, Memory, no_flow, no_jump, no_memory
-from diffabs.pytree import Scalar, param, pytree
+from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_jump, no_memory
+from diffabs.core.pytree import Scalar, param, pytree
 
 
 @pytree

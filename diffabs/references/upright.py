@@ -1,7 +1,7 @@
 """The reference of a balance: upright."""
 
-from diffabs.protocols import BalanceOutput, Memory, no_flow, no_jump
-from diffabs.pytree import Scalar, pytree
+from diffabs.core.protocols import BalanceOutput, Memory, no_flow, no_jump
+from diffabs.core.pytree import Scalar, pytree
 
 
 @pytree

@@ -8,11 +8,11 @@ from diffabs.roads.burckhardt import SNOW as SNOW
 from diffabs.roads.burckhardt import WET_ASPHALT as WET_ASPHALT
 from diffabs.roads.burckhardt import WET_COBBLESTONE as WET_COBBLESTONE
 from diffabs.roads.burckhardt import Burckhardt as Burckhardt
-from diffabs.roads.compound import Patches as Patches
-from diffabs.roads.compound import Scaled as Scaled
-from diffabs.roads.magic import MagicFormula as MagicFormula
+from diffabs.roads.magic_formula import MagicFormula as MagicFormula
 from diffabs.roads.optimum import Peak as Peak
 from diffabs.roads.optimum import peak as peak
+from diffabs.roads.patches import Patches as Patches
+from diffabs.roads.patches import Scaled as Scaled
 from diffabs.roads.rational import RIG as RIG
 from diffabs.roads.rational import RIG_UNROUNDED as RIG_UNROUNDED
 from diffabs.roads.rational import RationalCurve as RationalCurve

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 
 import jax.numpy as jnp
 
-from diffabs.numerics import odd
-from diffabs.pytree import Scalar, param, pytree
+from diffabs.core.numerics import odd
+from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.rules import Rule
 from diffabs.roads.sign import opposes
-from diffabs.rules import Rule
 
 
 @pytree

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.numerics import clamp, ratio
-from diffabs.protocols import Road
-from diffabs.pytree import Scalar
+from diffabs.core.numerics import clamp, ratio
+from diffabs.core.protocols import Road
+from diffabs.core.pytree import Scalar
 
 GRID = 1024  # intervals of (0, 1]: resolves the peak of every road with a peak slip above 0.001
 BISECTIONS = 50  # 2^-50 of an interval is below the spacing of float64

@@ -9,10 +9,10 @@ the slip of greatest friction" is not true of this curve: its local peak lies at
 from collections.abc import Iterator
 from typing import Any
 
-from diffabs.numerics import odd, power, quotient
-from diffabs.pytree import Scalar, param, pytree
+from diffabs.core.numerics import odd, power, quotient
+from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.rules import Rule
 from diffabs.roads.sign import opposes
-from diffabs.rules import Rule
 
 
 @pytree

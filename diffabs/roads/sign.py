@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.rules import Rule
+from diffabs.core.rules import Rule
 
 SLIPS = np.linspace(0.05, 1.0, 20)  # below them a fitted polynomial may dip under 0 by a millionth, as the rig's does
 

@@ -12,9 +12,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.numerics import odd, ratio
-from diffabs.pytree import Scalar, Vector, param, pytree
-from diffabs.rules import Rule, array, increasing
+from diffabs.core.numerics import odd, ratio
+from diffabs.core.pytree import Scalar, Vector, param, pytree
+from diffabs.core.rules import Rule, array, increasing
 
 
 @pytree

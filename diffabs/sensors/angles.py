@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 
-from diffabs.protocols import BalanceOutput, Clock, Jump, Memory, no_flow
-from diffabs.pytree import Scalar, param, pytree
-from diffabs.rules import Rule
-from diffabs.sensors.disturbance import drawn
-from diffabs.timing import steps, whole_steps
+from diffabs.core.protocols import BalanceOutput, Clock, Jump, Memory, no_flow
+from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.rules import Rule
+from diffabs.core.timing import steps, whole_steps
+from diffabs.sensors.noise import drawn
 
 
 @pytree

@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 
-from diffabs.protocols import BrakeOutput, Memory, no_flow, no_jump, no_memory
-from diffabs.pytree import Scalar, param, pytree
+from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_jump, no_memory
+from diffabs.core.pytree import Scalar, param, pytree
 
 
 @pytree

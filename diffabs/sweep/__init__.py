@@ -1,11 +1,5 @@
 """Monte-Carlo sweeps: what varies, who computes it, where it is kept, and what it says. Needs `diffabs[sweep]`."""
 
-from diffabs.sweep.designs import Corners as Corners
-from diffabs.sweep.designs import Grid as Grid
-from diffabs.sweep.designs import LatinHypercube as LatinHypercube
-from diffabs.sweep.designs import Random as Random
-from diffabs.sweep.designs import Saltelli as Saltelli
-from diffabs.sweep.designs import Sobol as Sobol
 from diffabs.sweep.discrete import Categorical as Categorical
 from diffabs.sweep.discrete import Empirical as Empirical
 from diffabs.sweep.discrete import Rows as Rows
@@ -17,7 +11,13 @@ from diffabs.sweep.engines import Local as Local
 from diffabs.sweep.results import Results as Results
 from diffabs.sweep.run import Progress as Progress
 from diffabs.sweep.run import sweep as sweep
-from diffabs.sweep.space import Correlation as Correlation
-from diffabs.sweep.space import Space as Space
+from diffabs.sweep.sampling import Corners as Corners
+from diffabs.sweep.sampling import Grid as Grid
+from diffabs.sweep.sampling import LatinHypercube as LatinHypercube
+from diffabs.sweep.sampling import Random as Random
+from diffabs.sweep.sampling import Saltelli as Saltelli
+from diffabs.sweep.sampling import Sobol as Sobol
 from diffabs.sweep.store import SweepError as SweepError
 from diffabs.sweep.study import Study as Study
+from diffabs.sweep.variables import Correlation as Correlation
+from diffabs.sweep.variables import Space as Space

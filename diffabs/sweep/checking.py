@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.accuracy import comparable, measure_finer, share
-from diffabs.rollout import Run
+from diffabs.simulate.accuracy import comparable, measure_finer, share
+from diffabs.simulate.solution import Run
 from diffabs.sweep.results import Results
 from diffabs.sweep.study import Study, precision
 

@@ -25,7 +25,7 @@ import numpy as np
 from distributed import Client, KilledWorker, LocalCluster, Security, as_completed
 from distributed.comm.core import connect
 
-from diffabs import files, provenance
+from diffabs.core import files, provenance
 from diffabs.sweep.engines import DECISIVE, Done, done
 from diffabs.sweep.manifest import Seals, described
 from diffabs.sweep.runner import Runner

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
-from diffabs.pytree import Spec
+from diffabs.core.pytree import Spec
 from diffabs.sweep.tables import FINITE, POSITIVE, table, weightless
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
-from diffabs.pytree import Spec
+from diffabs.core.pytree import Spec
 from diffabs.sweep.discrete import Categorical as Categorical
 from diffabs.sweep.discrete import Empirical as Empirical
 from diffabs.sweep.tables import FINITE, POSITIVE, crossed, described, kebab, outside, table, written

@@ -14,8 +14,8 @@ import pathlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from diffabs import files, provenance
-from diffabs.sweep import space
+from diffabs.core import files, provenance
+from diffabs.sweep import variables
 from diffabs.sweep.seal import Seal, SweepError, digest
 from diffabs.sweep.study import DTYPES, FLAGS, RANGES, Study
 from diffabs.sweep.tables import FINITE, POSITIVE, number, text, whole, wrong
@@ -41,7 +41,7 @@ class Seals:
         self.study = manifest["study"]
         self.owner = digest({name: manifest[name] for name in OWNING})
         self.count = -(-self.study["samples"] // self.study["chunk"])
-        varied = space.read(self.study["space"], "study.space").paths
+        varied = variables.read(self.study["space"], "study.space").paths
         self.columns = frozenset({"sample", *FLAGS, *self.study["objectives"], *varied})
 
     def of(self, chunk: int) -> Seal:
@@ -104,7 +104,7 @@ def _wrong_study(study: Mapping[str, Any]) -> Iterator[str]:
             yield f"study.failures.{text(name, 'a failure')} is not measured"
         if not FINITE.holds(number(bound, f"study.failures.{name}")):
             yield f"study.failures.{name} = {bound} is outside {FINITE.interval()}"
-    varied = space.read(study.get("space"), "study.space")
+    varied = variables.read(study.get("space"), "study.space")
     varied.check(study["samples"])
     for name in {"sample", *FLAGS, *varied.paths} & study["objectives"].keys():
         yield f"study.objectives.{name}: another column of the table has this name"

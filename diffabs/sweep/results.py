@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from diffabs import files
+from diffabs.core import files
 from diffabs.sweep import seal
 from diffabs.sweep.engines import accepted
 from diffabs.sweep.manifest import Seals, read_manifest

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from diffabs import provenance
+from diffabs.core import provenance
 from diffabs.sweep.engines import Engine, Local
 from diffabs.sweep.manifest import Seals, described
 from diffabs.sweep.results import Results

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from diffabs.conveyor import measure_lanes
-from diffabs.refusals import refusals
+from diffabs.simulate.refill import measure_lanes
+from diffabs.simulate.refusals import refusals
 from diffabs.sweep.study import FLAGS, Study, noise_key, numbers, precision
 
 PARTS_OF_A_CHUNK = 8

@@ -15,7 +15,7 @@ from typing import Any
 
 import filelock
 
-from diffabs import files
+from diffabs.core import files
 from diffabs.sweep import seal
 from diffabs.sweep.manifest import MANIFEST as MANIFEST
 from diffabs.sweep.manifest import Seals, sealed

@@ -13,14 +13,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.loop import Loop, task
-from diffabs.objectives import REPORTS
-from diffabs.protocols import Objective
-from diffabs.pytree import elements, get, problems, replace
-from diffabs.refusals import ill
-from diffabs.rollout import FixedStep
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import elements, get, problems, replace
+from diffabs.objectives import usual
+from diffabs.simulate.refusals import ill
+from diffabs.simulate.solution import FixedStep
 from diffabs.sweep.discrete import Categorical
-from diffabs.sweep.space import Space
+from diffabs.sweep.variables import Space
 
 DTYPES = ("float32", "float64")
 RANGES = (("samples", 1, 2**32 - 1), ("chunk", 1, 2**20), ("seed", 0, 2**32 - 1))  # keys are folded with 32 bits
@@ -34,7 +34,7 @@ class Study:
 
     space: distributions by dotted path, `plant.mass` or `controller.gain.0`, and the design that draws from them
     parts: for a path drawn by a `Categorical` of names, the part that each name stands for
-    objectives: what is measured; without any, the report of the plant's task
+    objectives: what is measured; without any, what is usual for what the plant shows
     failures: metrics whose excess over a bound counts as a failure; not stopping, locking, falling, diverging always do
     chunk: lanes that are computed and stored together; results are the same to the bit for the same chunk
     """
@@ -51,9 +51,9 @@ class Study:
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Without objectives, the report of the plant's task."""
+        """Without objectives, those usual for what the plant shows."""
         if not self.objectives:
-            object.__setattr__(self, "objectives", dict(REPORTS[task(self.loop.plant)]))
+            object.__setattr__(self, "objectives", usual(self.loop.plant))
 
     @property
     def chunks(self) -> int:

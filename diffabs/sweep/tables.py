@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.pytree import Spec
+from diffabs.core.pytree import Spec
 
 FINITE = Spec("1")
 POSITIVE = Spec("1", low=0.0, open_low=True)

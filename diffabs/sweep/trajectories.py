@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import zarr
 
-from diffabs import files
-from diffabs.loop import signals
-from diffabs.rollout import Trajectory, rollout
+from diffabs.core import files
+from diffabs.core.loop import signals
+from diffabs.simulate.run import rollout
+from diffabs.simulate.solution import Trajectory
 from diffabs.sweep.study import Study, precision
 
 NAME = "trajectories.zarr"

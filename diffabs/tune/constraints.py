@@ -7,10 +7,10 @@ from typing import Any, Protocol
 
 import jax.numpy as jnp
 
-from diffabs.design.polytope import Polytope
-from diffabs.design.reduction import feedback
-from diffabs.design.sensitivity import certified_decay
-from diffabs.loop import Loop
+from diffabs.core.loop import Loop
+from diffabs.design.interior.differentiable import certified_decay
+from diffabs.design.polytopes import Polytope
+from diffabs.design.state_feedback import feedback
 
 DEAD = 1e-9  # |z| of a discrete pole that decays at once
 

@@ -10,7 +10,6 @@ methods, Math. Program. 141 (2013), recommend for functions with kinks. A point 
 far, and its gradient is never used. All starts are evaluated in one compiled call; each decides on its own."""
 
 import dataclasses
-import enum
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from diffabs.core.reason import Reason
 from diffabs.tune.problem import Evaluation, Multipliers
 
 ARMIJO, WOLFE = 1e-4, 0.9
@@ -28,19 +28,6 @@ TRIALS = 12  # of a line search that has found something better, before it is co
 JUMPS = 2  # such searches in a row: no point beyond is better, so the loss jumps there and its gradient is no guide
 LONGEST = 2.0  # of a component of u, in units of z: about half of a finite range
 PATIENCE = 3  # accepted steps in a row that gain nothing
-
-
-class Reason(enum.Enum):
-    """Why a descent ended."""
-
-    GRADIENT = "the gradient is zero within its tolerance"
-    CHANGE = "steps no longer change the loss within its tolerance"
-    STEP = "no shorter step makes the loss smaller"
-    JUMP = "the loss jumps up just beyond, twice in a row"
-    LIMIT = "the limit of iterations was reached"
-    START = "the start diverged, or the integration step is not stable there"
-    KEPT = "where it ended a constraint is not met; the best of its steps that meets all of them is returned"
-    INTERRUPTED = "it was interrupted, before it was at a minimum"
 
 
 @dataclasses.dataclass(frozen=True)

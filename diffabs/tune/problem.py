@@ -17,15 +17,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.loop import Loop
-from diffabs.protocols import Objective
-from diffabs.pytree import replace, strong
-from diffabs.refusals import first_line, refusals
-from diffabs.rollout import FixedStep, Run
-from diffabs.tune.aggregate import Aggregate
-from diffabs.tune.batch import Batch, run
+from diffabs.core.bijectors import Space
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import replace, strong
+from diffabs.simulate.batch import Batch, run
+from diffabs.simulate.refusals import first_line, refusals
+from diffabs.simulate.solution import FixedStep, Run
 from diffabs.tune.constraints import Constraint
-from diffabs.tune.space import Space
+from diffabs.tune.risk import Aggregate
 
 FEW = 6  # parameters up to which forward mode is the cheaper one (benchmarks/bench_gradient.py)
 

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 
 import optax
 
-from diffabs.tune.descent import Point, Reason, Stopping
+from diffabs.core.reason import Reason
+from diffabs.tune.descent import Point, Stopping
 from diffabs.tune.problem import Mode, built
 
 

@@ -5,18 +5,17 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.loop import task
-from diffabs.objectives import REPORTS
-from diffabs.protocols import Objective
-from diffabs.pytree import check
-from diffabs.rollout import FixedStep
-from diffabs.tune.aggregate import Aggregate, Mean
-from diffabs.tune.batch import Batch
+from diffabs.core.bijectors import Range, space
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import check
+from diffabs.objectives import usual
+from diffabs.simulate.batch import Batch
+from diffabs.simulate.solution import FixedStep
+from diffabs.tune.augmented_lagrangian import Search
 from diffabs.tune.constraints import Constraint
-from diffabs.tune.lagrangian import Search
 from diffabs.tune.problem import Mode, Problem, automatic, built
 from diffabs.tune.result import Method, Progress, Tuned
-from diffabs.tune.space import Range, space
+from diffabs.tune.risk import Aggregate, Mean
 
 
 def tune(
@@ -37,7 +36,7 @@ def tune(
 
     subject: a Loop, or a part with a method `closed()`
     free: dotted paths of its parameters, with ranges in which they stay (declared ones where None)
-    measured: objectives by metric; None is the report of the plant's task
+    measured: objectives by metric; None is what is usual for what the plant shows
     objective: weight of each metric of `measured`, `{"stop_distance": 1.0, "effort": 1e-4}`
     over: the runs, parameters of the loop by path; none is the loop itself
     stopping: asked after every evaluation; True ends the search with the best that it has met so far
@@ -76,7 +75,7 @@ def posed(
     """The problem that `tune` solves, for those who bring their own search. Raises ValueError as `tune` does."""
     check(subject)
     loop = built(subject)
-    measured = REPORTS[task(loop.plant)] if measured is None else measured
+    measured = usual(loop.plant) if measured is None else measured
     batch = (over or Batch()).check(loop)
     _check_metrics(objective, measured, constraints)
     free_space = space(subject, free)

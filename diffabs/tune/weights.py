@@ -15,11 +15,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.design.polytope import Polytope
-from diffabs.design.regulator import dlqr, lqr
-from diffabs.design.sensitivity import robust_gain
-from diffabs.loop import Loop
-from diffabs.pytree import Scalar, Vector, param, part, pytree, replace, static
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import Scalar, Vector, param, part, pytree, replace, static
+from diffabs.design.interior.differentiable import robust_gain
+from diffabs.design.polytopes import Polytope
+from diffabs.linear.regulator import dlqr, lqr
 
 Gain = Callable[[Any, Any], Any]
 

@@ -18,17 +18,18 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
-from diffabs.loop import task
-from diffabs.objectives import REPORTS
-from diffabs.protocols import Objective
-from diffabs.pytree import check, replace
-from diffabs.refusals import first_line
-from diffabs.rollout import FixedStep, Run, measure
-from diffabs.tune.aggregate import Mean
-from diffabs.tune.batch import Batch
-from diffabs.tune.descent import Descent, Lane, Reason, Stopping, lbfgs
+from diffabs.core.bijectors import Range, Space, space
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import check, replace
+from diffabs.core.reason import Reason
+from diffabs.objectives import usual
+from diffabs.simulate.batch import Batch
+from diffabs.simulate.refusals import first_line
+from diffabs.simulate.run import measure
+from diffabs.simulate.solution import FixedStep, Run
+from diffabs.tune.descent import Descent, Lane, Stopping, lbfgs
 from diffabs.tune.problem import Mode, Multipliers, Problem, automatic
-from diffabs.tune.space import Range, Space, space
+from diffabs.tune.risk import Mean
 
 MOST_CORNERS = 64
 SAME = 1e-6  # of a value: no more than a corner's, which an ascent approaches and does not reach
@@ -113,7 +114,7 @@ def worst_case(
 ) -> WorstCase:
     """Look for the greatest value of a metric over a box {path: (low, high)}.
 
-    measured: objectives by metric; None is the report of the plant's task
+    measured: objectives by metric; None is what is usual for what the plant shows
     screen: points of a scrambled Sobol sequence that are run first, besides the corners (up to 64)
     starts: how many of the worst of them are ascended from, together
     price: rollouts that a gradient counts as; None is 1 + 1.5 p in forward mode and 6 in reverse
@@ -123,7 +124,7 @@ def worst_case(
             cannot be run.
     """
     check(loop)
-    measured = REPORTS[task(loop.plant)] if measured is None else measured
+    measured = usual(loop.plant) if measured is None else measured
     if metric not in measured:
         raise ValueError(f"{metric} is not measured; there is {', '.join(measured)}")
     middle = replace(loop, {path: 0.5 * (np.asarray(a, float) + np.asarray(b, float)) for path, (a, b) in over.items()})

@@ -1,0 +1,72 @@
+"""Actuators that are a gain or a differential equation: limits, lag, rate limit."""
+
+from collections.abc import Iterator
+
+from diffabs.core.numerics import clamp, quotient
+from diffabs.core.protocols import Memory, no_flow, no_jump, no_memory
+from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.rules import Rule, ordered
+
+
+@pytree
+class Limits:
+    """control = clamp(command, low, high)."""
+
+    low: Scalar = param(default=0.0, unit="N m")
+    high: Scalar = param(default=90.0, unit="N m")
+
+    start = no_memory
+    flow = no_flow
+    jump = no_jump
+
+    def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """Torque [N m]."""
+        del t, memory
+        return clamp(signal, self.low, self.high)
+
+    def rules(self) -> Iterator[Rule]:
+        """Limits that do not exclude each other."""
+        yield ordered(("low", self.low), ("high", self.high), "N m")
+
+
+@pytree
+class Lag:
+    """time_constant control' = command - control, control(0) = 0: a brake that has to build up pressure."""
+
+    time_constant: Scalar = param(default=0.01, unit="s", above=0.0)
+
+    jump = no_jump
+
+    def start(self, signal: Scalar) -> Memory:
+        """Brake released."""
+        return Memory(flow=0.0 * signal)
+
+    def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """control'."""
+        del t
+        return quotient(signal - memory.flow, self.time_constant)
+
+    def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """Torque [N m]."""
+        del t, signal
+        return memory.flow
+
+
+@pytree
+class RateLimit:
+    """control' = clamp((command - control)/time_constant, -rate, rate), control(0) = 0.
+
+    A servo whose speed saturates; the ideal rate limiter is the limit of a small time constant.
+    """
+
+    rate: Scalar = param(default=1000.0, unit="N m/s", above=0.0)
+    time_constant: Scalar = param(default=0.002, unit="s", above=0.0)
+
+    start = Lag.start
+    output = Lag.output
+    jump = no_jump
+
+    def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """control'."""
+        del t
+        return clamp(quotient(signal - memory.flow, self.time_constant), -self.rate, self.rate)

@@ -1,0 +1,260 @@
+"""What the commands that prove something share: a scenario as linear systems, a gain on them, a certificate as JSON.
+
+All of it needs the extra `diffabs[design]`, so what needs that is imported when a command runs."""
+
+import contextlib
+import dataclasses
+import itertools
+import pathlib
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import numpy as np
+
+from diffabs.cli import console, show
+from diffabs.controllers import ProportionalFeedback, Sampled
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Plant
+from diffabs.core.pytree import replace
+from diffabs.linear.balance_model import BalanceModel
+from diffabs.plants import BrakeStart
+from diffabs.scenario.registry import ScenarioError, shown
+from diffabs.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from diffabs.design import Certificate, Polytope, Spec
+    from diffabs.design.frozen import Frozen
+    from diffabs.design.state_feedback import Reduced
+
+# Of the JSON document. Without a certificate most are null.
+FROM_PROOF = ("quadratically_stable", "stable", "verified_exactly", "decay_rate", "damping", "trace_cost",
+              "guaranteed_cost", "worst_vertex", "margins", "claims")  # fmt: skip
+FROM_DESIGN = ("lower_bound", "gap", "residual")
+CELLS = 8  # in which a Lyapunov matrix that follows the speed is linear
+SLIPS, MARGIN = 2001, 1.01  # where friction is asked for its greatest value, and how much more is allowed for
+VERDICTS = {True: "proved", False: "disproved", None: "undecided"}
+
+Box = dict[str, tuple[float, float]]
+
+
+class Task(NamedTuple):
+    """A scenario brought to linear systems: the gain in question, the set it is about, the specification."""
+
+    chosen: Scenario
+    reduced: "Reduced"
+    gain: np.ndarray
+    model: Any  # of which the gain is one gain, and whose parameters the box is about
+    over: Box
+    polytope: "Polytope"
+    spec: "Spec"
+
+
+def task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) -> Task:
+    """A scenario's systems and gain, or another gain on them. Raises ScenarioError; ValueError for a loop that has no
+    linear model; ModuleNotFoundError without the extra."""
+    if weighed and chosen.design.Q is None:
+        raise ScenarioError("design.Q and design.R are missing: a design minimises the cost that they weigh")
+    from diffabs.design import Spec
+    from diffabs.design.parameter_box import polytope
+    from diffabs.design.parameter_grid import gridded
+    from diffabs.design.sdp import solver
+    from diffabs.design.state_feedback import state_feedback
+
+    reduced, wanted = state_feedback(chosen.loop), chosen.design
+    states = reduced.model.states
+    values = reduced.gain if gain is None else _gain(gain, states)
+    spec = Spec(Q=wanted.Q, R=wanted.R, decay=wanted.decay, damping=wanted.damping)
+    try:
+        spec = spec.checked(len(states), 1)
+    except ValueError as error:
+        raise ScenarioError(f"design.{error}; the states are {', '.join(states)}") from None
+    solver.solvers()  # says what is missing before anything is computed
+    reduced, model, over = _followed(chosen.loop, reduced, wanted.box(chosen.loop))
+    systems = gridded(model, over) if isinstance(model, BalanceModel) else polytope(model, over)
+    return Task(chosen, reduced, values, model, over, systems, spec)
+
+
+def _followed(loop: Loop, reduced: "Reduced", box: Box) -> tuple["Reduced", Any, Box]:
+    """The linear model and its box; where the gain follows the speed, those in which it is one gain, whose proof covers
+    every fall of the speed that friction allows."""
+    controller = loop.controller.controller if isinstance(loop.controller, Sampled) else loop.controller
+    if not isinstance(controller, ProportionalFeedback) or isinstance(reduced.model, BalanceModel):
+        return reduced, reduced.model, box
+    from diffabs.design.speed_scaled import SpeedScaled, fall
+
+    model = SpeedScaled(model=reduced.model, reference_speed=controller.reference_speed)
+    if model.period is None:
+        raise ValueError("controller proportional-feedback: only sampled it can be brought to one gain")
+    slowest = box.get("speed", (float(reduced.model.speed),))[0]
+    falls = (0.0, fall(_hardest(loop.plant, box, slowest), slowest, float(model.period)))
+    neglected = tuple(line for line in reduced.neglected if "fall of the speed" not in line)
+    over = {f"model.{path}": ends for path, ends in box.items()} | {"fall": falls}
+    return reduced._replace(neglected=neglected), model, over
+
+
+def _hardest(plant: Plant, box: Box, speed: float) -> float:
+    """The greatest deceleration [m/s^2] that friction gives at a speed, over the corners of the box."""
+    inside = {path.removeprefix("plant."): ends for path, ends in box.items() if path.startswith("plant.")}
+
+    def deceleration(plant: Plant, slip: Any) -> Any:
+        return plant.output(plant.start(BrakeStart(speed=speed, slip=slip))).deceleration
+
+    slips = np.linspace(0.0, 1.0, SLIPS)
+    plants = (replace(plant, dict(zip(inside, corner, strict=True))) for corner in itertools.product(*inside.values()))
+    return MARGIN * max(float(np.max(jax.vmap(partial(deceleration, one))(slips))) for one in plants)
+
+
+def certified(task: Task) -> "Certificate":
+    """What can be proved about the gain, with the fastest decay."""
+    from diffabs.design import analysis
+
+    return analysis.certify(task.gain, task.polytope, task.spec, fastest=True)
+
+
+def _gain(text: str, states: Sequence[str]) -> np.ndarray:
+    words = text.strip().removeprefix("[").removesuffix("]").split(",")
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        raise ScenarioError(f"--gain {shown(text)}: numbers are needed, as in --gain=-11753,-48") from None
+    if not np.isfinite(values).all():
+        raise ScenarioError(f"--gain {shown(text)} is outside (-inf, inf): a gain is finite")
+    if len(values) != len(states):
+        raise ScenarioError(f"--gain {shown(text)} has {len(values)} of {len(states)} numbers: {', '.join(states)}")
+    return values
+
+
+class Besides(NamedTuple):
+    """What is known of a gain that no common Lyapunov matrix proves: its loops at fixed parameters, and the fall of the
+    speed [m/s^2] up to which a Lyapunov matrix that follows the speed proves it; None if that was not asked or does not
+    succeed."""
+
+    frozen: "Frozen"
+    fall: float | None
+
+    def document(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"frozen": self.frozen._asdict(), "proved_for_a_speed_falling_by": self.fall}
+
+
+def besides(task: Task, proof: "Certificate") -> Besides | None:
+    """What is known besides; None where a common Lyapunov matrix says more."""
+    from diffabs.design.frozen import frozen
+
+    if proof.quadratically_stable:
+        return None
+    loops = frozen(task.gain, task.model, task.over)
+    return Besides(loops, _following(task) if loops.stable == loops.systems else None)
+
+
+def _following(task: Task) -> float | None:
+    """The greatest fall of the speed that friction allows, if a Lyapunov matrix piecewise linear in the speed proves
+    stability up to it."""
+    from diffabs.design import Spec, analysis
+    from diffabs.design.parameter_box import schedule
+
+    low, high = task.over.get("speed", (0.0, 0.0))
+    if not 0 < low < high or task.polytope.period is not None:
+        return None
+    fall = _hardest(task.chosen.loop.plant, task.over, low)
+    cells = schedule(task.model, task.over, along="speed", nodes=CELLS)
+    return fall if analysis.certify(task.gain, cells, Spec(rates=(-fall, 0.0))).stable else None
+
+
+def document(
+    task: Task,
+    proof: "Certificate | None" = None,
+    out: pathlib.Path | None = None,
+    reason: str | None = None,
+    known: Besides | None = None,
+    **numbers: float | None,
+) -> dict[str, Any]:
+    """The JSON document. Parameters have the names of the linear model, in SI."""
+    summary: dict[str, Any] = proof.summary() if proof else {}
+    if proof:
+        summary["worst_vertex"] = summary["worst_vertex"] or slowest(proof)
+    coverage = task.polytope.coverage
+    return {
+        "scenario": task.chosen.name,
+        "gain": np.ravel(proof.gain).tolist() if proof else None,  # one input: the row is the gain
+        "states": list(task.model.states),
+        **{name: summary.get(name) for name in FROM_PROOF},
+        **dict.fromkeys(FROM_DESIGN),
+        **numbers,
+        "reason": reason,
+        "besides": known.document() if known else None,
+        "period": task.polytope.period,
+        "over": {path: list(ends) for path, ends in task.over.items()},
+        "vertices": task.polytope.vertices,
+        "corners": [dict(corner) for corner in task.polytope.corners],
+        "poles": list(proof.frozen) if proof else None,
+        "coverage": dataclasses.asdict(coverage) if coverage else None,
+        "exact": task.reduced.exact,
+        "neglected": list(task.reduced.neglected),
+        "versions": show.versions("cvxpy", "clarabel", "scipy"),
+        "files": {"out": str(out)} if out and proof else {},
+    }
+
+
+def slowest(proof: "Certificate") -> dict[str, Any]:
+    """For a proof that is about all vertices together: the vertex with the slowest pole, as `worst_vertex`."""
+    index = int(np.argmax(proof.frozen))
+    margin = (0.0 if proof.period is None else 1.0) - proof.frozen[index]
+    corners = proof.cells[0].corners
+    corner = dict(corners[index]) if corners else None
+    return {"index": index, "cell": 0, "corner": corner, "claim": "poles", "margin": margin}
+
+
+def unproved(proof: "Certificate", spec: "Spec", known: Besides | None = None) -> str:
+    """What was asked for and is not proved, in words, and what is known besides; empty if all is proved."""
+    stable, refuted = proof.quadratically_stable, any(proof.proved("infeasible"))
+    asked = {
+        "decay": (spec.decay > 0, f"decay = {spec.decay:g} 1/s", not refuted),
+        "cost": (spec.Q is not None, "a guaranteed cost", True),
+        "damping": (spec.damping > 0, f"damping = {spec.damping:g}", True),
+    }
+    found = [] if stable else [f"quadratic stability is {VERDICTS[stable]}"]
+    if stable is False:
+        found[0] += f": no common Lyapunov matrix exists for the {proof.cells[0].vertices} vertices"
+        found[0] += ", so no design by one over these ranges, whatever Q and R, gives this gain"
+    else:
+        for kind, (wanted, words, still_open) in asked.items():
+            if wanted and not any(proof.proved(kind)):
+                found.append(f"{words} is {VERDICTS[None if still_open else False]}")
+    if not found:
+        return ""
+    if known and known.frozen.stable == known.frozen.systems:
+        return f"{', '.join(found)}; that is not instability: {stable_besides(known)}"
+    worst = slowest(proof)
+    where = ", ".join(f"{name} {value:.6g}" for name, value in (worst["corner"] or {}).items())
+    kind = "is unstable even if it is fixed" if worst["margin"] <= 0 else "has the slowest pole"
+    return f"{', '.join(found)}; vertex {worst['index']}{f' ({where})' if where else ''} {kind}"
+
+
+def stable_besides(known: Besides) -> str:
+    """In words, of a gain whose frozen loops are all stable."""
+    loops = known.frozen
+    where = ", ".join(f"{name} {value:.6g}" for name, value in loops.at.items())
+    said = f"each of {loops.systems} frozen systems is stable by its poles"
+    said += f", the slowest decays at {loops.slowest:.4g} 1/s{f' ({where})' if where else ''}"
+    if known.fall is None:
+        return said
+    return (
+        f"{said}, and a Lyapunov matrix that follows the speed proves stability while that falls by no more than"
+        f" {known.fall:.4g} m/s^2, all that friction allows"
+    )
+
+
+@contextlib.contextmanager
+def reported() -> Iterator[None]:
+    """What `diffabs.design` raises, in one line: what is missing or does not fit is bad input."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        console.fail(" ".join(str(error).split()))
+    except np.linalg.LinAlgError as error:
+        console.fail(f"the linear algebra failed: {error}", console.FAILED)
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None

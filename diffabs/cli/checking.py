@@ -1,0 +1,78 @@
+"""How accurate the metrics of a scenario's run are, as values of JSON: against steps of a half and a quarter, and in
+single precision."""
+
+import math
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffabs.scenario.registry import ScenarioError
+from diffabs.scenario.scenario import MOST_STEPS, Scenario
+from diffabs.simulate.accuracy import accuracy, needs_key, reasons
+from diffabs.simulate.run import measure
+
+SMALL = 1e-6  # of a value: below, nobody asks for its order
+FINEST = 4  # the shortest step is this part of the scenario's
+
+
+def checked(chosen: Scenario, key: Any) -> dict[str, Any]:
+    """The document, by metric: what a half step changes, absolutely and relative to the value, what a quarter changes
+    again, the order, the error, and what single precision changes. Raises ScenarioError for a step too short to be
+    shortened."""
+    solver = chosen.solver
+    if FINEST * solver.duration / solver.step > MOST_STEPS:
+        least = FINEST * solver.duration / MOST_STEPS
+        raise ScenarioError(
+            f"solver.step = {solver.step:g} s is outside [{least:g}, {solver.duration:g}] s: a quarter of it takes too "
+            "many steps for --check"
+        )
+    why = reasons(chosen.loop, solver, key)
+    found = jax.device_get(accuracy(chosen.loop, solver, chosen.objectives, key=key))
+    single = {} if needs_key(chosen.loop) else _single(chosen)
+    metrics = {}
+    for name in chosen.objectives:
+        one = found.estimates[name]
+        value, low = float(one.value), single.get(name)
+        metrics[name] = {
+            "value": value,
+            "difference": float(one.difference),
+            "relative": _share(float(one.difference), value),
+            "finer difference": float(one.finer),
+            "order": float(one.order),
+            "converges": bool(one.converges),
+            "error": float(one.error),
+            "float32 difference": None if low is None else low - value,
+        }
+    return {
+        "steps": [solver.step, solver.step / 2, solver.step / FINEST],
+        "comparable": not why,
+        "reasons": why,
+        "ended alike": bool(found.alike),
+        "metrics": metrics,
+    }
+
+
+def said(found: dict[str, Any]) -> list[str]:
+    """What a reader of the table must know, a line each."""
+    lines = [f"accuracy unknown: {why}" for why in found["reasons"]]
+    if found["comparable"] and not found["ended alike"]:
+        lines.append("accuracy unknown: with a shorter step the run ends in another way")
+    rows = found["metrics"].items()
+    loose = [name for name, row in rows if not row["converges"] and row["error"] > SMALL * abs(row["value"])]
+    if found["comparable"] and loose:
+        lines.append(f"a shorter step does not bring {', '.join(loose)} any nearer to a value: the error is a guess")
+    return lines
+
+
+def _single(chosen: Scenario) -> dict[str, float]:
+    """The metrics in single precision. Noise is not asked for: other bits are drawn for it."""
+    with jax.enable_x64(False):
+        loop, objectives = jax.tree.map(lambda x: np.asarray(x, np.float32), (chosen.loop, dict(chosen.objectives)))
+        return {name: float(x) for name, x in measure(loop, chosen.solver, objectives).metrics.items()}
+
+
+def _share(difference: float, value: float) -> float:
+    if difference == 0 or math.isnan(difference):
+        return abs(difference)
+    return abs(difference / value) if value else float("inf")

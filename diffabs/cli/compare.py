@@ -1,0 +1,76 @@
+"""The command `compare`: two sweeps over the same samples, sample by sample."""
+
+import pathlib
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from diffabs.cli import console, show
+from diffabs.cli.sweep import reported, warn_of_strays
+from diffabs.scenario.registry import ScenarioError, unknown
+
+if TYPE_CHECKING:
+    from diffabs.sweep import Results
+
+SAME = ("space", "seed", "samples")  # of two studies whose samples are the same
+
+
+def compare(
+    first: Annotated[pathlib.Path, typer.Argument(help="Folder of a sweep.")],
+    second: Annotated[pathlib.Path, typer.Argument(help="Folder of another, over the same samples.")],
+    metric: Annotated[list[str] | None, typer.Option(help="Only this metric; may be repeated.")] = None,
+    as_json: console.Json = False,
+) -> None:
+    """What the second sweep does better or worse than the first, on common random numbers."""
+    with console.guarded(), reported():
+        console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
+        from diffabs.sweep import Results
+
+        a, b = Results(first), Results(second)
+        _check_same(a, b)
+        result = {"first": str(first), "second": str(second), **_compared(a, b, _metrics(a, b, metric))}
+        show.as_json(result) if as_json else show.compared(result)
+
+
+def _check_same(a: "Results", b: "Results") -> None:
+    """Raises ScenarioError for sweeps over different samples, or that are not complete."""
+    from diffabs.sweep.store import differences
+
+    for found in (a, b):
+        warn_of_strays(found)
+        if not found.complete:
+            raise ScenarioError(f"{found.folder} is not complete; --resume goes on with it")
+    for line in differences({k: a.study[k] for k in SAME}, {k: b.study[k] for k in SAME}):
+        raise ScenarioError(
+            f"the samples are not the same: {line.replace(' there, ', ' in the first, ')} in the second"
+        )
+
+
+def _metrics(a: "Results", b: "Results", wanted: list[str] | None) -> list[str]:
+    both = [name for name in a.metrics if name in b.metrics]
+    for name in wanted or ():
+        if name not in both:
+            raise unknown(f"--metric {name} is not in both", name, both)
+    return wanted or both
+
+
+def _compared(a: "Results", b: "Results", metrics: list[str]) -> dict[str, Any]:
+    """Paired statistics of second minus first, over samples that diverged or were refused in neither."""
+    from diffabs.sweep.statistics.estimates import Moments
+    from diffabs.sweep.statistics.paired import paired
+
+    lost = a.column("diverged") | b.column("diverged") | ~a.accepted | ~b.accepted
+    rows = {}
+    for name in metrics:
+        before, after = a.column(name)[~lost], b.column(name)[~lost]
+        found = paired(after, before)
+        rows[name] = {
+            "first": Moments.of(before).mean().value,
+            "second": Moments.of(after).mean().value,
+            "difference": found.mean.table(),
+            "median difference": found.median.table(),
+            "share in which the second is less": found.less.table(),
+            "equal": found.ties,
+            "variance reduction": found.reduction,
+        }
+    return {"samples": len(lost), "left out": int(lost.sum()), "metrics": rows}

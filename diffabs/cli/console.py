@@ -1,0 +1,308 @@
+"""What every command does: report errors in one line, wait with a sign of life, replace files whole."""
+
+import contextlib
+import importlib.util
+import multiprocessing
+import os
+import pathlib
+import shlex
+import sys
+import tempfile
+import textwrap
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated, Any, NoReturn, TypeVar
+
+import typer
+from rich.console import Console
+
+from diffabs.cli import progress
+from diffabs.core import files, interrupt
+from diffabs.scenario.registry import ScenarioError
+from diffabs.scenario.scenario import Scenario, load, names
+
+T = TypeVar("T")
+
+FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, interrupt.INTERRUPTED, interrupt.TERMINATED
+PATIENCE, AGAIN = progress.PATIENCE, progress.AGAIN
+AWAKE = 0.1  # s between looks for Ctrl-C
+LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
+CONTINUED = " \\"  # a line of a shell that goes on in the next
+WORKER = "diffabs worker"
+PICTURES = (".png", ".pdf", ".svg")
+
+
+# What commands take.
+def scenarios_like(incomplete: str) -> list[str]:
+    """Completions; where there is none the shell offers files."""
+    return [name for name in names() if name.startswith(incomplete)]
+
+
+ScenarioName = Annotated[
+    str, typer.Argument(help="A TOML file, or the name of a packaged scenario.", autocompletion=scenarios_like)
+]
+Changes = Annotated[
+    list[str] | None, typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Override a field; may be repeated.")
+]
+Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout, nothing else there.")]
+
+
+_quiet = False
+
+
+def quieten(wanted: bool) -> None:
+    """Say no more than errors, warnings, and what was interrupted; or everything."""
+    global _quiet
+    _quiet = wanted
+
+
+def say(line: str) -> None:
+    """A line for a person, on stderr; on a terminal folded between words."""
+    if not _quiet or line.startswith(LOUD):
+        _write("\n".join(_folded(line)))
+
+
+def say_command(line: str, words: Sequence[str]) -> None:
+    """A line that ends in a command; on a terminal too narrow for both the command has its own lines, to copy."""
+    width, command = _width(), [shlex.quote(word) for word in words]
+    if width is None or len(" ".join([line, *command])) <= width:
+        say(" ".join([line, *command]))
+        return
+    say(line)
+    rows = [command[0]]
+    for word in command[1:]:
+        if len(rows[-1]) + len(word) + len(" ") + len(CONTINUED) <= width:
+            rows[-1] += f" {word}"
+        else:
+            rows.append(f"    {word}")
+    _write(f"{CONTINUED}\n".join(rows))
+
+
+def _write(text: str) -> None:
+    """Not with `typer.echo`, which writes past what has taken the place of stderr: the display of how far work is,
+    which moves out of the way."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def _folded(line: str) -> list[str]:
+    width = _width()
+    if width is None or len(line) <= width:
+        return [line]
+    return textwrap.wrap(line, width, break_long_words=False, break_on_hyphens=False)
+
+
+def _width() -> int | None:
+    """Columns of the terminal that stderr is; None where it is none."""
+    console = Console(stderr=True)
+    return console.width if console.is_terminal else None
+
+
+def fail(line: str, status: int = BAD_INPUT) -> NoReturn:
+    """Leave with one line. Raises typer.Exit."""
+    say(f"error: {line}")
+    raise typer.Exit(status)
+
+
+def animated() -> bool:
+    """Whether stderr shows a spinner: a terminal that can write over a line."""
+    console = Console(stderr=True)
+    return console.is_terminal and not console.is_dumb_terminal
+
+
+@contextlib.contextmanager
+def guarded() -> Iterator[None]:
+    """Bad input, a full disk, and Ctrl-C end a command with one line and their exit status."""
+    try:
+        yield
+    except ScenarioError as error:
+        fail(str(error))
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        fail(" ".join(str(error).split()), FAILED)
+    except MemoryError:
+        fail("out of memory", FAILED)
+    except KeyboardInterrupt:
+        say("interrupted")
+        raise typer.Exit(INTERRUPTED) from None
+
+
+class Ending:
+    """What Ctrl-C asks of work that can end early and has then something to show: to finish `what` it has in hand. The
+    work asks this object whether it shall. The second time Ctrl-C interrupts, and the first, too, while `nothing()` is
+    reached yet."""
+
+    def __init__(self, what: str, nothing: Callable[[], bool] = lambda: False):
+        """Nobody has asked yet."""
+        self.what, self.nothing, self.asked = what, nothing, False
+
+    def __call__(self) -> bool:
+        """Whether Ctrl-C was pressed."""
+        return self.asked
+
+    def ask(self) -> None:
+        """Ctrl-C was pressed. Raises KeyboardInterrupt if the work is not to be waited for."""
+        if self.asked or self.nothing():
+            raise KeyboardInterrupt
+        self.asked = True
+        say(f"interrupted: finishing {self.what} (Ctrl-C again: at once)")
+
+
+def waited(
+    work: Callable[[], T], message: str, detail: progress.Detail | None = None, ending: Ending | None = None
+) -> T:
+    """The result of `work`, with a spinner on a terminal, or a line if it takes long elsewhere. `detail` says how far
+    the work is: beside the spinner, or in a line every few seconds.
+
+    The work has a thread of its own, because Ctrl-C cannot interrupt compiled code in the main one. Raises what it
+    raises, and KeyboardInterrupt at once, or with an `ending` when there is nothing to wait for.
+    """
+    result: list[T] = []
+    errors: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            result.append(work())
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run, name=WORKER, daemon=True)
+    told = contextlib.nullcontext(lambda: None) if _quiet else progress.shown(message, detail, say, (PATIENCE, AGAIN))
+    with told as tell:
+        thread.start()
+        while thread.is_alive():
+            if _pressed_while(thread):
+                (ending or Ending("", nothing=lambda: True)).ask()
+            tell()
+    if errors:
+        raise errors[0]
+    return result[0]
+
+
+def _pressed_while(thread: threading.Thread) -> bool:
+    """Wait a moment for a thread. Whether Ctrl-C was pressed; an exception where this is not the command's process."""
+    try:
+        thread.join(AWAKE)
+    except KeyboardInterrupt:
+        return True
+    return interrupt.pressed()
+
+
+def loaded(scenario: str, changes: Sequence[str] | None, *, integrated: bool = True) -> Scenario:
+    """A scenario; says what is allowed in it but hardly meant. Raises ScenarioError."""
+    chosen = waited(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
+    for line in chosen.cautions():
+        say(f"warning: {line}")
+    return chosen
+
+
+def leave(status: Any) -> NoReturn:
+    """Exit at once where interrupted work still runs: the interpreter would wait for it; what that work has begun to
+    write and its processes go with it. Raises SystemExit else."""
+    status = TERMINATED if status == INTERRUPTED and interrupt.terminated() else status
+    if any(thread.name == WORKER for thread in threading.enumerate()):
+        for child in multiprocessing.active_children():
+            child.kill()
+        files.clear()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status if isinstance(status, int) else FAILED)
+    raise SystemExit(status)
+
+
+def need_extra(extra: str, *modules: str) -> None:
+    """Raises typer.Exit if a module of an optional extra is not installed."""
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    if missing:
+        fail(f'{" and ".join(missing)} needed: pip install "diffabs[{extra}]"')
+
+
+def need_matplotlib() -> None:
+    """Raises typer.Exit where no figure can be drawn."""
+    os.environ.setdefault("MPLBACKEND", "agg")
+    if importlib.util.find_spec("matplotlib") is None:
+        fail('figures need matplotlib: pip install "diffabs[plot]"')
+
+
+def check_picture(plot: pathlib.Path | None) -> None:
+    """Raises typer.Exit for a name that no figure can have, or without matplotlib."""
+    if plot:
+        if plot.suffix.lower() not in PICTURES:
+            fail(f"--plot {plot}: the name must end in {', '.join(PICTURES)}")
+        need_matplotlib()
+
+
+def check_scenario_file(out: pathlib.Path | None) -> None:
+    """Raises typer.Exit for a name under which no scenario would be found."""
+    if out and out.suffix != ".toml":
+        fail(f"--out {out}: the name must end in .toml")
+
+
+def resolved(path: pathlib.Path, option: str) -> pathlib.Path:
+    """A path without links. Raises typer.Exit for links that only lead to each other."""
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            path.stat()  # some versions of Python resolve a loop
+        return path.resolve()
+    except OSError as error:
+        fail(f"{option} {path}: cannot be written, {error.strerror}")
+    except ValueError:
+        fail(f"{option} {path}: is no name of a file")
+
+
+@contextlib.contextmanager
+def new_file(target: pathlib.Path, option: str) -> Iterator[pathlib.Path]:
+    """A temporary file beside `target` that takes its place at the end, or vanishes if anything goes wrong. Whoever
+    removes it leaves `target` as it was.
+
+    Raises typer.Exit where no file can be written.
+    """
+    target = resolved(target, option)
+    if target.exists() and not target.is_file():
+        fail(f"{option} {target}: is not a regular file")
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
+    except OSError as error:
+        fail(f"{option} {target}: cannot be written, {error.strerror}")
+    os.close(handle)
+    with files.unfinished(pathlib.Path(name)) as temporary:
+        yield temporary
+        if temporary.exists():
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(target)
+
+
+@contextlib.contextmanager
+def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
+    """A temporary folder beside `target` that takes its place at the end, or vanishes if anything goes wrong.
+
+    An older result (it has a summary.json) is replaced; any other content is left alone. Raises typer.Exit where the
+    folder cannot be made or replaced.
+    """
+    target = resolved(target, "--out")
+    if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "summary.json").exists())):
+        fail(f"--out {target}: exists and is no earlier result; move it away")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        room = pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
+    except OSError as error:
+        fail(f"--out {target}: cannot be written, {error.strerror}")
+    with files.unfinished(room):
+        new, old = room / "new", room / "old"
+        new.mkdir()
+        yield new
+        if target.exists():
+            target.rename(old)
+        try:
+            new.rename(target)
+        except OSError:
+            if old.exists():
+                old.rename(target)
+            raise
+
+
+def _umask() -> int:
+    """What new files may not have; it can only be read by setting it."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

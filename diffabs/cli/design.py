@@ -1,0 +1,121 @@
+"""The commands `design` and `certify`: a robust gain for a scenario, and what can be proved about one.
+
+Both need the extra `diffabs[design]`, so what needs it is imported when a command runs."""
+
+import contextlib
+import math
+import pathlib
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+
+from diffabs.cli import certificates, console, show
+from diffabs.core.pytree import parameters
+
+CHECK = "check it with: diffabs verify"
+
+Out = Annotated[pathlib.Path | None, typer.Option(metavar="FILE.json", help="Write the certificate to this file.")]
+
+
+def design(
+    scenario: console.ScenarioName,
+    changes: console.Changes = None,
+    as_json: console.Json = False,
+    out: Out = None,
+) -> None:
+    """Find the state feedback with the least guaranteed cost over the ranges of [design], and prove it."""
+    with console.guarded(), certificates.reported():
+        with _file(out) as file:
+            task = console.waited(lambda: _task(scenario, changes or (), weighed=True), "computing the polytope")
+            from diffabs.design import synthesis
+
+            try:
+                found = console.waited(
+                    lambda: synthesis.design(task.polytope, task.spec), f"designing for {task.chosen.name}"
+                )
+            except synthesis.DesignError as error:
+                if as_json:
+                    show.as_json(certificates.document(task, reason=str(error)))
+                console.fail(f"{task.chosen.name}: {error}", console.FAILED)
+            if file:
+                found.certificate.save(file)
+        numbers = {name: getattr(found, name) for name in (*certificates.FROM_DESIGN, "trace_cost")}
+        _show(certificates.document(task, found.certificate, out, **numbers), task, as_json)
+
+
+def certify(
+    scenario: console.ScenarioName,
+    gain: Annotated[
+        str | None, typer.Option(metavar="K1,K2,...", help="The gain of u = K x; else the scenario's controller's own.")
+    ] = None,
+    changes: console.Changes = None,
+    as_json: console.Json = False,
+    out: Out = None,
+) -> None:
+    """Prove, or disprove, that a gain is stable over the ranges of [design], however fast the parameters vary."""
+    with console.guarded(), certificates.reported():
+        with _file(out) as file:
+            task = console.waited(lambda: _task(scenario, changes or (), gain), "computing the polytope")
+            found = console.waited(lambda: certificates.certified(task), f"certifying {task.chosen.name}")
+            if file:
+                found.save(file)
+        known = console.waited(lambda: certificates.besides(task, found), "looking at what is known besides")
+        reason = certificates.unproved(found, task.spec, known)
+        _show(certificates.document(task, found, out, reason=reason or None, known=known), task, as_json)
+        if reason:
+            console.fail(f"{task.chosen.name}: {reason}", console.FAILED)
+
+
+def verify(
+    file: Annotated[pathlib.Path, typer.Argument(metavar="FILE.json", help="What design or certify wrote.")],
+    as_json: console.Json = False,
+) -> None:
+    """Prove a saved certificate again, in fractions, by code that shares nothing with what made it. Exit status 0
+    proved, 1 not proved, 2 no certificate."""
+    from diffabs.design.verify import verify as verified
+
+    with console.guarded():
+        try:
+            verdicts = console.waited(lambda: verified(file), f"verifying {file}")
+        except ValueError as error:
+            console.fail(f"{file}: {' '.join(str(error).split())}")
+        proved = bool(verdicts) and not any(verdict.reason for verdict in verdicts)
+        show.verified({
+            "file": str(file),
+            "proved": proved,
+            "claims": [{**verdict._asdict(), "proved": not verdict.reason} for verdict in verdicts],
+            "versions": show.versions(),
+        }, as_json)  # fmt: skip
+        if not proved:
+            why = "; ".join(f"{verdict.kind}: {verdict.reason}" for verdict in verdicts if verdict.reason)
+            console.fail(f"{file}: not proved: {why or 'the file claims nothing'}", console.FAILED)
+
+
+def _file(out: pathlib.Path | None) -> contextlib.AbstractContextManager[pathlib.Path | None]:
+    return console.new_file(out, "--out") if out else contextlib.nullcontext()
+
+
+def _task(
+    scenario: str, changes: Sequence[str], gain: str | None = None, *, weighed: bool = False
+) -> certificates.Task:
+    return certificates.task(console.loaded(scenario, changes, integrated=False), gain, weighed=weighed)
+
+
+def _show(result: dict[str, Any], task: certificates.Task, as_json: bool) -> None:
+    if as_json:
+        show.as_json(result)
+    else:
+        units = {path: spec.unit for path, spec, _ in parameters(task.model)}
+        show.proof(result, f"{task.chosen.name}: u = K x", units, certificates.VERDICTS[result["quadratically_stable"]])
+    for line in task.reduced.neglected:
+        console.say(f"neglected: {line}")
+    if not task.reduced.exact:
+        console.say("note: the linear model is not the loop's own linearisation; a proof is about the model")
+    spread = task.polytope.coverage.spread if task.polytope.coverage else 1.0
+    if not task.polytope.corners:
+        console.say("note: the corners do not cover the ranges; the vertices are those of a box around the systems")
+    elif not math.isclose(spread, 1.0):
+        console.say(f"note: the corners do not cover the ranges; the vertices are spread by {spread:.4g}")
+    for path in result["files"].values():
+        console.say(f"certificate: {path}; {CHECK} {path}")

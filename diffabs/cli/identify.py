@@ -1,0 +1,262 @@
+"""The command `identify`: parameters of a scenario from a measured run.
+
+It needs the extra `diffabs[tune]`; what needs that is imported when it runs."""
+
+import contextlib
+import dataclasses
+import math
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from diffabs.cli import certificates, console, show
+from diffabs.core.pytree import get, parameters
+from diffabs.scenario import section_tune, toml
+from diffabs.scenario.measurements import UNITS, Readings, read
+from diffabs.scenario.parameter_paths import flat
+from diffabs.scenario.registry import ScenarioError, shown, unknown
+from diffabs.scenario.scenario import Scenario, dump
+from diffabs.simulate.solution import FixedStep
+
+if TYPE_CHECKING:
+    from diffabs.identify.fit import Identified
+
+CORRELATED = 0.95
+ROUNDS = 3  # fits, where the noise is estimated from the residuals of the one before
+LEAST = 1e-6  # of a column's spread: less noise than that is not believed
+MOST_ROWS = 20_000  # of a simulated trajectory
+DEPENDENT = {"slip", "speed", "wheel_speed"}
+REDUNDANT = (
+    "slip, speed and wheel_speed: one follows from the others, and counted as independent they make the standard"
+    " deviations too small; choose with --column"
+)
+SPARE = 2  # steps after the last instant of the data
+
+
+def identify(
+    scenario: console.ScenarioName,
+    data: Annotated[pathlib.Path, typer.Option(metavar="FILE.csv", help="A run, in the columns of simulate --csv.")],
+    free: Annotated[
+        list[str], typer.Option(metavar="PATH[=LOW:HIGH]", help="A parameter to find, and its range; may be repeated.")
+    ],
+    sigma: Annotated[
+        list[str] | None,
+        typer.Option(metavar="COLUMN=NUMBER", help="Standard deviation of a column's noise; else from the residuals."),
+    ] = None,
+    column: Annotated[
+        list[str] | None, typer.Option(metavar="COLUMN", help="Compare this column, not all; may be repeated.")
+    ] = None,
+    changes: console.Changes = None,
+    as_json: console.Json = False,
+    out: Annotated[
+        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write the scenario with what was found.")
+    ] = None,
+) -> None:
+    """Find parameters of a scenario from a measured run, and say how well it determines them."""
+    with console.guarded(), certificates.reported():
+        console.need_extra("tune", "optax", "scipy")
+        console.check_scenario_file(out)
+        with console.new_file(out, "--out") if out else contextlib.nullcontext() as file:
+            readings = _readings(data, column)
+            noise = _noise(sigma or (), readings)
+            chosen = console.loaded(scenario, changes)
+            ranges = _ranges(free, chosen)
+            found, noise, interrupted = _watched(chosen, readings, ranges, noise)
+            result = {**_result(chosen, readings, ranges, found, noise), "interrupted": interrupted}
+            if interrupted:
+                show.as_json(result) if as_json else show.identified(result)
+                console.say("interrupted: these are the values so far, not the best ones; no file is written")
+                raise typer.Exit(console.INTERRUPTED)
+            if result["undetermined"]:  # inside, so that no file is written
+                show.as_json(result) if as_json else show.identified(result)
+                missing = "; ".join(row["direction"] for row in result["undetermined"])
+                console.fail(f"{chosen.name}: not identifiable from these data: {missing}", console.FAILED)
+            if file:
+                file.write_text(dump(chosen.with_loop(found.part, "identified")), encoding="utf-8")
+        result["files"] = {"out": str(out)} if out else {}
+        show.as_json(result) if as_json else show.identified(result)
+
+
+def _readings(data: pathlib.Path, names: Sequence[str] | None) -> Readings:
+    """Those columns of a file that are compared."""
+    readings = read(data)
+    for name in names or ():
+        if name not in readings.columns:
+            raise unknown(f"--column {shown(name)} is not in the data", name, readings.columns)
+    columns = {name: readings.columns[name] for name in names or readings.columns}
+    if set(columns) >= DEPENDENT:
+        console.say(f"note: {REDUNDANT}")
+    return Readings(readings.t, columns)
+
+
+def _noise(given: Sequence[str], readings: Readings) -> dict[str, float]:
+    """Standard deviations by column, in SI."""
+    found: dict[str, float] = {}
+    for text in given:
+        name, equals, number = text.partition("=")
+        name = name.strip()
+        if not equals:
+            raise ScenarioError(f"--sigma {shown(text)} is not of the form column=number")
+        if name not in readings.columns:
+            raise unknown(f"--sigma {shown(name)} is not a column of the data", name, readings.columns)
+        value = toml.value(number.strip())
+        unit = "" if UNITS[name] == "1" else f" {UNITS[name]}"
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ScenarioError(f"--sigma {name} = {shown(value)} is no number in (0, inf){unit}")
+        if not 0 < value < math.inf:
+            raise ScenarioError(f"--sigma {name} = {shown(value)} is outside (0, inf){unit}")
+        found[name] = float(value)
+    return found
+
+
+def _ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.Ends]:
+    """Ranges by path; None where they are the declared ones."""
+    table = {}
+    for text in given:
+        path, equals, ends = text.partition("=")
+        low, colon, high = ends.partition(":")
+        if not path.strip() or (equals and not colon):
+            raise ScenarioError(f"--free {shown(text)} is not of the form path or path=low:high")
+        (path,) = flat({path.strip(): 0.0}, "--free")
+        if path in table:
+            raise ScenarioError(f"--free {path} is given twice")
+        table[path] = [toml.value(low.strip()), toml.value(high.strip())] if equals else section_tune.DECLARED
+    found = section_tune.free_ranges(table, chosen.loop, "--free")
+    section_tune.check_starts(chosen.loop, found, "--free")
+    return found
+
+
+def _watched(
+    chosen: Scenario, readings: Readings, ranges: Mapping[str, section_tune.Ends], given: Mapping[str, float]
+) -> tuple["Identified", dict[str, float], bool]:
+    """The fit, the standard deviations it was made with, and whether Ctrl-C ended it."""
+    far: list[str] = []
+
+    def told(evaluations: int, cost: float) -> None:
+        far.append(f"{evaluations} evaluations, cost {cost:.6g}")
+
+    ending = console.Ending("the evaluation in hand", nothing=lambda: not far)
+    found, noise = console.waited(
+        lambda: _identified(chosen, readings, ranges, given, told, ending),
+        f"identifying {chosen.name}",
+        lambda: far[-1] if far else "compiling",
+        ending,
+    )
+    return found, noise, ending.asked
+
+
+def _identified(
+    chosen: Scenario,
+    readings: Readings,
+    ranges: Mapping[str, section_tune.Ends],
+    given: Mapping[str, float],
+    told: Callable[[int, float], None],
+    stopping: Callable[[], bool],
+) -> tuple["Identified", dict[str, float]]:
+    """The fit, and the standard deviations it was made with. What is not given is first the spread of a column, then
+    that of its residuals, until it hardly changes. Raises ValueError."""
+    from diffabs.identify.identification import identify
+    from diffabs.identify.traces import Traces
+
+    solver, columns = _solver(chosen.solver, readings), readings.columns
+
+    def fitted(noise: Mapping[str, float], starts: Sequence[Any] = ()) -> tuple["Identified", dict[str, np.ndarray]]:
+        traces = Traces(t=readings.t, columns=columns, sigma=noise)
+        options = {"solver": solver, "absolute": bool(given), "starts": starts}
+        found = identify(chosen.loop, traces, dict(ranges), **options, progress=told, stopping=stopping)
+        return found, traces.residuals(found)
+
+    spread = {name: float(np.std(values)) or 1.0 for name, values in columns.items()}
+    noise = {**spread, **given}
+    found, residuals = fitted(noise)
+    evaluations = found.evaluations
+    for _ in range(0 if len(given) == len(columns) else ROUNDS - 1):
+        if stopping():
+            break
+        noise = {name: given.get(name) or max(_rms(residuals[name]), LEAST * spread[name]) for name in columns}
+        found, residuals = fitted(noise, [found.values])
+        evaluations += found.evaluations
+    return dataclasses.replace(found, evaluations=evaluations), noise
+
+
+def _solver(solver: FixedStep, readings: Readings) -> FixedStep:
+    """As long as the data, with as many instants as memory allows."""
+    steps = math.ceil(float(readings.t[-1]) / solver.step) + SPARE
+    if steps * solver.step >= solver.duration:
+        steps = solver.steps
+    return dataclasses.replace(solver, duration=steps * solver.step, every=max(1, math.ceil(steps / MOST_ROWS)))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _result(
+    chosen: Scenario,
+    readings: Readings,
+    ranges: Mapping[str, section_tune.Ends],
+    found: "Identified",
+    noise: Mapping[str, float],
+) -> dict[str, Any]:
+    """The JSON document."""
+    known = found.uncertainty
+    return {
+        "scenario": chosen.name,
+        "data": {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])},
+        "values": _values(chosen, ranges, found),
+        "correlations": [
+            {"between": [known.names[i], known.names[j]], "correlation": float(known.correlation[i, j])}
+            for i in range(len(known.names))
+            for j in range(i)
+            if abs(known.correlation[i, j]) > CORRELATED
+        ],
+        "undetermined": [
+            {"direction": one.shown(), "spread": one.spread, "components": one.components}
+            for one in known.undetermined()
+        ],
+        "residuals": _residuals(readings, found, noise),
+        "chi2": found.chi2,
+        "degrees": known.degrees,
+        "scale": known.scale,
+        "reason": found.reason.value,
+        "evaluations": found.evaluations,
+        "parameters": {path: np.asarray(v, float).tolist() for path, _, v in parameters(found.part)},
+        "versions": show.versions("optax", "scipy"),
+        "files": {},
+    }
+
+
+def _values(
+    chosen: Scenario, ranges: Mapping[str, section_tune.Ends], found: "Identified"
+) -> dict[str, dict[str, Any]]:
+    """One for each number: `controller.gain.0` where a parameter is a list."""
+    specs = {path: spec for path, spec, _ in parameters(chosen.loop)}
+    rows = {}
+    for path, ends in ranges.items():
+        low, high = ends or (specs[path].low, specs[path].high)
+        values = np.asarray(found.values[path], float)
+        low, high, before, values = np.broadcast_arrays(low, high, np.asarray(get(chosen.loop, path), float), values)
+        for at in np.ndindex(values.shape):
+            name = ".".join([path, *map(str, at)])
+            numbers = {"before": before[at], "value": values[at], "low": low[at], "high": high[at]}
+            deviation = found.uncertainty.deviations[name]
+            rows[name] = {k: float(x) for k, x in numbers.items()} | {"deviation": deviation, "unit": specs[path].unit}
+    return rows
+
+
+def _residuals(readings: Readings, found: "Identified", noise: Mapping[str, float]) -> dict[str, dict[str, Any]]:
+    """Simulated minus measured, by column."""
+    each = np.split(np.asarray(found.residuals), len(readings.columns))
+    return {
+        name: {
+            "sigma": noise[name],
+            "rms": _rms(values),
+            "mean": float(np.mean(values)),
+            "largest": float(np.max(np.abs(values))),
+            "unit": UNITS[name],
+        }
+        for name, values in zip(readings.columns, each, strict=True)
+    }

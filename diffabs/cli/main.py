@@ -1,0 +1,320 @@
+"""The command `diffabs`. Exit status: 0 done, 1 not possible (diverged, no gain, not proved), 2 bad input.
+
+Results go to stdout, as tables or with --json as one JSON document; everything else goes to stderr."""
+
+import contextlib
+import dataclasses
+import importlib
+import math
+import pathlib
+import time
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import jax
+import numpy as np
+import typer
+
+from diffabs import __version__
+from diffabs.cli import compare, console, design, identify, rare, show, sweep, tune, usage
+from diffabs.cli.checking import checked, said
+from diffabs.core import interrupt
+from diffabs.core.protocols import BalanceOutput
+from diffabs.core.pytree import parameters
+from diffabs.scenario import registry
+from diffabs.scenario.scenario import Scenario, dump, header, names
+from diffabs.simulate.run import measure, rollout
+from diffabs.simulate.solution import Run
+
+if TYPE_CHECKING:
+    from diffabs.papers import Reproduction
+
+app = typer.Typer(
+    no_args_is_help=True,
+    cls=usage.Group,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode=None,  # plain help, that scripts and people can read
+    pretty_exceptions_enable=False,
+    help="Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers.",
+)
+
+MOST_ROWS = 20_000  # of a trajectory
+PLURALS = {f"{name}s": name for name in ("plant", "road", "controller", "reference", "actuator", "sensor")}
+PLURALS |= {"feedforward": "feedforward", "antiwindup": "antiwindup", "initial": "initial"}
+PLURALS |= {"stops": "stop", "objectives": "objective"}
+
+
+def main() -> NoReturn:
+    """The executable: run the command line, and leave."""
+    interrupt.begin()
+    try:
+        app()
+        status: Any = 0
+    except SystemExit as left:
+        status = left.code
+    interrupt.finish()
+    console.leave(status)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"diffabs {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def setup(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers."""
+    del version
+    jax.config.update("jax_enable_x64", True)
+
+
+def simulate(
+    scenario: Annotated[
+        str | None,
+        typer.Argument(
+            autocompletion=console.scenarios_like,
+            help="A TOML file, or the name of a packaged scenario.",
+            show_default=False,
+        ),
+    ] = None,
+    changes: console.Changes = None,
+    as_json: console.Json = False,
+    csv: Annotated[pathlib.Path | None, typer.Option(help="Write the trajectory to this file.")] = None,
+    plot: Annotated[pathlib.Path | None, typer.Option(help="Draw the run to this file (.png, .pdf, .svg).")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of noisy sensors; the same as --set solver.seed=N.")] = None,
+    from_sweep: Annotated[
+        pathlib.Path | None, typer.Option(metavar="DIR", help="Run a sample of this sweep again.")
+    ] = None,
+    sample: Annotated[int | None, typer.Option(help="Which one, with --from-sweep.")] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Also run half and quarter steps, and say how accurate each metric is.")
+    ] = False,
+) -> None:
+    """Run a scenario once and show its metrics."""
+    with console.guarded(), sweep.reported():
+        _check_source(scenario, from_sweep, sample, changes, seed)
+        _check_targets(csv, plot)
+        changes = [*(changes or ()), *([] if seed is None else [f"solver.seed={seed}"])]
+        with contextlib.ExitStack() as files:
+            csv_file = files.enter_context(console.new_file(csv, "--csv")) if csv else None
+            picture = files.enter_context(console.new_file(plot, "--plot")) if plot else None
+            if from_sweep and sample is not None:
+                chosen, key = console.waited(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
+            else:
+                chosen = console.loaded(scenario or "", changes)
+                key = chosen.key()
+            run = console.waited(lambda: _run(chosen, key, keep=bool(csv or plot)), f"simulating {chosen.name}")
+            if csv_file and run.trajectory:
+                show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
+            if picture:
+                console.waited(lambda: _draw(chosen, run, picture), "drawing")
+            found = console.waited(lambda: checked(chosen, key), "shortening the step") if check else None
+        result = _result(chosen, run, {"csv": csv, "plot": plot}) | ({"accuracy": found} if found else {})
+        show.as_json(result) if as_json else show.run(result, chosen)
+        if found:
+            if not as_json:
+                show.accuracy(found)
+            for line in said(found):
+                console.say(f"warning: {line}")
+        if result["diverged"]:
+            console.fail(f"{chosen.name} diverged: a number became infinite or impossible: there are no metrics", 1)
+        if warning := _warning(chosen, result):
+            console.say(f"warning: {warning}")
+
+
+def _warning(chosen: Scenario, result: dict[str, Any]) -> str:
+    """What a reader of the metrics must know about how the run ended."""
+    if chosen.loop.plant.shows is BalanceOutput:
+        return "FELL: the frame reached the stop's angle" if result["stopped"] else ""
+    if result["stopped"]:
+        return ""
+    duration = f"NOT STOPPED within solver.duration = {chosen.solver.duration:g} s"
+    return f"{duration}; stop_time and stop_distance are extrapolated with the last deceleration"
+
+
+def _check_source(scenario: Any, from_sweep: Any, sample: int | None, changes: Any, seed: int | None) -> None:
+    """Raises typer.Exit: either a scenario, or a sweep and a sample of it as it is."""
+    if (scenario is None) == (from_sweep is None):
+        console.fail("what shall be run: a SCENARIO, or --from-sweep DIR --sample N")
+    if (from_sweep is None) != (sample is None):
+        console.fail("--from-sweep DIR and --sample N need each other")
+    if from_sweep and (changes or seed is not None):
+        console.fail("a sample of a sweep is run as it was: no --set, no --seed")
+
+
+def _check_targets(csv: pathlib.Path | None, plot: pathlib.Path | None) -> None:
+    console.check_picture(plot)
+    if csv and plot and console.resolved(csv, "--csv") == console.resolved(plot, "--plot"):
+        console.fail(f"--csv and --plot are the same file, {csv}")
+
+
+def _run(chosen: Scenario, key: Any, keep: bool) -> Run:
+    """The run, on the host."""
+    if not keep:
+        return jax.device_get(measure(chosen.loop, chosen.solver, chosen.objectives, key=key))
+    steps = chosen.solver.steps
+    every = min(max(chosen.solver.every, math.ceil(steps / MOST_ROWS)), steps)
+    solver = dataclasses.replace(chosen.solver, every=every)
+    return jax.device_get(rollout(chosen.loop, solver, chosen.objectives, key=key))
+
+
+def _draw(chosen: Scenario, run: Run, picture: pathlib.Path) -> None:
+    plant = chosen.loop.plant
+    draw = importlib.import_module("diffabs.plot").of(plant)
+    draw(run, title=chosen.title or chosen.name, unit=plant.control_unit).savefig(picture)
+
+
+def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -> dict[str, Any]:
+    return {
+        "scenario": chosen.name,
+        "metrics": {name: float(run.metrics[name]) for name in chosen.objectives},
+        "stopped": bool(run.stopped),
+        "diverged": bool(run.diverged),
+        "title": chosen.title,
+        "parts": _parts(chosen),
+        "parameters": _parameters(chosen),
+        "solver": {"step": chosen.solver.step, "duration": chosen.solver.duration, "seed": chosen.seed},
+        "versions": show.versions(),
+        "files": {name: str(path) for name, path in files.items() if path},
+    }
+
+
+def list_parts(
+    family: Annotated[
+        str | None, typer.Argument(metavar="[FAMILY]", help=f"{', '.join(PLURALS)} or scenarios.")
+    ] = None,
+    as_json: console.Json = False,
+) -> None:
+    """Every part with its parameters, defaults, units and ranges; every packaged scenario."""
+    with console.guarded():
+        there = (*PLURALS, "scenarios")
+        if family is not None and family not in there:
+            raise registry.unknown(f"there is no family {registry.shown(family)}", family, there)
+        result = {name: _listed(name) for name in there if family in (None, name)}
+        if as_json:
+            return show.as_json(result)
+        for name, members in result.items():
+            show.family(name, members)
+    return None
+
+
+def show_scenario(
+    scenario: console.ScenarioName,
+    changes: console.Changes = None,
+    out: Annotated[
+        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write to this file; default: stdout.")
+    ] = None,
+) -> None:
+    """A scenario as TOML with every field, to start one's own from."""
+    with console.guarded():
+        console.check_scenario_file(out)
+        text = dump(console.loaded(scenario, changes, integrated=False))
+        if out is None:
+            return typer.echo(text, nl=False)
+        with console.new_file(out, "--out") as file:
+            file.write_text(text, encoding="utf-8")
+    return None
+
+
+def _listed(plural: str) -> dict[str, Any]:
+    """The members of a family as plain values."""
+    if plural == "scenarios":
+        return {name: header(name) for name in names()}
+    family = PLURALS[plural]
+    return {
+        name: {
+            "summary": registry.summary(part),
+            **({"unit": registry.unit_of(part)} if family == "objective" else {}),
+            "parameters": registry.described(family, part),
+        }
+        for name, part in registry.types(family).items()
+    }
+
+
+def reproduce(
+    name: Annotated[str, typer.Argument(help="slip-lmi, slip-estimator, arm-balance, or all.")] = "all",
+    out: Annotated[pathlib.Path, typer.Option(help="Folder for the results, one folder per paper.")] = pathlib.Path(
+        "out"
+    ),
+    as_json: console.Json = False,
+) -> None:
+    """A paper's whole result: figures, summary.json, and in short what agrees with it and what is refuted."""
+    with console.guarded():
+        console.need_matplotlib()
+        from diffabs.papers import PAPERS, compact
+
+        if name != "all" and name not in PAPERS:
+            raise registry.unknown(f"there is no paper {registry.shown(name)}", name, (*PAPERS, "all"))
+        results: dict[str, Any] = {}
+        try:
+            for paper in PAPERS if name == "all" else (name,):
+                with console.new_folder(out / paper) as folder:
+                    results[paper] = _reproduced(paper, PAPERS[paper], folder)
+                if not as_json:
+                    show.paper(compact(results[paper]), out / paper)
+        except KeyboardInterrupt:
+            if not results:
+                raise
+            console.say(f"interrupted: whole are {', '.join(str(out / paper) for paper in results)}")
+            raise typer.Exit(console.INTERRUPTED) from None
+        if as_json:
+            show.as_json({"out": str(out), "papers": results, "versions": show.versions()})
+
+
+def _reproduced(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> dict[str, Any]:
+    """The summary of a paper. Its steps are told beside the spinner, or in a line each where there is none."""
+    spins, steps, begun = console.animated(), ["starting"], time.monotonic()
+
+    def step(sentence: str) -> None:
+        steps.append(sentence.removeprefix(f"{name}: "))
+        if not spins:
+            console.say(sentence)
+
+    def detail() -> str:
+        return f"{time.monotonic() - begun:.0f} s: {steps[-1]}"
+
+    return console.waited(lambda: reproduction(folder, step), f"reproducing {name}", detail if spins else None)
+
+
+def _parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
+    """Every part by its path: its type, and what it has beside parameters."""
+    objectives = {f"objective.{name}": one for name, one in chosen.objectives.items()}
+    found = dict(registry.choices(chosen.loop))
+    for path, one in objectives.items():
+        found |= registry.choices(one, path)
+    return found
+
+
+def _parameters(chosen: Scenario) -> dict[str, dict[str, Any]]:
+    """Every number by its path, in SI; what JSON has no number for is a text that an override understands."""
+
+    def plain(value: Any) -> Any:
+        return value if math.isfinite(value) else str(value)
+
+    objectives = (
+        (f"objective.{name}.{path}", spec, value)
+        for name, one in chosen.objectives.items()
+        for path, spec, value in parameters(one)
+    )
+    return {
+        path: {"value": np.vectorize(plain, otypes=[object])(np.asarray(value, float)).tolist(), "unit": spec.unit}
+        for path, spec, value in (*parameters(chosen.loop), *objectives)
+    }
+
+
+usage.add(app, simulate, "simulate slip-lmi --set plant.mass=6.2 --plot run.png")
+usage.add(app, design.design, "design slip-lmi --set design.decay=80 --out gain.json")
+usage.add(app, design.certify, "certify slip-lmi --gain=-11753,-76.7")
+usage.add(app, design.verify, "verify gain.json")
+usage.add(app, tune.tune, "tune slip-cured --set reference.time_constant=0.03 --out tuned.toml")
+usage.add(app, identify.identify, "identify slip-lmi --data run.csv --free plant.mass=4:8")
+usage.add(app, sweep.sweep, "sweep slip-lmi --samples 10000 --set solver.step=1e-3 --figures")
+usage.add(app, rare.rare, "rare slip-lmi stop_time=2.2 --set solver.step=1e-3")
+usage.add(app, compare.compare, "compare out/sweep-slip-lmi out/sweep-mine --metric iae")
+usage.add(app, list_parts, "list roads", "list")
+usage.add(app, show_scenario, "show slip-lmi --set plant.mass=6.2 --out mine.toml", "show")
+usage.add(app, reproduce, "reproduce slip-estimator")

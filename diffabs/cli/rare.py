@@ -1,0 +1,118 @@
+"""The command `rare`: the probability of a failure that a sweep would hardly meet.
+
+It needs the extra `diffabs[sweep]`, which is imported when it runs."""
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from diffabs.cli import console, show
+from diffabs.core.pytree import Spec
+from diffabs.scenario import section_sweep
+from diffabs.scenario.registry import ScenarioError, number, unit_of, unknown
+from diffabs.scenario.scenario import Scenario
+from diffabs.scenario.toml import value
+
+if TYPE_CHECKING:
+    from diffabs.reliability.subset_simulation import Progress, RareEvent
+    from diffabs.sweep import Study
+
+SHOWN = 5  # failures
+
+
+def rare(
+    scenario: console.ScenarioName,
+    failure: Annotated[str, typer.Argument(metavar="METRIC[=BOUND]", help="Default: the bound in [sweep.failures].")],
+    changes: console.Changes = None,
+    samples: Annotated[int, typer.Option(help="Runs of each level.")] = 2800,
+    seed: Annotated[int | None, typer.Option(help="The same as --set sweep.seed=N.")] = None,
+    gradients: Annotated[bool, typer.Option("--gradients", help="Also draw around points found by gradients.")] = False,
+    as_json: console.Json = False,
+) -> None:
+    """The probability that a metric reaches a bound while [sweep.over] varies, down to 1e-7 and less."""
+    with console.guarded():
+        console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
+        changes = [*(changes or ()), *([f"sweep.seed={seed}"] if seed is not None else [])]
+        chosen = console.loaded(scenario, changes)
+        metric, bound = _failure(failure, chosen)
+        if samples < 20 or samples % 10:
+            console.fail(f"--samples {samples} is no multiple of 10 from 20 on")
+        study = section_sweep.study(chosen)
+        found = _estimated(study, metric, bound, samples, gradients)
+        result = _document(found, study, chosen, metric, bound)
+        show.as_json(result) if as_json else show.rare(result, chosen)
+
+
+def _failure(text: str, chosen: Scenario) -> tuple[str, float]:
+    """A metric and its bound in SI. Raises ScenarioError."""
+    metric, equals, bound = text.partition("=")
+    if metric not in chosen.objectives:
+        raise unknown(f"{metric} is not measured", metric, chosen.objectives)
+    if equals:
+        return metric, number(value(bound.strip()), Spec(unit_of(chosen.objectives[metric], chosen.loop.plant)), metric)
+    if metric not in chosen.sweep.failures:
+        raise ScenarioError(f"{metric} has no bound in [sweep.failures]: say {metric}=BOUND")
+    return metric, chosen.sweep.failures[metric]
+
+
+def _estimated(study: "Study", metric: str, bound: float, samples: int, gradients: bool) -> "RareEvent":
+    """Raises ScenarioError for what cannot be asked, typer.Exit where too many runs diverge."""
+    from diffabs.reliability.failure import failure_probability
+    from diffabs.reliability.importance_sampling import Diverged
+
+    levels: list[Progress] = []
+
+    def far() -> str:
+        if not levels:
+            return "level 1"
+        return f"level {len(levels) + 1}, {levels[-1].evaluations:,} runs, {metric} up to {levels[-1].threshold:.4g}"
+
+    try:
+        return console.waited(
+            lambda: failure_probability(
+                study, metric, bound, gradients=gradients, samples=samples, seed=study.seed, progress=levels.append
+            ),
+            "looking for failures",
+            far,
+        )
+    except KeyboardInterrupt:
+        if not levels:
+            raise
+        console.say(f"interrupted: {_reached(levels, metric)}, by {levels[-1].evaluations:,} runs; no further")
+        raise typer.Exit(console.INTERRUPTED) from None
+    except Diverged as error:
+        console.fail(str(error), console.FAILED)
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
+
+
+def _reached(levels: "list[Progress]", metric: str) -> str:
+    """What the levels tell that are finished."""
+    probability = math.prod(level.share for level in levels)
+    return f"{metric} >= {levels[-1].threshold:.4g} has a probability of about {probability:.2g}"
+
+
+def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str, bound: float) -> dict[str, Any]:
+    """As values of JSON; the failures, the most likely first, as values by path in SI."""
+    rows = study.space.normal(found.failing[:SHOWN]) if len(found.failing) else {}
+    return {
+        "scenario": chosen.name,
+        "metric": metric,
+        "bound": bound,
+        "unit": unit_of(chosen.objectives[metric], chosen.loop.plant),
+        "probability": found.probability,
+        "cov": found.cov,
+        "interval": list(found.interval),
+        "note": found.note,
+        "reason": found.reason.value,
+        "levels": [level._asdict() for level in found.levels],
+        "subset simulation": found.subset._asdict(),
+        "importance sampling": found.importance.estimate._asdict() if found.importance else None,
+        "failures": {path: column.tolist() for path, column in rows.items()},
+        "runs": found.evaluations,
+        "gradients": found.gradients,
+        "diverged": found.diverged,
+        "seed": study.seed,
+        "versions": show.versions("numpy", "scipy"),
+    }

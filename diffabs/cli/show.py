@@ -1,0 +1,313 @@
+"""What the commands show: tables for a person, JSON and CSV for a script."""
+
+import importlib.metadata
+import json
+import math
+import pathlib
+import platform
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, Group
+from rich.table import Table
+
+from diffabs import __version__
+from diffabs.cli.console import say
+from diffabs.cli.tables import fitted
+from diffabs.core.loop import signals
+from diffabs.papers.digest import Digest
+from diffabs.scenario.registry import unit_of
+from diffabs.scenario.scenario import Scenario
+from diffabs.simulate.solution import Trajectory
+
+PIPE_WIDTH = 140  # columns of a table that goes to a file
+PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
+
+
+def as_json(value: Any) -> None:
+    """One JSON document on stdout; numbers that JSON does not have are null."""
+    typer.echo(json.dumps(finite(value), indent=2, allow_nan=False))
+
+
+def finite(value: Any) -> Any:
+    """Numbers that JSON does not have become null."""
+    if isinstance(value, dict):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def versions(*others: str) -> dict[str, str]:
+    """What a result was computed with."""
+    always = {"diffabs": __version__, "jax": jax.__version__, "python": platform.python_version()}
+    return always | {name: importlib.metadata.version(name) for name in others}
+
+
+def write_csv(trajectory: Trajectory, plant: Any, path: pathlib.Path) -> None:
+    """The instants up to the end of the run, with units in the header."""
+    columns = {f"{name} [{unit}]": values for name, (unit, values) in signals(trajectory.sample, plant).items()}
+    rows = int(trajectory.running.sum()) + 1  # after the end the last sample is repeated
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(",".join(columns) + "\n")
+        for row in zip(*(values[:rows].tolist() for values in columns.values()), strict=True):
+            file.write(",".join(f"{value:.12g}" for value in row) + "\n")
+
+
+def run(result: dict[str, Any], chosen: Scenario) -> None:
+    """Metrics with their units, and what was written."""
+    table = Table("metric", "value", "unit")
+    for name, value in result["metrics"].items():
+        table.add_row(name, f"{value:.6g}", unit_of(chosen.objectives[name], chosen.loop.plant))
+    _print(chosen.title or chosen.name, table)
+    for name, path in result["files"].items():
+        say(f"{name}: {path}")
+
+
+def accuracy(found: dict[str, Any]) -> None:
+    """What shorter steps, and single precision, change."""
+    table = Table("metric", "half step", "relative", "order", "error", "float32")
+    for name, row in found["metrics"].items():
+        order = "none" if not row["converges"] else "" if math.isnan(row["order"]) else f"{row['order']:.1f}"
+        numbers = (row["difference"], row["relative"], row["error"], row["float32 difference"])
+        half, relative, error, single = ("" if x is None or math.isnan(x) else f"{x:.1e}" for x in numbers)
+        table.add_row(name, half, relative, order, error, single)
+    _print("what a half step changes, at which order, the error that is left at this step; float32", table)
+
+
+def family(name: str, members: dict[str, Any]) -> None:
+    """The members of a family, field by field; or the scenarios."""
+    if name == "scenarios":
+        table = Table("name", "title", "description")
+        for member, header in members.items():
+            table.add_row(member, header["title"], header["description"])
+    else:
+        table = Table("type", "field", "default", "unit", "range")
+        for member, about in members.items():
+            member = f"{member} [{about['unit']}]" if about.get("unit") else member
+            fields = about["parameters"] or {"": {"default": "", "unit": "", "range": ""}}
+            for field, row in fields.items():
+                table.add_row(
+                    member, field, _brief(row["default"]), row["unit"], row["range"].removesuffix(row["unit"])
+                )
+                member = ""
+            table.add_section()
+    _print(name, table)
+
+
+def paper(digest: Digest, folder: pathlib.Path) -> None:
+    """The compact result of a paper, and where everything else is."""
+    _console().print(compact(digest))
+    say(f"{digest.figures} figures, every number and note (summary.json): {folder}\n")
+
+
+def compact(digest: Digest) -> Group:
+    """Title, table, how many numbers agree, what is refuted: fits 80 columns."""
+    table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    for heading, *cells in zip(digest.headings, *digest.lines, strict=True):
+        words = heading == digest.headings[0] or any(cell[:1].isalpha() for cell in cells)
+        table.add_column(heading, justify="left" if words else "right", overflow="fold")
+    for line in digest.lines:
+        table.add_row(*line)
+    verdicts = Table.grid(padding=(0, 2, 0, 0))
+    for word, sentence in digest.verdicts:
+        verdicts.add_row(word, sentence)
+    return Group(digest.title, table, *digest.agreement, verdicts)
+
+
+def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict: str) -> None:
+    """A gain, what is proved about it, and the vertices for which it is."""
+    gains = Table("state", "gain")
+    for state, value in zip(result["states"], result["gain"], strict=True):
+        gains.add_row(state, f"{value:.8g}")
+    _print(title, gains)
+    numbers = Table("quantity", "value", "unit")
+    numbers.add_row("common Lyapunov matrix" if result["besides"] else "quadratically stable", verdict, "")
+    if known := result["besides"]:
+        loops, fall = known["frozen"], known["proved_for_a_speed_falling_by"]
+        numbers.add_row("systems of the ranges, each fixed", f"{loops['stable']} of {loops['systems']} stable", "")
+        numbers.add_row("slowest of them decays at", f"{loops['slowest']:.6g}", "1/s")
+        if fall is not None:
+            numbers.add_row("proved stable for a speed falling by no more than", f"{fall:.4g}", "m/s^2")
+    numbers.add_row("verified exactly", "yes" if result["verified_exactly"] else "no", "")
+    for name, unit in PROOF.items():
+        if result[name] is not None:
+            numbers.add_row(name.replace("_", " "), f"{result[name]:.8g}", unit)
+    _print("proof", numbers)
+    corners = result["corners"] or [{} for _ in result["poles"]]
+    discrete = result["period"] is not None
+    names = [f"{name} [{units[name]}]" for name in corners[0]]
+    vertices = Table("vertex", *names, "largest |pole| [1]" if discrete else "slowest pole, real part [1/s]")
+    for i, (corner, pole) in enumerate(zip(corners, result["poles"], strict=True)):
+        vertices.add_row(str(i), *(f"{value:.6g}" for value in corner.values()), f"{pole:.6g}")
+    covered = (
+        result["coverage"] and f"; their hull covers {result['coverage']['checked']} systems checked within the ranges"
+    )
+    _print(f"{result['vertices']} vertices{covered or ', the systems on a grid of the ranges'}", vertices)
+
+
+def verified(result: dict[str, Any], json_wanted: bool) -> None:
+    """A line for each claim."""
+    if json_wanted:
+        return as_json(result)
+    for claim in result["claims"]:
+        typer.echo(f"{'proved' if claim['proved'] else 'NOT PROVED'}  {claim['kind']}: {claim['says']}")
+    return None
+
+
+def tuned(result: dict[str, Any], chosen: Scenario) -> None:
+    """Parameters, metrics and constraints before and after, and how it went."""
+    free = Table("parameter", "before", "after", "low", "high", "unit")
+    for path, row in result["free"].items():
+        free.add_row(path, *(_brief(row[key]) for key in ("before", "after", "low", "high")), row["unit"])
+    _print(f"{chosen.title or chosen.name}: free parameters", free)
+    metrics = Table("metric", "mean before", "mean after", "worst before", "worst after", "unit")
+    for name in result["metrics"]["before"]["mean"]:
+        numbers = (result["metrics"][when][of][name] for of in ("mean", "worst") for when in ("before", "after"))
+        metrics.add_row(name, *map(_brief, numbers), unit_of(chosen.objectives[name], chosen.loop.plant))
+    _print(f"over {result['lanes']} lane{'s' if result['lanes'] > 1 else ''}", metrics)
+    if result["constraints"]:
+        limits = Table("constraint", "bound", "before", "after", "met")
+        for row in result["constraints"]:
+            numbers = ("" if row[key] is None else _brief(row[key]) for key in ("bound", "before", "after"))
+            limits.add_row(row["name"], *numbers, "yes" if row["met"] else f"NO, {missed(row)}")
+        _print("constraints, worst lane or vertex", limits)
+    how = Table("tuning", "")
+    for name in ("before", "after"):
+        how.add_row(f"objective {name}", _brief(result["objective"][name]))
+    how.add_row("gradients computed", str(result["evaluations"]))
+    how.add_row("gradient mode", result["mode"])
+    how.add_row("greatest component of the last gradient", f"{result['gradient_norm']:.2g}")
+    how.add_row("it ended because", result["reason"])
+    _print("", how)
+    for name, path in result["files"].items():
+        say(f"{name}: {path}")
+
+
+def missed(row: dict[str, Any]) -> str:
+    """By how much a constraint is not met."""
+    if row["missed"] is None:
+        return "not known"
+    part = f" ({100 * row['missed'] / abs(row['bound']):.2g} %)" if row["bound"] else ""
+    return f"by {row['missed']:.3g}{part}"
+
+
+def identified(result: dict[str, Any]) -> None:
+    """Values with standard deviations, what hangs together, what the data leave open, and what is left over."""
+    values = Table("parameter", "before", "identified", "standard deviation", "unit")
+    for name, row in result["values"].items():
+        values.add_row(name, _brief(row["before"]), _brief(row["value"]), f"{row['deviation']:.3g}", row["unit"])
+    _print(f"{result['scenario']}: identified from {result['data']['samples']} instants", values)
+    left = Table("column", "sigma", "rms", "mean", "largest", "unit")
+    for name, row in result["residuals"].items():
+        left.add_row(name, *(f"{row[key]:.3g}" for key in ("sigma", "rms", "mean", "largest")), row["unit"])
+    _print("simulated minus measured", left)
+    for row in result["correlations"]:
+        say(f"note: {row['between'][0]} and {row['between'][1]} are correlated by {row['correlation']:.4f}")
+    say(f"it ended because {result['reason']}, after {result['evaluations']} evaluations")
+    for name, path in result["files"].items():
+        say(f"{name}: {path}")
+
+
+def swept(result: dict[str, Any], chosen: Scenario) -> None:
+    """Failures, statistics with intervals, what moves what, the worst samples."""
+    failures = Table("failure", "lanes", "probability", "low", "high")
+    for name, row in result["failures"].items():
+        failures.add_row(name, str(row["count"]), *_estimate(row))
+    percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
+    _print(f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", failures)
+    kinds = list(next((row for row in result["metrics"].values() if row), {}))
+    kinds = [kind for kind in kinds if kind not in ("least", "greatest")]
+    metrics = Table("metric", "unit", "", "value", "low", "high")
+    for name, row in result["metrics"].items():
+        for i, kind in enumerate(kinds):
+            first = (name, unit_of(chosen.objectives[name], chosen.loop.plant)) if i == 0 else ("", "")
+            metrics.add_row(*first, kind, *_estimate(row[kind]))
+        metrics.add_section()
+    _print("statistics of the lanes that did not diverge", metrics)
+    paths = list(next(iter(result["sensitivity"].values()), {}))
+    if paths:
+        kind = list(next(iter(result["sensitivity"].values()))[paths[0]])[-1]
+        moves = Table("metric", *paths)
+        for name, row in result["sensitivity"].items():
+            moves.add_row(
+                name, *("" if row[p][kind]["value"] is None else f"{row[p][kind]['value']:.3f}" for p in paths)
+            )
+        _print({"spearman": "rank correlations", "total": "total Sobol' indices"}[kind], moves)
+    if (refused := result["refused"])["count"]:
+        why = "; ".join(f"{reason} ({count})" for reason, count in refused["reasons"].items())
+        say(
+            f"refused: {refused['count']} of {result['samples']} samples were not run and are in no number here, the"
+            f" first sample {refused['samples'][0]}: {why}"
+        )
+    if result["accuracy"] and result["accuracy"]["metrics"]:
+        changes = Table("metric", "median change", "largest", "in sample")
+        for name, row in result["accuracy"]["metrics"].items():
+            changes.add_row(name, f"{row['median']:.1e}", f"{row['largest']:.1e}", str(row["sample"]))
+        count = len(result["accuracy"]["samples"])
+        _print(f"what a half step changes, relative, in {count} lane{'s' if count > 1 else ''} drawn from all", changes)
+    for name, rows in result["worst"].items():
+        if rows:
+            say(f"greatest {name}: {_brief(rows[0]['value'])} in sample {rows[0]['sample']}")
+    say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
+
+
+def rare(result: dict[str, Any], chosen: Scenario) -> None:
+    """A small probability, the levels that led to it, and the likeliest failures."""
+    levels = Table("level", "at least", "share", "coefficient of variation", "accepted", "diverged")
+    for i, row in enumerate(result["levels"], 1):
+        names = ("threshold", "share", "cov", "acceptance")
+        levels.add_row(str(i), *(f"{row[name]:.4g}" for name in names), str(row["diverged"]))
+    _print(f"{chosen.title or chosen.name}: {result['metric']} >= {result['bound']:g} {result['unit']}", levels)
+    estimates = Table("estimate", "probability", "low", "high", "coefficient of variation")
+    for name in ("subset simulation", "importance sampling"):
+        if row := result[name]:
+            estimates.add_row(name, *(f"{x:.4g}" for x in (row["probability"], *row["interval"], row["cov"])))
+    low, high = result["interval"]
+    _print(f"probability {result['probability']:.3g}, 95 % interval {low:.3g} to {high:.3g}", estimates)
+    count = len(next(iter(result["failures"].values()), ()))
+    failures = Table("likeliest failures", *map(str, range(1, count + 1)))
+    for path, column in result["failures"].items():
+        failures.add_row(path, *map(_brief, column))
+    if result["failures"]:
+        _print("", failures)
+    say(f"{result['note']}; {result['reason']}")
+    say(f"{result['runs']} runs and {result['gradients']} gradients; {result['diverged']} diverged")
+
+
+def compared(result: dict[str, Any]) -> None:
+    """Means of two sweeps, and their difference sample by sample."""
+    table = Table("metric", "first", "second", "second - first", "low", "high", "less in", "variance reduction")
+    for name, row in result["metrics"].items():
+        less = f"{100 * row['share in which the second is less']['value']:.1f} %"
+        means = (_brief(row[key]) for key in ("first", "second"))
+        table.add_row(name, *means, *_estimate(row["difference"]), less, _brief(row["variance reduction"]))
+    out = f", {result['left out']} left out that diverged" if result["left out"] else ""
+    _print(f"{result['second']} against {result['first']}: {result['samples']} common samples{out}", table)
+
+
+def _estimate(row: dict[str, Any]) -> list[str]:
+    return ["" if row[key] is None else _brief(row[key]) for key in ("value", "low", "high")]
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, list):
+        return f"[{', '.join(map(_brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _print(title: str, table: Table) -> None:
+    for column in table.columns:
+        column.overflow = "fold"  # a pipe has no width: nothing may be cut off
+    console = _console()
+    console.print(*([title] if title else []), *fitted(table, console.width), sep="\n")
+
+
+def _console() -> Console:
+    console = Console(markup=False, emoji=False, highlight=False)  # `[N m]` is a unit here, not a style
+    if not console.is_terminal:
+        console.width = PIPE_WIDTH
+    return console

@@ -1,0 +1,254 @@
+"""The command `sweep`: a Monte-Carlo study into a folder, with statistics.
+
+It needs the extra `diffabs[sweep]`, and for Dask `diffabs[cluster]`; what needs them is imported when it runs."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import pathlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import typer
+
+from diffabs.cli import console, progress, show
+from diffabs.core.pytree import elements
+from diffabs.scenario import section_sweep
+from diffabs.scenario.registry import ScenarioError, unit_of, unknown
+from diffabs.scenario.scenario import Scenario, dump, loads
+from diffabs.simulate.refusals import first_line
+
+if TYPE_CHECKING:
+    from diffabs.sweep import Progress as Told
+    from diffabs.sweep import Results, Study
+
+ENGINES = ("local", "dask")
+SUMMARY, FIGURES = "summary.json", "figures"
+
+
+def sweep(
+    scenario: console.ScenarioName,
+    out: Annotated[
+        pathlib.Path | None, typer.Option(metavar="DIR", help="Folder of the sweep; default: out/sweep-NAME.")
+    ] = None,
+    changes: console.Changes = None,
+    samples: Annotated[int | None, typer.Option(help="The same as --set sweep.samples=N.")] = None,
+    seed: Annotated[int | None, typer.Option(help="The same as --set sweep.seed=N.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep that is in the folder.")] = False,
+    engine: Annotated[str, typer.Option(help="local or dask.")] = "local",
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(help="Dask workers on this machine.")] = None,
+    devices: Annotated[int | None, typer.Option(help="CPU devices of this process.")] = None,
+    keep: Annotated[
+        str | None, typer.Option(metavar="N,N,...", help="Samples whose trajectories are kept (zarr).")
+    ] = None,
+    figures: Annotated[bool, typer.Option("--figures", help=f"Draw into DIR/{FIGURES}.")] = False,
+    as_json: console.Json = False,
+) -> None:
+    """Run a scenario for many values of what [sweep.over] varies, and show statistics with confidence intervals."""
+    with console.guarded(), reported():
+        _check_options(engine, scheduler, workers, devices, figures)
+        if samples is not None and samples < 1:
+            console.fail(f"--samples {samples} is not positive")
+        if devices:
+            jax.config.update("jax_num_cpu_devices", devices)
+        given = {"samples": samples, "seed": seed}
+        changes = [*(changes or ()), *(f"sweep.{k}={v}" for k, v in given.items() if v is not None)]
+        chosen = console.loaded(scenario, changes)
+        out = out or pathlib.Path("out") / f"sweep-{chosen.name}"
+        study = section_sweep.study(chosen)
+        kept = _numbers(keep, study.samples)
+        for number in kept:
+            _check_runnable(study, number)
+        with _continued(out, resume):
+            found = _run(study, chosen, out, resume, lambda: _engine(engine, scheduler, workers))
+            warn_of_strays(found)
+            if not found.complete:
+                raise KeyboardInterrupt
+            check = chosen.sweep.check
+            result = console.waited(lambda: _result(found, study, out, kept, figures, check), "computing statistics")
+        show.as_json(result) if as_json else show.swept(result, chosen)
+        _warn(result["accuracy"])
+        if result["refused"]["count"] == result["samples"]:
+            why = next(iter(result["refused"]["reasons"]))
+            console.fail(f"{chosen.name}: no sample could be run: {why}", console.FAILED)
+
+
+def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
+    """A sample of a sweep as a scenario, and the key of its noise. Raises SweepError or ValueError."""
+    console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
+    from diffabs.sweep.store import SweepError, check_owner, differences, read_manifest
+
+    manifest = read_manifest(folder)
+    source = manifest["source"]
+    if "scenario" not in source:
+        raise SweepError(f"{folder} was not swept from a scenario; Study.lane({number}) is this sample")
+    chosen = loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
+    study = section_sweep.study(chosen)
+    for line in differences(manifest["study"], study.table(), "study"):
+        raise SweepError(f"{folder}: the scenario in its manifest is not what was swept: {line}")
+    if not 0 <= number < study.samples:
+        console.fail(f"--sample {number} is outside [0, {study.samples - 1}]")
+    check_owner(folder, manifest, number)
+    loop, key = _check_runnable(study, number)
+    loop = jax.tree.map(lambda x: jnp.asarray(x, study.dtype), loop)
+    return dataclasses.replace(chosen, name=f"{chosen.name}, sample {number}", title="", loop=loop), key
+
+
+def _check_runnable(study: "Study", number: int) -> tuple[Any, jax.Array]:
+    """Loop and key of a sample. Raises ScenarioError for one that must not be run."""
+    loop, key = study.lane(number)
+    if line := first_line(loop, {}, study.solver):
+        raise ScenarioError(f"sample {number} was refused: {line}")
+    return loop, key
+
+
+def warn_of_strays(found: "Results") -> None:
+    """Files among the chunks that are not read, but would be by others."""
+    if found.strays:
+        more = f" (and {len(found.strays) - 1} more)" if found.strays[1:] else ""
+        console.say(f"warning: {found.strays[0]}{more} is no chunk of this sweep; other readers would take it in")
+
+
+@contextlib.contextmanager
+def reported() -> Iterator[None]:
+    """A sweep that cannot be started or read is bad input."""
+    try:
+        yield
+    except ValueError as error:
+        if "SweepError" not in (cls.__name__ for cls in type(error).__mro__):  # its module needs the extra
+            raise
+        console.fail(str(error))
+
+
+@contextlib.contextmanager
+def _continued(out: pathlib.Path, resume: bool) -> Iterator[None]:
+    """A full disk and Ctrl-C say how to go on."""
+    try:
+        yield
+    except OSError as error:
+        console.fail(f"{' '.join(str(error).split())}; finished chunks stay, --resume goes on", console.FAILED)
+    except KeyboardInterrupt:
+        if not any((out / "chunks").glob("*.parquet")):
+            raise
+        line = f"interrupted: finished chunks are in {out}; go on with:"
+        console.say_command(line, ["diffabs", *sys.argv[1:], *([] if resume else ["--resume"])])
+        raise typer.Exit(console.INTERRUPTED) from None
+
+
+def _check_options(engine: str, scheduler: str | None, workers: int | None, devices: int | None, figures: bool) -> None:
+    console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
+    if engine not in ENGINES:
+        raise unknown(f"--engine {engine} is unknown", engine, ENGINES)
+    if engine == "dask":
+        console.need_extra("cluster", "distributed")
+    for option, value, needed in (
+        ("--scheduler", scheduler, "dask"),
+        ("--workers", workers, "dask"),
+        ("--devices", devices, "local"),
+    ):
+        if value is not None and engine != needed:
+            console.fail(f"{option} {value} needs --engine {needed}")
+    most = max(8, 2 * (os.cpu_count() or 1))
+    for option, value in (("--workers", workers), ("--devices", devices)):
+        if value is not None and not 1 <= value <= most:
+            why = ": more than twice the processors only cost memory" if value > most else ""
+            console.fail(f"{option} {value} is outside [1, {most}]{why}")
+    if scheduler and workers:
+        console.fail(f"--workers {workers}: the scheduler at {scheduler} has its own workers")
+    if figures:
+        console.need_matplotlib()
+
+
+def _numbers(keep: str | None, samples: int) -> list[int]:
+    """Sample numbers of an option. Raises typer.Exit."""
+    try:
+        numbers = [int(text) for text in keep.split(",")] if keep else []
+    except ValueError:
+        console.fail(f"--keep {keep} is no list of sample numbers N,N,...")
+    wrong = [n for n in numbers if not 0 <= n < samples]
+    if wrong:
+        console.fail(f"--keep {wrong[0]} is outside [0, {samples - 1}]")
+    return numbers
+
+
+def _engine(name: str, scheduler: str | None, workers: int | None) -> Any:
+    from diffabs.sweep.engines import Local
+
+    if name == "local":
+        return Local()
+    from diffabs.sweep.cluster import Dask
+
+    return Dask(scheduler, workers)
+
+
+def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, engine: Callable[[], Any]) -> "Results":
+    """Raises KeyboardInterrupt, after the chunks in hand or at once."""
+    far = [progress.Far("compiling")]
+    ending = console.Ending("the chunks in hand")
+
+    def told(at: "Told") -> None:
+        if at.damaged and not at.here:
+            console.say(f"damaged, computed again: chunk{'s' if len(at.damaged) > 1 else ''} {_listed(at.damaged)}")
+        far[0] = _far(at)
+
+    def run() -> "Results":
+        from diffabs.sweep import sweep as run
+
+        source = {"scenario": dump(chosen), "name": chosen.name}
+        return run(study, out, resume=resume, engine=engine(), progress=told, stopping=ending, source=source)
+
+    return console.waited(run, f"sweeping {chosen.name}", lambda: far[0], ending)
+
+
+def _far(at: "Told") -> progress.Far:
+    """How far a sweep is."""
+    if not at.here:
+        return progress.Far(f"{at.samples:,} of {at.total:,}", at.samples, at.total)
+    left = progress.left((at.total - at.samples) / at.rate)
+    bad = f"{at.failed:,} failed, {at.diverged:,} diverged" + (f", {at.refused:,} refused" if at.refused else "")
+    words = f"{at.samples:,} of {at.total:,}: {at.rate:,.0f}/s, {bad}{left}"
+    return progress.Far(words, at.samples, at.total)
+
+
+def _listed(numbers: tuple[int, ...]) -> str:
+    return ", ".join(map(str, numbers[:8])) + (f" and {len(numbers) - 8} more" if len(numbers) > 8 else "")
+
+
+def _warn(accuracy: dict[str, Any] | None) -> None:
+    from diffabs.sweep.checking import said
+
+    for line in said(accuracy) if accuracy else ():
+        console.say(f"warning: {line}")
+
+
+def _result(
+    found: "Results", study: "Study", out: pathlib.Path, kept: list[int], figures: bool, check: int
+) -> dict[str, Any]:
+    """The JSON document, which is also written into the folder."""
+    from diffabs.sweep.checking import checked
+    from diffabs.sweep.statistics.summary import summary
+    from diffabs.sweep.store import write_whole
+    from diffabs.sweep.trajectories import keep
+
+    accuracy = checked(study, found, check) if check else None
+    result = {"out": str(out), **summary(found), "accuracy": accuracy, "files": {}}
+    if kept:
+        result["files"]["trajectories"] = str(keep(study, out, kept))
+    if figures:
+        from diffabs.plot.sweeps import draw
+
+        folder = out / FIGURES
+        folder.mkdir(exist_ok=True)
+        units = {path: spec.unit for path, spec in elements(study.loop).items()}
+        units |= {name: unit_of(objective, study.loop.plant) for name, objective in study.objectives.items()}
+        result["files"]["figures"] = [str(path) for path in draw(found, result, folder, units)]
+    document = json.dumps(show.finite(result), indent=1, allow_nan=False)
+    write_whole(out / SUMMARY, document.encode())
+    return result

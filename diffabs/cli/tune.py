@@ -1,0 +1,323 @@
+"""The command `tune`: the free parameters of [tune] by gradients, and what can be proved of the result.
+
+It needs the extra `diffabs[tune]`, and for a proof `diffabs[design]`; what needs them is imported when it runs."""
+
+import contextlib
+import dataclasses
+import math
+import pathlib
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import jax
+import numpy as np
+import typer
+
+from diffabs.cli import certificates, console, show
+from diffabs.core.pytree import get, parameters
+from diffabs.scenario.registry import ScenarioError
+from diffabs.scenario.scenario import Scenario, dump
+from diffabs.simulate.refusals import first_line
+from diffabs.simulate.run import rollout
+from diffabs.simulate.solution import Trajectory
+
+if TYPE_CHECKING:
+    from diffabs.tune import Batch, Progress, Tuned
+
+WHEN = ("before", "after")
+ROUNDING = 1e-9  # relative: of a decay rate as a factor for one period, with plenty to spare
+
+
+class _Work(NamedTuple):
+    """What is tuned: the scenario, its lanes, its constraints by name, and the linear systems a decay is asked of."""
+
+    chosen: Scenario
+    batch: "Batch"
+    constraints: dict[str, Any]
+    task: certificates.Task | None
+
+
+class _Proved(NamedTuple):
+    """The JSON of a certificate, whose numbers are null where there is none, and why not in a sentence."""
+
+    document: dict[str, Any]
+    sentence: str
+    task: certificates.Task | None = None
+    certified: bool = False
+
+
+def tune(
+    scenario: console.ScenarioName,
+    changes: console.Changes = None,
+    starts: Annotated[int | None, typer.Option(help="Descents; the same as --set tune.starts=N.")] = None,
+    as_json: console.Json = False,
+    out: Annotated[
+        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write the tuned scenario to this file.")
+    ] = None,
+    plot: Annotated[
+        pathlib.Path | None, typer.Option(metavar="FILE.png", help="Draw how the tuning went, and its worst lane.")
+    ] = None,
+) -> None:
+    """Tune the free parameters of [tune] by gradients, over all its runs at once."""
+    with console.guarded(), certificates.reported():
+        console.need_extra("tune", "optax", "scipy")
+        console.check_picture(plot)
+        console.check_scenario_file(out)
+        changes = [*(changes or ()), *([] if starts is None else [f"tune.starts={starts}"])]
+        with contextlib.ExitStack() as files:
+            out_file = files.enter_context(console.new_file(out, "--out")) if out else None
+            picture = files.enter_context(console.new_file(plot, "--plot")) if plot else None
+            chosen = console.loaded(scenario, changes)
+            result, told = _tuned(chosen, out_file, picture)
+            if not result["met"]:  # inside, so that no file is written
+                _show(result, told, chosen, as_json)
+                _leave_if_interrupted(result)
+                console.fail(f"{chosen.name}: not met: {_unmet(result)}; {result['reason']}", console.FAILED)
+            drawn = plot if picture and picture.exists() else None
+        result["files"] = {name: str(path) for name, path in (("out", out), ("plot", drawn)) if path}
+        _show(result, told, chosen, as_json)
+        _leave_if_interrupted(result)
+
+
+def _leave_if_interrupted(result: dict[str, Any]) -> None:
+    """Raises typer.Exit: what was shown is the best so far."""
+    if result["interrupted"]:
+        met = "" if result["met"] else f"; not met: {_unmet(result)}, so that no file is written"
+        console.say(f"interrupted: this is the best so far, not a minimum{met}")
+        raise typer.Exit(console.INTERRUPTED)
+
+
+def _unmet(result: dict[str, Any]) -> str:
+    return ", ".join(f"{row['name']} {show.missed(row)}" for row in result["constraints"] if not row["met"])
+
+
+def _show(result: dict[str, Any], told: str, chosen: Scenario, as_json: bool) -> None:
+    show.as_json(result) if as_json else show.tuned(result, chosen)
+    console.say(told)
+
+
+def _tuned(chosen: Scenario, out: pathlib.Path | None, picture: pathlib.Path | None) -> tuple[dict[str, Any], str]:
+    """The JSON document and a sentence about the certificate. The files are written if all constraints are met. Ctrl-C
+    leaves out what is not there yet, once there is something to show."""
+    work = console.waited(lambda: _work(chosen), "computing the lanes")
+    found, interrupted = _watched(work)
+    after = chosen.with_loop(found.loop, "tuned")
+    try:
+        proved = console.waited(lambda: _proved(after), "certifying the result")
+        result = console.waited(lambda: _result(work, found, proved), "comparing with what there was before")
+    except KeyboardInterrupt:
+        interrupted, proved = True, _unproved("interrupted")
+        result = _without_proof(work, _result(work._replace(task=None), found, proved))
+    if out and result["met"]:
+        out.write_text(dump(after), encoding="utf-8")
+    if picture and result["met"]:
+        interrupted |= not _finished(lambda: _drawn(work, found, picture), picture)
+    return {**result, "interrupted": interrupted}, proved.sentence
+
+
+def _finished(draw: Callable[[], None], picture: pathlib.Path) -> bool:
+    """Whether a picture could be drawn before Ctrl-C; else there is none."""
+    try:
+        console.waited(draw, "drawing")
+    except KeyboardInterrupt:
+        picture.unlink()
+        return False
+    return True
+
+
+def _without_proof(work: _Work, result: dict[str, Any]) -> dict[str, Any]:
+    """With the constraints that nobody has looked at, which are therefore not met."""
+    seen = [row["name"] for row in result["constraints"]]
+    goal = work.chosen.tune
+    bounds = {"certified decay": goal.decay, "damping": goal.damping}
+    unseen = [
+        {"name": name, "bound": bounds[name], "before": None, "after": None, "met": False}
+        for name in work.constraints
+        if name not in seen
+    ]
+    return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
+
+
+def _work(chosen: Scenario) -> _Work:
+    """Raises ScenarioError for what does not fit together."""
+    from diffabs.tune import AtMost, CertifiedDecay, Poles
+
+    goal = chosen.tune.check(chosen.loop)
+    batch = goal.batch(chosen.seed).check(chosen.loop)
+    if line := first_line(chosen.loop, batch.values, chosen.solver):
+        raise ScenarioError(f"tune.over: {line}")
+    constraints: dict[str, Any] = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
+    task = certificates.task(chosen) if goal.decay or goal.damping else None
+    if task and goal.decay:
+        constraints["certified decay"] = CertifiedDecay(task.polytope, goal.decay)
+    if task and goal.damping:
+        constraints["damping"] = Poles(task.polytope, damping=goal.damping)
+    return _Work(chosen, batch, constraints, task)
+
+
+def _watched(work: _Work) -> tuple["Tuned", bool]:
+    """Tune, and say how far it is; whether Ctrl-C ended it. Raises typer.Exit where no start can be used."""
+    from diffabs import tune
+    from diffabs.tune import Method, StartError, Stopping
+
+    goal, told = work.chosen.tune, list["Progress"]()
+    ending = console.Ending("the evaluation in hand", nothing=lambda: not told)
+    method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
+
+    def tuned() -> "Tuned":
+        return tune.tune(
+            work.chosen.loop,
+            free=goal.free,
+            objective=goal.objective,
+            over=work.batch,
+            solver=work.chosen.solver,
+            measured=work.chosen.objectives,
+            aggregate=goal.aggregated(),
+            constraints=list(work.constraints.values()),
+            method=method,
+            progress=told.append,
+            stopping=ending,
+        )
+
+    try:
+        return console.waited(tuned, f"tuning {work.chosen.name}", lambda: _said(told), ending), ending.asked
+    except StartError as error:
+        console.fail(f"{work.chosen.name}: no start can be used: {error}", console.FAILED)
+
+
+def _said(told: "list[Progress]") -> str:
+    """How far it is, in one line."""
+    if not told:
+        return "compiling"
+    last, total = told[-1], len(told)
+    return (
+        f"loss {last.point.loss:.6g}, gradient {last.point.gradient:.2g}, violation {last.point.violation:.2g},"
+        f" {total} evaluations, {last.starts} under way"
+    )
+
+
+def _proved(after: Scenario) -> _Proved:
+    """A certificate over the ranges of [design], if there can be one, of the decay that is asked for, if that can be
+    proved."""
+    decay = after.tune.decay
+    try:
+        task = certificates.task(after)
+        found = certificates.certified(task)
+        if (found.decay_rate or 0.0) < decay:  # the search for the fastest ends a little below it
+            asked = certificates.certified(
+                task._replace(spec=dataclasses.replace(task.spec, decay=decay * (1 + ROUNDING)))
+            )
+            found = asked if (asked.decay_rate or 0.0) >= decay else found
+    except (ModuleNotFoundError, ValueError, np.linalg.LinAlgError) as error:
+        return _unproved(" ".join(str(error).split()))
+    known = certificates.besides(task, found)
+    reason = certificates.unproved(found, task.spec, known) or None
+    document = certificates.document(task, found, reason=reason, known=known)
+    document = {key: value for key, value in document.items() if key not in ("scenario", "versions", "files")}
+    rate = document["decay_rate"]
+    over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
+    said = reason or f"quadratically stable over {over}, decay rate {rate:.4g} 1/s"
+    return _Proved(document, f"certificate: {said}", task, certified=True)
+
+
+def _unproved(why: str) -> _Proved:
+    return _Proved({**dict.fromkeys(certificates.FROM_PROOF), "reason": why}, f"no certificate: {why}")
+
+
+def _result(work: _Work, found: "Tuned", proved: _Proved) -> dict[str, Any]:
+    """The JSON document."""
+    chosen, goal = work.chosen, work.chosen.tune
+    return {
+        "scenario": chosen.name,
+        "lanes": work.batch.size,
+        "free": {path: _free(chosen, found, path) for path in goal.free},
+        "objective": dict(zip(WHEN, map(float, found.objective), strict=True)),
+        "metrics": {when: _over_lanes(m, chosen) for when, m in zip(WHEN, found.metrics, strict=True)},
+        "constraints": (rows := _constraints(work, found, proved)),
+        "met": all(row["met"] for row in rows),
+        "reason": found.reason.value,
+        "gradient_norm": float(found.gradient),
+        "evaluations": found.evaluations,
+        "mode": found.mode.value,
+        "history": [point._asdict() for point in found.history],
+        "starts": [
+            {"objective": float(s.objective), "violation": float(s.violation), "reason": s.reason.value}
+            for s in found.starts
+        ],
+        "parameters": {path: _plain(value) for path, _, value in parameters(found.loop)},
+        "certificate": proved.document,
+        "versions": show.versions("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ())),
+        "files": {},
+    }
+
+
+def _free(chosen: Scenario, found: "Tuned", path: str) -> dict[str, Any]:
+    spec = next(spec for name, spec, _ in parameters(chosen.loop) if name == path)
+    low, high = chosen.tune.free[path] or (spec.low, spec.high)
+    before, after = (_plain(get(loop, path)) for loop in (chosen.loop, found.loop))
+    return {"before": before, "after": after, "low": _plain(low), "high": _plain(high), "unit": spec.unit}
+
+
+def _over_lanes(metrics: dict[str, Any], chosen: Scenario) -> dict[str, dict[str, float]]:
+    """NaN where a lane diverged: a mean over the others would hide it."""
+    each = {name: np.asarray(metrics[name], float) for name in chosen.objectives}
+    return {
+        "mean": {name: float(values.mean()) for name, values in each.items()},
+        "worst": {name: float(values.max()) for name, values in each.items()},
+    }
+
+
+def _constraints(work: _Work, found: "Tuned", proved: _Proved) -> list[dict[str, Any]]:
+    """What was asked for, its worst value before and after, and whether it is met."""
+    goal, rows = work.chosen.tune, []
+    for name, bound in goal.limits.items():
+        before, after = (float(np.max(metrics[name])) for metrics in found.metrics)
+        rows.append(_judged(name, bound, before, after, at_most=True))
+    if work.task and goal.decay:
+        before, after = certificates.certified(work.task).decay_rate, proved.document["decay_rate"]
+        rows.append(_judged("certified decay", goal.decay, before, after, at_most=False))
+    if work.task and goal.damping:
+        before = _damping(work.task, work.chosen.loop)
+        after = _damping(proved.task or work.task, found.loop)
+        rows.append(_judged("damping", goal.damping, before, after, at_most=False))
+    return rows
+
+
+def _judged(name: str, bound: float, before: float | None, after: float | None, *, at_most: bool) -> dict[str, Any]:
+    """A line of the constraints. Met is met, without a tolerance; else `missed` is by how much it is not, or null where
+    no number is known."""
+    reached = math.nan if after is None else after
+    beyond = reached - bound if at_most else bound - reached
+    missed = None if math.isnan(beyond) else max(beyond, 0.0)
+    row = {"name": name, "bound": bound, "before": before, "after": after}
+    return {**row, "met": beyond <= 0, "missed": missed}
+
+
+def _damping(task: certificates.Task, loop: Any) -> float:
+    """The least of the poles at the vertices."""
+    from diffabs.tune import Poles
+
+    return float(Poles(task.polytope).least_damping(loop))
+
+
+def _drawn(work: _Work, found: "Tuned", path: pathlib.Path) -> None:
+    """The history, and the lane that is the worst afterwards, before and after."""
+    from diffabs.plot.tuning import tuning
+
+    chosen, metrics = work.chosen, found.metrics[1]
+    worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in chosen.tune.objective.items())))
+    solver = dataclasses.replace(chosen.solver, every=min(chosen.solver.every, chosen.solver.steps))
+
+    def seen(loop: Any) -> Trajectory:
+        run = jax.device_get(rollout(work.batch.lane(loop, worst), solver, key=chosen.key()))
+        assert run.trajectory is not None
+        return run.trajectory
+
+    runs = {"before": seen(chosen.loop), "after": seen(found.loop)}
+    where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
+    title = chosen.title or chosen.name
+    tuning(found.history, runs, title=title, lane=where, unit=chosen.loop.plant.control_unit).savefig(path)
+
+
+def _plain(value: Any) -> Any:
+    return np.asarray(value, float).tolist()

@@ -1,0 +1,100 @@
+"""State feedback whose gain follows the measured speed.
+
+    u = clamp(ff + K(v) x, u_min, u_max),   x = (integral of (slip - target), slip - target)
+
+K is linear in v between nodes and constant beyond them: the gains that `diffabs.design.design` gives for a `Schedule`,
+and what its certificate is about. Gain scheduling by a parameter-dependent Lyapunov function: W. J. Rugh and J. S.
+Shamma, Research on gain scheduling, Automatica 36 (2000). The sign is that of `StateFeedback`."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.controllers.antiwindup import NoAntiWindup
+from diffabs.controllers.feedback import StateFeedback
+from diffabs.core.protocols import Memory, Tracking, no_jump
+from diffabs.core.pytree import Scalar, Vector, param, part, pytree
+from diffabs.core.rules import Rule, increasing
+
+
+@pytree
+class ScheduledFeedback:
+    """u = clamp(ff + k1(v) x1 + k2(v) x2, torque_min, torque_max); gains at increasing speeds."""
+
+    speeds: Vector = param(default=(5 / 3.6, 50 / 3.6), unit="m/s", low=0.0, free=True)
+    integral_gains: Vector = param(default=(-11753.0, -11753.0), unit="N m/s", free=True)
+    gains: Vector = param(default=(-58.0, -158.0), unit="N m", free=True)
+    torque_min: Scalar = param(default=-np.inf, unit="N m", infinite=True)
+    torque_max: Scalar = param(default=np.inf, unit="N m", infinite=True)
+    antiwindup: Any = part(default=NoAntiWindup)
+
+    start = StateFeedback.start
+    jump = no_jump
+
+    def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Any:
+        """x1' = slip - target, unless the anti-windup says otherwise."""
+        return self._here(signal).flow(t, memory, signal)
+
+    def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Any:
+        """Torque [N m]."""
+        return self._here(signal).output(t, memory, signal)
+
+    def _here(self, signal: Tracking) -> StateFeedback:
+        """The feedback at the measured speed. Raises ValueError for lists of different lengths."""
+        shapes = [np.shape(x) for x in (self.speeds, self.integral_gains, self.gains)]
+        if len(set(shapes)) != 1:
+            raise ValueError(f"speeds, integral_gains and gains have shapes {', '.join(map(str, shapes))}")
+        rise = _rise(signal.measured.speed, jnp.asarray(self.speeds))
+        rows = (_table(rise, jnp.asarray(gains)) for gains in (self.integral_gains, self.gains))
+        limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
+        return StateFeedback(gain=jnp.stack(list(rows)), **limits, antiwindup=self.antiwindup)
+
+    def problems(self) -> Iterator[str]:
+        """Lists of different lengths."""
+        shapes = {name: np.shape(getattr(self, name)) for name in ("speeds", "integral_gains", "gains")}
+        if len(set(shapes.values())) != 1 or len(shapes["speeds"]) != 1 or not shapes["speeds"][0]:
+            yield f"speeds, integral_gains and gains have shapes {', '.join(map(str, shapes.values()))}; they need one"
+
+    def rules(self) -> Iterator[Rule]:
+        """Speeds that increase, limits that do not exclude each other."""
+        yield increasing("speeds", self.speeds, "do not increase", "m/s")
+        yield from StateFeedback.rules(self)  # pyright: ignore[reportArgumentType]  # has the same limits
+
+
+def _rise(v: Any, nodes: Any) -> Any:
+    """How much of each interval between nodes lies below v, from 0 to 1. A table is a sum over it: no index to look up,
+    which derivatives would have to scatter to."""
+    inside = (v - nodes[:-1]) / jnp.diff(nodes)
+    return jnp.where(v >= nodes[1:], 1.0, jnp.where(v < nodes[:-1], 0.0, inside))
+
+
+def _table(rise: Any, values: Any) -> Any:
+    """Linear between nodes, constant beyond."""
+    return values[0] + jnp.sum(rise * jnp.diff(values))
+
+
+@pytree
+class ProportionalFeedback:
+    """u = clamp(ff + (v/v0) (k1 x1 + k2 x2), torque_min, torque_max): gains in proportion to the measured speed.
+
+    At a frozen speed the slip of a braked wheel answers to torque with a gain that goes with 1/v, eq. (16) of Maeda and
+    Sugiura; this cancels it, and the loop is equally fast at every speed. `gain` is that at `reference_speed` v0.
+    """
+
+    gain: Vector = param(default=(-11753.0, -158.0), unit="N m/s, N m")
+    reference_speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0)
+    torque_min: Scalar = param(default=-np.inf, unit="N m", infinite=True)
+    torque_max: Scalar = param(default=np.inf, unit="N m", infinite=True)
+    antiwindup: Any = part(default=NoAntiWindup)
+
+    start, problems, rules = StateFeedback.start, StateFeedback.problems, StateFeedback.rules
+    flow, output = ScheduledFeedback.flow, ScheduledFeedback.output
+    jump = no_jump
+
+    def _here(self, signal: Tracking) -> StateFeedback:
+        """The feedback at the measured speed."""
+        gain = jnp.asarray(self.gain) * (signal.measured.speed / self.reference_speed)
+        limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
+        return StateFeedback(gain=gain, **limits, antiwindup=self.antiwindup)

@@ -1,0 +1,1 @@
+"""What a part is, what a loop is, and the contracts between them. Knows no particular part."""

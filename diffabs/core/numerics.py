@@ -1,0 +1,83 @@
+"""Elementary functions whose gradients stay finite where the textbook ones do not."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.pytree import Scalar
+
+
+def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
+    """x limited to [low, high]. The slope in x is 1 at a limit and 0 beyond it, where that in the limit is 1.
+
+    Selections, since the tangent of `jnp.clip` divides, and `lax.clamp` refuses a batched limit of an unbatched x.
+    """
+    return jnp.where(jnp.less(x, low), low, jnp.where(jnp.greater(x, high), high, x))
+
+
+def larger(x: Scalar, y: Scalar) -> Any:
+    """max(x, y). Equal, the slope is that in x: `jnp.maximum` shares it between both, by a division in its tangent."""
+    return jnp.where(jnp.greater_equal(x, y), x, y)
+
+
+def smaller(x: Scalar, y: Scalar) -> Any:
+    """min(x, y), with the slope in x where they are equal."""
+    return jnp.where(jnp.less_equal(x, y), x, y)
+
+
+@jax.custom_jvp
+def quotient(x: Scalar, y: Scalar) -> Any:
+    """x/y, whose derivatives (dx - (x/y) dy)/y share one 1/y. JAX's own divide three times more."""
+    return x / y
+
+
+@quotient.defjvp
+def _quotient_slope(at: Any, moves: Any) -> tuple[Any, Any]:
+    inverse = 1.0 / at[1]
+    value = at[0] / at[1]
+    return value, (moves[0] - value * moves[1]) * inverse
+
+
+def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> Any:
+    """numerator/denominator, and `otherwise` where the denominator is zero (with zero slope there)."""
+    fine = jnp.not_equal(denominator, 0)
+    return jnp.where(fine, quotient(numerator, jnp.where(fine, denominator, 1.0)), otherwise)
+
+
+def power(base: Scalar, exponent: Scalar) -> Any:
+    """base ** exponent for base >= 0 and exponent > 1, with slope 0 at base = 0 in both arguments.
+
+    exp(q log x): XLA's own power is three to four times slower on a CPU.
+    """
+    positive = jnp.greater(base, 0)
+    return jnp.where(positive, jnp.exp(exponent * jnp.log(jnp.where(positive, base, 1.0))), 0.0)
+
+
+def sign(x: Scalar) -> Any:
+    """+1 for x >= 0, else -1: the odd extension of a curve given for x >= 0 keeps the slope of its right side at 0."""
+    return jnp.where(jnp.greater_equal(x, 0), 1.0, -1.0)
+
+
+def parabola(left: Scalar, middle: Scalar, right: Scalar) -> tuple[Any, Any]:
+    """Place (in steps from the middle, within [-1, 1]) and value of the extremum of the parabola through three equally
+    spaced values; the middle where the three lie on a line."""
+    place = clamp(ratio(0.5 * (left - right), left - 2 * middle + right), -1.0, 1.0)
+    return place, interpolate(left, middle, right, place)
+
+
+def interpolate(left: Scalar, middle: Scalar, right: Scalar, place: Scalar) -> Any:
+    """The parabola through three equally spaced values at `place` steps from the middle one."""
+    return middle + 0.5 * place * (right - left) + 0.5 * place**2 * (left - 2 * middle + right)
+
+
+def odd(curve: Callable[[Any], Any], x: Scalar) -> Any:
+    """The odd extension of a curve given for x >= 0. At 0 the slope is that of the curve (|x| would make it 0)."""
+    s = sign(x)
+    return s * curve(s * x)
+
+
+def axpy(a: Scalar, x: Any, y: Any) -> Any:
+    """a x + y on pytrees."""
+    return jax.tree.map(lambda x, y: a * x + y, x, y)

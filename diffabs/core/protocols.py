@@ -1,0 +1,256 @@
+"""The contracts, on one page: the map of the project.
+
+    initial --> Plant <-- Road
+                  |  output(x) = y                       (the truth)
+                Sensor       y -> measured y
+                Reference    measured y -> target
+                Feedforward  (plant, target) -> input
+                Controller   (target, measured, feedforward) -> command
+                Actuator     command -> control
+                  |
+                Plant.derivative(t, x, control)
+
+Sensor, Reference, Controller and Actuator are `Block`s: dynamic systems with a flow and a jump. The flow is evaluated
+inside every Runge-Kutta stage, the jump once at the start of every step; that is how a continuous PID and a computer's
+relay live in one loop. Nothing here is a base class: a part satisfies a contract by its shape.
+
+A plant says what it shows, a NamedTuple of named signals: a `BrakeOutput`, a `BalanceOutput`, or one of your own.
+Blocks, stops and objectives that read a signal that the plant does not show do not fit; tracing the loop finds them.
+
+Conventions. Arguments come in the order (t, x, u). SI units. slip = (v - r omega)/v, positive in braking. A positive
+torque brakes. State feedback is u = K x with x = (integral of (slip - target), slip - target): the sign of K is the
+papers', so a stabilising K is negative. A balance leans to the side of positive angles, and u = K x there too.
+"""
+
+from typing import Any, NamedTuple, Protocol
+
+from diffabs.core.pytree import Scalar
+
+
+class BrakeOutput(NamedTuple):
+    """What a braking plant shows of itself, and what a sensor measures."""
+
+    slip: Scalar  # [1] (v - r omega)/v
+    speed: Scalar  # [m/s] of the vehicle
+    wheel_speed: Scalar  # [m/s] r omega, of the wheel's rim
+    deceleration: Scalar  # [m/s^2] of the vehicle, positive in braking
+    distance: Scalar  # [m] travelled
+
+
+class BalanceOutput(NamedTuple):
+    """What a balancing plant shows of itself, and what a sensor measures. The motor's torque under a voltage u is
+    constant * clamp((u - emf)/resistance, -current_max, current_max)."""
+
+    theta: Scalar  # [rad] frame, from the vertical
+    psi: Scalar  # [rad] arm, from the frame
+    phi: Scalar  # [rad] rider, from the frame
+    theta_rate: Scalar  # [rad/s]
+    psi_rate: Scalar  # [rad/s]
+    phi_rate: Scalar  # [rad/s]
+    constant: Scalar  # [N m/A] torque per ampere, at the joint
+    emf: Scalar  # [V] that the turning joint induces
+    resistance: Scalar  # [ohm]
+    current_max: Scalar  # [A]
+
+
+UNITS = {  # of every output
+    **{"slip": "1", "speed": "m/s", "wheel_speed": "m/s", "deceleration": "m/s^2", "distance": "m"},
+    **{"theta": "rad", "psi": "rad", "phi": "rad", "theta_rate": "rad/s", "psi_rate": "rad/s", "phi_rate": "rad/s"},
+    **{"constant": "N m/A", "emf": "V", "resistance": "ohm", "current_max": "A"},
+}
+
+
+class Memory(NamedTuple):
+    """What a block remembers: `flow` is integrated with the plant, `held` changes only in jumps."""
+
+    flow: Any = ()
+    held: Any = ()
+
+
+class Clock(NamedTuple):
+    """The instant of a jump: time [s], step length [s], number of the step, and the run's random key (or None)."""
+
+    t: Scalar
+    h: Scalar
+    k: Any
+    key: Any
+
+
+class Tracking(NamedTuple):
+    """What a controller is given: target (a slip [1], or 0 rad), measured output, and the feed-forward input."""
+
+    target: Scalar
+    measured: Any
+    feedforward: Scalar
+
+
+class Sample(NamedTuple):
+    """What is seen of a run at an instant; the input of an objective."""
+
+    t: Scalar  # [s]
+    output: Any  # the truth, not the measurement: a BrakeOutput or a BalanceOutput
+    target: Scalar  # [1 or rad] what the controller is told to follow now
+    setpoint: Scalar  # [1 or rad] where the target will settle
+    feedforward: Scalar  # [N m or V]
+    command: Scalar  # what the controller asks for
+    control: Scalar  # what the actuator delivers
+
+
+class Ending(NamedTuple):
+    """How a run ended: its last sample, whether it reached the stop, and what remains to be added after the last sample
+    (the way from the stop speed to standstill; for a run that did not stop, the pessimistic rest)."""
+
+    sample: Sample
+    stopped: Any
+    time_left: Scalar  # [s]
+    distance_left: Scalar  # [m]
+
+
+class Road(Protocol):
+    """A friction curve. Odd in slip, finite with finite derivatives on [-1, 1]."""
+
+    def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
+        """Friction coefficient mu [1] at a slip [1], vehicle speed [m/s] and place on the road [m]."""
+        ...
+
+
+class Plant(Protocol):
+    """dx/dt = derivative(t, x, u), y = output(x).
+
+    The class says `shows`, the type of its output, a NamedTuple: usual parts, reports and figures go by it; and
+    `control_unit`, the unit of its control.
+
+    A plant may also offer `audit(initial)`, an Objective that watches every run of it. Its value is at most 1 for a run
+    that is physically possible; a run of another value has `diverged`, although all its numbers are finite."""
+
+    @property
+    def shows(self) -> Any:
+        """The type of `output`; a class attribute."""
+        ...
+
+    @property
+    def control_unit(self) -> str:
+        """ "N m", "V", or "1" for a command; a class attribute."""
+        ...
+
+    def start(self, initial: Any) -> Any:
+        """The state at t = 0."""
+        ...
+
+    def derivative(self, t: Scalar, state: Any, control: Scalar) -> Any:
+        """dx/dt, with the structure of the state."""
+        ...
+
+    def project(self, state: Any) -> Any:
+        """The nearest admissible state, applied after every step: a stopped wheel does not turn backwards."""
+        ...
+
+    def output(self, state: Any) -> Any:
+        """What is seen of the state."""
+        ...
+
+    def holding(self, output: Any, target: Scalar) -> Scalar:
+        """The control that holds the plant at `target`: the feed-forward tau*."""
+        ...
+
+
+class Block(Protocol):
+    """A dynamic block: Sensor, Reference, Controller or Actuator, by the signal it maps."""
+
+    def start(self, signal: Any) -> Memory:
+        """The memory at t = 0, given the first signal."""
+        ...
+
+    def flow(self, t: Scalar, memory: Memory, signal: Any) -> Any:
+        """d(memory.flow)/dt."""
+        ...
+
+    def output(self, t: Scalar, memory: Memory, signal: Any) -> Any:
+        """The block's output. Does not change the memory."""
+        ...
+
+    def jump(self, clock: Clock, memory: Memory, signal: Any) -> "Jump":
+        """The memory after the instant `clock.t`."""
+        ...
+
+
+class Jump(NamedTuple):
+    """A memory after an instant. `elapsed` [s] is the time since the event that caused the jump, which lies between
+    instants: the loop moves the state by elapsed * (new derivative - old derivative), so that values and gradients do
+    not depend on where the event falls in the step. None where a block has no events."""
+
+    memory: Memory
+    elapsed: Scalar | None = None
+
+
+class Reference(Block, Protocol):
+    """A Block whose output is the target."""
+
+    def setpoint(self, memory: Memory) -> Scalar:
+        """Where the target will settle, as known now: what settling and overshoot are measured against."""
+        ...
+
+
+class Feedforward(Protocol):
+    """The input that a controller adds its feedback to."""
+
+    def input(self, plant: Any, output: Any, target: Scalar) -> Scalar:
+        """Control [N m] for a target."""
+        ...
+
+
+class Stop(Protocol):
+    """When a run ends."""
+
+    def margin(self, output: Any) -> Scalar:
+        """Positive while the run goes on; the run ends where it crosses zero."""
+        ...
+
+    def rate(self, output: Any) -> Scalar:
+        """d(margin)/dt, negative near the end: the slope for landing on the crossing."""
+        ...
+
+    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
+        """Time [s] and distance [m] that are left after the last sample."""
+        ...
+
+
+class Objective(Protocol):
+    """What is measured on a run, streamed: a sweep stores no trajectories.
+
+    `physical = (low, high)`, if the class has it, is the range in which the value of any real run lies: a run with a
+    value outside, or none, has `diverged`."""
+
+    def start(self, sample: Sample) -> Memory:
+        """The accumulator before the first step."""
+        ...
+
+    def flow(self, memory: Memory, sample: Sample) -> Any:
+        """d(memory.flow)/dt, integrated with the plant at the order of the method."""
+        ...
+
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Any:
+        """`memory.held` after a step of length h from `before` (after the jump there) to `sample`."""
+        ...
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """The scalar result."""
+        ...
+
+
+def no_memory(self: Any, signal: Any) -> Memory:
+    """`start` of a block that remembers nothing."""
+    del self, signal
+    return Memory()
+
+
+def no_flow(self: Any, t: Scalar, memory: Memory, signal: Any) -> Any:
+    """`flow` of a block without continuous memory."""
+    del self, t, memory, signal
+    return ()
+
+
+def no_jump(self: Any, clock: Clock, memory: Memory, signal: Any) -> Jump:
+    """`jump` of a block without events."""
+    del self, clock, signal
+    return Jump(memory)

@@ -1,0 +1,16 @@
+"""Why an iteration ended."""
+
+import enum
+
+
+class Reason(enum.Enum):
+    """Why a descent ended."""
+
+    GRADIENT = "the gradient is zero within its tolerance"
+    CHANGE = "steps no longer change the loss within its tolerance"
+    STEP = "no shorter step makes the loss smaller"
+    JUMP = "the loss jumps up just beyond, twice in a row"
+    LIMIT = "the limit of iterations was reached"
+    START = "the start diverged, or the integration step is not stable there"
+    KEPT = "where it ended a constraint is not met; the best of its steps that meets all of them is returned"
+    INTERRUPTED = "it was interrupted, before it was at a minimum"

@@ -1,0 +1,24 @@
+"""Periods on the integration grid."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.pytree import Scalar
+from diffabs.core.rules import Rule, array
+
+
+def steps(period: Scalar, h: Scalar) -> Any:
+    """How many steps of length h make a period. An integer, so without a derivative."""
+    return jnp.maximum(jnp.round(jax.lax.stop_gradient(period / h)), 1).astype(int)
+
+
+def whole_steps(name: str, period: Scalar, step: float) -> Rule:
+    """A period is a whole multiple of the step."""
+    count = array(period) / step
+    return Rule(
+        (count >= 0.5) & (abs(count - count.round()) <= 1e-6 * count),
+        f"{name} is not a multiple of solver.step = {step:g} s",
+        lambda: f"{name} = {float(period):g} s is not a multiple of solver.step = {step:g} s",
+    )

@@ -1,0 +1,1 @@
+"""Interior-point methods in pure JAX, for derivatives through a design."""

@@ -1,0 +1,281 @@
+"""From a box of parameters to a polytope that covers it.
+
+The corners of the box give the vertices. Where the matrices depend on the parameters as they do in Maeda and Sugiura's
+eq. (16), through alpha(m)/omega and beta/omega, the hull of the corners contains the whole box. In general it does
+not, so it is checked on grids and random points, and the vertices are moved outwards until all of those lie inside.
+What lies between the checked points is not proved to be covered.
+
+    gauge(x) = min t with x in c + t (hull - c),  c the vertices' mean:  covered if gauge <= 1
+"""
+
+import difflib
+import itertools
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from diffabs.core.pytree import check, parameters, replace
+from diffabs.design.polytopes import LARGEST, Coverage, Polytope, Schedule
+
+CHUNK = 1024  # systems computed at once
+SAME = 1e-10  # an entry that varies by less, relative to itself, is constant
+SPAN = 1e-9  # a direction in which the data reach less far than this, relative to the furthest, does not count
+SLACK = 1e-9  # gauges are known to about this
+RANDOM = 2000  # points checked between those of a grid, each time
+ROUNDS = 6  # of checking and growing
+WIDEST = 2.0  # factor by which corners are spread, at most, before a box takes their place
+FLAT = 1e-6  # corners that reach less far than this in some direction are flat
+FACETS = (6, 256)  # facets are computed up to this dimension and number of vertices; above, linear programs
+PROBES = 200  # directions whose extreme systems the linear programs check
+
+
+class _Data(NamedTuple):
+    """Systems as rows A, B flattened."""
+
+    rows: np.ndarray
+    order: int
+    inputs: int
+
+
+def polytope(model: Any, over: Mapping[str, Sequence[float]], *, grid: int = 9, most: int = 20_000) -> Polytope:
+    """The polytope of `model`, which has `matrices()`, `states` and `period`, over a box {path: (low, high)}.
+
+    `grid` points per parameter are checked, then twice as many, but not more than `most` of them at once, and 2000
+    random points each time, until a new look finds nothing outside. If some lie outside of the corners' hull, the
+    corners are spread about their mean by the smallest factor that covers them: `coverage.spread`, 1 where the corners
+    suffice. Where that factor would exceed 2, or the systems leave the plane of the corners (a curved dependence on
+    one parameter: factor inf), the vertices are those of a box along the systems' principal directions, and `corners`
+    is empty. Vertices inside the hull of the others are dropped. Covered means to 1e-9 of the range of an entry.
+
+    Raises:
+        ValueError: a path that is no parameter of the model, an interval that is inverted, not finite or outside of the
+            parameter's range, a period that varies, more than 2^12 vertices, matrices that are not finite.
+    """
+    _scipy()
+    low, high = bounds(model, over)
+    free = tuple(path for path in over if low[path] < high[path])
+    if 2 ** len(free) > LARGEST:
+        raise ValueError(f"a box of {len(free)} parameters has {2 ** len(free)} corners, more than {LARGEST}; fix some")
+    model = replace(model, low)
+    box = np.array([[low[path], high[path]] for path in free]).reshape(-1, 2)
+    corners = np.array(list(itertools.product(*box))).reshape(2 ** len(free), len(free))
+    data = systems(model, free, corners)
+    rows, kept, coverage = _covered(model, free, box, data, grid, most)
+    n, m = data.order, data.inputs
+    a, b = np.split(rows, [n * n], axis=1)
+    labels = tuple({**low, **dict(zip(free, corners[i].tolist(), strict=True))} for i in kept)
+    return Polytope(a.reshape(-1, n, n), b.reshape(-1, n, m), model.period, tuple(model.states), labels, coverage)
+
+
+def schedule(
+    model: Any, over: Mapping[str, Sequence[float]], along: str, nodes: int | Sequence[float], **options: Any
+) -> Schedule:
+    """A chain of polytopes: the box, cut along one of its parameters at `nodes`. A number of cells cuts in geometric
+    progression (linearly where the interval reaches 0 or below). Options as for `polytope`.
+
+    Raises:
+        ValueError: a parameter that is not in the box, nodes that do not increase from its low to its high end.
+    """
+    if along not in over:
+        raise ValueError(f"along = '{along}' is not a parameter of the box; there is {', '.join(over) or 'nothing'}")
+    low, high = (bound[along] for bound in bounds(model, over))
+    if isinstance(nodes, int):
+        if nodes < 1:
+            raise ValueError(f"nodes = {nodes} cells; it needs at least 1")
+        at = np.geomspace(low, high, nodes + 1) if low > 0 else np.linspace(low, high, nodes + 1)
+    else:
+        at = np.array(nodes, float)
+    fits = at.ndim == 1 and len(at) > 1 and bool(np.all(np.diff(at) > 0))
+    if not (fits and np.allclose(at[[0, -1]], [low, high], rtol=1e-12, atol=0)):
+        raise ValueError(f"nodes = {at.tolist()} do not increase from {low:g} to {high:g}, the ends of {along}")
+    cells = [polytope(model, {**over, along: (a, b)}, **options) for a, b in itertools.pairwise(at.tolist())]
+    return Schedule(along, at, tuple(cells))
+
+
+def _scipy() -> None:
+    try:
+        import scipy.optimize  # noqa: F401  # pyright: ignore[reportUnusedImport]
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError('a polytope needs SciPy: pip install "diffabs[design]"') from None
+
+
+def bounds(model: Any, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
+    """The low and the high end of every interval, checked."""
+    known = {path: value for path, _, value in parameters(model)}
+    for path, ends in over.items():
+        if path not in known:
+            near = difflib.get_close_matches(path, known, 3, 0.4) or known
+            raise ValueError(f"over: the model has no parameter '{path}'; there is {', '.join(near)}")
+        if np.ndim(known[path]):
+            raise ValueError(f"over: {path} is an array of shape {np.shape(known[path])}, not a number")
+        if np.shape(ends) != (2,):
+            raise ValueError(f"over: {path} = {ends} is not an interval (low, high)")
+        if ends[0] > ends[1]:
+            raise ValueError(f"over: {path} = ({ends[0]:g}, {ends[1]:g}) is inverted")
+    low, high = ({path: float(ends[i]) for path, ends in over.items()} for i in (0, 1))
+    ends = [check(replace(model, bound), "over: ") for bound in (low, high)]
+    if ends[0].period != ends[1].period:
+        raise ValueError("over: the sampling period cannot vary within a polytope")
+    return low, high
+
+
+@partial(jax.jit, static_argnums=1)
+def _batch(model: Any, free: tuple[str, ...], points: Any) -> Any:
+    return jax.vmap(lambda p: replace(model, dict(zip(free, p, strict=True))).matrices())(points)
+
+
+def systems(model: Any, free: tuple[str, ...], points: np.ndarray) -> _Data:
+    """The matrices at points (N, k) of the box, in float64."""
+    parts, n, m = [], 0, 0
+    with jax.enable_x64(True):
+        for chunk in np.split(points, range(CHUNK, len(points), CHUNK)):
+            filled = np.concatenate([chunk, np.repeat(chunk[:1], CHUNK - len(chunk), 0)])  # one shape, one compilation
+            a, b = (np.asarray(x, float)[: len(chunk)] for x in _batch(model, free, filled))
+            n, m = b.shape[1:]
+            parts.append(np.concatenate([a.reshape(len(a), -1), b.reshape(len(b), -1)], axis=1))
+    rows = np.concatenate(parts)
+    bad = ~np.isfinite(rows).all(axis=1)
+    if bad.any():
+        where = ", ".join(f"{path} = {value:g}" for path, value in zip(free, points[bad][0], strict=True))
+        raise ValueError(f"the model's matrices are not finite at {where or 'its parameters'}")
+    return _Data(rows, n, m)
+
+
+def _points(box: np.ndarray, grid: int, most: int, seed: int) -> np.ndarray:
+    """A grid over the box and random points in it."""
+    k = len(box)
+    count = max(2, min(grid, int(most ** (1 / k) + 1e-9)))
+    axes = [np.linspace(low, high, count) for low, high in box]
+    on_grid = itertools.islice(itertools.product(*axes), most)
+    random = np.random.default_rng(seed).uniform(box[:, 0], box[:, 1], (RANDOM, k))
+    return np.concatenate([np.array(list(on_grid)), random])
+
+
+def _covered(
+    model: Any, free: tuple[str, ...], box: np.ndarray, corners: _Data, grid: int, most: int
+) -> tuple[np.ndarray, Sequence[int], Coverage]:
+    """Vertices as rows, which corners they are, and what was checked."""
+    if not free:
+        return corners.rows, [0], Coverage(1, 0.0, 1.0)
+    seen, hull = corners.rows, None
+    for i in range(ROUNDS):
+        new = systems(model, free, _points(box, (grid - 1) * 2 ** min(i, 1) + 1, most, i)).rows
+        seen, reach = np.concatenate([seen, new]), hull.reach(new)[0] if hull else 1.0
+        if hull and reach <= 1 + SLACK:
+            break
+        # what this look found beyond the last is granted once more, to what lies between its points
+        hull = _Hull.around(corners.rows, seen, reach if np.isfinite(reach) else 1.0)
+    assert hull is not None
+    furthest, checked = hull.reach(seen)
+    kept = [] if hull.box else _extreme(hull.vertices)
+    rows = hull.rows if hull.box else hull.rows[kept]
+    return rows, kept, Coverage(checked, float(furthest), float(hull.spread))
+
+
+class _Frame(NamedTuple):
+    """The plane in which the rows lie, and coordinates in it: each reaches over an interval of length 2."""
+
+    origin: np.ndarray
+    scale: np.ndarray
+    basis: np.ndarray
+    half: np.ndarray
+
+    @classmethod
+    def of(cls, rows: np.ndarray) -> "_Frame":
+        size, extent = np.abs(rows).max(axis=0), np.ptp(rows, axis=0)
+        varies = extent > SAME * size
+        scale = np.where(varies, extent, np.where(size > 0, size, 1.0))
+        z = (rows - rows[0]) / scale
+        basis = np.linalg.svd(z - z.mean(axis=0), full_matrices=False)[2] * varies
+        half = np.ptp(z @ basis.T, axis=0) / 2
+        return cls(rows[0], scale, basis[half > SPAN], half[half > SPAN])
+
+    def to(self, rows: np.ndarray) -> np.ndarray:
+        return (rows - self.origin) / self.scale @ self.basis.T / self.half
+
+    def back(self, y: np.ndarray) -> np.ndarray:
+        return self.origin + self.scale * (y * self.half @ self.basis)
+
+    def holds(self, rows: np.ndarray) -> bool:
+        return bool(np.all(np.abs(self.back(self.to(rows)) - rows) <= 2 * SPAN * self.scale))
+
+
+class _Hull(NamedTuple):
+    """Vertices as rows and in the coordinates of a frame; the factor that the corners needed; whether it is a box."""
+
+    frame: _Frame
+    rows: np.ndarray
+    vertices: np.ndarray
+    spread: float
+    box: bool
+
+    @classmethod
+    def around(cls, corners: np.ndarray, seen: np.ndarray, margin: float) -> "_Hull":
+        """The corners if they cover what was seen, spread by up to WIDEST if not, else a box."""
+        frame = _Frame.of(seen)
+        v, x = frame.to(corners), frame.to(seen)
+        needed = _reach(v, x)[0]
+        spread = 1.0 if needed <= 1 + SLACK else needed * margin * (1 + SLACK)
+        count = 2 ** len(frame.half)
+        if spread <= WIDEST or (np.isfinite(spread) and count > LARGEST):
+            rows, v = (a.mean(axis=0) + spread * (a - a.mean(axis=0)) if spread > 1 else a for a in (corners, v))
+            return cls(frame, rows, v, spread, False)
+        if count > LARGEST:
+            raise ValueError(f"the box needs {count} vertices, more than {LARGEST}: vary fewer parameters, or by less")
+        half, middle = np.ptp(x, axis=0) / 2 * margin * (1 + SLACK), (x.max(axis=0) + x.min(axis=0)) / 2
+        v = middle + half * np.array(list(itertools.product((-1.0, 1.0), repeat=len(half))))
+        return cls(frame, frame.back(v), v, spread, True)
+
+    def reach(self, rows: np.ndarray) -> tuple[float, int]:
+        """The largest gauge of the rows, and how many were looked at."""
+        if not self.frame.holds(rows):
+            return np.inf, len(rows)
+        x = self.frame.to(rows)
+        if self.box:
+            middle = self.vertices.mean(axis=0)
+            return float(np.max(np.abs(x - middle) / (self.vertices.max(axis=0) - middle))), len(x)
+        return _reach(self.vertices, x)
+
+
+def _reach(v: np.ndarray, x: np.ndarray) -> tuple[float, int]:
+    """The largest gauge of points x (N, d) in the hull of v (V, d), and how many of them were looked at: beyond some
+    size only those that reach furthest in one of many directions. Infinite if v is flat."""
+    centre = v.mean(axis=0)
+    v, x, d = v - centre, x - centre, v.shape[1]
+    if not d:
+        return 0.0, len(x)
+    if np.linalg.matrix_rank(v, tol=FLAT) < d:
+        return np.inf, len(x)
+    if d == 1:
+        return float(max(x.max() / v.max(), x.min() / v.min())), len(x)
+    if _few(v):
+        from scipy.spatial import ConvexHull
+
+        facets = ConvexHull(v).equations
+        slopes = facets[:, :-1] / -facets[:, -1:]
+        return max(float((part @ slopes.T).max()) for part in np.split(x, range(CHUNK, len(x), CHUNK))), len(x)
+    from scipy.optimize import linprog
+
+    directions = np.concatenate([np.eye(d), -np.eye(d), np.random.default_rng(0).normal(size=(PROBES, d))])
+    far = np.unique(np.argmax(x @ directions.T, axis=0))
+    return max(linprog(np.ones(len(v)), A_eq=v.T, b_eq=x[i]).fun for i in far), len(far)
+
+
+def _extreme(v: np.ndarray) -> list[int]:
+    """Which points span the hull of v."""
+    if not v.shape[1]:
+        return [0]
+    if v.shape[1] == 1:
+        return sorted({int(v.argmin()), int(v.argmax())})
+    if _few(v):
+        from scipy.spatial import ConvexHull
+
+        return sorted(ConvexHull(v).vertices.tolist())
+    return sorted(np.unique(v.round(12), axis=0, return_index=True)[1].tolist())
+
+
+def _few(v: np.ndarray) -> bool:
+    return v.shape[1] <= FACETS[0] and len(v) <= FACETS[1]

@@ -1,0 +1,39 @@
+"""From a box of parameters to the systems on a grid of it: for models that are rational in their parameters.
+
+A balance's A and B contain the inverse of a mass matrix. The hull of the corners of a box of masses then covers the box
+only if it is spread so far that it contains systems no vehicle has, and no gain holds those. So the vertices are the
+systems on the grid, corners included, and what is proved is about their hull: between the points it is likely, not
+proved. A finer grid says more.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from diffabs.core.pytree import replace
+from diffabs.design.parameter_box import bounds, systems
+from diffabs.design.polytopes import LARGEST, Polytope
+
+
+def gridded(model: Any, over: Mapping[str, Sequence[float]], points: int = 3) -> Polytope:
+    """The polytope whose vertices are the systems of `model` at `points` values of each parameter of the box {path:
+    (low, high)}, its ends among them.
+
+    Raises:
+        ValueError: as `box.polytope`; fewer than two points, more than 2^12 systems.
+    """
+    if points < 2:
+        raise ValueError(f"points = {points} is outside [2, inf): a grid has the ends of the box")
+    low, high = bounds(model, over)
+    free = tuple(path for path in over if low[path] < high[path])
+    if points ** len(free) > LARGEST:
+        raise ValueError(f"a grid of {points ** len(free)} systems is more than {LARGEST}; take fewer points")
+    axes = [np.linspace(low[path], high[path], points) for path in free]
+    grid = np.array(list(itertools.product(*axes))).reshape(points ** len(free), len(free))
+    data = systems(replace(model, low), free, grid)
+    n, m = data.order, data.inputs
+    a, b = np.split(data.rows, [n * n], axis=1)
+    labels = tuple({**low, **dict(zip(free, row.tolist(), strict=True))} for row in grid)
+    return Polytope(a.reshape(-1, n, n), b.reshape(-1, n, m), model.period, tuple(model.states), labels)

@@ -1,0 +1,1 @@
+"""Proofs and disproofs in exact arithmetic, and their files."""

@@ -1,0 +1,273 @@
+"""A robust design with its proofs: what is claimed about which matrices, kept in a file anyone can check again.
+
+A verdict is never stored: `Certificate.load` reads matrices and claims, `verify` proves them exactly (`exact`), and so
+does `verify`, which shares no code with the rest of this package. Claims and their data, by kind:
+
+    decay       P, rate (factor in discrete time)   V = x' P x falls like exp(-2 rate t), by factor^2 a period
+    cost        P, Q, R, maybe x0                   the cost from x0 is at most x0' P x0; trace P on average
+    damping     P, cot, zeta                        every fixed system of the hull has damping above zeta
+    l2          P, gamma, Bw, C, D                  the gain from w to C x + D u is below gamma
+    input       P, limit, points                    |u| <= limit for ever from the hull of the points
+    infeasible  W, rate (factor)                    no common P proves the rate
+    scheduled   P, rates, maybe rate, Q, R          the same with P(p), p' between the two `rates`
+"""
+
+import dataclasses
+import functools
+import math
+import os
+import pathlib
+from collections.abc import Iterator, Mapping
+from fractions import Fraction
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from diffabs.design.polytopes import Polytope, Schedule
+from diffabs.design.proof import exact, schema, serialise
+
+QUADRATIC = ("decay", "cost", "damping", "l2", "input")  # each has one P > 0 that decreases at every vertex
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Claim:
+    """One of the inequalities above and the numbers that prove it; arrays are copied and read-only."""
+
+    kind: str
+    data: Mapping[str, float | np.ndarray]
+
+    def __post_init__(self) -> None:
+        """Numbers as floats."""
+        data = {name: read_only(value) for name, value in self.data.items()}
+        data = {name: value if value.ndim else float(value) for name, value in data.items()}
+        object.__setattr__(self, "data", MappingProxyType(data))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Certificate:
+    """Claims about the loops A + B K of a polytope, or of a schedule with gain (m, n) or one for each node (N, m, n).
+
+    Holds copies that are read-only, so a verdict once found stays true. Raises ValueError for claims that do not fit.
+    """
+
+    system: Polytope | Schedule
+    gain: np.ndarray
+    claims: tuple[Claim, ...]
+
+    def __post_init__(self) -> None:
+        """Copies, and shapes and ranges of the claims."""
+        gain = read_only(self.gain)
+        object.__setattr__(self, "gain", read_only(gain[None]) if gain.ndim == 1 else gain)
+        object.__setattr__(self, "system", frozen(self.system))
+        object.__setattr__(self, "claims", tuple(self.claims))
+        schema.check_gain(self.system, self.gain)
+        for claim in self.claims:
+            schema.check(claim.kind, self.system, self.gain, claim.data)
+
+    def verify(self) -> tuple[bool, ...]:
+        """For each claim whether it is proved: exactly, and with every vertex off by up to 2^-40 of each entry."""
+        return self._verdicts
+
+    @functools.cached_property
+    def _verdicts(self) -> tuple[bool, ...]:
+        return tuple(exact.verify(claim.kind, self.system, self.gain, claim.data) for claim in self.claims)
+
+    @property
+    def verified_exactly(self) -> bool:
+        """Whether there is a claim and all are proved."""
+        return bool(self.claims) and all(self.verify())
+
+    def proved(self, *kinds: str) -> Iterator[Mapping[str, Any]]:
+        """Data of the proved claims of these kinds."""
+        for claim, verdict in zip(self.claims, self.verify(), strict=True):
+            if verdict and claim.kind in kinds:
+                yield claim.data
+
+    @property
+    def period(self) -> float | None:
+        """[s] of a discrete-time system."""
+        return self.cells[0].period
+
+    @property
+    def cells(self) -> tuple[Polytope, ...]:
+        """The polytopes of a schedule; a polytope is one."""
+        return self.system.cells if isinstance(self.system, Schedule) else (self.system,)
+
+    @property
+    def quadratically_stable(self) -> bool | None:
+        """True if one P is proved to decrease at all vertices, False if it is proved that none does, None if open."""
+        one = [data["P"] for data in self.proved("scheduled") if (data["P"] == data["P"][0]).all()]
+        if one or any(self.proved(*QUADRATIC)):
+            return True
+        refuted = (data.get("rate", 0.0) <= 0 and data.get("factor", 1.0) >= 1 for data in self.proved("infeasible"))
+        return False if any(refuted) else None
+
+    @property
+    def stable(self) -> bool | None:
+        """True if stability is proved, by one P or by one that depends on the parameter of a schedule; else None."""
+        return True if any(self.proved(*QUADRATIC, "scheduled")) else None
+
+    @property
+    def decay_rate(self) -> float | None:
+        """The best proved, of |x| [1/s]."""
+        rates = [data.get("rate", 0.0) for data in self.proved("decay", "scheduled")]
+        if self.period is not None:
+            rates = [-math.log(data.get("factor", 1.0)) / self.period for data in self.proved("decay")]
+        return max(rates, default=None)
+
+    @property
+    def guaranteed_cost(self) -> float | None:
+        """trace P of the first cost claim that is proved, rounded up; of a scheduled one the largest over the nodes."""
+        return self._cost(self.proved("cost", "scheduled"))
+
+    def _cost(self, claims: Iterator[Mapping[str, Any]]) -> float | None:
+        """trace P of the first of these claims that is about cost."""
+        for data in claims:
+            if "Q" in data or "R" in data:
+                return max(
+                    rounded_up(sum(map(Fraction, np.diag(P)))) for P in data["P"].reshape(-1, *data["P"].shape[-2:])
+                )
+        return None
+
+    @property
+    def cost_from_start(self) -> float | None:
+        """x0' P x0 of the first proved cost claim that has x0, rounded up."""
+        for data in self.proved("cost"):
+            if "x0" in data:
+                x, P = np.vectorize(Fraction, [object])(data["x0"]), np.vectorize(Fraction, [object])(data["P"])
+                return rounded_up(x @ P @ x)
+        return None
+
+    @property
+    def damping(self) -> float | None:
+        """The best damping ratio proved for all fixed systems of the hull."""
+        return max((data["zeta"] for data in self.proved("damping")), default=None)
+
+    @property
+    def l2_gain(self) -> float | None:
+        """The bound of the first l2 claim that is proved."""
+        return next((data["gamma"] for data in self.proved("l2")), None)
+
+    @property
+    def input_limit(self) -> np.ndarray | None:
+        """The bounds (m,) of the first input claim that is proved."""
+        return next((data["limit"] for data in self.proved("input")), None)
+
+    @functools.cached_property
+    def _margins(self) -> list[tuple[str, dict[int, float]]]:
+        return [(claim.kind, exact.margins(claim.kind, self.system, self.gain, claim.data)) for claim in self.claims]
+
+    @property
+    def margins(self) -> dict[str, float]:
+        """For each kind the smallest margin, relative and in floats, over its claims and the vertices."""
+        found: dict[str, float] = {}
+        for kind, margins in self._margins:
+            found[kind] = min(found.get(kind, math.inf), *margins.values())
+        return found
+
+    @property
+    def worst_vertex(self) -> dict[str, Any] | None:
+        """Where the margin is smallest: index (of all cells one after the other), cell, corner, claim and margin."""
+        all_of = [(value, i, kind) for kind, each in self._margins for i, value in each.items() if i != exact.ALL]
+        if not all_of:
+            return None
+        margin, index, kind = min(all_of)
+        places = [(c, cell.corners[i] if cell.corners else None) for c, cell in enumerate(self.cells)
+                  for i in range(cell.vertices)]  # fmt: skip
+        cell, corner = places[index]
+        corner = None if corner is None else dict(corner)
+        return {"index": index, "cell": cell, "corner": corner, "claim": kind, "margin": margin}
+
+    @property
+    def frozen(self) -> tuple[float, ...]:
+        """For each vertex the spectral abscissa of A + B K (radius in discrete time), in floats; not a proof.
+
+        In a schedule with the worse gain of the cell's two nodes.
+        """
+        gains = (
+            self.gain if self.gain.ndim == 3 else np.broadcast_to(self.gain, (len(self.cells) + 1, *self.gain.shape))
+        )
+        size = np.real if self.period is None else np.abs
+        found = []
+        for c, cell in enumerate(self.cells):
+            pair = [size(np.linalg.eigvals(cell.closed(gain))).max(axis=-1) for gain in gains[c : c + 2]]
+            found += np.max(pair, axis=0).tolist()
+        return tuple(found)
+
+    def summary(self) -> dict[str, Any]:
+        """What is proved, for JSON. `trace_cost` is claimed, `guaranteed_cost` proved."""
+        limit = self.input_limit
+        return {
+            "gain": self.gain.tolist(),
+            "verified_exactly": self.verified_exactly,
+            "quadratically_stable": self.quadratically_stable,
+            "stable": self.stable,
+            "decay_rate": self.decay_rate,
+            "trace_cost": self._cost(claim.data for claim in self.claims),
+            "guaranteed_cost": self.guaranteed_cost,
+            "cost_from_start": self.cost_from_start,
+            "damping": self.damping,
+            "l2_gain": self.l2_gain,
+            "input_limit": None if limit is None else limit.tolist(),
+            "worst_vertex": self.worst_vertex,
+            "margins": self.margins,
+            "claims": [{"kind": c.kind, "proved": ok} for c, ok in zip(self.claims, self.verify(), strict=True)],
+        }
+
+    def __str__(self) -> str:
+        """A line for each claim, and the worst vertex."""
+        size = f"{sum(cell.vertices for cell in self.cells)} vertices of order {self.cells[0].order}"
+        lines = [f"certificate for {size}, gain {' '.join(str(self.gain.tolist()).split())}"]
+        for claim, verdict in zip(self.claims, self.verify(), strict=True):
+            numbers = [f"{name} {value:.6g}" for name, value in claim.data.items() if isinstance(value, float)]
+            lines.append("  ".join([f"{claim.kind}:", "proved" if verdict else "NOT PROVED", *numbers]))
+        if worst := self.worst_vertex:
+            where = ", ".join(f"{name} {value:.6g}" for name, value in (worst["corner"] or {}).items())
+            lines.append(f"tightest at vertex {worst['index']} ({where or 'no corner named'}): {worst['margin']:.2e}")
+        return "\n".join(lines)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file whole or not at all. Raises OSError."""
+        target = pathlib.Path(path)
+        part = target.with_name(f".{target.name}.{os.getpid()}.part")
+        try:
+            claims = ((claim.kind, claim.data) for claim in self.claims)
+            part.write_text(serialise.text(self.system, self.gain, claims), encoding="utf-8")
+            os.replace(part, target)
+        finally:
+            part.unlink(missing_ok=True)
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> "Certificate":
+        """What `save` wrote, nothing proved yet. Raises OSError, or ValueError in one line that names the field."""
+        try:
+            system, gain, claims = serialise.read(path)
+            return Certificate(system, gain, tuple(Claim(kind, data) for kind, data in claims))
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"{os.fspath(path)}: {' '.join(str(error).split())}") from None
+
+
+def read_only(value: Any) -> np.ndarray:
+    """A copy as floats that cannot be written to."""
+    array = np.array(value, float)
+    array.setflags(write=False)
+    return array
+
+
+def frozen(system: Polytope | Schedule) -> Any:
+    """A copy whose arrays cannot be written to."""
+    if isinstance(system, Schedule):
+        copy = dataclasses.replace(system, cells=tuple(map(frozen, system.cells)))
+        copy.nodes.setflags(write=False)
+        return copy
+    copy = dataclasses.replace(system)
+    copy.A.setflags(write=False)
+    copy.B.setflags(write=False)
+    return copy
+
+
+def rounded_up(value: Any) -> float:
+    """The least float that is not below a rational number."""
+    near = float(value)
+    return near if Fraction(near) >= value else math.nextafter(near, math.inf)

@@ -1,0 +1,165 @@
+"""A design as one semidefinite programme, in the coordinates of a frame."""
+
+import itertools
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from diffabs.design.polytopes import Polytope, Schedule
+from diffabs.design.sdp import inequalities
+from diffabs.design.sdp.scaling import Frame, whitening
+from diffabs.design.sdp.solver import Block, Unknowns, grouped
+from diffabs.design.spec import Spec
+
+FINITE = 1e-4  # weight of trace Z where an L2 gain is minimised: its infimum is often that of infinite feedback
+TIGHTER = 1e-6  # relative: a design aims past the specification, so that the proof has room
+Values = Mapping[str, np.ndarray]
+
+
+class Place(NamedTuple):
+    """A vertex (A, B), and E, seen from a node; dX/dt there is the sum of rate times X over `drift`."""
+
+    A: np.ndarray
+    B: np.ndarray
+    E: np.ndarray
+    node: int
+    drift: tuple[tuple[int, float], ...] = ()
+
+
+class Programme:
+    """Minimise the mean over the nodes of trace Z, or the squared L2 gain g, under the specification.
+
+    Unknown: X, F, Z for each node (a polytope has one), and g. `level` bounds V on the set of starts of an input limit.
+    """
+
+    def __init__(self, system: Polytope | Schedule, whole: Polytope, spec: Spec, frame: Frame):
+        """Lay out the unknowns; `whole` has all vertices of the system."""
+        self.system, self.spec, self.frame, self.period = system, spec, frame, whole.period
+        self.nodes = len(system.nodes) if isinstance(system, Schedule) else 1
+        n, m = whole.order, whole.inputs
+        shapes: dict[str, tuple[int, int] | int] = {}
+        for i in range(self.nodes):
+            shapes |= {f"X{i}": n, f"F{i}": (m, n), f"Z{i}": n}
+        if spec.l2 is not None:
+            shapes |= {"g": (1, 1)} if spec.l2.bound is None else {"s": (1, 1)}
+        self.unknowns = Unknowns(**shapes)
+        weight = frame.trace_weight()
+        self.scale = float(np.trace(weight)) if spec.Q is not None else 1.0
+        self.weight = weight / np.trace(weight)
+        self.output, self.disturbance = self._sizes(whole)
+        self.root, self.even = np.zeros((0, n)), np.eye(n)
+        if spec.Q is not None:
+            k, weight = -frame.inputs(whole.B[0]).T, frame.weight(spec.Q)
+            self.root, self.even = _root(weight), whitening(weight + k.T @ k)
+        self.common = list(self._common())
+
+    def objective(self) -> np.ndarray:
+        """c, so that c'y times `scale` is what is minimised."""
+        trace = self.unknowns.row(
+            lambda v: sum(np.einsum("ij,dji->d", self.weight, v[f"Z{i}"]) for i in range(self.nodes)) / self.nodes
+        )
+        return trace if self.spec.Q is not None else FINITE * trace + self.unknowns.row(lambda v: v["g"])
+
+    def blocks(self, level: float) -> list[Block]:
+        """All inequalities, grouped by size."""
+        return grouped([*self.common, *self._input(level)])
+
+    def least_level(self) -> float:
+        """The least V of the frame's own solution that holds the starts of the input limit."""
+        if self.spec.input is None:
+            return 1.0
+        return float(((self.frame.inverse @ self.spec.input.points.T) ** 2).sum(axis=0).max())
+
+    def _sizes(self, whole: Polytope) -> tuple[float, float]:
+        """Units of z and w in which the gain of the frame's closed loop, K = -B', is about 1."""
+        l2, frame = self.spec.l2, self.frame
+        if l2 is None:
+            return 1.0, 1.0
+        k = -frame.inputs(whole.B[0]).T
+        z = np.linalg.norm(l2.output @ frame.T + l2.feedthrough @ frame.U @ k) / np.sqrt(frame.tau)
+        e = whole.B[0] if l2.disturbance is None else l2.disturbance
+        return float(z) or 1.0, float(np.linalg.norm(frame.inverse @ e)) / np.sqrt(frame.tau) or 1.0
+
+    def read(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gains (nodes, m, n) and forms P = X^-1 (nodes, n, n) in the original coordinates."""
+        v = self.unknowns.values(y)
+        inverses = [np.linalg.inv(v[f"X{i}"]) for i in range(self.nodes)]
+        gains = [self.frame.gain(v[f"F{i}"] @ inverse) for i, inverse in enumerate(inverses)]
+        return np.array(gains), np.array([self.frame.form(inverse) for inverse in inverses])
+
+    def _common(self) -> Iterator[Block]:
+        for place in self._places():
+            yield from self._at(place)
+        for i in range(self.nodes):
+            yield self.unknowns.affine(lambda v, i=i: inequalities.trace(v[f"X{i}"], v[f"Z{i}"]))
+
+    def _places(self) -> Iterator[Place]:
+        """Where an inequality has to hold. In a cell X and F are linear in the parameter and the system is any of the
+        cell's polytope, so the ends of the cell and of the rates suffice."""
+        cells = self.system.cells if isinstance(self.system, Schedule) else (self.system,)
+        frame, l2 = self.frame, self.spec.l2
+        for i, cell in enumerate(cells):
+            for a, b in zip(cell.A, cell.B, strict=True):
+                e = b if l2 is None or l2.disturbance is None else l2.disturbance
+                scaled = frame.states(a), frame.inputs(b), frame.inverse @ e / np.sqrt(frame.tau)
+                if isinstance(self.system, Polytope):
+                    yield Place(*scaled, 0)
+                    continue
+                width = self.system.nodes[i + 1] - self.system.nodes[i]
+                for node, rate in itertools.product((i, i + 1), sorted(set(self.spec.rates or ()))):
+                    slope = rate / width / frame.tau
+                    yield Place(*scaled, node, ((i, -slope), (i + 1, slope)))
+
+    def _at(self, place: Place) -> Iterator[Block]:
+        """Every inequality that a vertex has to satisfy."""
+        spec, frame, discrete = self.spec, self.frame, self.period is not None
+
+        def seen(v: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+            x, f = v[f"X{place.node}"], v[f"F{place.node}"]
+            drift = sum((rate * v[f"X{i}"] for i, rate in place.drift), np.zeros_like(x))
+            return x, f, place.A @ x + place.B @ f, drift
+
+        def cost(v: Values) -> np.ndarray:
+            x, f, flow, drift = seen(v)
+            return inequalities.cost(x, flow, drift, self.root, f, self.even, discrete=discrete)
+
+        def decay(v: Values) -> np.ndarray:
+            x, _, flow, drift = seen(v)
+            rate = spec.decay * (1 + TIGHTER) * (self.period or 1 / frame.tau)
+            return inequalities.decay(x, flow, drift, rate, discrete=discrete)
+
+        def damping(v: Values) -> np.ndarray:
+            zeta = 1 - (1 - spec.damping) * (1 - TIGHTER)
+            return inequalities.damping(seen(v)[2], zeta / np.sqrt(1 - zeta**2))
+
+        def gain(v: Values) -> np.ndarray:
+            (x, f, flow, drift), l2 = seen(v), spec.l2
+            assert l2 is not None
+            z = (l2.output @ frame.T @ x + l2.feedthrough @ frame.U @ f) / np.sqrt(frame.tau)
+            z, e = z / self.output, place.E / self.disturbance
+            if l2.bound is None:
+                return inequalities.gain(x, flow, drift, z, e, v["g"], 1.0, discrete=discrete)
+            g = (l2.bound * (1 - TIGHTER) / self.output / self.disturbance) ** 2
+            return inequalities.gain(x, flow, drift, z, e, g, v["s"], discrete=discrete)
+
+        wanted = ((spec.Q is not None, cost), (spec.decay > 0, decay), (spec.damping > 0, damping), (spec.l2, gain))
+        yield from (self.unknowns.affine(formula) for asked, formula in wanted if asked)
+
+    def _input(self, level: float) -> Iterator[Block]:
+        limit = self.spec.input
+        if limit is None:
+            return
+        for point in limit.points:
+            start = self.frame.inverse @ point
+            yield self.unknowns.affine(lambda v, start=start: inequalities.reaches(v["X0"], start, level))
+        for row, bound in zip(self.frame.U, limit.limit * (1 - TIGHTER), strict=True):
+            yield self.unknowns.affine(
+                lambda v, row=row, bound=bound: inequalities.limited(v["X0"], row[None] @ v["F0"], bound, level)
+            )
+
+
+def _root(q: np.ndarray) -> np.ndarray:
+    """Qh with Qh'Qh = Q."""
+    values, vectors = np.linalg.eigh(q)
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T

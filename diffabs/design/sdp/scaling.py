@@ -1,0 +1,150 @@
+"""Coordinates in which a solver of LMIs works well.
+
+    x = T z,  u = U v,  t = s/tau
+
+The rig's weights span eight decades and its states three; unscaled, Clarabel fails or returns a destabilising gain as
+optimal. In the coordinates of a Riccati solution P = T^-T T^-1 (or a Lyapunov solution) the unknown is near the unit
+matrix, and so are the weights of the input and, with tau, the closed loop.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from diffabs.design.polytopes import Polytope
+
+
+class Frame(NamedTuple):
+    """T (n, n) and its inverse, U (m, m), tau [1/s] (1 in discrete time)."""
+
+    T: np.ndarray
+    inverse: np.ndarray
+    U: np.ndarray
+    tau: float
+
+    def states(self, a: np.ndarray) -> np.ndarray:
+        """A, or stacks of it."""
+        return self.inverse @ a @ self.T / self.tau
+
+    def inputs(self, b: np.ndarray) -> np.ndarray:
+        """B."""
+        return self.inverse @ b @ self.U / self.tau
+
+    def weight(self, q: np.ndarray) -> np.ndarray:
+        """Q, or any quadratic form of x per unit of time."""
+        return self.T.T @ q @ self.T / self.tau
+
+    def form(self, p: np.ndarray) -> np.ndarray:
+        """P of the original coordinates from P of these."""
+        whole = self.inverse.T @ p @ self.inverse
+        return (whole + np.swapaxes(whole, -1, -2)) / 2
+
+    def gain(self, k: np.ndarray) -> np.ndarray:
+        """K of the original coordinates from K of these."""
+        return self.U @ k @ self.inverse
+
+    def trace_weight(self) -> np.ndarray:
+        """W with trace P = trace(W P of these coordinates)."""
+        return self.inverse @ self.inverse.T
+
+
+def whitening(weight: np.ndarray) -> np.ndarray:
+    """D with D' weight D = I, but for directions that weigh less than a trillionth of the largest.
+
+    A slow closed loop beside a fast one has little cost per unit of time; D M D' makes a solver's tolerance relative.
+    """
+    values, vectors = np.linalg.eigh(weight)
+    return vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+
+
+def frame(p: np.ndarray, a: np.ndarray, r: np.ndarray, *, discrete: bool) -> Frame:
+    """The frame in which P is the unit matrix, the closed loops A (V, n, n) have norms about 1, and R is the unit
+    matrix. Raises LinAlgError for a P that is not positive definite."""
+    lower = np.linalg.cholesky((p + p.T) / 2)
+    inverse = lower.T
+    t = np.linalg.inv(inverse)
+    tau = 1.0 if discrete else float(np.exp(np.mean(np.log(np.linalg.norm(inverse @ a @ t, axis=(1, 2)) + 1e-300))))
+    u = np.linalg.inv(np.linalg.cholesky(r)).T * np.sqrt(tau)
+    return Frame(t, inverse, u, tau)
+
+
+def design_frames(system: Polytope, q: np.ndarray, r: np.ndarray) -> Iterator[tuple[Frame, float]]:
+    """Frames for a design with weights Q, R, from the Riccati solutions of the vertices, the dearest first, with the
+    trace of that solution, a lower bound of every guaranteed cost. Raises ValueError for a vertex without a solution.
+    """
+    # a weight in every state, so that P is definite; relative, and too small to matter
+    regular = q + 1e-12 * np.diag(np.maximum(np.diag(q), 1e-6 * np.trace(q) / len(q)))
+    solutions = [_riccati(a, b, regular, r, i, system) for i, (a, b) in enumerate(zip(system.A, system.B, strict=True))]
+    traces = np.array([np.trace(p) for p in solutions])
+    for i in np.argsort(-traces):
+        p, b = solutions[i], system.B[i]
+        k = -np.linalg.solve(r, b.T @ p)
+        if system.period is not None:
+            k = -np.linalg.solve(r + b.T @ p @ b, b.T @ p @ system.A[i])
+        closed = (system.A[i] + b @ k)[None]
+        yield frame(p, closed, r, discrete=system.period is not None), float(traces[i])
+
+
+def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, i: int, system: Polytope) -> np.ndarray:
+    from scipy.linalg import solve_continuous_are, solve_discrete_are
+
+    try:
+        if system.period is not None:
+            p = solve_discrete_are(a, b, q, r)
+        else:
+            p = _hamiltonian(a, b, q, r)
+            p = solve_continuous_are(a, b, q, r) if p is None else p
+        np.linalg.cholesky(p)
+    except (np.linalg.LinAlgError, ValueError):
+        where = f" ({dict(system.corners[i])})" if system.corners else ""
+        raise ValueError(
+            f"vertex {i}{where} has no stabilising Riccati solution: (A, B) is not stabilisable, or Q does not see an "
+            f"undamped mode; A = {a.tolist()}, B = {b.tolist()}"
+        ) from None
+    return p
+
+
+def _hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray | None:
+    """The Riccati solution from the stable eigenvectors of the Hamiltonian matrix and a Newton step; None where its
+    residual is not small. A thirtieth of the time of SciPy's, whose BLAS may start threads for such small matrices."""
+    n, push = len(a), b @ np.linalg.solve(r, b.T)
+    size = np.sqrt(np.linalg.norm(q) / np.linalg.norm(push)) if push.any() else 1.0
+    modes, vectors = np.linalg.eig(np.block([[a, -push * size], [-q / size, -a.T]]))
+    stable = vectors[:, np.argsort(np.real(modes))[:n]]
+    try:
+        p = size * np.real(stable[n:] @ np.linalg.inv(stable[:n]))
+        closed = a - push @ p
+        left = np.kron(closed.T, np.eye(n)) + np.kron(np.eye(n), closed.T)
+        p = -np.linalg.solve(left, (q + p @ push @ p).ravel()).reshape(n, n)
+    except np.linalg.LinAlgError:
+        return None
+    p = (p + p.T) / 2
+    terms = (a.T @ p + p @ a, p @ push @ p, q)
+    residual = np.abs(terms[0] - terms[1] + terms[2]) / np.maximum(sum(np.abs(t) for t in terms), 1e-300)
+    settled = np.real(np.linalg.eigvals(a - push @ p)).max() < 0
+    return p if settled and residual.max() < 1e-10 else None
+
+
+def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | None = None) -> Frame:
+    """A frame for closed loops (V, n, n): the mean of their Lyapunov solutions for a cost rate `weight`, or, stable or
+    not, for shifted ones in balanced units."""
+    from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_discrete_lyapunov
+
+    n = closed.shape[1]
+    units = matrix_balance(np.abs(closed).mean(axis=0), permute=False, separate=True)[1][0]
+    mean = np.zeros((n, n))
+    for a in closed:
+        modes = np.linalg.eigvals(a)
+        if discrete:
+            a = a / max(1.0, 1.02 * np.abs(modes).max())
+        else:
+            a = a - (max(0.0, 1.02 * modes.real.max()) + 1e-6 * np.abs(modes).max() + 1e-300) * np.eye(n)
+        a = a * units / units[:, None]
+        q = np.eye(n) if weight is None else weight * units * units[:, None]
+        p = solve_discrete_lyapunov(a.T, q) if discrete else solve_continuous_lyapunov(a.T, -q)
+        mean += p / units / units[:, None] / (np.trace(p) if weight is None else len(closed))
+    try:
+        return frame(mean, closed, np.eye(1), discrete=discrete)
+    except np.linalg.LinAlgError:  # a mode on the edge of stability, or a weight that is blind to a state
+        return frame(np.diag(units**-2.0), closed, np.eye(1), discrete=discrete)

@@ -1,0 +1,66 @@
+"""The slip error under a feedback that is proportional to the speed, in coordinates in which the loop hardly varies.
+
+A torque of size v moves the slip equally fast at every speed v. In units of v/v0 for every torque of a sampled model
+
+    x = S z,  u = (v/v0) w,  S = diag(1, 1, ..., v/v0, ...),      x+ = A(v) x + B(v) u
+    z+ = S(v+)^-1 (A S z + B (v/v0) w) = D [S^-1 A S z + S^-1 B (v/v0) w],  D = diag(1, 1, ..., v/v+, ...)
+
+so w = K z is `ProportionalFeedback`. v/v+ = 1 + fall is how much the speed falls in a period: with it in the polytope,
+a certificate holds for every course of the speed whose fall per period is in the range.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.pytree import Scalar, param, part, pytree, strong
+from diffabs.linear.linearization import StateSpace
+from diffabs.linear.slip_model import Sampling, SlipModel
+
+TORQUES = ("actuator torque", "torque of the last sample")
+
+
+@pytree
+class SpeedScaled:
+    """A sampled `SlipModel` with its torques in units of speed/reference_speed; `fall` is v/v+ - 1 over a period."""
+
+    model: SlipModel = part(default=SlipModel)
+    reference_speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0)
+    fall: Scalar = param(default=0.0, unit="1", above=-1.0)
+
+    @property
+    def period(self) -> float | None:
+        """Sampling period [s]."""
+        return self.model.period
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """What the states are."""
+        return self.model.states
+
+    def matrices(self) -> StateSpace:
+        """A (n, n) and B (n, 1), differentiable in every parameter.
+
+        Raises:
+            ValueError: a model in continuous time, in which the speed's fall would have to be a rate.
+        """
+        if not isinstance(self.model.sampling, Sampling):
+            raise ValueError("a speed-scaled model is a sampled one: model.sampling is continuous")
+        return _matrices(self, tuple(name in TORQUES for name in self.states))
+
+
+def fall(deceleration: float, speed: float, period: float) -> float:
+    """The greatest fall v/v+ - 1 over a period [s], at a deceleration [m/s^2] and from the lowest speed [m/s]."""
+    return deceleration * period / (speed - deceleration * period)
+
+
+@partial(jax.jit, static_argnames="torques")
+def _matrices(scaled: SpeedScaled, torques: tuple[bool, ...]) -> StateSpace:
+    scaled = strong(scaled)
+    a, b = scaled.model.matrices()
+    torque = jnp.array(torques)
+    size = scaled.model.speed / scaled.reference_speed
+    s = jnp.where(torque, size, 1.0)
+    left = jnp.where(torque, 1 + scaled.fall, 1.0) / s
+    return StateSpace(left[:, None] * a * s, left[:, None] * b * size)

@@ -1,0 +1,157 @@
+"""A loop's controller as static state feedback u = K x on a linear slip model: what a certificate is about.
+
+    StateFeedback   K = (k1, k2)
+    BalanceFeedback K as it is, on the model of a balance: see `upright`
+    PID             K = (-ki, -(kp + kd wc), ..., kd wc), the last state being the slip error behind the filter wc
+
+since e = target - slip = -x2, and d = -x_f in Aoki and Nakamura's eq. (13). `Sampled` makes the model a discrete one;
+gains of zero leave out the integral and the filter.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.actuators import Delay, Lag, Limits, RateLimit
+from diffabs.controllers import (
+    PID,
+    BalanceFeedback,
+    HoldingInput,
+    NoAntiWindup,
+    ProportionalFeedback,
+    Sampled,
+    StateFeedback,
+)
+from diffabs.core.blocks import Direct, Series
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import BalanceOutput
+from diffabs.core.pytree import check
+from diffabs.design.state_feedback_balance import upright
+from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.slip_model import Continuous, LowPass, Sampling, SlipModel
+from diffabs.references import FixedSlip
+from diffabs.sensors import Bias, Noise
+
+
+class Reduced(NamedTuple):
+    """u = gain x on `model`, gain of shape (n,). `exact`: near the target, inside all limits and at a frozen speed,
+    this is the loop's own linearisation. `neglected` says what it leaves out, in sentences."""
+
+    model: SlipModel | BalanceModel
+    gain: np.ndarray
+    exact: bool
+    neglected: tuple[str, ...]
+
+
+def state_feedback(loop: Loop) -> Reduced:
+    """The loop at its initial speed and its setpoint as state feedback.
+
+    Raises:
+        ValueError: a controller or an actuator that is not linear, a parameter out of its range, a setpoint of 1.
+    """
+    check(loop)
+    if loop.plant.shows is BalanceOutput:
+        return Reduced(*upright(loop))
+    sampled = loop.controller if isinstance(loop.controller, Sampled) else None
+    controller = sampled.controller if sampled else loop.controller
+    integral, _, derivative, cutoff = map(float, _gains(controller))
+    actuator, by_actuator, exact = _actuator(loop.actuator)
+    setpoint = jax.jit(lambda loop: loop.reference.setpoint(loop.start().reference))(loop)
+    model = SlipModel(
+        plant=loop.plant,
+        slip=float(setpoint),
+        speed=float(loop.initial.speed),
+        actuator=actuator,
+        sampling=Sampling(period=float(sampled.period), delay=float(sampled.delay)) if sampled else Continuous(),
+        filter=LowPass(cutoff=cutoff) if derivative else Direct(),
+        integral=integral != 0,
+    )
+    gain = np.asarray(feedback(loop, check(model).states), float)
+    neglected = (*_of_controller(controller), *by_actuator, *_around(loop))
+    return Reduced(model, gain, exact and isinstance(loop.sensor, Direct | Noise | Bias), neglected)
+
+
+def feedback(loop: Loop, states: Sequence[str]) -> Any:
+    """K (n,) of a loop's controller on the states of a `SlipModel`, by their names; 0 on those it does not use.
+    Differentiable in the controller's parameters. That of a `ProportionalFeedback` is at its reference speed.
+
+    Raises:
+        ValueError: a controller that is not linear.
+    """
+    controller = loop.controller.controller if isinstance(loop.controller, Sampled) else loop.controller
+    if isinstance(controller, BalanceFeedback):
+        return jnp.asarray(controller.gain, float)
+    integral, proportional, derivative, _ = _gains(controller)
+    gains = {
+        "integral of slip error": integral,
+        "slip error": proportional + derivative,
+        "filtered slip error": -derivative,
+    }
+    return jnp.stack([jnp.asarray(gains.get(name, 0.0), float) for name in states])
+
+
+def _gains(controller: Any) -> tuple[Any, Any, Any, Any]:
+    """On the integral, the slip error, and slip error minus filtered slip error; the filter's cutoff."""
+    if isinstance(controller, StateFeedback | ProportionalFeedback):
+        return controller.gain[0], controller.gain[1], 0.0, 0.0
+    if isinstance(controller, PID):
+        wc = controller.cutoff
+        return -controller.ki, -controller.kp, -controller.kd * wc, wc
+    raise ValueError(f"controller {_words(controller)} is not linear: it cannot be brought to state feedback")
+
+
+def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
+    """The linear actuator, what it leaves out, and whether that is nothing near the target."""
+    blocks = actuator.blocks if isinstance(actuator, Series) else (actuator,)
+    lags, neglected, exact = [], [], True
+    for block in blocks:
+        match block:
+            case Direct():
+                pass
+            case Lag():
+                lags.append(block)
+            case RateLimit():
+                lags.append(Lag(time_constant=block.time_constant))
+                neglected.append(f"The actuator's rate limit of {float(block.rate):g} N m/s.")
+            case Limits():
+                neglected.append(f"The actuator's limits of {float(block.low):g} and {float(block.high):g} N m.")
+            case Delay():
+                exact = False
+                neglected.append(f"The actuator's delay of {float(block.time):g} s, which can destabilise.")
+            case _:
+                raise ValueError(
+                    f"actuator {_words(block)} is not known to be linear: it cannot be brought to state feedback"
+                )
+    if len(lags) > 1:
+        raise ValueError("actuator: a linear slip model has room for one lag, not for several in series")
+    return (lags[0] if lags else Direct()), tuple(neglected), exact
+
+
+def _of_controller(controller: Any) -> Iterator[str]:
+    low, high = float(controller.torque_min), float(controller.torque_max)
+    if np.isfinite([low, high]).any():
+        yield f"The controller's torque limits of {low:g} and {high:g} N m."
+        if not isinstance(controller.antiwindup, NoAntiWindup):
+            yield "Anti-windup, which acts at the torque limits only."
+
+
+def _around(loop: Loop) -> Iterator[str]:
+    """What is left out of the rest of the loop."""
+    yield "The fall of the speed: it is frozen."
+    if isinstance(loop.sensor, Noise | Bias):
+        yield f"The sensor's {_words(loop.sensor)}, a disturbance."
+    elif not isinstance(loop.sensor, Direct):
+        yield f"The sensor, {_words(loop.sensor)}: its dynamics, rounding or error."
+    if not isinstance(loop.reference, FixedSlip):
+        yield f"The motion of the target ({_words(loop.reference)}), a disturbance; the model is taken at its setpoint."
+    if not isinstance(loop.feedforward, HoldingInput):
+        yield f"The error of the feed-forward ({_words(loop.feedforward)}), a disturbance."
+
+
+def _words(part: Any) -> str:
+    """SlidingMode as `sliding mode`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower()

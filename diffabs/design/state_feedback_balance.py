@@ -1,0 +1,41 @@
+"""A balance's controller as static state feedback u = K x on its linear model about upright."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from diffabs.actuators import VoltageLimit
+from diffabs.controllers import BalanceFeedback, Sampled
+from diffabs.core.blocks import Direct
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import check
+from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.slip_model import Continuous, Sampling
+
+
+def upright(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tuple[str, ...]]:
+    """Model, gain (6,), whether this is the loop's own linearisation, and what is left out, in sentences.
+
+    Raises:
+        ValueError: a controller that is not feedback of the whole state, an actuator with dynamics.
+    """
+    sampled = loop.controller if isinstance(loop.controller, Sampled) else None
+    controller = sampled.controller if sampled else loop.controller
+    if not isinstance(controller, BalanceFeedback):
+        raise ValueError(f"controller {type(controller).__name__} is not feedback of the whole state")
+    if not isinstance(loop.actuator, Direct | VoltageLimit):
+        raise ValueError(f"actuator {type(loop.actuator).__name__} is not known to a linear model of a balance")
+    sampling = Sampling(period=float(sampled.period), delay=float(sampled.delay)) if sampled else Continuous()
+    model = check(BalanceModel(plant=loop.plant, sampling=sampling))
+    exact = isinstance(loop.sensor, Direct)
+    return model, np.asarray(controller.gain, float), exact, tuple(_neglected(loop))
+
+
+def _neglected(loop: Loop) -> Iterator[Any]:
+    yield "Everything that is not linear: the proof is about small angles."
+    yield "What lies between the points of the grid: a balance is rational in its masses, its hull covers no box."
+    if isinstance(loop.actuator, VoltageLimit):
+        yield f"The voltage limit of {float(loop.actuator.voltage_max):g} V."
+    if not isinstance(loop.sensor, Direct):
+        yield f"The sensor ({type(loop.sensor).__name__})."

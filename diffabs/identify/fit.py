@@ -1,0 +1,240 @@
+"""Nonlinear least squares over parameters of any part, by dotted path.
+
+    minimise  sum_i |r_i(part)/sigma_i|^norm + sum_j prior_j(part)^2
+
+in the unbounded coordinates of `space`, so that no step leaves a range, by SciPy's trust-region method (M. A. Branch,
+T. F. Coleman and Y. Li, SIAM J. Sci. Comput. 21 (1999)) with the Jacobian in forward mode, through events and stops. A
+norm of 2 is least squares; 8 or more comes near to the least greatest residual. A point at which a number is not finite
+is too far: the trust region shrinks."""
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import least_squares
+
+from diffabs.core.bijectors import Range, Space, space
+from diffabs.core.pytree import check, replace, strong
+from diffabs.core.reason import Reason
+from diffabs.identify.residuals import Prior, Problem, Residuals, Seen, traced
+from diffabs.identify.uncertainty import Uncertainty, uncertainty
+
+REASONS = {0: Reason.LIMIT, 1: Reason.GRADIENT, 2: Reason.CHANGE, 3: Reason.CHANGE, 4: Reason.CHANGE}
+
+
+@dataclasses.dataclass(frozen=True)
+class Tolerances:
+    """When a fit ends: relative change of the cost and of z, greatest component of the scaled gradient, and the number
+    of evaluations, rejected ones included."""
+
+    cost: float = 1e-10
+    step: float = 1e-10
+    gradient: float = 1e-10
+    evaluations: int = 100
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Identified:
+    """The best fit.
+
+    part: the given one with its free parameters changed; values: these, by path
+    residuals (n,), in their own units; sigma (n,); chi2: sum (residual/sigma)^2
+    cost: what was minimised: the norm, and the prior
+    uncertainty: covariance, standard deviations, correlation, and the directions that the data do not determine; always
+        that of least squares at this point, whatever the norm
+    history: cost at the start and after every accepted step; evaluations: with rejected ones
+    start: the values it began at
+    starts: the fits from all starts, in their order; diverged: starts that could not be used
+    """
+
+    part: Any
+    values: dict[str, Any]
+    residuals: np.ndarray
+    sigma: np.ndarray
+    chi2: float
+    cost: float
+    uncertainty: Uncertainty
+    history: list[float]
+    evaluations: int
+    reason: Reason
+    start: dict[str, Any]
+    starts: tuple["Identified", ...] = ()
+    diverged: tuple[dict[str, Any], ...] = ()
+
+
+def fit(
+    part: Any,
+    free: Sequence[str] | Mapping[str, Range | None],
+    residuals: Residuals,
+    *,
+    data: tuple[Any, ...] = (),
+    sigma: Any = None,
+    absolute: bool = True,
+    prior: Prior | None = None,
+    starts: Sequence[Mapping[str, Any]] = (),
+    norm: float = 2.0,
+    tolerances: Tolerances | None = None,
+    usable: Callable[[Any], bool] | None = None,
+    progress: Callable[[int, float], None] | None = None,
+    stopping: Callable[[], bool] = lambda: False,
+) -> Identified:
+    """Fit the free parameters of a part to residuals(part, *data), a JAX function that returns (n,).
+
+    free: paths, with a range each or None for the declared one
+    data: arrays that are handed on; with others of the same shape nothing is compiled again
+    sigma: standard deviations, a number or (n,). Without it all residuals weigh the same and s^2 is estimated
+    absolute: False if only the ratios of sigma are known, so that s^2 is estimated as well
+    prior: a JAX function of the part that returns deviations from what is known before, in standard deviations;
+        `gaussian` makes one; a penalty on roughness is another. Arguments in a `jax.tree_util.Partial` are traced
+    starts: values by path to begin at, instead of the part's own; the best fit is returned
+    usable: says on the host whether a part may be evaluated
+    progress: told the evaluations so far, of all starts, and the cost at each accepted point
+    stopping: asked before every evaluation; True ends the fit at the last accepted point, and no further start is tried
+
+    Raises:
+        ValueError: a path or range that does not fit, sigma <= 0, norm < 2, fewer residuals than parameters without a
+            prior, a prior without sigma, no start at which the residuals are finite.
+    """
+    part = strong(check(part))
+    where = space(part, free)
+    points = [where.place(check(replace(part, dict(start)))) for start in starts] or [where.place(part)]
+    problem = Problem(where, part, residuals, data, traced(prior), norm, usable)
+    n, k = problem.shapes()
+    _check(where.size, n, k, sigma, norm, absolute)
+    deviations = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, float), (n,))
+    estimated = sigma is None or not absolute
+    watch = _Watch(progress or (lambda _, __: None), stopping)
+    fits: list[Identified | None] = []
+    for z in points:
+        if not (any(fits) and stopping()):
+            fits.append(_fitted(problem, z, deviations, estimated, tolerances or Tolerances(), watch))
+    done = tuple(one for one in fits if one is not None)
+    if not done:
+        raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
+    diverged = tuple(_values(where, z) for z, one in zip(points, fits, strict=False) if one is None)
+    return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
+
+
+class _Stopped(Exception):
+    """Somebody has had enough."""
+
+
+@dataclasses.dataclass
+class _Watch:
+    """Who is told, who is asked, and the evaluations of the starts before."""
+
+    progress: Callable[[int, float], None]
+    stopping: Callable[[], bool]
+    before: int = 0
+
+
+def _check(p: int, n: int, k: int, sigma: Any, norm: float, absolute: bool) -> None:
+    if sigma is not None:
+        given = np.asarray(sigma, float)
+        if given.shape not in ((), (n,)):
+            raise ValueError(f"sigma has shape {given.shape}; {n} residuals need a number or ({n},)")
+        if not (np.isfinite(given) & (given > 0)).all():
+            raise ValueError(f"sigma = {np.min(given):g} is not positive and finite")
+    if k and sigma is None:
+        raise ValueError("a prior needs sigma: nothing else says how much the data weigh against it")
+    estimated = sigma is None or not absolute
+    if n < p + estimated and not (k and n > 0 and not estimated):
+        more = " and one more for the estimate of s^2" if estimated else ""
+        raise ValueError(f"{n} data do not determine {p} parameters{more}: free fewer, or state a prior")
+    if not 2 <= norm < np.inf:
+        raise ValueError(f"norm = {norm:g} is outside [2, inf)")
+
+
+def _fitted(
+    problem: Problem, start: np.ndarray, sigma: np.ndarray, estimated: bool, tolerances: Tolerances, watch: _Watch
+) -> Identified | None:
+    """From one start; None if it cannot be used."""
+    problem.evaluations, problem.last = 0, None
+    if problem.at(start) is None:
+        return None
+    end, reason, history = _descended(problem, start, sigma, tolerances, watch)
+    evaluations = problem.evaluations  # the point found may have to be computed once more, which was not SciPy's wish
+    watch.before += evaluations
+    seen = _known(problem, end)
+    return Identified(
+        part=jax.tree.map(np.asarray, problem.space.at(problem.part, jnp.asarray(end))),
+        values=_values(problem.space, end),
+        residuals=seen.residuals,
+        sigma=sigma,
+        chi2=float(np.sum((seen.residuals / sigma) ** 2)),
+        cost=float(np.sum(problem.vector(seen, sigma) ** 2)),
+        uncertainty=_uncertainty(problem.space, end, seen, sigma, estimated),
+        history=history,
+        evaluations=evaluations,
+        reason=reason,
+        start=_values(problem.space, start),
+    )
+
+
+def _descended(
+    problem: Problem, start: np.ndarray, sigma: np.ndarray, tolerances: Tolerances, watch: _Watch
+) -> tuple[np.ndarray, Reason, list[float]]:
+    """Where it ended and why, and the cost at every accepted point."""
+    rejected = np.full(len(problem.vector(_known(problem, start), sigma)), np.nan)  # SciPy then shrinks the region
+    history, accepted = [], [start]
+
+    def value(z: np.ndarray) -> np.ndarray:
+        if watch.stopping():
+            raise _Stopped
+        seen = problem.at(z)
+        return rejected if seen is None else problem.vector(seen, sigma)
+
+    def jacobian(z: np.ndarray) -> np.ndarray:
+        seen = _known(problem, z)
+        history.append(float(np.sum(problem.vector(seen, sigma) ** 2)))
+        accepted.append(z.copy())
+        watch.progress(watch.before + problem.evaluations, history[-1])
+        return problem.jacobian(seen, sigma)
+
+    try:
+        found = least_squares(
+            value,
+            start,
+            jacobian,  # pyright: ignore[reportArgumentType]  # a function, whatever SciPy's default suggests
+            method="trf",
+            x_scale="jac",
+            ftol=tolerances.cost,
+            xtol=tolerances.step,
+            gtol=tolerances.gradient,
+            max_nfev=tolerances.evaluations,
+        )
+    except _Stopped:
+        return accepted[-1], Reason.INTERRUPTED, history
+    return found.x, REASONS[found.status], history
+
+
+def _known(problem: Problem, z: np.ndarray) -> Seen:
+    """Of a point that was accepted before."""
+    seen = problem.at(z)
+    if seen is None:
+        raise RuntimeError("an accepted point is not finite when it is computed again")
+    return seen
+
+
+def _uncertainty(free: Space, z: np.ndarray, seen: Seen, sigma: np.ndarray, estimated: bool) -> Uncertainty:
+    """In the parameters themselves: dr/dp = dr/dz / (dp/dz), since each parameter has its own z. One that has arrived
+    at the end of its range (dp/dz = 0) is not determined."""
+    slope = np.array([float(jax.grad(m.value)(x)) for m, x in zip(_maps(free), z, strict=True)])
+    values = np.concatenate([np.ravel(x) for x in _values(free, z).values()])
+    chi2 = float(np.sum((seen.residuals / sigma) ** 2))
+    scale = float(np.sqrt(chi2 / (len(sigma) - free.size))) if estimated else 1.0
+    size = np.maximum(np.abs(values), np.abs(slope))
+    over = np.divide(1.0, slope, out=np.zeros_like(slope), where=slope != 0)
+    data, prior = seen.slopes[0] / sigma[:, None] * over, seen.slopes[1] * over
+    return uncertainty(free.names, size, data, prior, scale or float(np.finfo(float).tiny))
+
+
+def _maps(free: Space) -> list[Any]:
+    return [m for entry in free.entries for m in entry.maps]
+
+
+def _values(free: Space, z: np.ndarray) -> dict[str, Any]:
+    return {path: np.asarray(value) for path, value in free.values(jnp.asarray(z)).items()}

@@ -1,0 +1,72 @@
+"""Parameters of a loop from measurements: time traces of one or several runs, or tables of what runs were measured at.
+
+    found = identify(loop, Traces(t=t, columns={"wheel_speed": w}, sigma={"wheel_speed": 0.05}),
+                     {"plant.inertia": (0.2, 5.0), "plant.road.scale": None}, solver=FixedStep(1e-3, 4.0))
+
+The data are compared with the loop's measured outputs, behind its sensor; nothing is drawn at random. What is fitted,
+and how, is in `fit`; what is known afterwards, and what is not, in `uncertainty`."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+
+from diffabs.core.bijectors import Range
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import check, replace, strong
+from diffabs.identify.data import Data
+from diffabs.identify.fit import Identified, Tolerances, fit
+from diffabs.identify.residuals import Prior
+from diffabs.simulate.refusals import refusals
+from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.stable_step import stable_steps
+
+
+def identify(
+    loop: Loop,
+    data: Data,
+    free: Sequence[str] | Mapping[str, Range | None],
+    *,
+    solver: FixedStep,
+    absolute: bool = True,
+    prior: Prior | None = None,
+    starts: Sequence[Mapping[str, Any]] = (),
+    norm: float = 2.0,
+    tolerances: Tolerances | None = None,
+    progress: Callable[[int, float], None] | None = None,
+    stopping: Callable[[], bool] = lambda: False,
+) -> Identified:
+    """Fit free parameters of a loop, by dotted path, to data. The other arguments are those of `fit`.
+
+    A point is rejected where a run diverges, or must not be run: see `refusals`.
+
+    Raises:
+        ValueError: what `fit` and the data object to; a run that must not be run at the start.
+    """
+    check(loop)
+    against = data.against(loop, list(free), solver)
+
+    def refused(part: Any) -> str | None:
+        """Why the first run that must not be run must not."""
+        asked = (refusals(None, jax.device_get(strong(batch)), solver) for batch in against.loops(part))
+        return next((next(filter(None, found.texts)) for found in asked if found.number), None)
+
+    for start in starts or ({},):
+        if why := refused(first := replace(loop, dict(start))):
+            most = min(float(stable_steps(strong(batch)).min()) for batch in against.loops(first))
+            raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
+    return fit(
+        loop,
+        free,
+        against.residuals,
+        data=against.data,
+        sigma=against.sigma,
+        absolute=absolute,
+        prior=prior,
+        starts=starts,
+        norm=norm,
+        tolerances=tolerances,
+        usable=lambda part: refused(part) is None,
+        progress=progress,
+        stopping=stopping,
+    )

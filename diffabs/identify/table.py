@@ -1,0 +1,109 @@
+"""Tables of what runs were measured at, against the metrics of simulated ones."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import check, get, parameters, replace, strong
+from diffabs.identify.data import Comparison, check_positive
+from diffabs.objectives import BRAKING
+from diffabs.simulate.run import measure
+from diffabs.simulate.solution import FixedStep
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Table:
+    """Published or measured results of runs, the free parameters the same in all of them.
+
+    loops: by row; their structures may differ, those of equal structure are run together
+    values: {row: {metric: value}}, a row may lack some metrics
+    sigma: standard deviation by metric, in its unit; None where unknown, with one metric only
+    measured: the objectives by metric
+    """
+
+    loops: Mapping[str, Loop]
+    values: Mapping[str, Mapping[str, float]]
+    sigma: Mapping[str, float] | None = None
+    measured: Mapping[str, Objective] = dataclasses.field(default_factory=lambda: BRAKING)
+
+    @property
+    def labels(self) -> list[tuple[str, str]]:
+        """(row, metric) of each residual."""
+        return [(row, metric) for row, line in self.values.items() for metric in line]
+
+    def against(self, loop: Loop, free: Sequence[str], solver: FixedStep) -> Comparison:
+        """Compare with the metrics of every row's loop."""
+        self._check(loop, free)
+        groups: dict[Any, list[str]] = {}
+        for row in self.values:
+            one = strong(self.loops[row])
+            groups.setdefault((jax.tree.structure(one), tuple(map(jnp.shape, jax.tree.leaves(one)))), []).append(row)
+        batches = [_stacked([self.loops[row] for row in rows]) for rows in groups.values()]
+        order = [row for rows in groups.values() for row in rows]
+        metrics = list(dict.fromkeys(metric for _, metric in self.labels))
+        place = np.array([(order.index(row), metrics.index(metric)) for row, metric in self.labels])
+        target = np.array([self.values[row][metric] for row, metric in self.labels])
+        weights = self.sigma
+        sigma = None if weights is None else np.array([weights[metric] for _, metric in self.labels])
+        measured = _Measured(solver, tuple(free), tuple((name, self.measured[name]) for name in metrics))
+        data = batches, place, target
+        return Comparison(measured, data, sigma, lambda part: [measured.loops(part, batch) for batch in batches])
+
+    def _check(self, loop: Loop, free: Sequence[str]) -> None:
+        for row, line in self.values.items():
+            if row not in self.loops:
+                raise ValueError(f"row {row}: no loop; there is {', '.join(self.loops)}")
+            check(self.loops[row], f"{row}: ")
+            there = {path for path, _, _ in parameters(self.loops[row])}
+            for path in free:
+                if path not in there or np.shape(get(self.loops[row], path)) != np.shape(get(loop, path)):
+                    raise ValueError(f"row {row}: {path} is not a parameter of its loop, or of another shape")
+            for metric, value in line.items():
+                if metric not in self.measured:
+                    raise ValueError(f"row {row}: {metric} is not measured; there is {', '.join(self.measured)}")
+                if not math.isfinite(value):
+                    raise ValueError(f"row {row}: {metric} = {value} is not finite")
+        self._check_sigma({metric for _, metric in self.labels})
+
+    def _check_sigma(self, metrics: set[str]) -> None:
+        if self.sigma is None:
+            if len(metrics) > 1:
+                raise ValueError(f"sigma: needed to weigh {', '.join(sorted(metrics))} against each other")
+            return
+        for metric in sorted(metrics):
+            if metric not in self.sigma:
+                raise ValueError(f"sigma: none for {metric}")
+            check_positive(f"sigma.{metric}", self.sigma[metric], "in the metric's unit")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Measured:
+    """Metrics of rows of loops minus data. Equal ones are compiled once."""
+
+    solver: FixedStep
+    shared: tuple[str, ...]
+    objectives: tuple[tuple[str, Objective], ...]
+
+    def loops(self, part: Any, batch: Any) -> Any:
+        """Rows of a batch with the parameters that they share."""
+        values = {path: get(part, path) for path in self.shared}
+        return jax.vmap(lambda row: replace(row, values))(batch)
+
+    def __call__(self, part: Any, batches: Any, place: Any, target: Any) -> Any:
+        def row(loop: Any) -> Any:
+            metrics = measure(loop, self.solver, dict(self.objectives)).metrics
+            return jnp.stack([metrics[name] for name, _ in self.objectives])
+
+        seen = jnp.concatenate([jax.vmap(row)(self.loops(part, batch)) for batch in batches])
+        return seen[place[:, 0], place[:, 1]] - target
+
+
+def _stacked(loops: Sequence[Loop]) -> Any:
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x, float) for x in leaves]), *loops)

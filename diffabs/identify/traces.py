@@ -1,0 +1,154 @@
+"""Measured signals over time, against simulated ones."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.loop import Loop
+from diffabs.core.numerics import clamp, ratio
+from diffabs.core.protocols import UNITS
+from diffabs.core.pytree import replace, strong
+from diffabs.identify.data import Comparison, check_positive
+from diffabs.identify.fit import Identified
+from diffabs.simulate.batch import Batch
+from diffabs.simulate.run import rollout
+from diffabs.simulate.solution import FixedStep
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Traces:
+    """Measured signals over time.
+
+    t (n,): instants [s], increasing, from the start of braking; not necessarily equally spaced
+    columns: (n,) by the name of a field of the plant's output; with several runs (runs, n)
+    sigma: standard deviation of each column's noise, in its unit: a number, or of the column's shape. None where it is
+        not known, with one column only
+    over: what differs between runs: parameters by path, one row per run
+    until: the last instant [s] of each run that is compared, a number or (runs,); None is all
+
+    The simulated outputs are interpolated linearly between the instants that the solver keeps (`solver.every`). A run
+    that ends before the data do stays at its last sample: were the rest left out, ending early would pay. So cut data,
+    with `until`, that go on where the loop's stop ends the run, other than at rest.
+    """
+
+    t: Any
+    columns: Mapping[str, Any]
+    sigma: Mapping[str, Any] | None = None
+    over: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    until: Any = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Runs and instants."""
+        return Batch(self.over).size, np.size(self.t)
+
+    def against(self, loop: Loop, free: Sequence[str], solver: FixedStep) -> Comparison:
+        """Compare with runs of the loop."""
+        self._check(loop, free, solver)
+        kept = np.flatnonzero(self._kept())
+        over = {path: np.asarray(rows, float) for path, rows in self.over.items()}
+        target = np.concatenate([self._full(column) for column in self.columns.values()])[kept]
+        weights = self.sigma
+        sigma = None if weights is None else np.concatenate([self._full(weights[name]) for name in self.columns])[kept]
+        simulated = _Simulated(solver, tuple(self.columns), len(over) > 0)
+        return Comparison(
+            simulated,
+            (over, np.asarray(self.t, float), kept, target),
+            sigma,
+            lambda part: [simulated.loops(part, over)],
+        )
+
+    def residuals(self, found: Identified) -> dict[str, np.ndarray]:
+        """Simulated minus measured by column, (runs, n); NaN where nothing was compared."""
+        whole = np.full(len(self.columns) * math.prod(self.shape), np.nan)
+        whole[np.flatnonzero(self._kept())] = found.residuals
+        return dict(zip(self.columns, whole.reshape(len(self.columns), *self.shape), strict=True))
+
+    def _full(self, column: Any) -> np.ndarray:
+        return np.broadcast_to(np.asarray(column, float), self.shape).ravel()
+
+    def _kept(self) -> np.ndarray:
+        until = np.inf if self.until is None else np.asarray(self.until, float)
+        kept = np.asarray(self.t, float) <= np.broadcast_to(until, self.shape[:1])[:, None]
+        return np.tile(kept.ravel(), len(self.columns))
+
+    def _check(self, loop: Loop, free: Sequence[str], solver: FixedStep) -> None:
+        Batch(self.over).check(loop)
+        if both := set(free) & set(self.over):
+            raise ValueError(f"{', '.join(sorted(both))}: both free and given for each run (over)")
+        t = np.asarray(self.t, float)
+        if t.ndim != 1 or not t.size or not np.isfinite(t).all() or not (np.diff(t) > 0).all():
+            raise ValueError(f"t has shape {t.shape}; it must be finite numbers in increasing order [s]")
+        if t[0] < 0 or t[-1] > solver.duration:
+            raise ValueError(f"t = {t[0]:g} ... {t[-1]:g} s leaves [0, {solver.duration:g}] s, the solver's duration")
+        if not self.columns or set(self.columns) - set(_shown(loop)):
+            named = ", ".join(self.columns) or "none"
+            raise ValueError(f"columns: {named}; there is {', '.join(_shown(loop))}")
+        shapes = (self.shape, self.shape[1:]) if self.shape[0] == 1 else (self.shape,)
+        for name, column in self.columns.items():
+            _check_column(name, np.asarray(column, float), t, shapes)
+        self._check_sigma()
+        if self.until is not None and np.shape(self.until) not in ((), self.shape[:1]):
+            raise ValueError(f"until has shape {np.shape(self.until)}; it must be a number [s] or ({self.shape[0]},)")
+
+    def _check_sigma(self) -> None:
+        if self.sigma is None:
+            if len(self.columns) > 1:
+                raise ValueError(f"sigma: needed to weigh {', '.join(self.columns)} against each other")
+            return
+        if set(self.sigma) != set(self.columns):
+            raise ValueError(f"sigma is that of {', '.join(self.sigma)}; the columns are {', '.join(self.columns)}")
+        for name, value in self.sigma.items():
+            if np.shape(value) not in ((), self.shape[1:], self.shape):
+                raise ValueError(f"sigma.{name} has shape {np.shape(value)}, not () or {self.shape}")
+            check_positive(f"sigma.{name}", value, UNITS[name])
+
+
+def _shown(loop: Loop) -> tuple[str, ...]:
+    """What the plant shows of itself."""
+    return jax.eval_shape(lambda loop: loop.plant.output(loop.plant.start(loop.initial)), strong(loop))._fields
+
+
+@dataclasses.dataclass(frozen=True)
+class _Simulated:
+    """Traces of a loop minus data. Equal ones are compiled once."""
+
+    solver: FixedStep
+    fields: tuple[str, ...]
+    several: bool
+
+    def loops(self, loop: Any, over: Mapping[str, Any]) -> Any:
+        """One per run, stacked."""
+        loop = strong(loop)
+        if not self.several:
+            return jax.tree.map(lambda x: x[None], loop)
+        return jax.vmap(lambda values: replace(loop, values))(over)
+
+    def __call__(self, loop: Any, over: Any, t: Any, kept: Any, target: Any) -> Any:
+        seen = jax.vmap(lambda one: self._columns(one, t))(self.loops(loop, over))
+        return jnp.swapaxes(seen, 0, 1).ravel()[kept] - target
+
+    def _columns(self, loop: Any, t: Any) -> Any:
+        """(columns, n)."""
+        run = rollout(loop, self.solver)
+        assert run.trajectory is not None
+        times, stride = run.trajectory.sample.t, self.solver.step * self.solver.every
+        i = jnp.clip(jnp.floor(t / stride).astype(int), 0, len(times) - 2)
+        part = clamp(ratio(t - times[i], times[i + 1] - times[i]), 0.0, 1.0)  # 0 after the end, where times repeat
+        columns = [getattr(run.trajectory.measured, name) for name in self.fields]
+        seen = jnp.stack([x[i] + part * (x[i + 1] - x[i]) for x in columns])
+        return jnp.where(run.diverged, jnp.nan, seen)
+
+
+def _check_column(name: str, column: np.ndarray, t: np.ndarray, shapes: tuple[tuple[int, ...], ...]) -> None:
+    if column.shape not in shapes:
+        raise ValueError(f"{name} has shape {column.shape}; t and the runs (over) need {' or '.join(map(str, shapes))}")
+    bad = ~np.isfinite(column)
+    if bad.any():
+        first = t[np.nonzero(bad)[-1][0]]
+        raise ValueError(f"{name}: {bad.sum()} values are not finite, the first at t = {first:g} s; leave them out")

@@ -1,0 +1,1 @@
+"""Linear systems in pure JAX: linearisation, sampling, Riccati and Lyapunov equations, LQR and LQG."""

@@ -1,0 +1,88 @@
+"""Linear quadratic regulators, u = +K x: the sign is that of the rest of the package, and of the papers.
+
+    lqr    minimises the integral of x'Q x + 2 x'S u + u'R u,  x' = A x + B u    K = -R^-1 (B'P + S')
+    dlqr   minimises the sum,                                  x+ = A x + B u    K = -(R + B'P B)^-1 (B'P A + S')
+
+Pure JAX: compiled, batched and differentiated in every matrix. What a caller can be told before the equation is solved
+is told where the matrices are numbers; inside `jit` and `vmap` the flag `stabilising` says it, and K is NaN.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from diffabs.linear.riccati import Riccati, care, dare
+from diffabs.linear.weights import weight
+
+UNMOVED = 1e-10  # relative: a mode with no more input than this is not moved by it
+
+
+class Regulator(NamedTuple):
+    """Gain K (m, n), and what `Riccati` says of P (n, n)."""
+
+    gain: Any
+    P: Any
+    residual: Any
+    stabilising: Any
+
+
+def lqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
+    """The regulator in continuous time; A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m).
+
+    Raises:
+        ValueError: shapes that do not fit; and, for matrices that are numbers and not traced, entries that are not
+            finite, Q or R that are not symmetric, R that is not positive definite, a pair that is not stabilisable.
+    """
+    _check(A, B, Q, R, discrete=False)
+    found = care(A, B, Q, R, S)
+    turned = jnp.asarray(B).T @ found.P + (0.0 if S is None else jnp.asarray(S).T)
+    return _regulator(found, jnp.asarray(R, found.P.dtype), turned)
+
+
+def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
+    """The regulator in discrete time; otherwise as `lqr`."""
+    _check(A, B, Q, R, discrete=True)
+    found = dare(A, B, Q, R, S)
+    b = jnp.asarray(B)
+    turned = b.T @ found.P @ jnp.asarray(A) + (0.0 if S is None else jnp.asarray(S).T)
+    return _regulator(found, jnp.asarray(R) + b.T @ found.P @ b, turned)
+
+
+def _regulator(found: Riccati, effort: jax.Array, turned: jax.Array) -> Regulator:
+    return Regulator(-jnp.linalg.solve(effort, turned), found.P, found.residual, found.stabilising)
+
+
+def _check(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool) -> None:
+    """What can be said of numbers."""
+    if any(isinstance(x, Tracer) for x in (A, B, Q, R)):
+        return
+    a, b = np.asarray(A, float), np.asarray(B, float)
+    if a.ndim != 2 or a.shape[0] != a.shape[1] or b.ndim != 2 or len(b) != len(a):
+        raise ValueError(f"A has shape {a.shape} and B {b.shape}; (n, n) and (n, m) are needed")
+    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+        raise ValueError("A or B has an entry that is not finite")
+    for name, value, size in (("Q", Q, len(a)), ("R", R, b.shape[1])):
+        value = np.asarray(value, float)
+        if value.shape != (size, size):
+            raise ValueError(f"{name} has shape {value.shape}; ({size}, {size}) is needed")
+        if not np.isfinite(value).all() or not np.allclose(value, value.T, rtol=1e-12, atol=0):
+            raise ValueError(f"{name} = {value.tolist()} is not symmetric and finite")
+    weight("R", R, b.shape[1], definite=True)
+    unmoved = unstabilisable(a, b, discrete=discrete)
+    if unmoved is not None:
+        raise ValueError(f"the pair (A, B) is not stabilisable: the input does not move the mode at {unmoved:.6g}")
+
+
+def unstabilisable(A: Any, B: Any, *, discrete: bool = False) -> complex | None:
+    """An eigenvalue of A, not stable, that the input cannot move: (A - s I, B) has rank below n there (Popov, Belevitch
+    and Hautus). None if there is none."""
+    a, b = np.asarray(A, float), np.asarray(B, float)
+    for mode in np.linalg.eigvals(a):
+        unstable = abs(mode) >= 1 if discrete else np.real(mode) >= 0
+        pencil = np.hstack([a - mode * np.eye(len(a)), b])
+        if unstable and np.linalg.svd(pencil, compute_uv=False)[-1] <= UNMOVED * np.linalg.norm(pencil, 2):
+            return complex(mode) if abs(np.imag(mode)) > 0 else float(np.real(mode))
+    return None

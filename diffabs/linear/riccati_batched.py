@@ -1,0 +1,269 @@
+"""Riccati equations of many lanes at once: stacks (rows, columns, lanes), and a batch of `vmap` joins the lanes.
+
+See `riccati` for what is solved and how; here are its steps.
+"""
+
+from collections.abc import Callable
+from functools import partial, reduce
+from operator import add
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.custom_batching import custom_vmap
+
+from diffabs.linear.lyapunov import cholesky, eye, relative, size, smith, solve, times, transpose
+
+LANES = 128  # that advance together: their matrices stay in the cache, and a hard one delays no more than these
+SWEEPS, DOUBLINGS, SIGNS, STEPS = 12, 40, 40, 16  # at most: of balancing, doubling, the sign iteration, Newton-Kleinman
+ERROR = 1e-7  # largest admitted estimate of the relative error of P in balanced coordinates
+ROUNDING = 1e-12  # of R: pivots below are taken for 0
+RESIDUAL = 1e-9  # largest admitted relative residual in the given coordinates
+
+
+@partial(jax.jit, static_argnums=0)
+def one(solver: Callable, data: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+    """(P, residual) of one lane."""
+    P, residual = solver(*(x[None] for x in data))
+    return P[0], residual[0]
+
+
+def _lanes(solver: Callable) -> Callable:
+    """`solver` on arrays (lanes, rows, columns), LANES at a time, whose vmap has more lanes."""
+
+    @custom_vmap
+    def many(*data: jax.Array) -> Any:
+        lanes = len(data[0])
+        width = min(LANES, lanes)
+        padding = -lanes % width
+        chunks = [jnp.pad(x, ((0, padding), (0, 0), (0, 0)), mode="edge") for x in data]
+        chunks = [x.reshape(-1, width, *x.shape[1:]) for x in chunks]
+        P, residual = lax.map(lambda chunk: solver(*(jnp.moveaxis(x, 0, -1) for x in chunk)), chunks)
+        P = jnp.moveaxis(P, -1, 1)
+        return P.reshape(-1, *P.shape[2:])[:lanes], residual.ravel()[:lanes]
+
+    @many.def_vmap
+    def rule(axis_size: int, batched: Any, *data: jax.Array) -> Any:
+        full = [x if b else jnp.broadcast_to(x, (axis_size, *x.shape)) for x, b in zip(data, batched, strict=True)]
+        P, residual = many(*(x.reshape(-1, *x.shape[2:]) for x in full))
+        return (P.reshape(axis_size, -1, *P.shape[1:]), residual.reshape(axis_size, -1)), (True, True)
+
+    return many
+
+
+@_lanes
+def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Any:
+    """(P, residual) in continuous time, for A, B, Q, R, S; P is NaN where it is not proven."""
+    B, S, a, b, q, d = _prepared(A, B, Q, R, S)
+    G = times(b, transpose(b))
+    hamiltonian = _blocks(a, -G, -q, -transpose(a))
+    scale = jnp.exp(solve(hamiltonian, hamiltonian[:, :0])[1] / len(hamiltonian))
+    P, found = _doubled(*_cayley(a, G, q, scale))
+    P = _unless(found, P, lambda: _graph(_sign(hamiltonian)))
+    return _given(_refined(partial(_kleinman, a, b, q, scale), P), d, partial(_terms, A, B, Q, S))
+
+
+@_lanes
+def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Any:
+    """The same in discrete time, where R may be singular."""
+    pivots, diagonal = (jnp.sum(x * eye(len(R), R), 1) for x in (cholesky(R), R))
+    definite = jnp.all(pivots**2 > ROUNDING * diagonal, 0)
+    regular, same = jnp.all(definite), (Q, R, S, jnp.zeros_like(A))
+    Q, R, S, shift = lax.cond(regular, lambda: same, lambda: _shifted(A, B, Q, R, S, definite))
+    B, S, a, b, q, d = _prepared(A, B, Q, R, S)
+    I, G = eye(len(a), a), times(b, transpose(b))
+
+    def by_sign() -> jax.Array:
+        """A Cayley transformation takes the unit circle to the imaginary axis."""
+        minus = _blocks(a - I, -G, -q, I - transpose(a))
+        return _graph(_sign(solve(minus, _blocks(a + I, G, -q, I + transpose(a)))[0]))
+
+    P, found = _doubled(a, G, q)
+    P = _unless(found, P, by_sign)
+    P = _refined(partial(_hewer, a, b, q), P, shift * d * d[:, None])
+    P, residual = _given(P, d, partial(_discrete_terms, A, B, Q, S))
+
+    def curved() -> jax.Array:
+        """P where R + B' P B > 0."""
+        minimum = jnp.isfinite(size(cholesky(eye(B.shape[1], B) + times(transpose(B), P, B))))
+        return jnp.where(definite | minimum, P + shift, jnp.nan)
+
+    return lax.cond(regular, lambda: P, curved), residual
+
+
+def _blocks(*blocks: jax.Array) -> jax.Array:
+    return jnp.concatenate([jnp.concatenate(blocks[:2], 1), jnp.concatenate(blocks[2:], 1)], 0)
+
+
+# Steps 1 and 2
+
+
+def _prepared(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
+    """B L^-T and S L^-T, L L' = R; A - B R^-1 S', B L^-T, Q - S R^-1 S' balanced, for which R = I and S = 0; and d."""
+    inverse = transpose(solve(cholesky(R), eye(len(R), R))[0])
+    B, S = times(B, inverse), times(S, inverse)
+    a, q = A - times(B, transpose(S)), Q - times(S, transpose(S))
+    d = _balance(a, times(B, transpose(B)), q)
+    return B, S, a * d / d[:, None], B / d[:, None], q * d * d[:, None], d
+
+
+def _shifted(A: Any, B: Any, Q: Any, R: Any, S: Any, definite: jax.Array) -> tuple[Any, ...]:
+    """Q, R, S of the discrete equation for P less a diagonal matrix, and that matrix: 0 in lanes where R is definite,
+    NaN where it is not even semidefinite.
+
+    The weight of the inputs then is R + B' shift B, definite if any R + B' P B is. In balanced coordinates the shift is
+    as large as Q.
+    """
+    weight, one = size(R), eye(len(R), R)
+    semidefinite = jnp.isfinite(size(cholesky(R + jnp.where(weight > 0, ROUNDING * weight, 1.0) * one)))
+    d = _balance(A, times(B, transpose(B)), Q)
+    level = size(Q * d * d[:, None])
+    p = jnp.where(semidefinite, jnp.where(level > 0, level, 1.0) / (d * d), jnp.nan)
+    shift = jnp.where(definite, 0.0, p)[:, None] * eye(len(A), A)
+    moved = times(transpose(A), shift)
+    return Q + times(moved, A) - shift, R + times(transpose(B), shift, B), S + times(moved, B), shift
+
+
+def _balance(A: jax.Array, G: jax.Array, Q: jax.Array) -> jax.Array:
+    """Powers of two d (n, lanes), x = d z, for which row and column i of the Hamiltonian have about equal sums, its
+    diagonal left out."""
+    A, G, Q = jnp.abs(A) * (1 - eye(len(A), A)), jnp.abs(G), jnp.abs(Q)
+
+    def sweep(_: Any, d: jax.Array) -> jax.Array:
+        row = (jnp.sum(A * d, 1) + jnp.sum(G / d, 1)) / d
+        column = (jnp.sum(A / d[:, None], 0) + jnp.sum(Q * d, 1)) * d
+        fine = (row > 0) & (column > 0)
+        return d * jnp.where(fine, row / jnp.where(fine, column, 1.0), 1.0) ** 0.25
+
+    d = lax.fori_loop(0, SWEEPS, sweep, jnp.ones_like(A[0]))
+    return jnp.ldexp(jnp.ones_like(d), jnp.round(jnp.log2(d)).astype(int))
+
+
+def _cayley(A: jax.Array, G: jax.Array, Q: jax.Array, scale: jax.Array) -> tuple[jax.Array, ...]:
+    """(A, G, Q) of a discrete equation with the same P:  (A, -G; Q, A') <- I + 2 g (A - g, G; -Q, A' - g)^-1.
+
+    Chu, Fan and Lin (2005), eqs. (2.8), in one inverse. g is not an eigenvalue of A in ordinary examples.
+    """
+    n, g = len(A), 1.09 * scale
+    shifted = A - g * eye(n, A)
+    whole = _blocks(shifted, G, -Q, transpose(shifted))
+    whole = eye(2 * n, A) + 2 * g * solve(whole, eye(2 * n, A))[0]
+    return whole[:n, :n], -whole[:n, n:], whole[n:, :n]
+
+
+def _doubled(A: jax.Array, G: jax.Array, Q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """P of a discrete equation by structured doubling, and whether it converged. It does where P is stabilising and the
+    dual equation has a solution too; an unstable mode that costs nothing is an exception.
+
+        W = (I + G Q)^-1 (A, G);   A <- A W_A,   G <- G + A W_G A',   Q <- Q + A' Q W_A
+    """
+    n = len(A)
+
+    def going(carry: Any) -> jax.Array:
+        k, A, _, _ = carry
+        return (k < DOUBLINGS) & jnp.any(size(A) > 1e-5)  # the error of Q is its square
+
+    def double(carry: Any) -> Any:
+        k, A, G, Q = carry
+        W = solve(eye(n, A) + times(G, Q), jnp.concatenate([A, G], 1))[0]
+        T = transpose(A)
+        G, Q = G + times(A, W[:, n:], T), Q + times(T, Q, W[:, :n])
+        return k + 1, times(A, W[:, :n]), (G + transpose(G)) / 2, (Q + transpose(Q)) / 2
+
+    _, A, _, Q = lax.while_loop(going, double, (0, A, G, Q))
+    return Q, (size(A) <= 1e-5) & jnp.isfinite(size(Q))
+
+
+def _unless(found: jax.Array, P: jax.Array, otherwise: Callable) -> jax.Array:
+    """P, and `otherwise()` in lanes where it was not found: worked out only if there are any."""
+    return lax.cond(jnp.all(found), lambda: P, lambda: jnp.where(found, P, otherwise()))
+
+
+def _sign(Z: jax.Array) -> jax.Array:
+    """Newton's iteration Z <- (c Z + (c Z)^-1)/2, c = abs(det Z)^(-1/size)."""
+
+    def going(carry: Any) -> jax.Array:
+        k, _, moved = carry
+        return (k < SIGNS) & jnp.any(moved > 1e-5)  # converges quadratically
+
+    def step(carry: Any) -> Any:
+        k, Z, _ = carry
+        inverse, log = solve(Z, eye(len(Z), Z))
+        c = jnp.exp(-log / len(Z))
+        new = (c * Z + inverse / c) / 2
+        return k + 1, new, size(new - Z) / size(new)
+
+    return lax.while_loop(going, step, (0, Z, jnp.ones_like(Z[0, 0])))[1]
+
+
+def _graph(Z: jax.Array) -> jax.Array:
+    """P of (Z + I) (I, P)' = 0, 2n equations, in the sense of least squares."""
+    n = len(Z) // 2
+    N, M = jnp.split(Z + eye(2 * n, Z), [n], 1)
+    P = solve(times(transpose(M), M), -times(transpose(M), N))[0]
+    return (P + transpose(P)) / 2
+
+
+# Steps 3 and 4
+
+
+def _refined(newton: Callable, P: jax.Array, shift: Any = 0.0) -> jax.Array:
+    """Newton-Kleinman until P moves by less than 1e-7, then the last step and its proof; NaN where there is none.
+
+    Errors are relative to P + shift.
+    """
+
+    def going(carry: Any) -> jax.Array:
+        k, _, moved = carry
+        return (k < STEPS) & jnp.any(moved > 1e-7)
+
+    def step(carry: Any) -> Any:
+        k, P, _ = carry
+        D = newton(P)[1]
+        return k + 1, P + D, size(D) / size(P + D)
+
+    P = lax.while_loop(going, step, (0, P, jnp.ones_like(P[0, 0])))[1]
+    terms, D, X = newton(P, eye(len(P), P))
+    P = P + D
+    error, limit = jnp.finfo(P.dtype).eps * size(X) * terms, ERROR * size(P + shift)
+    return jnp.where((error <= limit) & (size(D) <= limit), P, jnp.nan)
+
+
+def _given(P: jax.Array, d: jax.Array, terms: Callable) -> tuple[jax.Array, jax.Array]:
+    """P and its residual in the given coordinates, x = d z."""
+    P = (P + transpose(P)) / 2 / (d * d[:, None])
+    parts = terms(P)
+    residual = relative(reduce(add, parts), *parts)
+    return jnp.where(residual <= RESIDUAL, P, jnp.nan), residual
+
+
+def _terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
+    """Those of the continuous equation with R = I."""
+    PA, T = times(P, A), times(P, B) + S
+    return PA, transpose(PA), -times(T, transpose(T)), Q
+
+
+def _discrete_terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
+    PA, PB = times(P, A), times(P, B)
+    T = times(transpose(B), PA) + transpose(S)
+    gain = solve(eye(B.shape[1], B) + times(transpose(B), PB), T)[0]
+    return times(transpose(A), PA), -P, -times(transpose(T), gain), Q
+
+
+def _kleinman(A: Any, B: Any, Q: Any, scale: Any, P: Any, *extra: Any) -> tuple[Any, ...]:
+    """The size of the terms; D of Ac' D + D Ac + (left side at P) = 0; X of Ac' X + X Ac + E = 0 for E of `extra`.
+
+    The Cayley transformation C = (Ac + g)(Ac - g)^-1 makes it C' D C - D + 2 g M' (..) M = 0, M = (Ac - g)^-1.
+    """
+    I, terms = eye(len(A), A), _terms(A, B, Q, jnp.zeros_like(B), P)
+    M = solve(A - times(B, transpose(B), P) - scale * I, I)[0]
+    right = (2 * scale * times(transpose(M), W, M) for W in (reduce(add, terms), *extra))
+    return sum(map(size, terms)), *smith(I + 2 * scale * M, *right)
+
+
+def _hewer(A: Any, B: Any, Q: Any, P: Any, *extra: Any) -> tuple[Any, ...]:
+    """The same in discrete time: Ac' D Ac - D + (left side at P) = 0."""
+    terms, PB = _discrete_terms(A, B, Q, jnp.zeros_like(B), P), times(P, B)
+    gain = solve(eye(B.shape[1], B) + times(transpose(B), PB), times(transpose(PB), A))[0]
+    return sum(map(size, terms)), *smith(A - times(B, gain), reduce(add, terms), *extra)

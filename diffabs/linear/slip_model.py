@@ -1,0 +1,153 @@
+"""The slip loop as a linear system: plant, sensor filter, actuator lag and sampling, at a frozen speed."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from diffabs.actuators import Lag
+from diffabs.core.blocks import Direct
+from diffabs.core.protocols import Plant
+from diffabs.core.pytree import Scalar, param, part, pytree, static, strong
+from diffabs.linear.linearization import FROZEN, NEWTON, StateSpace, _flat, _kept, _used, tracking
+from diffabs.linear.zero_order_hold import held
+from diffabs.plants import BrakeStart, MirroredRig
+
+
+@pytree
+class LowPass:
+    """x_f' = cutoff (slip error - x_f): what a PID's derivative is taken from."""
+
+    cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
+
+
+@pytree
+class Continuous:
+    """The controller runs in continuous time."""
+
+
+@pytree
+class Sampling:
+    """The controller runs every `period`; its output is held, and changes `delay` after the sample was taken."""
+
+    period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+    delay: Scalar = param(default=0.0, unit="s", low=0.0)
+
+    def problems(self) -> Iterator[str]:
+        """A computation that takes longer than the period."""
+        if not self.delay <= self.period:
+            yield f"delay = {self.delay:g} s exceeds the period of {self.period:g} s"
+
+
+@pytree
+class SlipModel:
+    """The slip error at a frozen speed, under u = control - holding control.
+
+    States in this order, those in brackets where they exist: [integral of the slip error, x1' = x2], slip error x2 =
+    slip - target, [what the plant has besides slip, speed and distance], [actuator], [previous sample's control], [slip
+    error behind `filter`]. Discrete in time if `sampling` says so: integral and filter by forward Euler from the sample
+    that the control is computed from, the rest exactly, as `Sampled` does.
+    """
+
+    plant: Plant = part(default=MirroredRig)
+    slip: Scalar = param(default=0.2, unit="1", above=0.0, below=1.0)
+    speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0, high=200.0)
+    actuator: Direct | Lag = part(default=Direct)
+    sampling: Continuous | Sampling = part(default=Continuous)
+    filter: Direct | LowPass = part(default=Direct)
+    integral: bool = static(default=True)
+
+    @property
+    def period(self) -> float | None:
+        """Sampling period [s], None in continuous time."""
+        return float(self.sampling.period) if isinstance(self.sampling, Sampling) else None
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """What the states are."""
+        self._supported()
+        start = jax.eval_shape(self.plant.start, BrakeStart(speed=self.speed, slip=self.slip))
+        paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(start)]
+        used = _used(self.plant, start, ("slip", *FROZEN))
+        kept = [jax.tree_util.keystr(p, simple=True) for p, u in zip(paths, used, strict=True) if not u]
+        return (
+            *(["integral of slip error"] if self.integral else []),
+            "slip error",
+            *kept,
+            *(["actuator torque"] if isinstance(self.actuator, Lag) else []),
+            *(["torque of the last sample"] if isinstance(self.sampling, Sampling) else []),
+            *(["filtered slip error"] if isinstance(self.filter, LowPass) else []),
+        )
+
+    def matrices(self) -> StateSpace:
+        """A (n, n) and B (n, 1), differentiable in every parameter; compiled once for each kind of model.
+
+        Raises:
+            ValueError: a part that a linear slip model does not know.
+        """
+        self._supported()
+        return _matrices(self)
+
+    def point(self) -> tuple[Any, Any]:
+        """State and control of the linearisation: the slip is held, what remains is at rest, the speed falls."""
+        start = self.plant.start(BrakeStart(speed=self.speed, slip=self.slip))
+        control = self.plant.holding(self.plant.output(start), self.slip)
+        kept = _kept(self.plant, start, ("slip", *FROZEN))
+        if not len(kept):
+            return start, control
+        flow, x, u = _flat(self.plant, start, control)
+
+        def rate(z: Any) -> Any:
+            return flow(x.at[kept].set(z), u)[kept]
+
+        def newton(_: Any, z: Any) -> Any:
+            return z - jnp.linalg.solve(jax.jacfwd(rate)(z), rate(z))
+
+        rest = jax.lax.fori_loop(0, NEWTON, newton, x[kept])
+        return ravel_pytree(start)[1](x.at[kept].set(rest)), control
+
+    def controlled(self) -> StateSpace:
+        """Plant and actuator, sampled if the controller is: what the control acts on, the slip error first."""
+        system = tracking(self.plant, *self.point())
+        if isinstance(self.actuator, Lag):
+            system = _behind_lag(system, self.actuator.time_constant)
+        if isinstance(self.sampling, Sampling):
+            system = held(system, self.sampling.period, self.sampling.delay)
+        return system
+
+    def with_memory(self, system: StateSpace) -> StateSpace:
+        """The system, whose first state is the slip error, with integral and filter of the controller."""
+        p, first = len(system.A), int(self.integral)
+        n = p + first + isinstance(self.filter, LowPass)
+        step, keep = (self.sampling.period, 1.0) if isinstance(self.sampling, Sampling) else (1.0, 0.0)
+        a = jnp.zeros((n, n), system.A.dtype).at[first : first + p, first : first + p].set(system.A)
+        if self.integral:
+            a = a.at[0, :2].set(jnp.stack([keep, step]))
+        if isinstance(self.filter, LowPass):
+            rate = step * self.filter.cutoff
+            a = a.at[-1, first].set(rate).at[-1, -1].set(keep - rate)
+        return StateSpace(a, jnp.zeros((n, 1), a.dtype).at[first : first + p].set(system.B))
+
+    def _supported(self) -> None:
+        known = {"actuator": (Direct, Lag), "sampling": (Continuous, Sampling), "filter": (Direct, LowPass)}
+        for name, types in known.items():
+            found = getattr(self, name)
+            if not isinstance(found, types):
+                names = " and ".join(t.__name__ for t in types)
+                raise ValueError(f"{name}: a linear slip model knows {names}, not {type(found).__name__}")
+
+
+@jax.jit
+def _matrices(model: SlipModel) -> StateSpace:
+    model = strong(model)
+    return model.with_memory(model.controlled())
+
+
+def _behind_lag(system: StateSpace, time_constant: Any) -> StateSpace:
+    """The system whose input is the last state, T x' = u - x."""
+    a, b = system
+    n, rate = len(a), 1 / time_constant
+    wider = jnp.zeros((n + 1, n + 1), a.dtype).at[:n, :n].set(a).at[:n, n:].set(b).at[n, n].set(-rate)
+    return StateSpace(wider, jnp.zeros((n + 1, 1), a.dtype).at[n, 0].set(rate))

@@ -1,0 +1,23 @@
+"""Figures of runs, sweeps and tunings. The only importer of matplotlib (`pip install "diffabs[plot]"`)."""
+
+from diffabs.plot.runs import COLOURS as COLOURS
+from diffabs.plot.runs import DASHES as DASHES
+from diffabs.plot.runs import DPI as DPI
+from diffabs.plot.runs import GREY as GREY
+from diffabs.plot.runs import KMH as KMH
+from diffabs.plot.runs import TITLE as TITLE
+from diffabs.plot.runs import angle_lines as angle_lines
+from diffabs.plot.runs import balance as balance
+from diffabs.plot.runs import braking as braking
+from diffabs.plot.runs import controlled as controlled
+from diffabs.plot.runs import convergence as convergence
+from diffabs.plot.runs import friction as friction
+from diffabs.plot.runs import label as label
+from diffabs.plot.runs import of as of
+from diffabs.plot.runs import positions as positions
+from diffabs.plot.runs import region as region
+from diffabs.plot.runs import save as save
+from diffabs.plot.runs import sheet as sheet
+from diffabs.plot.runs import slip_lines as slip_lines
+from diffabs.plot.runs import slips as slips
+from diffabs.plot.runs import speeds as speeds

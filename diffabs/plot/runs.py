@@ -1,0 +1,242 @@
+"""Figures of runs. The only module that needs matplotlib (`pip install "diffabs[plot]"`); it keeps no global state.
+
+Speeds are drawn in km/h, everything else in SI units. Colours are those of M. Okabe and K. Ito, Color Universal Design
+(2008), which colour-blind readers can tell apart; curves that lie close differ in their dashes as well.
+"""
+
+import os
+import pathlib
+import tempfile
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffabs.core import files
+from diffabs.core.protocols import BalanceOutput, BrakeOutput, Plant, Road
+from diffabs.objectives.balance import motor_torque
+from diffabs.simulate.solution import Run, Trajectory
+
+try:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError('figures need matplotlib: pip install "diffabs[plot]"', name=error.name) from error
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+DASHES = ("-", "--", "-.", ":", "-", "--", "-.")
+GREY = "#767676"
+KMH = 3.6  # km/h per m/s
+DPI = 150
+TITLE = 9  # characters per inch, with room to spare
+
+
+def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float, float] = (5.4, 3.4), **kwargs: Any):
+    """An empty figure in the house's look, and its axes, a list in reading order. `size` [inch] is that of one axes."""
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), dpi=DPI, layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False, **kwargs).flat)
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.spines[["left", "bottom"]].set_color(GREY)
+        ax.tick_params(labelsize=10, colors="#333333")
+        ax.grid(color="#DDDDDD", linewidth=0.7)
+        ax.set_axisbelow(True)
+    if title:
+        width = int(TITLE * size[0] * columns)
+        lines = "\n".join(textwrap.fill(line, width, max_lines=4) for line in title.splitlines())
+        figure.suptitle(lines, fontsize=12.5, fontweight="bold")
+    return figure, axes
+
+
+def label(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> None:
+    """Name the axes, with units, and show the legend if there is something in it."""
+    ax.set_xlabel(x, fontsize=11)
+    ax.set_ylabel(y, fontsize=11)
+    if title:
+        ax.set_title(title, fontsize=11)
+    if legend and ax.get_legend_handles_labels()[1]:
+        ax.legend(fontsize=9.5, framealpha=0.9, edgecolor="none")
+
+
+def save(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
+    """Write a figure in the format of the path's suffix, atomically: readers see the old file or the whole new one."""
+    path = pathlib.Path(path)
+    handle, name = tempfile.mkstemp(suffix=path.suffix, prefix=f".{path.stem}-", dir=path.parent)
+    with files.unfinished(pathlib.Path(name)):
+        with os.fdopen(handle, "wb") as file:
+            figure.savefig(file, format=path.suffix.lstrip(".") or "png", dpi=DPI)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    return path
+
+
+def controlled(unit: str) -> str:
+    """What an axis says of a plant's control in this unit."""
+    return {"N m": "brake torque [N m]", "V": "voltage [V]"}.get(unit, f"control [{unit}]")
+
+
+def braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
+    """A run at a glance: slip with target and setpoint, speeds, control in its `unit`, deceleration. Raises ValueError
+    for a run without a trajectory, as `measure` returns it."""
+    seen = _trajectory(run)
+    figure, (top, speed, torque, brake) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
+    t, sample = np.asarray(seen.sample.t), seen.sample
+    top.plot(t, sample.output.slip, color=COLOURS[0], label="slip")
+    top.plot(t, sample.target, "--", color=COLOURS[1], label="target")
+    top.plot(t, sample.setpoint, ":", color="black", label="setpoint")
+    label(top, "", "slip [1]")
+    _speeds(speed, seen)
+    label(speed, "", "speed [km/h]")
+    torque.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
+    torque.plot(t, sample.control, color=COLOURS[0], label="control")
+    label(torque, "time [s]", controlled(unit))
+    brake.plot(t, sample.output.deceleration, color=COLOURS[0])
+    label(brake, "time [s]", "deceleration [m/s²]")
+    return figure
+
+
+def balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
+    """A run of a two-wheeler at a glance: angles, rates, control in its `unit`, torque. Raises ValueError for a run
+    without a trajectory, as `measure` returns it."""
+    seen = _trajectory(run)
+    figure, (angles, rates, voltage, torque) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
+    t, sample = np.asarray(seen.sample.t), seen.sample
+    angle_lines(angles, seen)
+    label(angles, "", "angle [rad]")
+    angle_lines(rates, seen, "_rate")
+    label(rates, "", "rate [rad/s]", legend=False)
+    voltage.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
+    voltage.plot(t, sample.control, color=COLOURS[0], label="control")
+    most = np.max(np.abs(sample.control))
+    voltage.set_ylim(-1.5 * most - 1e-9, 1.5 * most + 1e-9)  # a command far beyond the supply says no more
+    label(voltage, "time [s]", controlled(unit))
+    torque.plot(t, motor_torque(sample), color=COLOURS[0])
+    label(torque, "time [s]", "motor torque [N m]")
+    return figure
+
+
+def of(plant: Plant) -> Callable[..., Figure]:
+    """Return the figure of one run that suits a plant, by what it shows."""
+    return {BrakeOutput: braking, BalanceOutput: balance}[plant.shows]
+
+
+def angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
+    """Draw frame, arm and rider into an axes; their rates with the suffix `_rate`."""
+    for i, (name, words) in enumerate({"theta": "frame", "psi": "arm", "phi": "rider"}.items()):
+        values = getattr(seen.sample.output, name + suffix)
+        ax.plot(np.asarray(seen.sample.t), values, DASHES[i], color=COLOURS[i], label=f"{words} {name}")
+
+
+def region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> None:
+    """Shade the cells of a grid, given their centres, first axis to the right: those whose value is true, those that
+    are `unknown`, and the rest."""
+    colours = ListedColormap(["#F3E3D7", "#9A9A9A", COLOURS[0]])
+    value = np.where(inside, 2, 0 if unknown is None else np.where(unknown, 1, 0))
+    ax.pcolormesh(np.asarray(first), np.asarray(second), value.T, cmap=colours, vmin=0, vmax=2, rasterized=True)
+
+
+def slips(runs: Mapping[str, Trajectory], *, title: str = "", until: float | None = None) -> Figure:
+    """Slip over time, one curve per run, and the setpoint of the first."""
+    figure, (ax,) = sheet(title=title, size=(6.4, 3.8))
+    slip_lines(ax, runs)
+    label(ax, "time [s]", "slip [1]")
+    ax.set_xlim(0, until)
+    return figure
+
+
+def slip_lines(ax: Axes, runs: Mapping[str, Trajectory]) -> None:
+    """Draw slips and the setpoint of the first run into an axes."""
+    for i, (name, seen) in enumerate(runs.items()):
+        ax.plot(np.asarray(seen.sample.t), seen.sample.output.slip, DASHES[i], color=COLOURS[i], label=name)
+    first = next(iter(runs.values())).sample
+    ax.plot(np.asarray(first.t), first.setpoint, color="black", linewidth=0.9, linestyle=":", label="setpoint")
+
+
+def speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
+    """Vehicle and wheel speed over time, one panel per run, side by side."""
+    figure, axes = sheet(1, len(runs), title=title, size=(5.2 if len(runs) > 1 else 6.4, 3.6), sharex=True, sharey=True)
+    for i, (ax, (name, seen)) in enumerate(zip(axes, runs.items(), strict=True)):
+        _speeds(ax, seen)
+        label(ax, "time [s]", "" if i else "speed [km/h]", name)
+        ax.set_xlim(0, None)
+    return figure
+
+
+def _speeds(ax: Axes, seen: Trajectory) -> None:
+    t, y = np.asarray(seen.sample.t), seen.sample.output
+    ax.plot(t, KMH * np.asarray(y.wheel_speed), color=COLOURS[1], linestyle="--", linewidth=1.3, label="wheel")
+    ax.plot(t, KMH * np.asarray(y.speed), color=COLOURS[0], linewidth=1.6, label="vehicle")
+
+
+def positions(
+    panels: Sequence[Mapping[str, Trajectory]], *, title: str = "", zoom: tuple[float, float] | None = None
+) -> Figure:
+    """Position over time, one panel per group of runs; with `zoom`, one more panel that shows the last group over these
+    times [s]."""
+    groups = list(panels) + ([panels[-1]] if zoom else [])
+    figure, axes = sheet(1, len(groups), title=title, size=(5.2, 3.6), sharey=zoom is None)
+    for i, (ax, runs) in enumerate(zip(axes, groups, strict=True)):
+        single = len(runs) == 1
+        for j, (name, seen) in enumerate(runs.items()):
+            t, x = np.asarray(seen.sample.t), np.asarray(seen.sample.output.distance)
+            ax.plot(t, x, DASHES[j], color=COLOURS[j], label=None if single else f"{name}: {x[-1]:.2f} m")
+            ax.plot(t[-1:], x[-1:], "o", color=COLOURS[j], markersize=4.5)
+        label(ax, "time [s]", "" if i else "position [m]", next(iter(runs)) if single else "")
+        ax.set_xlim(0, None)
+    if zoom:
+        ends = [np.interp(zoom, seen.sample.t, seen.sample.output.distance) for seen in panels[-1].values()]
+        low, high = float(np.min(ends)), float(np.max(ends))
+        axes[-1].set_xlim(*zoom)
+        axes[-1].set_ylim(low, high + 0.08 * (high - low))
+    return figure
+
+
+def friction(
+    roads: Mapping[str, Road],
+    *,
+    marks: Mapping[str, tuple[float, float]] | None = None,
+    zoom: tuple[float, float, float, float] | None = None,
+    speed: float = 0.0,
+    title: str = "",
+) -> Figure:
+    """Friction over slip, with points marked by name; `zoom` = (slip, slip, mu, mu) adds a panel with that window."""
+    figure, axes = sheet(1, 2 if zoom else 1, title=title, size=(5.6, 3.8))
+    for ax in axes:
+        limits = zoom[:2] if zoom and ax is axes[-1] else (0.0, 1.0)
+        s = np.linspace(*limits, 1001)
+        for i, (name, road) in enumerate(roads.items()):
+            mu = jax.vmap(lambda x, road=road: road.friction(x, speed, 0.0))(s)
+            ax.plot(s, np.asarray(mu), DASHES[i], color=COLOURS[i], label=name)
+        for i, (name, (x, y)) in enumerate((marks or {}).items()):
+            if limits[0] <= x <= limits[1]:
+                ax.plot([x], [y], "osD^v"[i % 5], color=COLOURS[(i + len(roads)) % 7], markersize=7, label=name)
+        label(ax, "slip [1]", "friction coefficient [1]")
+    if zoom:
+        axes[-1].set_xlim(*zoom[:2])
+        axes[-1].set_ylim(*zoom[2:])
+    return figure
+
+
+def convergence(
+    panels: Mapping[str, Mapping[str, Any]], steps: Sequence[float], *, orders: Sequence[int], title: str = ""
+) -> Figure:
+    """Error over step length in logarithmic axes, one panel per case, with a guide line for each order."""
+    figure, axes = sheet(1, len(panels), title=title, size=(5.2, 3.8), sharey=True)
+    h = np.asarray(steps)
+    for i, (ax, order, (name, curves)) in enumerate(zip(axes, orders, panels.items(), strict=True)):
+        for j, (quantity, errors) in enumerate(curves.items()):
+            ax.loglog(h, errors, "o" + DASHES[j], color=COLOURS[j], markersize=4.5, label=quantity.replace("_", " "))
+        top = 3.0 * np.max([np.max(e) for e in curves.values()])
+        ax.loglog(h, top * (h / h.max()) ** order, color=GREY, linewidth=0.9, label=f"slope {order}")
+        label(ax, "step [s]", "" if i else "relative error [1]", name, legend=False)
+        ax.legend(fontsize=9, loc="lower right", framealpha=0.9, edgecolor="none")
+    return figure
+
+
+def _trajectory(run: Run) -> Trajectory:
+    if run.trajectory is None:
+        raise ValueError("the run has no trajectory: use rollout, not measure")
+    return run.trajectory

@@ -1,0 +1,146 @@
+"""Figures of a tuning: how it went, a run before and after, the price of a short stop, the worst case."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from diffabs.plot.runs import COLOURS, DASHES, GREY, Axes, Figure, controlled, label, sheet
+from diffabs.simulate.solution import Trajectory
+
+MARKS = "osD^v"
+DECADES = 5.0  # an objective that falls by less is easier to read on a linear axis
+SETTLED = 1.5  # how much longer than the transient a panel is
+
+
+def history(points: Sequence[Any], *, title: str = "") -> Figure:
+    """Objective and gradient over the gradients computed. `points` have `evaluations`, `objective`, `gradient` and
+    `violation`."""
+    figure, axes = sheet(1, 2, title=title, size=(5.2, 3.4))
+    _objective(axes[0], points)
+    _gradient(axes[1], points)
+    return figure
+
+
+def tuning(
+    points: Sequence[Any], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "", unit: str = "N m"
+) -> Figure:
+    """History above, the runs of one lane below, their control in its `unit`: all that `diffabs tune` draws."""
+    figure, (objective, gradient, slip, torque) = sheet(2, 2, title=title, size=(5.8, 3.1))
+    _objective(objective, points)
+    _gradient(gradient, points)
+    _runs(slip, torque, runs, lane and f"worst lane: {lane}", unit)
+    return figure
+
+
+def before_after(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
+    """Slip and torque of runs by name, over time."""
+    figure, axes = sheet(1, 2, title=title, size=(5.6, 3.4))
+    _runs(axes[0], axes[1], runs)
+    return figure
+
+
+def pareto(
+    fronts: Mapping[str, tuple[Any, Any]],
+    *,
+    marks: Mapping[str, tuple[float, float]] | None = None,
+    x: str = "effort [N² m² s]",
+    y: str = "stopping distance [m]",
+    title: str = "",
+) -> Figure:
+    """What one objective costs in the other: points (x, y) by name, joined where no other is better in both; the rest
+    of them pale. `marks` are single points with names."""
+    figure, (ax,) = sheet(title=title, size=(6.2, 4.0))
+    for i, (name, (across, up)) in enumerate(fronts.items()):
+        across, up = np.asarray(across, float), np.asarray(up, float)
+        best = front(across, up)
+        ax.plot(across, up, "o", color=COLOURS[i], alpha=0.25, markersize=4)
+        ax.plot(across[best], up[best], "o-", color=COLOURS[i], markersize=5, label=name)
+    for i, (name, point) in enumerate((marks or {}).items()):
+        ax.plot([point[0]], [point[1]], MARKS[i % 5], color=COLOURS[(i + len(fronts)) % 7], markersize=8, label=name)
+    label(ax, x, y)
+    return figure
+
+
+def front(x: Any, y: Any) -> np.ndarray:
+    """Indices of the points of which no other is smaller in both, along x. NaN is never among them."""
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    order = [i for i in np.lexsort((y, x)) if np.isfinite([x[i], y[i]]).all()]
+    kept, least = [], np.inf
+    for i in order:
+        if y[i] < least:
+            kept.append(i)
+            least = y[i]
+    return np.array(kept, int)
+
+
+def worst_case(
+    nominal: Trajectory, worst: Trajectory, parameters: Mapping[str, Any], *, metric: str = "", title: str = ""
+) -> Figure:
+    """The nominal run against the worst one found, with the parameters of the latter; `metric` says of what it is the
+    worst, `overshoot = 0.31`."""
+    found = ", ".join(f"{path} = {_short(value)}" for path, value in parameters.items())
+    heading = "\n".join(line for line in (title, f"{metric} at {found}" if metric else found) if line)
+    figure, axes = sheet(1, 3, title=heading, size=(4.6, 3.4))
+    runs = {"nominal": nominal, "worst case": worst}
+    _runs(axes[0], axes[1], runs)
+    for i, (name, seen) in enumerate(runs.items()):
+        distance, speed = np.asarray(seen.sample.output.distance), np.asarray(seen.sample.output.speed)
+        axes[2].plot(distance, 3.6 * speed, DASHES[i], color=COLOURS[i], label=f"{name}: {distance[-1]:.2f} m")
+        axes[2].plot(distance[-1:], 3.6 * speed[-1:], "o", color=COLOURS[i], markersize=4.5)
+    label(axes[2], "distance [m]", "speed [km/h]")
+    return figure
+
+
+def _objective(ax: Axes, points: Sequence[Any]) -> None:
+    """The objective, and what violates the constraints most, on an axis of its own."""
+    n, values = [p.evaluations for p in points], np.array([p.objective for p in points])
+    ax.plot(n, values, "o-", markersize=3.5, color=COLOURS[0], label="objective")
+    known = values[np.isfinite(values)]
+    if len(known) and known.min() > 0 and known.max() > DECADES * known.min():
+        ax.set_yscale("log")
+    violation = np.array([p.violation for p in points])
+    if np.any(violation > 0):
+        other = ax.twinx()
+        other.spines[["top", "left"]].set_visible(False)
+        other.plot(n, violation, "--", color=COLOURS[1], linewidth=1.2)
+        other.set_ylabel("greatest violation [of its bound]", fontsize=10, color=COLOURS[1])
+        other.set_ylim(0, None)
+    label(ax, "gradients computed", "objective", legend=False)
+
+
+def _gradient(ax: Axes, points: Sequence[Any]) -> None:
+    ax.plot([p.evaluations for p in points], [p.gradient for p in points], "o-", markersize=3.5, color=COLOURS[2])
+    ax.set_yscale("log")
+    label(ax, "gradients computed", "gradient, greatest component")
+
+
+def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str = "", unit: str = "N m") -> None:
+    """Slip with its setpoint, and torque."""
+    for i, (name, seen) in enumerate(runs.items()):
+        t = np.asarray(seen.sample.t)
+        slip.plot(t, seen.sample.output.slip, DASHES[i], color=COLOURS[i], label=name)
+        torque.plot(t, seen.sample.control, DASHES[i], color=COLOURS[i], label=name, linewidth=1.2)
+    first = next(iter(runs.values())).sample
+    slip.plot(np.asarray(first.t), first.setpoint, color=GREY, linewidth=0.9, linestyle=":", label="setpoint")
+    label(slip, "time [s]", "slip [1]", title)
+    label(torque, "time [s]", controlled(unit), legend=False)
+    for ax in (slip, torque):
+        ax.set_xlim(0, _until(runs))
+        ax.locator_params(axis="x", nbins=6)
+
+
+def _until(runs: Mapping[str, Trajectory]) -> float:
+    """Long enough to see every run arrive within 2 % of its end, or the whole where one does not."""
+    ends = []
+    for seen in runs.values():
+        t, slip = np.asarray(seen.sample.t), np.asarray(seen.sample.output.slip)
+        away = np.flatnonzero(np.abs(slip - np.asarray(seen.sample.setpoint)) > 0.02 * np.max(np.abs(slip)))
+        ends.append(float(t[away[-1]]) if len(away) else 0.0)
+    whole = max(float(np.asarray(seen.sample.t)[-1]) for seen in runs.values())
+    return min(whole, SETTLED * max(ends)) or whole
+
+
+def _short(value: Any) -> str:
+    array = np.asarray(value, float)
+    return f"{float(array):.4g}" if array.ndim == 0 else f"[{', '.join(f'{x:.4g}' for x in array.ravel())}]"

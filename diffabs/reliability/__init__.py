@@ -1,0 +1,1 @@
+"""Probabilities of rare failures: subset simulation, importance sampling, design points."""

@@ -1,0 +1,118 @@
+"""The probability that a metric of a study exceeds a bound, where it is too small to be counted.
+
+Standard normal coordinates z are mapped to the parameters v by `Space.normal`, and the metric m of the run is the score
+of `rare.subset_simulation`. All runs share one sequence of sensor noise: the probability is that over the parameters,
+given this noise. It is of the whole space: where `simulate` would refuse a point there is no answer, since no run says
+on which side of the bound it lies. If asked for, design points are found by
+
+    dm/dz_j = sum_i dm/dv_i dv_i/dz_j
+
+with dm/dv through the run in reverse mode, and dv/dz, which costs no run, by central differences."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from diffabs.core.pytree import replace
+from diffabs.reliability.importance_sampling import STARTS, Gradient
+from diffabs.reliability.subset_simulation import RareEvent, subset_simulation
+from diffabs.simulate.refill import measure_lanes
+from diffabs.simulate.refusals import refusals
+from diffabs.simulate.run import measure
+from diffabs.sweep.study import Study, noise_key, precision
+
+STEP = 1e-4  # of the differences in z: errors of 1e-9 and 1e-12 of the values
+
+
+def failure_probability(
+    study: Study, metric: str, bound: float, *, gradients: bool = False, **options: Any
+) -> RareEvent:
+    """P[metric >= bound] over the space of a study, whose design and number of samples do not matter.
+
+    gradients: also draw around design points, found by gradients through the run: see `rare`
+    options: those of `subset_simulation`; runs that diverge do not count as failures and are reported
+
+    Raises ValueError for a metric that is not measured, for a study that draws parts, for a bound that is not finite,
+    for a point that is drawn and cannot be run, and (`proposals.Diverged`) where too many runs diverge.
+    """
+    study.check()
+    if metric not in study.objectives:
+        raise ValueError(f"{metric} is not measured; there is {', '.join(study.objectives)}")
+    if study.parts:
+        raise ValueError(f"{', '.join(study.parts)}: alternatives of parts have no normal coordinates")
+
+    def score(z: np.ndarray) -> np.ndarray:
+        return _scores(study, metric, z)
+
+    gradient = _gradient(study, metric) if gradients else None
+    return subset_simulation(score, study.space.dimension, bound, gradient=gradient, **options)
+
+
+def _scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
+    """The metric at z (n, dimension), NaN where the run diverges. n is filled up to a power of two: few programs."""
+    values = study.space.normal(_filled(z, 1 << (len(z) - 1).bit_length()))
+    size = len(next(iter(values.values())))
+    _check_runnable(study, values, len(z))
+    with precision(study.dtype):
+        keys = jax.vmap(lambda _: noise_key(study.seed, 0))(np.arange(size))
+        loop, objective = _typed(study, metric)
+        done = jax.device_get(
+            measure_lanes(loop, values, study.solver, objective, keys=keys, accepted=np.ones(size, bool))
+        )
+    return np.asarray(done.metrics[metric], float)[: len(z)]
+
+
+def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) -> None:
+    """Raises ValueError, in a line, for points of which the first `count` cannot all be run."""
+    refused = refusals(study.loop, values, study.solver)
+    bad = np.flatnonzero(refused.codes[:count])
+    if len(bad):
+        at = ", ".join(f"{path} = {column[bad[0]]:.6g}" for path, column in values.items())
+        why = f"{refused.texts[bad[0]]} (at {at})"
+        raise ValueError(f"no probability: {len(bad)} of {count} points cannot be run: {why}; narrow the ranges")
+
+
+def _gradient(study: Study, metric: str) -> Gradient:
+    """The metric (n,) and its derivative (n, dimension) at z (n, dimension), n at most STARTS."""
+    slopes = _slopes(study, metric)
+
+    def gradient(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values = study.space.normal(_filled(z, STARTS))
+        _check_runnable(study, values, len(z))
+        values = {path: column.astype(study.dtype) for path, column in values.items()}
+        with precision(study.dtype):
+            score, by_value = jax.device_get(slopes(values))
+        chain = [by_value[path][: len(z), None] * column for path, column in _steepness(study, z).items()]
+        return np.array(score[: len(z)], float), np.sum(chain, axis=0)
+
+    return gradient
+
+
+def _slopes(study: Study, metric: str) -> Callable[[Mapping[str, Any]], Any]:
+    """The metric of a batch of values, and its derivative in each. Compiled once."""
+
+    def one(values: Mapping[str, Any]) -> Any:
+        loop, objective = _typed(study, metric)
+        return measure(replace(loop, values), study.solver, objective, key=noise_key(study.seed, 0)).metrics[metric]
+
+    return jax.jit(jax.vmap(jax.value_and_grad(one)))
+
+
+def _steepness(study: Study, z: np.ndarray) -> dict[str, np.ndarray]:
+    """dv/dz (n, dimension) of each parameter: zero for lists of values, but next to their edges."""
+    n, d = z.shape
+    offsets = STEP * np.eye(d)
+    points = np.stack([z[:, None] + offsets, z[:, None] - offsets]).reshape(-1, d)
+    ends = {path: column.reshape(2, n, d) for path, column in study.space.normal(points).items()}
+    return {path: (above - below) / (2 * STEP) for path, (above, below) in ends.items()}
+
+
+def _filled(z: np.ndarray, size: int) -> np.ndarray:
+    """With copies of the last row."""
+    return np.concatenate([z, np.repeat(z[-1:], size - len(z), axis=0)])
+
+
+def _typed(study: Study, metric: str) -> tuple[Any, Any]:
+    return jax.tree.map(lambda x: np.asarray(x, study.dtype), (study.loop, {metric: study.objectives[metric]}))

@@ -1,0 +1,297 @@
+"""Probabilities too small to count: subset simulation, and importance sampling where its failures say that it pays.
+
+    P[F] = P[F_1] P[F_2|F_1] ... P[F_m|F_m-1],   F_j = {z: g(z) >= b_j},   z ~ N(0, I),   b_m = threshold
+
+S.-K. Au and J. L. Beck, Probabilistic Engineering Mechanics 16 (2001). b_j leaves `share` of the samples; those are the
+seeds of chains that fill the next level by adaptive conditional sampling (I. Papaioannou et al., ibid. 41 (2015)),
+
+    z' = sqrt(1 - s^2) z + s xi,  accepted if g(z') >= b_j,   log s += (acceptance - 0.44)/sqrt(step)
+
+where all chains make each step together and so adapt together. The shares are counted, not presumed, so scores may
+tie. The estimate is consistent, its bias O(1/samples) (positive, a few per cent by default).
+
+A level's relative variance is (1 - p)/(p n) (1 + correlation along chains). Levels depend on each other, too: the
+total is taken from the failures' ancestors among the first samples, sum_a (share of a)^2 (A. Lee and N. Whiteley,
+Biometrika 105 (2018)), but no less than for independent levels and no more than for fully dependent ones (the bounds
+of Au and Beck). Its interval is log-normal, with quantiles of Student's t of one degree for each effective ancestor.
+
+Importance sampling (`proposals`) follows if the failures foretell that it will halve the coefficient of variation at
+least. It replaces the estimate unless it proves more uncertain, or is far below, as it would be if it missed some.
+Failures that a few normal distributions do not cover (the surface of a sphere in ten dimensions) thus stay with subset
+simulation. Choosing one of two consistent estimates makes a small bias of its own, too."""
+
+import dataclasses
+import enum
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from diffabs.reliability.importance_sampling import Estimate, Gradient, Importance, Runs, Score, around, pays, refined
+
+ACCEPTANCE, SPREAD = 0.44, 0.6  # aimed at, and the s of the first step: Papaioannou et al.
+KEPT = 100  # failures in a result
+RULE = 3.0  # 0/n with 95 % confidence: less than 3/n
+Rng = np.random.Generator
+
+
+class Reason(enum.Enum):
+    """Why no further level was made."""
+
+    REACHED = "the threshold was reached"
+    PLATEAU = "no progress: no sample is above the score that they share"
+    LEVELS = "the levels were exhausted"
+
+
+class Progress(NamedTuple):
+    """After each level: its number from 1, and what it reached."""
+
+    level: int
+    threshold: float
+    share: float
+    evaluations: int  # so far
+
+
+class Level(NamedTuple):
+    """Samples of F_j-1, of which `share` are in F_j."""
+
+    threshold: float  # b_j
+    share: float
+    cov: float  # of the share: the chains' correlation included
+    acceptance: float  # of the proposals; 1 for the first level, whose samples are independent
+    spread: float  # s, after the last step
+    diverged: int
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RareEvent:
+    """P[g(z) >= threshold], and how it was found.
+
+    probability, cov, interval: of the better estimate. Where the threshold was not reached: 0 and infinite if no
+        sample failed, and an upper bound as the interval's end
+    subset, importance: both estimates; None where importance sampling was not tried, and `note` says why it is or is
+        not what is reported
+    failing (k, d): failures of subset simulation, distributed as phi on F, the most likely first; at most 100
+    evaluations, gradients: runs; `cost` counts a gradient as `price` of them
+    diverged: runs whose score was NaN. They count as not failing; a score says otherwise by +inf
+    """
+
+    probability: float
+    cov: float
+    interval: tuple[float, float]
+    reason: Reason
+    levels: list[Level]
+    subset: Estimate
+    importance: Importance | None
+    note: str
+    failing: np.ndarray
+    evaluations: int
+    gradients: int
+    diverged: int
+    price: float
+
+    @property
+    def cost(self) -> float:
+        """In runs."""
+        return self.evaluations + self.price * self.gradients
+
+
+def subset_simulation(
+    score: Score,
+    dimension: int,
+    threshold: float,
+    *,
+    samples: int = 2800,
+    share: float = 0.1,
+    seed: int = 0,
+    levels: int = 20,
+    draws: int = 2000,
+    gradient: Gradient | None = None,
+    price: float = 3.0,
+    tolerated: float = 0.05,
+    progress: Callable[[Progress], None] | None = None,
+) -> RareEvent:
+    """P[score(z) >= threshold] for z ~ N(0, I) in R^dimension.
+
+    score: (n, dimension) -> (n,); n is `samples` once, then samples * share, and `draws` at the end
+    samples, share: of each level; P = share^m costs samples (1 + (m - 1)(1 - share)) runs: 15400 for 1e-6
+    levels: at most
+    draws: of importance sampling; 0 for none
+    gradient: (n, dimension) -> score (n,), its derivative (n, dimension), n at most 8. It finds design points to draw
+        around, which the failures alone do not tell in many dimensions (from about 20)
+    price: runs that a gradient counts as, in `cost`
+    tolerated: share of a level's runs that may diverge
+
+    Raises ValueError: no such dimension, threshold or number of samples; a score of another shape; too many diverged.
+    """
+    plan = _plan(dimension, threshold, samples, share, levels, draws)
+    runs = Runs(score, gradient, tolerated)
+    first, second = (np.random.default_rng(each) for each in np.random.SeedSequence(seed).spawn(2))
+    walked = _walk(runs, dimension, plan, first, progress)
+    subset = _subset(walked, plan)
+    tried, note = _importance(runs, walked, subset, plan, second)
+    return _event(runs, walked, subset, tried, note, price)
+
+
+class _Plan(NamedTuple):
+    threshold: float
+    samples: int
+    chains: int
+    levels: int
+    draws: int
+
+
+def _plan(dimension: int, threshold: float, samples: int, share: float, levels: int, draws: int) -> _Plan:
+    chains = round(samples * share)
+    if dimension < 1:
+        raise ValueError(f"dimension must be at least 1, not {dimension}")
+    if not math.isfinite(threshold):
+        raise ValueError(f"threshold must be finite, not {threshold}")
+    if chains < 2 or abs(chains - samples * share) > 1e-9 * samples or samples % chains or samples == chains:
+        raise ValueError(
+            f"samples * share must be an integer of at least 2 that divides samples, not {samples}*{share}"
+        )
+    if levels < 1 or draws < 0 or draws == 1:
+        raise ValueError(f"levels must be at least 1 and draws 0 or at least 2, not {levels} and {draws}")
+    return _Plan(float(threshold), samples, chains, levels, draws)
+
+
+class _Population(NamedTuple):
+    """Samples (n, d) of a level, step by step, so that chain c holds c, c + chains, ...; `family`: the first sample
+    that each descends from."""
+
+    z: np.ndarray
+    scores: np.ndarray
+    family: np.ndarray
+    length: int
+    acceptance: float
+    spread: float
+    diverged: int
+
+
+class _Walked(NamedTuple):
+    """All levels; the last one's samples, and which of them fail (n,); why there is no further one."""
+
+    levels: list[Level]
+    last: _Population
+    hits: np.ndarray
+    reason: Reason
+
+
+def _walk(runs: Runs, dimension: int, plan: _Plan, rng: Rng, progress: Callable[[Progress], None] | None) -> _Walked:
+    z = rng.standard_normal((plan.samples, dimension))
+    scores = runs(z)
+    now = _Population(z, scores, np.arange(plan.samples), 1, 1.0, SPREAD, runs.since(0, 0))
+    made: list[Level] = []
+    while True:
+        aim = _aim(now.scores, plan)
+        ends = aim is None or aim >= plan.threshold or len(made) + 1 == plan.levels
+        value = plan.threshold if ends or aim is None else aim
+        hits = now.scores >= value
+        part, cov = float(np.mean(hits)), _cov(hits.reshape(now.length, -1))
+        made.append(Level(value, part, cov, now.acceptance, now.spread, now.diverged))
+        if progress:
+            progress(Progress(len(made), value, part, runs.evaluations))
+        if ends:
+            reached = Reason.REACHED if aim == plan.threshold else Reason.LEVELS
+            return _Walked(made, now, hits, Reason.PLATEAU if aim is None else reached)
+        now = _advanced(runs, now, hits, value, plan, rng)
+
+
+def _aim(scores: np.ndarray, plan: _Plan) -> float | None:
+    """The next level: the threshold if half as many samples as there are chains fail (another level would cost more
+    than it tells), else the score that `chains` samples reach. If ties let more than half of all reach it: the next
+    greater score, if a tenth of the chains can start from there or nothing else would be gained. None if all samples
+    share one score."""
+    if np.sum(scores >= plan.threshold) >= plan.chains / 2:
+        return plan.threshold
+    reached = np.sort(scores)[-plan.chains]
+    share, above = np.mean(scores >= reached), scores[scores > reached]
+    if share > 0.5 and (len(above) >= plan.chains / 10 or (share == 1 and len(above) > 0)):
+        return min(float(np.min(above)), plan.threshold)
+    return float(reached) if share < 1 else None
+
+
+def _advanced(runs: Runs, old: _Population, hits: np.ndarray, value: float, plan: _Plan, rng: Rng) -> _Population:
+    """Chains from the samples that reached a level; some samples start several where there are fewer than chains."""
+    before = runs.evaluations, runs.diverged
+    seeds = np.resize(rng.permutation(np.flatnonzero(hits)), plan.chains)
+    z, scores, s, length = old.z[seeds], old.scores[seeds], old.spread, plan.samples // plan.chains
+    points, values, taken = [z], [scores], []
+    for step in range(1, length):
+        proposed = math.sqrt(1 - s**2) * z + s * rng.standard_normal(z.shape)
+        new = runs(proposed)
+        accepted = new >= value
+        z, scores = np.where(accepted[:, None], proposed, z), np.where(accepted, new, scores)
+        points.append(z)
+        values.append(scores)
+        taken.append(float(np.mean(accepted)))
+        s = min(1.0, s * math.exp((taken[-1] - ACCEPTANCE) / math.sqrt(step)))
+    family = np.tile(old.family[seeds], length)
+    lost = runs.since(*before)
+    return _Population(np.concatenate(points), np.concatenate(values), family, length, float(np.mean(taken)), s, lost)
+
+
+def _cov(hits: np.ndarray) -> float:
+    """sqrt((1 - p)/(p n) (1 + 2 sum_k (1 - k/length) correlation_k)) of hits (length, chains): Au and Beck."""
+    p, length = float(np.mean(hits)), len(hits)
+    if p in (0.0, 1.0):
+        return np.inf if p == 0 else 0.0
+    lags = [np.mean(hits[:-k] & hits[k:]) - p**2 for k in range(1, length)]
+    excess = 2 * sum((1 - k / length) * lag for k, lag in enumerate(lags, 1)) / (p * (1 - p))
+    return math.sqrt((1 - p) / (p * hits.size) * (1 + max(0.0, excess)))
+
+
+def _subset(walked: _Walked, plan: _Plan) -> Estimate:
+    """What the levels tell; an upper bound where nothing failed."""
+    levels, last, hits, _ = walked
+    found = _estimate(levels, last.family[hits])
+    return found if hits.any() else found._replace(interval=(0.0, _bound(levels[:-1], last, plan.samples)))
+
+
+def _importance(runs: Runs, walked: _Walked, subset: Estimate, plan: _Plan, rng: Rng) -> tuple[Importance | None, str]:
+    levels, last, hits, _ = walked
+    if not hits.any() or plan.draws == 0 or len(levels) == 1:
+        return None, "subset simulation: no importance sampling of what one level shows, or without failures or draws"
+    chain = np.flatnonzero(hits) % plan.chains
+    return refined(runs, last.z[hits], chain, subset, threshold=plan.threshold, draws=plan.draws, rng=rng)
+
+
+def _event(
+    runs: Runs, walked: _Walked, subset: Estimate, tried: Importance | None, note: str, price: float
+) -> RareEvent:
+    """The better estimate, and all that was seen."""
+    failing = np.unique(walked.last.z[walked.hits], axis=0)
+    return RareEvent(
+        *(tried.estimate if tried and pays(tried, subset) else subset),
+        reason=walked.reason,
+        levels=walked.levels,
+        subset=subset,
+        importance=tried,
+        note=note,
+        failing=failing[np.argsort(np.sum(failing**2, axis=1), kind="stable")][:KEPT],
+        evaluations=runs.evaluations,
+        gradients=runs.gradients,
+        diverged=runs.diverged,
+        price=price,
+    )
+
+
+def _estimate(levels: list[Level], family: np.ndarray) -> Estimate:
+    """The product of the shares, with the variance that the families of the failures show."""
+    covs = np.array([level.cov for level in levels])
+    if not np.all(np.isfinite(covs)):
+        return Estimate(0.0, np.inf, (0.0, 1.0))
+    parts = np.bincount(family) / len(family)
+    cov = float(np.clip(np.sqrt(np.sum(parts**2)), np.sqrt(np.sum(covs**2)), np.sum(covs)))
+    probability, spread = math.prod(level.share for level in levels), math.log1p(cov**2)
+    middle = around(probability * math.exp(spread / 2), cov, math.sqrt(spread), 1 / max(cov**2, 1e-9))
+    return Estimate(probability, cov, middle.interval)
+
+
+def _bound(levels: list[Level], last: _Population, samples: int) -> float:
+    """What P is below: the upper end for the last level, times 3/n if none of n independent samples fails. Of chains
+    only the different starts count."""
+    starts = len(np.unique(last.z[: samples // last.length], axis=0))
+    return _estimate(levels, last.family).interval[1] * min(1.0, RULE / starts)

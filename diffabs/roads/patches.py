@@ -1,0 +1,65 @@
+"""Roads made of roads: a friction scale, and patches along the distance."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import Road
+from diffabs.core.pytree import Scalar, Vector, param, part, pytree
+from diffabs.core.rules import Rule, increasing
+from diffabs.roads.burckhardt import DRY_ASPHALT, SNOW
+
+
+@pytree
+class Scaled:
+    """scale * mu of another road: wear, temperature, wetness in one number."""
+
+    road: Road = part(default=DRY_ASPHALT)
+    scale: Scalar = param(default=1.0, unit="1", above=0.0, high=10.0)
+
+    def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
+        """scale * mu [1]."""
+        return self.scale * self.road.friction(slip, speed, distance)
+
+
+@pytree
+class Patches:
+    """Surfaces in a row, mu-jumps between them.
+
+        mu = mu_0 + sum_i S((x - edge_i)/width) (mu_(i+1) - mu_i),  S(z) = 3 y^2 - 2 y^3,  y = clamp(z + 1/2, 0, 1)
+
+    A width of about 0.1 m is the length of a tyre's contact patch. With width 0 the jump is sharp: values are right,
+    but a derivative through the run misses what moving the moment of the jump does. Differentiate with a width of a few
+    steps."""
+
+    roads: tuple[Road, ...] = part(default=(DRY_ASPHALT, SNOW))
+    edges: Vector = param(default=(10.0,), unit="m", low=0.0, free=True)
+    width: Scalar = param(default=0.1, unit="m", low=0.0)
+
+    def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
+        """mu [1] of the surface at this distance [m]. Raises ValueError where edges are missing or too many."""
+        if np.shape(self.edges) != (len(self.roads) - 1,):
+            raise ValueError(f"edges has shape {np.shape(self.edges)}; {len(self.roads)} roads need one less")
+        mus = [road.friction(slip, speed, distance) for road in self.roads]
+        smooth = jnp.greater(self.width, 0)
+        width = jnp.where(smooth, self.width, 1.0)
+        total = mus[0]
+        for i, (before, after) in enumerate(pairwise(mus)):
+            beyond = distance - jnp.asarray(self.edges)[i]
+            y = clamp(beyond / width + 0.5, 0.0, 1.0)
+            weight = jnp.where(smooth, y * y * (3 - 2 * y), jnp.where(beyond >= 0, 1.0, 0.0))
+            total = total + weight * (after - before)
+        return total
+
+    def problems(self) -> Iterator[str]:
+        """More or fewer edges than between the roads."""
+        edges = np.asarray(self.edges)
+        if edges.shape != (len(self.roads) - 1,):
+            yield f"edges has shape {edges.shape}; {len(self.roads)} roads need ({len(self.roads) - 1},)"
+
+    def rules(self) -> Iterator[Rule]:
+        """Edges that increase."""
+        yield increasing("edges", self.edges, "is not increasing", "m")

@@ -1,0 +1,1 @@
+"""TOML files to loops and tasks, and back."""

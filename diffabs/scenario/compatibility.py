@@ -1,0 +1,53 @@
+"""Parts that do not fit together: one reads what another does not show."""
+
+import dataclasses
+import traceback
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jax
+
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Memory, Objective
+from diffabs.core.pytree import strong
+from diffabs.scenario.registry import joined, kebab
+
+
+def misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
+    """One line for the first part of a loop, and for each objective, that reads what the plant does not show. Nothing
+    is computed: the loop is only traced."""
+    measured = _trial("", lambda: jax.eval_shape(_once, strong(loop)))
+    if isinstance(measured, str):
+        yield measured
+        return
+    for name, objective in objectives.items():
+        found = _trial(joined("objective", name), lambda o=objective: jax.eval_shape(_measured, strong((loop, o))))
+        if isinstance(found, str):
+            yield found
+
+
+def _once(loop: Loop) -> Any:
+    """Once around the loop."""
+    state = loop.start()
+    signals = loop.signals(0.0, state)
+    margin = loop.stop.margin(signals.sample.output), loop.stop.rate(signals.sample.output)
+    return margin, loop.flow(0.0, state, signals)
+
+
+def _measured(both: Any) -> Any:
+    loop, objective = both
+    sample = loop.signals(0.0, loop.start()).sample
+    memory: Memory = objective.start(sample)
+    return objective.flow(memory, sample), objective.update(memory, sample, sample, 1e-3)
+
+
+def _trial(path: str, trace: Any) -> Any:
+    """What `trace` returns, or a line if a part read something that is not there."""
+    try:
+        return trace()
+    except AttributeError as error:
+        frames = [frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__)]
+        parts = [part for part in frames if dataclasses.is_dataclass(part) and not isinstance(part, Loop)]
+        there = getattr(error.obj, "_fields", None) or [f.name for f in dataclasses.fields(error.obj)]  # pyright: ignore[reportArgumentType]
+        names = f"{kebab(type(parts[-1]).__name__)} needs {error.name}"
+        return f"{path or 'loop'}: {names}, and here is only {', '.join(there)}: these parts do not fit together"

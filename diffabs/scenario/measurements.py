@@ -1,0 +1,88 @@
+"""Measured runs as CSV files, in the columns that `diffabs simulate --csv` writes."""
+
+import csv
+import difflib
+import math
+import pathlib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from diffabs.core import files
+from diffabs.core.protocols import UNITS as UNITS
+from diffabs.scenario.registry import ScenarioError, shown
+
+LARGEST = 100_000_000  # bytes
+TIME = "t [s]"
+HEADERS = {f"{name} [{unit}]": name for name, unit in UNITS.items()}
+IGNORED = ("target [", "command [", "control [")  # what is simulated but not measured
+
+
+class Readings(NamedTuple):
+    """Instants [s], increasing, and what was measured at them, in SI, by the names of a plant's output."""
+
+    t: np.ndarray
+    columns: dict[str, np.ndarray]
+
+
+def read(path: pathlib.Path) -> Readings:
+    """The readings in a file. Raises ScenarioError, one line, with the line of the file, for whatever is wrong."""
+    try:
+        raw = files.content(path, LARGEST + 1)
+    except OSError as error:
+        raise ScenarioError(f"--data {path}: cannot be read, {error.strerror}") from None
+    if len(raw) > LARGEST:
+        raise ScenarioError(f"--data {path}: is larger than {LARGEST} bytes")
+    try:
+        rows = list(csv.reader(raw.decode("utf-8-sig").splitlines()))
+    except (UnicodeDecodeError, csv.Error):
+        raise ScenarioError(f"--data {path}: is not a CSV file of UTF-8 text") from None
+    header = [cell.strip() for cell in rows[0]] if rows else []
+    names = _names(header, path)
+    numbers = np.array([_numbers(row, i, header, path) for i, row in enumerate(rows[1:], 2) if row], float)
+    if not len(numbers):
+        raise ScenarioError(f"--data {path}: has a header and no numbers")
+    lines = [i for i, row in enumerate(rows[1:], 2) if row]
+    t = numbers[:, header.index(TIME)]
+    late = np.flatnonzero(np.diff(t) <= 0)
+    if t[0] < 0 or len(late):
+        line, before = (lines[late[0] + 1], t[late[0]]) if len(late) else (lines[0], 0.0)
+        at = t[late[0] + 1] if len(late) else t[0]
+        raise ScenarioError(f"--data {path}, line {line}: t = {at:g} s does not come after {before:g} s")
+    return Readings(t, {name: numbers[:, i] for i, name in names.items()})
+
+
+def _names(header: Sequence[str], path: pathlib.Path) -> dict[int, str]:
+    """The columns that are compared, by their numbers."""
+    there = ", ".join((TIME, *HEADERS))
+    if TIME not in header:
+        what = f"line 1 is no header with {TIME}" if header else "is empty"
+        raise ScenarioError(f"--data {path}: {what}; there is {there}")
+    for name in header:
+        if header.count(name) > 1:
+            raise ScenarioError(f"--data {path}: column {shown(name)} is there twice")
+        if name != TIME and name not in HEADERS and not name.startswith(IGNORED):
+            near = difflib.get_close_matches(name, HEADERS, 1, 0.5)
+            hint = f"did you mean {near[0]}? There is" if near else "there is"
+            raise ScenarioError(f"--data {path}: column {shown(name)} is unknown; {hint} {there}")
+    names = {i: HEADERS[name] for i, name in enumerate(header) if name in HEADERS}
+    if not names:
+        raise ScenarioError(f"--data {path}: no column was measured; there is {', '.join(HEADERS)}")
+    return names
+
+
+def _numbers(row: Sequence[str], line: int, header: Sequence[str], path: pathlib.Path) -> list[float]:
+    if len(row) != len(header):
+        raise ScenarioError(f"--data {path}, line {line}: has {len(row)} cells; the header has {len(header)}")
+    found = []
+    for cell, name in zip(row, header, strict=True):
+        try:
+            found.append(float(cell))
+        except ValueError:
+            raise ScenarioError(
+                f"--data {path}, line {line}: {name} = {shown(cell)} is text; a number is needed"
+            ) from None
+        if not math.isfinite(found[-1]):
+            raise ScenarioError(f"--data {path}, line {line}: {name} = {cell.strip()} is outside (-inf, inf)")
+    return found

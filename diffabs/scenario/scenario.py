@@ -1,0 +1,290 @@
+"""A scenario: a TOML file, or the name of a packaged one, that says what is run.
+
+    [plant] [road] [initial] [sensor] [reference] [feedforward] [controller] [actuator] [stop]    a part each: `type`
+    [solver]       step [s], duration [s], every (trajectories keep every so many steps), seed (of noisy sensors)
+    [objective]    name = a part; adds to, or changes, those of every report on such a plant
+    [design]       what a robust gain is asked for, and over which ranges: see `robust`
+    [tune]         which parameters are free, what is made small, and over which runs: see `goal`
+    [sweep]        what varies in a Monte-Carlo sweep, and what counts as a failure: see `variation`
+
+What is left out has its default, by what the plant shows, a brake or a balance. Speeds may be given in km/h:
+`speed_kmh`. A value is never evaluated as code."""
+
+import dataclasses
+import importlib.resources
+import pathlib
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+
+from diffabs.core import files
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import Spec, cautions, problems
+from diffabs.objectives import BRAKING, usual
+from diffabs.scenario import parameter_paths, section_design, section_sweep, section_tune, toml
+from diffabs.scenario.compatibility import misfits
+from diffabs.scenario.defaults import braking
+from diffabs.scenario.registry import OTHERS, build, joined, loop_of, number, shown, unknown, whole, wrong
+from diffabs.scenario.registry import ScenarioError as ScenarioError
+from diffabs.simulate.refusals import MOST_STEPS, together, unstable
+from diffabs.simulate.solution import FixedStep
+
+LARGEST_FILE = 1_000_000  # bytes
+LONGEST_PATH = 4096  # characters of it in a message
+TEXTS = ("title", "description")
+TIME = Spec("s", low=0.0, open_low=True)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario:
+    """What is run: a loop, how it is integrated [s], what is measured, the seed of its noise; what a design must do,
+    what is tuned, and what varies in a sweep."""
+
+    name: str
+    title: str = ""
+    description: str = ""
+    loop: Loop = dataclasses.field(default_factory=braking)
+    solver: FixedStep = dataclasses.field(default_factory=FixedStep)
+    objectives: Mapping[str, Objective] = dataclasses.field(default_factory=lambda: dict(BRAKING))
+    seed: int = 0
+    design: section_design.Task = dataclasses.field(default_factory=section_design.Task)
+    tune: section_tune.Goal = dataclasses.field(default_factory=section_tune.Goal)
+    sweep: section_sweep.Variation = dataclasses.field(default_factory=section_sweep.Variation)
+
+    def key(self) -> jax.Array:
+        """The random key of a run."""
+        return jax.random.key(self.seed)
+
+    def with_loop(self, loop: Loop, how: str) -> "Scenario":
+        """The same with another loop, of which the old title may not be true: it says `how` that came about."""
+        return dataclasses.replace(self, loop=loop, title=f"{self.name}, {how}", description="")
+
+    def cautions(self) -> list[str]:
+        """What is allowed but hardly meant, a line each."""
+        return list(cautions(self.loop))
+
+
+def names() -> list[str]:
+    """The packaged scenarios."""
+    folder = importlib.resources.files("diffabs") / "scenarios"
+    return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
+
+
+def header(name_or_path: str | pathlib.Path) -> dict[str, str]:
+    """Title and description of a scenario, without building it. Raises ScenarioError."""
+    table = _parsed(_read(name_or_path)[1], str(name_or_path))
+    return {key: _text(table.get(key, ""), key) for key in TEXTS}
+
+
+def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = (), *, integrated: bool = True) -> Scenario:
+    """The scenario in a TOML file, or a packaged one, with overrides such as `controller.kp=4000`.
+
+    An override's value is a TOML value; a bare word is text, and `1,2` a list. `controller=relay` replaces the part.
+    Raises ScenarioError, one line, for a file that cannot be read, unknown names, wrong types, values out of range, and
+    a step that is not stable for the loop (not asked for a scenario that will not be integrated).
+    """
+    name, raw = _read(name_or_path)
+    folder = pathlib.Path() if str(name_or_path) in names() else pathlib.Path(name_or_path).parent
+    return loads(raw, name, str(name_or_path), overrides, folder=folder, integrated=integrated)
+
+
+def loads(
+    raw: bytes,
+    name: str,
+    origin: str,
+    overrides: Sequence[str] = (),
+    *,
+    folder: pathlib.Path = pathlib.Path(),
+    integrated: bool = True,
+) -> Scenario:
+    """The scenario in a text; `origin` is its name in messages, `folder` where the files lie that it names. Raises
+    ScenarioError, as `load`."""
+    table = _parsed(raw, origin)
+    for override in overrides:
+        _override(table, override)
+    if overrides:
+        table |= _titled(name, overrides)
+    if "sweep" in table:
+        table["sweep"] = section_sweep.with_samples(table["sweep"], folder)
+    scenario = _assembled(name, table)
+    asked = (scenario.loop, scenario.solver)
+    _refuse(together(*asked), unstable(*asked) if integrated else ())
+    return scenario
+
+
+def _titled(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Title and description of what is no longer what the file says, but for what the overrides say themselves."""
+    said = {override.partition("=")[0].strip() for override in overrides}
+    new = {"title": f"{name} with {', '.join(overrides)}", "description": ""}
+    return {key: text for key, text in new.items() if key not in said}
+
+
+def _refuse(*objections: Iterable[str]) -> None:
+    """Raises ScenarioError with the lines of the first who objects; the later ones are not asked then."""
+    for lines in objections:
+        found = [re.sub(r"^plant\.road\b", "road", line) for line in lines]
+        if found:
+            raise ScenarioError("; ".join(found))
+
+
+def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
+    path, quoted = pathlib.Path(name_or_path), shown(str(name_or_path), LONGEST_PATH)
+    if str(name_or_path) in names():
+        file = importlib.resources.files("diffabs") / "scenarios" / f"{name_or_path}.toml"
+        return str(name_or_path), file.read_bytes()
+    try:
+        if len(path.parts) == 1 and not path.suffix and not path.exists():
+            raise unknown(f"no scenario and no file is called {quoted}", str(path), names())
+        raw = files.content(path, LARGEST_FILE + 1)
+    except (OSError, ValueError) as error:
+        if isinstance(error, ScenarioError):
+            raise
+        why = getattr(error, "strerror", None) or str(error)
+        raise ScenarioError(f"cannot read scenario {quoted}: {why}") from None
+    if len(raw) > LARGEST_FILE:
+        raise ScenarioError(f"{quoted} is larger than {LARGEST_FILE} bytes; it is no scenario")
+    return path.stem, raw
+
+
+def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
+    quoted = shown(origin, LONGEST_PATH)
+    try:
+        return _lifted(toml.parsed(raw.decode()))
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise ScenarioError(f"{quoted} is not UTF-8 text (at line {line})") from None
+    except ScenarioError as error:
+        raise ScenarioError(f"{quoted} is not a scenario: {error}") from None
+    except ValueError as error:
+        raise ScenarioError(f"{quoted} is not TOML: {error}") from None
+
+
+def _lifted(table: dict[str, Any]) -> dict[str, Any]:
+    """The road of the plant in its own section, and ranges by path, however they were written."""
+    plant = table.get("plant")
+    if isinstance(plant, dict) and "road" in plant:
+        if "road" in table:
+            raise ScenarioError("road is given twice, as a section and in plant")
+        table["road"] = plant.pop("road")
+    parameter_paths.lifted(table)
+    return table
+
+
+def _override(table: dict[str, Any], override: str) -> None:
+    path, equals, text = override.partition("=")
+    keys = path.strip().split(".")
+    if not equals or not all(keys):
+        raise ScenarioError(f"override {shown(override)} is not of the form section.field=value")
+    if len(keys) > toml.MOST_LEVELS:
+        raise ScenarioError(f"override {shown(override)} is nested more than {toml.MOST_LEVELS} deep")
+    if any("\ud800" <= letter <= "\udfff" for letter in override):
+        raise ScenarioError(f"override {shown(override)} is not UTF-8 text")
+    if keys[:2] == ["plant", "road"]:
+        keys = keys[1:]
+    keys = parameter_paths.joined_keys(keys)
+    node: Any = table
+    for i, key in enumerate(keys[:-1]):
+        place = _place(node, key, ".".join(keys[:i]))
+        child = node[place] if isinstance(node, list) else node.get(place, {})
+        child = {"type": child} if isinstance(child, str) else child
+        if not isinstance(child, dict | list):
+            raise ScenarioError(f"{'.'.join(keys[: i + 1])} = {shown(child)} has no field {shown(keys[i + 1])}")
+        node[place] = child
+        node = child
+    place = _place(node, keys[-1], ".".join(keys[:-1]))
+    if isinstance(place, str):
+        other = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
+        node.pop(other, None)
+    try:
+        node[place] = toml.value(text.strip())
+    except ScenarioError as error:
+        raise ScenarioError(f"override {shown(override)}: {error}") from None
+    _lifted(table)
+    new = node[place]
+    if isinstance(new, str) or (isinstance(new, dict) and "type" in new):
+        parameter_paths.forget(table, ".".join(keys))
+
+
+def _place(node: Any, key: str, path: str) -> Any:
+    if isinstance(node, dict):
+        return key
+    there = [str(i) for i in range(len(node))]
+    if key not in there:
+        raise unknown(f"{path}.{key} is not there", key, there)
+    return int(key)
+
+
+def _assembled(name: str, table: dict[str, Any]) -> Scenario:
+    text = {key: _text(table.get(key, ""), key) for key in TEXTS}
+    sections = {key: value for key, value in table.items() if key not in OTHERS}
+    if "road" in table:
+        plant = sections.get("plant", {})
+        plant = {"type": plant} if isinstance(plant, str) else plant
+        sections["plant"] = {**plant, "road": table["road"]} if isinstance(plant, dict) else plant
+    solver, seed = _solver(table.get("solver", {}))
+    given = table.get("objective", {})
+    if not isinstance(given, dict):
+        raise wrong("objective", given, "a table of objectives")
+    loop = loop_of(sections)
+    report = usual(loop.plant)
+    measured = {
+        key: build("objective", value, report.get(key), joined("objective", key)) for key, value in given.items()
+    }
+    objectives = {**report, **measured}
+    _refuse(_wrong_values(loop, objectives), misfits(loop, objectives))  # before what is said of their parameters
+    return Scenario(
+        name=name,
+        **text,
+        loop=loop,
+        solver=solver,
+        objectives=objectives,
+        seed=seed,
+        design=section_design.read(table.get("design", {}), loop),
+        tune=section_tune.read(table.get("tune", {}), loop, objectives),
+        sweep=section_sweep.read(table.get("sweep", {}), loop, objectives),
+    )
+
+
+def _text(value: Any, path: str) -> str:
+    if not isinstance(value, str):
+        raise wrong(path, value, "text")
+    return value
+
+
+def _solver(table: Any) -> tuple[FixedStep, int]:
+    fields = ("step", "duration", "every", "seed")
+    if not isinstance(table, dict):
+        raise wrong("solver", table, f"a table of {', '.join(fields)}")
+    for key in table:
+        if key not in fields:
+            raise unknown(f"{joined('solver', key)} is not a field of solver", key, fields)
+    times = {key: number(table[key], TIME, f"solver.{key}") for key in ("step", "duration") if key in table}
+    for key, value in times.items():
+        if not TIME.holds(value):
+            raise ScenarioError(f"solver.{key} = {shown(value)} is outside {TIME.interval()}")
+    every = whole(table.get("every", 1), 1, int(MOST_STEPS), "solver.every")
+    return FixedStep(**times, every=every), whole(table.get("seed", 0), 0, 2**32 - 1, "solver.seed")
+
+
+def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
+    """What the parts object to."""
+    yield from problems(loop)
+    for name, objective in objectives.items():
+        yield from problems(objective, f"{joined('objective', name)}.")
+
+
+def dump(scenario: Scenario) -> str:
+    """TOML that loads back to the same scenario; every field is written, numbers at full precision."""
+    sections = {
+        field.name: toml.table(field.name, getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)
+    }
+    if "road" in sections["plant"]:
+        sections["road"] = sections["plant"].pop("road")
+    solver = {name: getattr(scenario.solver, name) for name in ("step", "duration", "every")}
+    sections["solver"] = {**solver, "seed": scenario.seed}
+    sections["objective"] = {name: toml.table("objective", part) for name, part in scenario.objectives.items()}
+    sections |= {name: getattr(scenario, name).table() for name in ("design", "tune", "sweep")}
+    return toml.document({key: getattr(scenario, key) for key in TEXTS}, sections)

@@ -1,0 +1,90 @@
+"""TOML as values and back, no more of it than a scenario needs."""
+
+import dataclasses
+import json
+import re
+import tomllib
+from typing import Any
+
+import numpy as np
+
+from diffabs.scenario.registry import ScenarioError, family_of, kebab, shown
+
+MOST_LEVELS = 50  # of tables and lists; no scenario has a tenth of that
+LARGEST = 2**63  # of a whole number, as TOML has it
+
+
+def parsed(text: str) -> dict[str, Any]:
+    """The table that a text is. Raises ValueError for what is no TOML, and ScenarioError for values nested too deeply
+    and for whole numbers of more than 64 bits, which no message could show."""
+    try:
+        table = tomllib.loads(text)
+    except RecursionError:
+        raise ScenarioError("its values are nested too deeply") from None
+    _refuse_extremes(table)
+    return table
+
+
+def _refuse_extremes(table: dict[str, Any]) -> None:
+    pending: list[tuple[str, int, Any]] = [(key, 1, item) for key, item in table.items()]
+    while pending:
+        where, level, item = pending.pop()
+        if level > MOST_LEVELS:
+            raise ScenarioError(f"{shown(where.split('.')[0])} is nested more than {MOST_LEVELS} deep")
+        if isinstance(item, dict | list):
+            inside = item.items() if isinstance(item, dict) else enumerate(item)
+            pending += [(f"{where}.{key}", level + 1, each) for key, each in inside]
+        elif isinstance(item, int) and not -LARGEST <= item < LARGEST:
+            raise ScenarioError(f"{shown(where)} is a whole number outside [-2^63, 2^63)")
+
+
+def value(text: str) -> Any:
+    """The value that a text on the command line means. Raises ScenarioError, as `parsed`."""
+    for candidate in (f"v = {text}", f"v = [{text}]"):
+        try:
+            read = parsed(candidate)
+        except ScenarioError as error:
+            raise ScenarioError(str(error).replace('"v"', "its value").replace("its values are", "is")) from None
+        except ValueError:
+            continue
+        plain = candidate == f"v = {text}" or all(isinstance(x, int | float) for x in read["v"])
+        if read.keys() == {"v"} and plain and text:
+            return read["v"]
+    return text
+
+
+def table(family: str, part: Any) -> dict[str, Any]:
+    """A part as values of TOML: its type and every field, numbers at full precision."""
+    values: dict[str, Any] = {"type": kebab(type(part).__name__)}
+    for field in dataclasses.fields(part):
+        value, inner = getattr(part, field.name), family_of(field.name, family)
+        if "spec" in field.metadata:
+            value = np.asarray(value, float).tolist()
+        elif isinstance(value, tuple):
+            value = [table(inner, item) for item in value]
+        elif "part" in field.metadata:
+            value = table(inner, value)
+        values[field.name] = value
+    return values
+
+
+def document(top: dict[str, Any], sections: dict[str, dict[str, Any]]) -> str:
+    """The text of a file with these values, and these sections below them."""
+    lines = [f"{_key(key)} = {_written(value)}" for key, value in top.items()]
+    for name, values in sections.items():
+        lines += ["", f"[{name}]", *(f"{_key(key)} = {_written(value)}" for key, value in values.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, list):
+        return f"[{', '.join(map(_written, value))}]"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{_key(key)} = {_written(item)}' for key, item in value.items())}}}"
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+def _key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _written(key)

@@ -1,0 +1,132 @@
+"""Sensor errors: noise, bias, quantisation. Each has one parameter per measured channel."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+
+from diffabs.core.numerics import axpy
+from diffabs.core.protocols import BrakeOutput, Clock, Jump, Memory, no_flow, no_jump, no_memory
+from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.rules import Rule
+from diffabs.core.timing import steps, whole_steps
+
+
+@pytree
+class Noise:
+    """Gaussian noise of these standard deviations, drawn every `period` and held. Needs a key: `rollout(..., key=)`.
+
+    The k-th draw is a function of (key, k), so a run is deterministic and differentiable in the deviations. A channel
+    whose deviation is 0 draws nothing, which would take most of the time.
+    """
+
+    slip: Scalar = param(default=0.0, unit="1", low=0.0)
+    speed: Scalar = param(default=0.0, unit="m/s", low=0.0)
+    wheel_speed: Scalar = param(default=0.0, unit="m/s", low=0.0)
+    deceleration: Scalar = param(default=0.0, unit="m/s^2", low=0.0)
+    period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+
+    flow = no_flow
+
+    def start(self, signal: BrakeOutput) -> Memory:
+        """No noise before the first draw."""
+        return Memory(held=jax.tree.map(lambda x: 0.0 * x, signal))
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
+        """Signal plus noise."""
+        del t
+        return axpy(1.0, memory.held, signal)
+
+    def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
+        """Draw at the instants of the period. Raises ValueError without a key."""
+        if clock.key is None:
+            raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
+        n = steps(self.period, clock.h)
+        draw = clock.k // n
+        deviations = (self.slip, self.speed, self.wheel_speed, self.deceleration)
+        noise = [drawn(jnp.asarray(d), clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
+        held = BrakeOutput(noise[0], noise[1], noise[2], noise[3], 0.0 * signal.distance)
+        return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(draw * n == clock.k, a, b), held, memory.held)))
+
+    def grid_rules(self, step: float) -> Iterator[Rule]:
+        """The period is on the integration grid."""
+        yield whole_steps("period", self.period, step)
+
+
+@jax.custom_jvp
+def drawn(deviation: Any, key: Any, number: Any) -> Any:
+    """deviation z: z is drawn only where it counts, or where it is the derivative."""
+    return jax.lax.cond(deviation != 0, lambda: deviation * _normal(deviation, key, number), lambda: 0.0 * deviation)
+
+
+def _rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    value, moving = drawn(*primals), type(tangents[0]) is not SymbolicZero
+    return value, tangents[0] * _normal(*primals) if moving else jnp.zeros_like(value)
+
+
+drawn.defjvp(_rule, symbolic_zeros=True)
+
+
+def _normal(like: Any, key: Any, number: Any) -> Any:
+    return jax.random.normal(jax.random.fold_in(key, number), (), like.dtype)
+
+
+@pytree
+class Bias:
+    """measured = true + bias."""
+
+    slip: Scalar = param(default=0.0, unit="1")
+    speed: Scalar = param(default=0.0, unit="m/s")
+    wheel_speed: Scalar = param(default=0.0, unit="m/s")
+    deceleration: Scalar = param(default=0.0, unit="m/s^2")
+
+    start = no_memory
+    flow = no_flow
+    jump = no_jump
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
+        """Signal plus bias."""
+        del t, memory
+        return BrakeOutput(
+            signal.slip + self.slip,
+            signal.speed + self.speed,
+            signal.wheel_speed + self.wheel_speed,
+            signal.deceleration + self.deceleration,
+            signal.distance,
+        )
+
+
+@pytree
+class Quantisation:
+    """measured = q round(true/q) for each channel; q = 0 leaves the channel alone.
+
+    The derivative is the true one almost everywhere: 0 in the signal, round(true/q) in q. It says nothing of the jumps.
+    """
+
+    slip: Scalar = param(default=0.0, unit="1", low=0.0, tunable=False)
+    speed: Scalar = param(default=0.0, unit="m/s", low=0.0, tunable=False)
+    wheel_speed: Scalar = param(default=0.0, unit="m/s", low=0.0, tunable=False)
+    deceleration: Scalar = param(default=0.0, unit="m/s^2", low=0.0, tunable=False)
+
+    start = no_memory
+    flow = no_flow
+    jump = no_jump
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
+        """The nearest multiples."""
+        del t, memory
+        return BrakeOutput(
+            _rounded(signal.slip, self.slip),
+            _rounded(signal.speed, self.speed),
+            _rounded(signal.wheel_speed, self.wheel_speed),
+            _rounded(signal.deceleration, self.deceleration),
+            signal.distance,
+        )
+
+
+def _rounded(x: Scalar, q: Scalar) -> Any:
+    fine = jnp.greater(q, 0)
+    q = jnp.where(fine, q, 1.0)
+    return jnp.where(fine, q * jnp.round(x / q), x)

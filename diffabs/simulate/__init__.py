@@ -1,0 +1,1 @@
+"""Run a loop: Runge-Kutta steps, landing on the stop, one run or many, the largest stable step, attraction."""

@@ -1,0 +1,162 @@
+"""One step of a run, and its two ends: what happens in an interval is said here, and nowhere else."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.loop import Loop, LoopState
+from diffabs.core.numerics import axpy, clamp
+from diffabs.core.protocols import Clock, Memory, Objective, Sample
+from diffabs.simulate.rk4 import rk4_step_and_rate
+from diffabs.simulate.solution import Trajectory
+
+LANDINGS = 4  # Newton iterations for the length of the last step; quadratic from an error below one step
+
+
+class Carry(NamedTuple):
+    """A run on its way."""
+
+    state: LoopState
+    tally: dict[str, Memory]  # accumulators of the objectives; `held` is still without the last interval
+    before: Sample  # at the beginning of that interval
+    k: Any  # number of steps taken
+    t: Any  # the present instant; after a stop, that of the crossing
+    length: Any  # of the step to try: h, or shorter when landing
+    landing: Any  # how many times the last step was tried
+    running: Any
+    stopped: Any
+    diverged: Any
+
+
+def init_carry(loop: Loop, objectives: dict[str, Objective], h: Any) -> Carry:
+    """The carry at t = 0."""
+    state = loop.start()
+    sample = loop.signals(0.0 * h, state).sample
+    tally = {name: objective.start(sample) for name, objective in objectives.items()}
+    no, zero = jnp.asarray(False), jnp.asarray(0)
+    running = loop.stop.margin(sample.output) > 0
+    return _typed(Carry(state, tally, sample, zero, 0.0 * h, h, zero, running, no, ~running), h.dtype)
+
+
+def step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: int, carry: Carry) -> Carry:
+    """One step; or one try of the last step; or nothing if the run has ended."""
+    state, tally, before, late = _advance(loop, objectives, h, key, carry)
+    finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state.flow())]))
+    trying = carry.landing > 0
+    crossed = finite & (loop.stop.margin(loop.plant.output(state.plant)) <= 0)
+    landed = carry.running & trying & (carry.landing == LANDINGS)
+    ahead = carry.running & finite & ~trying & ~crossed
+    search = carry.running & finite & ~landed & ~ahead
+    taken = ahead | landed
+    state, tally, before = jax.tree.map(
+        lambda a, b: jnp.where(taken, a, b), (state, tally, before), (carry.state, carry.tally, carry.before)
+    )
+    k = carry.k + jnp.where(taken, 1, 0)
+    return Carry(
+        state=state,
+        tally=tally,
+        before=before,
+        k=k,
+        t=jnp.where(landed, carry.t + carry.length, jnp.where(ahead, k * h, carry.t)),
+        length=jnp.where(search, clamp(carry.length + late, 0.0, h), carry.length),
+        landing=carry.landing + jnp.where(search, 1, 0),
+        running=(ahead & (k < steps)) | search,
+        stopped=carry.stopped | landed,
+        diverged=carry.diverged | (carry.running & ~finite),
+    )
+
+
+def _advance(
+    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, carry: Carry
+) -> tuple[LoopState, dict[str, Memory], Sample, Any]:
+    """Update, jump, integrate over carry.length: state, accumulators, the sample after the jump, and how much later [s]
+    the margin crosses zero. That time only chooses the next length, so it has no derivative."""
+    held = _update_objectives(loop, objectives, carry, carry.state, carry.t, h)
+    state, events = loop.jump(Clock(carry.t, h, carry.k, key), carry.state)
+    tally_flow = {name: memory.flow for name, memory in carry.tally.items()}
+
+    def flow(t: Any, z: Any, state: LoopState = state) -> Any:
+        return _rates(loop, objectives, held, t, state.with_flow(z[0]), z[1])
+
+    z = (state.flow(), tally_flow)
+    for event in events:
+        old = flow(carry.t, (event.before.flow(), tally_flow), event.before)
+        new = flow(carry.t, (event.after.flow(), tally_flow), event.after)
+        z = axpy(event.elapsed, axpy(-1.0, old, new), z)
+    before = loop.signals(carry.t, state.with_flow(z[0])).sample
+    z, rate = rk4_step_and_rate(flow, carry.t, z, carry.length)
+    state = state.with_flow(z[0])
+    state = state._replace(plant=loop.plant.project(state.plant))
+    tally = {name: Memory(z[1][name], held[name]) for name in objectives}
+    return state, tally, before, _landing_correction(loop, state.plant, rate[0][0])
+
+
+def _landing_correction(loop: Loop, plant: Any, rate: Any) -> Any:
+    """How much later [s] the margin crosses zero if the plant's state goes on at this rate."""
+
+    def margin(x: Any) -> Any:
+        return loop.stop.margin(loop.plant.output(x))
+
+    left, slope = jax.jvp(margin, (plant,), (rate,))
+    return jax.lax.stop_gradient(-left / jnp.where(slope < 0, slope, -jnp.inf))
+
+
+def _rates(
+    loop: Loop, objectives: dict[str, Objective], held: dict[str, Any], t: Any, state: LoopState, tally: dict[str, Any]
+) -> tuple[Any, Any]:
+    """d/dt of the loop's state and of the objectives' integrals `tally`."""
+    signals = loop.signals(t, state)
+    rates = {name: o.flow(Memory(tally[name], held[name]), signals.sample) for name, o in objectives.items()}
+    return loop.flow(t, state, signals), rates
+
+
+def _update_objectives(
+    loop: Loop, objectives: dict[str, Objective], carry: Carry, state: LoopState, t: Any, h: Any
+) -> dict[str, Any]:
+    """`held` of the accumulators after the last interval, of length h; there is none before the first step."""
+    sample = loop.signals(t, state).sample
+
+    def updated(memory: Memory, objective: Objective) -> Any:
+        held = objective.update(memory, carry.before, sample, h)
+        return jax.tree.map(lambda a, b: jnp.where(carry.k > 0, a, b), held, memory.held)
+
+    return {name: updated(carry.tally[name], o) for name, o in objectives.items()}
+
+
+def finish(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) -> Carry:
+    """Move a stopped run onto its crossing, and update the objectives over the last interval.
+
+    The time to move is zero to rounding, but not its derivative, which is the implicit function theorem's: the state is
+    moved by it, and so carries the derivative of the moment of the crossing.
+    """
+    y = loop.plant.output(carry.state.plant)
+    slope = jax.lax.stop_gradient(loop.stop.rate(y))
+    moved = jnp.where(carry.stopped, -loop.stop.margin(y) / jnp.where(slope < 0, slope, -jnp.inf), 0.0)
+    tally = {name: memory.flow for name, memory in carry.tally.items()}
+    held = {name: memory.held for name, memory in carry.tally.items()}
+    rates = _rates(loop, objectives, held, carry.t, carry.state, tally)
+    flow, tally = axpy(moved, rates, (carry.state.flow(), tally))
+    state = carry.state.with_flow(flow)
+    state = state._replace(plant=loop.plant.project(state.plant))
+    carry = carry._replace(t=carry.t + moved, state=state)
+    carry = carry._replace(tally={name: Memory(tally[name], held[name]) for name in objectives})
+    length = jnp.where(carry.stopped, carry.length + moved, h)
+    held = _update_objectives(loop, objectives, carry, state, carry.t, length)
+    return carry._replace(tally={name: Memory(tally[name], held[name]) for name in objectives})
+
+
+def observe(loop: Loop, carry: Carry) -> Trajectory:
+    """Return what is seen of the loop at the present instant."""
+    signals = loop.signals(carry.t, carry.state)
+    return Trajectory(signals.sample, signals.measured, carry.state.plant, carry.running & (carry.landing == 0))
+
+
+def _typed(tree: Any, dtype: Any) -> Any:
+    """Strong types throughout: a scan refuses a carry whose type weakens or strengthens."""
+
+    def typed(x: Any) -> Any:
+        x = jnp.asarray(x)
+        return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(x.dtype)
+
+    return jax.tree.map(typed, tree)

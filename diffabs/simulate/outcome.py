@@ -1,0 +1,58 @@
+"""How a run is judged when it is over: its metrics, and whether it can have been.
+
+An unstable step may leave every number finite. So a run has `diverged`, too, if its landing did not come to rest on the
+crossing, if a metric is outside of its physical range, or if the plant's own audit says that it cannot have been."""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Ending, Objective
+from diffabs.core.pytree import prepared
+from diffabs.simulate.hybrid_step import Carry, finish, observe
+from diffabs.simulate.solution import Run, Trajectory
+
+MISSED = 0.1  # of the last step, by which a landing may miss the crossing: the state is still moved onto it
+ROUNDING = 1e-9  # of a metric beyond its physical range
+AUDIT = ""  # the name of a plant's audit among the objectives; no metric is called so
+
+
+def prepare(loop: Loop) -> tuple[Loop, dict[str, Objective]]:
+    """The loop with everything worked out that does not change during a run, and what its plant watches it by."""
+    loop = prepared(loop)
+    audit = getattr(loop.plant, "audit", None)
+    return loop, {AUDIT: audit(loop.initial)} if audit else {}
+
+
+def judge(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) -> tuple[Run, Trajectory]:
+    """The result of a run that is over, and its last instant. `objectives` with the plant's audit."""
+    missed = carry.stopped & ~_landed(loop, h, carry)
+    carry = finish(loop, objectives, h, carry)
+    last = observe(loop, carry)
+    ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample, carry.stopped))
+    metrics = {name: o.value(carry.tally[name], ending) for name, o in objectives.items()}
+    wrong = [_impossible(name, objectives[name], value) for name, value in metrics.items()]
+    diverged = jnp.any(jnp.stack([carry.diverged, missed, *wrong]))
+    metrics = {n: jnp.where(diverged, jnp.nan, value) for n, value in metrics.items() if n != AUDIT}
+    return Run(metrics, carry.stopped & ~diverged, diverged, ending, None), last
+
+
+def _impossible(name: str, objective: Objective, value: Any) -> Any:
+    """Whether no real run has this value: of an audit more than 1, of a metric one outside its range, or no number."""
+    if name == AUDIT:
+        return ~(value <= 1)
+    low, high = getattr(objective, "physical", (-math.inf, math.inf))
+    if math.isinf(low) and math.isinf(high):
+        return jnp.asarray(False)
+    return ~((value >= low - ROUNDING) & (value <= high + ROUNDING) & jnp.isfinite(value))
+
+
+def _landed(loop: Loop, h: Any, carry: Carry) -> Any:
+    """Whether the last step ended near the crossing, in units of the margin at its beginning and of its change in h."""
+    y = loop.plant.output(carry.state.plant)
+    left, ahead = loop.stop.margin(y), loop.stop.margin(carry.before.output)
+    first = loop.stop.margin(loop.plant.output(loop.plant.start(loop.initial)))
+    rounding = 16 * jnp.finfo(h.dtype).eps * jnp.abs(first)
+    return jnp.abs(left) <= MISSED * (jnp.abs(ahead) + h * jnp.abs(loop.stop.rate(y))) + rounding

@@ -1,0 +1,146 @@
+"""Many runs at once, none of which waits for another: for values, not for gradients.
+
+A batch under `jax.vmap` runs until its slowest lane ends. Here `width` lanes run at a time, like boxes on a belt: every
+ROUND steps what has ended is taken off and the next lanes are put in its place."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import misshapen, replace, strong
+from diffabs.core.tracing import separated
+from diffabs.simulate.hybrid_step import Carry, init_carry, step
+from diffabs.simulate.outcome import judge, prepare
+from diffabs.simulate.refusals import refusals, traced
+from diffabs.simulate.run import arguments, prepare
+from diffabs.simulate.solution import FixedStep, Run
+
+WIDTH = 1024  # lanes whose state stays in a processor's cache
+ROUND = 64  # steps
+
+
+class Enough(Protocol):
+    """When a run may end before its stop and its time, because how it goes on is known; a pytree."""
+
+    def reached(self, number: Any, output: Any) -> Any:
+        """Whether lane `number`, of which this is seen now, is taken off the belt."""
+        ...
+
+
+def measure_lanes(
+    loop: Loop,
+    values: Mapping[str, Any],
+    solver: FixedStep,
+    objectives: Mapping[str, Objective],
+    *,
+    keys: Any = None,
+    width: int = WIDTH,
+    accepted: Any = None,
+    enough: Enough | None = None,
+) -> Run:
+    """What `jax.vmap` of `measure` computes for lanes that differ in the values (lanes,) at these paths, and in their
+    keys. Compiled once for a number of lanes and paths; not differentiable in reverse mode. With `enough` a run ends
+    besides where that is reached, looked at every ROUND steps; it then has not stopped.
+
+    accepted (lanes,): lanes that are run; the others are flagged as diverged. None is those that `refusals` accepts,
+        which are asked for unless the call is itself traced: then say it
+
+    Raises ValueError without values, and for what `measure` objects to."""
+    if not values:
+        raise ValueError("no value differs between the lanes")
+    if lines := list(misshapen(replace(loop, {path: x[0] for path, x in values.items() if np.ndim(x)}))):
+        raise ValueError("; ".join(lines))
+    if accepted is None:
+        accepted = _accepted(loop, values, solver)
+    loop, objectives, h = arguments(loop, solver, objectives)
+    values = strong(jax.tree.map(lambda x: jnp.asarray(x, h.dtype), dict(values)))
+    return _run(loop, values, objectives, h, keys, jnp.asarray(accepted, bool), enough, steps=solver.steps, width=width)
+
+
+def _accepted(loop: Loop, values: Mapping[str, Any], solver: FixedStep) -> Any:
+    if traced(loop, dict(values)):
+        return jnp.ones(len(next(iter(values.values()))), bool)
+    return refusals(loop, values, solver).accepted
+
+
+class _Belt(NamedTuple):
+    """Lanes on their way: what is their own of their loops, key and carry of each; its number (how many lanes there are
+    if it has none), the next number; and what has ended, by number."""
+
+    leaves: Any
+    keys: Any
+    carry: Carry
+    number: Any
+    next: Any
+    ended: Run
+
+
+@partial(jax.jit, static_argnames=("steps", "width"))
+def _run(
+    loop: Loop,
+    values: dict[str, Any],
+    objectives: dict[str, Objective],
+    h: Any,
+    keys: Any,
+    accepted: Any,
+    enough: Enough | None = None,
+    *,
+    steps: int,
+    width: int,
+) -> Run:
+    count = len(next(iter(values.values())))
+    leaves, whole = separated(lambda v: prepare(replace(loop, v)), values)
+
+    def built(mine: Any) -> tuple[Loop, dict[str, Objective]]:
+        one, audit = whole(mine)
+        return one, objectives | audit
+
+    step_all = jax.vmap(lambda mine, key, carry: step(*built(mine), h, key, steps, carry))
+    start = jax.vmap(lambda mine: init_carry(*built(mine), h))
+    over = jax.vmap(lambda mine, carry: judge(*built(mine), h, carry)[0])
+
+    def early(number: Any, mine: Any, carry: Carry) -> Any:
+        """Lanes of which enough is seen."""
+        if enough is None:
+            return jnp.zeros_like(carry.running)
+        output = jax.vmap(lambda mine, carry: built(mine)[0].plant.output(carry.state.plant))(mine, carry)
+        return jax.vmap(enough.reached)(number, output)
+
+    def taken(number: Any) -> tuple[Any, Any, Carry]:
+        """Lanes at their start; beyond the last one a copy of it that does not run."""
+        mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
+        carry = start(mine)
+        running, diverged = carry.running & run & (number < count), carry.diverged | ~run
+        return mine, key, carry._replace(running=running, diverged=diverged)
+
+    def round_(belt: _Belt) -> _Belt:
+        def some(carry: Carry, _: Any) -> tuple[Carry, None]:
+            return step_all(belt.leaves, belt.keys, carry), None
+
+        carry = jax.lax.scan(some, belt.carry, length=ROUND)[0]
+        free = ~carry.running | early(belt.number, belt.leaves, carry)
+        place = jnp.where(free, belt.number, count)
+        ended = jax.tree.map(lambda all, x: all.at[place].set(x, mode="drop"), belt.ended, over(belt.leaves, carry))
+        number = jnp.where(free, belt.next + jnp.cumsum(free) - 1, belt.number)
+        old = (belt.leaves, belt.keys, carry)
+        mine, key, carry = jax.tree.map(partial(_by_lane, free), taken(number), old)
+        return _Belt(mine, key, carry, jnp.minimum(number, count), belt.next + jnp.sum(free), ended)
+
+    number = jnp.arange(min(width, count))
+    first = taken(number)
+    shapes = jax.eval_shape(over, first[0], first[2])
+    ended = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
+    belt = _Belt(*first, number, number[-1] + 1, ended)
+    return jax.lax.while_loop(lambda belt: jnp.any(belt.number < count), round_, belt).ended
+
+
+def _by_lane(which: Any, a: Any, b: Any) -> Any:
+    if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_by_lane(which, jax.random.key_data(a), jax.random.key_data(b)))
+    return jnp.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)

@@ -1,0 +1,188 @@
+"""What must not be run: a loop that its parts, the integration grid or its step do not allow, alone or in a batch.
+
+    check(loop, solver)                 raises for one loop, with its numbers
+    refusals(loop, values, solver)      for every lane of a batch, before it runs: a code, 0 where it is accepted
+
+Both ask the same things in the same order: ranges of fields and rules between them (`rules`), the start against the
+stop, the parts against the step, and last whether the step is stable, which is the dearest question."""
+
+import math
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import broken, grid_rules, replace, rules, strong
+from diffabs.core.pytree import check as check_parts
+from diffabs.core.rules import Rule
+from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.stable_step import stable, stable_step
+
+MOST_STEPS = 1e8
+T = TypeVar("T")
+
+
+class Refusals(NamedTuple):
+    """Which lanes must not run: a code for each (lanes,), and what the codes mean; code 0 is accepted."""
+
+    codes: np.ndarray
+    reasons: tuple[str, ...]
+
+    @property
+    def accepted(self) -> np.ndarray:
+        """Which lanes may run (lanes,)."""
+        return self.codes == 0
+
+    @property
+    def texts(self) -> np.ndarray:
+        """The reason of each lane (lanes,), empty where it is accepted."""
+        return np.array(self.reasons)[self.codes]
+
+    @property
+    def number(self) -> int:
+        """How many lanes are refused."""
+        return int(np.count_nonzero(self.codes))
+
+
+def check(part: T, solver: FixedStep | None = None) -> T:
+    """The part itself if its parameters are in their ranges; with a solver, if this loop may be run with it, too.
+
+    Raises:
+        ValueError: names every offending field with its value, range and unit; a start beyond the stop; a period off
+            the grid; a step that is not stable.
+    """
+    check_parts(part)
+    if isinstance(part, Loop) and solver is not None:
+        for lines in (together(part, solver), unstable(part, solver)):
+            if found := list(lines):
+                raise ValueError("; ".join(found))
+    return part
+
+
+def together(loop: Loop, solver: FixedStep) -> Iterator[str]:
+    """What does not go together: start and stop, parts and step; a line each."""
+    begun = _begun(loop)
+    if not begun.holds:
+        yield begun.says()
+        return
+    yield from ill(solver) or broken(grid_rules(loop, solver.step))
+
+
+def ill(solver: FixedStep) -> list[str]:
+    """What is wrong with the solver itself, whatever it integrates."""
+    step, duration = solver.step, solver.duration
+    if step > duration:
+        return [f"solver.step = {step:g} s is outside (0, {duration:g}] s: longer than solver.duration"]
+    if duration / step > MOST_STEPS:
+        least = duration / MOST_STEPS
+        return [f"solver.step = {step:g} s is outside [{least:g}, {duration:g}] s: too many steps"]
+    return []
+
+
+def unstable(loop: Loop, solver: FixedStep) -> Iterator[str]:
+    """A line for a step that is too long for the loop."""
+    largest, end = stable_step(loop), getattr(loop.stop, "speed", 0.0)
+    if solver.step > largest:
+        digit = 10.0 ** (math.floor(math.log10(largest)) - 2)
+        largest = math.floor(largest / digit) * digit  # what is printed must be stable too
+        yield (
+            f"solver.step = {solver.step:g} s is not stable: RK4 follows the fastest mode of this loop, between the "
+            f"initial speed and {end:g} m/s, only with steps in (0, {largest:.3g}] s"
+        )
+
+
+def refusals(loop: Loop | None, values: Any, solver: FixedStep) -> Refusals:
+    """The lanes of a loop that differ in the values (lanes,) at these paths: what `check` says of each, in one compiled
+    call for all. Without a loop (None) `values` is a batch of loops, whose leaves have a leading axis.
+
+    Raises ValueError for a solver that is wrong whatever it integrates."""
+    if lines := ill(solver):
+        raise ValueError(lines[0])
+    values = {path: np.asarray(x, float) for path, x in values.items()} if isinstance(values, Mapping) else values
+    loop, values = jax.tree.map(lambda x: np.asarray(x, float), (loop, values))
+    with jax.enable_x64(True):
+        codes = np.array(_codes(loop, values, step=solver.step))
+    if not codes.all():
+        fine = np.flatnonzero(codes == 0)
+        asked = values if len(fine) == len(codes) else jax.tree.map(lambda x: x[np.resize(fine, len(codes))], values)
+        codes[fine[~stable(loop, asked, solver.step)[: len(fine)]]] = -1
+    return _named(loop, values, solver.step, codes)
+
+
+def _named(loop: Loop | None, values: Any, step: float, codes: np.ndarray) -> Refusals:
+    """Only those reasons that occur; -1 is the step's."""
+    there = [code for code in np.unique(codes).tolist() if code]
+    named = {-1: f"solver.step = {step:g} s is not stable"}
+    if any(code > 0 for code in there):
+        with jax.enable_x64(True):
+            first = _lane(loop, jax.tree.map(lambda x: x[0], values))
+            named |= {i: rule.broken for i, rule in enumerate(_rules(first, step), 1)}
+    numbers = np.select([codes == code for code in there], range(1, len(there) + 1), 0) if there else codes
+    return Refusals(numbers, ("", *(named[code] for code in there)))
+
+
+def first_line(loop: Loop, values: Mapping[str, Any], solver: FixedStep) -> str | None:
+    """The first refused lane and why, in a line with its numbers; None if all lanes are accepted. Without values the
+    loop is the lane."""
+    if not values:
+        lines = [*broken(rules(loop)), *together(loop, solver)] or list(unstable(loop, solver))
+        return "; ".join(lines) or None
+    found = refusals(loop, values, solver)
+    if not found.number:
+        return None
+    i = int(np.flatnonzero(found.codes)[0])
+    lane = replace(loop, {path: np.asarray(column)[i] for path, column in values.items()})
+    try:
+        check(lane, solver)
+        why = found.texts[i]
+    except ValueError as error:
+        why = str(error)
+    return f"lane {i}: {why}"
+
+
+def traced(*trees: Any) -> bool:
+    """Whether these are not yet numbers, so that nothing can be asked of them: inside jit, grad or vmap."""
+    return any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
+
+
+def _lane(loop: Loop | None, values: Any) -> Loop:
+    return values if loop is None else replace(loop, values)
+
+
+def _rules(loop: Loop, step: float) -> Iterator[Rule]:
+    """Everything but the stability, in the order of `check`."""
+    yield from rules(loop)
+    yield _begun(loop)
+    yield from grid_rules(loop, step)
+
+
+@partial(jax.jit, static_argnames="step")
+def _codes(loop: Loop | None, values: Any, *, step: float) -> Any:
+    """The number of the first broken rule of each lane, from 1; 0 for none (lanes,)."""
+
+    def code(values: Any) -> Any:
+        holds = jnp.stack([jnp.asarray(rule.holds) for rule in _rules(strong(_lane(loop, values)), step)])
+        return jnp.where(jnp.all(holds), 0, 1 + jnp.argmin(holds))
+
+    return jax.vmap(code)(values)
+
+
+def _begun(loop: Loop) -> Rule:
+    """A run starts on this side of its stop."""
+    after = ": the run would end before it starts"
+    arrays = strong(loop)  # numbers of Python raise OverflowError where arrays are infinite
+    margin = arrays.stop.margin(arrays.plant.output(arrays.plant.start(arrays.initial)))
+    start, end = (getattr(part, "speed", None) for part in (loop.initial, loop.stop))
+    if start is None or end is None:
+        line = f"initial is at the stop or beyond{after}"
+        return Rule(margin > 0, line, lambda: line)
+    return Rule(
+        (margin > 0) & (start > end),
+        f"initial.speed is not above stop.speed{after}",
+        lambda: f"initial.speed = {start:g} m/s is not above stop.speed = {end:g} m/s{after}",
+    )

@@ -1,0 +1,47 @@
+"""How a run is asked for, and what it returns."""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.protocols import Ending, Sample
+
+
+@dataclasses.dataclass(frozen=True)
+class FixedStep:
+    """Steps of equal length [s], up to `duration` [s]; a trajectory keeps every `every`-th instant."""
+
+    step: float = 1e-3
+    duration: float = 10.0
+    every: int = 1
+
+    @property
+    def steps(self) -> int:
+        """How many steps the duration takes."""
+        return math.ceil(self.duration / self.step * (1 - 1e-12))
+
+
+class Trajectory(NamedTuple):
+    """What was seen, with a leading time axis. After the end of a run its last sample is repeated."""
+
+    sample: Sample
+    measured: Any  # output of the sensor
+    state: Any  # of the plant
+    running: Any  # bool: False once the run has ended
+
+    def finite(self) -> Any:
+        """Whether every number of the run is finite."""
+        return jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(self.sample)]))
+
+
+class Run(NamedTuple):
+    """The result: metrics by name (NaN for a run that diverged), how it ended, and the trajectory if asked for."""
+
+    metrics: dict[str, Any]
+    stopped: Any  # bool: the stop was reached in time
+    diverged: Any  # bool: its numbers mean nothing: one became infinite, NaN or impossible, or it began beyond its stop
+    ending: Ending
+    trajectory: Trajectory | None

@@ -1,0 +1,189 @@
+"""The largest integration step that is stable for a loop.
+
+RK4 is stable on a mode lambda while |R(h lambda)| <= 1, R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24. A braking loop stiffens
+as it slows down, its slip rate going with 1/v, so the loop is linearised at speeds down to the stop: at slips close to
+the setpoint, where the controller is not at a limit, and at slips all over the friction curve, which is steepest near
+0. A balance is linearised upright and at its start. Held memories do not move: a sampled controller is not judged here.
+
+Of many lanes few need the eigenvalues of their matrices: rho(A) <= |(D^-1 A D)^k|^(1/k) for every diagonal D and k, and
+with the D that balances the matrices of the first lane k = 1 is mostly enough, which costs less than the matrices.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import BalanceOutput
+from diffabs.core.pytree import replace, strong
+from diffabs.core.tracing import separated
+
+SPEEDS = 6  # between start and stop, in geometric progression: the ends decide
+OFFSETS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)  # slip below and above the setpoint
+SLIPS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # where a run may pass
+SQUARINGS = 4  # k = 16: within 3 % of the radius for the loops of the papers
+TOGETHER = 256  # lanes whose matrices stay in a processor's cache
+BALANCING = 30  # rounds
+SAFE = 1.01  # what single precision may take away from a bound
+RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 3.5 of the origin
+
+
+def stable_step(loop: Loop) -> float:
+    """Largest step [s] at which RK4 damps every damped mode of the loop, between its initial speed and its stop."""
+    return float(stable_steps(jax.tree.map(lambda x: x[None], strong(loop)))[0])
+
+
+def stable_steps(loops: Loop) -> np.ndarray:
+    """The same for a batch of loops, whose leaves have a leading axis (n,); returns (n,)."""
+    matrices = np.asarray(_jacobians(loops))
+    known = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
+    modes = np.linalg.eigvals(np.where(known[..., None, None], matrices, 0.0))
+    damped = (modes.real < 0) & known[..., None]
+    size = np.where(damped, np.abs(modes), 1.0)
+    limits = np.where(damped, _radius(np.where(damped, modes, -1.0) / size) / size, np.inf)
+    return limits.min(axis=tuple(range(1, limits.ndim)), initial=np.inf)
+
+
+def stable(loop: Any, values: Any, step: float) -> np.ndarray:
+    """Whether a step [s] is stable for each lane of a loop that differ in these values (lanes,) by path; without a loop
+    (None) the values are loops, whose leaves have a leading axis. Returns bool (lanes,)."""
+    with jax.enable_x64(False), np.errstate(over="ignore"):  # what single precision cannot hold is infinite
+        fine = step * np.asarray(_bounds(*_single(loop, values), squarings=0)) <= WITHIN
+        for squarings in (SQUARINGS, None):
+            left = np.flatnonzero(~fine)
+            for lanes in np.split(left, range(TOGETHER, len(left), TOGETHER)) if len(left) else ():
+                fine[lanes] = _judged(loop, _at(values, np.resize(lanes, TOGETHER)), step, squarings)[: len(lanes)]
+    return fine
+
+
+def _single(*trees: Any) -> Any:
+    """In single precision already here: several threads at once do not agree on what `enable_x64` makes of an array."""
+    return jax.tree.map(lambda x: np.asarray(x, np.float32), trees)
+
+
+def _at(values: Any, lanes: np.ndarray) -> Any:
+    return jax.tree.map(lambda x: np.asarray(x)[lanes], values)
+
+
+def _judged(loop: Any, values: Any, step: float, squarings: int | None) -> np.ndarray:
+    """Whether the step is known to be stable; by the eigenvalues themselves if not by so many squarings."""
+    if squarings is not None:
+        return step * np.asarray(_bounds(*_single(loop, values), squarings=squarings)) <= WITHIN
+    with jax.enable_x64(True):
+        return stable_steps(_built(loop, values)) >= step
+
+
+@jax.jit
+def _built(loop: Any, values: Any) -> Loop:
+    return strong(jax.vmap(_lane(loop))(values))
+
+
+def _lane(loop: Any) -> Callable[[Any], Loop]:
+    return lambda values: strong(values if loop is None else replace(loop, values))
+
+
+@partial(jax.jit, static_argnames="squarings")
+def _bounds(loop: Any, values: Any, *, squarings: int) -> jax.Array:
+    """What the modes of every lane are not faster than [1/s] (lanes,); infinite where that is not known."""
+    count = len(jax.tree.leaves(values)[0])
+
+    def matrices(values: Any) -> jax.Array:
+        return jnp.reshape(found := _jacobians_of(_lane(loop)(values)), (-1, *found.shape[-2:]))
+
+    one = matrices(jax.tree.map(lambda x: x[0], values))
+    balance = _balance(one)
+    if not separated(matrices, values)[0]:  # no lane has other matrices than the first
+        return jnp.full(count, _fastest(one, balance, squarings))
+    places = jnp.minimum(jnp.arange(-(-count // TOGETHER) * TOGETHER), count - 1)  # whole batches: one program
+    filled = jax.tree.map(lambda x: x[places], values) if count > TOGETHER else values
+    bounds = jax.lax.map(lambda v: _fastest(matrices(v), balance, squarings), filled, batch_size=min(TOGETHER, count))
+    return bounds[:count]
+
+
+def _fastest(matrices: jax.Array, balance: jax.Array, squarings: int) -> jax.Array:
+    """The greatest bound of some matrices (k, n, n) with their D (k, n); the norm is that of rows, or of columns."""
+    a = matrices * (balance[:, None, :] / balance[:, :, None])
+    log = jnp.zeros(len(a), a.dtype)  # of what has been divided out, to the power of one over k
+    for i in range(squarings):
+        size = jnp.maximum(jnp.max(jnp.abs(a), axis=(-2, -1)), 1e-30)  # else powers would leave single precision
+        a, log = a / size[:, None, None], log + jnp.log(size) / 2**i
+        a = jnp.matmul(a, a, precision="highest")
+    rows, columns = (jnp.max(jnp.sum(jnp.abs(a), axis), -1) for axis in (-1, -2))
+    bound = jnp.max(jnp.exp(log) * jnp.minimum(rows, columns) ** (1 / 2**squarings))
+    return jnp.where(jnp.isfinite(bound), SAFE * bound, jnp.inf)
+
+
+def _balance(matrices: jax.Array) -> jax.Array:
+    """D (k, n) for which rows and columns of D^-1 A D are about as large. E. E. Osborne, J. ACM 7 (1960), all at once
+    and by half."""
+    size = jnp.abs(matrices) * (1 - jnp.eye(matrices.shape[-1]))
+
+    def halve(_: Any, log: jax.Array) -> jax.Array:
+        scaled = size * jnp.exp(log[:, None, :] - log[:, :, None])
+        rows, columns = jnp.sum(scaled, -1), jnp.sum(scaled, -2)
+        fine = (rows > 0) & (columns > 0) & jnp.isfinite(rows / columns)
+        change = 0.25 * jnp.log(jnp.where(fine, rows, 1.0) / jnp.where(fine, columns, 1.0))
+        return jnp.clip(log + change, -30.0, 30.0)
+
+    return jnp.exp(jax.lax.fori_loop(0, BALANCING, halve, jnp.zeros(matrices.shape[:-1], matrices.dtype)))
+
+
+def _radius(direction: np.ndarray) -> np.ndarray:
+    """How far along each direction of the complex plane RK4 stays stable."""
+    angles = np.abs(np.angle(direction))  # the region is symmetric
+    return np.interp(angles, ANGLES, REACH)
+
+
+def _reach(angle: np.ndarray) -> np.ndarray:
+    z = RADII * np.exp(1j * angle[:, None])
+    grows = np.abs(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))) > 1 + 1e-9
+    return np.where(grows.any(axis=1), RADII[np.argmax(grows, axis=1)], RADII[-1])
+
+
+ANGLES = np.linspace(np.pi / 2, np.pi, 2001)
+REACH = _reach(ANGLES)
+WITHIN = float(REACH.min())  # a damped mode of whatever direction is stable up to here
+
+
+@jax.jit
+@jax.vmap
+def _jacobians(loop: Loop) -> jax.Array:
+    return _jacobians_of(loop)
+
+
+def _jacobians_of(loop: Loop) -> jax.Array:
+    """d(flow)/d(flow) over the grid of speeds and slips (SPEEDS, slips, n, n), or over two states (1, 2, n, n)."""
+    if loop.plant.shows is BalanceOutput:
+        return jax.vmap(lambda share: _balance_jacobian(loop, share))(jnp.array([0.0, 1.0]))[None]
+    state = loop.start()
+    setpoint = loop.reference.setpoint(state.reference)
+    near = jnp.concatenate([setpoint - jnp.array(OFFSETS), setpoint + jnp.array(OFFSETS)])
+    slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(SLIPS)])
+    speeds = jnp.geomspace(loop.initial.speed, loop.stop.speed, SPEEDS)  # pyright: ignore[reportAttributeAccessIssue]
+    return jax.vmap(jax.vmap(lambda v, s: _jacobian(loop, v, s), (None, 0)), (0, None))(speeds, slips)
+
+
+def _jacobian(loop: Loop, speed: jax.Array, slip: jax.Array) -> jax.Array:
+    return _of_flow(replace(loop, {"initial.speed": speed, "initial.slip": slip}))
+
+
+def _balance_jacobian(loop: Loop, share: jax.Array) -> jax.Array:
+    """At a share of the initial angles and rates."""
+    return _of_flow(dataclasses.replace(loop, initial=jax.tree.map(lambda x: share * x, loop.initial)))
+
+
+def _of_flow(loop: Loop) -> jax.Array:
+    state = loop.start()
+    z, unravel = jax.flatten_util.ravel_pytree(state.flow())
+
+    def flow(z: jax.Array) -> jax.Array:
+        at = state.with_flow(unravel(z))
+        return jax.flatten_util.ravel_pytree(loop.flow(0.0, at, loop.signals(0.0, at)))[0]
+
+    return jax.jacfwd(flow)(z)

@@ -1,0 +1,5 @@
+"""Stops: when a run ends."""
+
+from diffabs.stops.stops import Fallen as Fallen
+from diffabs.stops.stops import SpeedReached as SpeedReached
+from diffabs.stops.stops import Standstill as Standstill

@@ -1,0 +1,83 @@
+"""When a run ends, and what is left after its last sample."""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+
+from diffabs.core.protocols import BalanceOutput, BrakeOutput, Sample
+from diffabs.core.pytree import Scalar, param, pytree
+
+LEAST_DECELERATION = 1e-3  # m/s^2, so that a car that only rolls gets a finite, very long, stopping distance
+
+
+@pytree
+class SpeedReached:
+    """The run ends at this speed. If it is not reached in time, the rest is braked at the last deceleration."""
+
+    speed: Scalar = param(default=5 / 3.6, unit="m/s", above=0.0)
+
+    def margin(self, output: BrakeOutput) -> Scalar:
+        """Speed above the end [m/s]."""
+        return output.speed - self.speed
+
+    def rate(self, output: BrakeOutput) -> Scalar:
+        """d(margin)/dt."""
+        return -output.deceleration
+
+    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
+        """Nothing after a stop; else (v - v_end)/a and (v^2 - v_end^2)/(2 a)."""
+        time, distance = _braked(sample, self.speed, False)
+        return jnp.where(stopped, 0.0, time), jnp.where(stopped, 0.0, distance)
+
+
+@pytree
+class Standstill:
+    """The run is integrated to a small speed and braked from there to rest at the last deceleration: v/a, v^2/(2 a).
+
+    Slip is stiff near standstill (its rate goes with 1/v), so the last centimetres are not integrated. The result does
+    not depend on the speed between 0.01 and 1 m/s."""
+
+    speed: Scalar = param(default=0.05, unit="m/s", above=0.0)
+
+    def margin(self, output: BrakeOutput) -> Scalar:
+        """Speed above the end of integration [m/s]."""
+        return output.speed - self.speed
+
+    def rate(self, output: BrakeOutput) -> Scalar:
+        """d(margin)/dt."""
+        return -output.deceleration
+
+    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
+        """v/a and v^2/(2 a)."""
+        return _braked(sample, 0.0, stopped)
+
+
+@pytree
+class Fallen:
+    """The run of a two-wheeler ends where its frame leans by `angle`: pi/2 is the ground."""
+
+    angle: Scalar = param(default=math.pi / 2, unit="rad", above=0.0, high=math.pi)
+
+    def margin(self, output: BalanceOutput) -> Scalar:
+        """angle^2 - theta^2 [rad^2]."""
+        return self.angle**2 - output.theta**2
+
+    def rate(self, output: BalanceOutput) -> Scalar:
+        """d(margin)/dt."""
+        return -2 * output.theta * output.theta_rate
+
+    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
+        """Nothing is left."""
+        del stopped
+        return 0.0 * sample.t, 0.0 * sample.t
+
+
+def _braked(sample: Sample, end: Scalar, stopped: Any) -> tuple[Any, Any]:
+    """Braked to `end` at the last deceleration. For a run that stopped, at no less than half its mean deceleration:
+    slip may chatter at the very end, and the last instant then says little."""
+    output, t = sample.output, jnp.maximum(sample.t, 1e-9)
+    mean = 2 * (output.distance / t - output.speed) / t
+    a = jnp.where(stopped, jnp.maximum(output.deceleration, 0.5 * mean), output.deceleration)
+    a = jnp.maximum(a, LEAST_DECELERATION)
+    return (output.speed - end) / a, (output.speed**2 - end**2) / (2 * a)

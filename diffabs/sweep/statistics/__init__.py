@@ -1,0 +1,1 @@
+"""What a sweep says: estimates with intervals, sensitivities, paired comparisons, the summary."""

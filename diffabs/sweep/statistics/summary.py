@@ -1,0 +1,176 @@
+"""What a finished sweep says, as values of JSON: counts, probabilities of failure, statistics of each metric,
+sensitivities, the worst samples. A column at a time, so that ten million rows fit into memory.
+
+Which intervals are right depends on the design:
+
+    random                      of independent samples
+    sobol, replicates > 1       from the spread between the replicates
+    sobol, latin-hypercube      of independent samples, which are too wide
+    grid, corners               none: nothing is random; limits of intervals are null
+    saltelli                    of its rows A, too wide as those of Sobol' sequences; Sobol' indices from all"""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from diffabs.sweep.engines import failing, missed
+from diffabs.sweep.results import Results
+from diffabs.sweep.statistics.estimates import Count, Tail, cvar, quantile, replicated
+from diffabs.sweep.statistics.estimates import summary as summarised
+from diffabs.sweep.statistics.sensitivity import correlations, sobol_indices
+
+LEVELS, TAIL = (0.05, 0.5, 0.95), 0.95
+MOST_CORRELATED = 200_000  # samples from which correlations are computed: the first ones
+WORST = 10
+FEWEST = 4  # samples of which anything is said
+NOTES = {
+    "random": "independent samples",
+    "sobol": "spread between replicates",
+    "one sobol": "as of independent samples: too wide for a Sobol' sequence",
+    "latin-hypercube": "as of independent samples: too wide for a Latin hypercube",
+    "saltelli": "as of independent samples, rows A only: too wide for a Sobol' sequence",
+    "grid": "none: a grid is not random",
+    "corners": "none: corners are not random",
+}
+
+
+def summary(found: Results, confidence: float = 0.95) -> dict[str, Any]:
+    """Of the chunks that are there. Lanes that diverged are counted, and in no statistic but the failures; lanes that
+    were refused are counted, and in none."""
+    accepted = found.accepted
+    diverged = found.column("diverged") & accepted
+    view = _View(found, accepted & ~diverged, accepted)
+    kind = found.study["space"]["design"]["type"]
+    note = NOTES["one sobol" if kind == "sobol" and view.replicates == 1 else kind]
+    return {
+        "samples": len(diverged),
+        "complete": found.complete,
+        "diverged": {"count": int(diverged.sum()), "samples": found.column("sample")[diverged][:WORST].tolist()},
+        "refused": _refused(found, accepted),
+        "confidence": confidence,
+        "intervals": note,
+        "failures": dict(_failures(found, view, confidence)),
+        "metrics": {name: _metric(view, name, confidence) for name in found.metrics},
+        "sensitivity": _sensitivity(found, view, confidence),
+        "worst": {name: _worst(found, view, name) for name in found.metrics},
+        "digest": found.digest,
+    }
+
+
+def _refused(found: Results, accepted: np.ndarray) -> dict[str, Any]:
+    """How many samples were not run, the first of them, and how often for which reason."""
+    reasons, counts = np.unique(found.column("refused")[~accepted].astype(str), return_counts=True)
+    return {
+        "count": int(np.sum(~accepted)),
+        "samples": found.column("sample")[~accepted][:WORST].tolist(),
+        "reasons": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
+    }
+
+
+class _View:
+    """The rows that are in the statistics, and how they are grouped."""
+
+    def __init__(self, found: Results, good: np.ndarray, accepted: np.ndarray):
+        design = found.study["space"]["design"]
+        self.found, self.good, self.accepted = found, good, accepted
+        self.random = design["type"] not in ("grid", "corners")
+        self.replicates = design.get("replicates", 1) if found.complete else 1
+        self.period = len(found.study["space"]["variables"]) + 2 if design["type"] == "saltelli" else 1
+        self.rows = np.arange(len(good)) % self.period == 0
+
+    def column(self, name: str) -> np.ndarray:
+        return self.found.column(name)[self.good & self.rows]
+
+    def blocks(self, name: str) -> list[np.ndarray]:
+        """One column for each replicate."""
+        values = np.where(self.good, self.found.column(name), np.nan)
+        return [block[~np.isnan(block)] for block in np.split(values, self.replicates)]
+
+
+def _failures(found: Results, view: _View, confidence: float) -> Iterator[tuple[str, Any]]:
+    columns = {name: found.column(name) for name in failing(found.study) | {"stopped": 0, "diverged": 0}}
+    kinds = {
+        "diverged": columns["diverged"] & view.accepted,
+        "not stopped": missed(columns["stopped"], found.study["objectives"]),
+    }
+    kinds |= {f"{name} > {bound:g}": columns[name] > bound for name, bound in failing(found.study).items()}
+    kinds["any"] = np.any(list(kinds.values()), axis=0)
+    asked = view.rows & view.accepted
+    if not asked.any():
+        return
+    parts = np.split(view.accepted, view.replicates)
+    for name, failed in kinds.items():
+        count = Count(int(failed[asked].sum()), int(asked.sum()))
+        one = count.probability(confidence=confidence).table()
+        if view.replicates > 1 and all(part.any() for part in parts):
+            blocks = zip(np.split(failed, view.replicates), parts, strict=True)
+            shares = [float(block[part].mean()) for block, part in blocks]
+            one = replicated(shares, confidence=confidence).table() | {"value": count.failures / count.samples}
+        yield name, {"count": count.failures, **_plain(one, view.random)}
+
+
+def _metric(view: _View, name: str, confidence: float) -> dict[str, Any]:
+    values = view.column(name)
+    if len(values) < FEWEST:
+        return {}
+    found = summarised(values, confidence, LEVELS, TAIL)
+    if view.replicates > 1:
+        blocks = view.blocks(name)
+        kinds = {"mean": np.mean, "deviation": lambda x: np.std(x, ddof=1)}
+        kinds |= {f"quantile {level:g}": lambda x, level=level: quantile(x, level).value for level in LEVELS}
+        kinds[f"cvar {TAIL:g}"] = lambda x: cvar(x, TAIL, replicates=100).value
+        found |= {
+            k: replicated([float(of(b)) for b in blocks], confidence=confidence).table() for k, of in kinds.items()
+        }
+    ends = {"least": float(values.min()), "greatest": float(values.max())}
+    return {**{kind: _plain(one, view.random) for kind, one in found.items()}, **ends}
+
+
+def _sensitivity(found: Results, view: _View, confidence: float) -> dict[str, Any]:
+    """By metric and variable: correlations, or for a Saltelli design Sobol' indices."""
+    variables = [path for path in found.variables if found.is_number(path)]
+    metrics = {name: found.column(name) for name in found.metrics}
+    if view.period > 1:
+        names = list(found.study["space"]["variables"])
+        return {name: _indices(values, view, names, confidence) for name, values in metrics.items()}
+    rows = np.flatnonzero(view.good)[:MOST_CORRELATED]
+    if not view.random or not variables or len(rows) < FEWEST:
+        return {}
+    x = np.stack([found.column(path)[rows] for path in variables], axis=1)
+    result = {}
+    for name, values in metrics.items():
+        both = correlations(x, values[rows], confidence=confidence, binormal=False)
+        result[name] = {
+            path: {"pearson": _plain(p.table(), True), "spearman": _plain(s.table(), True)}
+            for path, p, s in zip(variables, *both, strict=True)
+        }
+    return result
+
+
+def _indices(values: np.ndarray, view: _View, names: list[str], confidence: float) -> dict[str, Any]:
+    """Rows of which a lane diverged are left out whole."""
+    whole = len(values) // view.period * view.period
+    table, good = values[:whole].reshape(-1, view.period), view.good[:whole].reshape(-1, view.period).all(axis=1)
+    if good.sum() < FEWEST:
+        return {}
+    a, b, *ab = table[good].T
+    both = sobol_indices(a, b, np.array(ab), confidence=confidence)
+    return {
+        name: {"first": _plain(first.table(), True), "total": _plain(total.table(), True)}
+        for name, first, total in zip(names, *both, strict=True)
+    }
+
+
+def _worst(found: Results, view: _View, name: str) -> list[dict[str, Any]]:
+    values, samples = found.column(name)[view.good], found.column("sample")[view.good]
+    tail = Tail.of(values, samples, WORST)
+    return [{"sample": int(i), "value": float(v)} for i, v in zip(tail.indices, tail.values, strict=True)]
+
+
+def _plain(estimate: dict[str, Any], random: bool) -> dict[str, Any]:
+    """Ends of an interval that are not finite, or not there, are null."""
+    ends = {end: estimate[end] if random and math.isfinite(estimate[end]) else None for end in ("low", "high")}
+    value = estimate["value"]
+    return {"value": value if math.isfinite(value) else None, **ends}

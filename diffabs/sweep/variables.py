@@ -1,0 +1,212 @@
+"""What varies in a sweep, together: distributions by path, how they depend on each other, and the design of samples."""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtri
+
+from diffabs.core.pytree import Spec
+from diffabs.sweep import distributions, sampling
+from diffabs.sweep.discrete import Rows as Rows
+from diffabs.sweep.distributions import Distribution, Normal, leaving
+from diffabs.sweep.sampling import Design, Grid, LatinHypercube, Random, Sobol
+from diffabs.sweep.tables import described, kebab, listed, number, unknown, wrong
+
+LEAST = 1e-10  # eigenvalue of a correlation matrix: below, its factor has no digits
+SAME = 1e-9  # relative, of entries that have to be equal
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Correlation:
+    """A Gaussian copula: z = L n with L L^T = `matrix` and n independent standard normals; a variable is the quantile
+    of its distribution at Phi(z). Normal variables without limits are then jointly normal, with these correlations.
+
+    paths: variables; those not named are independent"""
+
+    paths: tuple[str, ...]
+    matrix: Any
+
+    @staticmethod
+    def from_covariance(
+        paths: tuple[str, ...], covariance: Any, variables: Mapping[str, Any] | None = None
+    ) -> "Correlation":
+        """The correlations of a covariance matrix. Raises ValueError where the root of a variance is not the deviation
+        of the normal variable, if variables are given."""
+        variances = np.diag(np.asarray(covariance, float))
+        for path, variance in zip(paths, variances, strict=True):
+            if not variance > 0:
+                raise ValueError(f"covariance: the variance of {path} = {variance:g} is not positive")
+            marginal = (variables or {}).get(path)
+            if isinstance(marginal, Normal) and abs(marginal.deviation / np.sqrt(variance) - 1) > SAME:
+                root = f"{np.sqrt(variance):g}, the root of its variance in the covariance"
+                raise ValueError(f"{path}: deviation = {marginal.deviation:g} is not {root}")
+        matrix = covariance / np.sqrt(np.outer(variances, variances))
+        return Correlation(tuple(paths), tuple(map(tuple, matrix.tolist())))
+
+    def mixed(self, z: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """L z: independent standard normals of these paths, correlated."""
+        factor = np.linalg.cholesky(np.asarray(self.matrix, float))
+        # Term by term: a matrix product may round a sample differently in chunks of different lengths.
+        return {
+            path: np.add.reduce([factor[i, j] * z[self.paths[j]] for j in range(i + 1)])
+            for i, path in enumerate(self.paths)
+        }
+
+    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
+        """One line for each thing that cannot be, or cannot with these variables."""
+        for path in dict.fromkeys(self.paths):
+            if self.paths.count(path) > 1:
+                yield f"{name}: {path} is named {self.paths.count(path)} times"
+            if variables is not None and (path not in variables or isinstance(variables[path], Rows)):
+                yield f"{name}: {path} is not a variable with a distribution of its own"
+        yield from self._indefinite(name)
+
+    def _indefinite(self, name: str) -> Iterator[str]:
+        n = len(self.paths)
+        try:
+            matrix = np.asarray(self.matrix, float)
+        except (TypeError, ValueError):  # ragged, or no numbers
+            matrix = np.empty(0)
+        if matrix.shape != (n, n):
+            yield f"{name}: matrix needs {n} rows of {n} numbers, as many as paths"
+        elif not np.isfinite(matrix).all():
+            yield f"{name}: matrix is not finite"
+        elif not np.allclose(matrix, matrix.T, rtol=0, atol=SAME):
+            yield f"{name}: matrix is not symmetric"
+        elif not np.allclose(np.diag(matrix), 1, rtol=0, atol=SAME):
+            yield f"{name}: matrix has {np.diag(matrix).tolist()} on its diagonal, not ones"
+        elif (least := np.linalg.eigvalsh(matrix)[0]) < LEAST:
+            yield f"{name}: matrix is not positive definite: its least eigenvalue is {least:.3g}, below {LEAST:g}"
+
+    def table(self) -> dict[str, Any]:
+        """As values of TOML."""
+        return {"paths": list(self.paths), "matrix": np.asarray(self.matrix, float).tolist()}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Space:
+    """The variables of a sweep, in the order of the columns of its design. Those whose value is a `Distribution` are
+    parameters, by path; `Rows` hold several and may have any name."""
+
+    variables: Mapping[str, Distribution | Rows]
+    correlation: Correlation | None = None
+    design: Design = dataclasses.field(default_factory=Random)
+
+    @property
+    def dimension(self) -> int:
+        """How many uniforms make a sample."""
+        return len(self.variables)
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """The parameters, in order."""
+        return tuple(path for name, item in self.variables.items() for path in _paths(name, item))
+
+    def check(self, samples: int | None = None) -> int:
+        """How many samples the design has. Raises ValueError, in one line, for everything that is wrong."""
+        if lines := list(self.problems()):
+            raise ValueError("; ".join(lines))
+        return self.design.count(self.variables, samples)
+
+    def draw(self, seed: int, start: int, stop: int, samples: int) -> dict[str, np.ndarray]:
+        """Samples start, ..., stop - 1 of so many: an array for each path. The space is taken to be checked. Raises
+        ValueError for samples that are not there."""
+        count = self.design.count(self.variables, samples)
+        if not 0 <= start <= stop <= count:
+            raise ValueError(f"samples [{start}, {stop}) are outside [0, {count})")
+        design = self.design.over(self.variables) if isinstance(self.design, Grid) else self.design
+        u = self._columns(design.unit(seed, start, stop, self.dimension, count))
+        z = (
+            self.correlation.mixed({name: ndtri(u[name]) for name in self.correlation.paths})
+            if self.correlation
+            else {}
+        )
+        values = {
+            name: item.from_normal(z[name]) if name in z else item.value(u[name])
+            for name, item in self.variables.items()
+        }
+        return _flat(values)
+
+    def normal(self, z: Any) -> dict[str, np.ndarray]:
+        """The values at independent standard normal coordinates z (n, dimension), correct to their last digits in both
+        tails: an array for each path."""
+        columns = self._columns(np.asarray(z, float))
+        columns |= self.correlation.mixed(columns) if self.correlation else {}
+        return _flat({name: item.from_normal(columns[name]) for name, item in self.variables.items()})
+
+    def _columns(self, points: np.ndarray) -> dict[str, np.ndarray]:
+        return dict(zip(self.variables, np.ascontiguousarray(points.T), strict=True))
+
+    def problems(self) -> Iterator[str]:
+        """One line for each thing that is wrong with the space."""
+        if not self.variables:
+            yield "variables are empty: nothing varies"
+        lines = [line for name, item in self.variables.items() for line in item.problems(name)]
+        yield from lines
+        yield from (
+            f"{path} is given {n} times" for path in dict.fromkeys(self.paths) if (n := self.paths.count(path)) > 1
+        )
+        # What a design or a correlation says of a variable makes sense only if the variable does.
+        yield from self.design.problems("design", None if lines else self.variables)
+        if self.correlation:
+            yield from self.correlation.problems("correlation", self.variables)
+            if not isinstance(self.design, Random | Sobol | LatinHypercube):
+                yield f"correlation: a {kebab(type(self.design))} design needs independent variables"
+
+    def leaving(self, specs: Mapping[str, Spec], prefix: str = "") -> Iterator[str]:
+        """A line for each parameter with one of these specs that can leave its range."""
+        for name, item in self.variables.items():
+            if isinstance(item, Rows):
+                for path, column in item.columns.items():
+                    if path in specs and not specs[path].holds(column):
+                        reached = f"{np.min(column):g} ... {np.max(column):g}"
+                        yield f"{prefix}{name}: column {path} = {reached} leaves {specs[path].interval()}"
+            elif name in specs and (line := leaving(item, specs[name], prefix + name)):
+                yield line
+
+    def table(self) -> dict[str, Any]:
+        """As values of TOML, which `read` reads."""
+        correlation = {"correlation": self.correlation.table()} if self.correlation else {}
+        variables = {name: item.table() for name, item in self.variables.items()}
+        return {"variables": variables, **correlation, "design": self.design.table()}
+
+
+def read(given: Any, where: str) -> Space:
+    """The space of a table with `variables`, and maybe `correlation` and `design`. Raises ValueError, in one line, for
+    whatever is wrong with one of them; `Space.check` says what is wrong with them together."""
+    if not isinstance(given, Mapping) or not isinstance(given.get("variables"), Mapping):
+        raise wrong(where, given, "a table with a table of variables")
+    for key in given:
+        if key not in ("variables", "correlation", "design"):
+            raise unknown(f"{where}.{key} is unknown", key, ("variables", "correlation", "design"))
+    kinds = distributions.KINDS | {"rows": Rows}
+    variables = {
+        path: described(kinds, item, f"{where}.variables.{path}", columns=_columns, weights=listed(number))
+        for path, item in given["variables"].items()
+    }
+    correlation = given.get("correlation")
+    if correlation is not None:
+        named = {"type": "correlation", **correlation} if isinstance(correlation, Mapping) else correlation
+        readers = {"matrix": listed(listed(number))}
+        correlation = described({"correlation": Correlation}, named, f"{where}.correlation", **readers)
+    return Space(variables, correlation, sampling.read(given.get("design", "random"), f"{where}.design"))
+
+
+def _columns(given: Any, where: str) -> dict[str, np.ndarray]:
+    if not isinstance(given, Mapping):
+        raise wrong(where, given, "a table of lists")
+    return {path: np.array(listed(lambda x, at: x)(column, f"{where}.{path}")) for path, column in given.items()}
+
+
+def _paths(name: str, item: Any) -> tuple[str, ...]:
+    return tuple(item.columns) if isinstance(item, Rows) else (name,)
+
+
+def _flat(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The columns of rows in the place of their variable."""
+    flat = {}
+    for name, drawn in values.items():
+        flat |= drawn if isinstance(drawn, dict) else {name: drawn}
+    return flat
