@@ -109,6 +109,13 @@ class TestBeforeARun:
                 with pytest.raises(ValueError, match=next(iter(values)).split(".")[0]):
                     d.check(lane, SOLVER)
 
+    def test_numbers_of_a_tuple_are_asked_like_those_of_an_array(self, any_step):
+        """Inside the compiled call a gain given as a tuple is a tuple of traced numbers."""
+        for gain in ((-11753.0, -48.0), np.array([-11753.0, -48.0])):
+            loop = d.braking(plant=plants.MirroredRig(), controller=controllers.StateFeedback(gain=gain))
+            found = refusals.refusals(loop, {"plant.mass": np.array([5.3, -1.0])}, SOLVER)
+            assert found.accepted.tolist() == [True, False], found.texts
+
     def test_a_solver_that_fits_nothing_is_named(self, any_step):
         for solver, message in (
             (d.FixedStep(0.3, 0.25), "longer than solver.duration"),

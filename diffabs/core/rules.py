@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 SHOWN = 8  # numbers of a list in a message
@@ -27,7 +28,9 @@ class Rule(NamedTuple):
 
 def array(x: Any) -> Any:
     """An array to calculate with: traced numbers as they are, others in float64 whatever JAX's default type is."""
-    return x if isinstance(x, jax.Array) else np.asarray(x, float)
+    if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(x)):
+        return jnp.asarray(x)
+    return np.asarray(x, float)
 
 
 def ordered(low: tuple[str, Any], high: tuple[str, Any], unit: str, *, equal: bool = True) -> Rule:

@@ -5,6 +5,7 @@ and Lyapunov equations are pure JAX and need nothing.
 """
 
 from diffabs.design.analysis import certify as certify
+from diffabs.design.parameter_box import polytope as polytope
 from diffabs.design.polytopes import Polytope as Polytope
 from diffabs.design.polytopes import Schedule as Schedule
 from diffabs.design.proof.certificate import Certificate as Certificate

@@ -1,1 +1,23 @@
-"""Linear systems in pure JAX: linearisation, sampling, Riccati and Lyapunov equations, LQR and LQG."""
+"""Linear systems in pure JAX: linearisation, sampling, Riccati and Lyapunov equations, LQR and LQG.
+
+Everything is jit-able and differentiable, and `vmap` solves many systems at once."""
+
+from diffabs.linear.balance_model import BalanceModel as BalanceModel
+from diffabs.linear.gaussian import Filter as Filter
+from diffabs.linear.gaussian import kalman as kalman
+from diffabs.linear.gaussian import lqg as lqg
+from diffabs.linear.linearization import StateSpace as StateSpace
+from diffabs.linear.linearization import linearize as linearize
+from diffabs.linear.lyapunov import discrete_lyapunov as discrete_lyapunov
+from diffabs.linear.lyapunov import lyapunov as lyapunov
+from diffabs.linear.recoverable import recoverable_bound as recoverable_bound
+from diffabs.linear.regulator import Regulator as Regulator
+from diffabs.linear.regulator import dlqr as dlqr
+from diffabs.linear.regulator import lqr as lqr
+from diffabs.linear.riccati import Riccati as Riccati
+from diffabs.linear.riccati import care as care
+from diffabs.linear.riccati import dare as dare
+from diffabs.linear.slip_model import Continuous as Continuous
+from diffabs.linear.slip_model import LowPass as LowPass
+from diffabs.linear.slip_model import Sampling as Sampling
+from diffabs.linear.slip_model import SlipModel as SlipModel

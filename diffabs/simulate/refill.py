@@ -18,7 +18,7 @@ from diffabs.core.tracing import separated
 from diffabs.simulate.hybrid_step import Carry, init_carry, step
 from diffabs.simulate.outcome import judge, prepare
 from diffabs.simulate.refusals import refusals, traced
-from diffabs.simulate.run import arguments, prepare
+from diffabs.simulate.run import arguments
 from diffabs.simulate.solution import FixedStep, Run
 
 WIDTH = 1024  # lanes whose state stays in a processor's cache
