@@ -12,7 +12,8 @@ from diffabs.core.pytree import Scalar
 def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
     """x limited to [low, high]. The slope in x is 1 at a limit and 0 beyond it, where that in the limit is 1.
 
-    Selections, since the tangent of `jnp.clip` divides, and `lax.clamp` refuses a batched limit of an unbatched x.
+    Selections, since the tangent of `jnp.clip` divides, and `lax.clamp` refuses to batch an upper limit
+    alone (JAX 0.10; of the kind of github.com/jax-ml/jax/issues/5325, whose repair leaves this case out).
     """
     return jnp.where(jnp.less(x, low), low, jnp.where(jnp.greater(x, high), high, x))
 

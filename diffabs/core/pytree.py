@@ -130,7 +130,8 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
 
     Not `jax.tree_util.register_dataclass`: with that, in JAX 0.10, the tree structures of two different classes compare
     equal if they have as many leaves and the same static values, and so jit, when their hashes meet, now and then runs
-    what it compiled for the other class."""
+    what it compiled for the other class. No issue of JAX is
+    known to us; `test_structures_of_different_classes_differ` shows it."""
 
     def flatten(part: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         return tuple(getattr(part, name) for name in data), tuple(getattr(part, name) for name in meta)
@@ -244,6 +245,8 @@ def cautions(part: Any, prefix: str = "") -> Iterator[str]:
 def check(part: T, prefix: str = "") -> T:
     """Return `part` if every parameter is in its range.
 
+    prefix: is put before every name in a message, `"plant."`
+
     Raises:
         ValueError: names every offending field with its value, range and unit. NaN offends.
     """
@@ -268,8 +271,8 @@ def elements(part: Any) -> dict[str, Spec]:
 
 
 def get(part: Any, path: str) -> Any:
-    """The value at a dotted path, `plant.road.scale`, or `controller.gain.0` for one of a list. Raises KeyError naming
-    what is there instead."""
+    """Return the value in `part` at a dotted `path`, `plant.road.scale`, or `controller.gain.0` for one of a list.
+    Raises KeyError naming what is there instead."""
     for name in path.split("."):
         names = _names(part)
         if name not in names:
@@ -285,7 +288,9 @@ def _names(part: Any) -> list[str]:
 
 
 def replace(part: T, values: Mapping[str, Any]) -> T:
-    """A copy with the parameters at these dotted paths replaced: `replace(loop, {"plant.mass": 5.3})`.
+    """Return a copy of `part` with the parameters in `values`, by dotted path, replaced.
+
+        replace(loop, {"plant.mass": 5.3, "controller.gain.0": -9e3})
 
     Works under jit, grad and vmap. Raises KeyError for a path that does not exist.
     """

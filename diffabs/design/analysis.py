@@ -32,11 +32,13 @@ SEARCH = 20  # programmes of that search, at most
 
 
 def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *, fastest: bool = False) -> Certificate:
-    """What can be proved about u = K x, K = `gain` (m, n) or (n,): quadratic stability or its impossibility, and every
-    property that the specification asks for. A schedule takes a gain for each node, too, (N + 1, m, n).
+    """Return what can be proved about u = K x: quadratic stability or its impossibility, and each specified property.
 
-    `fastest` looks for the largest decay rate that a common P proves (a few more programmes); else the claimed rate is
-    that of the specification, or what the first P happens to prove.
+    gain: K (m, n) or (n,); for a schedule also one for each node, (N + 1, m, n)
+    system: a polytope, in which the system may vary at will, or a schedule along a measured parameter
+    spec: what the gain is asked for besides; None is stability
+    fastest: look for the largest decay rate that a common P proves (a few more programs); else the claimed rate is
+        that of the specification, or what the first P happens to prove
 
     Raises ValueError for shapes that do not fit, ModuleNotFoundError without cvxpy. That something cannot be proved is
     no error: the certificate says so.

@@ -59,7 +59,10 @@ class Design:
 
 
 def design(system: Polytope | Schedule, spec: Spec) -> Design:
-    """The gain that minimises the guaranteed cost (with Q, R), or else the L2 gain, under all specifications.
+    """Return the gain that minimises the guaranteed cost (with Q, R), or else the L2 gain, under all specifications.
+
+    system: a polytope, or a schedule along a measured parameter
+    spec: weights, decay, damping, input limit, L2 gain: what the gain must have at every vertex
 
     Every answer is checked: exact proof of every specification (`certify`), duality gap, lower bound. A failed check
     tries other coordinates, then other solvers.

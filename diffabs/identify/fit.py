@@ -81,7 +81,7 @@ def fit(
     progress: Callable[[int, float], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> Identified:
-    """Fit the free parameters of a part to residuals(part, *data), a JAX function that returns (n,).
+    """Return the free parameters of a part that fit residuals(part, *data), a JAX function that returns (n,).
 
     free: paths, with a range each or None for the declared one
     data: arrays that are handed on; with others of the same shape nothing is compiled again
@@ -90,6 +90,8 @@ def fit(
     prior: a JAX function of the part that returns deviations from what is known before, in standard deviations;
         `gaussian` makes one; a penalty on roughness is another. Arguments in a `jax.tree_util.Partial` are traced
     starts: values by path to begin at, instead of the part's own; the best fit is returned
+    norm: of the weighted residuals, 2 for least squares, more towards the greatest one
+    tolerances: at which an iteration ends, and how many evaluations it may take
     usable: says on the host whether a part may be evaluated
     progress: told the evaluations so far, of all starts, and the cost at each accepted point
     stopping: asked before every evaluation; True ends the fit at the last accepted point, and no further start is tried

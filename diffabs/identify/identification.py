@@ -36,7 +36,12 @@ def identify(
     progress: Callable[[int, float], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> Identified:
-    """Fit free parameters of a loop, by dotted path, to data. The other arguments are those of `fit`.
+    """Return the parameters of a loop, by dotted path, that fit the data best, with their uncertainty.
+
+    data: measured traces, or a table of metrics
+    free: paths, with a range each or None for the declared one
+    solver: of every run
+    absolute, prior, starts, norm, tolerances, progress, stopping: as in `fit`
 
     A point is rejected where a run diverges, or must not be run: see `refusals`.
 

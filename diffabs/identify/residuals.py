@@ -30,8 +30,8 @@ class _Gaussian:
 
 
 def gaussian(known: Mapping[str, tuple[Any, Any]]) -> Prior:
-    """The prior {path: (mean, standard deviation)}; other numbers do not compile again. Raises ValueError for a
-    deviation that is not positive."""
+    """Return the prior in which the parameters `known` are {path: (mean, standard deviation)}; other numbers do not
+    compile again. Raises ValueError for a deviation that is not positive."""
     for path, (_, deviation) in known.items():
         if not (np.asarray(deviation, float) > 0).all():
             raise ValueError(f"{path}: the prior's standard deviation is {np.min(deviation):g}; it must be positive")

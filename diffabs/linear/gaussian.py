@@ -48,12 +48,15 @@ def lqg(
     noise: Any = (1e-3, 1e-3),
     voltage_max: float = np.inf,
 ) -> Sampled:
-    """The computer's controller of a balance that measures theta and psi only.
+    """Return the computer's controller of a balance that measures theta and psi only: LQR on a Kalman filter, sampled.
 
+    plant: the two-wheeler, linearised upright
     Q (6, 6), R a number: weights of the integral of x'Q x + R u^2, by its sum over the samples
+    period: of the computer [s]
     disturbance: standard deviations of unknown accelerations of theta, psi, phi [rad/s^2], constant over a period; an
         estimate that the filter shall trust less wants more
     noise: of the angles theta and psi [rad]
+    voltage_max: limit of the command [V]
 
     Raises ValueError as `dlqr`.
     """

@@ -32,8 +32,10 @@ class StateSpace(NamedTuple):
 
 
 def linearize(plant: Plant, state: Any, control: Any) -> StateSpace:
-    """df/dx (n, n) and df/du (n, m) at a state and a control, which need not be an equilibrium. The state's components
-    are in the order of its leaves."""
+    """Return df/dx (n, n) and df/du (n, m) of a plant, x' = f(x, u), at a state and a control.
+
+    plant: its `derivative` is f
+    state, control: the point, which need not be an equilibrium; the components of x are the leaves of the state"""
     flow, x, u = _flat(plant, state, control)
     return StateSpace(*jax.jacfwd(flow, (0, 1))(x, u))
 

@@ -54,6 +54,7 @@ def _linear(operator: jax.Array, Q: jax.Array) -> jax.Array:
 
 def matrices(*given: Any) -> tuple[Any, ...]:
     """As arrays of one floating type."""
+    given = tuple(jnp.asarray(x) if isinstance(x, list | tuple) else x for x in given)
     kind = jnp.result_type(float, *given)
     return tuple(jnp.asarray(x, kind) for x in given)
 

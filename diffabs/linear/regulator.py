@@ -30,7 +30,11 @@ class Regulator(NamedTuple):
 
 
 def lqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
-    """The regulator in continuous time; A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m).
+    """Return the gain that minimises the integral of x'Q x + 2 x'S u + u'R u of x' = A x + B u, and what belongs to it.
+
+    A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m) or none
+
+        lqr([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], jnp.eye(2), [[1.0]]).gain       # [[-1, -sqrt(3)]]
 
     Raises:
         ValueError: shapes that do not fit; and, for matrices that are numbers and not traced, entries that are not
@@ -43,7 +47,11 @@ def lqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
 
 
 def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
-    """The regulator in discrete time; otherwise as `lqr`."""
+    """Return the gain that minimises the sum of x'Q x + 2 x'S u + u'R u of x(k+1) = A x(k) + B u(k).
+
+    A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m) or none; R may be singular where R + B'P B > 0
+
+    Raises ValueError as `lqr`."""
     _check(A, B, Q, R, discrete=True)
     found = dare(A, B, Q, R, S)
     b = jnp.asarray(B)

@@ -42,7 +42,7 @@ class Riccati(NamedTuple):
 
 
 def care(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
-    """The stabilising P of A' P + P A - (P B + S) R^-1 (P B + S)' + Q = 0.
+    """Return the stabilising P of A' P + P A - (P B + S) R^-1 (P B + S)' + Q = 0.
 
     A (n, n), B (n, m), Q (n, n), R (m, m) > 0, S (n, m) or none; of Q and R the symmetric part counts. Q may be
     indefinite: P then too, if there is a stabilising one. Works under jit, vmap, and both modes of differentiation, in
@@ -52,10 +52,10 @@ def care(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
 
 
 def dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
-    """The stabilising P of A' P A - P - (A' P B + S) (R + B' P B)^-1 (A' P B + S)' + Q = 0. As `care`, but R may be
-    singular, R >= 0, where R + B' P B > 0.
+    """Return the stabilising P of A' P A - P - (A' P B + S) (R + B' P B)^-1 (A' P B + S)' + Q = 0.
 
-    The feedback is u = -(R + B' P B)^-1 (B' P A + S') x.
+    A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m) or none. As `care`, but R may be singular, R >= 0, where
+    R + B' P B > 0. The feedback is u = -(R + B' P B)^-1 (B' P A + S') x.
     """
     return _riccati(_discrete, A, B, Q, R, S)
 

@@ -23,7 +23,8 @@ def held(system: StateSpace, period: Any, delay: Any) -> StateSpace:
 def _exponential(a: Any) -> Any:
     """e^a by scaling and squaring of its Taylor series, to about rounding for norms up to 2^SQUARINGS.
 
-    Not `jax.scipy.linalg.expm`: 20,000 of the lab rig's models at once with it waited for ever (JAX 0.10.2, two cores).
+    Not `jax.scipy.linalg.expm`: 20,000 of the lab rig's models at once with it waited for ever (JAX 0.10.2, two cores;
+    no issue of JAX is known to us; github.com/jax-ml/jax/issues/20428 is one of its kind).
     """
     norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(a), axis=1)))
     halvings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(norm, 0.25))) + 1, 0, SQUARINGS)

@@ -29,13 +29,14 @@ STEP = 1e-4  # of the differences in z: errors of 1e-9 and 1e-12 of the values
 def failure_probability(
     study: Study, metric: str, bound: float, *, gradients: bool = False, **options: Any
 ) -> RareEvent:
-    """P[metric >= bound] over the space of a study, whose design and number of samples do not matter.
+    """Return an estimate of P[metric >= bound] over the space of a study, whose design and samples do not matter.
 
-    gradients: also draw around design points, found by gradients through the run: see `rare`
+    metric: a name of what the study measures
+    gradients: also draw around design points, found by gradients through the run
     options: those of `subset_simulation`; runs that diverge do not count as failures and are reported
 
     Raises ValueError for a metric that is not measured, for a study that draws parts, for a bound that is not finite,
-    for a point that is drawn and cannot be run, and (`proposals.Diverged`) where too many runs diverge.
+    for a point that is drawn and cannot be run, and (`importance_sampling.Diverged`) where too many runs diverge.
     """
     study.check()
     if metric not in study.objectives:

@@ -21,7 +21,9 @@ class Peak(NamedTuple):
 
 
 def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
-    """The first local maximum of mu over slip in (0, 1]; slip 1 where mu only rises (ice).
+    """Return the first local maximum of mu over slip in (0, 1] of a road; slip 1 where mu only rises (ice).
+
+    speed, distance: of the vehicle [m/s] and along the road [m], at which the curve is looked at
 
     It is the first maximum that a braking wheel meets, not always the greatest: the rig's curve rises again towards
     lock. Bracketed on a grid, bisected on the slope, and polished by one Newton step s - mu'/mu'' whose derivative is

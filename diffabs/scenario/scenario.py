@@ -68,7 +68,7 @@ class Scenario:
 
 
 def names() -> list[str]:
-    """The packaged scenarios."""
+    """Return the names of the packaged scenarios."""
     folder = importlib.resources.files("diffabs") / "scenarios"
     return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
 
@@ -80,11 +80,15 @@ def header(name_or_path: str | pathlib.Path) -> dict[str, str]:
 
 
 def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = (), *, integrated: bool = True) -> Scenario:
-    """The scenario in a TOML file, or a packaged one, with overrides such as `controller.kp=4000`.
+    """Return the scenario in a TOML file, or a packaged one, with overrides such as `controller.kp=4000`.
 
-    An override's value is a TOML value; a bare word is text, and `1,2` a list. `controller=relay` replaces the part.
+    name_or_path: `slip-lmi`, or `mine.toml`
+    overrides: `path=value`; a value is one of TOML, a bare word is text, and `1,2` a list; `controller=relay` replaces
+        the part
+    integrated: ask, too, whether the step is stable for the loop
+
     Raises ScenarioError, one line, for a file that cannot be read, unknown names, wrong types, values out of range, and
-    a step that is not stable for the loop (not asked for a scenario that will not be integrated).
+    a step that is not stable.
     """
     name, raw = _read(name_or_path)
     folder = pathlib.Path() if str(name_or_path) in names() else pathlib.Path(name_or_path).parent
@@ -100,8 +104,14 @@ def loads(
     folder: pathlib.Path = pathlib.Path(),
     integrated: bool = True,
 ) -> Scenario:
-    """The scenario in a text; `origin` is its name in messages, `folder` where the files lie that it names. Raises
-    ScenarioError, as `load`."""
+    """Return the scenario in a text.
+
+    raw: the text, in UTF-8
+    name, origin: of the scenario, and of the text in messages
+    folder: where the files lie that the text names
+    overrides, integrated: as in `load`
+
+    Raises ScenarioError, as `load`."""
     table = _parsed(raw, origin)
     for override in overrides:
         _override(table, override)
@@ -277,7 +287,7 @@ def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[s
 
 
 def dump(scenario: Scenario) -> str:
-    """TOML that loads back to the same scenario; every field is written, numbers at full precision."""
+    """Return TOML that loads back to the same scenario; every field is written, numbers at full precision."""
     sections = {
         field.name: toml.table(field.name, getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)
     }

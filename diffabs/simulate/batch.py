@@ -89,7 +89,11 @@ def check_lanes(loop: Any, batch: Batch, solver: FixedStep) -> None:
 
 
 def run(loop: Any, batch: Batch, solver: FixedStep, measured: Mapping[str, Objective]) -> Run:
-    """Every lane of a batch, in order, without trajectories: metrics (lanes,). Pure; differentiable in the loop.
+    """Run every lane of a batch, in order, and return the metrics (lanes,), without trajectories.
+
+    loop: a Loop, or a part with a method `closed()`; differentiable in it
+    solver: of every run
+    measured: objectives by metric
 
     Raises ValueError for a lane that must not be run, unless the call is traced: then ask `check_lanes` before."""
     if not traced(loop, dict(batch.values)):
@@ -114,13 +118,16 @@ def _together(loop: Any, values: Any, keys: Any, solver: FixedStep, measured: Ma
 
 
 def grid(values: Mapping[str, Sequence[float]]) -> Batch:
-    """Every combination of the values."""
+    """Return a lane for every combination of the values by path."""
     axes = np.meshgrid(*(np.asarray(v, float) for v in values.values()), indexing="ij")
     return Batch({path: axis.ravel() for path, axis in zip(values, axes, strict=True)})
 
 
 def latin(ranges: Mapping[str, tuple[float, float]], count: int, seed: int = 0) -> Batch:
-    """`count` lanes spread over a box: a scrambled Latin hypercube (SciPy's)."""
+    """Return `count` lanes spread over a box by a scrambled Latin hypercube (SciPy's).
+
+    ranges: low and high by path
+    seed: of the scrambling"""
     from scipy.stats import qmc
 
     low, high = np.array(list(ranges.values()), float).T

@@ -30,10 +30,14 @@ MOST_STEPS = 2**31 - 8  # that a counter in 32 bits holds, landing included
 def rollout(
     loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective] | None = None, *, key: Any = None
 ) -> Run:
-    """Run a loop and keep its trajectory.
+    """Run a loop and return its trajectory and what is measured.
 
-    Pure and jit-compiled; batch it with `jax.vmap`, differentiate it in any leaf of `loop`. It is compiled once per
-    structure of the loop and number of steps: new values do not compile again. `key` seeds noisy sensors.
+    loop: every part and parameter; differentiable in each leaf, and batched by `jax.vmap` over any
+    solver: step, duration [s], and how many instants are kept
+    objectives: by the names of the metrics
+    key: of `jax.random`, for noisy sensors
+
+    Pure and jit-compiled, once per structure of the loop and number of steps: new values do not compile again.
     Raises ValueError for a step, duration or stride that is not positive, a step longer than the duration, and
     parameters that are no real numbers of 32 bits or more, or have another shape than they need.
     """
@@ -41,7 +45,10 @@ def rollout(
 
 
 def measure(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], *, key: Any = None) -> Run:
-    """Run a loop and keep only the objectives: memory does not grow with the number of steps."""
+    """Run a loop and return only what is measured: memory does not grow with the number of steps.
+
+    loop, solver, objectives, key: as in `rollout`, whose ValueErrors it raises
+    """
     return _call(loop, solver, objectives, key, 0)
 
 

@@ -49,12 +49,16 @@ def sweep(
     stopping: Callable[[], bool] = lambda: False,
     source: Mapping[str, Any] | None = None,
 ) -> Results:
-    """Compute every chunk that the folder does not have yet, and open it.
+    """Compute every chunk of a study that the folder does not have yet, and return the results.
 
     Of several processes (`jax.distributed.initialize`) that all call this with the same study and a folder on a common
     disk, the first has the lock and the manifest, each computes and writes its share, and all return the whole. One
     that fails says so after the others have finished theirs.
 
+    out: the folder; it is made
+    resume: go on with a folder that has chunks of this study already
+    engine: who computes; None is every device of this process
+    progress: told after every chunk how many runs are done
     stopping: asked after every chunk; True ends the run, and `resume` goes on later
     source: put into the manifest, for whoever reads it
 

@@ -32,13 +32,18 @@ def tune(
     progress: Callable[[Progress], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> Tuned:
-    """Minimise an aggregate, over a batch of runs, of a weighted sum of metrics.
+    """Minimise an aggregate, over a batch of runs, of a weighted sum of metrics, and return what was found.
 
     subject: a Loop, or a part with a method `closed()`
     free: dotted paths of its parameters, with ranges in which they stay (declared ones where None)
     measured: objectives by metric; None is what is usual for what the plant shows
     objective: weight of each metric of `measured`, `{"stop_distance": 1.0, "effort": 1e-4}`
     over: the runs, parameters of the loop by path; none is the loop itself
+    solver: of every run
+    aggregate: from a number per lane to one: Mean (as None), SmoothWorst, CVaR, Quantile
+    constraints: what must hold: AtMost of a metric on every lane, Poles, CertifiedDecay
+    method: optimiser, starts, iterations; None is L-BFGS from the subject's own values
+    progress: told the best so far after every iteration
     stopping: asked after every evaluation; True ends the search with the best that it has met so far
 
     Raises:
@@ -72,7 +77,12 @@ def posed(
     constraints: Sequence[Constraint] = (),
     mode: Mode | None = None,
 ) -> Problem:
-    """The problem that `tune` solves, for those who bring their own search. Raises ValueError as `tune` does."""
+    """Return the problem that `tune` solves, for those who bring their own search.
+
+    subject, free, objective, over, solver, measured, aggregate, constraints: as in `tune`
+    mode: of differentiation, forward or reverse; None is the cheaper one
+
+    Raises ValueError as `tune` does."""
     check(subject)
     loop = built(subject)
     measured = usual(loop.plant) if measured is None else measured

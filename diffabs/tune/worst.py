@@ -112,11 +112,17 @@ def worst_case(
     seed_of_noise: int | None = None,
     price: float | None = None,
 ) -> WorstCase:
-    """Look for the greatest value of a metric over a box {path: (low, high)}.
+    """Return the greatest value of a metric found over a box: Sobol points and corners, then ascent by gradients.
 
+    loop: a Loop, or a part with a method `closed()`
+    over: the box {path: (low, high)}
+    metric: the name of what is made large
+    solver: of every run
     measured: objectives by metric; None is what is usual for what the plant shows
+    bound: report, too, whether the metric exceeds it
     screen: points of a scrambled Sobol sequence that are run first, besides the corners (up to 64)
-    starts: how many of the worst of them are ascended from, together
+    starts: how many of the worst of them are ascended from, together, for so many `iterations`
+    seed, seed_of_noise: of the sequence, and of noisy sensors
     price: rollouts that a gradient counts as; None is 1 + 1.5 p in forward mode and 6 in reverse
 
     Raises:
