@@ -61,7 +61,11 @@ def whole(tmp_path_factory, runs):
     simulated = main._run
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(main, "_run", lambda *args, **more: runs.append(simulated(*args, **more)) or runs[-1])
-        plot = types.SimpleNamespace(braking=lambda run, *, title="", unit="": Figure(f"{title}: {bool(run.stopped)}"))
+
+        def draw(run, *, title="", unit=""):
+            return Figure(f"{title}: {bool(run.stopped)}")
+
+        plot = types.SimpleNamespace(of=lambda plant: draw)
         patch.setitem(sys.modules, "diffabs.plot", plot)
         result = run("simulate", "slip-lmi", "--json", "--csv", folder / "a.csv", "--plot", folder / "a.png")
     return folder, json.loads(result.stdout)
@@ -244,7 +248,7 @@ def test_failure_at_the_end_leaves_old_files_as_they_were(tmp_path, monkeypatch,
     def full(run, **_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(braking=full))
+    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(of=lambda plant: full))
     (tmp_path / "a.csv").write_text("old")
     files = ("--csv", tmp_path / "a.csv", "--plot", tmp_path / "a.png")
     result = run("simulate", "slip-lmi", *files, status=1)
@@ -285,8 +289,12 @@ def test_parts_and_parameters_of_the_json_make_the_same_loop(name):
 def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
     """Seen at least once: "published gain" over a run with another gain."""
     titles = []
-    draw = types.SimpleNamespace(braking=lambda run, *, title="", unit="": titles.append(title) or Figure(title))
-    monkeypatch.setitem(sys.modules, "diffabs.plot", draw)
+
+    def draw(run, *, title="", unit=""):
+        titles.append(title)
+        return Figure(title)
+
+    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(of=lambda plant: draw))
     monkeypatch.setattr(main, "_run", lambda chosen, key, keep: runs[0])
     gain = ("--set", "controller.gain=-4000,-40")
     tables = [run("simulate", "slip-lmi", *more, "--plot", tmp_path / "a.png").stdout for more in ((), gain)]
@@ -354,7 +362,7 @@ def test_quiet_says_results_and_warnings_only(monkeypatch):
     assert "simulating" in loud.stderr
     assert [line.partition(":")[0] for line in quiet.stderr.splitlines()] == ["warning"]
     assert quiet.stdout == loud.stdout
-    assert "simulating" in run("simulate", "slip-lmi", *SHORT).stderr  # the next one is loud again
+    assert "checking the scenario" in run("simulate", "slip-lmi", *SHORT).stderr  # the next one is loud again
 
 
 def test_show_prints_a_scenario_to_start_from(tmp_path):

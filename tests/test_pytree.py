@@ -119,7 +119,7 @@ def test_get_and_replace_by_dotted_path():
     assert (get(pair, "springs.0.stiffness"), get(pair, "limit")) == (2.0, 4.0)
     assert get(Pair(), "springs.1.stiffness") == 5.0  # the original is untouched
     assert diffabs.replace(pair, {"springs.0": Spring(turns=9)}).springs[0].turns == 9
-    assert get(replace(diffabs.Loop(), {"plant.road": MagicFormula(D=0.5)}), "plant.road.D") == 0.5
+    assert get(replace(diffabs.braking(), {"plant.road": MagicFormula(D=0.5)}), "plant.road.D") == 0.5
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_strong_saves_a_compilation():
 
 
 def test_prepared_reaches_nested_parts_and_keeps_the_rest():
-    loop = diffabs.Loop(plant=diffabs.Loop().plant)
+    loop = diffabs.braking(plant=diffabs.braking().plant)
     road = prepared(replace(loop, {"plant.road": Patches(roads=(Scaled(road=SPLINE_B, scale=0.7), DRY_ASPHALT))}))
     inner = road.plant.road.roads[0]
     assert type(inner.road).__name__ == "PiecewiseCubic"

@@ -130,8 +130,8 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
 
     Not `jax.tree_util.register_dataclass`: with that, in JAX 0.10, the tree structures of two different classes compare
     equal if they have as many leaves and the same static values, and so jit, when their hashes meet, now and then runs
-    what it compiled for the other class. No issue of JAX is
-    known to us; `test_structures_of_different_classes_differ` shows it."""
+    what it compiled for the other class. No issue of JAX is known to us;
+    `test_structures_of_different_classes_differ` shows it."""
 
     def flatten(part: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         return tuple(getattr(part, name) for name in data), tuple(getattr(part, name) for name in meta)
