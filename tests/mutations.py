@@ -50,11 +50,11 @@ MUTATIONS = [
         "simulate/rk4.py",
         "return jax.jvp(step, (moving,), (rates,))",
         "return jax.jvp(step, (moving,), ([*rates[:2], *(0.0 * r for r in rates[2:])],))",
-        "test_checkpoints.py::test_three_levels_reverse_forward_and_differences_agree",
+        "test_checkpoints.py::test_reverse_forward_and_differences_agree_in_nested_scans",
     ),
     Mutation(
         "a scan that keeps every carry",
-        "simulate/rk4.py",
+        "simulate/checkpoint.py",
         "SLOTS = 1800",
         "SLOTS = 10**9",
         "test_checkpoints.py::test_memory_of_reverse_mode_hardly_grows_with_the_number_of_steps",
@@ -251,8 +251,8 @@ MUTATIONS = [
     Mutation(
         "noise drawn off its period",
         "sensors/noise.py",
-        "jnp.where(clock.k % n == 0, a, b), drawn",
-        "jnp.where(clock.k % n == 1, a, b), drawn",
+        "jnp.where(draw * n == clock.k, a, b)",
+        "jnp.where(draw * n + 1 == clock.k, a, b)",
         "test_blocks.py::test_noise",
     ),
     Mutation(
@@ -349,7 +349,7 @@ MUTATIONS = [
     ),
     Mutation(
         "a diverged lane with metrics",
-        "simulate/hybrid_step.py",
+        "simulate/outcome.py",
         "jnp.where(diverged, jnp.nan, value)",
         "value",
         "test_rollout.py::test_a_diverging_lane_is_flagged_and_leaves_the_others_alone",
@@ -469,8 +469,8 @@ MUTATIONS = [
     Mutation(
         "sensitivity: implicit function with the wrong sign",
         "design/interior/differentiable.py",
-        "step = -centre.solved(hessian, by_problem)",
-        "step = centre.solved(hessian, by_problem)",
+        "step = -central_path.solved(hessian, by_problem)",
+        "step = central_path.solved(hessian, by_problem)",
         "test_sensitivity.py::test_derivatives_of_a_design_are_differences[ones]",
     ),
     Mutation(
@@ -511,7 +511,7 @@ MUTATIONS = [
     Mutation(
         "riccati: never refused",
         "linear/riccati_batched.py",
-        "return jnp.where((error <= ERROR * size(P)) & (size(D) <= ERROR * size(P)), P, jnp.nan)",
+        "return jnp.where((error <= limit) & (size(D) <= limit), P, jnp.nan)",
         "return P",
         "test_riccati.py::test_nearly_unstabilisable_is_right_or_reported",
     ),
@@ -567,8 +567,8 @@ MUTATIONS = [
     Mutation(
         "command line: dump forgets design",
         "scenario/scenario.py",
-        "scenario.design.table(), scenario.tune.table()",
-        "{}, scenario.tune.table()",
+        'for name in ("design", "tune", "sweep")',
+        'for name in ("tune", "sweep")',
         "test_scenario.py::test_packaged_scenario_survives_dump_and_load",
     ),
     Mutation(
@@ -602,8 +602,8 @@ MUTATIONS = [
     Mutation(
         "command line: no JSON when infeasible",
         "cli/design.py",
-        "                if as_json:\n                    show.as_json(proof.document(task, reason=str(error)))\n",
-        "",
+        "                    show.as_json(certificates.document(task, reason=str(error)))\n",
+        "                    pass\n",
         "test_cli_design.py::test_no_gain_could_not_be_done",
     ),
     Mutation(
@@ -623,8 +623,8 @@ MUTATIONS = [
     Mutation(
         "command line: dump forgets what is tuned",
         "scenario/scenario.py",
-        "scenario.design.table(), scenario.tune.table()",
-        "scenario.design.table(), {}",
+        'for name in ("design", "tune", "sweep")',
+        'for name in ("design", "sweep")',
         "test_scenario.py::test_packaged_scenario_survives_dump_and_load",
     ),
     Mutation(
@@ -637,7 +637,7 @@ MUTATIONS = [
     Mutation(
         "command line: the scenario is written as it was",
         "cli/tune.py",
-        "after = dataclasses.replace(chosen, loop=found.loop)",
+        'after = chosen.with_loop(found.loop, "tuned")',
         "after = chosen",
         "test_cli_tune.py::test_what_is_written_loads_and_simulates_to_what_was_reported",
     ),
@@ -721,7 +721,7 @@ MUTATIONS = [
     Mutation(
         "command line: a proportional gain proved as a fixed one",
         "cli/certificates.py",
-        "    if not isinstance(controller, ProportionalFeedback):",
+        "    if not isinstance(controller, ProportionalFeedback) or isinstance(reduced.model, BalanceModel):",
         "    if True:",
         "test_cli_design.py::test_a_gain_that_follows_the_speed_is_proved_as_one",
     ),
@@ -1030,8 +1030,8 @@ MUTATIONS = [
     Mutation(
         "lanes that one run would refuse are run",
         "simulate/refill.py",
-        "running = carry.running & run & (number < count)",
-        "running = carry.running & (number < count)",
+        "carry.running & run & (number < count)",
+        "carry.running & (number < count)",
         "test_refusals.py::TestWhoeverRuns::test_a_batch_does_not_run_them",
     ),
     Mutation(
@@ -1071,14 +1071,14 @@ MUTATIONS = [
     ),
     Mutation(
         "no audit of a brake",
-        "simulate/run.py",
+        "simulate/outcome.py",
         'audit = getattr(loop.plant, "audit", None)',
         "audit = None",
         "test_refusals.py::TestAfterARun::test_an_unstable_step_is_seen_although_every_number_is_finite",
     ),
     Mutation(
         "metrics of whatever size",
-        "simulate/run.py",
+        "simulate/outcome.py",
         "(value >= low - ROUNDING)",
         "(value >= -jnp.inf)",
         "test_refusals.py::TestAfterARun::test_a_metric_outside_its_range_is_a_run_that_diverged",

@@ -2,13 +2,15 @@
 die when the tests were written: those whose survival would say most."""
 
 DISTRIBUTIONS, DESIGNS, SPACE, DISCRETE = (
-    f"sweep/{name}.py" for name in ("distributions", "designs", "space", "discrete")
+    f"sweep/{name}.py" for name in ("distributions", "sampling", "variables", "discrete")
 )
-STATISTICS, SENSITIVITY, COMPARISON = (f"sweep/{name}.py" for name in ("statistics", "sensitivity", "comparison"))
-RARE, PROPOSALS, RELIABILITY = (f"sweep/{name}.py" for name in ("rare", "proposals", "reliability"))
+STATISTICS, SENSITIVITY, COMPARISON = (f"sweep/statistics/{name}.py" for name in ("estimates", "sensitivity", "paired"))
+RARE, PROPOSALS, RELIABILITY = (
+    f"reliability/{name}.py" for name in ("subset_simulation", "importance_sampling", "failure")
+)
 STORE, RUNNER, CLUSTER, RUN = (f"sweep/{name}.py" for name in ("store", "runner", "cluster", "run"))
 SEAL, MANIFEST, RESULTS = (f"sweep/{name}.py" for name in ("seal", "manifest", "results"))
-FIGURES = "plot_sweep.py"
+FIGURES = "plot/sweeps.py"
 
 SWEEP = [
     (
