@@ -1,9 +1,9 @@
-"""Robust design: what a new weight or a new gain costs, against a programme written out in cvxpy each time.
+"""Robust design: what a new weight or a new gain costs, against a program written out in cvxpy each time.
 
 The rig of [lmi], four vertices (5.3 and 6.2 kg, 5 and 50 km/h). One run, medians over random weights; both sides solve
 with Clarabel in good units, and agree on the cost to the accuracy shown.
 
-    solve     the parametrised programme (eqs. 30-32), coefficients included
+    solve     the parametrised program (eqs. 30-32), coefficients included
     design    the same with Riccati lower bounds, duality gap, and the exact proof of the gain
     certify   any gain: quadratic stability or its impossibility, proved
     by hand   eqs. (30)-(32) in cvxpy's language, compiled anew as a script does it
@@ -28,7 +28,7 @@ from rich.table import Table
 
 from diffabs.design import Polytope, Spec, certify, design
 from diffabs.design.sdp import solver
-from diffabs.design.sdp.program import Programme
+from diffabs.design.sdp.program import Program
 from diffabs.design.sdp.scaling import design_frames
 
 BETA, ALPHAS, SPEEDS = 133.472842636189, (83.8796606703, 84.6321445666), (140.291806958, 14.0291806958)
@@ -39,15 +39,15 @@ RIG = Polytope(
 
 
 def solved(spec):
-    """Only the programme, in the first frame."""
+    """Only the program, in the first frame."""
     frame, _ = next(iter(design_frames(RIG, spec.Q, spec.R)))
-    programme = Programme(RIG, RIG, spec, frame)
-    c = programme.objective()
-    return float(c @ solver.solve(c, programme.blocks(1.0)).y) * programme.scale
+    program = Program(RIG, RIG, spec, frame)
+    c = program.objective()
+    return float(c @ solver.solve(c, program.blocks(1.0)).y) * program.scale
 
 
 def by_hand(spec):
-    """The programme in cvxpy, in the units that REFERENCE of [lmi] asks for: time, integral, torque, cost."""
+    """The program in cvxpy, in the units that REFERENCE of [lmi] asks for: time, integral, torque, cost."""
     q1, q2, r = spec.Q[0, 0], spec.Q[1, 1], spec.R[0, 0]
     t = np.sqrt(SPEEDS[0] / (BETA * np.sqrt(q1 / r)))
     unit = np.diag([t, 1.0])

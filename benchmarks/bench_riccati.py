@@ -1,4 +1,4 @@
-"""Ten thousand Riccati equations of six states: one `vmap` of `diffabs.design.riccati.care` against a loop over SciPy.
+"""Ten thousand Riccati equations of six states: one `vmap` of `diffabs.linear.care` against a loop over SciPy.
 
 One run, the same problems: A (6, 6) and B (6, 2) normal, Q = I, R = I. SciPy solves a part of them, and its time is
 scaled. Errors are against SciPy's P after two Newton-Kleinman steps. Set OMP_NUM_THREADS=1 to see SciPy without BLAS

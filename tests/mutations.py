@@ -387,7 +387,7 @@ MUTATIONS = [
         "design/sdp/program.py",
         "self.weight = weight / np.trace(weight)",
         "self.weight = np.eye(n) / n",
-        "test_design.py::test_four_vertices_agree_with_the_programme_by_hand",
+        "test_design.py::test_four_vertices_agree_with_the_program_by_hand",
     ),
     Mutation(
         "design: drift of a schedule forgotten",

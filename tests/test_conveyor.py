@@ -1,4 +1,4 @@
-"""Lanes on the conveyor against `jax.vmap` of `measure`, whatever its width."""
+"""Lanes that are refilled against `jax.vmap` of `measure`, whatever its width."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""Robust design against closed forms, a programme written out by hand, and simulated switching."""
+"""Robust design against closed forms, a program written out by hand, and simulated switching."""
 
 import builtins
 import itertools
@@ -101,7 +101,7 @@ def test_one_vertex_is_the_closed_form_over_ten_decades():
         np.testing.assert_allclose(found.lower_bound, trace, rtol=1e-9)
 
 
-def test_four_vertices_agree_with_the_programme_by_hand():
+def test_four_vertices_agree_with_the_program_by_hand():
     random = np.random.default_rng(2)
     for q1, q2, r in 10.0 ** np.stack([random.uniform(0, 6, 8), random.uniform(0, 4, 8), random.uniform(-1, 1, 8)], 1):
         gain, trace = by_hand(RIG, q1, q2, r)
@@ -559,7 +559,7 @@ def test_gap_and_violation():
 
 
 def test_a_gap_counts_what_the_multipliers_leave():
-    """Multipliers that do not balance the objective prove nothing: the optimum of the toy programme is 1/2."""
+    """Multipliers that do not balance the objective prove nothing: the optimum of the toy program is 1/2."""
     unknowns = lmi.Unknowns(y=(1, 1))
     blocks = [unknowns.affine(lambda v: lmi.symmetric([[v["y"]], [np.ones((1, 1)), 2 * np.ones((1, 1))]]))]
     answer = lmi.Answer(np.array([0.8]), [np.array([[[0.5, -0.6], [-0.6, 0.2]]])], "optimal")  # bound 0.8, gap "0"

@@ -11,7 +11,7 @@ from diffabs.design import Polytope, Spec, analysis, certify, design
 from diffabs.design.interior.decay_rate import certified_decay
 from diffabs.design.interior.differentiable import robust_design, robust_gain
 from diffabs.design.sdp import solver
-from diffabs.design.sdp.program import Programme
+from diffabs.design.sdp.program import Program
 from diffabs.design.sdp.scaling import design_frames
 from diffabs.linear.riccati import care
 
@@ -107,14 +107,14 @@ def test_cost_obeys_the_envelope_theorem():
     for q1, q2, r in PUBLISHED.values():
         spec = Spec(Q=(q1, q2), R=r).checked(2, 1)
         frame = next(design_frames(RIG, spec.Q, spec.R))[0]
-        programme = Programme(RIG, RIG, spec, frame)
-        blocks = programme.blocks(1.0)
-        answer = solver.solve(programme.objective(), blocks)
-        v = programme.unknowns.values(answer.y)
-        sizes = [float(max(np.abs(b.G).max(), np.abs(b.h).max())) for b in programme.common[:4]]
+        program = Program(RIG, RIG, spec, frame)
+        blocks = program.blocks(1.0)
+        answer = solver.solve(program.objective(), blocks)
+        v = program.unknowns.values(answer.y)
+        sizes = [float(max(np.abs(b.G).max(), np.abs(b.h).max())) for b in program.common[:4]]
         group = next(w for w, b in zip(answer.multipliers, blocks, strict=True) if b.h.shape[-1] == 5)
-        total = sum(w[:2, :2] / size for w, size in zip(group, sizes, strict=True)) * programme.scale
-        x = frame.T @ v["X0"] @ programme.even @ total @ programme.even.T @ v["X0"] @ frame.T.T / frame.tau
+        total = sum(w[:2, :2] / size for w, size in zip(group, sizes, strict=True)) * program.scale
+        x = frame.T @ v["X0"] @ program.even @ total @ program.even.T @ v["X0"] @ frame.T.T / frame.tau
         (_, _), (by_cost, _) = by_logarithms(RIG.A, RIG.B, jnp.array((q1, q2, r)))
         np.testing.assert_allclose(by_cost[:2], np.diag(x) * (q1, q2), rtol=1e-4)
 

@@ -4,7 +4,7 @@
     ObserverFeedback    x^- = A x^ + B clamp(u),   x^ = x^- + L (y - C x^-),   u = K x^,   y = (theta, psi)
 
 The sign is that of the rest of the package: u = +K x. An observer is a computer's: `Sampled` runs it, and A, B are
-those of one period. `diffabs.design.lqg` computes K and L.
+those of one period. `diffabs.linear.lqg` computes K and L.
 """
 
 from collections.abc import Iterator

@@ -6,7 +6,7 @@
     ...        see `certificate` for the others, for discrete time, and for schedules
 
 P is found by a solver in floating point and then proved in exact arithmetic (`certificate`). Where no common P exists
-the multipliers of the same programme are the proof of that: W_i >= 0 with sum He[C_i W_i] > 0; where it has no answer,
+the multipliers of the same program are the proof of that: W_i >= 0 with sum He[C_i W_i] > 0; where it has no answer,
 those of two vertices that refute at once (`pairs`).
 """
 
@@ -28,7 +28,7 @@ from diffabs.design.spec import Spec
 
 TRIES = 4  # frames, each better than the one before
 RAISED = 1e-3  # relative: where the search for the fastest decay stops
-SEARCH = 20  # programmes of that search, at most
+SEARCH = 20  # programs of that search, at most
 
 
 def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *, fastest: bool = False) -> Certificate:
@@ -155,7 +155,7 @@ class _Analysis:
         return None
 
     def _fastest(self, claim: Claim) -> Claim:
-        """Close in on the fastest rate that a common P proves: each programme between the bounds gives a P, whose own
+        """Close in on the fastest rate that a common P proves: each program between the bounds gives a P, whose own
         rate is a lower bound, and multipliers, which are a witness against every rate above an upper bound."""
         p = np.asarray(claim.data["P"])
         low, high = self._rate_of(p), self._slowest_mode()

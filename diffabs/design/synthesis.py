@@ -22,7 +22,7 @@ from diffabs.design.analysis import certify
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof.certificate import Certificate
 from diffabs.design.sdp import solver as lmi
-from diffabs.design.sdp.program import Programme
+from diffabs.design.sdp.program import Program
 from diffabs.design.sdp.scaling import Frame, design_frames
 from diffabs.design.sdp.solver import he
 from diffabs.design.spec import Spec
@@ -124,10 +124,10 @@ def _attempt(
     system: Polytope | Schedule, whole: Polytope, spec: Spec, frame: Frame, solver: str, lower: float | None
 ) -> tuple[Design | None, str]:
     """A design in one frame by one solver, and what is wrong with it, if anything."""
-    programme = Programme(system, whole, spec, frame)
-    c, best, status = programme.objective(), None, "no answer"
-    for level in LEVELS * programme.least_level() if spec.input else (1.0,):
-        blocks = programme.blocks(level)
+    program = Program(system, whole, spec, frame)
+    c, best, status = program.objective(), None, "no answer"
+    for level in LEVELS * program.least_level() if spec.input else (1.0,):
+        blocks = program.blocks(level)
         answer = lmi.solve(c, blocks, solver)
         status = answer.status
         if np.isfinite(answer.y).all() and answer.violation(blocks) < 1e-6:
@@ -138,13 +138,13 @@ def _attempt(
         return None, f"the solver says {status}"
     value, y, gap = best
     try:
-        gains, forms = programme.read(y)
+        gains, forms = program.read(y)
         residual = _residual(whole, gains[0], forms[0], spec) if lower is not None else None
     except np.linalg.LinAlgError:
         return None, f"the solver says {status}, with a singular X"
     gain = gains[0] if isinstance(system, Polytope) else gains
     proof = certify(gain, system, spec, fastest=False)
-    cost = None if spec.Q is None else value * programme.scale
+    cost = None if spec.Q is None else value * program.scale
     found = Design(gain, proof, cost, lower, gap, residual)
     return found, _trouble(found, spec, isinstance(system, Schedule))
 

@@ -27,7 +27,7 @@ def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Any:
 
 @pytree
 class Fell:
-    """1 if the run ended before its time, by a fall; else 0 [1], which does not say that it comes to rest: `basin`
+    """1 if the run ended before its time, by a fall; else 0 [1], which does not say that it comes to rest: `attraction`
     tells when that is sure."""
 
     physical = (0.0, 1.0)
@@ -121,7 +121,7 @@ class PeakTorque:
 class SoftLoss:
     """1/(1 + (radius/|x|)^(1/softness)) of the last state [1], |x|^2 = sum of weight x^2 in rad and rad/s: near 0 for a
     run that comes to rest, near 1 for one that runs away, and smooth between. Its mean over starts is one minus a soft
-    share of the region of attraction; see `basin`."""
+    share of the region of attraction; see `diffabs.design.attraction`."""
 
     physical = (0.0, 1.0)
 

@@ -1,4 +1,4 @@
-"""A design as one semidefinite programme, in the coordinates of a frame."""
+"""A design as one semidefinite program, in the coordinates of a frame."""
 
 import itertools
 from collections.abc import Iterator, Mapping
@@ -27,7 +27,7 @@ class Place(NamedTuple):
     drift: tuple[tuple[int, float], ...] = ()
 
 
-class Programme:
+class Program:
     """Minimise the mean over the nodes of trace Z, or the squared L2 gain g, under the specification.
 
     Unknown: X, F, Z for each node (a polytope has one), and g. `level` bounds V on the set of starts of an input limit.
