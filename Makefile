@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow versions lint bench mutations fuzz clean
+.PHONY: demo test test-slow coverage versions lint bench bench-guard mutations fuzz clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -11,6 +11,10 @@ demo: $(VENV)/.installed
 
 test: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
+
+# the share of lines and branches that the fast tests run; the last line is the number
+coverage: $(VENV)/.test
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow" --cov=diffabs --cov-branch --cov-report=term:skip-covered
 
 test-slow: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m slow
@@ -28,6 +32,10 @@ bench: $(VENV)/.bench
 	$(BIN)/python benchmarks/bench_design.py
 	$(BIN)/python benchmarks/bench_sweep.py
 	$(BIN)/python benchmarks/bench_basin.py
+
+# have the ratios that are claimed become worse?
+bench-guard: $(VENV)/.bench
+	$(BIN)/python benchmarks/guard.py
 
 mutations: $(VENV)/.test
 	$(BIN)/python tests/mutations.py
