@@ -300,8 +300,8 @@ MUTATIONS = [
     Mutation(
         "a peak before the first sample",
         "objectives/tracking.py",
-        "(last > earlier) & (last > slip)",
-        "(last >= earlier) & (last > slip)",
+        "(last > earlier) & (last > value)",
+        "(last >= earlier) & (last > value)",
         "test_rollout.py::test_the_peak_of_a_falling_slip_is_its_first_value",
     ),
     Mutation(
@@ -980,7 +980,7 @@ MUTATIONS = [
     Mutation(
         "balance: upright lanes that missed their stop",
         "sweep/engines.py",
-        'return np.zeros(np.shape(stopped), bool) if "fell" in names else ~np.asarray(stopped)',
+        "return np.asarray(stopped) != success",
         "return ~np.asarray(stopped)",
         "test_arm_cli.py::test_a_stop_that_is_a_fall_is_not_missed",
     ),
