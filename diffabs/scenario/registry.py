@@ -132,7 +132,7 @@ def _packaged(family: str) -> Mapping[str, Any]:
 
 def kebab(name: str) -> str:
     """`QuarterCar`, `PID`, `RIG_UNROUNDED` -> `quarter-car`, `pid`, `rig-unrounded`."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "-", name).replace("_", "-").lower()
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z]{2})(?=[A-Z][a-z])", "-", name).replace("_", "-").lower()
 
 
 def name_of(family: str, part: Any) -> str:

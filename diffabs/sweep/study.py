@@ -64,7 +64,8 @@ class Study:
     @property
     def bounded(self) -> dict[str, float]:
         """Bounds of metrics beyond which a lane has failed: those of the objectives themselves, then the study's."""
-        own = {name: float(part.failure) for name, part in self.objectives.items() if hasattr(part, "failure")}
+        said = {name: getattr(part, "failure", None) for name, part in self.objectives.items()}
+        own = {name: float(bound) for name, bound in said.items() if bound is not None}
         return own | {name: float(bound) for name, bound in self.failures.items()}
 
     @property
