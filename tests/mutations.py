@@ -309,7 +309,7 @@ MUTATIONS = [
         "objectives/tracking.py",
         'getattr(output, "highest", math.inf)',
         'getattr(output, "highest", 1.0)',
-        "test_servo.py::test_the_servo_at_its_limits_agrees_with_scipy",
+        "test_servo.py::test_the_linear_servo_follows_its_closed_form",
     ),
     Mutation(
         "stability: only at the limit of the controller",

@@ -107,6 +107,9 @@ def test_the_linear_servo_follows_its_closed_form(servo):
     for name, value in expected.items():
         np.testing.assert_allclose(found.metrics[name], value, rtol=1e-4, err_msg=name)
     assert not found.stopped
+    coarse = replace(loop, {"reference.value": 2.0}), FixedStep(step=3e-3, duration=0.4)
+    peak = measure(*coarse, {"overshoot": Overshoot()}).metrics["overshoot"]  # between samples, and beyond 1
+    np.testing.assert_allclose(peak, expected["overshoot"], rtol=1e-4)
     mirrored = measure(replace(loop, {"reference.value": -0.2}), solver, metrics).metrics
     for name in metrics:
         np.testing.assert_allclose(mirrored[name], found.metrics[name], rtol=1e-9, err_msg=name)
@@ -309,7 +312,7 @@ def test_certify_and_design_prove_a_gain_over_the_box():
 
 
 def test_tune_is_by_gradients_over_inertia_and_load(tmp_path):
-    few = ("--set", "tune.iterations=4", "--set", "tune.limits={}")
+    few = ("--set", "tune.iterations=4", "--set", "tune.limits={}", "--set", "tune.decay=0")
     document = json.loads(run("tune", "servo.toml", *PARTS, *FAST, *few, "--out", tmp_path / "t.toml", "--json").stdout)
     assert document["lanes"] == 6
     assert document["objective"]["after"] < 0.8 * document["objective"]["before"]
@@ -318,7 +321,7 @@ def test_tune_is_by_gradients_over_inertia_and_load(tmp_path):
     assert float(tuned.loop.controller.kp) == document["free"]["controller.kp"]["after"]
 
 
-def test_sweep_counts_and_rare_finds_what_overshoots(tmp_path):
+def test_sweep_counts_what_overshoots(tmp_path):
     out = tmp_path / "out"
     document = json.loads(run("sweep", "servo.toml", *PARTS, *FAST, "--samples", 64, "--out", out, "--json").stdout)
     counts = {name: row["count"] for name, row in document["failures"].items()}
@@ -326,6 +329,19 @@ def test_sweep_counts_and_rare_finds_what_overshoots(tmp_path):
     assert counts["any"] > 0
     again = json.loads(run("simulate", *PARTS, "--from-sweep", out, "--sample", 3, "--json").stdout)
     assert list(again["metrics"]) == METRICS
+
+
+@pytest.mark.slow
+def test_workers_know_the_parts_and_rare_events_are_found(tmp_path):
+    """A process of its own imports the module too; the sweep is the same to the bit."""
+    pytest.importorskip("distributed")
+    tables = []
+    for name, engine in (("here", ()), ("there", ("--engine", "dask", "--workers", 1))):
+        out = ("--samples", 32, "--out", tmp_path / name, "--json")
+        tables.append(json.loads(run("sweep", "servo.toml", *PARTS, *FAST, *engine, *out).stdout)["digest"])
+    assert tables[0] == tables[1]
+    found = json.loads(run("rare", "servo.toml", "overshoot=0.54", *PARTS, "--samples", 200, "--json").stdout)
+    assert 0 < found["interval"][0] < found["probability"] < found["interval"][1] < 0.1
 
 
 def test_the_page_is_the_example():
