@@ -61,7 +61,8 @@ def whole(tmp_path_factory, runs):
     simulated = main._run
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(main, "_run", lambda *args, **more: runs.append(simulated(*args, **more)) or runs[-1])
-        plot = types.SimpleNamespace(braking=lambda run, *, title="", unit="": Figure(f"{title}: {bool(run.stopped)}"))
+        drawn = lambda run, *, title="", unit="": Figure(f"{title}: {bool(run.stopped)}")  # noqa: E731
+        plot = types.SimpleNamespace(of=lambda plant: drawn)
         patch.setitem(sys.modules, "diffabs.plot", plot)
         result = run("simulate", "slip-lmi", "--json", "--csv", folder / "a.csv", "--plot", folder / "a.png")
     return folder, json.loads(result.stdout)
@@ -244,7 +245,7 @@ def test_failure_at_the_end_leaves_old_files_as_they_were(tmp_path, monkeypatch,
     def full(run, **_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(braking=full))
+    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(of=lambda plant: full))
     (tmp_path / "a.csv").write_text("old")
     files = ("--csv", tmp_path / "a.csv", "--plot", tmp_path / "a.png")
     result = run("simulate", "slip-lmi", *files, status=1)
@@ -285,7 +286,8 @@ def test_parts_and_parameters_of_the_json_make_the_same_loop(name):
 def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
     """Seen at least once: "published gain" over a run with another gain."""
     titles = []
-    draw = types.SimpleNamespace(braking=lambda run, *, title="", unit="": titles.append(title) or Figure(title))
+    drawn = lambda run, *, title="", unit="": titles.append(title) or Figure(title)  # noqa: E731
+    draw = types.SimpleNamespace(of=lambda plant: drawn)
     monkeypatch.setitem(sys.modules, "diffabs.plot", draw)
     monkeypatch.setattr(main, "_run", lambda chosen, key, keep: runs[0])
     gain = ("--set", "controller.gain=-4000,-40")
