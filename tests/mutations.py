@@ -291,6 +291,76 @@ MUTATIONS = [
         "test_papers_verdicts.py::test_the_nearest_explanation_of_the_gain",
     ),
     Mutation(
+        "units: what stands below the line stands above",
+        "core/units.py",
+        "exponent = int(power or 1) * (-1 if slash else 1)",
+        "exponent = int(power or 1)",
+        "test_servo.py::test_units_are_those_of_the_loop",
+    ),
+    Mutation(
+        "overshoot: only above",
+        "objectives/tracking.py",
+        "jnp.where(sample.setpoint < 0, -1.0, 1.0)",
+        "jnp.where(sample.setpoint < 0, 1.0, 1.0)",
+        "test_servo.py::test_the_linear_servo_follows_its_closed_form",
+    ),
+    Mutation(
+        "overshoot: an angle is limited like a slip",
+        "objectives/tracking.py",
+        'getattr(output, "highest", math.inf)',
+        'getattr(output, "highest", 1.0)',
+        "test_servo.py::test_the_linear_servo_follows_its_closed_form",
+    ),
+    Mutation(
+        "stability: only at the limit of the controller",
+        "simulate/stable_step.py",
+        "for one in (loop, arrived)",
+        "for one in (loop,)",
+        "test_servo.py::test_the_step_is_judged_where_the_controller_is_not_at_its_limit",
+    ),
+    Mutation(
+        "operating point: states of the controller left out",
+        "linear/operating_point.py",
+        "kept = plant | (found.K != 0)",
+        "kept = plant | (found.K != found.K)",
+        "test_servo.py::test_the_linear_model_is_the_one_written_by_hand",
+    ),
+    Mutation(
+        "operating point: whatever does not rest has a model",
+        "linear/operating_point.py",
+        "if not found.residue < RESIDUE:",
+        "if False:",
+        "test_servo.py::test_what_has_no_linear_model_says_so",
+    ),
+    Mutation(
+        "parts from outside: a name is taken twice",
+        "scenario/registry.py",
+        "if name in _packaged(family) or name in found:",
+        "if name in found:",
+        "test_servo.py::test_a_module_that_cannot_be_used_is_one_line",
+    ),
+    Mutation(
+        "parts from outside: of another group",
+        "scenario/outside.py",
+        "entry_points(group=GROUP)",
+        'entry_points(group="other")',
+        "test_servo.py::test_an_installed_module_is_known_by_its_entry_point",
+    ),
+    Mutation(
+        "parts from outside: --parts is not looked at",
+        "cli/usage.py",
+        "know(parts or ())",
+        "know(())",
+        "test_servo.py::test_simulate_prints_writes_and_draws",
+    ),
+    Mutation(
+        "a part that is missing is taken from a brake",
+        "scenario/registry.py",
+        'own, units = getattr(plant, "usual_parts", dict), units_of(plant)',
+        "own, units = braking().plant.usual_parts, units_of(plant)",
+        "test_servo.py::test_what_a_plant_of_ones_own_needs_is_asked_for_by_name",
+    ),
+    Mutation(
         "IAE without abs",
         "objectives/tracking.py",
         "jnp.abs(whole))",
@@ -300,8 +370,8 @@ MUTATIONS = [
     Mutation(
         "a peak before the first sample",
         "objectives/tracking.py",
-        "(last > earlier) & (last > slip)",
-        "(last >= earlier) & (last > slip)",
+        "(last > earlier) & (last > value)",
+        "(last >= earlier) & (last > value)",
         "test_rollout.py::test_the_peak_of_a_falling_slip_is_its_first_value",
     ),
     Mutation(
@@ -980,7 +1050,7 @@ MUTATIONS = [
     Mutation(
         "balance: upright lanes that missed their stop",
         "sweep/engines.py",
-        'return np.zeros(np.shape(stopped), bool) if "fell" in names else ~np.asarray(stopped)',
+        "return np.asarray(stopped) != success",
         "return ~np.asarray(stopped)",
         "test_arm_cli.py::test_a_stop_that_is_a_fall_is_not_missed",
     ),
@@ -1123,8 +1193,8 @@ def passes(tests: list[str], folder: pathlib.Path) -> bool:
 
 
 def copied(folder: pathlib.Path) -> None:
-    """The package, its tests, experiments and pages, and a proof that it is this copy that Python finds."""
-    for name in ("diffabs", "tests", "experiments", "docs"):
+    """The package, its tests, experiments, examples and pages, and a proof that it is this copy that Python finds."""
+    for name in ("diffabs", "tests", "experiments", "docs", "examples"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", folder)
     command = [sys.executable, "-c", "import diffabs; print(diffabs.__file__)"]

@@ -102,6 +102,7 @@ REFERENCES: dict[str, Any] = {
     "literal": references.PeakLiteral(),
     "latch": references.PeakLatch(),
     "upright": references.Upright(),
+    "setpoint": references.Setpoint(value=0.3),
     "robust": references.PeakRobust(time_constant=0.002, threshold=0.01),
 }
 
@@ -151,7 +152,12 @@ PARTS: dict[str, dict[str, Any]] = {
         "constant": controllers.ConstantInput(value=2.5),
         "holding": controllers.HoldingInput(),
     },
-    "stop": {"speed reached": stops.SpeedReached(), "standstill": stops.Standstill(), "fallen": stops.Fallen()},
+    "stop": {
+        "speed reached": stops.SpeedReached(),
+        "standstill": stops.Standstill(),
+        "fallen": stops.Fallen(),
+        "none": stops.NoStop(),
+    },
     "objective": {
         **objectives.BRAKING,
         "itae": objectives.ITAE(),

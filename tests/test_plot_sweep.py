@@ -32,7 +32,8 @@ def made(tmp_path):
         columns = {"sample": np.arange(n), **variables, **metrics, **flags}
         store, size = Store(tmp_path / str(len(list(tmp_path.iterdir())))), -(-n // 2)
         store.folder.mkdir()
-        table = manifest(n, size, variables, metrics, failures=failures or {}, **study)
+        own = {"locked_time": 0.0} if "locked_time" in metrics else {}  # as a study writes what objectives say
+        table = manifest(n, size, variables, metrics, failures=own | (failures or {}), **study)
         table["source"] = {"name": name}
         table["study"]["space"]["design"] = {"type": design, **({"levels": n} if design == "grid" else {})}
         store.begin(table, resume=False)

@@ -140,7 +140,7 @@ def test_members_are_told_by_shape():
     assert not set(registry.types("controller")) & {*registry.types("antiwindup"), *registry.types("feedforward")}
     assert {"direct", "series", "lag"} <= set(registry.types("actuator"))
     assert {"direct", "series", "noise"} <= set(registry.types("sensor"))
-    assert set(registry.types("stop")) == {"standstill", "speed-reached", "fallen"}
+    assert set(registry.types("stop")) == {"standstill", "speed-reached", "fallen", "no-stop"}
     assert registry.types("road")["snow"] is roads.SNOW
 
 

@@ -474,4 +474,4 @@ def test_a_study_has_a_table_of_plain_values(study):
     failures = {"overshoot": np.float32(0.5)}
     table = dataclasses.replace(study, failures=failures).check().table()
     assert json.loads(json.dumps(table)) == table
-    assert table["failures"] == {"overshoot": 0.5}
+    assert (table["failures"], table["success"]) == ({"locked_time": 0.0, "overshoot": 0.5}, True)

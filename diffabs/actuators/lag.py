@@ -12,8 +12,8 @@ from diffabs.core.rules import Rule, ordered
 class Limits:
     """control = clamp(command, low, high)."""
 
-    low: Scalar = param(default=0.0, unit="N m")
-    high: Scalar = param(default=90.0, unit="N m")
+    low: Scalar = param(default=0.0, unit="control")
+    high: Scalar = param(default=90.0, unit="control")
 
     start = no_memory
     flow = no_flow
@@ -26,7 +26,7 @@ class Limits:
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""
-        yield ordered(("low", self.low), ("high", self.high), "N m")
+        yield ordered(("low", self.low), ("high", self.high), "{control}")
 
 
 @pytree
@@ -59,7 +59,7 @@ class RateLimit:
     A servo whose speed saturates; the ideal rate limiter is the limit of a small time constant.
     """
 
-    rate: Scalar = param(default=1000.0, unit="N m/s", above=0.0)
+    rate: Scalar = param(default=1000.0, unit="control/s", above=0.0)
     time_constant: Scalar = param(default=0.002, unit="s", above=0.0)
 
     start = Lag.start

@@ -19,6 +19,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import replace
 from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.slip_model import SlipModel
 from diffabs.plants import BrakeStart
 from diffabs.scenario.registry import ScenarioError, shown
 from diffabs.scenario.scenario import Scenario
@@ -80,7 +81,7 @@ def _followed(loop: Loop, reduced: "Reduced", box: Box) -> tuple["Reduced", Any,
     """The linear model and its box; where the gain follows the speed, those in which it is one gain, whose proof covers
     every fall of the speed that friction allows."""
     controller = loop.controller.controller if isinstance(loop.controller, Sampled) else loop.controller
-    if not isinstance(controller, ProportionalFeedback) or isinstance(reduced.model, BalanceModel):
+    if not isinstance(controller, ProportionalFeedback) or not isinstance(reduced.model, SlipModel):
         return reduced, reduced.model, box
     from diffabs.design.speed_scaled import SpeedScaled, fall
 

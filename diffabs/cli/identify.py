@@ -15,7 +15,7 @@ import typer
 from diffabs.cli import certificates, console, show
 from diffabs.core.pytree import get, parameters
 from diffabs.scenario import section_tune, toml
-from diffabs.scenario.measurements import UNITS, Readings, read
+from diffabs.scenario.measurements import Readings, read
 from diffabs.scenario.parameter_paths import flat
 from diffabs.scenario.registry import ScenarioError, shown, unknown
 from diffabs.scenario.scenario import Scenario, dump
@@ -60,9 +60,10 @@ def identify(
         console.need_extra("tune", "optax", "scipy")
         console.check_scenario_file(out)
         with console.new_file(out, "--out") if out else contextlib.nullcontext() as file:
-            readings = _readings(data, column)
-            noise = _noise(sigma or (), readings)
             chosen = console.loaded(scenario, changes)
+            units = chosen.loop.plant.shows.units
+            readings = _readings(data, column, units)
+            noise = _noise(sigma or (), readings, units)
             ranges = _ranges(free, chosen)
             found, noise, interrupted = _watched(chosen, readings, ranges, noise)
             result = {**_result(chosen, readings, ranges, found, noise), "interrupted": interrupted}
@@ -80,9 +81,9 @@ def identify(
         show.as_json(result) if as_json else show.identified(result)
 
 
-def _readings(data: pathlib.Path, names: Sequence[str] | None) -> Readings:
+def _readings(data: pathlib.Path, names: Sequence[str] | None, units: Mapping[str, str]) -> Readings:
     """Those columns of a file that are compared."""
-    readings = read(data)
+    readings = read(data, units)
     for name in names or ():
         if name not in readings.columns:
             raise unknown(f"--column {shown(name)} is not in the data", name, readings.columns)
@@ -92,7 +93,7 @@ def _readings(data: pathlib.Path, names: Sequence[str] | None) -> Readings:
     return Readings(readings.t, columns)
 
 
-def _noise(given: Sequence[str], readings: Readings) -> dict[str, float]:
+def _noise(given: Sequence[str], readings: Readings, units: Mapping[str, str]) -> dict[str, float]:
     """Standard deviations by column, in SI."""
     found: dict[str, float] = {}
     for text in given:
@@ -103,7 +104,7 @@ def _noise(given: Sequence[str], readings: Readings) -> dict[str, float]:
         if name not in readings.columns:
             raise unknown(f"--sigma {shown(name)} is not a column of the data", name, readings.columns)
         value = toml.value(number.strip())
-        unit = "" if UNITS[name] == "1" else f" {UNITS[name]}"
+        unit = "" if units[name] == "1" else f" {units[name]}"
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise ScenarioError(f"--sigma {name} = {shown(value)} is no number in (0, inf){unit}")
         if not 0 < value < math.inf:
@@ -217,7 +218,7 @@ def _result(
             {"direction": one.shown(), "spread": one.spread, "components": one.components}
             for one in known.undetermined()
         ],
-        "residuals": _residuals(readings, found, noise),
+        "residuals": _residuals(readings, found, noise, chosen.loop.plant.shows.units),
         "chi2": found.chi2,
         "degrees": known.degrees,
         "scale": known.scale,
@@ -247,7 +248,9 @@ def _values(
     return rows
 
 
-def _residuals(readings: Readings, found: "Identified", noise: Mapping[str, float]) -> dict[str, dict[str, Any]]:
+def _residuals(
+    readings: Readings, found: "Identified", noise: Mapping[str, float], units: Mapping[str, str]
+) -> dict[str, dict[str, Any]]:
     """Simulated minus measured, by column."""
     each = np.split(np.asarray(found.residuals), len(readings.columns))
     return {
@@ -256,7 +259,7 @@ def _residuals(readings: Readings, found: "Identified", noise: Mapping[str, floa
             "rms": _rms(values),
             "mean": float(np.mean(values)),
             "largest": float(np.max(np.abs(values))),
-            "unit": UNITS[name],
+            "unit": units[name],
         }
         for name, values in zip(readings.columns, each, strict=True)
     }

@@ -18,8 +18,8 @@ from diffabs import __version__
 from diffabs.cli import compare, console, design, identify, rare, show, sweep, tune, usage
 from diffabs.cli.checking import checked, said
 from diffabs.core import interrupt
-from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import parameters
+from diffabs.core.units import units_of
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import Scenario, dump, header, names
 from diffabs.simulate.run import measure, rollout
@@ -128,12 +128,13 @@ def simulate(
 
 def _warning(chosen: Scenario, result: dict[str, Any]) -> str:
     """What a reader of the metrics must know about how the run ended."""
-    if chosen.loop.plant.shows is BalanceOutput:
-        return "FELL: the frame reached the stop's angle" if result["stopped"] else ""
-    if result["stopped"]:
+    stop = chosen.loop.stop
+    if result["stopped"] == stop.success:
         return ""
-    duration = f"NOT STOPPED within solver.duration = {chosen.solver.duration:g} s"
-    return f"{duration}; stop_time and stop_distance are extrapolated with the last deceleration"
+    otherwise = getattr(stop, "otherwise", "")
+    if result["stopped"]:
+        return otherwise or "STOPPED EARLY: the run reached its stop"
+    return f"NOT STOPPED within solver.duration = {chosen.solver.duration:g} s{otherwise and f'; {otherwise}'}"
 
 
 def _check_source(scenario: Any, from_sweep: Any, sample: int | None, changes: Any, seed: int | None) -> None:
@@ -298,7 +299,7 @@ def _parameters(chosen: Scenario) -> dict[str, dict[str, Any]]:
     objectives = (
         (f"objective.{name}.{path}", spec, value)
         for name, one in chosen.objectives.items()
-        for path, spec, value in parameters(one)
+        for path, spec, value in parameters(one, units=units_of(chosen.loop.plant))
     )
     return {
         path: {"value": np.vectorize(plain, otypes=[object])(np.asarray(value, float)).tolist(), "unit": spec.unit}

@@ -1,4 +1,5 @@
-"""How the command line is used: an example in every help, --quiet everywhere, and one line for a wrong usage."""
+"""How the command line is used: an example in every help, --quiet and --parts everywhere, and one line for a wrong
+usage."""
 
 import functools
 import inspect
@@ -11,10 +12,14 @@ import typer
 import typer.core
 
 from diffabs.cli import console
+from diffabs.scenario.registry import know
 
 # Of the click that this typer brings or needs: the ancestor of all complaints about arguments.
 UsageError: Any = typer.BadParameter.__base__
 Quiet = Annotated[bool, typer.Option("-q", "--quiet", help="Say nothing but results, warnings and errors.")]
+Parts = Annotated[
+    list[str] | None, typer.Option(metavar="MODULE", help="Know the parts in this Python module; may be repeated.")
+]
 
 
 class Group(typer.core.TyperGroup):
@@ -43,15 +48,20 @@ def _told(error: Any) -> int:
 
 
 def add(app: typer.Typer, function: Callable[..., Any], example: str, name: str | None = None) -> None:
-    """Make a function a command: with its example (what follows `diffabs`), and with --quiet."""
+    """Make a function a command: with its example (what follows `diffabs`), with --quiet and --parts."""
 
     @functools.wraps(function)
-    def command(*args: Any, quiet: bool, **given: Any) -> Any:
+    def command(*args: Any, quiet: bool, parts: list[str] | None, **given: Any) -> Any:
         console.quieten(quiet)
+        with console.guarded():
+            know(parts or ())
         return function(*args, **given)
 
     signature = inspect.signature(function)
-    more = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Quiet)
-    command.__signature__ = signature.replace(parameters=[*signature.parameters.values(), more])  # pyright: ignore
-    command.__annotations__ = {**function.__annotations__, "quiet": Quiet}
+    more = [
+        inspect.Parameter(option, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+        for option, default, annotation in (("parts", None, Parts), ("quiet", False, Quiet))
+    ]
+    command.__signature__ = signature.replace(parameters=[*signature.parameters.values(), *more])  # pyright: ignore
+    command.__annotations__ = {**function.__annotations__, "parts": Parts, "quiet": Quiet}
     app.command(name, epilog=f"Example:\n\n\b\n  diffabs {example}")(command)

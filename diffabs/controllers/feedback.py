@@ -21,19 +21,19 @@ from diffabs.core.rules import Rule, ordered
 class StateFeedback:
     """u = clamp(ff + k1 x1 + k2 x2, torque_min, torque_max); the default gain is the paper's, from its section 4."""
 
-    gain: Vector = param(default=(-11753.0, -48.0), unit="N m/s, N m")
-    torque_min: Scalar = param(default=-np.inf, unit="N m", infinite=True)
-    torque_max: Scalar = param(default=np.inf, unit="N m", infinite=True)
+    gain: Vector = param(default=(-11753.0, -48.0), unit="control/signal/s, control/signal")
+    torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
+    torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
     antiwindup: Any = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:
         """x1(0) = 0."""
-        return Memory(flow=0.0 * signal.measured.slip)
+        return Memory(flow=0.0 * signal.measured[0])
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """x1' = slip - target, unless the anti-windup says otherwise."""
         raw, limited = self._torque(memory, signal)
-        error = signal.measured.slip - signal.target
+        error = signal.measured[0] - signal.target
         return self.antiwindup.rate(error, self.gain[0], raw, limited)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
@@ -43,7 +43,7 @@ class StateFeedback:
     jump = no_jump
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
-        error = signal.measured.slip - signal.target
+        error = signal.measured[0] - signal.target
         raw = signal.feedforward + self.gain[0] * memory.flow + self.gain[1] * error
         return raw, clamp(raw, self.torque_min, self.torque_max)
 
@@ -54,4 +54,4 @@ class StateFeedback:
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""
-        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "N m")
+        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}")

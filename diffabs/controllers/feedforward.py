@@ -10,7 +10,7 @@ from diffabs.core.pytree import Scalar, param, pytree
 class ConstantInput:
     """A number: what a controller does that knows neither mass nor road."""
 
-    value: Scalar = param(default=0.0, unit="N m")
+    value: Scalar = param(default=0.0, unit="control")
 
     def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
         """The number [N m]."""

@@ -24,10 +24,10 @@ class ScheduledFeedback:
     """u = clamp(ff + k1(v) x1 + k2(v) x2, torque_min, torque_max); gains at increasing speeds."""
 
     speeds: Vector = param(default=(5 / 3.6, 50 / 3.6), unit="m/s", low=0.0, free=True)
-    integral_gains: Vector = param(default=(-11753.0, -11753.0), unit="N m/s", free=True)
-    gains: Vector = param(default=(-58.0, -158.0), unit="N m", free=True)
-    torque_min: Scalar = param(default=-np.inf, unit="N m", infinite=True)
-    torque_max: Scalar = param(default=np.inf, unit="N m", infinite=True)
+    integral_gains: Vector = param(default=(-11753.0, -11753.0), unit="control/signal/s", free=True)
+    gains: Vector = param(default=(-58.0, -158.0), unit="control/signal", free=True)
+    torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
+    torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
     antiwindup: Any = part(default=NoAntiWindup)
 
     start = StateFeedback.start
@@ -83,10 +83,10 @@ class ProportionalFeedback:
     Sugiura; this cancels it, and the loop is equally fast at every speed. `gain` is that at `reference_speed` v0.
     """
 
-    gain: Vector = param(default=(-11753.0, -158.0), unit="N m/s, N m")
+    gain: Vector = param(default=(-11753.0, -158.0), unit="control/signal/s, control/signal")
     reference_speed: Scalar = param(default=50 / 3.6, unit="m/s", above=0.0)
-    torque_min: Scalar = param(default=-np.inf, unit="N m", infinite=True)
-    torque_max: Scalar = param(default=np.inf, unit="N m", infinite=True)
+    torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
+    torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
     antiwindup: Any = part(default=NoAntiWindup)
 
     start, problems, rules = StateFeedback.start, StateFeedback.problems, StateFeedback.rules

@@ -1,4 +1,4 @@
-"""PID control of the slip, with filtered derivative and limits.
+"""PID control of the first signal, a brake's slip, with filtered derivative and limits.
 
     u = clamp(ff + kp e + kI I + kD wc (e - d), u_min, u_max),   I' = e,   d' = wc (e - d),   e = target - slip
 
@@ -17,7 +17,7 @@ from diffabs.core.rules import Rule, ordered
 
 
 class PIDMemory(NamedTuple):
-    """Integral of the error [s], filtered error [1]."""
+    """Integral of the error [signal s], filtered error [signal]."""
 
     integral: Scalar
     filtered: Scalar
@@ -27,38 +27,38 @@ class PIDMemory(NamedTuple):
 class PID:
     """u = clamp(ff + kp e + kI I + kD wc (e - d), torque_min, torque_max)."""
 
-    kp: Scalar = param(default=3893.0, unit="N m", low=0.0)
-    ki: Scalar = param(default=0.0, unit="N m/s", low=0.0)
-    kd: Scalar = param(default=0.0, unit="N m s", low=0.0)
+    kp: Scalar = param(default=3893.0, unit="control/signal", low=0.0)
+    ki: Scalar = param(default=0.0, unit="control/signal/s", low=0.0)
+    kd: Scalar = param(default=0.0, unit="control s/signal", low=0.0)
     cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
-    torque_min: Scalar = param(default=0.0, unit="N m", infinite=True)
-    torque_max: Scalar = param(default=90.0, unit="N m", infinite=True)
+    torque_min: Scalar = param(default=0.0, unit="control", infinite=True)
+    torque_max: Scalar = param(default=90.0, unit="control", infinite=True)
     antiwindup: Any = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:
         """Integral and filter at zero."""
-        zero = 0.0 * signal.measured.slip
+        zero = 0.0 * signal.measured[0]
         return Memory(flow=PIDMemory(zero, zero))
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> PIDMemory:
         """I' and d'."""
         raw, limited = self._torque(memory, signal)
-        error = signal.target - signal.measured.slip
+        error = signal.target - signal.measured[0]
         integral = self.antiwindup.rate(error, self.ki, raw, limited)
         return PIDMemory(integral, self.cutoff * (error - memory.flow.filtered))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Torque [N m]."""
+        """Control: a brake's torque [N m]."""
         return self._torque(memory, signal)[1]
 
     jump = no_jump
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
-        error = signal.target - signal.measured.slip
+        error = signal.target - signal.measured[0]
         derivative = self.cutoff * (error - memory.flow.filtered)
         raw = signal.feedforward + self.kp * error + self.ki * memory.flow.integral + self.kd * derivative
         return raw, clamp(raw, self.torque_min, self.torque_max)
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""
-        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "N m")
+        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}")

@@ -15,7 +15,7 @@ from diffabs.core.rules import Rule, ordered
 class ConstantTorque:
     """u = torque: a driver who stands on the brake, no anti-lock control."""
 
-    torque: Scalar = param(default=90.0, unit="N m")
+    torque: Scalar = param(default=90.0, unit="control")
 
     start = no_memory
     flow = no_flow
@@ -42,15 +42,15 @@ class Relay:
     interpolation, so that a run does not depend on the grid and is differentiable.
     """
 
-    band: Scalar = param(default=0.02, unit="1", above=0.0, below=1.0)
-    torque_min: Scalar = param(default=0.0, unit="N m")
-    torque_max: Scalar = param(default=90.0, unit="N m")
+    band: Scalar = param(default=0.02, unit="signal", above=0.0, below=1.0)
+    torque_min: Scalar = param(default=0.0, unit="control")
+    torque_max: Scalar = param(default=90.0, unit="control")
 
     flow = no_flow
 
     def start(self, signal: Tracking) -> Memory:
         """Applied if the slip is below the target."""
-        excess = signal.measured.slip - signal.target
+        excess = signal.measured[0] - signal.target
         return Memory(held=RelayMemory(jnp.where(excess < 0, 1.0, 0.0) + 0.0 * excess, excess))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
@@ -62,7 +62,7 @@ class Relay:
     def jump(self, clock: Clock, memory: Memory, signal: Tracking) -> Jump:
         """Switch at the far side of the band."""
         applied, before = memory.held
-        excess = signal.measured.slip - signal.target
+        excess = signal.measured[0] - signal.target
         release = (applied > 0.5) & (excess > self.band)
         apply = (applied < 0.5) & (excess < -self.band)
         level = jnp.where(release, self.band, -self.band)
@@ -73,7 +73,7 @@ class Relay:
 
     def rules(self) -> Iterator[Rule]:
         """A release torque below the applied one."""
-        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "N m", equal=False)
+        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}", equal=False)
 
 
 @pytree
@@ -83,10 +83,10 @@ class SlidingMode:
     First-order sliding mode with a boundary layer. Slotine and Li, Applied Nonlinear Control, sec. 7.2.
     """
 
-    gain: Scalar = param(default=90.0, unit="N m", low=0.0)
-    boundary: Scalar = param(default=0.02, unit="1", above=0.0)
-    torque_min: Scalar = param(default=0.0, unit="N m")
-    torque_max: Scalar = param(default=90.0, unit="N m")
+    gain: Scalar = param(default=90.0, unit="control", low=0.0)
+    boundary: Scalar = param(default=0.02, unit="signal", above=0.0)
+    torque_min: Scalar = param(default=0.0, unit="control")
+    torque_max: Scalar = param(default=90.0, unit="control")
 
     start = no_memory
     flow = no_flow
@@ -95,9 +95,9 @@ class SlidingMode:
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Torque [N m]."""
         del t, memory
-        inside = clamp((signal.target - signal.measured.slip) / self.boundary, -1.0, 1.0)
+        inside = clamp((signal.target - signal.measured[0]) / self.boundary, -1.0, 1.0)
         return clamp(signal.feedforward + self.gain * inside, self.torque_min, self.torque_max)
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""
-        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "N m", equal=False)
+        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}", equal=False)

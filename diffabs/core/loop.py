@@ -9,7 +9,7 @@ A `Loop` is one pytree: every parameter of every part is a leaf with a dotted pa
 from typing import Any, NamedTuple
 
 from diffabs.core.blocks import Direct, NoFeedforward
-from diffabs.core.protocols import UNITS, Block, Clock, Feedforward, Memory, Plant, Reference, Sample, Stop, Tracking
+from diffabs.core.protocols import Block, Clock, Feedforward, Memory, Plant, Reference, Sample, Stop, Tracking
 from diffabs.core.pytree import Scalar, part, pytree
 
 
@@ -123,7 +123,8 @@ class Loop:
 
 def signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, Any]]:
     """Unit and values of what is kept of a run, by name: time, all that the plant shows, target, command, control."""
-    shown = {name: (UNITS[name], values) for name, values in sample.output._asdict().items()}
-    asked = {"target": (UNITS[sample.output._fields[0]], sample.target)}
+    units = plant.shows.units
+    shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}
+    asked = {"target": (units[sample.output._fields[0]], sample.target)}
     given = {name: (plant.control_unit, getattr(sample, name)) for name in ("command", "control")}
     return {"t": ("s", sample.t), **shown, **asked, **given}

@@ -14,14 +14,36 @@ Sensor, Reference, Controller and Actuator are `Block`s: dynamic systems with a 
 inside every Runge-Kutta stage, the jump once at the start of every step; that is how a continuous PID and a computer's
 relay live in one loop. Nothing here is a base class: a part satisfies a contract by its shape.
 
-A plant says what it shows, a NamedTuple of named signals: a `BrakeOutput`, a `BalanceOutput`, or one of your own.
-Blocks, stops and objectives that read a signal that the plant does not show do not fit; tracing the loop finds them.
+A plant says what it shows, a NamedTuple of named signals with their `units`: a `BrakeOutput`, a `BalanceOutput`, or one
+of your own. The target is of the first signal. Blocks, stops and objectives that read a signal that the plant does not
+show do not fit; tracing the loop finds them.
+
+What a part may offer beyond its contract, as a method or an attribute of its class:
+
+    of             offer                                what it is for
+    any part       problems(), rules()                  what is wrong with its fields; rules between its numbers
+                   grid_rules(step)                     rules about the integration step
+                   cautions()                           what is allowed but hardly meant
+                   prepared(), refined(times)           the part for a run; for a step that is so many times shorter
+                   family = "sensor"                    which blocks from outside it is among
+    plant          usual_parts(), usual_objectives()    the loop around it, and its metrics, where a scenario says none
+                   audit(initial)                       an objective whose value exceeds 1 where a run cannot have been
+                   probes(initial, setpoint, stop)      starts (k,) where its loop may be stiffest
+                   frozen = ("speed", ...)              outputs that a linear model of its first signal holds
+    output         highest                              the greatest value that the first signal can have
+    stop           otherwise = "..."                    what a reader must know of a run that ended as it should not
+    objective      physical = (low, high)               where the value of a real run lies
+                   failure = 0.0                        a run with a greater value has failed
+
+Units may be relative to the loop, in the words `control` and `signal` (the first that the plant shows): the gain of a
+PID is in "control/signal", N m around a brake, V/rad around a servo.
 
 Conventions. Arguments come in the order (t, x, u). SI units. slip = (v - r omega)/v, positive in braking. A positive
 torque brakes. State feedback is u = K x with x = (integral of (slip - target), slip - target): the sign of K is the
 papers', so a stabilising K is negative. A balance leans to the side of positive angles, and u = K x there too.
 """
 
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 from diffabs.core.pytree import Scalar
@@ -35,6 +57,11 @@ class BrakeOutput(NamedTuple):
     wheel_speed: Scalar  # [m/s] r omega, of the wheel's rim
     deceleration: Scalar  # [m/s^2] of the vehicle, positive in braking
     distance: Scalar  # [m] travelled
+
+    units = MappingProxyType({
+        **{"slip": "1", "speed": "m/s", "wheel_speed": "m/s", "deceleration": "m/s^2", "distance": "m"},
+    })  # fmt: skip
+    highest = 1.0  # that the first signal can be
 
 
 class BalanceOutput(NamedTuple):
@@ -52,12 +79,10 @@ class BalanceOutput(NamedTuple):
     resistance: Scalar  # [ohm]
     current_max: Scalar  # [A]
 
-
-UNITS = {  # of every output
-    **{"slip": "1", "speed": "m/s", "wheel_speed": "m/s", "deceleration": "m/s^2", "distance": "m"},
-    **{"theta": "rad", "psi": "rad", "phi": "rad", "theta_rate": "rad/s", "psi_rate": "rad/s", "phi_rate": "rad/s"},
-    **{"constant": "N m/A", "emf": "V", "resistance": "ohm", "current_max": "A"},
-}
+    units = MappingProxyType({
+        **{"theta": "rad", "psi": "rad", "phi": "rad", "theta_rate": "rad/s", "psi_rate": "rad/s", "phi_rate": "rad/s"},
+        **{"constant": "N m/A", "emf": "V", "resistance": "ohm", "current_max": "A"},
+    })  # fmt: skip
 
 
 class Memory(NamedTuple):
@@ -77,7 +102,7 @@ class Clock(NamedTuple):
 
 
 class Tracking(NamedTuple):
-    """What a controller is given: target (a slip [1], or 0 rad), measured output, and the feed-forward input."""
+    """What a controller is given: target (a slip, an angle), measured output, and the feed-forward input."""
 
     target: Scalar
     measured: Any
@@ -88,10 +113,10 @@ class Sample(NamedTuple):
     """What is seen of a run at an instant; the input of an objective."""
 
     t: Scalar  # [s]
-    output: Any  # the truth, not the measurement: a BrakeOutput or a BalanceOutput
-    target: Scalar  # [1 or rad] what the controller is told to follow now
-    setpoint: Scalar  # [1 or rad] where the target will settle
-    feedforward: Scalar  # [N m or V]
+    output: Any  # the truth, not the measurement: what the plant shows
+    target: Scalar  # what the controller is told to follow now, in the unit of the first signal
+    setpoint: Scalar  # where the target will settle
+    feedforward: Scalar  # in the unit of the control
     command: Scalar  # what the controller asks for
     control: Scalar  # what the actuator delivers
 
@@ -117,15 +142,12 @@ class Road(Protocol):
 class Plant(Protocol):
     """dx/dt = derivative(t, x, u), y = output(x).
 
-    The class says `shows`, the type of its output, a NamedTuple: usual parts, reports and figures go by it; and
-    `control_unit`, the unit of its control.
-
-    A plant may also offer `audit(initial)`, an Objective that watches every run of it. Its value is at most 1 for a run
-    that is physically possible; a run of another value has `diverged`, although all its numbers are finite."""
+    An `audit` watches every run of the plant. Its value is at most 1 for a run that is physically possible; a run of
+    another value has `diverged`, although all its numbers are finite."""
 
     @property
     def shows(self) -> Any:
-        """The type of `output`; a class attribute."""
+        """The type of `output`, a NamedTuple whose class has `units`, by name; a class attribute."""
         ...
 
     @property
@@ -195,12 +217,17 @@ class Feedforward(Protocol):
     """The input that a controller adds its feedback to."""
 
     def input(self, plant: Any, output: Any, target: Scalar) -> Scalar:
-        """Control [N m] for a target."""
+        """Control for a target, in the plant's unit."""
         ...
 
 
 class Stop(Protocol):
     """When a run ends."""
+
+    @property
+    def success(self) -> bool:
+        """Whether a run shall reach the stop (a car that brakes), or shall not (a fall); a class attribute."""
+        ...
 
     def margin(self, output: Any) -> Scalar:
         """Positive while the run goes on; the run ends where it crosses zero."""
@@ -216,10 +243,13 @@ class Stop(Protocol):
 
 
 class Objective(Protocol):
-    """What is measured on a run, streamed: a sweep stores no trajectories.
+    """What is measured on a run, streamed: a sweep stores no trajectories. A run whose value is outside of `physical`,
+    or no number, has `diverged`."""
 
-    `physical = (low, high)`, if the class has it, is the range in which the value of any real run lies: a run with a
-    value outside, or none, has `diverged`."""
+    @property
+    def unit(self) -> str:
+        """Of the value; a class attribute. "" where it depends on parameters."""
+        ...
 
     def start(self, sample: Sample) -> Memory:
         """The accumulator before the first step."""

@@ -23,6 +23,7 @@ from jax.typing import ArrayLike
 
 from diffabs.core import kinds
 from diffabs.core.rules import Rule, array
+from diffabs.core.units import Units, in_loop, in_words, units_of
 
 Scalar = Any  # a float, a NumPy or JAX scalar, a tracer; a batch of them under vmap
 Vector = Any  # the same with one axis
@@ -52,6 +53,11 @@ class Spec:
         right = ")" if self.open_high or self.high == math.inf else "]"
         unit = "" if self.unit == "1" else f" {self.unit}"
         return f"{left}{self.low:g}, {self.high:g}{right}{unit}"
+
+    def around(self, units: Units | None) -> "Spec":
+        """The same in a loop, in whose units a relative unit is worked out."""
+        unit = in_loop(self.unit, units)
+        return self if unit == self.unit else dataclasses.replace(self, unit=unit)
 
     def within(self, value: Any) -> Any:
         """Whether every element lies in the range, also of traced numbers. Written so that NaN does not."""
@@ -146,13 +152,15 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
 
 
-def parameters(part: Any, prefix: str = "") -> Iterator[tuple[str, Spec, Any]]:
-    """Every parameter below `part` as (dotted path, spec, value), in the order of declaration."""
+def parameters(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[tuple[str, Spec, Any]]:
+    """Every parameter below `part` as (dotted path, spec, value), in the order of declaration. Units relative to a loop
+    are worked out below a part with a plant, or in the `units` given."""
+    units = units or units_of(getattr(part, "plant", None))
     for name, field, value in _children(part, prefix):
         if field is not None and "spec" in field.metadata:
-            yield name, field.metadata["spec"], value
+            yield name, field.metadata["spec"].around(units), value
         else:
-            yield from parameters(value, f"{name}.")
+            yield from parameters(value, f"{name}.", units)
 
 
 def _children(part: Any, prefix: str) -> Iterator[tuple[str, dataclasses.Field[Any] | None, Any]]:
@@ -165,13 +173,14 @@ def _children(part: Any, prefix: str) -> Iterator[tuple[str, dataclasses.Field[A
                 yield prefix + field.name, field, getattr(part, field.name)
 
 
-def problems(part: Any, prefix: str = "") -> Iterator[str]:
+def problems(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[str]:
     """One line for each field that is out of range, then what the parts themselves object to: the shapes of their
     fields (a method `problems`), and if these are right, the rules between their numbers (`rules`)."""
     found = False
+    units = units or units_of(getattr(part, "plant", None))
     for name, field, value in _children(part, prefix):
         if field is not None and "spec" in field.metadata:
-            spec: Spec = field.metadata["spec"]
+            spec: Spec = field.metadata["spec"].around(units)
             if line := _unfit(name, spec, value):
                 found = True
                 yield line
@@ -179,10 +188,10 @@ def problems(part: Any, prefix: str = "") -> Iterator[str]:
                 found = True
                 yield f"{name} = {_show(value)} is outside {spec.interval()}"
         else:
-            yield from problems(value, f"{name}.")
+            yield from problems(value, f"{name}.", units)
     if not found:
         shapes = list(part.problems()) if hasattr(part, "problems") else []
-        yield from (prefix + line for line in shapes or broken(_own(part, "rules")))
+        yield from (prefix + in_words(line, units) for line in shapes or broken(_own(part, "rules")))
 
 
 def rules(part: Any, prefix: str = "") -> Iterator[Rule]:
@@ -192,12 +201,12 @@ def rules(part: Any, prefix: str = "") -> Iterator[Rule]:
         outside = f"is outside {spec.interval()}"
         line = f"{name} = {{}} {outside}"
         yield Rule(spec.within(value), f"{name} {outside}", lambda line=line, value=value: line.format(_show(value)))
-    yield from _below(part, prefix, "rules")
+    yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "rules")
 
 
 def grid_rules(part: Any, step: float, prefix: str = "") -> Iterator[Rule]:
     """What the parts demand of an integration step [s]."""
-    yield from _below(part, prefix, "grid_rules", step)
+    yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "grid_rules", step)
 
 
 def broken(rules: Iterable[Rule]) -> Iterator[str]:
@@ -210,11 +219,11 @@ def _own(part: Any, hook: str, *args: Any) -> Iterator[Rule]:
         yield from getattr(part, hook)(*args)
 
 
-def _below(part: Any, prefix: str, hook: str, *args: Any) -> Iterator[Rule]:
+def _below(part: Any, prefix: str, units: Units | None, hook: str, *args: Any) -> Iterator[Rule]:
     for name, field, value in _children(part, prefix):
         if field is None or "spec" not in field.metadata:
-            yield from _below(value, f"{name}.", hook, *args)
-    yield from (rule.under(prefix) for rule in _own(part, hook, *args))
+            yield from _below(value, f"{name}.", units, hook, *args)
+    yield from (rule.under(prefix, units) for rule in _own(part, hook, *args))
 
 
 def misshapen(part: Any, prefix: str = "") -> Iterator[str]:

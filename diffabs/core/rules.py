@@ -10,20 +10,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.units import Units, in_words
+
 SHOWN = 8  # numbers of a list in a message
 
 
 class Rule(NamedTuple):
     """holds: bool, an expression of the part's numbers; broken: what is said of lanes that break it, without numbers;
-    says: the same of one part, with its numbers, for which they must be concrete."""
+    says: the same of one part, with its numbers, for which they must be concrete; ` {control}` in it is the unit of the
+    loop's control."""
 
     holds: Any
     broken: str
     says: Callable[[], str]
 
-    def under(self, prefix: str) -> "Rule":
-        """The same rule, of a part at this place."""
-        return Rule(self.holds, prefix + self.broken, lambda: prefix + self.says())
+    def under(self, prefix: str, units: Units | None = None) -> "Rule":
+        """The same rule, of a part at this place, in a loop with these units."""
+        return Rule(self.holds, prefix + self.broken, lambda: prefix + in_words(self.says(), units))
 
 
 def array(x: Any) -> Any:

@@ -2,12 +2,14 @@
 
     StateFeedback   K = (k1, k2)
     BalanceFeedback K as it is, on the model of a balance: see `upright`
+    any other       around a plant that is no brake: on the states of the loop at rest (`operating_point`)
     PID             K = (-ki, -(kp + kd wc), ..., kd wc), the last state being the slip error behind the filter wc
 
 since e = target - slip = -x2, and d = -x_f in Aoki and Nakamura's eq. (13). `Sampled` makes the model a discrete one;
 gains of zero leave out the integral and the filter.
 """
 
+import dataclasses
 import re
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -28,10 +30,10 @@ from diffabs.controllers import (
 )
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.loop import Loop
-from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import check
 from diffabs.design.state_feedback_balance import upright
 from diffabs.linear.balance_model import BalanceModel
+from diffabs.linear.operating_point import OperatingPoint, loop_gain, operating_point
 from diffabs.linear.slip_model import Continuous, LowPass, Sampling, SlipModel
 from diffabs.references import FixedSlip
 from diffabs.sensors import Bias, Noise
@@ -41,7 +43,7 @@ class Reduced(NamedTuple):
     """u = gain x on `model`, gain of shape (n,). `exact`: near the target, inside all limits and at a frozen speed,
     this is the loop's own linearisation. `neglected` says what it leaves out, in sentences."""
 
-    model: SlipModel | BalanceModel
+    model: SlipModel | BalanceModel | OperatingPoint
     gain: np.ndarray
     exact: bool
     neglected: tuple[str, ...]
@@ -51,11 +53,14 @@ def state_feedback(loop: Loop) -> Reduced:
     """The loop at its initial speed and its setpoint as state feedback.
 
     Raises:
-        ValueError: a controller or an actuator that is not linear, a parameter out of its range, a setpoint of 1.
+        ValueError: a controller or an actuator that is not linear, a parameter out of its range, a setpoint of 1; a
+            loop that does not come to rest.
     """
     check(loop)
-    if loop.plant.shows is BalanceOutput:
+    if isinstance(_unsampled(loop.controller), BalanceFeedback):
         return Reduced(*upright(loop))
+    if not hasattr(loop.plant, "frozen"):
+        return _at_rest(loop)
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     controller = sampled.controller if sampled else loop.controller
     integral, _, derivative, cutoff = map(float, _gains(controller))
@@ -82,9 +87,11 @@ def feedback(loop: Loop, states: Sequence[str]) -> Any:
     Raises:
         ValueError: a controller that is not linear.
     """
-    controller = loop.controller.controller if isinstance(loop.controller, Sampled) else loop.controller
+    controller = _unsampled(loop.controller)
     if isinstance(controller, BalanceFeedback):
         return jnp.asarray(controller.gain, float)
+    if not hasattr(loop.plant, "frozen"):
+        return loop_gain(loop, tuple(states))
     integral, proportional, derivative, _ = _gains(controller)
     gains = {
         "integral of slip error": integral,
@@ -92,6 +99,21 @@ def feedback(loop: Loop, states: Sequence[str]) -> Any:
         "filtered slip error": -derivative,
     }
     return jnp.stack([jnp.asarray(gains.get(name, 0.0), float) for name in states])
+
+
+def _unsampled(controller: Any) -> Any:
+    return controller.controller if isinstance(controller, Sampled) else controller
+
+
+def _at_rest(loop: Loop) -> Reduced:
+    """Any other loop, at rest on its setpoint. Noise and bias of the sensor are disturbances."""
+    disturbed = isinstance(loop.sensor, Noise | Bias)
+    model = operating_point(dataclasses.replace(loop, sensor=Direct()) if disturbed else loop)
+    neglected = ["Everything that is not linear: the proof is about the neighbourhood of rest on the setpoint, inside"
+                 " all limits; the gain is the controller's with the parameters of the scenario."]  # fmt: skip
+    if disturbed:
+        neglected.append(f"The sensor's {_words(loop.sensor)}, a disturbance.")
+    return Reduced(model, np.asarray(model.gain(), float), True, tuple(neglected))
 
 
 def _gains(controller: Any) -> tuple[Any, Any, Any, Any]:

@@ -11,7 +11,6 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import clamp, ratio
-from diffabs.core.protocols import UNITS
 from diffabs.core.pytree import replace, strong
 from diffabs.identify.data import Comparison, check_positive
 from diffabs.identify.fit import Identified
@@ -92,11 +91,11 @@ class Traces:
         shapes = (self.shape, self.shape[1:]) if self.shape[0] == 1 else (self.shape,)
         for name, column in self.columns.items():
             _check_column(name, np.asarray(column, float), t, shapes)
-        self._check_sigma()
+        self._check_sigma(loop.plant.shows.units)
         if self.until is not None and np.shape(self.until) not in ((), self.shape[:1]):
             raise ValueError(f"until has shape {np.shape(self.until)}; it must be a number [s] or ({self.shape[0]},)")
 
-    def _check_sigma(self) -> None:
+    def _check_sigma(self, units: Mapping[str, str]) -> None:
         if self.sigma is None:
             if len(self.columns) > 1:
                 raise ValueError(f"sigma: needed to weigh {', '.join(self.columns)} against each other")
@@ -106,7 +105,7 @@ class Traces:
         for name, value in self.sigma.items():
             if np.shape(value) not in ((), self.shape[1:], self.shape):
                 raise ValueError(f"sigma.{name} has shape {np.shape(value)}, not () or {self.shape}")
-            check_positive(f"sigma.{name}", value, UNITS[name])
+            check_positive(f"sigma.{name}", value, units[name])
 
 
 def _shown(loop: Loop) -> tuple[str, ...]:

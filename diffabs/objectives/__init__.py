@@ -1,7 +1,7 @@
 """Objectives: what is measured on a run, streamed. `BRAKING` and `BALANCE` are those of every report on a plant
 that shows a `BrakeOutput` or a `BalanceOutput`."""
 
-from diffabs.core.protocols import BalanceOutput, BrakeOutput, Objective, Plant
+from diffabs.core.protocols import Objective, Plant
 from diffabs.objectives.balance import BalanceCost as BalanceCost
 from diffabs.objectives.balance import Fell as Fell
 from diffabs.objectives.balance import FinalNorm as FinalNorm
@@ -19,7 +19,7 @@ from diffabs.objectives.braking import TorqueRate as TorqueRate
 from diffabs.objectives.braking import Variation as Variation
 from diffabs.objectives.tracking import IAE as IAE
 from diffabs.objectives.tracking import ITAE as ITAE
-from diffabs.objectives.tracking import FinalSlipError as FinalSlipError
+from diffabs.objectives.tracking import FinalError as FinalError
 from diffabs.objectives.tracking import MaxSlip as MaxSlip
 from diffabs.objectives.tracking import Overshoot as Overshoot
 from diffabs.objectives.tracking import QuadraticCost as QuadraticCost
@@ -32,7 +32,7 @@ BRAKING = {
     "overshoot": Overshoot(),
     "settling_time": SettlingTime(),
     "iae": IAE(),
-    "final_slip_error": FinalSlipError(),
+    "final_slip_error": FinalError(),
     "locked_time": LockedTime(),
 }
 
@@ -46,9 +46,11 @@ BALANCE = {
     "fell": Fell(),
 }
 
-REPORTS = {BrakeOutput: BRAKING, BalanceOutput: BALANCE}
+TRACKING = {"overshoot": Overshoot(), "settling_time": SettlingTime(), "iae": IAE(), "final_error": FinalError()}
 
 
 def usual(plant: Plant) -> dict[str, Objective]:
-    """Return the objectives that are measured where none are named, by name: by what the plant shows, else none."""
-    return dict(REPORTS.get(plant.shows, {}))
+    """Return the objectives, by name, of a run where none are named: what the plant says itself (`usual_objectives`),
+    else how well its first signal follows the setpoint."""
+    own = getattr(plant, "usual_objectives", None)
+    return own() if own else dict(TRACKING)

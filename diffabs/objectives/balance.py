@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample
 from diffabs.core.pytree import Scalar, Vector, param, pytree
-from diffabs.objectives.tracking import FinalSlipError, integral, nothing, unchanged
+from diffabs.objectives.tracking import FinalError, integral, nothing, unchanged
 
 RATES = ("theta_rate", "psi_rate", "phi_rate")
 ANGLES = ("theta", "psi", "phi")
@@ -30,9 +30,11 @@ class Fell:
     """1 if the run ended before its time, by a fall; else 0 [1], which does not say that it comes to rest: `attraction`
     tells when that is sure."""
 
+    unit = "1"
+    failure = 0.0  # a fall
     physical = (0.0, 1.0)
 
-    start, flow, update = FinalSlipError.start, nothing, unchanged
+    start, flow, update = FinalError.start, nothing, unchanged
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Whether the stop was reached."""
@@ -44,6 +46,7 @@ class Fell:
 class FinalNorm:
     """sqrt(x'x) at the end [1], x = (theta, psi, phi, theta', psi', phi') in rad and rad/s."""
 
+    unit = "1"
     physical = (0.0, math.inf)
 
     start, flow, update = Fell.start, nothing, unchanged
@@ -79,6 +82,7 @@ def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
 class PeakLean:
     """Greatest |theta| of the frame [rad], at the instants of the integration."""
 
+    unit = "rad"
     physical = (0.0, math.inf)
 
     start, flow, update, value = _peak(lambda sample: jnp.abs(sample.output.theta))
@@ -88,6 +92,7 @@ class PeakLean:
 class PeakArmAngle:
     """Greatest |psi| of the arm [rad], at the instants of the integration."""
 
+    unit = "rad"
     physical = (0.0, math.inf)
 
     start, flow, update, value = _peak(lambda sample: jnp.abs(sample.output.psi))
@@ -97,6 +102,7 @@ class PeakArmAngle:
 class PeakVoltage:
     """Greatest |u| that the motor gets [V]."""
 
+    unit = "V"
     physical = (0.0, math.inf)
 
     start, flow, update, value = _peak(lambda sample: jnp.abs(sample.control))
@@ -112,6 +118,7 @@ def motor_torque(sample: Sample) -> Any:
 class PeakTorque:
     """Greatest torque of the motor [N m], in absolute value and without its friction."""
 
+    unit = "N m"
     physical = (0.0, math.inf)
 
     start, flow, update, value = _peak(lambda sample: jnp.abs(motor_torque(sample)))
@@ -123,6 +130,7 @@ class SoftLoss:
     run that comes to rest, near 1 for one that runs away, and smooth between. Its mean over starts is one minus a soft
     share of the region of attraction; see `diffabs.design.attraction`."""
 
+    unit = "1"
     physical = (0.0, 1.0)
 
     weight: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
@@ -142,6 +150,7 @@ class SoftLoss:
 class RestTime:
     """Since when every angle has stayed within `band` of upright [s]; the end of the run if the last did not."""
 
+    unit = "s"
     physical = (0.0, math.inf)
 
     band: Scalar = param(default=0.01, unit="rad", above=0.0)
@@ -174,6 +183,7 @@ class RestTime:
 class BalanceCost:
     """Integral of x'diag(q) x + r u^2 dt [rad^2 s], u the voltage that the motor gets [V]."""
 
+    unit = "rad^2 s"
     physical = (0.0, math.inf)
 
     q: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)

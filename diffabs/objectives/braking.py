@@ -8,16 +8,17 @@ import jax.numpy as jnp
 from diffabs.core.numerics import ratio
 from diffabs.core.protocols import Ending, Memory, Sample
 from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.objectives.tracking import FinalSlipError, from_zero, integral, nothing, unchanged
+from diffabs.objectives.tracking import FinalError, from_zero, integral, nothing, unchanged
 
 
 @pytree
 class StopTime:
     """Time to the stop [s]. A run that did not stop gets t + v/a with its last deceleration."""
 
+    unit = "s"
     physical = (0.0, math.inf)
 
-    start, flow, update = FinalSlipError.start, nothing, unchanged
+    start, flow, update = FinalError.start, nothing, unchanged
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Time of the last sample and what is left."""
@@ -29,9 +30,10 @@ class StopTime:
 class StopDistance:
     """Distance to the stop [m]. A run that did not stop gets x + v^2/(2 a), so that rolling on is never the best."""
 
+    unit = "m"
     physical = (0.0, math.inf)
 
-    start, flow, update = FinalSlipError.start, nothing, unchanged
+    start, flow, update = FinalError.start, nothing, unchanged
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Distance of the last sample and what is left."""
@@ -43,6 +45,8 @@ class StopDistance:
 class LockedTime:
     """Time [s] during which the slip exceeds `threshold`. Crossings are interpolated linearly inside a step."""
 
+    unit = "s"
+    failure = 0.0  # a wheel that locks
     physical = (0.0, math.inf)
 
     threshold: Scalar = param(default=0.99, unit="1", above=0.0, below=1.0)
@@ -70,6 +74,7 @@ class LockedTime:
 class Effort:
     """Integral of u^2 dt [N^2 m^2 s], u the torque that the actuator delivers."""
 
+    unit = "control^2 s"
     physical = (0.0, math.inf)
 
     start, update, value = from_zero, unchanged, integral
@@ -91,6 +96,7 @@ class Varied(NamedTuple):
 class Variation:
     """Total variation of the torque, sum of |u_(k+1) - u_k| [N m]: what chattering costs."""
 
+    unit = "control"
     physical = (0.0, math.inf)
 
     flow = nothing
@@ -127,6 +133,7 @@ class TorqueRate:
     controller's own jumps the quotient says no more than jump/step.
     """
 
+    unit = "control/s"
     physical = (0.0, math.inf)
 
     flow = nothing

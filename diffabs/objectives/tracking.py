@@ -1,6 +1,7 @@
-"""How well a run follows its slip: peak, overshoot, settling, integrals of the error.
+"""How well a run follows its setpoint: peak, overshoot, settling, integrals of the error. They read the first signal
+that the plant shows, y: a brake's slip, a servo's angle.
 
-The error e = slip - setpoint is against where the reference will settle, not against a filtered target on its way
+The error e = y - setpoint is against where the reference will settle, not against a filtered target on its way
 there."""
 
 import math
@@ -14,7 +15,7 @@ from diffabs.core.numerics import clamp, larger, parabola, ratio, sign, smaller
 from diffabs.core.protocols import Ending, Memory, Sample
 from diffabs.core.pytree import Scalar, Vector, param, pytree
 
-LEAST = 0.01  # slip of which an overshoot is a fraction
+LEAST = 0.01  # of the first signal, of which an overshoot is a fraction
 
 
 def nothing(self: Any, memory: Memory, sample: Sample) -> Any:
@@ -38,12 +39,22 @@ def integral(self: Any, memory: Memory, ending: Ending) -> Scalar:
 def from_zero(self: Any, sample: Sample) -> Memory:
     """`start` of an objective that is only an integral."""
     del self
-    return Memory(flow=0.0 * sample.output.slip)
+    return Memory(flow=0.0 * sample.output[0])
 
 
 def error(sample: Sample) -> Scalar:
-    """slip - setpoint."""
-    return sample.output.slip - sample.setpoint
+    """The first signal - setpoint."""
+    return sample.output[0] - sample.setpoint
+
+
+def highest(output: Any) -> float:
+    """The greatest value that the first signal can have; infinite where the output does not say."""
+    return getattr(output, "highest", math.inf)
+
+
+def _side(sample: Sample) -> Any:
+    """-1 below a setpoint of 0, else 1."""
+    return jnp.where(sample.setpoint < 0, -1.0, 1.0)
 
 
 class Area(NamedTuple):
@@ -65,17 +76,18 @@ def _area(memory: Memory, a: Scalar, b: Scalar, left: Scalar, right: Scalar, cro
 
 @pytree
 class IAE:
-    """Integral of |e| dt [s], e = slip - setpoint.
+    """Integral of |e| dt, e = y - setpoint: for a slip [s].
 
     e is integrated with the plant; |e|, whose kink would cost the method its order and the derivative its smoothness,
     is put together step by step, with the crossings of zero interpolated linearly.
     """
 
+    unit = "signal s"
     physical = (0.0, math.inf)
 
     def start(self, sample: Sample) -> Memory:
         """Zero."""
-        zero = 0.0 * sample.output.slip
+        zero = 0.0 * sample.output[0]
         return Memory(zero, Area(zero, zero))
 
     def flow(self, memory: Memory, sample: Sample) -> Scalar:
@@ -97,8 +109,9 @@ class IAE:
 
 @pytree
 class ITAE:
-    """Integral of t |e| dt [s^2], by the method of IAE."""
+    """Integral of t |e| dt, by the method of IAE: for a slip [s^2]."""
 
+    unit = "signal s^2"
     physical = (0.0, math.inf)
 
     start, value = IAE.start, IAE.value
@@ -126,26 +139,36 @@ class Peak(NamedTuple):
     earlier: Scalar
 
 
+def _first(value: Scalar) -> Memory:
+    """The greatest of one value."""
+    return Memory(held=Peak(value, value, value))
+
+
+def _peaked(held: Peak, value: Scalar, most: Scalar) -> Peak:
+    """Look for a vertex, at most `most`, at the last sample but one."""
+    greatest, last, earlier = held
+    turned = (last > earlier) & (last > value)
+    vertex = jnp.where(turned, smaller(parabola(earlier, last, value)[1], most), value)
+    return Peak(larger(greatest, larger(vertex, value)), value, last)
+
+
 @pytree
 class MaxSlip:
     """Greatest slip of the run [1]: the vertex of the parabola through the three samples around it, at most 1."""
 
+    unit = "1"
     physical = (-1.0, 1.0)
 
     flow = nothing
 
     def start(self, sample: Sample) -> Memory:
         """The first slip."""
-        return Memory(held=Peak(*(sample.output.slip,) * 3))
+        return _first(sample.output.slip)
 
     def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Peak:
         """Look for a vertex at the last sample but one."""
         del before, h
-        greatest, last, earlier = memory.held
-        slip = sample.output.slip
-        turned = (last > earlier) & (last > slip)
-        vertex = jnp.where(turned, smaller(parabola(earlier, last, slip)[1], 1.0), slip)
-        return Peak(larger(greatest, larger(vertex, slip)), slip, last)
+        return _peaked(memory.held, sample.output.slip, 1.0)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Greatest slip."""
@@ -155,18 +178,26 @@ class MaxSlip:
 
 @pytree
 class Overshoot:
-    """max(0, max slip/setpoint - 1), a fraction of the final setpoint [1], or of a slip of 0.01 where that is more: an
-    estimator may end at 0. Zero derivative where there is none."""
+    """max(0, max y/setpoint - 1), a fraction of the final setpoint [1], or of 0.01 where that is more: an estimator may
+    end at a slip of 0. Below a negative setpoint it is the same of -y. Zero derivative where there is none."""
 
+    unit = "1"
     physical = (0.0, math.inf)
 
     flow = nothing
-    start = MaxSlip.start
-    update = MaxSlip.update
+
+    def start(self, sample: Sample) -> Memory:
+        """The first value."""
+        return _first(_side(sample) * sample.output[0])
+
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Peak:
+        """Look for a vertex at the last sample but one."""
+        del before, h
+        return _peaked(memory.held, _side(sample) * sample.output[0], highest(sample.output))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Overshoot."""
-        setpoint = ending.sample.setpoint
+        setpoint = _side(ending.sample) * ending.sample.setpoint
         usual = setpoint >= LEAST
         fraction = memory.held.greatest / jnp.where(usual, setpoint, LEAST) - 1
         excess = jnp.where(usual, fraction, (memory.held.greatest - setpoint) / LEAST)
@@ -175,14 +206,15 @@ class Overshoot:
 
 @pytree
 class SettlingTime:
-    """Time [s] after which |slip - setpoint| stays within `band`; the end of the run if it never does.
+    """Time [s] after which |y - setpoint| stays within `band`; the end of the run if it never does.
 
     The entry is interpolated linearly between samples.
     """
 
+    unit = "s"
     physical = (0.0, math.inf)
 
-    band: Scalar = param(default=0.01, unit="1", above=0.0)
+    band: Scalar = param(default=0.01, unit="signal", above=0.0)
 
     flow = nothing
 
@@ -203,9 +235,10 @@ class SettlingTime:
 
 
 @pytree
-class FinalSlipError:
-    """|slip - setpoint| at the end [1]."""
+class FinalError:
+    """|y - setpoint| at the end."""
 
+    unit = "signal"
     physical = (0.0, math.inf)
 
     flow, update = nothing, unchanged
@@ -233,9 +266,10 @@ class QuadraticCost:
     """Integral of q1 x1^2 + q2 x2^2 + r (u - ff)^2 dt, x1 = integral of e, x2 = e: eq. (24) of Maeda and Sugiura with
     eps = 0.
 
-    u is the torque that the actuator delivers.
+    u is what the actuator delivers.
     """
 
+    unit = ""
     physical = (0.0, math.inf)
 
     q: Vector = param(default=(1.0, 1.0), unit="1", low=0.0)
@@ -245,7 +279,7 @@ class QuadraticCost:
 
     def start(self, sample: Sample) -> Memory:
         """Zero."""
-        return Memory(flow=Quadratic(*(0.0 * sample.output.slip,) * 2))
+        return Memory(flow=Quadratic(*(0.0 * sample.output[0],) * 2))
 
     def flow(self, memory: Memory, sample: Sample) -> Quadratic:
         """e, and the integrand."""

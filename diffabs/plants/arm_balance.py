@@ -27,10 +27,15 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.actuators import VoltageLimit
+from diffabs.controllers import BalanceFeedback
 from diffabs.core.numerics import clamp, quotient
 from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.objectives import BALANCE
 from diffabs.plants.audit import BalanceAudit
+from diffabs.references import Upright
+from diffabs.stops import Fallen
 
 
 class ArmState(NamedTuple):
@@ -69,6 +74,19 @@ class BalanceStart:
     phi_rate: Scalar = param(default=0.0, unit="rad/s")
 
 
+def usual_parts(self: Any) -> dict[str, Any]:
+    """Return what surrounds a two-wheeler where nothing is said: feedback that holds it upright until it falls."""
+    del self
+    around = {"reference": Upright(), "controller": BalanceFeedback(), "actuator": VoltageLimit(), "stop": Fallen()}
+    return {"initial": BalanceStart(), **around}
+
+
+def usual_objectives(self: Any) -> dict[str, Any]:
+    """Return what every run of a two-wheeler is measured by."""
+    del self
+    return dict(BALANCE)
+
+
 @pytree
 class ArmBalance:
     """Frame, arm and rider under the voltage of the arm's motor. A negative `arm_length` is an arm that hangs."""
@@ -96,6 +114,8 @@ class ArmBalance:
 
     shows = BalanceOutput
     control_unit = "V"
+
+    usual_parts, usual_objectives = usual_parts, usual_objectives
 
     def lumps(self) -> Lumps:
         """Masses and lengths as they enter the equations."""

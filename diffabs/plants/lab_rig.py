@@ -22,7 +22,7 @@ from diffabs.core.numerics import clamp, larger, quotient, smaller
 from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.plants.audit import BrakeAudit
-from diffabs.plants.wheel import BrakeStart, forward, halted, slip_ratio
+from diffabs.plants.wheel import FROZEN, BrakeStart, forward, halted, probes, slip_ratio, usual_objectives, usual_parts
 from diffabs.roads import RIG
 
 
@@ -60,6 +60,9 @@ class LabRig:
 
     shows = BrakeOutput
     control_unit = "1"  # a command, where other plants take a torque in N m
+    frozen = FROZEN
+
+    usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
     def start(self, initial: BrakeStart) -> LabRigState:
         """State for a speed and a slip, brake released."""

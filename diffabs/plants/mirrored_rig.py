@@ -15,7 +15,17 @@ from diffabs.core.numerics import quotient
 from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.plants.audit import BrakeAudit
-from diffabs.plants.wheel import GRAVITY, BrakeStart, forward, halted, slip_ratio
+from diffabs.plants.wheel import (
+    FROZEN,
+    GRAVITY,
+    BrakeStart,
+    forward,
+    halted,
+    probes,
+    slip_ratio,
+    usual_objectives,
+    usual_parts,
+)
 from diffabs.roads import RIG
 
 
@@ -41,6 +51,9 @@ class MirroredRig:
 
     shows = BrakeOutput
     control_unit = "N m"
+    frozen = FROZEN
+
+    usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
     def start(self, initial: BrakeStart) -> RigState:
         """State for a speed and a slip."""

@@ -12,7 +12,7 @@ from no potential, and no machine has them. In these equations the arm falls to 
 from diffabs.core.numerics import quotient
 from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import Scalar, part, pytree
-from diffabs.plants.arm_balance import ArmBalance, ArmState, BalanceStart
+from diffabs.plants.arm_balance import ArmBalance, ArmState, BalanceStart, usual_objectives, usual_parts
 
 
 @pytree
@@ -23,6 +23,8 @@ class PrintedArm:
 
     shows = BalanceOutput
     control_unit = "V"
+
+    usual_parts, usual_objectives = usual_parts, usual_objectives
 
     def start(self, initial: BalanceStart) -> ArmState:
         """The state with these angles and rates."""

@@ -2,11 +2,21 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
+from diffabs.controllers import PID
 from diffabs.core.numerics import larger, quotient
 from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.objectives import BRAKING
+from diffabs.references import FixedSlip
+from diffabs.stops import Standstill
 
+SPEEDS = 6  # between start and stop, in geometric progression: the ends decide
+OFFSETS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)  # slip below and above the setpoint
+SLIPS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # where a run may pass
+
+FROZEN = ("speed", "distance")  # outputs that a linear model of the slip holds
 GRAVITY = 9.81  # m/s^2, the value behind every number of the papers
 
 
@@ -35,3 +45,26 @@ def halted(speed: Scalar, rate: Scalar) -> Any:
 def forward(speed: Scalar) -> Any:
     """The speed, or 0 where a step went past standstill."""
     return jnp.where(jnp.greater(speed, 0), speed, 0.0)
+
+
+def usual_parts(self: Any) -> dict[str, Any]:
+    """Return what surrounds a brake where nothing is said: a PID that holds a fixed slip until standstill."""
+    del self
+    return {"initial": BrakeStart(), "reference": FixedSlip(), "controller": PID(), "stop": Standstill()}
+
+
+def usual_objectives(self: Any) -> dict[str, Any]:
+    """Return what every run of a brake is measured by."""
+    del self
+    return dict(BRAKING)
+
+
+def probes(self: Any, initial: BrakeStart, setpoint: Scalar, stop: Any) -> BrakeStart:
+    """Return where the loop may be stiffest, (k,) starts: at speeds down to the stop, at slips close to the setpoint,
+    where the controller is not at a limit, and all over the friction curve, which is steepest near 0."""
+    del self
+    near = jnp.concatenate([setpoint - jnp.array(OFFSETS), setpoint + jnp.array(OFFSETS)])
+    slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(SLIPS)])
+    speeds = jnp.geomspace(initial.speed, stop.speed, SPEEDS)
+    speed, slip = jnp.meshgrid(speeds, slips, indexing="ij")
+    return jax.tree.map(jnp.ravel, BrakeStart(speed=speed, slip=slip))

@@ -13,11 +13,13 @@ from diffabs.plot.runs import controlled as controlled
 from diffabs.plot.runs import convergence as convergence
 from diffabs.plot.runs import friction as friction
 from diffabs.plot.runs import label as label
+from diffabs.plot.runs import named as named
 from diffabs.plot.runs import of as of
 from diffabs.plot.runs import positions as positions
 from diffabs.plot.runs import region as region
 from diffabs.plot.runs import save as save
 from diffabs.plot.runs import sheet as sheet
+from diffabs.plot.runs import signals as signals
 from diffabs.plot.runs import slip_lines as slip_lines
 from diffabs.plot.runs import slips as slips
 from diffabs.plot.runs import speeds as speeds

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from diffabs.core import files
-from diffabs.core.protocols import BalanceOutput, BrakeOutput, Plant, Road
+from diffabs.core.protocols import Plant, Road
 from diffabs.objectives.balance import motor_torque
 from diffabs.simulate.solution import Run, Trajectory
 
@@ -118,9 +118,52 @@ def balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
     return figure
 
 
+def signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
+    """A run of whatever plant at a glance: its signals, a panel for each unit, the first with target and setpoint; and
+    control in its `unit`. Raises ValueError for a run without a trajectory, as `measure` returns it."""
+    seen = _trajectory(run)
+    t, sample = np.asarray(seen.sample.t), seen.sample
+    groups: dict[str, list[str]] = {}
+    for name, of_signal in sample.output.units.items():
+        groups.setdefault(of_signal, []).append(name)
+    figure, axes = sheet(-(-(len(groups) + 1) // 2), 2, title=title, size=(5.6, 3.0), sharex=True)
+    for ax, (of_signal, names) in zip(axes, groups.items(), strict=False):
+        for i, name in enumerate(names):
+            ax.plot(t, getattr(sample.output, name), DASHES[i % 7], color=COLOURS[i % 7], label=_words(name))
+        if ax is axes[0]:
+            ax.plot(t, sample.target, "--", color=GREY, label="target")
+            ax.plot(t, sample.setpoint, ":", color="black", label="setpoint")
+        alone = len(names) == 1
+        words = f"{_words(names[0])} " if alone else ""
+        label(ax, "time [s]", f"{words}[{of_signal}]", legend=ax is axes[0] or not alone)
+    control = axes[len(groups)]
+    control.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
+    control.plot(t, sample.control, color=COLOURS[0], label="control")
+    label(control, "time [s]", controlled(unit))
+    for ax in axes[len(groups) + 1 :]:
+        ax.set_visible(False)
+    return figure
+
+
+def named(output: Any) -> str:
+    """Return what an axis says of the first signal of an output."""
+    name, unit = next(iter(output.units.items()))
+    return f"{_words(name)} [{unit}]"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+FIGURES = {  # of runs, by the signals that they draw
+    frozenset(("slip", "speed", "wheel_speed", "deceleration")): braking,
+    frozenset(("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate", "constant", "emf")): balance,
+}
+
+
 def of(plant: Plant) -> Callable[..., Figure]:
-    """Return the figure of one run that suits a plant, by what it shows."""
-    return {BrakeOutput: braking, BalanceOutput: balance}[plant.shows]
+    """Return the figure of one run that suits a plant: the one that draws just such signals, else that of any."""
+    return next((figure for drawn, figure in FIGURES.items() if drawn <= {*plant.shows.units}), signals)
 
 
 def angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:

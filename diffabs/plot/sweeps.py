@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffabs.plot.runs import COLOURS, GREY, KMH, Axes, Figure, label, save, sheet
-from diffabs.sweep.engines import failing, missed
+from diffabs.sweep.engines import missed, missing
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics.estimates import Count, Tail
 
@@ -137,7 +137,7 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """The share of failed runs in cells of the two variables that move it most, or that move the metric of `worst` most
     if too few failed, or did not; cells without a run are grey. None where no variable varies."""
     view = _View(found, units)
-    late = missed(found.column("stopped"), found.study["objectives"])
+    late = missed(found.column("stopped"), success := found.study.get("success", True))
     rules = [~view.good, late, *(found.column(name) > view.bounds[name] for name in view.bounds)]
     failed = np.any(rules, axis=0)[every := view.accepted]
     rows, result = every, failed
@@ -157,7 +157,7 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     ax.yaxis.set_visible(len(ones) > 1)
     _name_axes(ax, ones)
     bounds = "".join(f", {name} > {bound:g}" for name, bound in view.bounds.items())
-    ax.set_title(f"failed: diverged, not stopped{bounds}", fontsize=9.5)
+    ax.set_title(f"failed: diverged, {missing(success)}{bounds}", fontsize=9.5)
     return figure
 
 
@@ -173,7 +173,7 @@ class _View:
     """What the figures ask of a sweep."""
 
     def __init__(self, found: Results, units: Mapping[str, str] = {}):
-        self.found, self.units, self.bounds = found, units, failing(found.study)
+        self.found, self.units, self.bounds = found, units, found.study["failures"]
         self.design, self.good = found.study["space"]["design"]["type"], ~found.column("diverged")
         self.accepted = found.accepted
         self.good &= self.accepted

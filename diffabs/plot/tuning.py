@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.plot.runs import COLOURS, DASHES, GREY, Axes, Figure, controlled, label, sheet
+from diffabs.plot.runs import COLOURS, DASHES, GREY, Axes, Figure, controlled, label, named, sheet
 from diffabs.simulate.solution import Trajectory
 
 MARKS = "osD^v"
@@ -116,14 +116,14 @@ def _gradient(ax: Axes, points: Sequence[Any]) -> None:
 
 
 def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str = "", unit: str = "N m") -> None:
-    """Slip with its setpoint, and torque."""
+    """The first signal, a brake's slip, with its setpoint, and the control."""
     for i, (name, seen) in enumerate(runs.items()):
         t = np.asarray(seen.sample.t)
-        slip.plot(t, seen.sample.output.slip, DASHES[i], color=COLOURS[i], label=name)
+        slip.plot(t, seen.sample.output[0], DASHES[i], color=COLOURS[i], label=name)
         torque.plot(t, seen.sample.control, DASHES[i], color=COLOURS[i], label=name, linewidth=1.2)
     first = next(iter(runs.values())).sample
     slip.plot(np.asarray(first.t), first.setpoint, color=GREY, linewidth=0.9, linestyle=":", label="setpoint")
-    label(slip, "time [s]", "slip [1]", title)
+    label(slip, "time [s]", named(first.output), title)
     label(torque, "time [s]", controlled(unit), legend=False)
     for ax in (slip, torque):
         ax.set_xlim(0, _until(runs))
@@ -134,7 +134,7 @@ def _until(runs: Mapping[str, Trajectory]) -> float:
     """Long enough to see every run arrive within 2 % of its end, or the whole where one does not."""
     ends = []
     for seen in runs.values():
-        t, slip = np.asarray(seen.sample.t), np.asarray(seen.sample.output.slip)
+        t, slip = np.asarray(seen.sample.t), np.asarray(seen.sample.output[0])
         away = np.flatnonzero(np.abs(slip - np.asarray(seen.sample.setpoint)) > 0.02 * np.max(np.abs(slip)))
         ends.append(float(t[away[-1]]) if len(away) else 0.0)
     whole = max(float(np.asarray(seen.sample.t)[-1]) for seen in runs.values())

@@ -5,4 +5,5 @@ from diffabs.references.peak_slip import PeakLiteral as PeakLiteral
 from diffabs.references.peak_slip import PeakRobust as PeakRobust
 from diffabs.references.setpoint import FilteredSlip as FilteredSlip
 from diffabs.references.setpoint import FixedSlip as FixedSlip
+from diffabs.references.setpoint import Setpoint as Setpoint
 from diffabs.references.upright import Upright as Upright

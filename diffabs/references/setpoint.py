@@ -1,7 +1,30 @@
-"""Slip references that know their target: fixed, and first-order filtered."""
+"""References that know their target: a number of whatever the plant shows first; a slip, fixed or filtered."""
+
+from typing import Any
 
 from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_jump, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
+
+
+@pytree
+class Setpoint:
+    """target = value, of the first signal that the plant shows."""
+
+    value: Scalar = param(default=1.0, unit="signal")
+
+    start = no_memory
+    flow = no_flow
+    jump = no_jump
+
+    def output(self, t: Scalar, memory: Memory, signal: Any) -> Scalar:
+        """The value."""
+        del t, memory, signal
+        return self.value
+
+    def setpoint(self, memory: Memory) -> Scalar:
+        """The same."""
+        del memory
+        return self.value
 
 
 @pytree

@@ -4,18 +4,16 @@ import csv
 import difflib
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from diffabs.core import files
-from diffabs.core.protocols import UNITS as UNITS
 from diffabs.scenario.registry import ScenarioError, shown
 
 LARGEST = 100_000_000  # bytes
 TIME = "t [s]"
-HEADERS = {f"{name} [{unit}]": name for name, unit in UNITS.items()}
 IGNORED = ("target [", "command [", "control [")  # what is simulated but not measured
 
 
@@ -26,8 +24,9 @@ class Readings(NamedTuple):
     columns: dict[str, np.ndarray]
 
 
-def read(path: pathlib.Path) -> Readings:
-    """The readings in a file. Raises ScenarioError, one line, with the line of the file, for whatever is wrong."""
+def read(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
+    """The readings in a file, of signals with these units by name. Raises ScenarioError, one line, with the line of the
+    file, for whatever is wrong."""
     try:
         raw = files.content(path, LARGEST + 1)
     except OSError as error:
@@ -39,7 +38,7 @@ def read(path: pathlib.Path) -> Readings:
     except (UnicodeDecodeError, csv.Error):
         raise ScenarioError(f"--data {path}: is not a CSV file of UTF-8 text") from None
     header = [cell.strip() for cell in rows[0]] if rows else []
-    names = _names(header, path)
+    names = _names(header, path, units)
     numbers = np.array([_numbers(row, i, header, path) for i, row in enumerate(rows[1:], 2) if row], float)
     if not len(numbers):
         raise ScenarioError(f"--data {path}: has a header and no numbers")
@@ -53,22 +52,23 @@ def read(path: pathlib.Path) -> Readings:
     return Readings(t, {name: numbers[:, i] for i, name in names.items()})
 
 
-def _names(header: Sequence[str], path: pathlib.Path) -> dict[int, str]:
+def _names(header: Sequence[str], path: pathlib.Path, units: Mapping[str, str]) -> dict[int, str]:
     """The columns that are compared, by their numbers."""
-    there = ", ".join((TIME, *HEADERS))
+    headers = {f"{name} [{unit}]": name for name, unit in units.items()}
+    there = ", ".join((TIME, *headers))
     if TIME not in header:
         what = f"line 1 is no header with {TIME}" if header else "is empty"
         raise ScenarioError(f"--data {path}: {what}; there is {there}")
     for name in header:
         if header.count(name) > 1:
             raise ScenarioError(f"--data {path}: column {shown(name)} is there twice")
-        if name != TIME and name not in HEADERS and not name.startswith(IGNORED):
-            near = difflib.get_close_matches(name, HEADERS, 1, 0.5)
+        if name != TIME and name not in headers and not name.startswith(IGNORED):
+            near = difflib.get_close_matches(name, headers, 1, 0.5)
             hint = f"did you mean {near[0]}? There is" if near else "there is"
             raise ScenarioError(f"--data {path}: column {shown(name)} is unknown; {hint} {there}")
-    names = {i: HEADERS[name] for i, name in enumerate(header) if name in HEADERS}
+    names = {i: headers[name] for i, name in enumerate(header) if name in headers}
     if not names:
-        raise ScenarioError(f"--data {path}: no column was measured; there is {', '.join(HEADERS)}")
+        raise ScenarioError(f"--data {path}: no column was measured; there is {', '.join(headers)}")
     return names
 
 

@@ -2,7 +2,8 @@
 
 A part is found by its shape among the names that its family's package exports: whoever has the methods of the family's
 contract is listed, under the kebab-case of its name (`QuarterCar` is `quarter-car`, `SNOW` is `snow`). Writing a part
-and exporting it is thus all that it takes to use it in a scenario."""
+and exporting it is thus all that it takes to use it in a scenario. Parts from outside are in modules of their own, all
+families in one: such a part is of the family whose contract asks most of it, or of its `family`, if it says one."""
 
 import dataclasses
 import difflib
@@ -21,11 +22,14 @@ from diffabs import actuators, controllers, objectives, plants, references, road
 from diffabs.core import blocks, protocols
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import Spec
-from diffabs.scenario.defaults import around, braking
+from diffabs.core.units import Units, in_loop, units_of
+from diffabs.scenario import outside
+from diffabs.scenario.defaults import braking
 
 KMH = 3.6  # km/h in a m/s
 DEEPEST = 16  # parts inside parts; more is a mistake, and Python's stack is finite
 LARGEST = 10_000_000  # of a whole number that shapes arrays
+USUAL = units_of(braking().plant)  # in which parts are listed that are in no loop
 
 
 class ScenarioError(ValueError):
@@ -56,9 +60,67 @@ FAMILIES: dict[str, tuple[tuple[ModuleType, ...], frozenset[str]]] = {
 }
 
 
-@cache
 def types(family: str) -> Mapping[str, Any]:
-    """The parts of a family by name, with their defaults: one of each class, and the named constants."""
+    """The parts of a family by name, with their defaults: one of each class, and the named constants; also those from
+    outside. Raises ScenarioError for a module of those that does not import, or that takes a name twice."""
+    try:
+        modules = outside.modules()
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
+    return {**_packaged(family), **_added(family, modules)}
+
+
+def know(names: Iterable[str]) -> None:
+    """Find the parts of these modules, too, from now on. Raises ScenarioError for a module that does not import, has no
+    parts, or takes a name twice."""
+    try:
+        outside.know(names)
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
+    there = {id(item) for family in FAMILIES for item in types(family).values()}
+    for module in outside.modules():
+        if module.__name__ in names and not there & {id(part) for part in _parts_of(module).values()}:
+            raise ScenarioError(f"--parts {module.__name__}: there is no part in this module")
+
+
+@cache
+def _added(family: str, modules: tuple[ModuleType, ...]) -> Mapping[str, Any]:
+    """Parts from outside by name. Raises ScenarioError."""
+    found: dict[str, Any] = {}
+    for module in modules:
+        for exported, part in _parts_of(module).items():
+            name = kebab(exported)
+            if family not in _families_of(type(part)):
+                continue
+            if name in _packaged(family) or name in found:
+                whose = "diffabs" if name in _packaged(family) else "another module"
+                raise ScenarioError(f"parts of {module.__name__}: there is a {family} {name} already, of {whose}")
+            found[name] = part
+    return found
+
+
+@cache
+def _parts_of(module: ModuleType) -> Mapping[str, Any]:
+    """An instance of every part that a module exports. Raises ScenarioError for a field without default."""
+    try:
+        return {name: item() if isinstance(item, type) else item for name, item in outside.exports(module)}
+    except TypeError as error:
+        raise ScenarioError(f"parts of {module.__name__}: {error}: every field needs a default") from None
+
+
+def _families_of(cls: type) -> set[str]:
+    """Of those whose methods it has, the family that asks for most; blocks alone are alike in three."""
+    if said := getattr(cls, "family", None):
+        return {said}
+    fits = {name: len(contract) for name, (_, contract) in FAMILIES.items() if contract and contract <= _methods(cls)}
+    if not fits:
+        return set() if _methods(cls) else {"initial"}
+    return {name for name, size in fits.items() if size == max(fits.values())}
+
+
+@cache
+def _packaged(family: str) -> Mapping[str, Any]:
+    """The parts of diffabs itself."""
     modules, contract = FAMILIES[family]
     found = {}
     for exported, item in ((n, x) for module in modules for n, x in vars(module).items()):
@@ -70,7 +132,7 @@ def types(family: str) -> Mapping[str, Any]:
 
 def kebab(name: str) -> str:
     """`QuarterCar`, `PID`, `RIG_UNROUNDED` -> `quarter-car`, `pid`, `rig-unrounded`."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").lower()
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z]{2})(?=[A-Z][a-z])", "-", name).replace("_", "-").lower()
 
 
 def name_of(family: str, part: Any) -> str:
@@ -90,15 +152,8 @@ def summary(part: Any) -> str:
 
 
 def unit_of(objective: Any, plant: Any = None) -> str:
-    """The unit of what an objective measures: the first bracket of its docstring, as in `[N m]`; else empty. With a
-    brake whose control is no torque, that of its control in the place of N m."""
-    bracket = re.search(r"\[(.+?)\]", inspect.getdoc(type(objective)) or "")
-    unit = bracket.group(1) if bracket else ""
-    control = "N m" if plant is None or plant.shows is not protocols.BrakeOutput else plant.control_unit
-    if control == "N m":
-        return unit
-    unit = unit.replace("N^2 m^2", "1" if control == "1" else f"{control}^2").replace("N m", control)
-    return re.sub(r"\b1 (?=\S)", "", unit)
+    """The unit of what an objective measures on a plant, without one on the usual; empty where it does not say."""
+    return in_loop(getattr(objective, "unit", ""), units_of(plant) or USUAL)
 
 
 def shown(value: Any, most: int = 60) -> str:
@@ -146,10 +201,11 @@ def whole(value: Any, low: int, high: int, path: str) -> int:
     return value
 
 
-def build(family: str, given: Any, default: Any, path: str) -> Any:
+def build(family: str, given: Any, default: Any, path: str, units: Units | None = None) -> Any:
     """The part that a table, or the bare name of a type, describes.
 
     A table without `type` describes `default` with some fields changed; default None means that a type is needed.
+    `units` are those of the loop, for messages.
     Raises ScenarioError; ranges are left to `diffabs.check`.
     """
     there = types(family)
@@ -164,10 +220,10 @@ def build(family: str, given: Any, default: Any, path: str) -> Any:
     if name is not None and name not in there:
         raise unknown(f"{path}.type = {shown(name)} is unknown", name, there)
     template = default if name is None else there[name]
-    return filled(template, {k: v for k, v in table.items() if k != "type"}, family, path)
+    return filled(template, {k: v for k, v in table.items() if k != "type"}, family, path, units)
 
 
-def filled(template: Any, table: dict[str, Any], family: str, path: str) -> Any:
+def filled(template: Any, table: dict[str, Any], family: str, path: str, units: Units | None = None) -> Any:
     """A copy of a part with the fields of a table. Raises ScenarioError for an unknown field or a wrong type."""
     if path.count(".") > DEEPEST:
         raise ScenarioError(f"{shown(path)}: parts are nested more than {DEEPEST} deep")
@@ -185,18 +241,23 @@ def filled(template: Any, table: dict[str, Any], family: str, path: str) -> Any:
         if key in edge:
             values[field.name] = _metres_per_second(given, field.metadata["spec"], where)
         else:
-            values[field.name] = _value(given, field, getattr(template, key), family, where)
+            values[field.name] = _value(given, field, getattr(template, key), (family, where), units)
     return dataclasses.replace(template, **values) if values else template
 
 
 def loop_of(sections: dict[str, Any]) -> Loop:
-    """The loop of the sections of a scenario; what is left out is usual for what the plant shows. Raises
-    ScenarioError."""
-    usual = braking()
-    if "plant" in sections:
-        plant = filled(usual, {"plant": sections["plant"]}, "", "").plant
-        usual = around(plant)
-    return filled(usual, sections, "", "")
+    """The loop of the sections of a scenario; what is left out is as the plant says that it usually is, or is missing.
+    Raises ScenarioError."""
+    plant = filled(braking(), {"plant": sections["plant"]}, "", "").plant if "plant" in sections else braking().plant
+    own, units = getattr(plant, "usual_parts", dict), units_of(plant)
+    parts = {"plant": plant, **own()}
+    needed = [f.name for f in dataclasses.fields(Loop) if dataclasses.MISSING is f.default is f.default_factory]
+    for family in (name for name in needed if name not in parts):
+        if family not in sections:
+            there = f"there is {', '.join(types(family))}"
+            raise ScenarioError(f"{family} is missing: plant {name_of('plant', plant)} has no usual one; {there}")
+        parts[family] = build(family, sections[family], None, family, units)
+    return filled(Loop(**parts), sections, "", "", units)
 
 
 # What a scenario has besides the fields of a loop.
@@ -211,19 +272,20 @@ def joined(path: str, key: str) -> str:
     return f"{path}.{key}" if path else key
 
 
-def _value(given: Any, field: dataclasses.Field[Any], default: Any, family: str, path: str) -> Any:
+def _value(given: Any, field: dataclasses.Field[Any], default: Any, place: tuple[str, str], units: Units | None) -> Any:
+    family, path = place
     if "part" in field.metadata:
         inner = family_of(field.name, family)
         if isinstance(default, tuple):
-            return _parts(inner, given, default, path)
-        return build(inner, given, default, path)
+            return _parts(inner, given, default, path, units)
+        return build(inner, given, default, path, units)
     if "static" in field.metadata:
         if isinstance(default, int) and not isinstance(default, bool):
             return whole(given, 1, LARGEST, path)
         if type(given) is not type(default):
             raise wrong(path, given, f"a value like {shown(default)}")
         return given
-    spec: Spec = field.metadata["spec"]
+    spec: Spec = field.metadata["spec"].around(units)
     if np.ndim(default) == 0:
         return number(given, spec, path)
     if not isinstance(given, list):
@@ -231,17 +293,17 @@ def _value(given: Any, field: dataclasses.Field[Any], default: Any, family: str,
     return np.array([number(item, spec, f"{path}.{i}") for i, item in enumerate(given)], float)
 
 
-def _parts(family: str, given: Any, default: tuple[Any, ...], path: str) -> tuple[Any, ...]:
+def _parts(family: str, given: Any, default: tuple[Any, ...], path: str, units: Units | None) -> tuple[Any, ...]:
     """A list of parts; or a table by number, which changes some of the default ones."""
     if isinstance(given, list) and given:
-        return tuple(build(family, item, None, f"{path}.{i}") for i, item in enumerate(given))
+        return tuple(build(family, item, None, f"{path}.{i}", units) for i, item in enumerate(given))
     if not isinstance(given, dict):
         raise wrong(path, given, "a list of parts")
     parts = list(default)
     for key, item in given.items():
         if key not in map(str, range(len(parts))):
             raise unknown(f"{joined(path, key)} is not there", key, map(str, range(len(parts))))
-        parts[int(key)] = build(family, item, parts[int(key)], f"{path}.{key}")
+        parts[int(key)] = build(family, item, parts[int(key)], f"{path}.{key}", units)
     return tuple(parts)
 
 
@@ -259,6 +321,7 @@ def described(family: str, part: Any) -> dict[str, dict[str, Any]]:
     rows = {}
     for field in dataclasses.fields(part):
         value, spec = getattr(part, field.name), field.metadata.get("spec")
+        spec = spec and spec.around(USUAL)
         if "part" in field.metadata:
             inner = family_of(field.name, family)
             names = [name_of(inner, item) for item in value] if isinstance(value, tuple) else name_of(inner, value)

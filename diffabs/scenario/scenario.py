@@ -7,7 +7,7 @@
     [tune]         which parameters are free, what is made small, and over which runs: see `goal`
     [sweep]        what varies in a Monte-Carlo sweep, and what counts as a failure: see `variation`
 
-What is left out has its default, by what the plant shows, a brake or a balance. Speeds may be given in km/h:
+What is left out has its default, if the plant says one; else it is asked for. Speeds may be given in km/h:
 `speed_kmh`. A value is never evaluated as code."""
 
 import dataclasses
@@ -23,6 +23,7 @@ from diffabs.core import files
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import Spec, cautions, problems
+from diffabs.core.units import units_of
 from diffabs.objectives import BRAKING, usual
 from diffabs.scenario import parameter_paths, section_design, section_sweep, section_tune, toml
 from diffabs.scenario.compatibility import misfits
@@ -241,7 +242,8 @@ def _assembled(name: str, table: dict[str, Any]) -> Scenario:
     loop = loop_of(sections)
     report = usual(loop.plant)
     measured = {
-        key: build("objective", value, report.get(key), joined("objective", key)) for key, value in given.items()
+        key: build("objective", value, report.get(key), joined("objective", key), units_of(loop.plant))
+        for key, value in given.items()
     }
     objectives = {**report, **measured}
     _refuse(_wrong_values(loop, objectives), misfits(loop, objectives))  # before what is said of their parameters
@@ -283,7 +285,7 @@ def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[s
     """What the parts object to."""
     yield from problems(loop)
     for name, objective in objectives.items():
-        yield from problems(objective, f"{joined('objective', name)}.")
+        yield from problems(objective, f"{joined('objective', name)}.", units_of(loop.plant))
 
 
 def dump(scenario: Scenario) -> str:

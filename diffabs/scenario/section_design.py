@@ -19,7 +19,6 @@ from diffabs.actuators import Lag, RateLimit
 from diffabs.controllers import Sampled
 from diffabs.core.blocks import Series
 from diffabs.core.loop import Loop
-from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import Spec, parameters
 from diffabs.linear.slip_model import SlipModel
 from diffabs.scenario.parameter_paths import Entry, entries
@@ -141,7 +140,7 @@ def _range(entry: Entry, shape: tuple[int, ...]) -> Range:
 
 def _known(loop: Loop) -> dict[str, _Parameter]:
     """What can have a range, by path of the loop. The model's names for the rest of the loop are `reduction`'s."""
-    if loop.plant.shows is BalanceOutput:
+    if not hasattr(loop.plant, "frozen"):
         return {path: _Parameter(path, spec, np.shape(x)) for path, spec, x in parameters(loop.plant, "plant.")}
     model = {field.name: field.metadata["spec"] for field in dataclasses.fields(SlipModel) if "spec" in field.metadata}
     found = {"initial.speed": _Parameter("speed", model["speed"]), "reference.slip": _Parameter("slip", model["slip"])}

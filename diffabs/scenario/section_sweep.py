@@ -96,7 +96,7 @@ def read(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Variati
     for name, given in table.get("failures", {}).items():
         if name not in objectives:
             raise unknown(f"{joined('sweep.failures', name)} is not measured", name, objectives)
-        failures[name] = number(given, Spec(unit_of(objectives[name])), joined("sweep.failures", name))
+        failures[name] = number(given, Spec(unit_of(objectives[name], loop.plant)), joined("sweep.failures", name))
     return Variation(
         **numbers,
         dtype=dtype,

@@ -138,15 +138,16 @@ def read(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
     numbers |= {name: _within(table.get(name, 0.0), spec, f"tune.{name}") for name, spec in REAL.items()}
     over = _over(_table(table, "over", "values"), loop)
     lanes = math.prod(map(len, over.values()))
+    units = {name: unit_of(one, loop.plant) for name, one in objectives.items()}
     if lanes > MOST_LANES and not numbers["samples"]:
         raise ScenarioError(f"tune.over has {lanes} combinations, outside [1, {MOST_LANES}]; set tune.samples")
     return Goal(
         **numbers,
         free=free_ranges(_table(table, "free", "ranges"), loop, "tune.free"),
-        objective=_metrics(_table(table, "objective", "weights of metrics"), "tune.objective", objectives, units=False),
+        objective=_metrics(_table(table, "objective", "weights of metrics"), "tune.objective", objectives, {}),
         over=over,
         aggregate=_aggregate(table.get("aggregate", "mean")),
-        limits=_metrics(_table(table, "limits", "greatest values of metrics"), "tune.limits", objectives, units=True),
+        limits=_metrics(_table(table, "limits", "greatest values of metrics"), "tune.limits", objectives, units),
     )
 
 
@@ -246,13 +247,13 @@ def _over(table: dict[str, Any], loop: Loop) -> dict[str, tuple[float, ...]]:
 
 
 def _metrics(
-    table: dict[str, Any], section: str, objectives: Mapping[str, Objective], *, units: bool
+    table: dict[str, Any], section: str, objectives: Mapping[str, Objective], units: Mapping[str, str]
 ) -> dict[str, float]:
     found = {}
     for name, given in table.items():
         if name not in objectives:
             raise unknown(f"{joined(section, name)} is not measured", name, objectives)
-        spec = Spec(unit_of(objectives[name]) if units else "1")
+        spec = Spec(units.get(name, "1"))
         found[name] = _within(given, spec, joined(section, name))
     return found
 

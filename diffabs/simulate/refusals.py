@@ -86,13 +86,14 @@ def ill(solver: FixedStep) -> list[str]:
 
 def unstable(loop: Loop, solver: FixedStep) -> Iterator[str]:
     """A line for a step that is too long for the loop."""
-    largest, end = stable_step(loop), getattr(loop.stop, "speed", 0.0)
+    largest, end = stable_step(loop), getattr(loop.stop, "speed", None)
+    where = "" if end is None else f", between the initial speed and {end:g} m/s,"
     if solver.step > largest:
         digit = 10.0 ** (math.floor(math.log10(largest)) - 2)
         largest = math.floor(largest / digit) * digit  # what is printed must be stable too
         yield (
-            f"solver.step = {solver.step:g} s is not stable: RK4 follows the fastest mode of this loop, between the "
-            f"initial speed and {end:g} m/s, only with steps in (0, {largest:.3g}] s"
+            f"solver.step = {solver.step:g} s is not stable: RK4 follows the fastest mode of this loop"
+            f"{where} only with steps in (0, {largest:.3g}] s"
         )
 
 

@@ -1,9 +1,8 @@
 """The largest integration step that is stable for a loop.
 
 RK4 is stable on a mode lambda while |R(h lambda)| <= 1, R(z) = 1 + z + z^2/2 + z^3/6 + z^4/24. A braking loop stiffens
-as it slows down, its slip rate going with 1/v, so the loop is linearised at speeds down to the stop: at slips close to
-the setpoint, where the controller is not at a limit, and at slips all over the friction curve, which is steepest near
-0. A balance is linearised upright and at its start. Held memories do not move: a sampled controller is not judged here.
+as it slows down, its slip rate going with 1/v, so the loop is linearised where the plant says that it may be stiffest;
+else at its start and at rest. Held memories do not move: a sampled controller is not judged here.
 
 Of many lanes few need the eigenvalues of their matrices: rho(A) <= |(D^-1 A D)^k|^(1/k) for every diagonal D and k, and
 with the D that balances the matrices of the first lane k = 1 is mostly enough, which costs less than the matrices.
@@ -20,13 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.loop import Loop
-from diffabs.core.protocols import BalanceOutput
-from diffabs.core.pytree import replace, strong
+from diffabs.core.protocols import Clock, Jump, Memory, Reference
+from diffabs.core.pytree import Scalar, part, pytree, replace, strong
 from diffabs.core.tracing import separated
 
-SPEEDS = 6  # between start and stop, in geometric progression: the ends decide
-OFFSETS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)  # slip below and above the setpoint
-SLIPS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # where a run may pass
 SQUARINGS = 4  # k = 16: within 3 % of the radius for the loops of the papers
 TOGETHER = 256  # lanes whose matrices stay in a processor's cache
 BALANCING = 30  # rounds
@@ -158,24 +154,42 @@ def _jacobians(loop: Loop) -> jax.Array:
 
 
 def _jacobians_of(loop: Loop) -> jax.Array:
-    """d(flow)/d(flow) over the grid of speeds and slips (SPEEDS, slips, n, n), or over two states (1, 2, n, n)."""
-    if loop.plant.shows is BalanceOutput:
-        return jax.vmap(lambda share: _balance_jacobian(loop, share))(jnp.array([0.0, 1.0]))[None]
-    state = loop.start()
-    setpoint = loop.reference.setpoint(state.reference)
-    near = jnp.concatenate([setpoint - jnp.array(OFFSETS), setpoint + jnp.array(OFFSETS)])
-    slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(SLIPS)])
-    speeds = jnp.geomspace(loop.initial.speed, loop.stop.speed, SPEEDS)  # pyright: ignore[reportAttributeAccessIssue]
-    return jax.vmap(jax.vmap(lambda v, s: _jacobian(loop, v, s), (None, 0)), (0, None))(speeds, slips)
+    """d(flow)/d(flow) (k, n, n) where the plant says that its loop may be stiffest (`probes`); else at its start and at
+    a start of zero, far from the target and on it."""
+    probes = getattr(loop.plant, "probes", None)
+    if probes:
+        starts = probes(loop.initial, loop.reference.setpoint(loop.start().reference), loop.stop)
+        return jax.vmap(lambda start: _of_flow(dataclasses.replace(loop, initial=start)))(starts)
+    starts = jax.tree.map(lambda x: jnp.array([0.0, 1.0]) * x, loop.initial)
+    arrived = dataclasses.replace(loop, reference=_Arrived(reference=loop.reference))
+    found = [
+        jax.vmap(lambda start, one=one: _of_flow(dataclasses.replace(one, initial=start)))(starts)
+        for one in (loop, arrived)
+    ]
+    return jnp.concatenate(found)
 
 
-def _jacobian(loop: Loop, speed: jax.Array, slip: jax.Array) -> jax.Array:
-    return _of_flow(replace(loop, {"initial.speed": speed, "initial.slip": slip}))
+@pytree
+class _Arrived:
+    """A reference whose target is wherever the plant is: the controller is not at a limit there."""
 
+    reference: Reference = part()
 
-def _balance_jacobian(loop: Loop, share: jax.Array) -> jax.Array:
-    """At a share of the initial angles and rates."""
-    return _of_flow(dataclasses.replace(loop, initial=jax.tree.map(lambda x: share * x, loop.initial)))
+    def start(self, signal: Any) -> Memory:
+        return self.reference.start(signal)
+
+    def flow(self, t: Scalar, memory: Memory, signal: Any) -> Any:
+        return self.reference.flow(t, memory, signal)
+
+    def output(self, t: Scalar, memory: Memory, signal: Any) -> Scalar:
+        del t, memory
+        return jax.lax.stop_gradient(signal[0])
+
+    def jump(self, clock: Clock, memory: Memory, signal: Any) -> Jump:
+        return self.reference.jump(clock, memory, signal)
+
+    def setpoint(self, memory: Memory) -> Scalar:
+        return self.reference.setpoint(memory)
 
 
 def _of_flow(loop: Loop) -> jax.Array:

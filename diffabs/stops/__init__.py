@@ -1,5 +1,6 @@
 """Stops: when a run ends."""
 
 from diffabs.stops.stops import Fallen as Fallen
+from diffabs.stops.stops import NoStop as NoStop
 from diffabs.stops.stops import SpeedReached as SpeedReached
 from diffabs.stops.stops import Standstill as Standstill

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from diffabs.core.protocols import BalanceOutput, BrakeOutput, Sample
 from diffabs.core.pytree import Scalar, param, pytree
 
+EXTRAPOLATED = "stop_time and stop_distance are extrapolated with the last deceleration"
 LEAST_DECELERATION = 1e-3  # m/s^2, so that a car that only rolls gets a finite, very long, stopping distance
 
 
@@ -16,6 +17,9 @@ class SpeedReached:
     """The run ends at this speed. If it is not reached in time, the rest is braked at the last deceleration."""
 
     speed: Scalar = param(default=5 / 3.6, unit="m/s", above=0.0)
+
+    success = True
+    otherwise = EXTRAPOLATED
 
     def margin(self, output: BrakeOutput) -> Scalar:
         """Speed above the end [m/s]."""
@@ -40,6 +44,9 @@ class Standstill:
 
     speed: Scalar = param(default=0.05, unit="m/s", above=0.0)
 
+    success = True
+    otherwise = EXTRAPOLATED
+
     def margin(self, output: BrakeOutput) -> Scalar:
         """Speed above the end of integration [m/s]."""
         return output.speed - self.speed
@@ -59,6 +66,9 @@ class Fallen:
 
     angle: Scalar = param(default=math.pi / 2, unit="rad", above=0.0, high=math.pi)
 
+    success = False
+    otherwise = "FELL: the frame reached the stop's angle"
+
     def margin(self, output: BalanceOutput) -> Scalar:
         """angle^2 - theta^2 [rad^2]."""
         return self.angle**2 - output.theta**2
@@ -66,6 +76,26 @@ class Fallen:
     def rate(self, output: BalanceOutput) -> Scalar:
         """d(margin)/dt."""
         return -2 * output.theta * output.theta_rate
+
+    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
+        """Nothing is left."""
+        del stopped
+        return 0.0 * sample.t, 0.0 * sample.t
+
+
+@pytree
+class NoStop:
+    """No stop: the run goes on for the whole duration of the solver."""
+
+    success = False
+
+    def margin(self, output: Any) -> Scalar:
+        """1: never crossed."""
+        return 1.0 + 0.0 * output[0]
+
+    def rate(self, output: Any) -> Scalar:
+        """0."""
+        return 0.0 * output[0]
 
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """Nothing is left."""

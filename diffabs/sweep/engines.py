@@ -1,7 +1,7 @@
 """Who computes the chunks: the devices of this process, or a Dask cluster (`cluster`)."""
 
 import itertools
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -69,22 +69,21 @@ def accepted(refused: Any) -> np.ndarray:
 
 
 def failures(study: Study, columns: Any) -> np.ndarray:
-    """Lanes that were run and diverged, did not stop, locked, or left a bound of the study (lanes,)."""
-    failed = np.asarray(columns["diverged"]) | missed(columns["stopped"], columns)
-    bounds = failing({"objectives": study.objectives, "failures": study.failures})
-    failed = np.any([failed, *(np.asarray(columns[name]) > bound for name, bound in bounds.items())], axis=0)
+    """Lanes that were run and diverged, ended as they should not, or left a bound of the study (lanes,)."""
+    failed = np.asarray(columns["diverged"]) | missed(columns["stopped"], study.success)
+    failed = np.any([failed, *(np.asarray(columns[name]) > bound for name, bound in study.bounded.items())], axis=0)
     return failed & accepted(columns["refused"])
 
 
-def failing(study: Mapping[str, Any]) -> dict[str, float]:
-    """Bounds of metrics, beyond which a lane has failed: those of the study, a wheel that locks, a fall."""
-    always = {name: 0.0 for name in ("locked_time", "fell") if name in study["objectives"]}
-    return {**always, **study["failures"]}
+def missed(stopped: Any, success: bool) -> np.ndarray:
+    """Return which lanes (lanes,) ended as they should not: without reaching a stop that is a `success`, or at one that
+    is not."""
+    return np.asarray(stopped) != success
 
 
-def missed(stopped: Any, names: Iterable[str]) -> np.ndarray:
-    """Which lanes did not reach their stop, a failure; but where a fall is measured, the stop is the fall."""
-    return np.zeros(np.shape(stopped), bool) if "fell" in names else ~np.asarray(stopped)
+def missing(success: bool) -> str:
+    """Return what is said of those lanes."""
+    return "not stopped" if success else "stopped"
 
 
 def batched(items: Sequence[int], size: int) -> Iterator[list[int]]:

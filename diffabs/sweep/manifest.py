@@ -20,12 +20,13 @@ from diffabs.sweep.seal import Seal, SweepError, digest
 from diffabs.sweep.study import DTYPES, FLAGS, RANGES, Study
 from diffabs.sweep.tables import FINITE, POSITIVE, number, text, whole, wrong
 
-FORMAT = 2
+FORMAT = 3
 MANIFEST = "manifest.json"
 LARGEST = 2**30  # bytes
 DECISIVE = ("jax", "jaxlib", "numpy", "scipy", "pyarrow")  # packages that can change a bit of the result
 OWNING = ("format", "study", "versions")
-OLD = "written by a diffabs that did not seal sweeps: read its chunks with pandas, or sweep again"
+EARLIER = (1, 2)
+OLD = "written by an earlier diffabs: read its chunks with pandas, or sweep again"
 
 
 def described(study: Study) -> dict[str, Any]:
@@ -74,7 +75,7 @@ def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
 def _checked(given: Any) -> dict[str, Any]:
     if not isinstance(given, dict):
         raise wrong("it", given, "a table")
-    if given.get("format") == 1:
+    if given.get("format") in EARLIER:
         raise ValueError(OLD)
     if given.get("format") != FORMAT:
         raise wrong("format", given.get("format"), str(FORMAT))

@@ -35,7 +35,8 @@ class Study:
     space: distributions by dotted path, `plant.mass` or `controller.gain.0`, and the design that draws from them
     parts: for a path drawn by a `Categorical` of names, the part that each name stands for
     objectives: what is measured; without any, what is usual for what the plant shows
-    failures: metrics whose excess over a bound counts as a failure; not stopping, locking, falling, diverging always do
+    failures: metrics whose excess over a bound counts as a failure; so do, always, diverging, an end that the stop does
+        not call a success, and the bounds that objectives have of their own (`failure`)
     chunk: lanes that are computed and stored together; results are the same to the bit for the same chunk
     """
 
@@ -54,6 +55,18 @@ class Study:
         """Without objectives, those usual for what the plant shows."""
         if not self.objectives:
             object.__setattr__(self, "objectives", usual(self.loop.plant))
+
+    @property
+    def success(self) -> bool:
+        """Whether reaching the stop is what a run shall do."""
+        return bool(self.loop.stop.success)
+
+    @property
+    def bounded(self) -> dict[str, float]:
+        """Bounds of metrics beyond which a lane has failed: those of the objectives themselves, then the study's."""
+        said = {name: getattr(part, "failure", None) for name, part in self.objectives.items()}
+        own = {name: float(bound) for name, bound in said.items() if bound is not None}
+        return own | {name: float(bound) for name, bound in self.failures.items()}
 
     @property
     def chunks(self) -> int:
@@ -90,7 +103,7 @@ class Study:
     def table(self) -> dict[str, Any]:
         """Everything that decides the results, as values of JSON."""
         own: dict[str, Any] = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
-        own["failures"] = {name: float(bound) for name, bound in self.failures.items()}
+        own |= {"failures": self.bounded, "success": self.success}
         return json.loads(
             json.dumps(
                 {

@@ -1,0 +1,68 @@
+"""Parts from outside: the modules of installed packages, by entry points of the group `diffabs.parts`, and those that a
+person names (`--parts`). A scenario file never names one: a file that somebody sends must not import code."""
+
+import dataclasses
+import importlib
+import importlib.metadata
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from functools import cache
+from types import ModuleType
+from typing import Any
+
+GROUP = "diffabs.parts"
+
+_named: dict[str, ModuleType] = {}
+
+
+def know(names: Iterable[str]) -> None:
+    """Import modules whose parts are to be known from now on, from the Python path or the working directory. Raises
+    ValueError, one line, for what is no name of a module, and for one that cannot be imported."""
+    for name in names:
+        if not all(word.isidentifier() for word in name.split(".")):
+            raise ValueError(f"--parts {name} is no name of a Python module, such as dc_servo")
+        here = os.getcwd()
+        if here not in sys.path:
+            sys.path.append(here)  # at the end: nothing here hides a module of Python's
+        _named[name] = _imported(name, f"--parts {name}")
+
+
+@cache
+def installed() -> tuple[ModuleType, ...]:
+    """Return the modules of installed packages. Raises ValueError for one that cannot be imported."""
+    points = sorted(importlib.metadata.entry_points(group=GROUP), key=lambda point: point.name)
+    return tuple(_imported(point.value, f"entry point {point.name} of {GROUP}") for point in points)
+
+
+def modules() -> tuple[ModuleType, ...]:
+    """Return every module with parts from outside, each once."""
+    return tuple({module.__name__: module for module in (*installed(), *_named.values())}.values())
+
+
+def exports(module: ModuleType) -> Iterator[tuple[str, Any]]:
+    """Yield the parts of a module by name: classes made with `pytree` here, and named instances; not what is imported
+    from diffabs."""
+    for name in getattr(module, "__all__", [name for name in vars(module) if not name.startswith("_")]):
+        item = getattr(module, name)
+        cls = item if isinstance(item, type) else type(item)
+        if not dataclasses.is_dataclass(cls) or not all(
+            {"spec", "part", "static"} & {*f.metadata} for f in _fields(cls)
+        ):
+            continue
+        if not (isinstance(item, type) and cls.__module__.partition(".")[0] == "diffabs"):
+            yield name, item
+
+
+def _fields(cls: Any) -> tuple[Any, ...]:
+    return dataclasses.fields(cls)
+
+
+def _imported(name: str, whose: str) -> ModuleType:
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        where = "" if error.name != name.partition(".")[0] else ", on the Python path or in the working directory"
+        raise ValueError(f"{whose}: there is no module {error.name}{where}") from None
+    except Exception as error:
+        raise ValueError(f"{whose}: cannot be imported: {type(error).__name__}: {error}") from None
