@@ -2,7 +2,7 @@
 die when the tests were written: those whose survival would say most."""
 
 DISTRIBUTIONS, DESIGNS, SPACE, DISCRETE = (
-    f"sweep/{name}.py" for name in ("distributions", "designs", "space", "discrete")
+    f"sweep/{name}.py" for name in ("distributions", "sampling", "variables", "discrete")
 )
 STATISTICS, SENSITIVITY, COMPARISON = (f"sweep/{name}.py" for name in ("statistics", "sensitivity", "comparison"))
 RARE, PROPOSALS, RELIABILITY = (f"sweep/{name}.py" for name in ("rare", "proposals", "reliability"))
@@ -83,9 +83,9 @@ SWEEP = [
     ),
     (
         "sweep: an empirical sample that is not in SI",
-        "scenario/section_sweep.py",
-        "value if name in unscaled else _scaled(value, entry.scale)",
-        "value",
+        DISTRIBUTIONS,
+        "return tuple(x / scale for x in value)",
+        "return tuple(value)",
         "test_columns.py::test_a_file_is_its_numbers",
     ),
     (

@@ -18,9 +18,9 @@ from diffabs.controllers import ProportionalFeedback, Sampled
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import replace
+from diffabs.core.values import ScenarioError, shown
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.plants import BrakeStart
-from diffabs.scenario.registry import ScenarioError, shown
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import typer
 
 from diffabs.cli import console, show
 from diffabs.cli.sweep import reported, warn_of_strays
-from diffabs.scenario.registry import ScenarioError, unknown
+from diffabs.core.values import ScenarioError, unknown
 
 if TYPE_CHECKING:
     from diffabs.sweep import Results

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from diffabs.cli import progress
 from diffabs.core import files, interrupt
-from diffabs.scenario.registry import ScenarioError
+from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, load, names
 
 T = TypeVar("T")

@@ -14,10 +14,10 @@ import typer
 
 from diffabs.cli import certificates, console, show
 from diffabs.core.pytree import get, parameters
+from diffabs.core.values import ScenarioError, shown, unknown
 from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import UNITS, Readings, read
 from diffabs.scenario.parameter_paths import flat
-from diffabs.scenario.registry import ScenarioError, shown, unknown
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.solution import FixedStep
 
@@ -112,7 +112,7 @@ def _noise(given: Sequence[str], readings: Readings) -> dict[str, float]:
     return found
 
 
-def _ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.Ends]:
+def _ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.Ends | None]:
     """Ranges by path; None where they are the declared ones."""
     table = {}
     for text in given:
@@ -130,7 +130,7 @@ def _ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.En
 
 
 def _watched(
-    chosen: Scenario, readings: Readings, ranges: Mapping[str, section_tune.Ends], given: Mapping[str, float]
+    chosen: Scenario, readings: Readings, ranges: Mapping[str, section_tune.Ends | None], given: Mapping[str, float]
 ) -> tuple["Identified", dict[str, float], bool]:
     """The fit, the standard deviations it was made with, and whether Ctrl-C ended it."""
     far: list[str] = []
@@ -151,7 +151,7 @@ def _watched(
 def _identified(
     chosen: Scenario,
     readings: Readings,
-    ranges: Mapping[str, section_tune.Ends],
+    ranges: Mapping[str, section_tune.Ends | None],
     given: Mapping[str, float],
     told: Callable[[int, float], None],
     stopping: Callable[[], bool],
@@ -197,7 +197,7 @@ def _rms(values: np.ndarray) -> float:
 def _result(
     chosen: Scenario,
     readings: Readings,
-    ranges: Mapping[str, section_tune.Ends],
+    ranges: Mapping[str, section_tune.Ends | None],
     found: "Identified",
     noise: Mapping[str, float],
 ) -> dict[str, Any]:
@@ -230,7 +230,7 @@ def _result(
 
 
 def _values(
-    chosen: Scenario, ranges: Mapping[str, section_tune.Ends], found: "Identified"
+    chosen: Scenario, ranges: Mapping[str, section_tune.Ends | None], found: "Identified"
 ) -> dict[str, dict[str, Any]]:
     """One for each number: `controller.gain.0` where a parameter is a list."""
     specs = {path: spec for path, spec, _ in parameters(chosen.loop)}

@@ -17,7 +17,7 @@ import typer
 from diffabs import __version__
 from diffabs.cli import compare, console, design, identify, rare, show, sweep, tune, usage
 from diffabs.cli.checking import checked, said
-from diffabs.core import interrupt
+from diffabs.core import interrupt, values
 from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import parameters
 from diffabs.scenario import registry
@@ -193,7 +193,7 @@ def list_parts(
     with console.guarded():
         there = (*PLURALS, "scenarios")
         if family is not None and family not in there:
-            raise registry.unknown(f"there is no family {registry.shown(family)}", family, there)
+            raise values.unknown(f"there is no family {values.shown(family)}", family, there)
         result = {name: _listed(name) for name in there if family in (None, name)}
         if as_json:
             return show.as_json(result)
@@ -248,7 +248,7 @@ def reproduce(
         from diffabs.papers import PAPERS, compact
 
         if name != "all" and name not in PAPERS:
-            raise registry.unknown(f"there is no paper {registry.shown(name)}", name, (*PAPERS, "all"))
+            raise values.unknown(f"there is no paper {values.shown(name)}", name, (*PAPERS, "all"))
         results: dict[str, Any] = {}
         try:
             for paper in PAPERS if name == "all" else (name,):

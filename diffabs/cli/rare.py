@@ -9,8 +9,9 @@ import typer
 
 from diffabs.cli import console, show
 from diffabs.core.pytree import Spec
+from diffabs.core.values import ScenarioError, number, unknown
 from diffabs.scenario import section_sweep
-from diffabs.scenario.registry import ScenarioError, number, unit_of, unknown
+from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.toml import value
 

@@ -17,8 +17,9 @@ import typer
 
 from diffabs.cli import console, progress, show
 from diffabs.core.pytree import elements
+from diffabs.core.values import ScenarioError, unknown
 from diffabs.scenario import section_sweep
-from diffabs.scenario.registry import ScenarioError, unit_of, unknown
+from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads
 from diffabs.simulate.refusals import first_line
 

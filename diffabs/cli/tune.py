@@ -15,7 +15,7 @@ import typer
 
 from diffabs.cli import certificates, console, show
 from diffabs.core.pytree import get, parameters
-from diffabs.scenario.registry import ScenarioError
+from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.refusals import first_line
 from diffabs.simulate.run import rollout

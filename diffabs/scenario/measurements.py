@@ -11,7 +11,7 @@ import numpy as np
 
 from diffabs.core import files
 from diffabs.core.protocols import UNITS as UNITS
-from diffabs.scenario.registry import ScenarioError, shown
+from diffabs.core.values import ScenarioError, shown
 
 LARGEST = 100_000_000  # bytes
 TIME = "t [s]"

@@ -5,12 +5,10 @@ contract is listed, under the kebab-case of its name (`QuarterCar` is `quarter-c
 and exporting it is thus all that it takes to use it in a scenario."""
 
 import dataclasses
-import difflib
 import inspect
-import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from types import ModuleType
 from typing import Any
@@ -21,19 +19,12 @@ from diffabs import actuators, controllers, objectives, plants, references, road
 from diffabs.core import blocks, protocols
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import Spec
+from diffabs.core.values import ScenarioError, dotted, inside, kebab, number, shown, unknown, whole, wrong
 from diffabs.scenario.defaults import around, braking
 
 KMH = 3.6  # km/h in a m/s
 DEEPEST = 16  # parts inside parts; more is a mistake, and Python's stack is finite
 LARGEST = 10_000_000  # of a whole number that shapes arrays
-
-
-class ScenarioError(ValueError):
-    """A scenario that cannot be used; the message is one line for a person."""
-
-    def __init__(self, message: str):
-        """Whatever the user wrote, the message stays on one line."""
-        super().__init__(" ".join(message.split()))
 
 
 def _methods(cls: type) -> frozenset[str]:
@@ -68,11 +59,6 @@ def types(family: str) -> Mapping[str, Any]:
     return found
 
 
-def kebab(name: str) -> str:
-    """`QuarterCar`, `PID`, `RIG_UNROUNDED` -> `quarter-car`, `pid`, `rig-unrounded`."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", name).replace("_", "-").lower()
-
-
 def name_of(family: str, part: Any) -> str:
     """The name of a named constant, else that of the part's class."""
     named = (name for name, item in types(family).items() if item is part)
@@ -99,51 +85,6 @@ def unit_of(objective: Any, plant: Any = None) -> str:
         return unit
     unit = unit.replace("N^2 m^2", "1" if control == "1" else f"{control}^2").replace("N m", control)
     return re.sub(r"\b1 (?=\S)", "", unit)
-
-
-def shown(value: Any, most: int = 60) -> str:
-    """A value of a scenario as it may stand in a message: on one line, of bounded length."""
-    if isinstance(value, float) or (isinstance(value, int) and abs(value) < 10**15):
-        return f"{value:.15g}" if not isinstance(value, bool) else str(value).lower()
-    try:
-        text = json.dumps(value, ensure_ascii=True) if isinstance(value, str) else repr(value)
-    except (ValueError, RecursionError):  # more digits than Python writes, more levels than it descends
-        text = "a number of thousands of digits" if isinstance(value, int) else "something nested too deeply"
-    return text if len(text) <= most else f"{text[: most - 3]}..."
-
-
-def unknown(what: str, name: str, there: Iterable[str]) -> ScenarioError:
-    """An error for a name that is not there, with the nearest one that is."""
-    there = list(there)
-    near = difflib.get_close_matches(str(name).lower(), there, 1, 0.5)
-    hint = f"did you mean {near[0]}? There is" if near else "there is"
-    return ScenarioError(f"{what}; {hint} {', '.join(there) or 'nothing'}")
-
-
-def wrong(path: str, value: Any, needed: str) -> ScenarioError:
-    """An error for a value of the wrong kind."""
-    kinds = ((bool, "a boolean"), (str, "text"), ((int, float), "a number"), (list, "a list"), (dict, "a table"))
-    kind = next((name for of, name in kinds if isinstance(value, of)), "a date or time")
-    return ScenarioError(f"{path} = {shown(value)} is {kind}; {needed} is needed")
-
-
-def number(value: Any, spec: Spec, path: str) -> float:
-    """A number of TOML as a float. Raises ScenarioError for anything else; the range is not looked at."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise wrong(path, value, f"a number in {spec.interval()}")
-    try:
-        return float(value)
-    except OverflowError:
-        raise ScenarioError(f"{path} = {shown(value)} is too large for a number in {spec.interval()}") from None
-
-
-def whole(value: Any, low: int, high: int, path: str) -> int:
-    """A whole number of TOML. Raises ScenarioError for anything else, or out of range."""
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise wrong(path, value, f"a whole number in [{low}, {high}]")
-    if not low <= value <= high:
-        raise ScenarioError(f"{path} = {shown(value)} is outside [{low}, {high}]")
-    return value
 
 
 def build(family: str, given: Any, default: Any, path: str) -> Any:
@@ -205,10 +146,7 @@ OTHERS = ("road", "solver", "objective", "design", "tune", "sweep", "title", "de
 
 def joined(path: str, key: str) -> str:
     """A dotted path; the road of the plant has a section of its own."""
-    if (path, key) == ("plant", "road"):
-        return "road"
-    key = key if re.fullmatch(r"[\w-]{1,60}", key) else shown(key)
-    return f"{path}.{key}" if path else key
+    return "road" if (path, key) == ("plant", "road") else dotted(path, key)
 
 
 def _value(given: Any, field: dataclasses.Field[Any], default: Any, family: str, path: str) -> Any:
@@ -248,10 +186,7 @@ def _parts(family: str, given: Any, default: tuple[Any, ...], path: str) -> tupl
 def _metres_per_second(given: Any, spec: Spec, path: str) -> float:
     """Checked here, in the unit in which it was given."""
     there = dataclasses.replace(spec, unit="km/h", low=spec.low * KMH, high=spec.high * KMH)
-    speed = number(given, there, path)
-    if not there.holds(speed):
-        raise ScenarioError(f"{path} = {shown(speed)} is outside {there.interval()}")
-    return speed / KMH
+    return inside(given, there, path) / KMH
 
 
 def described(family: str, part: Any) -> dict[str, dict[str, Any]]:
