@@ -96,13 +96,6 @@ SWEEP = [
         "test_columns.py::test_what_is_wrong_with_a_file_is_said",
     ),
     (
-        "sweep: moments merged with the wrong share",
-        STATISTICS,
-        "self.centre + b * step",
-        "self.centre + a * step",
-        "test_sweep_statistics.py::TestMoments::test_any_partition_in_any_order_merges_to_the_whole",
-    ),
-    (
         "sweep: Clopper and Pearson's upper end of one failure less",
         STATISTICS,
         "stats.beta.ppf(top, k + 1, n - k)",

@@ -2,7 +2,6 @@
 
 It needs the extra `diffabs[tune]`; what needs that is imported when it runs."""
 
-import contextlib
 import dataclasses
 import math
 import pathlib
@@ -13,6 +12,7 @@ import numpy as np
 import typer
 
 from diffabs.cli import certificates, console, show
+from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
 from diffabs.core.values import ScenarioError, shown, unknown
 from diffabs.scenario import section_tune, toml
@@ -57,9 +57,9 @@ def identify(
 ) -> None:
     """Find parameters of a scenario from a measured run, and say how well it determines them."""
     with console.guarded(), certificates.reported():
-        console.need_extra("tune", "optax", "scipy")
+        console.need_extra("tune")
         console.check_scenario_file(out)
-        with console.new_file(out, "--out") if out else contextlib.nullcontext() as file:
+        with console.new_file(out, "--out") as file:
             readings = _readings(data, column)
             noise = _noise(sigma or (), readings)
             chosen = console.loaded(scenario, changes)
@@ -224,7 +224,7 @@ def _result(
         "reason": found.reason.value,
         "evaluations": found.evaluations,
         "parameters": {path: np.asarray(v, float).tolist() for path, _, v in parameters(found.part)},
-        "versions": show.versions("optax", "scipy"),
+        "versions": provenance.versions("optax", "scipy"),
         "files": {},
     }
 

@@ -17,7 +17,7 @@ import typer
 from diffabs import __version__
 from diffabs.cli import compare, console, design, identify, rare, show, sweep, tune, usage
 from diffabs.cli.checking import checked, said
-from diffabs.core import interrupt, values
+from diffabs.core import interrupt, provenance, values
 from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import parameters
 from diffabs.scenario import registry
@@ -95,17 +95,16 @@ def simulate(
     ] = False,
 ) -> None:
     """Run a scenario once and show its metrics."""
-    with console.guarded(), sweep.reported():
+    with console.guarded():
         _check_source(scenario, from_sweep, sample, changes, seed)
         _check_targets(csv, plot)
-        changes = [*(changes or ()), *([] if seed is None else [f"solver.seed={seed}"])]
         with contextlib.ExitStack() as files:
-            csv_file = files.enter_context(console.new_file(csv, "--csv")) if csv else None
-            picture = files.enter_context(console.new_file(plot, "--plot")) if plot else None
+            csv_file = files.enter_context(console.new_file(csv, "--csv"))
+            picture = files.enter_context(console.new_file(plot, "--plot"))
             if from_sweep and sample is not None:
                 chosen, key = console.waited(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
             else:
-                chosen = console.loaded(scenario or "", changes)
+                chosen = console.loaded(scenario or "", console.changed(changes, "solver", seed=seed))
                 key = chosen.key()
             run = console.waited(lambda: _run(chosen, key, keep=bool(csv or plot)), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
@@ -178,7 +177,7 @@ def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -
         "parts": _parts(chosen),
         "parameters": _parameters(chosen),
         "solver": {"step": chosen.solver.step, "duration": chosen.solver.duration, "seed": chosen.seed},
-        "versions": show.versions(),
+        "versions": provenance.versions(),
         "files": {name: str(path) for name, path in files.items() if path},
     }
 
@@ -213,11 +212,8 @@ def show_scenario(
     with console.guarded():
         console.check_scenario_file(out)
         text = dump(console.loaded(scenario, changes, integrated=False))
-        if out is None:
-            return typer.echo(text, nl=False)
         with console.new_file(out, "--out") as file:
-            file.write_text(text, encoding="utf-8")
-    return None
+            file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
 
 
 def _listed(plural: str) -> dict[str, Any]:
@@ -262,7 +258,7 @@ def reproduce(
             console.say(f"interrupted: whole are {', '.join(str(out / paper) for paper in results)}")
             raise typer.Exit(console.INTERRUPTED) from None
         if as_json:
-            show.as_json({"out": str(out), "papers": results, "versions": show.versions()})
+            show.as_json({"out": str(out), "papers": results, "versions": provenance.versions()})
 
 
 def _reproduced(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> dict[str, Any]:

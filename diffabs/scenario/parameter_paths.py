@@ -84,12 +84,19 @@ def in_si(value: Any, scale: float) -> Any:
     return tuple(in_si(item, scale) for item in value) if isinstance(value, tuple) else value / scale
 
 
-def lifted(table: dict[str, Any]) -> None:
-    """Every such table of a scenario by dotted path, however it was written. Raises ScenarioError."""
+def lifted(table: dict[str, Any]) -> dict[str, Any]:
+    """Bring a scenario to its canonical form: the road in a section of its own, and every such table by dotted path,
+    however they were written. Returns the table. Raises ScenarioError."""
+    plant = table.get("plant")
+    if isinstance(plant, dict) and "road" in plant:
+        if "road" in table:
+            raise ScenarioError("road is given twice, as a section and in plant")
+        table["road"] = plant.pop("road")
     for section, name in TABLES:
         inside = table.get(section)
         if isinstance(inside, dict) and isinstance(inside.get(name), dict):
             inside[name] = flat(inside[name], f"{section}.{name}")
+    return table
 
 
 def forget(table: dict[str, Any], replaced: str) -> None:

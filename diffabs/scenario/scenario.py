@@ -152,7 +152,7 @@ def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
 def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
     quoted = shown(origin, LONGEST_PATH)
     try:
-        return _lifted(toml.parsed(raw.decode()))
+        return parameter_paths.lifted(toml.parsed(raw.decode()))
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         raise ScenarioError(f"{quoted} is not UTF-8 text (at line {line})") from None
@@ -160,17 +160,6 @@ def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
         raise ScenarioError(f"{quoted} is not a scenario: {error}") from None
     except ValueError as error:
         raise ScenarioError(f"{quoted} is not TOML: {error}") from None
-
-
-def _lifted(table: dict[str, Any]) -> dict[str, Any]:
-    """The road of the plant in its own section, and ranges by path, however they were written."""
-    plant = table.get("plant")
-    if isinstance(plant, dict) and "road" in plant:
-        if "road" in table:
-            raise ScenarioError("road is given twice, as a section and in plant")
-        table["road"] = plant.pop("road")
-    parameter_paths.lifted(table)
-    return table
 
 
 def _override(table: dict[str, Any], override: str) -> None:
@@ -202,7 +191,7 @@ def _override(table: dict[str, Any], override: str) -> None:
         node[place] = toml.value(text.strip())
     except ScenarioError as error:
         raise ScenarioError(f"override {shown(override)}: {error}") from None
-    _lifted(table)
+    parameter_paths.lifted(table)
     new = node[place]
     if isinstance(new, str) or (isinstance(new, dict) and "type" in new):
         parameter_paths.forget(table, ".".join(keys))

@@ -41,7 +41,7 @@ from diffabs.sweep.variables import Space
 FORMAT = 2
 MANIFEST = "manifest.json"
 LARGEST = 2**30  # bytes
-DECISIVE = ("jax", "jaxlib", "numpy", "scipy", "pyarrow")  # packages that can change a bit of the result
+DECISIVE = ("jaxlib", "numpy", "scipy", "pyarrow")  # packages beside JAX that can change a bit of the result
 SECONDS = Spec("s", low=0.0, open_low=True)
 OWNING = ("format", "study", "versions")
 OLD = "written by a diffabs that did not seal sweeps: read its chunks with pandas, or sweep again"
@@ -49,7 +49,7 @@ OLD = "written by a diffabs that did not seal sweeps: read its chunks with panda
 
 def described(study: Study) -> dict[str, Any]:
     """What owns the chunks of a study, computed here and now."""
-    return {"format": FORMAT, "study": study.table(), "versions": provenance.versions(*DECISIVE)}
+    return {"format": FORMAT, "study": study.table(), "versions": provenance.origin(*DECISIVE)}
 
 
 class Seals:

@@ -5,7 +5,6 @@ computed in chunk i // chunk, and nothing about it depends on who computes that 
 
 import contextlib
 import dataclasses
-import difflib
 import json
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -16,7 +15,7 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, problems, replace
-from diffabs.core.values import plain
+from diffabs.core.values import plain, unknown
 from diffabs.objectives import usual
 from diffabs.simulate.refusals import ill
 from diffabs.simulate.solution import FixedStep
@@ -123,7 +122,7 @@ class Study:
             yield f"objectives.{name}: another column of the table has this name"
         for name, bound in self.failures.items():
             if name not in self.objectives:
-                yield f"failures.{name} is not measured; there is {', '.join(self.objectives)}"
+                yield str(unknown(f"failures.{name} is not measured", name, self.objectives))
             elif not np.isfinite(bound):
                 yield f"failures.{name} = {bound} is not a finite number"
 
@@ -135,8 +134,7 @@ class Study:
             if path in self.parts:
                 yield from _wrong_parts(path, self.space.variables.get(path), self.parts[path], self.loop)
             elif path not in known:
-                near = difflib.get_close_matches(path, known, 1, 0.5)
-                yield f"{path} is not a parameter of this loop" + (f"; did you mean {near[0]}?" if near else "")
+                yield str(unknown(f"{path} is not a parameter of this loop", path, known))
         yield from (f"parts.{path} has no distribution" for path in self.parts if path not in self.space.paths)
         if not wrong:
             yield from self.space.leaving(known)
