@@ -81,14 +81,19 @@ class Variation:
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def table(self) -> dict[str, Any]:
-        """As values of TOML."""
-        over = {
-            path: item.given if isinstance(item, Choice) else plain(item, brief=True)
-            for path, item in self.over.items()
-        }
-        given = {"design": plain(self.design, brief=True), "over": over}
-        correlation = members(self.correlation) if self.correlation else {}
-        return members(dataclasses.replace(self, over={}, correlation=None)) | given | {"correlation": correlation}
+        """As values of TOML, what is usual in short."""
+        design = plain(self.design, brief=True)
+        given = {"design": design["type"] if len(design) == 1 else design}
+        given["over"] = {path: _written(item) for path, item in self.over.items()}
+        given["correlation"] = members(self.correlation) if self.correlation else {}
+        return members(dataclasses.replace(self, over={}, correlation=None)) | given
+
+
+def _written(item: Any) -> Any:
+    """A distribution, or a choice of parts, as it is given."""
+    if isinstance(item, distributions.Uniform):
+        return [item.low, item.high]
+    return item.given if isinstance(item, Choice) else plain(item, brief=True)
 
 
 def read(table: Any, loop: Loop, objectives: Mapping[str, Objective], folder: pathlib.Path) -> Variation:
