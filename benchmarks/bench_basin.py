@@ -84,7 +84,7 @@ def main():
         **found,
         "cells that agree": agree,
         "machine": {"cores": os.cpu_count(), "load": os.getloadavg()},
-        "versions": {**provenance.versions("jax", "jaxlib", "numpy"), **provenance.commit()},
+        "versions": {**provenance.origin("jaxlib", "numpy"), **provenance.commit()},
     }
     options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     Console().print(f"{100 * agree:.2f} % of the cells agree; written to {options.out}")

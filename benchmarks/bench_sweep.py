@@ -104,7 +104,7 @@ def main():
         "rounds": rounds,
         "options": {name: str(value) for name, value in vars(options).items()},
         "machine": {"cores": os.cpu_count(), "load": os.getloadavg()},
-        "versions": {**provenance.versions("jax", "jaxlib", "numpy", "pyarrow"), **provenance.commit()},
+        "versions": {**provenance.origin("jaxlib", "numpy", "pyarrow"), **provenance.commit()},
         "same table": len(tables) == 1,
     }
     options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")

@@ -1,5 +1,6 @@
 """Running the command line in this process, for the tests of every command."""
 
+import os
 import pathlib
 
 from typer.testing import CliRunner
@@ -23,3 +24,10 @@ def assert_one_error_line(result):
 
 def left_in(folder: pathlib.Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
+
+
+def umask() -> int:
+    """What new files may not have; it can only be read by setting it."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

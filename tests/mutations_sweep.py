@@ -85,9 +85,9 @@ SWEEP = [
     ),
     (
         "sweep: an empirical sample that is not in SI",
-        "scenario/section_sweep.py",
-        "value if name in unscaled else _scaled(value, entry.scale)",
-        "value",
+        DISTRIBUTIONS,
+        "return tuple(x / scale for x in value)",
+        "return tuple(value)",
         "test_columns.py::test_a_file_is_its_numbers",
     ),
     (
@@ -96,13 +96,6 @@ SWEEP = [
         "isinstance(value, bool) else np.nan",
         "isinstance(value, bool) else 0.0",
         "test_columns.py::test_what_is_wrong_with_a_file_is_said",
-    ),
-    (
-        "sweep: moments merged with the wrong share",
-        STATISTICS,
-        "self.centre + b * step",
-        "self.centre + a * step",
-        "test_sweep_statistics.py::TestMoments::test_any_partition_in_any_order_merges_to_the_whole",
     ),
     (
         "sweep: Clopper and Pearson's upper end of one failure less",

@@ -15,7 +15,7 @@ import types
 import numpy as np
 import pytest
 import typer
-from commands import assert_one_error_line, left_in, run
+from commands import assert_one_error_line, left_in, run, umask
 
 import diffabs
 from diffabs.cli import console, main
@@ -122,7 +122,7 @@ def test_figure_and_nothing_else_is_left(whole):
     folder, _ = whole
     assert (folder / "a.png").read_text() == "State feedback on the mirrored rig, published gain: True .png"
     assert left_in(folder) == {"a.csv", "a.png"}
-    assert (folder / "a.csv").stat().st_mode & 0o777 == 0o666 & ~main.console._umask()
+    assert (folder / "a.csv").stat().st_mode & 0o777 == 0o666 & ~umask()
 
 
 def test_a_long_trajectory_is_thinned(tmp_path, monkeypatch):

@@ -374,11 +374,15 @@ def test_without_the_extra(command, monkeypatch, no_polytope):
 
 
 def test_other_commands_do_without_the_extra():
-    code = (
-        "import sys; sys.modules.update(dict.fromkeys(['cvxpy', 'scipy', 'clarabel', 'optax'])); "
-        "import diffabs.cli.main as c, diffabs.scenario as s; s.load('slip-lmi', integrated=False); "
-        "c.app(['list', 'scenarios'])"
-    )
+    code = """
+import sys
+sys.modules.update(dict.fromkeys(['cvxpy', 'scipy', 'clarabel', 'optax', 'pyarrow', 'filelock']))
+from diffabs.cli.main import app
+from diffabs.scenario.scenario import load
+drawn = 'sweep.over.plant.mass={type="normal", mean=5.7, deviation=0.3, low=5}'
+load('slip-lmi', [drawn, 'tune.aggregate=cvar', 'tune.free.reference.slip=0.1,0.3'], integrated=False)
+app(['list', 'scenarios'])
+"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "slip-lmi" in done.stdout

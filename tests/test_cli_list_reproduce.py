@@ -7,7 +7,7 @@ import sys
 import types
 
 import pytest
-from commands import assert_one_error_line, left_in, run
+from commands import assert_one_error_line, left_in, run, umask
 
 from diffabs.cli import console, main
 from diffabs.papers.digest import Digest
@@ -92,7 +92,7 @@ def test_reproduce_everything(papers, tmp_path):
     assert lines.count(["refuted", "a", "claim:", "5"]) == 2
     assert result.stderr.count("drawing\n") == 2
     assert f"1 figures, every number and note (summary.json): {out / 'slip-lmi'}\n" in result.stderr
-    assert os.stat(out / "slip-lmi").st_mode & 0o777 == 0o777 & ~main.console._umask()
+    assert os.stat(out / "slip-lmi").st_mode & 0o777 == 0o777 & ~umask()
 
 
 def test_on_a_terminal_the_spinner_says_which_step(papers, tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ import types
 import jax
 import numpy as np
 import pytest
-from commands import assert_one_error_line, left_in, run
+from commands import assert_one_error_line, left_in, run, umask
 
 import diffabs.tune as library
 from diffabs.cli import certificates, console
@@ -197,7 +197,7 @@ def test_figure_and_file_and_nothing_else_are_left(tuned):
     assert left_in(folder) == {"small.toml", "out.toml", "a.png"}
     points = len(document["history"])
     assert (folder / "a.png").read_text() == f"small: {points} points, before, after, plant.mass = 5.3 [N m]"
-    assert (folder / "out.toml").stat().st_mode & 0o777 == 0o666 & ~console._umask()
+    assert (folder / "out.toml").stat().st_mode & 0o777 == 0o666 & ~umask()
 
 
 # What is asked

@@ -12,8 +12,9 @@ from diffabs.scenario import registry, scenario
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import dump, load, names
 from diffabs.scenario.section_design import Task
-from diffabs.scenario.section_tune import AGGREGATES, Goal
+from diffabs.scenario.section_tune import Goal
 from diffabs.simulate.solution import FixedStep
+from diffabs.tune import risk
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")
 
@@ -420,14 +421,11 @@ def test_lanes_are_every_combination_with_one_noise():
     assert tuple(batch.seeds) == (4,) * 9
 
 
-@pytest.mark.parametrize("kind", AGGREGATES)
+@pytest.mark.parametrize("kind", risk.KINDS)
 def test_aggregates_are_those_of_the_library(kind):
-    """The section is read without the extra; here the two are compared."""
-    part = Goal(aggregate={"type": kind, **{name: value for name, (value, _) in AGGREGATES[kind].items()}}).aggregated()
-    assert registry.kebab(type(part).__name__).replace("cva-r", "cvar") == kind
-    fields = {field.name: field.metadata["spec"] for field in dataclasses.fields(part)}
-    assert fields == {name: spec for name, (_, spec) in AGGREGATES[kind].items()}
-    assert {name: getattr(type(part)(), name) for name in fields} == {n: v for n, (v, _) in AGGREGATES[kind].items()}
+    part = load("slip-lmi", [f"tune.aggregate={kind}"]).tune.aggregated()
+    assert type(part) is risk.KINDS[kind]
+    assert vars(part) == vars(risk.KINDS[kind]())
 
 
 def test_slip_cured_is_the_rig_with_what_the_paper_leaves_out():

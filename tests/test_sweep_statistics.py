@@ -24,19 +24,6 @@ def ends(estimate):
     return [estimate.low, estimate.high]
 
 
-def merged(pieces):
-    total = pieces[0]
-    for piece in pieces[1:]:
-        total = total.merge(piece)
-    return total
-
-
-def chunks(random, n):
-    """Index arrays of a random partition of shuffled samples, some of them empty."""
-    edges = np.sort(random.integers(0, n + 1, random.integers(1, 9)))
-    return np.split(random.permutation(n), edges)
-
-
 class TestColumn:
     @pytest.mark.parametrize(
         "function",
@@ -74,8 +61,6 @@ class TestColumn:
             estimates.cvar(np.arange(99.0), 0.5, confidence=0.99, replicates=99)
         with pytest.raises(ValueError, match="99 replicates are too few"):
             sensitivity.sobol_indices(np.ones(6), np.ones(6), np.ones((2, 6)), confidence=0.99, replicates=99)
-        with pytest.raises(ValueError, match="do not merge"):
-            Tail.of([1.0], [0], 2).merge(Tail.of([1.0], [0], 3))
         with pytest.raises(ValueError, match="are not pairs"):
             paired.paired(np.ones(5), np.ones(6))
         with pytest.raises(ValueError, match=r"\(5, 2\) do not fit 6 outputs"):
@@ -89,23 +74,9 @@ class TestMoments:
 
     def test_are_those_of_numpy(self):
         one, d = Moments.of(self.X), self.X - np.mean(self.X)
-        assert (one.count, one.least, one.greatest) == (1000, self.X.min(), self.X.max())
-        found = [one.centre, one.second, one.third, one.fourth]
-        np.testing.assert_allclose(found, [self.X.mean(), *(np.sum(d**p) for p in (2, 3, 4))], rtol=1e-12, atol=0)
+        found = [one.count, one.centre, one.second, one.fourth]
+        np.testing.assert_allclose(found, [1000, self.X.mean(), np.sum(d**2), np.sum(d**4)], rtol=1e-12, atol=0)
         np.testing.assert_allclose(one.deviation().value, np.std(self.X, ddof=1), rtol=1e-12, atol=0)
-
-    @pytest.mark.parametrize("seed", range(20))
-    def test_any_partition_in_any_order_merges_to_the_whole(self, seed):
-        whole = Moments.of(self.X)
-        one = merged([Moments.of(self.X[index]) for index in chunks(np.random.default_rng(seed), 1000)])
-        assert (one.count, one.least, one.greatest) == (whole.count, whole.least, whole.greatest)
-        # the mean is 60 deviations large: rounding of 60 eps, times ten merges and some
-        for name in ("centre", "second", "third", "fourth"):
-            np.testing.assert_allclose(getattr(one, name), getattr(whole, name), rtol=1e-12, atol=0)
-
-    def test_nothing_merges_with_nothing(self):
-        assert Moments.of([]).merge(Moments()) == Moments()
-        assert Moments.of([]).merge(Moments.of(self.X)) == Moments.of(self.X).merge(Moments()) == Moments.of(self.X)
 
     def test_the_mean_has_the_interval_of_the_t_test(self):
         theirs = stats.ttest_1samp(self.X, 0.0).confidence_interval(0.9)
@@ -127,9 +98,6 @@ class TestCount:
         low, high = ends(Count(3, 10**7).probability())
         np.testing.assert_allclose(stats.binom.sf(2, 10**7, low), 0.025, rtol=1e-7, atol=0)
         np.testing.assert_allclose(stats.binom.cdf(3, 10**7, high), 0.025, rtol=1e-7, atol=0)
-
-    def test_merges(self):
-        assert Count(3, 10).merge(Count(0, 7)).merge(Count(2, 5)) == Count(5, 22)
 
 
 class TestQuantile:
@@ -214,11 +182,12 @@ class TestCVaR:
 
 class TestTail:
     @pytest.mark.parametrize("seed", range(20))
-    def test_any_partition_keeps_the_greatest_and_of_equal_ones_the_first(self, seed):
+    def test_keeps_the_greatest_and_of_equal_ones_the_first(self, seed):
         random = np.random.default_rng(seed)
         x, k = random.integers(0, 30, 200).astype(float), int(random.integers(1, 250))
         theirs = sorted(range(200), key=lambda i: (-x[i], i))[:k]
-        one = merged([Tail.of(x[index], index, k) for index in chunks(random, 200)])
+        index = random.permutation(200)
+        one = Tail.of(x[index], index, k)
         assert one.indices.tolist() == theirs
         assert one.values.tolist() == x[theirs].tolist()
 

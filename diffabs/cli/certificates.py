@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from diffabs.cli import console, show
+from diffabs.cli import console
 from diffabs.controllers import ProportionalFeedback, Sampled
+from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import replace
+from diffabs.core.values import ScenarioError, shown
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import SlipModel
 from diffabs.plants import BrakeStart
-from diffabs.scenario.registry import ScenarioError, shown
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -194,7 +195,7 @@ def document(
         "coverage": dataclasses.asdict(coverage) if coverage else None,
         "exact": task.reduced.exact,
         "neglected": list(task.reduced.neglected),
-        "versions": show.versions("cvxpy", "clarabel", "scipy"),
+        "versions": provenance.versions("cvxpy", "clarabel", "scipy"),
         "files": {"out": str(out)} if out and proof else {},
     }
 

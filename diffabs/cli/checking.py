@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.scenario.registry import ScenarioError
+from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import MOST_STEPS, Scenario
 from diffabs.simulate.accuracy import accuracy, needs_key, reasons
 from diffabs.simulate.run import measure

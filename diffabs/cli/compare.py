@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from diffabs.cli import console, show
-from diffabs.cli.sweep import reported, warn_of_strays
-from diffabs.scenario.registry import ScenarioError, unknown
+from diffabs.cli.sweep import warn_of_strays
+from diffabs.core.values import ScenarioError, unknown
 
 if TYPE_CHECKING:
     from diffabs.sweep import Results
@@ -22,8 +22,8 @@ def compare(
     as_json: console.Json = False,
 ) -> None:
     """What the second sweep does better or worse than the first, on common random numbers."""
-    with console.guarded(), reported():
-        console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
+    with console.guarded():
+        console.need_extra("sweep")
         from diffabs.sweep import Results
 
         a, b = Results(first), Results(second)

@@ -7,7 +7,6 @@ import os
 import pathlib
 import shlex
 import sys
-import tempfile
 import textwrap
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +17,7 @@ from rich.console import Console
 
 from diffabs.cli import progress
 from diffabs.core import files, interrupt
-from diffabs.scenario.registry import ScenarioError
+from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, load, names
 
 T = TypeVar("T")
@@ -29,6 +28,7 @@ AWAKE = 0.1  # s between looks for Ctrl-C
 LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
 CONTINUED = " \\"  # a line of a shell that goes on in the next
 WORKER = "diffabs worker"
+EXTRAS = {"sweep": ("filelock", "pyarrow", "scipy", "zarr"), "cluster": ("distributed",), "tune": ("optax", "scipy")}
 PICTURES = (".png", ".pdf", ".svg")
 
 
@@ -210,9 +210,14 @@ def leave(status: Any) -> NoReturn:
     raise SystemExit(status)
 
 
-def need_extra(extra: str, *modules: str) -> None:
+def changed(changes: Sequence[str] | None, section: str, **fields: Any) -> list[str]:
+    """Return overrides, with those that options of their own say of fields of a section."""
+    return [*(changes or ()), *(f"{section}.{name}={value}" for name, value in fields.items() if value is not None)]
+
+
+def need_extra(extra: str) -> None:
     """Raises typer.Exit if a module of an optional extra is not installed."""
-    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    missing = [name for name in EXTRAS[extra] if importlib.util.find_spec(name) is None]
     if missing:
         fail(f'{" and ".join(missing)} needed: pip install "diffabs[{extra}]"')
 
@@ -251,25 +256,20 @@ def resolved(path: pathlib.Path, option: str) -> pathlib.Path:
 
 
 @contextlib.contextmanager
-def new_file(target: pathlib.Path, option: str) -> Iterator[pathlib.Path]:
-    """A temporary file beside `target` that takes its place at the end, or vanishes if anything goes wrong. Whoever
-    removes it leaves `target` as it was.
+def new_file(target: pathlib.Path | None, option: str) -> Iterator[pathlib.Path | None]:
+    """A temporary file beside `target` that takes its place at the end, or vanishes if anything goes wrong; None where
+    no file is wanted. Whoever removes it leaves `target` as it was.
 
     Raises typer.Exit where no file can be written.
     """
+    if target is None:
+        yield None
+        return
     target = resolved(target, option)
     if target.exists() and not target.is_file():
         fail(f"{option} {target}: is not a regular file")
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{target.stem}.", suffix=target.suffix, dir=target.parent)
-    except OSError as error:
-        fail(f"{option} {target}: cannot be written, {error.strerror}")
-    os.close(handle)
-    with files.unfinished(pathlib.Path(name)) as temporary:
+    with _made(files.new_file(target), option, target) as temporary:
         yield temporary
-        if temporary.exists():
-            temporary.chmod(0o666 & ~_umask())
-            temporary.replace(target)
 
 
 @contextlib.contextmanager
@@ -277,32 +277,23 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     """A temporary folder beside `target` that takes its place at the end, or vanishes if anything goes wrong.
 
     An older result (it has a summary.json) is replaced; any other content is left alone. Raises typer.Exit where the
-    folder cannot be made or replaced.
+    folder cannot be made.
     """
     target = resolved(target, "--out")
     if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "summary.json").exists())):
         fail(f"--out {target}: exists and is no earlier result; move it away")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        room = pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))
-    except OSError as error:
-        fail(f"--out {target}: cannot be written, {error.strerror}")
-    with files.unfinished(room):
-        new, old = room / "new", room / "old"
-        new.mkdir()
+    with _made(files.new_folder(target), "--out", target) as new:
         yield new
-        if target.exists():
-            target.rename(old)
+
+
+@contextlib.contextmanager
+def _made(
+    making: contextlib.AbstractContextManager[pathlib.Path], option: str, target: pathlib.Path
+) -> Iterator[pathlib.Path]:
+    """What is being made. Raises typer.Exit where it cannot be begun."""
+    with contextlib.ExitStack() as stack:
         try:
-            new.rename(target)
-        except OSError:
-            if old.exists():
-                old.rename(target)
-            raise
-
-
-def _umask() -> int:
-    """What new files may not have; it can only be read by setting it."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+            made = stack.enter_context(making)
+        except OSError as error:
+            fail(f"{option} {target}: cannot be written, {error.strerror}")
+        yield made

@@ -2,7 +2,6 @@
 
 Both need the extra `diffabs[design]`, so what needs it is imported when a command runs."""
 
-import contextlib
 import math
 import pathlib
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from diffabs.cli import certificates, console, show
+from diffabs.core import provenance
 from diffabs.core.pytree import parameters
 
 CHECK = "check it with: diffabs verify"
@@ -26,7 +26,7 @@ def design(
 ) -> None:
     """Find the state feedback with the least guaranteed cost over the ranges of [design], and prove it."""
     with console.guarded(), certificates.reported():
-        with _file(out) as file:
+        with console.new_file(out, "--out") as file:
             task = console.waited(lambda: _task(scenario, changes or (), weighed=True), "computing the polytope")
             from diffabs.design import synthesis
 
@@ -55,7 +55,7 @@ def certify(
 ) -> None:
     """Prove, or disprove, that a gain is stable over the ranges of [design], however fast the parameters vary."""
     with console.guarded(), certificates.reported():
-        with _file(out) as file:
+        with console.new_file(out, "--out") as file:
             task = console.waited(lambda: _task(scenario, changes or (), gain), "computing the polytope")
             found = console.waited(lambda: certificates.certified(task), f"certifying {task.chosen.name}")
             if file:
@@ -85,15 +85,11 @@ def verify(
             "file": str(file),
             "proved": proved,
             "claims": [{**verdict._asdict(), "proved": not verdict.reason} for verdict in verdicts],
-            "versions": show.versions(),
+            "versions": provenance.versions(),
         }, as_json)  # fmt: skip
         if not proved:
             why = "; ".join(f"{verdict.kind}: {verdict.reason}" for verdict in verdicts if verdict.reason)
             console.fail(f"{file}: not proved: {why or 'the file claims nothing'}", console.FAILED)
-
-
-def _file(out: pathlib.Path | None) -> contextlib.AbstractContextManager[pathlib.Path | None]:
-    return console.new_file(out, "--out") if out else contextlib.nullcontext()
 
 
 def _task(

@@ -2,7 +2,6 @@
 
 It needs the extra `diffabs[tune]`; what needs that is imported when it runs."""
 
-import contextlib
 import dataclasses
 import math
 import pathlib
@@ -13,11 +12,12 @@ import numpy as np
 import typer
 
 from diffabs.cli import certificates, console, show
+from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
+from diffabs.core.values import ScenarioError, shown, unknown
 from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import Readings, read
 from diffabs.scenario.parameter_paths import flat
-from diffabs.scenario.registry import ScenarioError, shown, unknown
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.solution import FixedStep
 
@@ -57,9 +57,9 @@ def identify(
 ) -> None:
     """Find parameters of a scenario from a measured run, and say how well it determines them."""
     with console.guarded(), certificates.reported():
-        console.need_extra("tune", "optax", "scipy")
+        console.need_extra("tune")
         console.check_scenario_file(out)
-        with console.new_file(out, "--out") if out else contextlib.nullcontext() as file:
+        with console.new_file(out, "--out") as file:
             chosen = console.loaded(scenario, changes)
             units = chosen.loop.plant.shows.units
             readings = _readings(data, column, units)
@@ -113,7 +113,7 @@ def _noise(given: Sequence[str], readings: Readings, units: Mapping[str, str]) -
     return found
 
 
-def _ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.Ends]:
+def _ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.Ends | None]:
     """Ranges by path; None where they are the declared ones."""
     table = {}
     for text in given:
@@ -131,7 +131,7 @@ def _ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.En
 
 
 def _watched(
-    chosen: Scenario, readings: Readings, ranges: Mapping[str, section_tune.Ends], given: Mapping[str, float]
+    chosen: Scenario, readings: Readings, ranges: Mapping[str, section_tune.Ends | None], given: Mapping[str, float]
 ) -> tuple["Identified", dict[str, float], bool]:
     """The fit, the standard deviations it was made with, and whether Ctrl-C ended it."""
     far: list[str] = []
@@ -152,7 +152,7 @@ def _watched(
 def _identified(
     chosen: Scenario,
     readings: Readings,
-    ranges: Mapping[str, section_tune.Ends],
+    ranges: Mapping[str, section_tune.Ends | None],
     given: Mapping[str, float],
     told: Callable[[int, float], None],
     stopping: Callable[[], bool],
@@ -198,7 +198,7 @@ def _rms(values: np.ndarray) -> float:
 def _result(
     chosen: Scenario,
     readings: Readings,
-    ranges: Mapping[str, section_tune.Ends],
+    ranges: Mapping[str, section_tune.Ends | None],
     found: "Identified",
     noise: Mapping[str, float],
 ) -> dict[str, Any]:
@@ -225,13 +225,13 @@ def _result(
         "reason": found.reason.value,
         "evaluations": found.evaluations,
         "parameters": {path: np.asarray(v, float).tolist() for path, _, v in parameters(found.part)},
-        "versions": show.versions("optax", "scipy"),
+        "versions": provenance.versions("optax", "scipy"),
         "files": {},
     }
 
 
 def _values(
-    chosen: Scenario, ranges: Mapping[str, section_tune.Ends], found: "Identified"
+    chosen: Scenario, ranges: Mapping[str, section_tune.Ends | None], found: "Identified"
 ) -> dict[str, dict[str, Any]]:
     """One for each number: `controller.gain.0` where a parameter is a list."""
     specs = {path: spec for path, spec, _ in parameters(chosen.loop)}

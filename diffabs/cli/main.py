@@ -17,7 +17,7 @@ import typer
 from diffabs import __version__
 from diffabs.cli import compare, console, design, identify, rare, show, sweep, tune, usage
 from diffabs.cli.checking import checked, said
-from diffabs.core import interrupt
+from diffabs.core import interrupt, provenance, values
 from diffabs.core.pytree import parameters
 from diffabs.core.units import units_of
 from diffabs.scenario import registry
@@ -95,17 +95,16 @@ def simulate(
     ] = False,
 ) -> None:
     """Run a scenario once and show its metrics."""
-    with console.guarded(), sweep.reported():
+    with console.guarded():
         _check_source(scenario, from_sweep, sample, changes, seed)
         _check_targets(csv, plot)
-        changes = [*(changes or ()), *([] if seed is None else [f"solver.seed={seed}"])]
         with contextlib.ExitStack() as files:
-            csv_file = files.enter_context(console.new_file(csv, "--csv")) if csv else None
-            picture = files.enter_context(console.new_file(plot, "--plot")) if plot else None
+            csv_file = files.enter_context(console.new_file(csv, "--csv"))
+            picture = files.enter_context(console.new_file(plot, "--plot"))
             if from_sweep and sample is not None:
                 chosen, key = console.waited(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
             else:
-                chosen = console.loaded(scenario or "", changes)
+                chosen = console.loaded(scenario or "", console.changed(changes, "solver", seed=seed))
                 key = chosen.key()
             run = console.waited(lambda: _run(chosen, key, keep=bool(csv or plot)), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
@@ -179,7 +178,7 @@ def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -
         "parts": _parts(chosen),
         "parameters": _parameters(chosen),
         "solver": {"step": chosen.solver.step, "duration": chosen.solver.duration, "seed": chosen.seed},
-        "versions": show.versions(),
+        "versions": provenance.versions(),
         "files": {name: str(path) for name, path in files.items() if path},
     }
 
@@ -194,7 +193,7 @@ def list_parts(
     with console.guarded():
         there = (*PLURALS, "scenarios")
         if family is not None and family not in there:
-            raise registry.unknown(f"there is no family {registry.shown(family)}", family, there)
+            raise values.unknown(f"there is no family {values.shown(family)}", family, there)
         result = {name: _listed(name) for name in there if family in (None, name)}
         if as_json:
             return show.as_json(result)
@@ -214,11 +213,8 @@ def show_scenario(
     with console.guarded():
         console.check_scenario_file(out)
         text = dump(console.loaded(scenario, changes, integrated=False))
-        if out is None:
-            return typer.echo(text, nl=False)
         with console.new_file(out, "--out") as file:
-            file.write_text(text, encoding="utf-8")
-    return None
+            file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
 
 
 def _listed(plural: str) -> dict[str, Any]:
@@ -249,7 +245,7 @@ def reproduce(
         from diffabs.papers import PAPERS, compact
 
         if name != "all" and name not in PAPERS:
-            raise registry.unknown(f"there is no paper {registry.shown(name)}", name, (*PAPERS, "all"))
+            raise values.unknown(f"there is no paper {values.shown(name)}", name, (*PAPERS, "all"))
         results: dict[str, Any] = {}
         try:
             for paper in PAPERS if name == "all" else (name,):
@@ -263,7 +259,7 @@ def reproduce(
             console.say(f"interrupted: whole are {', '.join(str(out / paper) for paper in results)}")
             raise typer.Exit(console.INTERRUPTED) from None
         if as_json:
-            show.as_json({"out": str(out), "papers": results, "versions": show.versions()})
+            show.as_json({"out": str(out), "papers": results, "versions": provenance.versions()})
 
 
 def _reproduced(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> dict[str, Any]:

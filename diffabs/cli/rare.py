@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from diffabs.cli import console, show
+from diffabs.core import provenance
 from diffabs.core.pytree import Spec
+from diffabs.core.values import ScenarioError, number, unknown
 from diffabs.scenario import section_sweep
-from diffabs.scenario.registry import ScenarioError, number, unit_of, unknown
+from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.toml import value
 
@@ -32,9 +34,8 @@ def rare(
 ) -> None:
     """The probability that a metric reaches a bound while [sweep.over] varies, down to 1e-7 and less."""
     with console.guarded():
-        console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
-        changes = [*(changes or ()), *([f"sweep.seed={seed}"] if seed is not None else [])]
-        chosen = console.loaded(scenario, changes)
+        console.need_extra("sweep")
+        chosen = console.loaded(scenario, console.changed(changes, "sweep", seed=seed))
         metric, bound = _failure(failure, chosen)
         if samples < 20 or samples % 10:
             console.fail(f"--samples {samples} is no multiple of 10 from 20 on")
@@ -114,5 +115,5 @@ def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str,
         "gradients": found.gradients,
         "diverged": found.diverged,
         "seed": study.seed,
-        "versions": show.versions("numpy", "scipy"),
+        "versions": provenance.versions("numpy", "scipy"),
     }

@@ -1,20 +1,16 @@
 """What the commands show: tables for a person, JSON and CSV for a script."""
 
-import importlib.metadata
 import json
 import math
 import pathlib
-import platform
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
 from rich.table import Table
 
-from diffabs import __version__
 from diffabs.cli.console import say
 from diffabs.cli.tables import fitted
 from diffabs.core.loop import signals
@@ -39,12 +35,6 @@ def finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def versions(*others: str) -> dict[str, str]:
-    """What a result was computed with."""
-    always = {"diffabs": __version__, "jax": jax.__version__, "python": platform.python_version()}
-    return always | {name: importlib.metadata.version(name) for name in others}
 
 
 def write_csv(trajectory: Trajectory, plant: Any, path: pathlib.Path) -> None:

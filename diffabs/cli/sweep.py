@@ -16,9 +16,11 @@ import jax.numpy as jnp
 import typer
 
 from diffabs.cli import console, progress, show
+from diffabs.core import files
 from diffabs.core.pytree import elements
+from diffabs.core.values import ScenarioError, unknown
 from diffabs.scenario import section_sweep
-from diffabs.scenario.registry import ScenarioError, unit_of, unknown
+from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads
 from diffabs.simulate.refusals import first_line
 
@@ -52,15 +54,13 @@ def sweep(
     as_json: console.Json = False,
 ) -> None:
     """Run a scenario for many values of what [sweep.over] varies, and show statistics with confidence intervals."""
-    with console.guarded(), reported():
+    with console.guarded():
         _check_options(engine, scheduler, workers, devices, figures)
         if samples is not None and samples < 1:
             console.fail(f"--samples {samples} is not positive")
         if devices:
             jax.config.update("jax_num_cpu_devices", devices)
-        given = {"samples": samples, "seed": seed}
-        changes = [*(changes or ()), *(f"sweep.{k}={v}" for k, v in given.items() if v is not None)]
-        chosen = console.loaded(scenario, changes)
+        chosen = console.loaded(scenario, console.changed(changes, "sweep", samples=samples, seed=seed))
         out = out or pathlib.Path("out") / f"sweep-{chosen.name}"
         study = section_sweep.study(chosen)
         kept = _numbers(keep, study.samples)
@@ -82,7 +82,7 @@ def sweep(
 
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     """A sample of a sweep as a scenario, and the key of its noise. Raises SweepError or ValueError."""
-    console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
+    console.need_extra("sweep")
     from diffabs.sweep.store import SweepError, check_owner, differences, read_manifest
 
     manifest = read_manifest(folder)
@@ -117,17 +117,6 @@ def warn_of_strays(found: "Results") -> None:
 
 
 @contextlib.contextmanager
-def reported() -> Iterator[None]:
-    """A sweep that cannot be started or read is bad input."""
-    try:
-        yield
-    except ValueError as error:
-        if "SweepError" not in (cls.__name__ for cls in type(error).__mro__):  # its module needs the extra
-            raise
-        console.fail(str(error))
-
-
-@contextlib.contextmanager
 def _continued(out: pathlib.Path, resume: bool) -> Iterator[None]:
     """A full disk and Ctrl-C say how to go on."""
     try:
@@ -143,11 +132,11 @@ def _continued(out: pathlib.Path, resume: bool) -> Iterator[None]:
 
 
 def _check_options(engine: str, scheduler: str | None, workers: int | None, devices: int | None, figures: bool) -> None:
-    console.need_extra("sweep", "filelock", "pyarrow", "scipy", "zarr")
+    console.need_extra("sweep")
     if engine not in ENGINES:
         raise unknown(f"--engine {engine} is unknown", engine, ENGINES)
     if engine == "dask":
-        console.need_extra("cluster", "distributed")
+        console.need_extra("cluster")
     for option, value, needed in (
         ("--scheduler", scheduler, "dask"),
         ("--workers", workers, "dask"),
@@ -234,7 +223,6 @@ def _result(
     """The JSON document, which is also written into the folder."""
     from diffabs.sweep.checking import checked
     from diffabs.sweep.statistics.summary import summary
-    from diffabs.sweep.store import write_whole
     from diffabs.sweep.trajectories import keep
 
     accuracy = checked(study, found, check) if check else None
@@ -250,5 +238,5 @@ def _result(
         units |= {name: unit_of(objective, study.loop.plant) for name, objective in study.objectives.items()}
         result["files"]["figures"] = [str(path) for path in draw(found, result, folder, units)]
     document = json.dumps(show.finite(result), indent=1, allow_nan=False)
-    write_whole(out / SUMMARY, document.encode())
+    files.write_durably(out / SUMMARY, document.encode())
     return result

@@ -14,8 +14,9 @@ import numpy as np
 import typer
 
 from diffabs.cli import certificates, console, show
+from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
-from diffabs.scenario.registry import ScenarioError
+from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.refusals import first_line
 from diffabs.simulate.run import rollout
@@ -60,14 +61,13 @@ def tune(
 ) -> None:
     """Tune the free parameters of [tune] by gradients, over all its runs at once."""
     with console.guarded(), certificates.reported():
-        console.need_extra("tune", "optax", "scipy")
+        console.need_extra("tune")
         console.check_picture(plot)
         console.check_scenario_file(out)
-        changes = [*(changes or ()), *([] if starts is None else [f"tune.starts={starts}"])]
         with contextlib.ExitStack() as files:
-            out_file = files.enter_context(console.new_file(out, "--out")) if out else None
-            picture = files.enter_context(console.new_file(plot, "--plot")) if plot else None
-            chosen = console.loaded(scenario, changes)
+            out_file = files.enter_context(console.new_file(out, "--out"))
+            picture = files.enter_context(console.new_file(plot, "--plot"))
+            chosen = console.loaded(scenario, console.changed(changes, "tune", starts=starts))
             result, told = _tuned(chosen, out_file, picture)
             if not result["met"]:  # inside, so that no file is written
                 _show(result, told, chosen, as_json)
@@ -246,7 +246,7 @@ def _result(work: _Work, found: "Tuned", proved: _Proved) -> dict[str, Any]:
         ],
         "parameters": {path: _plain(value) for path, _, value in parameters(found.loop)},
         "certificate": proved.document,
-        "versions": show.versions("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ())),
+        "versions": provenance.versions("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ())),
         "files": {},
     }
 

@@ -4,9 +4,11 @@ import contextlib
 import errno
 import os
 import pathlib
+import secrets
 import shutil
 import stat
 import sys
+import tempfile
 from collections.abc import Iterator
 from typing import BinaryIO
 
@@ -48,6 +50,62 @@ def unfinished(path: pathlib.Path) -> Iterator[pathlib.Path]:
         raise
     _remove(path)
     _unfinished.discard(path)
+
+
+@contextlib.contextmanager
+def new_file(target: pathlib.Path, temporary: pathlib.Path | None = None) -> Iterator[pathlib.Path]:
+    """An empty file beside `target` that takes its place at the end, or vanishes if anything goes wrong: readers see
+    the old file or the whole new one. Whoever removes it leaves `target` as it was. `temporary`: its path, where only
+    one process writes; else one that nobody else has. Raises OSError where no file can be made."""
+    temporary = temporary or target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
+    temporary.touch(exist_ok=False)
+    with unfinished(temporary):
+        yield temporary
+        if temporary.exists():
+            temporary.replace(target)
+
+
+def write(target: pathlib.Path, data: bytes) -> None:
+    """Write a file, whole or not at all. Raises OSError."""
+    with new_file(target) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_durably(target: pathlib.Path, data: bytes) -> pathlib.Path:
+    """Write a file that is whole at every instant at which it is there, also after a power cut; only one process may.
+    What a kill leaves behind ends in `.tmp`. Returns the path. Raises OSError."""
+    temporary = target.with_name(f"{target.name}.tmp")
+    temporary.unlink(missing_ok=True)
+    with new_file(target, temporary), temporary.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    if hasattr(os, "O_DIRECTORY"):
+        folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    return target
+
+
+@contextlib.contextmanager
+def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
+    """An empty folder beside `target` that takes its place at the end, or vanishes if anything goes wrong. Raises
+    OSError where the folder cannot be made or replaced; the old one is then back."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with unfinished(pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))) as room:
+        new, old = room / "new", room / "old"
+        new.mkdir()
+        yield new
+        if target.exists():
+            target.rename(old)
+        try:
+            new.rename(target)
+        except OSError:
+            if old.exists():
+                old.rename(target)
+            raise
 
 
 def clear() -> None:

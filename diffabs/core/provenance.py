@@ -9,10 +9,14 @@ import jax
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Of diffabs, Python and these packages; the processor and JAX's backend."""
-    found = {name: importlib.metadata.version(name) for name in ("diffabs", *packages)}
-    platforms = {"python": platform.python_version(), "backend": jax.default_backend(), "machine": platform.machine()}
-    return {**found, **platforms}
+    """Return the versions of diffabs, JAX, these packages, and Python, by name."""
+    found = {name: importlib.metadata.version(name) for name in ("diffabs", "jax", *packages)}
+    return {**found, "python": platform.python_version()}
+
+
+def origin(*packages: str) -> dict[str, str]:
+    """Return what can change a bit of a result: `versions`, JAX's backend, and the processor."""
+    return versions(*packages) | {"backend": jax.default_backend(), "machine": platform.machine()}
 
 
 def commit() -> dict[str, str]:

@@ -259,6 +259,6 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
             for name, (_, reaches) in over_riders.items()
         },
         "solver": record.solver(SOLVER),
-        "versions": record.versions(),
+        "versions": record.origin(),
     }
     return record.write(folder, summary)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from diffabs import plot
-from diffabs.core import provenance
+from diffabs.core import files, provenance
 from diffabs.simulate.solution import FixedStep, Run
 
 
@@ -50,19 +49,16 @@ def solver(step: FixedStep, **more: Any) -> dict[str, Any]:
     return {"method": "RK4, fixed step", "step": step.step, "duration": step.duration, "dtype": dtype, **more}
 
 
-def versions() -> dict[str, str]:
+def origin() -> dict[str, str]:
     """Of everything that can change a number, and the commit where there is one."""
-    return provenance.versions("jax", "jaxlib", "numpy", "matplotlib") | provenance.commit()
+    return provenance.origin("jaxlib", "numpy", "matplotlib") | provenance.commit()
 
 
 def write(folder: pathlib.Path, summary: dict[str, Any], name: str = "summary.json") -> dict[str, Any]:
     """Write a summary, whole or not at all, and return it as a reader would get it. Raises ValueError for a number
     that is not finite."""
     text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False)
-    path = folder / name
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(text + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    files.write(folder / name, f"{text}\n".encode())
     return json.loads(text)
 
 
@@ -91,5 +87,5 @@ def experiment(config: Any, results: Mapping[str, Any], figures: Mapping[str, An
     folder = pathlib.Path(config.out)
     folder.mkdir(parents=True, exist_ok=True)
     names = [plot.save(figure, folder / f"{name}.png").name for name, figure in figures.items()]
-    whole = {"config": dataclasses.asdict(config), **results, "figures": names, "versions": versions()}
+    whole = {"config": dataclasses.asdict(config), **results, "figures": names, "versions": origin()}
     return write(folder, whole, "results.json")

@@ -207,7 +207,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
         "figures": names,
         "notes": [*NOTES, _step_note(results)],
         "solver": record.solver(SOLVER, speed_at_which_integration_ends=0.05),
-        "versions": record.versions(),
+        "versions": record.origin(),
     }
     return record.write(folder, summary)
 

@@ -228,7 +228,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
         "judged": more["judged"],
         "solver": record.solver(SOLVER),
         "convergence": {"steps": HALVINGS, "relative_error": errors},
-        "versions": record.versions(),
+        "versions": record.origin(),
     }
     return record.write(folder, summary)
 

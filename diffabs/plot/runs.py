@@ -6,7 +6,6 @@ Speeds are drawn in km/h, everything else in SI units. Colours are those of M. O
 
 import os
 import pathlib
-import tempfile
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -64,12 +63,8 @@ def label(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> 
 def save(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
     """Write a figure in the format of the path's suffix, atomically: readers see the old file or the whole new one."""
     path = pathlib.Path(path)
-    handle, name = tempfile.mkstemp(suffix=path.suffix, prefix=f".{path.stem}-", dir=path.parent)
-    with files.unfinished(pathlib.Path(name)):
-        with os.fdopen(handle, "wb") as file:
-            figure.savefig(file, format=path.suffix.lstrip(".") or "png", dpi=DPI)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
+    with files.new_file(path) as temporary:
+        figure.savefig(temporary, format=path.suffix.lstrip(".") or "png", dpi=DPI)
     return path
 
 

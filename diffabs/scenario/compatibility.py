@@ -10,7 +10,8 @@ import jax
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Memory, Objective
 from diffabs.core.pytree import strong
-from diffabs.scenario.registry import joined, kebab
+from diffabs.core.values import kebab
+from diffabs.scenario.registry import joined
 
 
 def misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:

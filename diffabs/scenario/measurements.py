@@ -1,7 +1,6 @@
 """Measured runs as CSV files, in the columns that `diffabs simulate --csv` writes."""
 
 import csv
-import difflib
 import math
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -10,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.core import files
-from diffabs.scenario.registry import ScenarioError, shown
+from diffabs.core.values import ScenarioError, shown, unknown
 
 LARGEST = 100_000_000  # bytes
 TIME = "t [s]"
@@ -63,9 +62,7 @@ def _names(header: Sequence[str], path: pathlib.Path, units: Mapping[str, str]) 
         if header.count(name) > 1:
             raise ScenarioError(f"--data {path}: column {shown(name)} is there twice")
         if name != TIME and name not in headers and not name.startswith(IGNORED):
-            near = difflib.get_close_matches(name, headers, 1, 0.5)
-            hint = f"did you mean {near[0]}? There is" if near else "there is"
-            raise ScenarioError(f"--data {path}: column {shown(name)} is unknown; {hint} {there}")
+            raise unknown(f"--data {path}: column {shown(name)} is unknown", name, (TIME, *headers))
     names = {i: headers[name] for i, name in enumerate(header) if name in headers}
     if not names:
         raise ScenarioError(f"--data {path}: no column was measured; there is {', '.join(headers)}")

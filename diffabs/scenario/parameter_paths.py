@@ -12,8 +12,13 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from diffabs.core.pytree import Spec
-from diffabs.scenario.registry import DEEPEST, KMH, ScenarioError, shown, unknown
+import numpy as np
+
+from diffabs.core.pytree import Spec, parameters
+from diffabs.core.values import ScenarioError, inside, number, shown, unknown, wrong
+from diffabs.scenario.registry import DEEPEST, KMH
+
+Ends = tuple[Any, Any]  # low and high, tuples where the parameter is a list
 
 TABLES = (("design", "over"), ("tune", "free"), ("tune", "over"), ("sweep", "over"))
 
@@ -21,21 +26,77 @@ TABLES = (("design", "over"), ("tune", "free"), ("tune", "over"), ("sweep", "ove
 @dataclasses.dataclass(frozen=True)
 class Entry:
     """What was given for a parameter: its path in the loop, the place for messages, and the parameter's unit and range,
-    both in the unit in which the value was given, `scale` of which make one in SI."""
+    both in the unit in which the value was given, `scale` of which make one in SI; and its shape, () for a number."""
 
     path: str
     where: str
     given: Any
     spec: Spec
+    shape: tuple[int, ...]
     scale: float
 
+    def single(self, what: str) -> "Entry":
+        """Return this entry. Raises ScenarioError for a parameter that is a list: only single numbers can do `what`."""
+        if self.shape:
+            raise ScenarioError(f"{self.where} is a list of {self.shape[0]} numbers; only single numbers can {what}")
+        return self
 
-def lifted(table: dict[str, Any]) -> None:
-    """Every such table of a scenario by dotted path, however it was written. Raises ScenarioError."""
+    def values(self) -> tuple[float, ...]:
+        """Return the numbers that were given, or the one, in SI. Raises ScenarioError, also where there are none."""
+        given = self.given if isinstance(self.given, list) else [self.given]
+        if not given:
+            raise ScenarioError(f"{self.where} = [] is empty; numbers in {self.spec.interval()} are needed")
+        return tuple(inside(x, self.spec, f"{self.where}.{i}") / self.scale for i, x in enumerate(given))
+
+    def range(self, or_else: str = "") -> Ends:
+        """Return low and high in SI, each a tuple where the parameter is a list and one was given.
+
+        or_else: what might have been given instead; such a range is of coordinates, which never reach its ends: they
+            may be those of an open range, and must differ.
+        Raises ScenarioError."""
+        needed = f"a range [low, high] in {self.spec.interval()}"
+        if not isinstance(self.given, list):
+            raise wrong(self.where, self.given, needed + or_else)
+        if len(self.given) != 2:
+            raise ScenarioError(f"{self.where} = {shown(self.given)} is no range [low, high] in {self.spec.interval()}")
+        ends = [self._end(item, f"{self.where}.{i}") for i, item in enumerate(self.given)]
+        low, high = map(np.asarray, ends)
+        closed = dataclasses.replace(self.spec, open_low=False, open_high=False, infinite=True)
+        allowed = closed if or_else else self.spec
+        if not (allowed.holds(low) and allowed.holds(high)):
+            raise ScenarioError(f"{self.where} = {shown(ends)} is outside {self.spec.interval()}")
+        if not (np.all(low < high) or (not or_else and np.all(low <= high))):
+            raise ScenarioError(f"{self.where} = {shown(ends)} is {'empty' if or_else else 'inverted'}: {needed}")
+        return tuple(in_si(end, self.scale) for end in ends)
+
+    def _end(self, given: Any, path: str) -> Any:
+        """A number, or a tuple of as many as the parameter has."""
+        if not self.shape or not isinstance(given, list):
+            return number(given, self.spec, path)
+        if len(given) != self.shape[0]:
+            have = f"has {len(given)} numbers; the parameter has {self.shape[0]}"
+            raise ScenarioError(f"{path} = {shown(given)} {have}")
+        return tuple(number(item, self.spec, f"{path}.{i}") for i, item in enumerate(given))
+
+
+def in_si(value: Any, scale: float) -> Any:
+    """Return a number, or a tuple of them, that was given in units of which `scale` make one in SI."""
+    return tuple(in_si(item, scale) for item in value) if isinstance(value, tuple) else value / scale
+
+
+def lifted(table: dict[str, Any]) -> dict[str, Any]:
+    """Bring a scenario to its canonical form: the road in a section of its own, and every such table by dotted path,
+    however they were written. Returns the table. Raises ScenarioError."""
+    plant = table.get("plant")
+    if isinstance(plant, dict) and "road" in plant:
+        if "road" in table:
+            raise ScenarioError("road is given twice, as a section and in plant")
+        table["road"] = plant.pop("road")
     for section, name in TABLES:
         inside = table.get(section)
         if isinstance(inside, dict) and isinstance(inside.get(name), dict):
             inside[name] = flat(inside[name], f"{section}.{name}")
+    return table
 
 
 def forget(table: dict[str, Any], replaced: str) -> None:
@@ -77,20 +138,27 @@ def canonical(path: str) -> str:
     return path.removeprefix("plant.") if path.startswith("plant.road.") else path
 
 
-def entries(table: Mapping[str, Any], section: str, specs: Mapping[str, Spec], otherwise: str) -> Iterator[Entry]:
-    """What was given, by parameter. `specs`: of what may be there, by path of the loop; `otherwise`: what to say of a
-    name that is not. Raises ScenarioError."""
-    known = {canonical(path): (path, spec, 1.0) for path, spec in specs.items()}
-    known |= {f"{key}_kmh": (path, _kmh(spec), KMH) for key, (path, spec, _) in known.items() if spec.unit == "m/s"}
+def entries(
+    table: Mapping[str, Any], section: str, there: Mapping[str, tuple[Spec, tuple[int, ...]]], otherwise: str
+) -> Iterator[Entry]:
+    """What was given, by parameter. `there`: spec and shape of what may be, by path of the loop; `otherwise`: what to
+    say of a name that is not. Raises ScenarioError."""
+    known = {canonical(path): (path, spec, shape, 1.0) for path, (spec, shape) in there.items()}
+    known |= {f"{k}_kmh": (path, _kmh(spec), n, KMH) for k, (path, spec, n, _) in known.items() if spec.unit == "m/s"}
     seen = set()
     for key, given in flat(table, section).items():
         if key not in known:
             raise unknown(f"{_where(section, key)} is {otherwise}", key, known)
-        path, spec, scale = known[key]
+        path, spec, shape, scale = known[key]
         if path in seen:
             raise ScenarioError(f"{_where(section, canonical(path))} is given twice, in m/s and in km/h")
         seen.add(path)
-        yield Entry(path, _where(section, key), given, spec, scale)
+        yield Entry(path, _where(section, key), given, spec, shape, scale)
+
+
+def parameters_of(loop: Any) -> dict[str, tuple[Spec, tuple[int, ...]]]:
+    """Return spec and shape of every parameter by path."""
+    return {path: (spec, np.shape(value)) for path, spec, value in parameters(loop)}
 
 
 def _kmh(spec: Spec) -> Spec:

@@ -6,11 +6,8 @@ and exporting it is thus all that it takes to use it in a scenario. Parts from o
 families in one: such a part is of the family whose contract asks most of it, or of its `family`, if it says one."""
 
 import dataclasses
-import difflib
 import inspect
-import json
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from types import ModuleType
@@ -23,6 +20,7 @@ from diffabs.core import blocks, protocols
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import Spec
 from diffabs.core.units import Units, in_loop, units_of
+from diffabs.core.values import ScenarioError, dotted, inside, kebab, number, shown, unknown, whole, wrong
 from diffabs.scenario import outside
 from diffabs.scenario.defaults import braking
 
@@ -30,14 +28,6 @@ KMH = 3.6  # km/h in a m/s
 DEEPEST = 16  # parts inside parts; more is a mistake, and Python's stack is finite
 LARGEST = 10_000_000  # of a whole number that shapes arrays
 USUAL = units_of(braking().plant)  # in which parts are listed that are in no loop
-
-
-class ScenarioError(ValueError):
-    """A scenario that cannot be used; the message is one line for a person."""
-
-    def __init__(self, message: str):
-        """Whatever the user wrote, the message stays on one line."""
-        super().__init__(" ".join(message.split()))
 
 
 def _methods(cls: type) -> frozenset[str]:
@@ -130,11 +120,6 @@ def _packaged(family: str) -> Mapping[str, Any]:
     return found
 
 
-def kebab(name: str) -> str:
-    """`QuarterCar`, `PID`, `RIG_UNROUNDED` -> `quarter-car`, `pid`, `rig-unrounded`."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z]{2})(?=[A-Z][a-z])", "-", name).replace("_", "-").lower()
-
-
 def name_of(family: str, part: Any) -> str:
     """The name of a named constant, else that of the part's class."""
     named = (name for name, item in types(family).items() if item is part)
@@ -154,51 +139,6 @@ def summary(part: Any) -> str:
 def unit_of(objective: Any, plant: Any = None) -> str:
     """The unit of what an objective measures on a plant, without one on the usual; empty where it does not say."""
     return in_loop(getattr(objective, "unit", ""), units_of(plant) or USUAL)
-
-
-def shown(value: Any, most: int = 60) -> str:
-    """A value of a scenario as it may stand in a message: on one line, of bounded length."""
-    if isinstance(value, float) or (isinstance(value, int) and abs(value) < 10**15):
-        return f"{value:.15g}" if not isinstance(value, bool) else str(value).lower()
-    try:
-        text = json.dumps(value, ensure_ascii=True) if isinstance(value, str) else repr(value)
-    except (ValueError, RecursionError):  # more digits than Python writes, more levels than it descends
-        text = "a number of thousands of digits" if isinstance(value, int) else "something nested too deeply"
-    return text if len(text) <= most else f"{text[: most - 3]}..."
-
-
-def unknown(what: str, name: str, there: Iterable[str]) -> ScenarioError:
-    """An error for a name that is not there, with the nearest one that is."""
-    there = list(there)
-    near = difflib.get_close_matches(str(name).lower(), there, 1, 0.5)
-    hint = f"did you mean {near[0]}? There is" if near else "there is"
-    return ScenarioError(f"{what}; {hint} {', '.join(there) or 'nothing'}")
-
-
-def wrong(path: str, value: Any, needed: str) -> ScenarioError:
-    """An error for a value of the wrong kind."""
-    kinds = ((bool, "a boolean"), (str, "text"), ((int, float), "a number"), (list, "a list"), (dict, "a table"))
-    kind = next((name for of, name in kinds if isinstance(value, of)), "a date or time")
-    return ScenarioError(f"{path} = {shown(value)} is {kind}; {needed} is needed")
-
-
-def number(value: Any, spec: Spec, path: str) -> float:
-    """A number of TOML as a float. Raises ScenarioError for anything else; the range is not looked at."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise wrong(path, value, f"a number in {spec.interval()}")
-    try:
-        return float(value)
-    except OverflowError:
-        raise ScenarioError(f"{path} = {shown(value)} is too large for a number in {spec.interval()}") from None
-
-
-def whole(value: Any, low: int, high: int, path: str) -> int:
-    """A whole number of TOML. Raises ScenarioError for anything else, or out of range."""
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise wrong(path, value, f"a whole number in [{low}, {high}]")
-    if not low <= value <= high:
-        raise ScenarioError(f"{path} = {shown(value)} is outside [{low}, {high}]")
-    return value
 
 
 def build(family: str, given: Any, default: Any, path: str, units: Units | None = None) -> Any:
@@ -266,10 +206,7 @@ OTHERS = ("road", "solver", "objective", "design", "tune", "sweep", "title", "de
 
 def joined(path: str, key: str) -> str:
     """A dotted path; the road of the plant has a section of its own."""
-    if (path, key) == ("plant", "road"):
-        return "road"
-    key = key if re.fullmatch(r"[\w-]{1,60}", key) else shown(key)
-    return f"{path}.{key}" if path else key
+    return "road" if (path, key) == ("plant", "road") else dotted(path, key)
 
 
 def _value(given: Any, field: dataclasses.Field[Any], default: Any, place: tuple[str, str], units: Units | None) -> Any:
@@ -310,10 +247,7 @@ def _parts(family: str, given: Any, default: tuple[Any, ...], path: str, units: 
 def _metres_per_second(given: Any, spec: Spec, path: str) -> float:
     """Checked here, in the unit in which it was given."""
     there = dataclasses.replace(spec, unit="km/h", low=spec.low * KMH, high=spec.high * KMH)
-    speed = number(given, there, path)
-    if not there.holds(speed):
-        raise ScenarioError(f"{path} = {shown(speed)} is outside {there.interval()}")
-    return speed / KMH
+    return inside(given, there, path) / KMH
 
 
 def described(family: str, part: Any) -> dict[str, dict[str, Any]]:

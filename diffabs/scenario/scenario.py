@@ -24,12 +24,14 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import Spec, cautions, problems
 from diffabs.core.units import units_of
+from diffabs.core.values import ScenarioError as ScenarioError
+from diffabs.core.values import entry, members, plain, ranged, shown, text, unknown, within, wrong
+from diffabs.core.values import read as read_table
 from diffabs.objectives import BRAKING, usual
 from diffabs.scenario import parameter_paths, section_design, section_sweep, section_tune, toml
 from diffabs.scenario.compatibility import misfits
 from diffabs.scenario.defaults import braking
-from diffabs.scenario.registry import OTHERS, build, joined, loop_of, number, shown, unknown, whole, wrong
-from diffabs.scenario.registry import ScenarioError as ScenarioError
+from diffabs.scenario.registry import OTHERS, build, joined, loop_of
 from diffabs.simulate.refusals import MOST_STEPS, together, unstable
 from diffabs.simulate.solution import FixedStep
 
@@ -77,7 +79,7 @@ def names() -> list[str]:
 def header(name_or_path: str | pathlib.Path) -> dict[str, str]:
     """Title and description of a scenario, without building it. Raises ScenarioError."""
     table = _parsed(_read(name_or_path)[1], str(name_or_path))
-    return {key: _text(table.get(key, ""), key) for key in TEXTS}
+    return {key: text(table.get(key, ""), key) for key in TEXTS}
 
 
 def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = (), *, integrated: bool = True) -> Scenario:
@@ -118,9 +120,7 @@ def loads(
         _override(table, override)
     if overrides:
         table |= _titled(name, overrides)
-    if "sweep" in table:
-        table["sweep"] = section_sweep.with_samples(table["sweep"], folder)
-    scenario = _assembled(name, table)
+    scenario = _assembled(name, table, folder)
     asked = (scenario.loop, scenario.solver)
     _refuse(together(*asked), unstable(*asked) if integrated else ())
     return scenario
@@ -163,7 +163,7 @@ def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
 def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
     quoted = shown(origin, LONGEST_PATH)
     try:
-        return _lifted(toml.parsed(raw.decode()))
+        return parameter_paths.lifted(toml.parsed(raw.decode()))
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         raise ScenarioError(f"{quoted} is not UTF-8 text (at line {line})") from None
@@ -171,17 +171,6 @@ def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
         raise ScenarioError(f"{quoted} is not a scenario: {error}") from None
     except ValueError as error:
         raise ScenarioError(f"{quoted} is not TOML: {error}") from None
-
-
-def _lifted(table: dict[str, Any]) -> dict[str, Any]:
-    """The road of the plant in its own section, and ranges by path, however they were written."""
-    plant = table.get("plant")
-    if isinstance(plant, dict) and "road" in plant:
-        if "road" in table:
-            raise ScenarioError("road is given twice, as a section and in plant")
-        table["road"] = plant.pop("road")
-    parameter_paths.lifted(table)
-    return table
 
 
 def _override(table: dict[str, Any], override: str) -> None:
@@ -213,7 +202,7 @@ def _override(table: dict[str, Any], override: str) -> None:
         node[place] = toml.value(text.strip())
     except ScenarioError as error:
         raise ScenarioError(f"override {shown(override)}: {error}") from None
-    _lifted(table)
+    parameter_paths.lifted(table)
     new = node[place]
     if isinstance(new, str) or (isinstance(new, dict) and "type" in new):
         parameter_paths.forget(table, ".".join(keys))
@@ -228,14 +217,14 @@ def _place(node: Any, key: str, path: str) -> Any:
     return int(key)
 
 
-def _assembled(name: str, table: dict[str, Any]) -> Scenario:
-    text = {key: _text(table.get(key, ""), key) for key in TEXTS}
+def _assembled(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenario:
+    texts = {key: text(table.get(key, ""), key) for key in TEXTS}
     sections = {key: value for key, value in table.items() if key not in OTHERS}
     if "road" in table:
         plant = sections.get("plant", {})
         plant = {"type": plant} if isinstance(plant, str) else plant
         sections["plant"] = {**plant, "road": table["road"]} if isinstance(plant, dict) else plant
-    solver, seed = _solver(table.get("solver", {}))
+    solver: _Solver = read_table(_Solver, table.get("solver", {}), "solver")
     given = table.get("objective", {})
     if not isinstance(given, dict):
         raise wrong("objective", given, "a table of objectives")
@@ -249,36 +238,25 @@ def _assembled(name: str, table: dict[str, Any]) -> Scenario:
     _refuse(_wrong_values(loop, objectives), misfits(loop, objectives))  # before what is said of their parameters
     return Scenario(
         name=name,
-        **text,
+        **texts,
         loop=loop,
-        solver=solver,
+        solver=FixedStep(solver.step, solver.duration, solver.every),
         objectives=objectives,
-        seed=seed,
+        seed=solver.seed,
         design=section_design.read(table.get("design", {}), loop),
         tune=section_tune.read(table.get("tune", {}), loop, objectives),
-        sweep=section_sweep.read(table.get("sweep", {}), loop, objectives),
+        sweep=section_sweep.read(table.get("sweep", {}), loop, objectives, folder),
     )
 
 
-def _text(value: Any, path: str) -> str:
-    if not isinstance(value, str):
-        raise wrong(path, value, "text")
-    return value
+@dataclasses.dataclass(frozen=True)
+class _Solver:
+    """The section [solver]: the fields of a solver, and the seed of the noise."""
 
-
-def _solver(table: Any) -> tuple[FixedStep, int]:
-    fields = ("step", "duration", "every", "seed")
-    if not isinstance(table, dict):
-        raise wrong("solver", table, f"a table of {', '.join(fields)}")
-    for key in table:
-        if key not in fields:
-            raise unknown(f"{joined('solver', key)} is not a field of solver", key, fields)
-    times = {key: number(table[key], TIME, f"solver.{key}") for key in ("step", "duration") if key in table}
-    for key, value in times.items():
-        if not TIME.holds(value):
-            raise ScenarioError(f"solver.{key} = {shown(value)} is outside {TIME.interval()}")
-    every = whole(table.get("every", 1), 1, int(MOST_STEPS), "solver.every")
-    return FixedStep(**times, every=every), whole(table.get("seed", 0), 0, 2**32 - 1, "solver.seed")
+    step: float = entry(ranged(TIME), FixedStep.step)
+    duration: float = entry(ranged(TIME), FixedStep.duration)
+    every: int = entry(within(1, int(MOST_STEPS)), FixedStep.every)
+    seed: int = entry(within(0, 2**32 - 1), 0)
 
 
 def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
@@ -290,13 +268,10 @@ def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[s
 
 def dump(scenario: Scenario) -> str:
     """Return TOML that loads back to the same scenario; every field is written, numbers at full precision."""
-    sections = {
-        field.name: toml.table(field.name, getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)
-    }
+    sections = {field.name: plain(getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)}
     if "road" in sections["plant"]:
         sections["road"] = sections["plant"].pop("road")
-    solver = {name: getattr(scenario.solver, name) for name in ("step", "duration", "every")}
-    sections["solver"] = {**solver, "seed": scenario.seed}
-    sections["objective"] = {name: toml.table("objective", part) for name, part in scenario.objectives.items()}
+    sections["solver"] = {**members(scenario.solver), "seed": scenario.seed}
+    sections["objective"] = plain(scenario.objectives)
     sections |= {name: getattr(scenario, name).table() for name in ("design", "tune", "sweep")}
     return toml.document({key: getattr(scenario, key) for key in TEXTS}, sections)

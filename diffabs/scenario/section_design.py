@@ -20,16 +20,39 @@ from diffabs.controllers import Sampled
 from diffabs.core.blocks import Series
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import Spec, parameters
+from diffabs.core.values import ScenarioError, as_given, entry, members, number, ranged, shown, table_of, wrong
+from diffabs.core.values import read as read_table
 from diffabs.linear.slip_model import SlipModel
-from diffabs.scenario.parameter_paths import Entry, entries
-from diffabs.scenario.registry import ScenarioError, joined, number, shown, unknown, wrong
+from diffabs.scenario.parameter_paths import entries
 
-FIELDS = ("Q", "R", "decay", "damping", "over")
 ENTRY = Spec("1")
-DECAY = Spec("1/s", low=0.0)
-DAMPING = Spec("1", low=0.0, high=1.0, open_high=True)
 
 Range = tuple[float, float]
+
+
+def _weight(given: Any, path: str) -> Any:
+    """A weight as a number or nested tuples, which compare; its order is for the model to say."""
+    from diffabs.linear.weights import weight
+
+    if not isinstance(given, list | int | float) or isinstance(given, bool):
+        raise wrong(path, given, "a number, a diagonal or a matrix")
+    if given == []:
+        raise ScenarioError(f"{path} = [] is empty")
+    rows = given if isinstance(given, list) and any(isinstance(row, list) for row in given) else ()
+    if not all(isinstance(row, list) and len(row) == len(rows) for row in rows):
+        raise ScenarioError(f"{path} = {shown(given)} is not square: {len(rows)} rows need as many numbers each")
+    value = _numbers(given, path)
+    try:
+        weight(path, value, len(np.atleast_1d(value)), definite=path == "design.R")
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
+    return value
+
+
+def _numbers(given: Any, path: str) -> Any:
+    if not isinstance(given, list):
+        return number(given, ENTRY, path)
+    return tuple(_numbers(item, f"{path}.{i}") for i, item in enumerate(given))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,10 +60,10 @@ class Task:
     """What a gain is asked for: weights (tuples of their rows, or of a diagonal) or None, decay [1/s], damping, and the
     ranges given, in SI, by path of the loop."""
 
-    Q: Any = None
-    R: Any = None
-    decay: float = 0.0
-    damping: float = 0.0
+    Q: Any = entry(_weight, None)
+    R: Any = entry(_weight, None)
+    decay: float = entry(ranged(Spec("1/s", low=0.0)), 0.0)
+    damping: float = entry(ranged(Spec("1", low=0.0, high=1.0, open_high=True)), 0.0)
     over: Mapping[str, Range] = dataclasses.field(default_factory=dict)
 
     def box(self, loop: Loop) -> dict[str, Range]:
@@ -54,9 +77,7 @@ class Task:
 
     def table(self) -> dict[str, Any]:
         """As values of TOML."""
-        weights = {name: _listed(getattr(self, name)) for name in ("Q", "R") if getattr(self, name) is not None}
-        over = {path: list(ends) for path, ends in self.over.items()}
-        return {**weights, "decay": self.decay, "damping": self.damping, "over": over}
+        return {name: value for name, value in members(self).items() if value is not None}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,72 +91,18 @@ class _Parameter:
 
 def read(table: Any, loop: Loop) -> Task:
     """The task of a section. Raises ScenarioError, one line, for whatever is wrong with it."""
-    if not isinstance(table, dict):
-        raise wrong("design", table, f"a table of {', '.join(FIELDS)}")
-    for key in table:
-        if key not in FIELDS:
-            raise unknown(f"{joined('design', key)} is not a field of design", key, FIELDS)
-    weights = {name: _weight(table[name], f"design.{name}") for name in ("Q", "R") if name in table}
-    if len(weights) == 1:
-        (there,), (missing,) = weights, {"Q", "R"} - set(weights)
-        raise ScenarioError(f"design.{missing} is missing: with design.{there}, a cost needs both")
-    numbers = {}
-    for name, spec in (("decay", DECAY), ("damping", DAMPING)):
-        numbers[name] = number(table.get(name, 0.0), spec, f"design.{name}")
-        if not spec.holds(numbers[name]):
-            raise ScenarioError(f"design.{name} = {shown(numbers[name])} is outside {spec.interval()}")
-    return Task(**weights, **numbers, over=_over(table.get("over", {}), loop))
+    task: Task = read_table(Task, table, "design", over=lambda given, path: _over(given, path, loop))
+    for there, missing in (("Q", "R"), ("R", "Q")):
+        if getattr(task, there) is not None and getattr(task, missing) is None:
+            raise ScenarioError(f"design.{missing} is missing: with design.{there}, a cost needs both")
+    return task
 
 
-def _weight(given: Any, path: str) -> Any:
-    """A weight as a number or nested tuples, which compare; its order is for the model to say."""
-    from diffabs.linear.weights import weight
-
-    if not isinstance(given, list):
-        if isinstance(given, bool) or not isinstance(given, int | float):
-            raise wrong(path, given, "a number, a diagonal or a matrix")
-        value = number(given, ENTRY, path)
-    elif any(isinstance(row, list) for row in given):
-        if not all(isinstance(row, list) and len(row) == len(given) for row in given):
-            raise ScenarioError(f"{path} = {shown(given)} is not square: {len(given)} rows need as many numbers each")
-        value = tuple(
-            tuple(number(x, ENTRY, f"{path}.{i}.{j}") for j, x in enumerate(row)) for i, row in enumerate(given)
-        )
-    else:
-        value = tuple(number(item, ENTRY, f"{path}.{i}") for i, item in enumerate(given))
-    if given == []:
-        raise ScenarioError(f"{path} = [] is empty")
-    try:
-        weight(path, value, len(np.atleast_1d(value)), definite=path == "design.R")
-    except ValueError as error:
-        raise ScenarioError(str(error)) from None
-    return value
-
-
-def _over(table: Any, loop: Loop) -> dict[str, Range]:
-    if not isinstance(table, dict):
-        raise wrong("design.over", table, "a table of ranges")
-    known = _known(loop)
-    specs = {path: parameter.spec for path, parameter in known.items()}
-    given = entries(table, "design.over", specs, "nothing that the linear model of this loop depends on")
-    return {entry.path: _range(entry, known[entry.path].shape) for entry in given}
-
-
-def _range(entry: Entry, shape: tuple[int, ...]) -> Range:
-    """Low and high end in SI, checked in the unit in which they were given."""
-    path, given, spec = entry.where, entry.given, entry.spec
-    if shape:
-        raise ScenarioError(f"{path} is a list of {shape[0]} numbers; only single numbers can have a range")
-    if not isinstance(given, list):
-        raise wrong(path, given, f"a range [low, high] in {spec.interval()}")
-    if len(given) != 2:
-        raise ScenarioError(f"{path} = {shown(given)} is no range [low, high] in {spec.interval()}")
-    low, high = (number(item, spec, f"{path}.{i}") for i, item in enumerate(given))
-    if not spec.holds(np.array([low, high])):
-        raise ScenarioError(f"{path} = {shown([low, high])} is outside {spec.interval()}")
-    if low > high:
-        raise ScenarioError(f"{path} = {shown([low, high])} is inverted: a range [low, high] in {spec.interval()}")
-    return low / entry.scale, high / entry.scale
+def _over(given: Any, path: str, loop: Loop) -> dict[str, Range]:
+    table = table_of(as_given, "ranges")(given, path)
+    there = {name: (parameter.spec, parameter.shape) for name, parameter in _known(loop).items()}
+    found = entries(table, path, there, "nothing that the linear model of this loop depends on")
+    return {item.path: item.single("have a range").range() for item in found}
 
 
 def _known(loop: Loop) -> dict[str, _Parameter]:
@@ -159,7 +126,3 @@ def _known(loop: Loop) -> dict[str, _Parameter]:
 
 def _one(part: Any, prefix: str, name: str, model: str) -> dict[str, _Parameter]:
     return {path: _Parameter(model, spec) for path, spec, _ in parameters(part, prefix) if path == prefix + name}
-
-
-def _listed(value: Any) -> Any:
-    return [_listed(item) for item in value] if isinstance(value, tuple) else value

@@ -18,7 +18,8 @@
     [sweep.failures]
     overshoot = 0.5                                           # more is a failure; so is not to stop, or to lock
 
-The distributions are those of `diffabs.sweep.distributions`. Reading needs no extra, running `diffabs[sweep]`."""
+The distributions are those of `diffabs.sweep.distributions`. Reading needs no extra, but for
+files; running needs `diffabs[sweep]`."""
 
 import dataclasses
 import pathlib
@@ -27,137 +28,174 @@ from typing import TYPE_CHECKING, Any
 
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import Spec, elements, get
-from diffabs.scenario.parameter_paths import Entry, canonical, entries, flat
-from diffabs.scenario.registry import (
-    FAMILIES,
+from diffabs.core.pytree import elements, get
+from diffabs.core.values import (
     ScenarioError,
-    build,
-    family_of,
-    joined,
-    number,
+    as_given,
+    entry,
+    members,
+    one_of,
+    plain,
     shown,
-    unit_of,
+    table_of,
+    text,
     unknown,
-    whole,
+    within,
     wrong,
 )
+from diffabs.core.values import read as read_table
+from diffabs.scenario.parameter_paths import Entry, canonical, entries, flat
+from diffabs.scenario.registry import FAMILIES, build, family_of, unit_of
+from diffabs.scenario.section_tune import metrics
+from diffabs.sweep import distributions, sampling
+from diffabs.sweep.variables import Correlation, Space, read_correlation
 
 if TYPE_CHECKING:
     from diffabs.sweep import Study
 
-WHOLE = {"samples": (0, 0, 2**32 - 1), "seed": (0, 0, 2**32 - 1), "chunk": (4096, 1, 2**20), "check": (16, 0, 4096)}
 SAMPLES = 1000  # where the design does not say how many there are
-DTYPES = ("float64", "float32")
-FIELDS = (*WHOLE, "dtype", "design", "over", "correlation", "failures")
-UNSCALED = ("weights", "type", "levels", "interpolated")  # fields of a distribution that have no unit
 PARTS = {field.name for field in dataclasses.fields(Loop)} | {"road"}
 
 
 @dataclasses.dataclass(frozen=True)
-class Variation:
-    """What was said, checked for its form: `over` by path of the scenario, as it was given."""
+class Choice:
+    """One of some parts: what was given, the distribution of their names, and the part of each name."""
 
-    samples: int = 0
-    seed: int = 0
-    chunk: int = 4096
-    check: int = 16
-    dtype: str = "float64"
-    design: Any = "random"
+    given: Any
+    names: distributions.Categorical
+    parts: Mapping[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Variation:
+    """What varies, in SI. `over`: distributions, and choices of parts, by path of the loop."""
+
+    samples: int = entry(within(0, sampling.MOST), 0)
+    seed: int = entry(within(0, sampling.MOST), 0)
+    chunk: int = entry(within(1, 2**20), 4096)
+    check: int = entry(within(0, 4096), 16)
+    dtype: str = entry(one_of("float64", "float32"), "float64")
+    design: sampling.Design = entry(sampling.read, sampling.Random)
     over: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    correlation: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    correlation: Correlation | None = None
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def table(self) -> dict[str, Any]:
-        """As values of TOML."""
-        return {f.name: _plain(getattr(self, f.name)) for f in dataclasses.fields(self)}
+        """As values of TOML, what is usual in short."""
+        design = plain(self.design, brief=True)
+        given = {"design": design["type"] if len(design) == 1 else design}
+        given["over"] = {path: _written(item) for path, item in self.over.items()}
+        given["correlation"] = members(self.correlation) if self.correlation else {}
+        return members(dataclasses.replace(self, over={}, correlation=None)) | given
 
 
-def read(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Variation:
-    """The section, without its distributions. Raises ScenarioError, one line, for whatever is wrong with it."""
-    if not isinstance(table, dict):
-        raise wrong("sweep", table, f"a table of {', '.join(FIELDS)}")
-    for key in table:
-        if key not in FIELDS:
-            raise unknown(f"{joined('sweep', key)} is not a field of sweep", key, FIELDS)
-    for name in ("over", "correlation", "failures"):
-        if not isinstance(table.get(name, {}), dict):
-            raise wrong(f"sweep.{name}", table[name], "a table")
-    numbers = {
-        name: whole(table.get(name, default), low, high, f"sweep.{name}")
-        for name, (default, low, high) in WHOLE.items()
-    }
-    dtype = table.get("dtype", DTYPES[0])
-    if dtype not in DTYPES:
-        raise unknown(f"sweep.dtype = {shown(dtype)} is unknown", str(dtype), DTYPES)
-    over = flat(table.get("over", {}), "sweep.over")
-    list(_entries(over, loop))
-    failures = {}
-    for name, given in table.get("failures", {}).items():
-        if name not in objectives:
-            raise unknown(f"{joined('sweep.failures', name)} is not measured", name, objectives)
-        failures[name] = number(given, Spec(unit_of(objectives[name], loop.plant)), joined("sweep.failures", name))
-    return Variation(
-        **numbers,
-        dtype=dtype,
-        design=table.get("design", "random"),
-        over=over,
-        correlation=table.get("correlation", {}),
-        failures=failures,
+def _written(item: Any) -> Any:
+    """A distribution, or a choice of parts, as it is given."""
+    if isinstance(item, distributions.Uniform):
+        return [item.low, item.high]
+    return item.given if isinstance(item, Choice) else plain(item, brief=True)
+
+
+def read(table: Any, loop: Loop, objectives: Mapping[str, Objective], folder: pathlib.Path) -> Variation:
+    """The section. Files are read now, and their names are relative to `folder`: what was read no longer depends on
+    them. Raises ScenarioError, one line, for whatever is wrong with it."""
+    plan: Variation = read_table(
+        Variation,
+        table,
+        "sweep",
+        over=lambda given, path: _over(flat(table_of(as_given)(given, path), path), loop, folder),
+        correlation=lambda given, path: read_correlation(given, path) if given != {} else None,
+        failures=metrics(objectives, "bounds by metric", lambda one: unit_of(one, loop.plant)),
     )
+    correlation = plan.correlation and _in_loop(plan.correlation, plan.over)
+    return dataclasses.replace(plan, correlation=correlation)
 
 
-def with_samples(table: Any, folder: pathlib.Path) -> Any:
-    """The section with the numbers of files in the place of their names, which are relative to `folder`: a scenario
-    that was read no longer depends on them. Raises ScenarioError."""
-    over = table.get("over") if isinstance(table, dict) else None
-    if not isinstance(over, dict):
-        return table
-    return {**table, "over": {path: _sample(given, f"sweep.over.{path}", folder) for path, given in over.items()}}
+def _over(given: Mapping[str, Any], loop: Loop, folder: pathlib.Path) -> dict[str, Any]:
+    """Distributions and choices by path of the loop, in the order given."""
+    there = {path: (spec, ()) for path, spec in elements(loop).items()}
+    numbers = {path: item for path, item in given.items() if path not in PARTS}
+    known = entries(numbers, "sweep.over", there, "not a parameter of this loop")
+    found = {}
+    for key, value in given.items():
+        if key in PARTS:
+            path = "plant.road" if key == "road" else key
+            found[path] = _choice(key, value, get(loop, path))
+        else:
+            item = next(known)
+            found[item.path] = _distribution(item, folder)
+    return found
 
 
-def _sample(given: Any, where: str, folder: pathlib.Path) -> Any:
-    if not isinstance(given, dict) or given.get("type") != "empirical" or "file" not in given:
+def _distribution(item: Entry, folder: pathlib.Path) -> Any:
+    """In SI; a pair of numbers is uniform."""
+    given = item.given
+    if isinstance(given, list):
+        if len(given) != 2:
+            raise ScenarioError(f"{item.where} = {shown(given)} is no pair [low, high], and no table with a type")
+        given = {"type": "uniform", "low": given[0], "high": given[1]}
+    if not isinstance(given, dict):
+        raise wrong(item.where, given, "a pair [low, high] or a table with a type")
+    found = distributions.read(_with_numbers(given, item.where, folder), item.where)
+    if line := distributions.leaving(found, item.spec, item.where):
+        raise ScenarioError(line)
+    return distributions.in_si(found, item.scale)
+
+
+def _with_numbers(given: Mapping[str, Any], where: str, folder: pathlib.Path) -> Mapping[str, Any]:
+    """The table of a distribution with the numbers of a file in the place of its name."""
+    if given.get("type") != "empirical" or "file" not in given:
         return given
     if "values" in given:
         raise ScenarioError(f"{where} has values and a file; one of them is needed")
     if "column" not in given:
         raise ScenarioError(f"{where}.column is missing: which one of {shown(given['file'])}?")
-    for key in ("file", "column"):
-        if not isinstance(given[key], str):
-            raise wrong(f"{where}.{key}", given[key], "text")
+    file, column = (text(given[key], f"{where}.{key}") for key in ("file", "column"))
     try:
         from diffabs.sweep import sample_files
     except ImportError:
         raise ScenarioError(f'{where}: reading a file needs pip install "diffabs[sweep]"') from None
     try:
-        values = sample_files.read(folder / given["file"], given["column"])
+        values = sample_files.read(folder / file, column)
     except ValueError as error:
-        raise ScenarioError(f"{where}: {' '.join(str(error).split())}") from None
-    rest = {key: value for key, value in given.items() if key not in ("file", "column")}
-    return {**rest, "values": values.tolist()}
+        raise ScenarioError(f"{where}: {error}") from None
+    return {key: value for key, value in given.items() if key not in ("file", "column")} | {"values": values.tolist()}
 
 
-def _entries(over: Mapping[str, Any], loop: Loop) -> Iterable[Entry]:
-    """Single numbers of the loop that vary; parts are left out."""
-    numbers = {path: given for path, given in over.items() if path not in PARTS}
-    return entries(numbers, "sweep.over", elements(loop), "not a parameter of this loop")
+def _choice(key: str, given: Any, default: Any) -> Choice:
+    """Names of parts as they are drawn; one that has no name has its number."""
+    where = f"sweep.over.{key}"
+    table = {"choices": given} if isinstance(given, list) else given
+    if not isinstance(table, dict) or not isinstance(table.get("choices"), list) or not table["choices"]:
+        raise wrong(where, given, "a list of parts, or a table of choices and weights,")
+    names = [item if isinstance(item, str) else f"{i}" for i, item in enumerate(table["choices"])]
+    drawn = distributions.read({**table, "type": "categorical", "choices": names}, where)
+    family = key if key in FAMILIES else family_of(key, key)
+    items = enumerate(zip(names, table["choices"], strict=True))
+    return Choice(given, drawn, {name: build(family, item, default, f"{where}.{i}") for i, (name, item) in items})
+
+
+def _in_loop(correlation: Correlation, over: Iterable[str]) -> Correlation:
+    """The same with paths of the loop, however they were written."""
+    known = {canonical(path): path for path in over}
+    paths = [canonical(path).removesuffix("_kmh") for path in correlation.paths]
+    for path, given in zip(paths, correlation.paths, strict=True):
+        if path not in known:
+            raise unknown(f"sweep.correlation.paths: {shown(given)} does not vary", given, known)
+    return dataclasses.replace(correlation, paths=tuple(known[path] for path in paths))
 
 
 def study(chosen: Any) -> "Study":
     """The sweep of a scenario. Raises ScenarioError."""
     from diffabs.sweep import Study
-    from diffabs.sweep import sampling as all_designs
-    from diffabs.sweep.variables import Space
 
     plan: Variation = chosen.sweep
     if not plan.over:
         raise ScenarioError('sweep.over is empty: say what varies, as in [sweep.over] "plant.mass" = [5.3, 6.2]')
+    choices = {path: item for path, item in plan.over.items() if isinstance(item, Choice)}
+    variables = {path: item.names if path in choices else item for path, item in plan.over.items()}
+    space = Space(variables, plan.correlation, plan.design)
     try:
-        variables, parts = _variables(plan.over, chosen.loop)
-        design = {"type": plan.design} if isinstance(plan.design, str) else plan.design
-        drawn = all_designs.read(design, "sweep.design")
-        space = Space(variables, _correlation(plan.correlation, variables), drawn)
         return Study(
             loop=chosen.loop,
             space=space,
@@ -167,94 +205,13 @@ def study(chosen: Any) -> "Study":
             seed=plan.seed,
             chunk=plan.chunk,
             dtype=plan.dtype,
-            parts=parts,
+            parts={path: item.parts for path, item in choices.items()},
             failures=plan.failures,
         ).check()
-    except ScenarioError:
-        raise
     except ValueError as error:
         raise ScenarioError(str(error)) from None
 
 
-def _counted(space: Any) -> int:
+def _counted(space: Space) -> int:
     """As many samples as the design has by itself."""
-    from diffabs.sweep.sampling import Corners, Grid
-
-    return space.check() if isinstance(space.design, Corners | Grid) else SAMPLES
-
-
-def _variables(over: Mapping[str, Any], loop: Loop) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Distributions by path of the loop, in SI and in the order given; and the parts by path and name."""
-    numbers = {entry.where.removeprefix("sweep.over."): entry for entry in _entries(over, loop)}
-    variables, parts = {}, {}
-    for key, given in over.items():
-        if key in PARTS:
-            path = "plant.road" if key == "road" else key
-            variables[path], parts[path] = _choice(key, given, get(loop, path))
-        else:
-            entry = numbers[key]
-            variables[entry.path] = _distribution(entry)
-    return variables, parts
-
-
-def _distribution(entry: Entry) -> Any:
-    """In SI; a pair of numbers is uniform."""
-    from diffabs.sweep import distributions
-
-    given = entry.given
-    if isinstance(given, list):
-        if len(given) != 2:
-            raise ScenarioError(f"{entry.where} = {shown(given)} is no pair [low, high], and no table with a type")
-        given = {"type": "uniform", "low": given[0], "high": given[1]}
-    if not isinstance(given, dict):
-        raise wrong(entry.where, given, "a pair [low, high] or a table with a type")
-    found = distributions.read(given, entry.where)
-    if line := distributions.leaving(found, entry.spec, entry.where):
-        raise ScenarioError(line)
-    unscaled = (*UNSCALED, *(("deviation",) if given.get("type") == "log-normal" else ()))
-    table = {name: value if name in unscaled else _scaled(value, entry.scale) for name, value in found.table().items()}
-    return distributions.read(table, entry.where)
-
-
-def _scaled(value: Any, scale: float) -> Any:
-    return [_scaled(item, scale) for item in value] if isinstance(value, list | tuple) else value / scale
-
-
-def _choice(key: str, given: Any, default: Any) -> tuple[Any, dict[str, Any]]:
-    """A categorical distribution of names, and the part of each."""
-    from diffabs.sweep.distributions import read as read_distribution
-
-    where = f"sweep.over.{key}"
-    table = {"choices": given} if isinstance(given, list) else given
-    if not isinstance(table, dict) or not isinstance(table.get("choices"), list) or not table["choices"]:
-        raise wrong(where, given, "a list of parts, or a table of choices and weights,")
-    for name in table:
-        if name not in ("choices", "weights", "type"):
-            raise unknown(f"{where}.{name} is not a field of a choice", name, ("choices", "weights"))
-    family = key if key in FAMILIES else family_of(key, key)
-    names = [item if isinstance(item, str) else f"{i}" for i, item in enumerate(table["choices"])]
-    parts = {
-        name: build(family, item, default, f"{where}.{i}")
-        for i, (name, item) in enumerate(zip(names, table["choices"], strict=True))
-    }
-    weights = {"weights": table["weights"]} if "weights" in table else {}
-    return read_distribution({"type": "categorical", "choices": names, **weights}, where), parts
-
-
-def _correlation(table: Mapping[str, Any], variables: Mapping[str, Any]) -> Any:
-    from diffabs.sweep.variables import Correlation
-
-    if not table:
-        return None
-    paths = [str(path) for path in table.get("paths", ())]
-    known = {canonical(path).removesuffix("_kmh"): path for path in variables}
-    for path in paths:
-        if canonical(path).removesuffix("_kmh") not in known:
-            raise unknown(f"sweep.correlation.paths: {shown(path)} does not vary", path, known)
-    return Correlation(tuple(known[canonical(path).removesuffix("_kmh")] for path in paths), table.get("matrix", []))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+    return space.check() if isinstance(space.design, sampling.Corners | sampling.Grid) else SAMPLES

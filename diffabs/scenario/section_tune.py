@@ -24,36 +24,43 @@ Paths are those of `ranges`. Only reading is done without the extra `diffabs[tun
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import Spec, get, parameters
-from diffabs.scenario.parameter_paths import Entry, canonical, entries
-from diffabs.scenario.registry import ScenarioError, joined, number, shown, unit_of, unknown, whole, wrong
+from diffabs.core.pytree import Spec, parameters
+from diffabs.core.values import (
+    Reader,
+    ScenarioError,
+    as_given,
+    dotted,
+    entry,
+    inside,
+    members,
+    plain,
+    ranged,
+    read_one,
+    table_of,
+    unknown,
+    within,
+)
+from diffabs.core.values import read as read_table
+from diffabs.scenario.parameter_paths import Ends, Entry, canonical, entries, parameters_of
+from diffabs.scenario.registry import unit_of
+from diffabs.simulate.batch import Batch, grid, latin
+from diffabs.tune import risk
 
-if TYPE_CHECKING:
-    from diffabs.tune import AtMost, Batch
-    from diffabs.tune.risk import Aggregate
-
-# Fields that are whole numbers, with their defaults and ranges.
-WHOLE = {"starts": (1, 1, 1000), "seed": (0, 0, 2**32 - 1), "iterations": (60, 1, 100_000), "samples": (0, 0, 100_000)}
 DECLARED = "declared"
-REAL = {"decay": Spec("1/s", low=0.0), "damping": Spec("1", low=0.0, high=1.0, open_high=True)}  # default 0
-FIELDS = (*WHOLE, *REAL, "free", "objective", "over", "aggregate", "limits")
 MOST_LANES = 100_000
-# As in `diffabs.tune.aggregate`, which is not there without the extra; a test compares the two.
-AGGREGATES: dict[str, dict[str, tuple[float, Spec]]] = {
-    "mean": {},
-    "smooth-worst": {"softness": (0.02, Spec("1", low=0.0, open_low=True))},
-    "cvar": {"level": (0.9, Spec("1", low=0.0, high=1.0, open_high=True))},
-    "quantile": {"level": (0.9, Spec("1", low=0.0, high=1.0))},
-}
 
-Ends = tuple[Any, Any] | None  # low and high, tuples where the parameter is a list; None is declared
+
+def _aggregate(given: Any, path: str) -> dict[str, Any]:
+    """Type and fields."""
+    part = read_one(risk.KINDS, given, path)
+    return {"type": next(name for name, kind in risk.KINDS.items() if type(part) is kind), **members(part)}
 
 
 def _mean() -> dict[str, Any]:
@@ -65,24 +72,22 @@ class Goal:
     """What is tuned, in SI. `free`: ranges by path, None the declared one; `objective`: weights by metric; `over`:
     values by path; `aggregate`: its type and fields; `limits`: greatest values by metric."""
 
-    starts: int = 1
-    seed: int = 0
-    iterations: int = 60
-    samples: int = 0
-    decay: float = 0.0
-    damping: float = 0.0
-    free: Mapping[str, Ends] = dataclasses.field(default_factory=dict)
+    starts: int = entry(within(1, 1000), 1)
+    seed: int = entry(within(0, 2**32 - 1), 0)
+    iterations: int = entry(within(1, 100_000), 60)
+    samples: int = entry(within(0, MOST_LANES), 0)
+    decay: float = entry(ranged(Spec("1/s", low=0.0)), 0.0)
+    damping: float = entry(ranged(Spec("1", low=0.0, high=1.0, open_high=True)), 0.0)
+    free: Mapping[str, Ends | None] = dataclasses.field(default_factory=dict)
     objective: Mapping[str, float] = dataclasses.field(default_factory=dict)
     over: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
-    aggregate: Mapping[str, Any] = dataclasses.field(default_factory=_mean)
+    aggregate: Mapping[str, Any] = entry(_aggregate, _mean)
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def table(self) -> dict[str, Any]:
         """As values of TOML."""
-        free = {path: DECLARED if ends is None else _listed(ends) for path, ends in self.free.items()}
-        over = {path: list(values) for path, values in self.over.items()}
-        others = {name: dict(getattr(self, name)) for name in ("objective", "aggregate", "limits")}
-        return {name: getattr(self, name) for name in (*WHOLE, *REAL)} | {"free": free, "over": over, **others}
+        free = {path: DECLARED if ends is None else plain(ends) for path, ends in self.free.items()}
+        return members(self) | {"free": free}
 
     def check(self, loop: Loop) -> "Goal":
         """What only matters once a loop is tuned. Raises ScenarioError: nothing free, no objective, a start at an end
@@ -99,10 +104,8 @@ class Goal:
             )
         return self
 
-    def batch(self, seed: int) -> "Batch":
+    def batch(self, seed: int) -> Batch:
         """The lanes, each with the same noise."""
-        from diffabs.tune import grid, latin
-
         if not self.over:
             lanes = grid({})
         elif self.samples:
@@ -111,88 +114,67 @@ class Goal:
             lanes = grid(self.over)
         return dataclasses.replace(lanes, seeds=(seed,) * max(lanes.size, 1))
 
-    def aggregated(self) -> "Aggregate":
+    def aggregated(self) -> risk.Aggregate:
         """From a number per lane to one."""
-        from diffabs import tune
-
-        kinds = {"mean": tune.Mean, "smooth-worst": tune.SmoothWorst, "cvar": tune.CVaR, "quantile": tune.Quantile}
-        return kinds[self.aggregate["type"]](**{k: v for k, v in self.aggregate.items() if k != "type"})
-
-    def constraints(self) -> list["AtMost"]:
-        """One for each limit, in their order."""
-        from diffabs.tune import AtMost
-
-        return [AtMost(metric=name, bound=bound) for name, bound in self.limits.items()]
+        return read_one(risk.KINDS, self.aggregate, "tune.aggregate")
 
 
 def read(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
     """The goal of a section. Raises ScenarioError, one line, for whatever is wrong with it."""
-    if not isinstance(table, dict):
-        raise wrong("tune", table, f"a table of {', '.join(FIELDS)}")
-    for key in table:
-        if key not in FIELDS:
-            raise unknown(f"{joined('tune', key)} is not a field of tune", key, FIELDS)
-    numbers: dict[str, Any] = {
-        name: whole(table.get(name, default), low, high, f"tune.{name}") for name, (default, low, high) in WHOLE.items()
-    }
-    numbers |= {name: _within(table.get(name, 0.0), spec, f"tune.{name}") for name, spec in REAL.items()}
-    over = _over(_table(table, "over", "values"), loop)
-    lanes = math.prod(map(len, over.values()))
-    units = {name: unit_of(one, loop.plant) for name, one in objectives.items()}
-    if lanes > MOST_LANES and not numbers["samples"]:
-        raise ScenarioError(f"tune.over has {lanes} combinations, outside [1, {MOST_LANES}]; set tune.samples")
-    return Goal(
-        **numbers,
-        free=free_ranges(_table(table, "free", "ranges"), loop, "tune.free"),
-        objective=_metrics(_table(table, "objective", "weights of metrics"), "tune.objective", objectives, {}),
-        over=over,
-        aggregate=_aggregate(table.get("aggregate", "mean")),
-        limits=_metrics(_table(table, "limits", "greatest values of metrics"), "tune.limits", objectives, units),
+    goal: Goal = read_table(
+        Goal,
+        table,
+        "tune",
+        free=lambda given, path: free_ranges(table_of(as_given, "ranges")(given, path), loop, path),
+        over=lambda given, path: _over(table_of(as_given, "values")(given, path), loop),
+        objective=metrics(objectives, "weights of metrics"),
+        limits=metrics(objectives, "greatest values of metrics", lambda one: unit_of(one, loop.plant)),
     )
+    lanes = math.prod(map(len, goal.over.values()))
+    if lanes > MOST_LANES and not goal.samples:
+        raise ScenarioError(f"tune.over has {lanes} combinations, outside [1, {MOST_LANES}]; set tune.samples")
+    return goal
 
 
-def _table(table: dict[str, Any], name: str, what: str) -> dict[str, Any]:
-    inside = table.get(name, {})
-    if not isinstance(inside, dict):
-        raise wrong(f"tune.{name}", inside, f"a table of {what}")
-    return inside
+def metrics(objectives: Mapping[str, Objective], what: str, unit: Callable[[Objective], str] = lambda _: "1") -> Reader:
+    """Return the reader of a table of numbers by metric, in these units."""
 
+    def read(given: Any, path: str) -> dict[str, float]:
+        for name in table_of(as_given, what)(given, path):
+            if name not in objectives:
+                raise unknown(f"{dotted(path, name)} is not measured", name, objectives)
+        return {name: inside(x, Spec(unit(objectives[name])), dotted(path, name)) for name, x in given.items()}
 
-def _within(given: Any, spec: Spec, path: str) -> float:
-    value = number(given, spec, path)
-    if not spec.holds(value):
-        raise ScenarioError(f"{path} = {shown(value)} is outside {spec.interval()}")
-    return value
-
-
-def _tunable(loop: Loop) -> dict[str, tuple[Spec, Any]]:
-    return {path: (spec, value) for path, spec, value in parameters(loop)}
+    return read
 
 
 def _entries(table: dict[str, Any], section: str, loop: Loop) -> Iterable[Entry]:
-    specs = {path: spec for path, (spec, _) in _tunable(loop).items()}
-    return entries(table, section, specs, "not a parameter of this loop")
+    return entries(table, section, parameters_of(loop), "not a parameter of this loop")
 
 
-def free_ranges(table: dict[str, Any], loop: Loop, section: str) -> dict[str, Ends]:
-    """Ranges by path of the loop, in SI. Raises ScenarioError."""
-    found: dict[str, Ends] = {}
-    for entry in _entries(table, section, loop):
-        if not entry.spec.tunable:
-            raise ScenarioError(f"{entry.where} cannot be tuned: a run does not depend smoothly on it")
-        found[entry.path] = _ends(entry, np.shape(get(loop, entry.path)))
+def free_ranges(table: dict[str, Any], loop: Loop, section: str) -> dict[str, Ends | None]:
+    """Ranges by path of the loop, in SI; None for the declared one. Raises ScenarioError."""
+    found: dict[str, Ends | None] = {}
+    for item in _entries(table, section, loop):
+        if not item.spec.tunable:
+            raise ScenarioError(f"{item.where} cannot be tuned: a run does not depend smoothly on it")
+        found[item.path] = None if item.given == DECLARED else item.range(f', or "{DECLARED}",')
     return found
 
 
-def check_starts(loop: Loop, free: Mapping[str, Ends], section: str) -> None:
+def _over(table: dict[str, Any], loop: Loop) -> dict[str, tuple[float, ...]]:
+    return {item.path: item.single("differ between lanes").values() for item in _entries(table, "tune.over", loop)}
+
+
+def check_starts(loop: Loop, free: Mapping[str, Ends | None], section: str) -> None:
     """Raises ScenarioError for a value of the loop at an end of its range or outside: it could not be moved."""
     lines = [line for path, ends in free.items() for line in _stuck(loop, path, ends, section)]
     if lines:
         raise ScenarioError("; ".join(lines))
 
 
-def _stuck(loop: Loop, path: str, ends: Ends, section: str) -> Iterator[str]:
-    spec, value = _tunable(loop)[path]
+def _stuck(loop: Loop, path: str, ends: Ends | None, section: str) -> Iterator[str]:
+    spec, value = next((spec, value) for name, spec, value in parameters(loop) if name == path)
     low, high = ends or (spec.low, spec.high)
     low, high, value = np.broadcast_arrays(low, high, np.asarray(value, float))
     for at in np.ndindex(value.shape):
@@ -200,83 +182,3 @@ def _stuck(loop: Loop, path: str, ends: Ends, section: str) -> Iterator[str]:
         if not inside.holds(value[at]):
             name = ".".join([canonical(path), *map(str, at)])
             yield f"{name} = {value[at]:g} is outside {inside.interval()}, its range in {section}"
-
-
-def _ends(entry: Entry, shape: tuple[int, ...]) -> Ends:
-    """In SI, checked in the unit in which they were given."""
-    path, given, spec = entry.where, entry.given, entry.spec
-    needed = f'a range [low, high] in {spec.interval()}, or "{DECLARED}",'
-    if given == DECLARED:
-        return None
-    if not isinstance(given, list):
-        raise wrong(path, given, needed)
-    if len(given) != 2:
-        raise ScenarioError(f"{path} = {shown(given)} is no range [low, high] in {spec.interval()}")
-    low, high = (_end(item, shape, spec, f"{path}.{i}") for i, item in enumerate(given))
-    if not (np.all(np.asarray(low) >= spec.low) and np.all(np.asarray(high) <= spec.high)):
-        raise ScenarioError(f"{path} = {shown([low, high])} is outside {spec.interval()}")
-    if not np.all(np.asarray(low) < np.asarray(high)):
-        raise ScenarioError(f"{path} = {shown([low, high])} is empty: a range [low, high] in {spec.interval()}")
-    return _divided(low, entry.scale), _divided(high, entry.scale)
-
-
-def _end(given: Any, shape: tuple[int, ...], spec: Spec, path: str) -> Any:
-    """A number, or a tuple of as many as the parameter has."""
-    if not shape or not isinstance(given, list):
-        return number(given, spec, path)
-    if len(given) != shape[0]:
-        raise ScenarioError(f"{path} = {shown(given)} has {len(given)} numbers; the parameter has {shape[0]}")
-    return tuple(number(item, spec, f"{path}.{i}") for i, item in enumerate(given))
-
-
-def _divided(end: Any, scale: float) -> Any:
-    return tuple(x / scale for x in end) if isinstance(end, tuple) else end / scale
-
-
-def _over(table: dict[str, Any], loop: Loop) -> dict[str, tuple[float, ...]]:
-    found = {}
-    for entry in _entries(table, "tune.over", loop):
-        path, spec, shape = entry.where, entry.spec, np.shape(get(loop, entry.path))
-        if shape:
-            raise ScenarioError(f"{path} is a list of {shape[0]} numbers; only single numbers can differ between lanes")
-        given = entry.given if isinstance(entry.given, list) else [entry.given]
-        if not given:
-            raise ScenarioError(f"{path} = [] is empty; numbers in {spec.interval()} are needed")
-        found[entry.path] = tuple(_within(x, spec, f"{path}.{i}") / entry.scale for i, x in enumerate(given))
-    return found
-
-
-def _metrics(
-    table: dict[str, Any], section: str, objectives: Mapping[str, Objective], units: Mapping[str, str]
-) -> dict[str, float]:
-    found = {}
-    for name, given in table.items():
-        if name not in objectives:
-            raise unknown(f"{joined(section, name)} is not measured", name, objectives)
-        spec = Spec(units.get(name, "1"))
-        found[name] = _within(given, spec, joined(section, name))
-    return found
-
-
-def _aggregate(given: Any) -> dict[str, Any]:
-    table = {"type": given} if isinstance(given, str) else given
-    path = "tune.aggregate"
-    if not isinstance(table, dict):
-        raise wrong(path, given, f"a table, or the name of a type ({', '.join(AGGREGATES)}),")
-    kind = table.get("type", "mean")
-    if not isinstance(kind, str):
-        raise wrong(f"{path}.type", kind, f"one of {', '.join(AGGREGATES)}")
-    if kind not in AGGREGATES:
-        raise unknown(f"{path}.type = {shown(kind)} is unknown", kind, AGGREGATES)
-    fields = AGGREGATES[kind]
-    for key in table:
-        if key != "type" and key not in fields:
-            raise unknown(f"{joined(path, key)} is not a field of {kind}", key, fields)
-    values = {
-        name: _within(table.get(name, default), spec, f"{path}.{name}") for name, (default, spec) in fields.items()
-    }
-    return {"type": kind, **values}
-
-
-def _listed(value: Any) -> Any:
-    return [_listed(item) for item in value] if isinstance(value, tuple) else value

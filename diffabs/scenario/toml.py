@@ -1,14 +1,11 @@
 """TOML as values and back, no more of it than a scenario needs."""
 
-import dataclasses
 import json
 import re
 import tomllib
 from typing import Any
 
-import numpy as np
-
-from diffabs.scenario.registry import ScenarioError, family_of, kebab, shown
+from diffabs.core.values import ScenarioError, shown
 
 MOST_LEVELS = 50  # of tables and lists; no scenario has a tenth of that
 LARGEST = 2**63  # of a whole number, as TOML has it
@@ -51,21 +48,6 @@ def value(text: str) -> Any:
         if read.keys() == {"v"} and plain and text:
             return read["v"]
     return text
-
-
-def table(family: str, part: Any) -> dict[str, Any]:
-    """A part as values of TOML: its type and every field, numbers at full precision."""
-    values: dict[str, Any] = {"type": kebab(type(part).__name__)}
-    for field in dataclasses.fields(part):
-        value, inner = getattr(part, field.name), family_of(field.name, family)
-        if "spec" in field.metadata:
-            value = np.asarray(value, float).tolist()
-        elif isinstance(value, tuple):
-            value = [table(inner, item) for item in value]
-        elif "part" in field.metadata:
-            value = table(inner, value)
-        values[field.name] = value
-    return values
 
 
 def document(top: dict[str, Any], sections: dict[str, dict[str, Any]]) -> str:

@@ -120,9 +120,9 @@ def _check(client: Client) -> None:
         client.wait_for_workers(1, timeout=TIMEOUT)
     except TimeoutError:
         raise SweepError(f"the scheduler has no worker within {TIMEOUT:g} s") from None
-    here = provenance.versions(*DECISIVE)
+    here = provenance.origin(*DECISIVE)
     try:
-        answers: Any = client.run(provenance.versions, *DECISIVE)
+        answers: Any = client.run(provenance.origin, *DECISIVE)
     except Exception as error:  # that is all Dask says of a worker without diffabs
         raise SweepError(f"a worker cannot say its versions: {str(error).splitlines()[0]}") from None
     for worker, there in answers.items():

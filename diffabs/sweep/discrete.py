@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr
 
 from diffabs.core.pytree import Spec
-from diffabs.sweep.tables import FINITE, POSITIVE, table, weightless
+from diffabs.core.values import FINITE, POSITIVE, any_number, as_given, entry, listed, plain, table_of
 
 
 def chosen(u: ArrayLike, count: int, weights: Sequence[float] | None = None) -> np.ndarray:
@@ -32,12 +31,37 @@ def _edges(count: int, weights: Sequence[float] | None) -> np.ndarray:
     return edges / edges[-1]
 
 
+def _weightless(weights: Sequence[float] | None, count: int, name: str, each: Spec) -> Iterator[str]:
+    """Lines on weights that are not as many as what they weigh, not all in `each`, or all zero."""
+    if weights is None:
+        return
+    if len(weights) != count:
+        yield f"{name}: weights are {len(weights)}; there are {count} to weigh"
+    if not each.holds(np.asarray(weights, float)):
+        yield f"{name}: weights = {reprlib.repr(plain(weights))} are not all in {each.interval()}"
+    elif not np.sum(weights) > 0:
+        yield f"{name}: weights have sum {np.sum(weights):g}"
+
+
+class _Listed:
+    """What is drawn from a list has its value at Phi(z) at the u = Phi(z)."""
+
+    def value(self, u: ArrayLike) -> Any:
+        raise NotImplementedError
+
+    def from_normal(self, z: ArrayLike) -> Any:
+        from scipy.special import ndtr
+
+        return self.value(ndtr(z))
+
+
 @dataclasses.dataclass(frozen=True)
-class Categorical:
+class Categorical(_Listed):
     """One of some numbers, or of some texts. `weights`: in proportion to the probabilities; all equal if None."""
 
     choices: tuple[float | str, ...]
     weights: tuple[float, ...] | None = None
+    scaled = ("choices",)
 
     def index(self, u: ArrayLike) -> np.ndarray:
         """The number of the choice, from 0."""
@@ -46,9 +70,6 @@ class Categorical:
     def value(self, u: ArrayLike) -> np.ndarray:
         """The choice: an array of objects for texts."""
         return np.array(self.choices, object if self.textual() else float)[self.index(u)]
-
-    def from_normal(self, z: ArrayLike) -> np.ndarray:
-        return self.value(ndtr(z))
 
     def textual(self) -> bool:
         """Whether the choices are texts."""
@@ -71,26 +92,21 @@ class Categorical:
             yield f"{name}: choices = {reprlib.repr(list(self.choices))} mix numbers and texts"
         if not FINITE.holds(np.array(numbers, float)):
             yield f"{name}: choices = {reprlib.repr(list(self.choices))} are not all in {FINITE.interval()}"
-        yield from weightless(self.weights, len(self.choices), name, POSITIVE)
-
-    def table(self) -> dict[str, Any]:
-        return table(self)
+        yield from _weightless(self.weights, len(self.choices), name, POSITIVE)
 
 
 @dataclasses.dataclass(frozen=True)
-class Empirical:
+class Empirical(_Listed):
     """The values of a sample, in any order, each as likely: the smallest with F(value) >= u. `interpolated`: linearly
     between neighbours, the k-th of n at u = (k - 1)/(n - 1), as `numpy.quantile` does."""
 
     values: tuple[float, ...]
     interpolated: bool = False
+    scaled = ("values",)
 
     def value(self, u: ArrayLike) -> np.ndarray:
         method = "linear" if self.interpolated else "inverted_cdf"
         return np.quantile(np.array(self.values, float), np.asarray(u), method=method)
-
-    def from_normal(self, z: ArrayLike) -> np.ndarray:
-        return self.value(ndtr(z))
 
     def support(self) -> tuple[float, float]:
         return min(self.values), max(self.values)
@@ -101,17 +117,18 @@ class Empirical:
         if not FINITE.holds(np.array(self.values, float)):
             yield f"{name}: values = {reprlib.repr(list(self.values))} are not all in {FINITE.interval()}"
 
-    def table(self) -> dict[str, Any]:
-        return table(self)
+
+def _columns(given: Any, where: str) -> dict[str, np.ndarray]:
+    return {path: np.array(column) for path, column in table_of(listed(as_given), "lists")(given, where).items()}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Rows:
+class Rows(_Listed):
     """Whole rows of a table, each as likely or by its weight: the joint distribution of its columns, which are
     parameters by path. One uniform picks a row."""
 
-    columns: Mapping[str, Any]
-    weights: Any = None
+    columns: Mapping[str, Any] = entry(_columns)
+    weights: Any = entry(listed(any_number), None)
 
     @property
     def size(self) -> int:
@@ -122,10 +139,6 @@ class Rows:
         """The rows at u, by column."""
         rows = chosen(u, self.size, self.weights)
         return {path: np.asarray(column)[rows] for path, column in self.columns.items()}
-
-    def from_normal(self, z: ArrayLike) -> dict[str, np.ndarray]:
-        """The rows at Phi(z), by column."""
-        return self.value(ndtr(z))
 
     def middles(self) -> np.ndarray:
         """The u that give each row once."""
@@ -142,8 +155,4 @@ class Rows:
         for path, column in self.columns.items():
             if np.asarray(column).dtype.kind in "fiu" and not np.isfinite(column).all():
                 yield f"{name}: column {path} is not finite in row {int(np.argmin(np.isfinite(column)))}"
-        yield from weightless(self.weights, self.size, name, Spec("1", low=0.0))
-
-    def table(self) -> dict[str, Any]:
-        """As values of TOML."""
-        return table(self)
+        yield from _weightless(self.weights, self.size, name, Spec("1", low=0.0))

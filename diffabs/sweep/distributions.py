@@ -8,24 +8,24 @@ lost twelve of them, Phi(-7) none. At u = 0 and 1 the value is the end of the su
 
 import dataclasses
 import math
-from collections.abc import Iterator
-from typing import Any, Protocol
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr, ndtri
 
-from diffabs.core.pytree import Spec
+from diffabs.core.pytree import Spec, param
+from diffabs.core.values import kebab, read_one, sound, written
 from diffabs.sweep.discrete import Categorical as Categorical
 from diffabs.sweep.discrete import Empirical as Empirical
-from diffabs.sweep.tables import FINITE, POSITIVE, crossed, described, kebab, outside, table, written
 
-END = Spec("1", infinite=True)
 LEAST = 1e-290  # probability between the limits of a distribution; below, its tails have no digits
 
 
 class Distribution(Protocol):
-    """A scalar random variable."""
+    """A scalar random variable. `scaled`: its fields that have the unit of the parameter."""
+
+    scaled: ClassVar[tuple[str, ...]]
 
     def value(self, u: ArrayLike) -> np.ndarray:
         """The quantile at u in [0, 1], of any shape."""
@@ -43,57 +43,74 @@ class Distribution(Protocol):
         """One line for each field that cannot be."""
         ...
 
-    def table(self) -> dict[str, Any]:
-        """As values of TOML, which `read` reads."""
-        ...
 
+class _Continuous:
+    """What distributions between `low` and `high` have in common: quantiles by p and q, numbers in their ranges."""
 
-@dataclasses.dataclass(frozen=True)
-class Uniform:
-    """q low + p high."""
-
-    low: float
-    high: float
+    low: Any
+    high: Any
 
     def value(self, u: ArrayLike) -> np.ndarray:
         return self._at(np.asarray(u), 1 - np.asarray(u))
 
     def from_normal(self, z: ArrayLike) -> np.ndarray:
+        from scipy.special import ndtr
+
         return self._at(ndtr(z), ndtr(-np.asarray(z)))
 
     def _at(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        return np.clip(q * self.low + p * self.high, self.low, self.high)
+        raise NotImplementedError
 
     def support(self) -> tuple[float, float]:
         return self.low, self.high
 
     def problems(self, name: str) -> Iterator[str]:
-        yield from outside(self, name, low=FINITE, high=FINITE)
-        yield from crossed(self, name)
+        lines = []
+        for field in dataclasses.fields(self):  # pyright: ignore[reportArgumentType]
+            value, spec = getattr(self, field.name), field.metadata["spec"]
+            if not spec.holds(value):
+                lines.append(f"{name}: {field.name} = {value:g} is outside {spec.interval()}")
+        if self.low >= self.high:
+            lines.append(f"{name}: low = {self.low:g} is not below high = {self.high:g}")
+        yield from lines or self._impossible(name)
 
-    def table(self) -> dict[str, Any]:
-        return table(self)
+    def _impossible(self, name: str) -> Iterator[str]:
+        """What cannot be although each number by itself could."""
+        del name
+        yield from ()
 
 
 @dataclasses.dataclass(frozen=True)
-class Normal:
+class Uniform(_Continuous):
+    """q low + p high."""
+
+    low: float = param(unit="1")
+    high: float = param(unit="1")
+    scaled = ("low", "high")
+
+    def _at(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        return np.clip(q * self.low + p * self.high, self.low, self.high)
+
+
+@dataclasses.dataclass(frozen=True)
+class Normal(_Continuous):
     """mean + deviation Phi^-1(q Phi(a) + p Phi(b)): a normal distribution, cut off at its limits if it has any, which
     are a and b deviations from its mean."""
 
-    mean: float
-    deviation: float
-    low: float = -math.inf
-    high: float = math.inf
-
-    def value(self, u: ArrayLike) -> np.ndarray:
-        return self._at(np.asarray(u), 1 - np.asarray(u))
+    mean: float = param(unit="1")
+    deviation: float = param(unit="1", above=0.0)
+    low: float = param(default=-math.inf, unit="1", infinite=True)
+    high: float = param(default=math.inf, unit="1", infinite=True)
+    scaled = ("mean", "deviation", "low", "high")
 
     def from_normal(self, z: ArrayLike) -> np.ndarray:
         if self.support() == (-math.inf, math.inf):
             return self.mean + self.deviation * np.asarray(z)
-        return self._at(ndtr(z), ndtr(-np.asarray(z)))
+        return super().from_normal(z)
 
     def _at(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        from scipy.special import ndtr, ndtri
+
         a, b = self._limits()
         below, above = q * ndtr(a) + p * ndtr(b), q * ndtr(-a) + p * ndtr(-b)
         z = ndtri(np.minimum(below, above))
@@ -102,34 +119,27 @@ class Normal:
     def _limits(self) -> tuple[float, float]:
         return (self.low - self.mean) / self.deviation, (self.high - self.mean) / self.deviation
 
-    def support(self) -> tuple[float, float]:
-        return self.low, self.high
+    def _impossible(self, name: str) -> Iterator[str]:
+        if self.left() < LEAST:
+            yield f"{name}: {written(self)} has nothing between its limits"
 
     def left(self) -> float:
         """The probability, without the limits, of what lies between them."""
-        a, b = self._limits()
-        return float(max(ndtr(b) - ndtr(a), ndtr(-a) - ndtr(-b)))
-
-    def problems(self, name: str) -> Iterator[str]:
-        lines = [*outside(self, name, mean=FINITE, deviation=POSITIVE, low=END, high=END), *crossed(self, name)]
-        yield from lines
-        if not lines and self.left() < LEAST:
-            yield f"{name}: {written(self)} has nothing between its limits"
-
-    def table(self) -> dict[str, Any]:
-        return table(self)
+        a, b = (end / math.sqrt(2) for end in self._limits())
+        return max(math.erfc(-b) - math.erfc(-a), math.erfc(a) - math.erfc(b)) / 2
 
 
 @dataclasses.dataclass(frozen=True)
-class LogNormal:
+class LogNormal(_Continuous):
     """exp of a normal distribution with mean log(median), cut off at its limits if it has any.
 
     deviation: of the natural logarithm; 0.1 is about a tenth of the median"""
 
-    median: float
-    deviation: float
-    low: float = 0.0
-    high: float = math.inf
+    median: float = param(unit="1", above=0.0)
+    deviation: float = param(unit="1", above=0.0)
+    low: float = param(default=0.0, unit="1", low=0.0)
+    high: float = param(default=math.inf, unit="1", infinite=True)
+    scaled = ("median", "low", "high")
 
     def value(self, u: ArrayLike) -> np.ndarray:
         return np.clip(np.exp(self._logarithm().value(u)), self.low, self.high)
@@ -141,59 +151,47 @@ class LogNormal:
         low, high = (math.log(end) if end > 0 else -math.inf for end in self.support())
         return Normal(math.log(self.median), self.deviation, low, high)
 
-    def support(self) -> tuple[float, float]:
-        return self.low, self.high
-
-    def problems(self, name: str) -> Iterator[str]:
-        ranges = {"median": POSITIVE, "deviation": POSITIVE, "low": Spec("1", low=0.0), "high": END}
-        lines = [*outside(self, name, **ranges), *crossed(self, name)]
-        yield from lines
-        if not lines and self._logarithm().left() < LEAST:
+    def _impossible(self, name: str) -> Iterator[str]:
+        if self._logarithm().left() < LEAST:
             yield f"{name}: {written(self)} has nothing between its limits"
-
-    def table(self) -> dict[str, Any]:
-        return table(self)
 
 
 @dataclasses.dataclass(frozen=True)
-class Triangular:
+class Triangular(_Continuous):
     """low + sqrt(p (high - low) (mode - low)) below the mode, high - sqrt(q (high - low) (high - mode)) above it."""
 
-    low: float
-    mode: float
-    high: float
-
-    def value(self, u: ArrayLike) -> np.ndarray:
-        return self._at(np.asarray(u), 1 - np.asarray(u))
-
-    def from_normal(self, z: ArrayLike) -> np.ndarray:
-        return self._at(ndtr(z), ndtr(-np.asarray(z)))
+    low: float = param(unit="1")
+    mode: float = param(unit="1")
+    high: float = param(unit="1")
+    scaled = ("low", "mode", "high")
 
     def _at(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
         width, rise, fall = self.high - self.low, self.mode - self.low, self.high - self.mode
         rising, falling = self.low + np.sqrt(p * width * rise), self.high - np.sqrt(q * width * fall)
         return np.clip(np.where(p * width < rise, rising, falling), self.low, self.high)
 
-    def support(self) -> tuple[float, float]:
-        return self.low, self.high
-
-    def problems(self, name: str) -> Iterator[str]:
-        lines = [*outside(self, name, low=FINITE, mode=FINITE, high=FINITE), *crossed(self, name)]
-        yield from lines
-        if not lines:
-            yield from outside(self, name, mode=Spec("1", self.low, self.high))
-
-    def table(self) -> dict[str, Any]:
-        return table(self)
+    def _impossible(self, name: str) -> Iterator[str]:
+        between = Spec("1", self.low, self.high)
+        if not between.holds(self.mode):
+            yield f"{name}: mode = {self.mode:g} is outside {between.interval()}"
 
 
-KINDS = {kebab(cls): cls for cls in (Uniform, Normal, LogNormal, Triangular, Categorical, Empirical)}
+KINDS = {kebab(cls.__name__): cls for cls in (Uniform, Normal, LogNormal, Triangular, Categorical, Empirical)}
 
 
-def read(given: Any, where: str) -> Distribution:
-    """The distribution of a table. Raises ValueError, one line, for an unknown type, a missing or unknown field, a
+def read(given: Any, where: str, kinds: Mapping[str, type] = KINDS) -> Any:
+    """The distribution of a table. Raises ScenarioError, one line, for an unknown type, a missing or unknown field, a
     value that is not a number, and for whatever the distribution itself objects to."""
-    return described(KINDS, given, where)
+    return sound(read_one(kinds, given, where), where)
+
+
+def in_si(distribution: Any, scale: float) -> Any:
+    """Return the distribution of a parameter in SI, given in units of which `scale` make one."""
+
+    def divided(value: Any) -> Any:
+        return tuple(x / scale for x in value) if isinstance(value, tuple) else value / scale
+
+    return dataclasses.replace(distribution, **{n: divided(getattr(distribution, n)) for n in distribution.scaled})
 
 
 def reach(distribution: Distribution) -> Spec:

@@ -9,21 +9,40 @@
 
 Format, study and versions own the chunks: their digest is in each (`seal`)."""
 
+import dataclasses
 import json
 import pathlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from diffabs.core import files, provenance
+from diffabs.core.pytree import Spec
+from diffabs.core.values import (
+    FINITE,
+    ScenarioError,
+    as_given,
+    entry,
+    one_of,
+    ranged,
+    read,
+    shown,
+    table_of,
+    text,
+    unknown,
+    within,
+    wrong,
+)
 from diffabs.sweep import variables
 from diffabs.sweep.seal import Seal, SweepError, digest
 from diffabs.sweep.study import DTYPES, FLAGS, RANGES, Study
-from diffabs.sweep.tables import FINITE, POSITIVE, number, text, whole, wrong
+from diffabs.sweep.variables import Space
 
 FORMAT = 3
 MANIFEST = "manifest.json"
 LARGEST = 2**30  # bytes
-DECISIVE = ("jax", "jaxlib", "numpy", "scipy", "pyarrow")  # packages that can change a bit of the result
+DECISIVE = ("jaxlib", "numpy", "scipy", "pyarrow")  # packages beside JAX that can change a bit of the result
+SECONDS = Spec("s", low=0.0, open_low=True)
 OWNING = ("format", "study", "versions")
 EARLIER = (1, 2)
 OLD = "written by an earlier diffabs: read its chunks with pandas, or sweep again"
@@ -31,7 +50,7 @@ OLD = "written by an earlier diffabs: read its chunks with pandas, or sweep agai
 
 def described(study: Study) -> dict[str, Any]:
     """What owns the chunks of a study, computed here and now."""
-    return {"format": FORMAT, "study": study.table(), "versions": provenance.versions(*DECISIVE)}
+    return {"format": FORMAT, "study": study.table(), "versions": provenance.origin(*DECISIVE)}
 
 
 class Seals:
@@ -82,47 +101,55 @@ def _checked(given: Any) -> dict[str, Any]:
     manifest = {name: value for name, value in given.items() if name != "digest"}
     if given.get("digest") != digest(manifest):
         raise ValueError("it was changed after it was written: its digest is another one")
-    for line in (*_wrong_study(_table(manifest, "study")), *_wrong_others(manifest)):
-        raise ValueError(line)
+    _check_study(read(_Manifest, manifest, "", "a manifest"))
     return manifest
 
 
-def _wrong_study(study: Mapping[str, Any]) -> Iterator[str]:
-    """One line for what a reader could not use. Raises ValueError for what is of another type."""
-    for name, least, most in RANGES:
-        if not least <= whole(study.get(name), f"study.{name}") <= most:
-            yield f"study.{name} = {study[name]} is outside [{least}, {most}]"
-    if study.get("dtype") not in list(DTYPES):
-        raise wrong("study.dtype", study.get("dtype"), " or ".join(DTYPES))
-    for name in ("loop", "parts", "objectives", "failures"):
-        _table(study, name, "study.")
-    solver = _table(study, "solver", "study.")
-    for name in ("step", "duration"):
-        if not POSITIVE.holds(number(solver.get(name), f"study.solver.{name}")):
-            yield f"study.solver.{name} = {solver[name]} is outside {POSITIVE.interval()} s"
-    for name, bound in study["failures"].items():
-        if name not in study["objectives"]:
-            yield f"study.failures.{text(name, 'a failure')} is not measured"
-        if not FINITE.holds(number(bound, f"study.failures.{name}")):
-            yield f"study.failures.{name} = {bound} is outside {FINITE.interval()}"
-    varied = variables.read(study.get("space"), "study.space")
-    varied.check(study["samples"])
-    for name in {"sample", *FLAGS, *varied.paths} & study["objectives"].keys():
-        yield f"study.objectives.{name}: another column of the table has this name"
+def _check_study(manifest: "_Manifest") -> None:
+    """Raises ScenarioError for what a reader could not use."""
+    study = manifest.study
+    for name in study.failures:
+        if name not in study.objectives:
+            raise unknown(f"study.failures.{shown(name)} is not measured", name, study.objectives)
+    study.space.check(study.samples)
+    for name in {"sample", *FLAGS, *study.space.paths} & study.objectives.keys():
+        raise ScenarioError(f"study.objectives.{name}: another column of the table has this name")
 
 
-def _wrong_others(manifest: Mapping[str, Any]) -> Iterator[str]:
-    for name, version in _table(manifest, "versions").items():
-        text(version, f"versions.{name}")
-    source = _table(manifest, "source")
-    for name in ("scenario", "name"):
-        try:
-            text(source.get(name, ""), f"source.{name}").encode()
-        except UnicodeEncodeError:
-            yield f"source.{name} is not text"
+def _utf8(given: Any, path: str) -> str:
+    try:
+        text(given, path).encode()
+    except UnicodeEncodeError:
+        raise wrong(path, given, "text without surrogates") from None
+    return given
 
 
-def _table(given: Mapping[str, Any], name: str, where: str = "") -> Mapping[str, Any]:
-    if not isinstance(given.get(name), dict):
-        raise wrong(f"{where}{name}", given.get(name), "a table")
-    return given[name]
+@dataclasses.dataclass(frozen=True)
+class _Solver:
+    step: float = entry(ranged(SECONDS))
+    duration: float = entry(ranged(SECONDS))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Study:
+    """What must be of a study (`Study.table`) for its results to be read; the parts are for the reader of the file."""
+
+    samples: int = entry(within(*RANGES["samples"]))
+    seed: int = entry(within(*RANGES["seed"]))
+    chunk: int = entry(within(*RANGES["chunk"]))
+    dtype: str = entry(one_of(*DTYPES))
+    failures: Mapping[str, float] = entry(table_of(ranged(FINITE)))
+    solver: _Solver = entry(partial(read, _Solver))
+    space: Space = entry(variables.read)
+    loop: Mapping[str, Any] = entry(table_of(as_given))
+    parts: Mapping[str, Any] = entry(table_of(table_of(as_given)))
+    objectives: Mapping[str, Any] = entry(table_of(as_given))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Manifest:
+    format: int = entry(as_given)
+    study: _Study = entry(partial(read, _Study))
+    versions: Mapping[str, str] = entry(table_of(text))
+    source: Mapping[str, str] = entry(table_of(_utf8))
+    commit: str = entry(text, "")

@@ -8,7 +8,7 @@ import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
 from diffabs.core import files
-from diffabs.sweep.tables import unknown
+from diffabs.core.values import unknown
 
 READERS = {".csv": pc.read_csv, ".parquet": pq.read_table}
 

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.values import any_number, entry, kebab, listed, read_one, sound, table_of, whole, within, written
 from diffabs.sweep.distributions import reach
-from diffabs.sweep.tables import described, kebab, listed, number, table, whole, written
 
 MOST = 2**32 - 1  # samples, whose numbers have 32 bits in JAX's keys and in the sequences; and the greatest seed
 MOST_AT_ONCE = 1_000_000  # of a Latin hypercube, which has to be made as a whole
@@ -35,15 +35,12 @@ class Design(Protocol):
 
     def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
         """One line for each field that cannot be, or cannot with these variables."""
-        ...
-
-    def table(self) -> dict[str, Any]:
-        """As values of TOML, which `read` reads."""
-        ...
+        del name, variables
+        yield from ()
 
 
 @dataclasses.dataclass(frozen=True)
-class Random:
+class Random(Design):
     """Independent samples: bits of JAX's `fold_in(key(seed), i)` (Threefry), 52 to a number."""
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
@@ -55,12 +52,6 @@ class Random:
         del variables
         return _counted(samples)
 
-    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
-        yield from ()
-
-    def table(self) -> dict[str, Any]:
-        return table(self)
-
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
 def _words(seed: Any, start: Any, count: int, dimension: int) -> jax.Array:
@@ -70,13 +61,13 @@ def _words(seed: Any, start: Any, count: int, dimension: int) -> jax.Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sobol:
+class Sobol(Design):
     """Scrambled Sobol' sequences (SciPy's: linear matrix scramble and digital shift, Matousek 1998), one after another.
 
     replicates: how many, scrambled independently: the spread of their means tells the error. Each is balanced only if
         it has a power of two of samples (Owen 2020, arXiv:2008.08051)"""
 
-    replicates: int = 1
+    replicates: int = entry(within(1, MOST), 1)
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         block = samples // self.replicates
@@ -94,9 +85,6 @@ class Sobol:
         if self.replicates < 1:
             yield f"{name}: replicates = {self.replicates} is not positive"
 
-    def table(self) -> dict[str, Any]:
-        return table(self)
-
 
 def _sequence(seed: int, replicate: int, start: int, stop: int, dimension: int) -> np.ndarray:
     """Points of one scrambled sequence, moved by half of their last bit. Skipping 10^7 points takes a tenth of a
@@ -113,7 +101,7 @@ def _sequence(seed: int, replicate: int, start: int, stop: int, dimension: int) 
 
 
 @dataclasses.dataclass(frozen=True)
-class LatinHypercube:
+class LatinHypercube(Design):
     """SciPy's Latin hypercube: each variable has one sample in each of its N strata. All are drawn at once and kept."""
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
@@ -124,12 +112,6 @@ class LatinHypercube:
         if (count := _counted(samples)) > MOST_AT_ONCE:
             raise ValueError(f"samples = {count} are more than a latin-hypercube can have, {MOST_AT_ONCE}; use sobol")
         return count
-
-    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
-        yield from ()
-
-    def table(self) -> dict[str, Any]:
-        return table(self)
 
 
 @functools.lru_cache(1)
@@ -142,14 +124,22 @@ def _hypercube(seed: int, samples: int, dimension: int) -> np.ndarray:
     return points
 
 
+def _level(given: Any, where: str) -> Any:
+    return listed(any_number)(given, where) if isinstance(given, list | tuple) else whole(given, 2, MOST, where)
+
+
+def _levels(given: Any, where: str) -> Any:
+    return table_of(_level)(given, where) if isinstance(given, Mapping) else whole(given, 2, MOST, where)
+
+
 @dataclasses.dataclass(frozen=True)
-class Grid:
+class Grid(Design):
     """Every combination of levels, the last variable changing fastest.
 
     levels: of every variable, or of each by name: how many, which are equally spaced in u from 0 to 1, or a tuple of u.
         What is drawn from a list, `Categorical` and `Rows`, has a level for each of its items unless it is given u."""
 
-    levels: int | Mapping[str, int | tuple[float, ...]]
+    levels: int | Mapping[str, int | tuple[float, ...]] = entry(_levels)
 
     def over(self, variables: Mapping[str, Any]) -> "Grid":
         """The same with the levels u of each of these variables, in their order."""
@@ -192,12 +182,9 @@ class Grid:
             if not hasattr(variable, "middles") and {0.0, 1.0} & set(self._axis(path, variable)):
                 yield from _unbounded(name, path, variable, "grid")
 
-    def table(self) -> dict[str, Any]:
-        return table(self)
-
 
 @dataclasses.dataclass(frozen=True)
-class Corners:
+class Corners(Design):
     """The 2^d corners of the box of supports, the last variable changing fastest."""
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
@@ -213,12 +200,9 @@ class Corners:
             elif len(variable.middles()) != 2:
                 yield f"{name}: {path} is one of {len(variable.middles())}; corners need two ends; use grid"
 
-    def table(self) -> dict[str, Any]:
-        return table(self)
-
 
 @dataclasses.dataclass(frozen=True)
-class Saltelli:
+class Saltelli(Design):
     """Rows of d + 2 samples for Sobol' sensitivity indices: A, B, and A with column j from B for j = 0, ..., d - 1.
 
     Row r of A and B is point r of one scrambled Sobol' sequence of dimension 2 d. Saltelli et al. 2010, Computer
@@ -235,29 +219,13 @@ class Saltelli:
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
         return _multiple(_counted(samples), len(variables) + 2, "the number of variables plus 2")
 
-    def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
-        yield from ()
 
-    def table(self) -> dict[str, Any]:
-        return table(self)
-
-
-KINDS = {kebab(cls): cls for cls in (Random, Sobol, LatinHypercube, Grid, Corners, Saltelli)}
+KINDS = {kebab(cls.__name__): cls for cls in (Random, Sobol, LatinHypercube, Grid, Corners, Saltelli)}
 
 
 def read(given: Any, where: str) -> Design:
-    """The design of a table, or of the bare name of a type. Raises ValueError, in one line."""
-    return described(KINDS, {"type": given} if isinstance(given, str) else given, where, levels=_levels)
-
-
-def _levels(given: Any, where: str) -> Any:
-    if isinstance(given, Mapping):
-        return {path: _level(item, f"{where}.{path}") for path, item in given.items()}
-    return whole(given, where)
-
-
-def _level(given: Any, where: str) -> Any:
-    return listed(number)(given, where) if isinstance(given, list | tuple) else whole(given, where)
+    """The design of a table, or of the bare name of a type. Raises ScenarioError, in one line."""
+    return sound(read_one(KINDS, given, where), where)
 
 
 def _seed(seed: int) -> np.uint32:

@@ -16,11 +16,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from diffabs.core.values import ScenarioError
+
 NAME = re.compile(r"part-(\d{8,})-([0-9a-f]{16})\.parquet")
 DIGITS = 16
 
 
-class SweepError(ValueError):
+class SweepError(ScenarioError):
     """A sweep that cannot be started, continued or read; one line."""
 
 

@@ -8,7 +8,6 @@ what must be in it: no index to keep, nothing to repair after a kill. One proces
 
 import contextlib
 import json
-import os
 import pathlib
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -81,7 +80,7 @@ class Store:
         if others:
             raise SweepError(f"{self.folder} is no sweep, but holds {others[0]}; choose a folder that is new or empty")
         self.chunks.mkdir(exist_ok=True)
-        write_whole(self.folder / MANIFEST, sealed(manifest))
+        files.write_durably(self.folder / MANIFEST, sealed(manifest))
 
     def scan(self, seals: Seals) -> tuple[dict[int, pathlib.Path], list[int]]:
         """Chunks of a sweep that are there and whole, and those that are damaged. A damaged file is removed; one of
@@ -99,7 +98,7 @@ class Store:
 
     def write(self, chunk: int, data: bytes) -> pathlib.Path:
         """A chunk, whole or not at all."""
-        return write_whole(self.chunks / seal.name(chunk, data), data)
+        return files.write_durably(self.chunks / seal.name(chunk, data), data)
 
 
 def listing(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathlib.Path]], list[pathlib.Path]]:
@@ -134,23 +133,6 @@ def read_chunk(path: pathlib.Path) -> bytes:
         return files.content(path)
     except OSError as error:
         raise SweepError(f"{path} cannot be read: {error.strerror}; move it away") from None
-
-
-def write_whole(path: pathlib.Path, data: bytes) -> pathlib.Path:
-    """A file that is whole at every instant at which it is there, also after a power cut."""
-    with files.unfinished(path.with_name(f"{path.name}.tmp")) as temporary:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    if hasattr(os, "O_DIRECTORY"):
-        folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-    return path
 
 
 def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:

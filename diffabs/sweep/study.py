@@ -5,7 +5,6 @@ computed in chunk i // chunk, and nothing about it depends on who computes that 
 
 import contextlib
 import dataclasses
-import difflib
 import json
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, problems, replace
+from diffabs.core.values import plain, unknown
 from diffabs.objectives import usual
 from diffabs.simulate.refusals import ill
 from diffabs.simulate.solution import FixedStep
@@ -23,7 +23,7 @@ from diffabs.sweep.discrete import Categorical
 from diffabs.sweep.variables import Space
 
 DTYPES = ("float32", "float64")
-RANGES = (("samples", 1, 2**32 - 1), ("chunk", 1, 2**20), ("seed", 0, 2**32 - 1))  # keys are folded with 32 bits
+RANGES = {"samples": (1, 2**32 - 1), "chunk": (1, 2**20), "seed": (0, 2**32 - 1)}  # keys are folded with 32 bits
 NOISE = 2**32 - 1  # of the stream of keys, folded into the seed where the random design folds the number of a sample
 FLAGS = ("stopped", "diverged", "refused")
 
@@ -111,16 +111,14 @@ class Study:
                     "solver": {"step": self.solver.step, "duration": self.solver.duration},
                     "space": self.space.table(),
                     "loop": plain(self.loop),
-                    "parts": {
-                        path: {n: plain(part) for n, part in choices.items()} for path, choices in self.parts.items()
-                    },
-                    "objectives": {name: plain(part) for name, part in self.objectives.items()},
+                    "parts": plain(self.parts),
+                    "objectives": plain(self.objectives),
                 }
             )
         )
 
     def _wrong_numbers(self) -> Iterator[str]:
-        for name, least, most in RANGES:
+        for name, (least, most) in RANGES.items():
             value = getattr(self, name)
             if not isinstance(value, int):
                 yield f"{name} = {value!r} is not a whole number"
@@ -137,7 +135,7 @@ class Study:
             yield f"objectives.{name}: another column of the table has this name"
         for name, bound in self.failures.items():
             if name not in self.objectives:
-                yield f"failures.{name} is not measured; there is {', '.join(self.objectives)}"
+                yield str(unknown(f"failures.{name} is not measured", name, self.objectives))
             elif not np.isfinite(bound):
                 yield f"failures.{name} = {bound} is not a finite number"
 
@@ -149,8 +147,7 @@ class Study:
             if path in self.parts:
                 yield from _wrong_parts(path, self.space.variables.get(path), self.parts[path], self.loop)
             elif path not in known:
-                near = difflib.get_close_matches(path, known, 1, 0.5)
-                yield f"{path} is not a parameter of this loop" + (f"; did you mean {near[0]}?" if near else "")
+                yield str(unknown(f"{path} is not a parameter of this loop", path, known))
         yield from (f"parts.{path} has no distribution" for path in self.parts if path not in self.space.paths)
         if not wrong:
             yield from self.space.leaving(known)
@@ -190,15 +187,3 @@ def precision(dtype: str) -> Iterator[None]:
 def noise_key(seed: Any, i: Any) -> jax.Array:
     """The key of sample i's sensors."""
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), NOISE), i)
-
-
-def plain(part: Any) -> Any:
-    """A part as values of JSON: its type and its fields."""
-    if dataclasses.is_dataclass(part):
-        fields = {f.name: plain(getattr(part, f.name)) for f in dataclasses.fields(part)}
-        return {"type": type(part).__name__, **fields}
-    if isinstance(part, tuple):
-        return [plain(item) for item in part]
-    if isinstance(part, str | bool | int | None):
-        return part
-    return np.asarray(part, float).tolist()

@@ -4,7 +4,6 @@
 
 import dataclasses
 import pathlib
-import shutil
 from collections.abc import Sequence
 
 import jax
@@ -28,9 +27,8 @@ def keep(study: Study, folder: str | pathlib.Path, samples: Sequence[int]) -> pa
     Raises ValueError for a sample that is not in the sweep."""
     path = pathlib.Path(folder) / NAME
     seen = [signals(trajectory(study, i).sample, study.loop.plant) for i in samples]
-    with files.unfinished(path.with_name(f"{NAME}.tmp")) as temporary:
-        shutil.rmtree(temporary, ignore_errors=True)
-        group = zarr.open_group(temporary, mode="w")
+    with files.new_folder(path) as folder:
+        group = zarr.open_group(folder, mode="w")
         numbers = {"sample": ("", np.asarray(samples, np.int64))}
         for name, (unit, _) in seen[0].items():
             numbers["time" if name == "t" else name] = unit, np.stack([one[name][1] for one in seen])
@@ -39,8 +37,6 @@ def keep(study: Study, folder: str | pathlib.Path, samples: Sequence[int]) -> pa
             array = group.create_array(name, shape=values.shape, dtype=values.dtype, dimension_names=dimensions)
             array[...] = np.asarray(values)
             array.attrs["units"] = unit
-        shutil.rmtree(path, ignore_errors=True)
-        temporary.rename(path)
     return path
 
 

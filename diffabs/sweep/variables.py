@@ -5,14 +5,14 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
 
+from diffabs.core import values
 from diffabs.core.pytree import Spec
+from diffabs.core.values import any_number, entry, kebab, listed, members, plain, sound, table_of
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.discrete import Rows as Rows
 from diffabs.sweep.distributions import Distribution, Normal, leaving
 from diffabs.sweep.sampling import Design, Grid, LatinHypercube, Random, Sobol
-from diffabs.sweep.tables import described, kebab, listed, number, unknown, wrong
 
 LEAST = 1e-10  # eigenvalue of a correlation matrix: below, its factor has no digits
 SAME = 1e-9  # relative, of entries that have to be equal
@@ -26,7 +26,7 @@ class Correlation:
     paths: variables; those not named are independent"""
 
     paths: tuple[str, ...]
-    matrix: Any
+    matrix: Any = entry(listed(listed(any_number)))
 
     @staticmethod
     def from_covariance(
@@ -80,9 +80,14 @@ class Correlation:
         elif (least := np.linalg.eigvalsh(matrix)[0]) < LEAST:
             yield f"{name}: matrix is not positive definite: its least eigenvalue is {least:.3g}, below {LEAST:g}"
 
-    def table(self) -> dict[str, Any]:
-        """As values of TOML."""
-        return {"paths": list(self.paths), "matrix": np.asarray(self.matrix, float).tolist()}
+
+def read_correlation(given: Any, where: str) -> Correlation:
+    """The correlation of a table. Raises ScenarioError."""
+    return sound(values.read(Correlation, given, where), where)
+
+
+def _variable(given: Any, where: str) -> Any:
+    return distributions.read(given, where, distributions.KINDS | {"rows": Rows})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -90,9 +95,9 @@ class Space:
     """The variables of a sweep, in the order of the columns of its design. Those whose value is a `Distribution` are
     parameters, by path; `Rows` hold several and may have any name."""
 
-    variables: Mapping[str, Distribution | Rows]
-    correlation: Correlation | None = None
-    design: Design = dataclasses.field(default_factory=Random)
+    variables: Mapping[str, Distribution | Rows] = entry(table_of(_variable))
+    correlation: Correlation | None = entry(read_correlation, None)
+    design: Design = entry(sampling.read, Random)
 
     @property
     def dimension(self) -> int:
@@ -116,6 +121,8 @@ class Space:
         count = self.design.count(self.variables, samples)
         if not 0 <= start <= stop <= count:
             raise ValueError(f"samples [{start}, {stop}) are outside [0, {count})")
+        from scipy.special import ndtri
+
         design = self.design.over(self.variables) if isinstance(self.design, Grid) else self.design
         u = self._columns(design.unit(seed, start, stop, self.dimension, count))
         z = (
@@ -123,11 +130,11 @@ class Space:
             if self.correlation
             else {}
         )
-        values = {
+        drawn = {
             name: item.from_normal(z[name]) if name in z else item.value(u[name])
             for name, item in self.variables.items()
         }
-        return _flat(values)
+        return _flat(drawn)
 
     def normal(self, z: Any) -> dict[str, np.ndarray]:
         """The values at independent standard normal coordinates z (n, dimension), correct to their last digits in both
@@ -153,7 +160,7 @@ class Space:
         if self.correlation:
             yield from self.correlation.problems("correlation", self.variables)
             if not isinstance(self.design, Random | Sobol | LatinHypercube):
-                yield f"correlation: a {kebab(type(self.design))} design needs independent variables"
+                yield f"correlation: a {kebab(type(self.design).__name__)} design needs independent variables"
 
     def leaving(self, specs: Mapping[str, Spec], prefix: str = "") -> Iterator[str]:
         """A line for each parameter with one of these specs that can leave its range."""
@@ -168,36 +175,15 @@ class Space:
 
     def table(self) -> dict[str, Any]:
         """As values of TOML, which `read` reads."""
-        correlation = {"correlation": self.correlation.table()} if self.correlation else {}
-        variables = {name: item.table() for name, item in self.variables.items()}
-        return {"variables": variables, **correlation, "design": self.design.table()}
+        correlation = {"correlation": members(self.correlation)} if self.correlation else {}
+        variables = {name: plain(item, brief=True) for name, item in self.variables.items()}
+        return {"variables": variables, **correlation, "design": plain(self.design, brief=True)}
 
 
 def read(given: Any, where: str) -> Space:
-    """The space of a table with `variables`, and maybe `correlation` and `design`. Raises ValueError, in one line, for
-    whatever is wrong with one of them; `Space.check` says what is wrong with them together."""
-    if not isinstance(given, Mapping) or not isinstance(given.get("variables"), Mapping):
-        raise wrong(where, given, "a table with a table of variables")
-    for key in given:
-        if key not in ("variables", "correlation", "design"):
-            raise unknown(f"{where}.{key} is unknown", key, ("variables", "correlation", "design"))
-    kinds = distributions.KINDS | {"rows": Rows}
-    variables = {
-        path: described(kinds, item, f"{where}.variables.{path}", columns=_columns, weights=listed(number))
-        for path, item in given["variables"].items()
-    }
-    correlation = given.get("correlation")
-    if correlation is not None:
-        named = {"type": "correlation", **correlation} if isinstance(correlation, Mapping) else correlation
-        readers = {"matrix": listed(listed(number))}
-        correlation = described({"correlation": Correlation}, named, f"{where}.correlation", **readers)
-    return Space(variables, correlation, sampling.read(given.get("design", "random"), f"{where}.design"))
-
-
-def _columns(given: Any, where: str) -> dict[str, np.ndarray]:
-    if not isinstance(given, Mapping):
-        raise wrong(where, given, "a table of lists")
-    return {path: np.array(listed(lambda x, at: x)(column, f"{where}.{path}")) for path, column in given.items()}
+    """The space of a table with `variables`, and maybe `correlation` and `design`. Raises ScenarioError, in one line,
+    for whatever is wrong with one of them; `Space.check` says what is wrong with them together."""
+    return values.read(Space, given, where)
 
 
 def _paths(name: str, item: Any) -> tuple[str, ...]:

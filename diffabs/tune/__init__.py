@@ -1,25 +1,43 @@
 """Tuning by gradients, worst cases, identification: what a differentiable model is for."""
 
-from diffabs.core.reason import Reason as Reason
-from diffabs.simulate.batch import Batch as Batch
-from diffabs.simulate.batch import grid as grid
-from diffabs.simulate.batch import latin as latin
-from diffabs.simulate.batch import run as run
-from diffabs.tune.constraints import AtMost as AtMost
-from diffabs.tune.constraints import CertifiedDecay as CertifiedDecay
-from diffabs.tune.constraints import Poles as Poles
-from diffabs.tune.descent import Point as Point
-from diffabs.tune.descent import Stopping as Stopping
-from diffabs.tune.problem import Mode as Mode
-from diffabs.tune.result import Method as Method
-from diffabs.tune.result import Progress as Progress
-from diffabs.tune.result import StartError as StartError
-from diffabs.tune.result import Tuned as Tuned
-from diffabs.tune.risk import CVaR as CVaR
-from diffabs.tune.risk import Mean as Mean
-from diffabs.tune.risk import Quantile as Quantile
-from diffabs.tune.risk import SmoothWorst as SmoothWorst
-from diffabs.tune.tuning import posed as posed
-from diffabs.tune.tuning import tune as tune
-from diffabs.tune.worst import WorstCase as WorstCase
-from diffabs.tune.worst import worst_case as worst_case
+from typing import TYPE_CHECKING
+
+from diffabs.core.exports import lazily
+
+if TYPE_CHECKING:
+    from diffabs.core.reason import Reason as Reason
+    from diffabs.simulate.batch import Batch as Batch
+    from diffabs.simulate.batch import grid as grid
+    from diffabs.simulate.batch import latin as latin
+    from diffabs.simulate.batch import run as run
+    from diffabs.tune.constraints import AtMost as AtMost
+    from diffabs.tune.constraints import CertifiedDecay as CertifiedDecay
+    from diffabs.tune.constraints import Poles as Poles
+    from diffabs.tune.descent import Point as Point
+    from diffabs.tune.descent import Stopping as Stopping
+    from diffabs.tune.problem import Mode as Mode
+    from diffabs.tune.result import Method as Method
+    from diffabs.tune.result import Progress as Progress
+    from diffabs.tune.result import StartError as StartError
+    from diffabs.tune.result import Tuned as Tuned
+    from diffabs.tune.risk import CVaR as CVaR
+    from diffabs.tune.risk import Mean as Mean
+    from diffabs.tune.risk import Quantile as Quantile
+    from diffabs.tune.risk import SmoothWorst as SmoothWorst
+    from diffabs.tune.tuning import posed as posed
+    from diffabs.tune.tuning import tune as tune
+    from diffabs.tune.worst import WorstCase as WorstCase
+    from diffabs.tune.worst import worst_case as worst_case
+
+__getattr__ = lazily(
+    __name__,
+    "diffabs.core.reason Reason",
+    "diffabs.simulate.batch Batch grid latin run",
+    "diffabs.tune.constraints AtMost CertifiedDecay Poles",
+    "diffabs.tune.descent Point Stopping",
+    "diffabs.tune.problem Mode",
+    "diffabs.tune.result Method Progress StartError Tuned",
+    "diffabs.tune.risk CVaR Mean Quantile SmoothWorst",
+    "diffabs.tune.tuning posed tune",
+    "diffabs.tune.worst WorstCase worst_case",
+)

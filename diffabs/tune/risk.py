@@ -65,3 +65,6 @@ class Quantile:
     def __call__(self, values: Vector) -> Any:
         """Quantile."""
         return jnp.quantile(values, self.level)
+
+
+KINDS: dict[str, type] = {"mean": Mean, "smooth-worst": SmoothWorst, "cvar": CVaR, "quantile": Quantile}

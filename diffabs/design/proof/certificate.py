@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from diffabs.core import files
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof import exact, schema, serialise
 
@@ -229,14 +230,8 @@ class Certificate:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file whole or not at all. Raises OSError."""
-        target = pathlib.Path(path)
-        part = target.with_name(f".{target.name}.{os.getpid()}.part")
-        try:
-            claims = ((claim.kind, claim.data) for claim in self.claims)
-            part.write_text(serialise.text(self.system, self.gain, claims), encoding="utf-8")
-            os.replace(part, target)
-        finally:
-            part.unlink(missing_ok=True)
+        claims = ((claim.kind, claim.data) for claim in self.claims)
+        files.write(pathlib.Path(path), serialise.text(self.system, self.gain, claims).encode())
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Certificate":

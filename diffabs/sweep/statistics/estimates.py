@@ -7,13 +7,12 @@
     CVaR            c - t*_(1-a/2) e,  c - t*_(a/2) e                                  studentised bootstrap
 
 with 1 - a the confidence, c = n/(n - z) and g = n M4/M2^2, Mp the sum of p-th powers of deviations from m (Bonett takes
-them from a trimmed mean, which cannot be merged). The chi-square interval for a deviation is not offered: off the
+them from a trimmed mean). The chi-square interval for a deviation is not offered: off the
 normal law it is wrong at every n. An end that data cannot give is infinite. Columns are finite; lanes that diverged are
 counted and left out before.
 
 D. G. Bonett, Approximate confidence interval for standard deviation of nonnormal distributions, Comput. Stat. Data
-Anal. 50 (2006). P. Pébay, Formulas for robust, one-pass parallel computation of covariances and arbitrary-order
-statistical moments, Sandia report SAND2008-6212 (2008). R. T. Rockafellar and S. Uryasev, Optimization of conditional
+Anal. 50 (2006). R. T. Rockafellar and S. Uryasev, Optimization of conditional
 value-at-risk, J. Risk 2 (2000)."""
 
 import dataclasses
@@ -73,45 +72,21 @@ def outer(replicates: int, confidence: float) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Moments:
-    """Count, mean, sums of second, third and fourth powers of deviations from it, least and greatest value.
+    """Count, mean, sums of second and fourth powers of deviations from it."""
 
-    No samples are a valid start of merging.
-    """
-
-    count: int = 0
-    centre: float = 0.0
-    second: float = 0.0
-    third: float = 0.0
-    fourth: float = 0.0
-    least: float = math.inf
-    greatest: float = -math.inf
+    count: int
+    centre: float
+    second: float
+    fourth: float
 
     @classmethod
     def of(cls, values: Any) -> "Moments":
         """Of a column, in two passes. Raises ValueError for values not finite."""
         x = column(values, least=0)
         if not x.size:
-            return cls()
-        d = x - x.mean()
-        squares = d * d
-        second, fourth = squares.sum(), np.square(squares).sum()
-        third = np.multiply(squares, d, out=squares).sum()
-        return cls(x.size, float(x.mean()), float(second), float(third), float(fourth), float(x.min()), float(x.max()))
-
-    def merge(self, other: "Moments") -> "Moments":
-        """Of both samples together, in any order to rounding. Pébay (2008)."""
-        if not (self.count and other.count):
-            return self if self.count else other
-        a, b, n = self.count, other.count, self.count + other.count
-        step = (other.centre - self.centre) / n
-        second = self.second + other.second + step**2 * n * a * b
-        third = self.third + other.third + 3 * step * (a * other.second - b * self.second)
-        third += step**3 * n * a * b * (a - b)
-        fourth = self.fourth + other.fourth + 4 * step * (a * other.third - b * self.third)
-        fourth += 6 * step**2 * (a * a * other.second + b * b * self.second)
-        fourth += step**4 * n * a * b * (a * a - a * b + b * b)
-        least, greatest = min(self.least, other.least), max(self.greatest, other.greatest)
-        return Moments(n, self.centre + b * step, second, third, fourth, least, greatest)
+            return cls(0, 0.0, 0.0, 0.0)
+        squares = np.square(x - x.mean())
+        return cls(x.size, float(x.mean()), float(squares.sum()), float(np.square(squares).sum()))
 
     def mean(self, *, confidence: float = 0.95) -> Estimate:
         """Mean. Raises ValueError for fewer than two samples."""
@@ -141,10 +116,6 @@ class Count(NamedTuple):
 
     failures: int
     samples: int
-
-    def merge(self, other: "Count") -> "Count":
-        """Of both samples together."""
-        return Count(self.failures + other.failures, self.samples + other.samples)
 
     def probability(self, *, confidence: float = 0.95) -> Estimate:
         """Clopper-Pearson: covers at least as often as asked. Raises ValueError for counts that are none."""
@@ -178,13 +149,6 @@ class Tail:
             x, index = x[kept], index[kept]
         order = np.lexsort((index, -x))[:k]
         return cls(k, x[order], index[order])
-
-    def merge(self, other: "Tail") -> "Tail":
-        """Of both samples together. Raises ValueError for another k."""
-        if self.k != other.k:
-            raise ValueError(f"tails of {self.k} and {other.k} values do not merge")
-        both = np.concatenate([self.values, other.values]), np.concatenate([self.indices, other.indices])
-        return Tail.of(*both, self.k)
 
 
 def quantile(values: Any, level: float, *, confidence: float = 0.95) -> Estimate:

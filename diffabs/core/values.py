@@ -1,0 +1,266 @@
+"""Values that somebody wrote, in TOML, in JSON or on the command line: read once, or refused in one line; and the way
+back.
+
+A table becomes a dataclass, whose fields say how they are read: `entry(reader, default)`, or the reader of their type.
+A reader takes what was given and the place for messages, and returns the value."""
+
+import dataclasses
+import difflib
+import json
+import re
+import reprlib
+import types
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from diffabs.core.pytree import Spec
+
+FINITE = Spec("1")
+POSITIVE = Spec("1", low=0.0, open_low=True)
+PLAIN = (str, bool, int, float, type(None))
+
+Reader = Callable[[Any, str], Any]
+
+
+class ScenarioError(ValueError):
+    """A value, or what is made of it, that cannot be used; the message is one line for a person."""
+
+    def __init__(self, message: str):
+        """Whatever the user wrote, the message stays on one line."""
+        super().__init__(" ".join(message.split()))
+
+
+def kebab(name: str) -> str:
+    """Return the name in tables: `QuarterCar`, `PID`, `RIG_UNROUNDED` are `quarter-car`, `pid`, `rig-unrounded`."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z]{2})(?=[A-Z][a-z])", "-", name).replace("_", "-").lower()
+
+
+def dotted(path: str, key: str) -> str:
+    """Return the path of a key below another path, as it may stand in a message."""
+    key = key if re.fullmatch(r"[\w-]{1,60}", key) else shown(key)
+    return f"{path}.{key}" if path else key
+
+
+def shown(value: Any, most: int = 60) -> str:
+    """Return a value as it may stand in a message: on one line, of bounded length."""
+    if isinstance(value, float) or (isinstance(value, int) and abs(value) < 10**15):
+        return f"{value:.15g}" if not isinstance(value, bool) else str(value).lower()
+    try:
+        text = json.dumps(value, ensure_ascii=True) if isinstance(value, str) else repr(value)
+    except (ValueError, RecursionError):  # more digits than Python writes, more levels than it descends
+        text = "a number of thousands of digits" if isinstance(value, int) else "something nested too deeply"
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def unknown(what: str, name: Any, there: Iterable[str]) -> ScenarioError:
+    """Return the error for a name that is not there, with the nearest one that is."""
+    there = list(there)
+    near = difflib.get_close_matches(str(name).lower(), there, 1, 0.5)
+    hint = f"did you mean {near[0]}? There is" if near else "there is"
+    return ScenarioError(f"{what}; {hint} {', '.join(there) or 'nothing'}")
+
+
+def wrong(path: str, value: Any, needed: str) -> ScenarioError:
+    """Return the error for a value of the wrong kind."""
+    kinds = ((bool, "a boolean"), (str, "text"), ((int, float), "a number"), (list, "a list"), (dict, "a table"))
+    kind = next((name for of, name in kinds if isinstance(value, of)), "nothing" if value is None else "a date or time")
+    return ScenarioError(f"{path} = {shown(value)} is {kind}; {needed} is needed")
+
+
+def number(value: Any, spec: Spec, path: str) -> float:
+    """Return a number as a float. Raises ScenarioError for anything else; the range is not looked at."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise wrong(path, value, f"a number in {spec.interval()}")
+    try:
+        return float(value)
+    except OverflowError:
+        raise ScenarioError(f"{path} = {shown(value)} is too large for a number in {spec.interval()}") from None
+
+
+def inside(value: Any, spec: Spec, path: str) -> float:
+    """Return a number as a float. Raises ScenarioError for anything else, or out of range."""
+    found = number(value, spec, path)
+    if not spec.holds(found):
+        raise ScenarioError(f"{path} = {shown(found)} is outside {spec.interval()}")
+    return found
+
+
+def whole(value: Any, low: int, high: int, path: str) -> int:
+    """Return a whole number. Raises ScenarioError for anything else, or out of range."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise wrong(path, value, f"a whole number in [{low}, {high}]")
+    if not low <= value <= high:
+        raise ScenarioError(f"{path} = {shown(value)} is outside [{low}, {high}]")
+    return value
+
+
+def within(low: int, high: int) -> Reader:
+    """Return the reader of whole numbers in a range."""
+    return lambda given, path: whole(given, low, high, path)
+
+
+def ranged(spec: Spec) -> Reader:
+    """Return the reader of numbers in a range."""
+    return lambda given, path: inside(given, spec, path)
+
+
+def one_of(*names: str) -> Reader:
+    """Return the reader of one of these texts."""
+
+    def read(given: Any, path: str) -> str:
+        if not isinstance(given, str):
+            raise wrong(path, given, f"one of {', '.join(names)}")
+        if given not in names:
+            raise unknown(f"{path} = {shown(given)} is unknown", given, names)
+        return given
+
+    return read
+
+
+def listed(item: Reader) -> Reader:
+    """Return the reader of lists, as tuples, whose items this one reads."""
+
+    def read(given: Any, path: str) -> tuple[Any, ...]:
+        if not isinstance(given, list | tuple):
+            raise wrong(path, given, "a list")
+        return tuple(item(value, f"{path}.{i}") for i, value in enumerate(given))
+
+    return read
+
+
+def table_of(item: Reader, what: str = "") -> Reader:
+    """Return the reader of tables whose values this one reads, under any names. `what`: they are, for a message."""
+
+    def read(given: Any, path: str) -> dict[str, Any]:
+        if not isinstance(given, Mapping):
+            raise wrong(path, given, f"a table of {what}" if what else "a table")
+        return {key: item(value, dotted(path, key)) for key, value in given.items()}
+
+    return read
+
+
+def as_given(value: Any, path: str) -> Any:
+    """Return the value itself, whatever it is."""
+    del path
+    return value
+
+
+def text(given: Any, path: str) -> str:
+    """Return a text. Raises ScenarioError for anything else."""
+    if not isinstance(given, str):
+        raise wrong(path, given, "text")
+    return given
+
+
+def _switch(given: Any, path: str) -> bool:
+    if not isinstance(given, bool):
+        raise wrong(path, given, "true or false")
+    return given
+
+
+def any_number(given: Any, path: str) -> float:
+    """Return any number, also NaN and infinity, as a float. Raises ScenarioError for anything else."""
+    return number(given, FINITE, path)
+
+
+def _choice(given: Any, path: str) -> float | str:
+    return given if isinstance(given, str) else any_number(given, path)
+
+
+READERS: dict[Any, Reader] = {
+    float: any_number,
+    bool: _switch,
+    str: text,
+    tuple[str, ...]: listed(text),
+    tuple[float, ...]: listed(any_number),
+    tuple[float, ...] | None: listed(any_number),
+    tuple[float | str, ...]: listed(_choice),
+}
+
+
+def entry(read: Reader, default: Any = dataclasses.MISSING) -> Any:
+    """Return the field of a dataclass that is read so. A default that is a class or a function is called for
+    each new one."""
+    if isinstance(default, type | types.FunctionType):
+        return dataclasses.field(default_factory=default, metadata={"read": read})
+    return dataclasses.field(default=default, metadata={"read": read})
+
+
+def read(cls: type, given: Any, path: str, kind: str = "", **readers: Reader) -> Any:
+    """Return the instance of a dataclass that a table describes.
+
+    kind: what it is called in messages, else by its path; readers: of fields whose own need more than the table.
+    Raises ScenarioError, in one line, for what is no table, an unknown or missing field, and what a reader refuses.
+    """
+    fields = {field.name: field for field in dataclasses.fields(cls)}
+    if not isinstance(given, Mapping):
+        raise wrong(path, given, f"a table of {', '.join(fields)}")
+    values = {}
+    for key, item in given.items():
+        if key not in fields:
+            raise unknown(f"{dotted(path, key)} is not a field of {kind or path}", key, fields)
+        values[key] = (readers.get(key) or _reader(fields[key]))(item, dotted(path, key))
+    for name, field in fields.items():
+        if name not in values and field.default is field.default_factory is dataclasses.MISSING:
+            raise ScenarioError(f"{dotted(path, name)} is missing: {kind or path} needs it")
+    return cls(**values)
+
+
+def _reader(field: dataclasses.Field[Any]) -> Reader:
+    spec = field.metadata.get("spec")
+    return ranged(spec) if spec else field.metadata.get("read") or READERS[field.type]
+
+
+def read_one(kinds: Mapping[str, type], given: Any, path: str, **readers: Reader) -> Any:
+    """Return the instance of one of these dataclasses, by name, that a table with a type, or a bare name, describes.
+    Raises ScenarioError, as `read`."""
+    table = {"type": given} if isinstance(given, str) else given
+    if not isinstance(table, Mapping):
+        raise wrong(path, given, f"a table, or the name of a type ({', '.join(kinds)}),")
+    if "type" not in table:
+        raise ScenarioError(f"{path}.type is missing; there is {', '.join(kinds)}")
+    kind = one_of(*kinds)(table["type"], f"{path}.type")
+    return read(kinds[kind], {k: v for k, v in table.items() if k != "type"}, path, kind, **readers)
+
+
+def sound(part: Any, name: str) -> Any:
+    """Return the part. Raises ScenarioError with everything that its method `problems` says of it, under this name."""
+    if lines := list(part.problems(name)):
+        raise ScenarioError("; ".join(lines))
+    return part
+
+
+def plain(value: Any, *, brief: bool = False) -> Any:
+    """Return a value as TOML and JSON have them: parts as tables, with every field or, if `brief`, without those that
+    are as by default; numbers of parts at full precision."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {"type": kebab(type(value).__name__), **members(value, brief=brief)}
+    if isinstance(value, Mapping):
+        return {key: plain(item, brief=brief) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [plain(item, brief=brief) for item in value]
+    return value if type(value) in PLAIN else np.asarray(value).tolist()
+
+
+def members(part: Any, *, brief: bool = False) -> dict[str, Any]:
+    """Return the fields of a dataclass by name, as `plain` values."""
+    found = {}
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        if brief and field.default is not dataclasses.MISSING and plain(value) == plain(field.default):
+            continue
+        found[field.name] = np.asarray(value, float).tolist() if "spec" in field.metadata else plain(value, brief=brief)
+    return found
+
+
+def written(part: Any) -> str:
+    """Return a dataclass as messages have it: `normal(5.75, 0.3, low = 5)`."""
+    cells = []
+    for field in dataclasses.fields(part):
+        value = getattr(part, field.name)
+        if field.default is dataclasses.MISSING or value != field.default:
+            cell = f"{value:g}" if isinstance(value, int | float) else reprlib.repr(plain(value))
+            cells.append(cell if field.default is dataclasses.MISSING else f"{field.name} = {cell}")
+    return f"{kebab(type(part).__name__)}({', '.join(cells)})"
