@@ -54,7 +54,7 @@ MUTATIONS = [
     ),
     Mutation(
         "a scan that keeps every carry",
-        "simulate/rk4.py",
+        "simulate/checkpoint.py",
         "SLOTS = 1800",
         "SLOTS = 10**9",
         "test_checkpoints.py::test_memory_of_reverse_mode_hardly_grows_with_the_number_of_steps",
@@ -62,9 +62,23 @@ MUTATIONS = [
     Mutation(
         "nested scans that make too few steps",
         "simulate/checkpoint.py",
-        "[math.ceil(count / inner), inner]",
-        "[count // inner, inner]",
+        "return math.ceil(count / inner), inner",
+        "return count // inner, inner",
         "test_checkpoints.py::test_nested_scans_make_enough_steps_and_keep_few_carries[1801]",
+    ),
+    Mutation(
+        "steps beyond the duration are made",
+        "simulate/checkpoint.py",
+        "(i * inner < count) & on(carry)",
+        "on(carry)",
+        "test_checkpoints.py::test_groups_beyond_the_count_are_skipped_and_have_no_derivative",
+    ),
+    Mutation(
+        "a batch ends with its first lane",
+        "simulate/drivers.py",
+        "jnp.any(running, axis=0)",
+        "jnp.all(running, axis=0)",
+        "test_rollout.py::test_a_batch_ends_with_its_last_lane",
     ),
     Mutation(
         "structures that forget their class",
@@ -349,7 +363,7 @@ MUTATIONS = [
     ),
     Mutation(
         "a diverged lane with metrics",
-        "simulate/hybrid_step.py",
+        "simulate/outcome.py",
         "jnp.where(diverged, jnp.nan, value)",
         "value",
         "test_rollout.py::test_a_diverging_lane_is_flagged_and_leaves_the_others_alone",
@@ -1071,14 +1085,14 @@ MUTATIONS = [
     ),
     Mutation(
         "no audit of a brake",
-        "simulate/run.py",
+        "simulate/outcome.py",
         'audit = getattr(loop.plant, "audit", None)',
         "audit = None",
         "test_refusals.py::TestAfterARun::test_an_unstable_step_is_seen_although_every_number_is_finite",
     ),
     Mutation(
         "metrics of whatever size",
-        "simulate/run.py",
+        "simulate/outcome.py",
         "(value >= low - ROUNDING)",
         "(value >= -jnp.inf)",
         "test_refusals.py::TestAfterARun::test_a_metric_outside_its_range_is_a_run_that_diverged",

@@ -39,7 +39,7 @@ def init_carry(loop: Loop, objectives: dict[str, Objective], h: Any) -> Carry:
     return _typed(Carry(state, tally, sample, zero, 0.0 * h, h, zero, running, no, ~running), h.dtype)
 
 
-def step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: int, carry: Carry) -> Carry:
+def step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, carry: Carry) -> Carry:
     """One step; or one try of the last step; or nothing if the run has ended."""
     state, tally, before, late = _advance(loop, objectives, h, key, carry)
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state.flow())]))
