@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.loop import Loop, LoopState
+from diffabs.core.loop import Event, Loop, LoopState
 from diffabs.core.numerics import axpy, clamp
 from diffabs.core.protocols import Clock, Memory, Objective, Sample
 from diffabs.simulate.rk4 import rk4_step_and_rate
@@ -72,8 +72,9 @@ def _advance(
 ) -> tuple[LoopState, dict[str, Memory], Sample, Any]:
     """Update, jump, integrate over carry.length: state, accumulators, the sample after the jump, and how much later [s]
     the margin crosses zero. That time only chooses the next length, so it has no derivative."""
-    held = _update_objectives(loop, objectives, carry, carry.state, carry.t, h)
-    state, events = loop.jump(Clock(carry.t, h, carry.k, key), carry.state)
+    signals = loop.signals(carry.t, carry.state)
+    held = _update_objectives(objectives, carry, signals.sample, h)
+    state, events = loop.jump(Clock(carry.t, h, carry.k, key), carry.state, signals)
     tally_flow = {name: memory.flow for name, memory in carry.tally.items()}
 
     def flow(t: Any, z: Any, state: LoopState = state) -> Any:
@@ -81,15 +82,24 @@ def _advance(
 
     z = (state.flow(), tally_flow)
     for event in events:
-        old = flow(carry.t, (event.before.flow(), tally_flow), event.before)
-        new = flow(carry.t, (event.after.flow(), tally_flow), event.after)
-        z = axpy(event.elapsed, axpy(-1.0, old, new), z)
+        z = _saltation(flow, carry.t, z, event)
     before = loop.signals(carry.t, state.with_flow(z[0])).sample
     z, rate = rk4_step_and_rate(flow, carry.t, z, carry.length)
     state = state.with_flow(z[0])
     state = state._replace(plant=loop.plant.project(state.plant))
     tally = {name: Memory(z[1][name], held[name]) for name in objectives}
     return state, tally, before, _landing_correction(loop, state.plant, rate[0][0])
+
+
+def _saltation(flow: Any, t: Any, z: Any, event: Event) -> Any:
+    """z at t, if the event happened `elapsed` ago and not now: back by that with the rates from before it, and forth
+    again with those from after it, both by the midpoint rule."""
+
+    def moved(t: Any, z: Any, e: Any, state: LoopState) -> Any:
+        return axpy(e, flow(t + e / 2, axpy(e / 2, flow(t, z, state), z), state), z)
+
+    e = event.elapsed
+    return moved(t - e, moved(t, z, -e, event.before), e, event.after)
 
 
 def _landing_correction(loop: Loop, plant: Any, rate: Any) -> Any:
@@ -111,11 +121,9 @@ def _rates(
     return loop.flow(t, state, signals), rates
 
 
-def _update_objectives(
-    loop: Loop, objectives: dict[str, Objective], carry: Carry, state: LoopState, t: Any, h: Any
-) -> dict[str, Any]:
-    """`held` of the accumulators after the last interval, of length h; there is none before the first step."""
-    sample = loop.signals(t, state).sample
+def _update_objectives(objectives: dict[str, Objective], carry: Carry, sample: Sample, h: Any) -> dict[str, Any]:
+    """`held` of the accumulators after the last interval, of length h, that ends on `sample`; there is none before the
+    first step."""
 
     def updated(memory: Memory, objective: Objective) -> Any:
         held = objective.update(memory, carry.before, sample, h)
@@ -142,7 +150,7 @@ def finish(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) -
     carry = carry._replace(t=carry.t + moved, state=state)
     carry = carry._replace(tally={name: Memory(tally[name], held[name]) for name in objectives})
     length = jnp.where(carry.stopped, carry.length + moved, h)
-    held = _update_objectives(loop, objectives, carry, state, carry.t, length)
+    held = _update_objectives(objectives, carry, loop.signals(carry.t, state).sample, length)
     return carry._replace(tally={name: Memory(tally[name], held[name]) for name in objectives})
 
 
