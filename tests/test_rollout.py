@@ -80,8 +80,10 @@ def test_the_peak_of_a_falling_slip_is_its_first_value():
 
 def test_a_run_that_does_not_stop_is_charged_the_rest():
     run = d.measure(SLIDING, d.FixedStep(1e-3, 0.5), BRAKING)
+    assert run.timed_out
     assert not run.stopped
     assert not run.diverged
+    assert not d.measure(SLIDING, d.FixedStep(1e-3, 3.0), BRAKING).timed_out
     np.testing.assert_allclose(run.ending.sample.t, 0.5, rtol=1e-12)
     np.testing.assert_allclose(run.metrics["stop_distance"], 50 / DECELERATION, rtol=1e-12)
     coasting = dataclasses.replace(

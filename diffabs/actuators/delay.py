@@ -68,12 +68,13 @@ class Delay:
         before = signal if clock.before is None else clock.before
         share, last, now = clock.late * (signal - before), (clock.k - 1) % self.capacity, clock.k % self.capacity
         end = before + share / clock.h
-        rings = DelayMemory(
-            memory.held.start.at[now].set(signal),
-            memory.held.end.at[last].set(end),
-            memory.held.mean.at[last].set((memory.flow + share) / clock.h),
-            *(clock.t + 0.5 * clock.h,) * 3,
-            clock.h,
+        held: DelayMemory = memory.held
+        rings = held._replace(
+            start=held.start.at[now].set(signal),
+            end=held.end.at[last].set(end),
+            mean=held.mean.at[last].set((memory.flow + share) / clock.h),
+            middle=clock.t + 0.5 * clock.h,
+            h=clock.h,
         )
         back = clamp(self.time / clock.h, 1.0, self.capacity - 2.0)
         whole = jnp.ceil(back)

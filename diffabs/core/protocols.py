@@ -185,8 +185,9 @@ class Block(Protocol):
 
 class Jump(NamedTuple):
     """A memory after an instant. `elapsed` [s] is the time since the event that caused the jump, which lies between
-    instants: the loop moves the state by elapsed * (new derivative - old derivative), so that values and gradients do
-    not depend on where the event falls in the step. None where a block has no events."""
+    instants: the loop takes the state back by that with the rates from before the event and forth with those from after
+    it, so that values and gradients do not depend on where the event falls in the step. None where a block has no
+    events."""
 
     memory: Memory
     elapsed: Scalar | None = None

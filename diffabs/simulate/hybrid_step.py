@@ -1,5 +1,6 @@
 """One step of a run, and its two ends: what happens in an interval is said here, and nowhere else."""
 
+import enum
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,12 @@ from diffabs.simulate.solution import Trajectory
 LANDINGS = 4  # Newton iterations for the length of the last step; quadratic from an error below one step
 
 
+class Condition(enum.IntEnum):
+    """How a run is: it goes on, or looks for the length of its last step, or it is over, in one of three ways."""
+
+    RUNNING, LANDING, STOPPED, TIMED_OUT, DIVERGED = range(5)
+
+
 class Carry(NamedTuple):
     """A run on its way."""
 
@@ -23,36 +30,47 @@ class Carry(NamedTuple):
     k: Any  # number of steps taken
     t: Any  # the present instant; after a stop, that of the crossing
     length: Any  # of the step to try: h, or shorter when landing
-    landing: Any  # how many times the last step was tried
-    running: Any
-    stopped: Any
-    diverged: Any
+    tries: Any  # how many times the last step was tried
+    condition: Any  # a Condition
+
+    @property
+    def running(self) -> Any:
+        """Whether another step is to be made or tried."""
+        return self.condition <= Condition.LANDING
+
+    @property
+    def stopped(self) -> Any:
+        """Whether the stop was reached."""
+        return self.condition == Condition.STOPPED
 
 
 def init_carry(loop: Loop, objectives: dict[str, Objective], h: Any) -> Carry:
-    """The carry at t = 0."""
+    """Return the carry at t = 0."""
     state = loop.start()
     sample = loop.signals(0.0 * h, state).sample
     tally = {name: objective.start(sample) for name, objective in objectives.items()}
-    no, zero = jnp.asarray(False), jnp.asarray(0)
-    running = loop.stop.margin(sample.output) > 0
-    return _typed(Carry(state, tally, sample, zero, 0.0 * h, h, zero, running, no, ~running), h.dtype)
+    zero = jnp.asarray(0)
+    condition = jnp.where(loop.stop.margin(sample.output) > 0, zero + Condition.RUNNING, zero + Condition.DIVERGED)
+    return _typed(Carry(state, tally, sample, zero, 0.0 * h, h, zero, condition), h.dtype)
 
 
 def step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, carry: Carry) -> Carry:
-    """One step; or one try of the last step; or nothing if the run has ended."""
+    """Return the carry after one step; or one try of the last step; or the same if the run has ended."""
     state, tally, before, late = _advance(loop, objectives, h, key, carry)
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state.flow())]))
-    trying = carry.landing > 0
+    trying = carry.condition == Condition.LANDING
     crossed = finite & (loop.stop.margin(loop.plant.output(state.plant)) <= 0)
-    landed = carry.running & trying & (carry.landing == LANDINGS)
-    ahead = carry.running & finite & ~trying & ~crossed
+    landed = trying & (carry.tries == LANDINGS)
+    ahead = (carry.condition == Condition.RUNNING) & finite & ~crossed
     search = carry.running & finite & ~landed & ~ahead
     taken = ahead | landed
     state, tally, before = jax.tree.map(
         lambda a, b: jnp.where(taken, a, b), (state, tally, before), (carry.state, carry.tally, carry.before)
     )
     k = carry.k + jnp.where(taken, 1, 0)
+    after = jnp.where(landed, Condition.STOPPED, Condition.LANDING)
+    after = jnp.where(ahead, jnp.where(k < steps, Condition.RUNNING, Condition.TIMED_OUT), after)
+    after = jnp.where(finite, after, Condition.DIVERGED)
     return Carry(
         state=state,
         tally=tally,
@@ -60,10 +78,8 @@ def step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: 
         k=k,
         t=jnp.where(landed, carry.t + carry.length, jnp.where(ahead, k * h, carry.t)),
         length=jnp.where(search, clamp(carry.length + late, 0.0, h), carry.length),
-        landing=carry.landing + jnp.where(search, 1, 0),
-        running=(ahead & (k < steps)) | search,
-        stopped=carry.stopped | landed,
-        diverged=carry.diverged | (carry.running & ~finite),
+        tries=carry.tries + jnp.where(search, 1, 0),
+        condition=jnp.where(carry.running, after, carry.condition).astype(carry.condition.dtype),
     )
 
 
@@ -157,7 +173,7 @@ def finish(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) -
 def observe(loop: Loop, carry: Carry) -> Trajectory:
     """Return what is seen of the loop at the present instant."""
     signals = loop.signals(carry.t, carry.state)
-    return Trajectory(signals.sample, signals.measured, carry.state.plant, carry.running & (carry.landing == 0))
+    return Trajectory(signals.sample, signals.measured, carry.state.plant, carry.condition == Condition.RUNNING)
 
 
 def _typed(tree: Any, dtype: Any) -> Any:

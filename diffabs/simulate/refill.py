@@ -15,7 +15,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import misshapen, replace, strong
 from diffabs.core.tracing import separated
-from diffabs.simulate.hybrid_step import Carry, init_carry, step
+from diffabs.simulate.hybrid_step import Carry, Condition, init_carry, step
 from diffabs.simulate.outcome import judge, prepare
 from diffabs.simulate.refusals import refusals, traced
 from diffabs.simulate.run import arguments
@@ -118,8 +118,8 @@ def _run(
         """Lanes at their start; beyond the last one a copy of it that does not run."""
         mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
         carry = start(mine)
-        running, diverged = carry.running & run & (number < count), carry.diverged | ~run
-        return mine, key, carry._replace(running=running, diverged=diverged)
+        condition = jnp.where(run & (number < count), carry.condition, Condition.DIVERGED)
+        return mine, key, carry._replace(condition=condition.astype(carry.condition.dtype))
 
     def round_(belt: _Belt) -> _Belt:
         def some(carry: Carry, _: Any) -> tuple[Carry, None]:
