@@ -287,28 +287,69 @@ def test_two_lags_in_series():
     close(u, 1 - (t1 * np.exp(-t / t1) - t2 * np.exp(-t / t2)) / (t1 - t2), rtol=0, atol=2e-6)
 
 
+def lines(block, signal, steps, h=H):
+    """The delayed command at both ends of each step, (steps, 2)."""
+
+    def step(memory, k):
+        t = k * h
+        memory = block.jump(Clock(t, h, k, None), memory, signal(t)).memory
+        flow = rk4_step(lambda t, z: block.flow(t, Memory(z, memory.held), signal(t)), t, memory.flow, h)
+        ends = jnp.array([block.output(at, memory, signal(at)) for at in (t, t + h)])
+        return Memory(flow, memory.held), ends
+
+    start = jax.tree.map(jnp.asarray, block.start(jnp.asarray(signal(0.0))))
+    return np.asarray(jax.jit(lambda start: jax.lax.scan(step, start, jnp.arange(steps))[1])(start))
+
+
 @pytest.mark.parametrize("back", [1.0, 2.0, 2.7, 5.5])
 def test_delay_shifts_a_ramp(back):
-    """The mean over a step of a ramp is its value in the middle; the impulse of the first step is exact."""
-    u, _ = run(Delay(time=back * H, capacity=9), lambda t: 3.0 + 1000.0 * t, 25)
-    middle = (np.arange(25) + 0.5 - back) * H
-    whole = middle > 0.5 * H
-    close(np.asarray(u)[whole], 3.0 + 1000.0 * middle[whole], rtol=1e-11)
-    come = 24 * H - back * H + H  # of the command, by the end of the last step
-    close(H * np.sum(u), 3.0 * come + 500.0 * come**2, rtol=1e-11)
+    """Exact within and at the ends of a step; so is the impulse of the first step, in which the command comes."""
+    u = lines(Delay(time=back * H, capacity=9), lambda t: 3.0 + 1000.0 * t, 25)
+    came = (np.arange(25)[:, None] + [0, 1] - back) * H
+    whole = came[:, 0] > -1e-9
+    close(u[whole], 3.0 + 1000.0 * came[whole], rtol=1e-11)
+    come = came[-1, 1]  # of the command, by the end of the last step
+    close(H * np.sum(u.mean(1)), 3.0 * come + 500.0 * come**2, rtol=1e-11)
 
 
-def test_delay_of_a_sine_is_second_order():
-    def error(n):
-        h = 0.05 / n
-        u, _ = run(Delay(time=0.0123, capacity=n + 4), lambda t: jnp.sin(200.0 * t), n, h=h)
-        t = h * np.arange(n) - 0.0123
-        exact = (np.cos(200.0 * t) - np.cos(200.0 * (t + h))) / (200.0 * h)
-        return np.max(np.abs((u - exact)[t > 0]))
+def test_delay_of_a_sine_has_its_moments_to_fourth_order():
+    """Mean and first moment of each step, against closed forms."""
+
+    def errors(n):
+        h, w = 0.05 / n, 200.0
+        u = lines(Delay(time=0.0123, capacity=n + 4), lambda t: jnp.sin(w * t), n, h=h)
+        a = h * np.arange(n) - 0.0123
+        b = a + h
+        mean = (np.cos(w * a) - np.cos(w * b)) / (w * h)
+        middle = 0.5 * (a + b)  # integral of sin(w t) (t - middle)
+        moment = [(np.sin(w * t) / w - (t - middle) * np.cos(w * t)) / w for t in (b, a)]
+        rise = 12.0 * (moment[0] - moment[1]) / h**2
+        whole = a > 0
+        return np.max(np.abs(u.mean(1) - mean)[whole]), np.max(np.abs(u[:, 1] - u[:, 0] - rise)[whole])
 
     counts = np.array([100, 200, 400])
-    order = -np.polyfit(np.log(counts), np.log([error(int(n)) for n in counts]), 1)[0]
-    assert 1.9 < order < 2.1
+    found = np.log([errors(int(n)) for n in counts])
+    orders = -np.polyfit(np.log(counts), found, 1)[0]
+    assert orders[0] > 3.8, orders
+    assert orders[1] > 2.8, orders
+
+
+def test_delay_of_a_relay_that_switches_within_a_step():
+    """A command that falls from 5 to 2 at 0.3 of step 7, which is told at the end of the step, `late`: the impulse that
+    comes out is exact, and the command hardly leaves 2 ... 5."""
+    delay, share = Delay(time=2.6 * H, capacity=9), 0.7
+    memory, seen = jax.tree.map(jnp.asarray, delay.start(jnp.asarray(5.0))), []
+    for k in range(14):
+        before, now = (5.0 if k <= 8 else 2.0), (5.0 if k < 8 else 2.0)
+        late = share * H if k == 8 else 0.0
+        memory = delay.jump(Clock(k * H, H, k, None, before, late), memory, now).memory
+        flow = memory.flow + late * (now - before) + H * now  # the loop's correction, and the step
+        seen.append([delay.output(t, memory, now) for t in (k * H, (k + 1) * H)])
+        memory = Memory(flow, memory.held)
+    seen = np.asarray(seen)[3:]  # all that has come through in whole steps
+    assert seen.min() >= 1.8
+    assert seen.max() <= 5.0 + 1e-12
+    close(np.sum(seen.mean(1)), (7.3 + 2.6 - 3.0) * 5.0 + (14 - 7.3 - 2.6) * 2.0, rtol=1e-12)
 
 
 def test_delay_is_differentiable_in_its_time():

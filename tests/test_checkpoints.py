@@ -12,8 +12,9 @@ from diffabs import controllers, plants
 from diffabs.core.pytree import get
 from diffabs.objectives import IAE, StopDistance
 from diffabs.scenario.defaults import braking
-from diffabs.simulate import rk4
-from diffabs.simulate.checkpoint import SLOTS, levels
+from diffabs.simulate import checkpoint
+from diffabs.simulate.checkpoint import GROUP, SLOTS, levels, repeated
+from diffabs.simulate.drivers import slots
 from diffabs.stops import SpeedReached
 
 LOOP = braking(
@@ -61,17 +62,40 @@ def test_memory_of_reverse_mode_hardly_grows_with_the_number_of_steps():
 
 @pytest.mark.parametrize("count", [1, 2, 7, 900, 1800, 1801, 1804, 4004, 16004, 10**6])
 def test_nested_scans_make_enough_steps_and_keep_few_carries(count):
-    lengths = levels(count)
-    assert count <= math.prod(lengths) <= 1.002 * count
-    if count >= SLOTS / 2:
-        assert SLOTS / 2 <= sum(lengths) <= 1.5 * SLOTS
+    groups, steps = levels(count)
+    assert count <= groups * steps <= count + max(GROUP, 0.002 * count)
+    if count > SLOTS:  # what is kept: the carry of each group, and in one group at a time of each step
+        assert SLOTS / 2 <= groups + steps <= 1.5 * SLOTS
+
+
+@pytest.mark.parametrize("count", [1, 5, 17, 1000, 4004, 123457])
+def test_slots_leave_little_over_and_are_few(count):
+    room = slots(count)
+    assert count <= room <= 1.125 * count + 1
+    assert len({slots(n) for n in range(1000, 4000)}) <= 17
+
+
+def test_groups_beyond_the_count_are_skipped_and_have_no_derivative():
+    def power(x, count, room):
+        def step(carry):
+            return carry[0] * x, carry[1] + 1
+
+        return repeated(step, (1.0, 0), room, lambda carry: carry[1] >= 0, count)
+
+    for room in (100, 4000):
+        made = levels(room)[1] * math.ceil(70 / levels(room)[1])
+        value, times = jax.jit(power, static_argnums=2)(1.01, 70, room)
+        assert times == made
+        np.testing.assert_allclose(value, 1.01**made, rtol=1e-12)
+        slope = jax.jit(jax.grad(lambda x, n, room: power(x, n, room)[0]), static_argnums=2)(1.01, 70, room)
+        np.testing.assert_allclose(slope, made * 1.01 ** (made - 1), rtol=1e-12)
 
 
 @pytest.mark.slow
 def test_reverse_forward_and_differences_agree_in_nested_scans(monkeypatch):
-    monkeypatch.setattr(rk4, "SLOTS", 16)
+    monkeypatch.setattr(checkpoint, "SLOTS", 16)
     jax.clear_caches()
-    assert len(levels(104)) == 2
+    assert levels(104) == (15, 7)
     mean, zero = objective(100, lanes=2, step=2e-3), jnp.zeros(len(PATHS))
     reverse, forward = jax.jit(jax.grad(mean))(zero), jax.jit(jax.jacfwd(mean))(zero)
     moves = 1e-5 * jnp.eye(len(PATHS))

@@ -138,7 +138,11 @@ SOLVERS = dict.fromkeys(LOOPS, d.FixedStep(5e-4, 0.8)) | {
 }
 # Step of the differences and what they may miss: their own truncation (an oscillating end wants a smaller step), and a
 # kink that moves inside an integration step, where the derivative of the numerical run jumps by O(h).
-ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {"feedback": (3e-6, 1e-6), "computer": (1e-5, 5e-5)}
+ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {
+    "feedback": (3e-6, 1e-6),
+    "computer": (1e-5, 5e-5),
+    "delay": (1e-5, 2e-6),
+}
 
 
 # The largest programs to compile.

@@ -12,7 +12,9 @@ from diffabs import controllers, plants, references, roads
 from diffabs.actuators import Lag
 from diffabs.objectives import BRAKING, Effort, MaxSlip, TorqueRate, Variation
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.run import _run
+from diffabs.simulate.hybrid_step import LANDINGS, init_carry, step
+from diffabs.simulate.outcome import judge, prepare
+from diffabs.simulate.run import _run, arguments
 from diffabs.simulate.stable_step import stable_step
 from diffabs.stops import SpeedReached, Standstill
 
@@ -78,8 +80,10 @@ def test_the_peak_of_a_falling_slip_is_its_first_value():
 
 def test_a_run_that_does_not_stop_is_charged_the_rest():
     run = d.measure(SLIDING, d.FixedStep(1e-3, 0.5), BRAKING)
+    assert run.timed_out
     assert not run.stopped
     assert not run.diverged
+    assert not d.measure(SLIDING, d.FixedStep(1e-3, 3.0), BRAKING).timed_out
     np.testing.assert_allclose(run.ending.sample.t, 0.5, rtol=1e-12)
     np.testing.assert_allclose(run.metrics["stop_distance"], 50 / DECELERATION, rtol=1e-12)
     coasting = dataclasses.replace(
@@ -137,6 +141,57 @@ def test_new_values_do_not_compile_again():
     d.measure(d.replace(RIG, {"plant.mass": jnp.asarray(6.1), "initial.speed": np.float64(12.0)}), solver, BRAKING)
     d.measure(RIG, d.FixedStep(0.9e-3, 0.018), BRAKING)  # same number of steps
     assert _run._cache_size() == before
+
+
+@pytest.mark.parametrize("duration", [0.02, 0.3, 3.0])
+def test_another_duration_is_the_same_program_and_the_same_steps(duration):
+    """Against the steps one after the other, without any driver."""
+    solver = d.FixedStep(1e-3, duration)
+    d.measure(RIG, d.FixedStep(1e-3, 0.5), BRAKING)
+    before = _run._cache_size()
+    run = d.measure(RIG, solver, BRAKING)
+    assert _run._cache_size() == before
+    loop, objectives, h = arguments(RIG, solver, BRAKING)
+
+    @jax.jit
+    def plainly(loop, objectives):
+        loop, audit = prepare(loop)
+        objectives = objectives | audit
+        carry = init_carry(loop, objectives, h)
+        over = jax.lax.fori_loop(
+            0, solver.steps + LANDINGS, lambda _, carry: step(loop, objectives, h, None, solver.steps, carry), carry
+        )
+        return judge(loop, objectives, h, over)[0]
+
+    assert bool(run.stopped) == (duration == 3.0)
+    jax.tree.map(np.testing.assert_array_equal, run, plainly(loop, objectives))
+
+
+def test_trajectories_of_other_durations_and_strides_are_of_one_program():
+    d.rollout(RIG, d.FixedStep(1e-3, 0.5, every=5), BRAKING)
+    before = _run._cache_size()
+    all_of_it = d.rollout(RIG, d.FixedStep(1e-3, 3.0), BRAKING).trajectory
+    for duration, every in ((0.494, 5), (0.306, 3)):
+        seen = d.rollout(RIG, d.FixedStep(1e-3, duration, every=every), BRAKING).trajectory
+        assert len(seen.sample.t) == -(-round(duration * 1000) // every) + 1
+        whole = round(duration * 1000) // every * every  # the last instant of a stride that does not fit is another
+        np.testing.assert_array_equal(
+            seen.sample.output.slip[: whole // every + 1], all_of_it.sample.output.slip[: whole + 1 : every]
+        )
+    assert _run._cache_size() == before + 1  # of the whole trajectory's length
+
+
+def test_a_batch_ends_with_its_last_lane():
+    """Behind `vmap` the condition of the loop is one for all lanes; each lane ends as it would alone."""
+    speeds = jnp.array([3.0, 12.0, 7.0])
+
+    def run(speed):
+        return d.measure(d.replace(RIG, {"initial.speed": speed}), d.FixedStep(1e-3, 1e6), BRAKING)
+
+    many = jax.vmap(jax.vmap(run))(speeds[None])  # a duration of which no batch sees the end
+    assert many.stopped.all()
+    for i, speed in enumerate(speeds):
+        np.testing.assert_allclose(many.ending.sample.t[0, i], run(speed).ending.sample.t, rtol=1e-12)
 
 
 def test_a_diverging_lane_is_flagged_and_leaves_the_others_alone():

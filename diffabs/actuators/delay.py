@@ -1,8 +1,11 @@
 """Pure delay: control(t) = command(t - time), and 0 before the first command has come through.
 
-The command is kept at the instants of the integration grid and joined by straight lines; each step uses the exact mean
-of the delayed command over the step. That is second order in the step, exact in the impulse of the first command, and
-differentiable in the delay."""
+Of each past step the ring keeps the command at both ends and its mean, which is integrated with the plant: a parabola
+that is the command to third order, also where the command jumps at an instant or changed in an event within the step.
+The step that lies ahead needs it between t - time and t - time + h, where the end of a ring's step may lie and the
+command may jump. Runge-Kutta stages would not see that, so the step uses the straight line that has the same mean and
+the same first moment: of a smooth command that costs no order, and of a jump the impulse is exact. The line does not
+leave the range of the commands that it stands for."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -11,7 +14,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp
-from diffabs.core.protocols import Clock, Jump, Memory, no_flow
+from diffabs.core.protocols import Clock, Jump, Memory
 from diffabs.core.pytree import Scalar, param, pytree, static
 from diffabs.core.rules import Rule, array
 
@@ -19,10 +22,16 @@ ROUNDING = 1e-6  # relative
 
 
 class DelayMemory(NamedTuple):
-    """Ring of past commands; mean of the delayed command over the present step."""
+    """Rings of the past steps: command at the start, at the end, and mean. Of the present step: the delayed command in
+    its middle, its change over the step, that middle [s], and the step's length [s]."""
 
-    ring: Any
-    applied: Scalar
+    start: Any
+    end: Any
+    mean: Any
+    level: Scalar
+    rise: Scalar
+    middle: Scalar
+    h: Scalar
 
 
 @pytree
@@ -33,34 +42,56 @@ class Delay:
     time: Scalar = param(default=0.01, unit="s", above=0.0)
     capacity: int = static(default=1024)
 
-    flow = no_flow
-
     def start(self, signal: Scalar) -> Memory:
         """Nothing on the way yet."""
         zero = 0.0 * jnp.asarray(signal)
-        return Memory(held=DelayMemory(jnp.zeros(self.capacity, zero.dtype) + zero, zero))
+        ring = jnp.zeros(self.capacity, zero.dtype) + zero
+        return Memory(zero, DelayMemory(ring, ring, ring, zero, zero, zero, zero + 1.0))
+
+    def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
+        """The command: what is integrated over the present step is its mean."""
+        del t, memory
+        return signal
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """The delayed command, averaged over the present step."""
-        del t, signal
-        return memory.held.applied
+        """The line that stands for the delayed command."""
+        del signal
+        m: DelayMemory = memory.held
+        return m.level + m.rise * (t - m.middle) / m.h
 
     def jump(self, clock: Clock, memory: Memory, signal: Scalar) -> Jump:
-        """Store the present command, average the delayed one over the step that follows."""
-        ring = memory.held.ring.at[clock.k % self.capacity].set(signal)
+        """Store the step that is over, and find the line for the one that follows.
+
+        An event in the last step changed the command `clock.late` ago. The loop adds that share to what is integrated
+        from now on; here it belongs to the last step.
+        """
+        before = signal if clock.before is None else clock.before
+        share, last, now = clock.late * (signal - before), (clock.k - 1) % self.capacity, clock.k % self.capacity
+        end = before + share / clock.h
+        held: DelayMemory = memory.held
+        rings = held._replace(
+            start=held.start.at[now].set(signal),
+            end=held.end.at[last].set(end),
+            mean=held.mean.at[last].set((memory.flow + share) / clock.h),
+            middle=clock.t + 0.5 * clock.h,
+            h=clock.h,
+        )
         back = clamp(self.time / clock.h, 1.0, self.capacity - 2.0)
         whole = jnp.ceil(back)
-        first = clock.k - whole.astype(int)  # sample at or before t - time
-        part = whole - back  # how far into that segment the step begins
+        level, rise = self._line(rings, clock.k - whole.astype(int), whole - back, clock.k)
+        return Jump(Memory(-share, rings._replace(level=level, rise=rise)))
 
-        def line(i: Any, left: Any, right: Any) -> Any:
-            """Integral of the command over [i + left, i + right] steps, 0 before the first command."""
-            a, b = ring[i % self.capacity], ring[(i + 1) % self.capacity]
-            mean = a + (b - a) * 0.5 * (left + right)
-            return jnp.where(i >= 0, mean * (right - left), 0.0)
-
-        second = jnp.minimum(first + 1, clock.k - 1)  # with a delay of one step, part is 0 and so is its share
-        return Jump(Memory(held=DelayMemory(ring, line(first, part, 1.0) + line(second, 0.0, part))))
+    def _line(self, rings: DelayMemory, first: Any, part: Any, now: Any) -> tuple[Any, Any]:
+        """The delayed command in the middle of a step that begins a `part` into step `first` of the ring, and its
+        change. With a delay of one step, the second piece has no length, and is not known yet."""
+        pieces = ((first, part, 1.0, -part), (jnp.minimum(first + 1, now - 1), 0.0, part, 1.0 - part))
+        found = [_moments(rings, i % self.capacity, *place) for i, *place in pieces]
+        found = [[jnp.where(i >= 0, x, 0.0) for x in one] for (i, *_), one in zip(pieces, found, strict=True)]
+        mean, moment = (found[0][n] + found[1][n] for n in (0, 1))
+        low = jnp.minimum(found[0][2], jnp.where(part > 0, found[1][2], jnp.inf))
+        high = jnp.maximum(found[0][3], jnp.where(part > 0, found[1][3], -jnp.inf))
+        most = 2.0 * jnp.maximum(jnp.minimum(mean - low, high - mean), 0.0)
+        return mean, clamp(12.0 * (moment - 0.5 * mean), -most, most)
 
     def refined(self, times: int) -> "Delay":
         """The same delay in so many more steps."""
@@ -75,3 +106,20 @@ class Delay:
             f"time is {outside}",
             lambda: f"time = {float(self.time):g} s is {outside}",
         )
+
+
+def _moments(rings: DelayMemory, i: Any, left: Any, right: Any, shift: Any) -> tuple[Any, Any, Any, Any]:
+    """Of the parabola of step i of a ring: integrals over [left, right] of the command, and of the command times the
+    place + shift, in steps; the least and the greatest command that the whole of it stands for."""
+    start, end, mean = rings.start[i], rings.end[i], rings.mean[i]
+    bend = 3.0 * (start + end) - 6.0 * mean
+    slope = end - start - bend
+
+    def integral(power: int) -> Any:
+        terms = ((start, power + 1), (slope, power + 2), (bend, power + 3))
+        return sum(c * (right**n - left**n) / n for c, n in terms)
+
+    # The line of a smooth command leaves the range of its ends on the side to which it bends, by this at most.
+    low = jnp.minimum(start, end) - jnp.maximum(bend, 0.0) / 2.0
+    high = jnp.maximum(start, end) - jnp.minimum(bend, 0.0) / 2.0
+    return integral(0), integral(1) + shift * integral(0), low, high

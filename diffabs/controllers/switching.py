@@ -1,7 +1,7 @@
 """Controllers without memory of the plant: constant torque, relay with hysteresis, sliding mode."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
@@ -38,8 +38,9 @@ class RelayMemory(NamedTuple):
 class Relay:
     """torque_max until slip > target + band, then torque_min until slip < target - band.
 
-    Switches at the instants of the integration grid; the moment of the crossing inside the step is found by linear
-    interpolation, so that a run does not depend on the grid and is differentiable.
+    Switches at the instants of the integration grid; the moment of the crossing inside the step is that of the parabola
+    through the excess at both ends with its rate at the later one, so that a run does not depend on the grid and is
+    differentiable.
     """
 
     band: Scalar = param(default=0.02, unit="signal", above=0.0, below=1.0)
@@ -65,8 +66,12 @@ class Relay:
         excess = signal.measured[0] - signal.target
         release = (applied > 0.5) & (excess > self.band)
         apply = (applied < 0.5) & (excess < -self.band)
-        level = jnp.where(release, self.band, -self.band)
-        late = clamp(ratio(excess - level, excess - before), 0.0, 1.0)
+        side = jnp.where(release, 1.0, -1.0)
+        slope = excess - before
+        if clock.rate is not None:
+            rate = clock.rate()
+            slope = clock.h * (rate.measured.slip - rate.target)
+        late = _crossed(side * (before - side * self.band), side * (excess - side * self.band), side * slope)
         elapsed = jnp.where(release | apply, late * clock.h, 0.0)
         now = jnp.where(release, 0.0, jnp.where(apply, 1.0, applied))
         return Jump(Memory(held=RelayMemory(now, excess)), elapsed)
@@ -74,6 +79,15 @@ class Relay:
     def rules(self) -> Iterator[Rule]:
         """A release torque below the applied one."""
         yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}", equal=False)
+
+
+def _crossed(before: Scalar, after: Scalar, slope: Scalar) -> Any:
+    """How long ago, in steps, a value became positive that was `before` <= 0, is `after` > 0, and now rises by `slope`
+    a step: the latest zero of the parabola after - slope r + bend r^2, in a form that does not cancel."""
+    bend = before - after + slope
+    square = slope**2 - 4.0 * bend * after
+    root = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    return clamp(ratio(2.0 * after, slope + root), 0.0, 1.0)
 
 
 @pytree

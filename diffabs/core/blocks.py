@@ -52,11 +52,11 @@ class Series:
 
     def jump(self, clock: Clock, memory: Memory, signal: Any) -> Jump:
         """Their jumps, in order; each draws from its own random stream."""
-        memories = []
+        memories, before = [], signal if clock.before is None else clock.before
         for i, (block, m) in enumerate(self._pairs(memory)):
             key = None if clock.key is None else jax.random.fold_in(clock.key, i)
-            memories.append(block.jump(clock._replace(key=key), m, signal).memory)
-            signal = block.output(clock.t, memories[-1], signal)
+            memories.append(block.jump(clock._replace(key=key, before=before, rate=None), m, signal).memory)
+            signal, before = block.output(clock.t, memories[-1], signal), block.output(clock.t, m, before)
         return Jump(Memory(tuple(m.flow for m in memories), tuple(m.held for m in memories)))
 
     def _pairs(self, memory: Memory) -> Any:

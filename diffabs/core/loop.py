@@ -6,7 +6,11 @@
 A `Loop` is one pytree: every parameter of every part is a leaf with a dotted path, `loop.plant.road.scale`.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
 
 from diffabs.core.blocks import Direct, NoFeedforward
 from diffabs.core.protocols import Block, Clock, Feedforward, Memory, Plant, Reference, Sample, Stop, Tracking
@@ -95,16 +99,23 @@ class Loop:
             self.actuator.flow(t, state.actuator, sample.command),
         )
 
-    def jump(self, clock: Clock, state: LoopState) -> tuple[LoopState, list[Event]]:
-        """The blocks' jumps in the order of the signal, and those that are localised events."""
-        t, events = clock.t, []
+    def jump(self, clock: Clock, state: LoopState, before: Signals | None = None) -> tuple[LoopState, list[Event]]:
+        """The blocks' jumps in the order of the signal, and those that are localised events. `before` are the signals
+        at (clock.t, state), if they are known."""
+        t, events, start = clock.t, [], state
+        seen = _seen(before or self.signals(t, state))
+
+        def rate(name: str) -> Any:
+            return _seen(self._signal_rates(t, start, before or self.signals(t, start)))[name]
 
         def jumped(name: str, signal: Any) -> Memory:
-            nonlocal state
+            nonlocal state, clock
+            clock = clock._replace(before=seen[name], rate=partial(rate, name))
             memory, elapsed = getattr(self, name).jump(clock, getattr(state, name), signal)
             after = state._replace(**{name: memory})
             if elapsed is not None:
                 events.append(Event(state, after, elapsed))
+                clock = clock._replace(late=clock.late + elapsed)
             state = after
             return memory
 
@@ -115,10 +126,21 @@ class Loop:
         jumped("actuator", command)
         return state, events
 
+    def _signal_rates(self, t: Scalar, state: LoopState, signals: Signals) -> Signals:
+        """d(signals)/dt where nothing jumps."""
+        moves = (jnp.ones_like(jnp.asarray(t)), self.flow(t, state, signals))
+        return jax.jvp(lambda t, z: self.signals(t, state.with_flow(z)), (jnp.asarray(t), state.flow()), moves)[1]
+
     def _tracking(self, t: Scalar, reference: Memory, measured: Any) -> Tracking:
         target = self.reference.output(t, reference, measured)
         setpoint = self.reference.setpoint(reference)
         return Tracking(target, measured, self.feedforward.input(self.plant, measured, setpoint))
+
+
+def _seen(signals: Signals) -> dict[str, Any]:
+    """What each block is given."""
+    sample, measured, tracking = signals
+    return {"sensor": sample.output, "reference": measured, "controller": tracking, "actuator": sample.command}
 
 
 def signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, Any]]:

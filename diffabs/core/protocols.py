@@ -43,6 +43,7 @@ torque brakes. State feedback is u = K x with x = (integral of (slip - target), 
 papers', so a stabilising K is negative. A balance leans to the side of positive angles, and u = K x there too.
 """
 
+from collections.abc import Callable
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
@@ -93,12 +94,20 @@ class Memory(NamedTuple):
 
 
 class Clock(NamedTuple):
-    """The instant of a jump: time [s], step length [s], number of the step, and the run's random key (or None)."""
+    """The instant of a jump: time [s], step length [s], number of the step, and the run's random key (or None).
+
+    A block's signal may change in an instant, by a jump of a block before it: `before` is what the signal was until
+    then (None: the same), and `late` [s] how long ago that event happened, 0 if it happens now. `rate()`, where it is
+    known, is d(before)/dt then; it costs two evaluations of the loop, if it is asked for.
+    """
 
     t: Scalar
     h: Scalar
     k: Any
     key: Any
+    before: Any = None
+    late: Scalar = 0.0
+    rate: Callable[[], Any] | None = None
 
 
 class Tracking(NamedTuple):
@@ -198,8 +207,9 @@ class Block(Protocol):
 
 class Jump(NamedTuple):
     """A memory after an instant. `elapsed` [s] is the time since the event that caused the jump, which lies between
-    instants: the loop moves the state by elapsed * (new derivative - old derivative), so that values and gradients do
-    not depend on where the event falls in the step. None where a block has no events."""
+    instants: the loop takes the state back by that with the rates from before the event and forth with those from after
+    it, so that values and gradients do not depend on where the event falls in the step. None where a block has no
+    events."""
 
     memory: Memory
     elapsed: Scalar | None = None

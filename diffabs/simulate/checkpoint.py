@@ -5,38 +5,36 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 
 X = TypeVar("X")
+GROUP = 32  # steps that are skipped together, where no more than SLOTS are made
 SLOTS = 1800  # carries that reverse mode keeps in one scan: some 0.2 MB for each lane of a batch
 
 
-def repeated(step: Callable[[X], X], carry: X, count: int, on: Callable[[X], Any]) -> X:
-    """step(step(... carry)), at least `count` times, in nested scans that are skipped where `on(carry)` is False.
+def repeated(step: Callable[[X], X], carry: X, room: int, on: Callable[[X], Any], count: Any) -> X:
+    """Return step(step(... carry)), at least `count` times, in nested scans that have room for `room` steps.
 
-    Reverse mode keeps the carries of one scan at each level, and runs every step once more for each level.
+    Groups of steps beyond `count`, which may be traced, are skipped, and those where `on(carry)` is False; for a batch
+    under `jax.vmap` only if both are one number for all lanes. `step` must do nothing there. Reverse mode keeps the
+    carries of the steps, or, of more than SLOTS, those of groups, whose steps it then runs once more.
     """
-    lengths = levels(count)
+    outer, inner = levels(room)
 
-    def nested(carry: X, level: int) -> X:
-        if level == len(lengths):
-            return step(carry)
+    def group(carry: X) -> X:
+        return jax.lax.scan(forgetful(lambda carry, _: (step(carry), None)), carry, length=inner)[0]
 
-        def body(carry: X, _: Any) -> tuple[X, None]:
-            return nested(carry, level + 1), None
+    def body(carry: X, i: Any) -> tuple[X, None]:
+        return jax.lax.cond((i * inner < count) & on(carry), group, lambda carry: carry, carry), None
 
-        def scan(carry: X) -> X:
-            return jax.lax.scan(forgetful(body), carry, length=lengths[level])[0]
-
-        return jax.lax.cond(on(carry), scan, lambda carry: carry, carry)
-
-    return nested(carry, 0)
+    return jax.lax.scan(forgetful(body) if room > SLOTS else body, carry, jnp.arange(outer))[0]
 
 
-def levels(count: int) -> list[int]:
-    """Lengths of the nested scans that make `count` steps: one scan, or two where one would keep more than SLOTS
-    carries. From SLOTS/2 steps to SLOTS^2/2 they keep between SLOTS/2 and 3/2 SLOTS, whatever the number of steps."""
-    inner = math.ceil(count / SLOTS)
-    return [count] if inner == 1 else [math.ceil(count / inner), inner]
+def levels(count: int) -> tuple[int, int]:
+    """Return how many groups of how many steps make `count`: of GROUP, or of so many that groups and steps in a group
+    are at most 3/2 SLOTS together, whatever the number of steps up to SLOTS^2/2."""
+    inner = math.ceil(count / SLOTS) if count > SLOTS else min(GROUP, count)
+    return math.ceil(count / inner), inner
 
 
 def forgetful(body: Any) -> Any:

@@ -1,17 +1,24 @@
 """One step of a run, and its two ends: what happens in an interval is said here, and nowhere else."""
 
+import enum
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.loop import Loop, LoopState
+from diffabs.core.loop import Event, Loop, LoopState
 from diffabs.core.numerics import axpy, clamp
 from diffabs.core.protocols import Clock, Memory, Objective, Sample
 from diffabs.simulate.rk4 import rk4_step_and_rate
 from diffabs.simulate.solution import Trajectory
 
 LANDINGS = 4  # Newton iterations for the length of the last step; quadratic from an error below one step
+
+
+class Condition(enum.IntEnum):
+    """How a run is: it goes on, or looks for the length of its last step, or it is over, in one of three ways."""
+
+    RUNNING, LANDING, STOPPED, TIMED_OUT, DIVERGED = range(5)
 
 
 class Carry(NamedTuple):
@@ -23,36 +30,47 @@ class Carry(NamedTuple):
     k: Any  # number of steps taken
     t: Any  # the present instant; after a stop, that of the crossing
     length: Any  # of the step to try: h, or shorter when landing
-    landing: Any  # how many times the last step was tried
-    running: Any
-    stopped: Any
-    diverged: Any
+    tries: Any  # how many times the last step was tried
+    condition: Any  # a Condition
+
+    @property
+    def running(self) -> Any:
+        """Whether another step is to be made or tried."""
+        return self.condition <= Condition.LANDING
+
+    @property
+    def stopped(self) -> Any:
+        """Whether the stop was reached."""
+        return self.condition == Condition.STOPPED
 
 
 def init_carry(loop: Loop, objectives: dict[str, Objective], h: Any) -> Carry:
-    """The carry at t = 0."""
+    """Return the carry at t = 0."""
     state = loop.start()
     sample = loop.signals(0.0 * h, state).sample
     tally = {name: objective.start(sample) for name, objective in objectives.items()}
-    no, zero = jnp.asarray(False), jnp.asarray(0)
-    running = loop.stop.margin(sample.output) > 0
-    return _typed(Carry(state, tally, sample, zero, 0.0 * h, h, zero, running, no, ~running), h.dtype)
+    zero = jnp.asarray(0)
+    condition = jnp.where(loop.stop.margin(sample.output) > 0, zero + Condition.RUNNING, zero + Condition.DIVERGED)
+    return _typed(Carry(state, tally, sample, zero, 0.0 * h, h, zero, condition), h.dtype)
 
 
-def step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: int, carry: Carry) -> Carry:
-    """One step; or one try of the last step; or nothing if the run has ended."""
+def step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, carry: Carry) -> Carry:
+    """Return the carry after one step; or one try of the last step; or the same if the run has ended."""
     state, tally, before, late = _advance(loop, objectives, h, key, carry)
     finite = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(state.flow())]))
-    trying = carry.landing > 0
+    trying = carry.condition == Condition.LANDING
     crossed = finite & (loop.stop.margin(loop.plant.output(state.plant)) <= 0)
-    landed = carry.running & trying & (carry.landing == LANDINGS)
-    ahead = carry.running & finite & ~trying & ~crossed
+    landed = trying & (carry.tries == LANDINGS)
+    ahead = (carry.condition == Condition.RUNNING) & finite & ~crossed
     search = carry.running & finite & ~landed & ~ahead
     taken = ahead | landed
     state, tally, before = jax.tree.map(
         lambda a, b: jnp.where(taken, a, b), (state, tally, before), (carry.state, carry.tally, carry.before)
     )
     k = carry.k + jnp.where(taken, 1, 0)
+    after = jnp.where(landed, Condition.STOPPED, Condition.LANDING)
+    after = jnp.where(ahead, jnp.where(k < steps, Condition.RUNNING, Condition.TIMED_OUT), after)
+    after = jnp.where(finite, after, Condition.DIVERGED)
     return Carry(
         state=state,
         tally=tally,
@@ -60,10 +78,8 @@ def step(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: 
         k=k,
         t=jnp.where(landed, carry.t + carry.length, jnp.where(ahead, k * h, carry.t)),
         length=jnp.where(search, clamp(carry.length + late, 0.0, h), carry.length),
-        landing=carry.landing + jnp.where(search, 1, 0),
-        running=(ahead & (k < steps)) | search,
-        stopped=carry.stopped | landed,
-        diverged=carry.diverged | (carry.running & ~finite),
+        tries=carry.tries + jnp.where(search, 1, 0),
+        condition=jnp.where(carry.running, after, carry.condition).astype(carry.condition.dtype),
     )
 
 
@@ -72,8 +88,9 @@ def _advance(
 ) -> tuple[LoopState, dict[str, Memory], Sample, Any]:
     """Update, jump, integrate over carry.length: state, accumulators, the sample after the jump, and how much later [s]
     the margin crosses zero. That time only chooses the next length, so it has no derivative."""
-    held = _update_objectives(loop, objectives, carry, carry.state, carry.t, h)
-    state, events = loop.jump(Clock(carry.t, h, carry.k, key), carry.state)
+    signals = loop.signals(carry.t, carry.state)
+    held = _update_objectives(objectives, carry, signals.sample, h)
+    state, events = loop.jump(Clock(carry.t, h, carry.k, key), carry.state, signals)
     tally_flow = {name: memory.flow for name, memory in carry.tally.items()}
 
     def flow(t: Any, z: Any, state: LoopState = state) -> Any:
@@ -81,15 +98,24 @@ def _advance(
 
     z = (state.flow(), tally_flow)
     for event in events:
-        old = flow(carry.t, (event.before.flow(), tally_flow), event.before)
-        new = flow(carry.t, (event.after.flow(), tally_flow), event.after)
-        z = axpy(event.elapsed, axpy(-1.0, old, new), z)
+        z = _saltation(flow, carry.t, z, event)
     before = loop.signals(carry.t, state.with_flow(z[0])).sample
     z, rate = rk4_step_and_rate(flow, carry.t, z, carry.length)
     state = state.with_flow(z[0])
     state = state._replace(plant=loop.plant.project(state.plant))
     tally = {name: Memory(z[1][name], held[name]) for name in objectives}
     return state, tally, before, _landing_correction(loop, state.plant, rate[0][0])
+
+
+def _saltation(flow: Any, t: Any, z: Any, event: Event) -> Any:
+    """z at t, if the event happened `elapsed` ago and not now: back by that with the rates from before it, and forth
+    again with those from after it, both by the midpoint rule."""
+
+    def moved(t: Any, z: Any, e: Any, state: LoopState) -> Any:
+        return axpy(e, flow(t + e / 2, axpy(e / 2, flow(t, z, state), z), state), z)
+
+    e = event.elapsed
+    return moved(t - e, moved(t, z, -e, event.before), e, event.after)
 
 
 def _landing_correction(loop: Loop, plant: Any, rate: Any) -> Any:
@@ -111,11 +137,9 @@ def _rates(
     return loop.flow(t, state, signals), rates
 
 
-def _update_objectives(
-    loop: Loop, objectives: dict[str, Objective], carry: Carry, state: LoopState, t: Any, h: Any
-) -> dict[str, Any]:
-    """`held` of the accumulators after the last interval, of length h; there is none before the first step."""
-    sample = loop.signals(t, state).sample
+def _update_objectives(objectives: dict[str, Objective], carry: Carry, sample: Sample, h: Any) -> dict[str, Any]:
+    """`held` of the accumulators after the last interval, of length h, that ends on `sample`; there is none before the
+    first step."""
 
     def updated(memory: Memory, objective: Objective) -> Any:
         held = objective.update(memory, carry.before, sample, h)
@@ -142,14 +166,14 @@ def finish(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) -
     carry = carry._replace(t=carry.t + moved, state=state)
     carry = carry._replace(tally={name: Memory(tally[name], held[name]) for name in objectives})
     length = jnp.where(carry.stopped, carry.length + moved, h)
-    held = _update_objectives(loop, objectives, carry, state, carry.t, length)
+    held = _update_objectives(objectives, carry, loop.signals(carry.t, state).sample, length)
     return carry._replace(tally={name: Memory(tally[name], held[name]) for name in objectives})
 
 
 def observe(loop: Loop, carry: Carry) -> Trajectory:
     """Return what is seen of the loop at the present instant."""
     signals = loop.signals(carry.t, carry.state)
-    return Trajectory(signals.sample, signals.measured, carry.state.plant, carry.running & (carry.landing == 0))
+    return Trajectory(signals.sample, signals.measured, carry.state.plant, carry.condition == Condition.RUNNING)
 
 
 def _typed(tree: Any, dtype: Any) -> Any:

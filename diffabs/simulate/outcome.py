@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Ending, Objective
 from diffabs.core.pytree import prepared
-from diffabs.simulate.hybrid_step import Carry, finish, observe
+from diffabs.simulate.hybrid_step import Carry, Condition, finish, observe
 from diffabs.simulate.solution import Run, Trajectory
 
 MISSED = 0.1  # of the last step, by which a landing may miss the crossing: the state is still moved onto it
@@ -34,9 +34,10 @@ def judge(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) ->
     ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample, carry.stopped))
     metrics = {name: o.value(carry.tally[name], ending) for name, o in objectives.items()}
     wrong = [_impossible(name, objectives[name], value) for name, value in metrics.items()]
-    diverged = jnp.any(jnp.stack([carry.diverged, missed, *wrong]))
+    diverged = jnp.any(jnp.stack([carry.condition == Condition.DIVERGED, missed, *wrong]))
     metrics = {n: jnp.where(diverged, jnp.nan, value) for n, value in metrics.items() if n != AUDIT}
-    return Run(metrics, carry.stopped & ~diverged, diverged, ending, None), last
+    timed_out = (carry.condition == Condition.TIMED_OUT) & ~diverged
+    return Run(metrics, carry.stopped & ~diverged, diverged, timed_out, ending, None), last
 
 
 def _impossible(name: str, objective: Objective, value: Any) -> Any:

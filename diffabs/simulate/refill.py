@@ -15,7 +15,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import misshapen, replace, strong
 from diffabs.core.tracing import separated
-from diffabs.simulate.hybrid_step import Carry, init_carry, step
+from diffabs.simulate.hybrid_step import Carry, Condition, init_carry, step
 from diffabs.simulate.outcome import judge, prepare
 from diffabs.simulate.refusals import refusals, traced
 from diffabs.simulate.run import arguments
@@ -60,7 +60,9 @@ def measure_lanes(
         accepted = _accepted(loop, values, solver)
     loop, objectives, h = arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, h.dtype), dict(values)))
-    return _run(loop, values, objectives, h, keys, jnp.asarray(accepted, bool), enough, steps=solver.steps, width=width)
+    return _run(
+        loop, values, objectives, h, keys, jnp.asarray(accepted, bool), enough, jnp.asarray(solver.steps), width=width
+    )
 
 
 def _accepted(loop: Loop, values: Mapping[str, Any], solver: FixedStep) -> Any:
@@ -81,7 +83,7 @@ class _Belt(NamedTuple):
     ended: Run
 
 
-@partial(jax.jit, static_argnames=("steps", "width"))
+@partial(jax.jit, static_argnames="width")
 def _run(
     loop: Loop,
     values: dict[str, Any],
@@ -89,9 +91,9 @@ def _run(
     h: Any,
     keys: Any,
     accepted: Any,
-    enough: Enough | None = None,
+    enough: Enough | None,
+    steps: Any,
     *,
-    steps: int,
     width: int,
 ) -> Run:
     count = len(next(iter(values.values())))
@@ -116,8 +118,8 @@ def _run(
         """Lanes at their start; beyond the last one a copy of it that does not run."""
         mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
         carry = start(mine)
-        running, diverged = carry.running & run & (number < count), carry.diverged | ~run
-        return mine, key, carry._replace(running=running, diverged=diverged)
+        condition = jnp.where(run & (number < count), carry.condition, Condition.DIVERGED)
+        return mine, key, carry._replace(condition=condition.astype(carry.condition.dtype))
 
     def round_(belt: _Belt) -> _Belt:
         def some(carry: Carry, _: Any) -> tuple[Carry, None]:

@@ -14,12 +14,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core import kinds
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, misshapen, strong
-from diffabs.simulate.checkpoint import forgetful, repeated
+from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
 from diffabs.simulate.hybrid_step import LANDINGS, Carry, init_carry, observe, step
 from diffabs.simulate.outcome import judge, prepare
 from diffabs.simulate.solution import FixedStep, Run, Trajectory
@@ -37,7 +38,8 @@ def rollout(
     objectives: by the names of the metrics
     key: of `jax.random`, for noisy sensors
 
-    Pure and jit-compiled, once per structure of the loop and number of steps: new values do not compile again.
+    Pure and jit-compiled, once per structure of the loop: new values and another duration do not compile again, but for
+    the length of a trajectory, and of a derivative, in steps of an eighth.
     Raises ValueError for a step, duration or stride that is not positive, a step longer than the duration, and
     parameters that are no real numbers of 32 bits or more, or have another shape than they need.
     """
@@ -54,7 +56,15 @@ def measure(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], 
 
 def _call(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
     loop, objectives, h = arguments(loop, solver, objectives)
-    return _run(loop, objectives, h, key, steps=solver.steps, every=every)
+    steps, every = solver.steps, int(every)
+    room = slots(-(-(steps + LANDINGS) // every)) if every else 0
+    run = _simulated((slots(steps + LANDINGS), room, every), (loop, objectives, h, key), jnp.asarray(steps))
+    return run._replace(trajectory=_shortened(run.trajectory, -(-steps // every) + 1)) if every else run
+
+
+@partial(jax.jit, static_argnums=1)
+def _shortened(trajectory: Any, count: int) -> Any:
+    return jax.tree.map(lambda x: x[:count], trajectory)
 
 
 def arguments(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
@@ -87,40 +97,67 @@ def _wrong_number(solver: FixedStep, name: str) -> str:
     return f"= {value} is no whole number" if name == "every" and value != int(value) else ""
 
 
-@partial(jax.jit, static_argnames=("steps", "every"))
-def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, steps: int, every: int) -> Run:
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _simulated(room: tuple[int, int, int], run: Any, steps: Any) -> Run:
+    """The run of (loop, objectives, h, key), with room for so many steps and instants of a trajectory."""
+    return _run(*run, steps, jnp.asarray(room[2]), room=room[1])
+
+
+def _rule(room: tuple[int, int, int], primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """Only what has a tangent is differentiated: zeros worked out would cost as much as any other."""
+    values, tree = jax.tree.flatten(primals)
+    moves = tree.flatten_up_to(tangents)
+    live = [type(move) is not SymbolicZero for move in moves]
+
+    def run(moving: list[Any]) -> Run:
+        left = iter(moving)
+        run, steps = tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)])
+        return _reversible(*run, steps, room=room)
+
+    moving, rates = ([x for x, on in zip(xs, live, strict=True) if on] for xs in (values, moves))
+    return jax.jvp(run, (moving,), (rates,))
+
+
+_simulated.defjvp(_rule, symbolic_zeros=True)
+
+
+@partial(jax.jit, static_argnames="room")
+def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, every: Any, *, room: int) -> Run:
+    """For values: `room` for a trajectory, 0 without."""
+    loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps)
+    if not room:
+        return judge(loop, objectives, h, until(stepped, carry))[0]
+    first, count = observe(loop, carry), -(-(steps + LANDINGS) // every)
+    carry, seen = watch(stepped, partial(observe, loop), carry, every, count, room)
+    return _with_trajectory(judge(loop, objectives, h, carry), first, seen)
+
+
+@partial(jax.jit, static_argnames="room")
+def _reversible(
+    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, *, room: tuple[int, int, int]
+) -> Run:
+    """For derivatives: room for steps, and for a trajectory, of every so many steps."""
+    loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps)
+    most, instants, every = room
+    if not every:
+        return judge(loop, objectives, h, scan(stepped, carry, steps + LANDINGS, most))[0]
+    first, count = observe(loop, carry), -(-(steps + LANDINGS) // every)
+    carry, seen = scan_and_watch(stepped, partial(observe, loop), carry, every, count, instants)
+    return _with_trajectory(judge(loop, objectives, h, carry), first, seen)
+
+
+def _begun(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any) -> tuple[Loop, Any, Carry, Any]:
     loop, audit = prepare(loop)
     objectives = objectives | audit
-    carry = init_carry(loop, objectives, h)
-    stepped = partial(step, loop, objectives, h, key, steps)
-    first = observe(loop, carry)
-    if every:
-        carry, seen = _segments(stepped, partial(observe, loop), carry, every, steps + LANDINGS)
-    else:
-        carry, seen = repeated(stepped, carry, steps + LANDINGS, _running), None
-    done, last = judge(loop, objectives, h, carry)
-    return done._replace(trajectory=_assembled(first, seen, last, -(-steps // every))) if every else done
+    return loop, objectives, init_carry(loop, objectives, h), partial(step, loop, objectives, h, key, steps)
 
 
-def _segments(step: Any, seen: Any, carry: Carry, every: int, steps: int) -> tuple[Carry, Any]:
-    """At least `steps` steps, and what was seen after every `every`-th."""
-
-    def segment(carry: Carry, _: Any) -> tuple[Carry, Any]:
-        carry = repeated(step, carry, every, _running)
-        return carry, seen(carry)
-
-    return jax.lax.scan(forgetful(segment), carry, length=-(-steps // every))
-
-
-def _running(carry: Carry) -> Any:
-    return carry.running
-
-
-def _assembled(first: Trajectory, seen: Any, last: Trajectory, count: int) -> Trajectory:
-    """First instant, `count` instants of the scan, and the last one in place of everything after the end."""
+def _with_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: Any) -> Run:
+    """The first instant, those seen, and the last one in place of everything after the end."""
+    run, last = judged
 
     def join(a: Any, b: Any, c: Any) -> Any:
         b = jnp.where(jnp.expand_dims(seen.running, range(1, b.ndim)), b, c)
-        return jnp.concatenate([jnp.asarray(a)[None], b[:count]])
+        return jnp.concatenate([jnp.asarray(a)[None], b])
 
-    return jax.tree.map(join, first, seen, last)
+    return run._replace(trajectory=jax.tree.map(join, first, seen, last))

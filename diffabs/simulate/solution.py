@@ -43,5 +43,6 @@ class Run(NamedTuple):
     metrics: dict[str, Any]
     stopped: Any  # bool: the stop was reached in time
     diverged: Any  # bool: its numbers mean nothing: one became infinite, NaN or impossible, or it began beyond its stop
+    timed_out: Any  # bool: the duration was over before the stop; a run is one of the three, or was ended from outside
     ending: Ending
     trajectory: Trajectory | None
