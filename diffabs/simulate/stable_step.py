@@ -141,9 +141,15 @@ def _radius(direction: np.ndarray) -> np.ndarray:
 
 
 def _reach(angle: np.ndarray) -> np.ndarray:
-    z = RADII * np.exp(1j * angle[:, None])
-    grows = np.abs(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))) > 1 + 1e-9
-    return np.where(grows.any(axis=1), RADII[np.argmax(grows, axis=1)], RADII[-1])
+    """The first of RADII along each direction at which RK4 grows, or the last one: by bisection, since the region is
+    star-shaped and a table of all of them would cost every command half a second."""
+    low, high = np.zeros(angle.shape, int), np.full(angle.shape, len(RADII) - 1)
+    for _ in range(len(RADII).bit_length()):
+        middle = (low + high) // 2
+        z = RADII[middle] * np.exp(1j * angle)
+        grows = np.abs(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))) > 1 + 1e-9
+        low, high = np.where(grows, low, np.minimum(middle + 1, high)), np.where(grows, middle, high)
+    return RADII[high]
 
 
 ANGLES = np.linspace(np.pi / 2, np.pi, 2001)
