@@ -64,7 +64,8 @@ def test_workers_end_with_their_sweep(file, room, times):
 
 LEAVING = """
 import pathlib, sys, time
-from diffabs import console, files, interrupt
+from diffabs.cli import console
+from diffabs.core import files, interrupt
 
 def work():
     with files.unfinished(pathlib.Path(sys.argv[1]) / "half.tmp") as path:

@@ -36,7 +36,7 @@ RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 
 
 def stable_step(loop: Loop) -> float:
     """Largest step [s] at which RK4 damps every damped mode of the loop, between its initial speed and its stop."""
-    return float(stable_steps(jax.tree.map(lambda x: x[None], strong(loop)))[0])
+    return float(stable_steps(jax.tree.map(lambda x: np.asarray(x)[None], strong(loop)))[0])
 
 
 def stable_steps(loops: Loop) -> np.ndarray:
