@@ -376,7 +376,7 @@ def test_without_the_extra(command, monkeypatch, no_polytope):
 def test_other_commands_do_without_the_extra():
     code = (
         "import sys; sys.modules.update(dict.fromkeys(['cvxpy', 'scipy', 'clarabel', 'optax'])); "
-        "import diffabs.cli as c, diffabs.scenario as s; s.load('slip-lmi', integrated=False); "
+        "import diffabs.cli.main as c, diffabs.scenario.scenario as s; s.load('slip-lmi', integrated=False); "
         "c.app(['list', 'scenarios'])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

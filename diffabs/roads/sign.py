@@ -2,11 +2,11 @@
 
 from typing import Any
 
-import jax
 import numpy as np
 from jax.core import Tracer
 from jax.tree_util import Partial
 
+from diffabs.core.compiling import QUICK, compile_once
 from diffabs.core.rules import Rule
 
 SLIPS = np.linspace(0.05, 1.0, 20)  # below them a fitted polynomial may dip under 0 by a millionth, as the rig's does
@@ -24,7 +24,7 @@ def opposes(friction: Partial) -> Rule:
     return Rule((mu >= 0).all(), "friction is negative at some slip: such a road drives", says)
 
 
-@jax.jit
+@compile_once(options=QUICK)
 def _along(friction: Partial) -> Any:
     """Return the friction at SLIPS. Compiled as one: each operation by itself costs as much as all of them."""
     return friction(SLIPS)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from diffabs.core.compiling import QUICK, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import broken, grid_rules, replace, rules, strong
 from diffabs.core.pytree import check as check_parts
@@ -172,7 +173,7 @@ def _codes(loop: Loop | None, values: Any, *, step: float) -> Any:
     return jax.vmap(code)(values)
 
 
-@jax.jit
+@compile_once(options=QUICK)
 def _margin(plant: Any, initial: Any, stop: Any) -> jax.Array:
     """The margin of the stop at the start. Compiled as one: each operation by itself costs as much as all of them."""
     return stop.margin(plant.output(plant.start(initial)))

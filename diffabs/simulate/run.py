@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core import kinds
+from diffabs.core.compiling import SAME, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, misshapen, strong
@@ -80,7 +81,7 @@ def _wrong_number(solver: FixedStep, name: str) -> str:
     return f"= {value} is no whole number" if name == "every" and value != int(value) else ""
 
 
-@partial(jax.jit, static_argnames=("steps", "every"))
+@compile_once(static=("steps", "every"), options=SAME)
 def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, *, steps: int, every: int) -> Run:
     loop, audit = prepare(loop)
     objectives = objectives | audit

@@ -19,6 +19,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.compiling import SAME, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import BalanceOutput
 from diffabs.core.pytree import replace, strong
@@ -157,7 +158,7 @@ REACH = _reach(ANGLES)
 WITHIN = float(REACH.min())  # a damped mode of whatever direction is stable up to here
 
 
-@jax.jit
+@compile_once(options=SAME)
 @jax.vmap
 def _jacobians(loop: Loop) -> jax.Array:
     return _jacobians_of(loop)
