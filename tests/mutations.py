@@ -511,7 +511,7 @@ MUTATIONS = [
     Mutation(
         "riccati: never refused",
         "linear/riccati_batched.py",
-        "return jnp.where((error <= ERROR * size(P)) & (size(D) <= ERROR * size(P)), P, jnp.nan)",
+        "return jnp.where((error <= limit) & (moved <= limit), P, jnp.nan)",
         "return P",
         "test_riccati.py::test_nearly_unstabilisable_is_right_or_reported",
     ),
@@ -532,8 +532,8 @@ MUTATIONS = [
     Mutation(
         "riccati: gain with the other sign",
         "linear/regulator.py",
-        "return Regulator(-jnp.linalg.solve(effort, turned)",
-        "return Regulator(jnp.linalg.solve(effort, turned)",
+        "return Regulator(-jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned)",
+        "return Regulator(jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned)",
         "test_riccati.py::test_the_rig_is_its_closed_form[q1-140.291806958]",
     ),
     Mutation(
