@@ -22,7 +22,9 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | Non
 
     static: names of static arguments, or the number of leading ones. options: of XLA (`SAME`, `QUICK`), which apply
     where nothing is traced."""
-    fixed = {"static_argnums": tuple(range(static))} if isinstance(static, int) else {"static_argnames": tuple(static)}
+    fixed: dict[str, Any] = (
+        {"static_argnums": tuple(range(static))} if isinstance(static, int) else {"static_argnames": tuple(static)}
+    )
 
     def decorate(function: F) -> F:
         plain = jax.jit(function, **fixed)
