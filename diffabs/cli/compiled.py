@@ -21,7 +21,8 @@ CHOSEN = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")  # by whi
 def keep() -> pathlib.Path | None:
     """Return the folder that JAX from now on keeps compiled programs in, or None: without one everything works, and
     compiles. Nothing is said of a folder that cannot be written or of a damaged entry."""
-    if os.environ.get(OFF) or any(name in os.environ for name in CHOSEN) or jax.config.jax_compilation_cache_dir:
+    chosen = jax.config.values.get("jax_compilation_cache_dir")
+    if os.environ.get(OFF) or any(name in os.environ for name in CHOSEN) or chosen:
         return None
     try:
         folder = _user_folder() / "diffabs" / f"jax-{_processor()}"
