@@ -630,7 +630,7 @@ MUTATIONS = [
     Mutation(
         "riccati: never refused",
         "linear/riccati_batched.py",
-        "return jnp.where((error <= limit) & (size(D) <= limit), P, jnp.nan)",
+        "return jnp.where((error <= limit) & (moved <= limit), P, jnp.nan)",
         "return P",
         "test_riccati.py::test_nearly_unstabilisable_is_right_or_reported",
     ),
@@ -651,8 +651,8 @@ MUTATIONS = [
     Mutation(
         "riccati: gain with the other sign",
         "linear/regulator.py",
-        "return Regulator(-jnp.linalg.solve(effort, turned)",
-        "return Regulator(jnp.linalg.solve(effort, turned)",
+        "return Regulator(-jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned)",
+        "return Regulator(jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned)",
         "test_riccati.py::test_the_rig_is_its_closed_form[q1-140.291806958]",
     ),
     Mutation(
@@ -889,7 +889,7 @@ MUTATIONS = [
     Mutation(
         "command line: a proportional gain proved as a fixed one",
         "cli/certificates.py",
-        "    if not isinstance(controller, ProportionalFeedback) or isinstance(reduced.model, BalanceModel):",
+        "    if not isinstance(controller, ProportionalFeedback) or not isinstance(reduced.model, SlipModel):",
         "    if True:",
         "test_cli_design.py::test_a_gain_that_follows_the_speed_is_proved_as_one",
     ),
@@ -1219,7 +1219,7 @@ MUTATIONS = [
     Mutation(
         "the rules between numbers are not asked",
         "core/pytree.py",
-        '    yield from _below(part, prefix, "rules")',
+        '    yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "rules")',
         "    yield from ()",
         "test_refusals.py::TestBeforeARun::test_a_lane_is_refused_where_its_loop_alone_would_be[limits]",
     ),

@@ -93,6 +93,7 @@ def noisy(period):
     return dataclasses.replace(RIG, sensor=sensors.Noise(slip=0.01, period=period))
 
 
+@pytest.mark.slow
 def test_noise_with_its_own_clock_is_the_same_at_every_step():
     key, solver = jax.random.key(4), d.FixedStep(1e-3, 2.0)
     found = acc.accuracy(noisy(2e-3), solver, OBJECTIVES, key=key)

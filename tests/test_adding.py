@@ -46,6 +46,7 @@ def test_the_page_has_a_road_and_a_controller_in_under_80_lines_each():
     assert all(20 < lines < 80 for lines in files.values()), files
 
 
+@pytest.mark.slow
 def test_new_parts_pass_once_they_are_listed(project):
     conformance = (
         "pytest",
@@ -73,6 +74,7 @@ def test_new_parts_pass_once_they_are_listed(project):
     assert int(re.search(r"(\d+) passed", after.stdout)[1]) >= 12  # both parts, all their conformance tests
 
 
+@pytest.mark.slow
 def test_new_parts_are_on_the_command_line(project):
     listed = run(project, "diffabs", "list", "roads", "--json")
     assert '"brush"' in listed.stdout, listed.stderr

@@ -75,7 +75,7 @@ def test_what_is_not_known_in_time_is_undecided_and_nothing_else():
 BORDER = 0.01  # relative distance from it
 
 
-@pytest.mark.parametrize("gain", [SLOW, GAIN], ids=["slow", "LQR"])
+@pytest.mark.parametrize("gain", [pytest.param(SLOW, id="slow", marks=pytest.mark.slow), pytest.param(GAIN, id="LQR")])
 def test_starts_beside_the_border_end_as_scipy_says(gain):
     """Inside and outside, along each of eight rays; SciPy runs until rest or ground."""
     loop = closed(controller=BalanceFeedback(gain=gain))
@@ -120,6 +120,7 @@ def test_nothing_and_all_can_be_recovered():
     assert recoverable(closed(controller=BalanceFeedback(gain=-GAIN)), DIRECTION, SOLVER, most=0.1) == (0.0, False)
 
 
+@pytest.mark.slow
 def test_the_lqr_for_fifty_kilograms_holds_riders_of_up_to_71():
     """By the eigenvalues of separately written equations; and 0.040 of the start with 68 kg, which SciPy confirms."""
 

@@ -55,7 +55,7 @@ def arm(tmp_path_factory):
 
 
 FIXTURES = {"slip-lmi": "lmi", "slip-estimator": "estimator", "arm-balance": "arm"}
-SLOW = ("arm-balance",)  # two maps of 10,000 runs
+SLOW = ("arm-balance", "slip-estimator")  # two maps of 10,000 runs; twenty braking tests
 
 
 @pytest.fixture(
@@ -146,6 +146,7 @@ def test_all_twenty_numbers_round_to_the_printed_ones(estimator):
     assert estimator["matches"] == {"of": 20, "to the printed digit": 20}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("quantity", "bound"), [("stopping time", 0.0094 + 0.001), ("stopping distance", 0.056 + 0.005)]
 )
@@ -155,6 +156,7 @@ def test_five_parameters_come_close_to_all_twenty(estimator, quantity, bound):
     assert max(abs(row["difference"]) for row in rows) <= bound
 
 
+@pytest.mark.slow
 def test_the_estimator_as_printed_does_not_brake(estimator):
     fine, coarse = (
         next(row["ours"] for row in _rows(estimator, f"estimator as printed, step {step}") if row["unit"] == "m")
@@ -166,6 +168,7 @@ def test_the_estimator_as_printed_does_not_brake(estimator):
     assert (rolling - coarse) / (rolling - fine) == pytest.approx(10, rel=0.02)
 
 
+@pytest.mark.slow
 def test_physical_bounds_of_the_distance(estimator):
     for row in _rows(estimator, "bound"):
         assert row["ours"] == pytest.approx(row["reference"], abs=1e-3), row
@@ -173,6 +176,7 @@ def test_physical_bounds_of_the_distance(estimator):
     assert best > max(row["ours"] for row in _rows(estimator, "bound"))
 
 
+@pytest.mark.slow
 def test_passing_remarks_are_judged_in_the_summary(lmi, estimator):
     """What they are worth: test_papers_verdicts.py. Here: that they are written down."""
     abrupt = {r["name"]: r["ours"] for r in estimator["judged"] if r["quantity"] == "variation of the torque"}
@@ -182,6 +186,7 @@ def test_passing_remarks_are_judged_in_the_summary(lmi, estimator):
     assert nearest == pytest.approx(4.54, abs=5e-3)
 
 
+@pytest.mark.slow
 def test_what_does_not_agree_is_said(estimator):
     (row,) = _rows(estimator, "no ABS, from lock to stop")
     assert row["ours"] == pytest.approx(1.224, abs=1e-3)

@@ -306,6 +306,7 @@ class TestWhoeverRuns:
         assert Method().starts == 1
 
 
+@pytest.mark.slow
 def test_the_sweep_of_the_report(tmp_path):
     """0 diverged, 0 not stopped, a mean stopping time of 0.002 s and a mean distance of -2.6e11 m, once."""
     over = 'sweep.over={"sensor.time_constant"=[1e-6,1e-5]}'

@@ -35,6 +35,7 @@ def nothing_temporary(folder):
     return there <= {"dask-scratch-space"} and not list(folder.rglob("*.tmp"))
 
 
+@pytest.mark.slow
 def test_a_sweep_finishes_its_chunks_and_says_how_to_go_on(file, room):
     out = room / "out"
     with started(*command(file(SCENARIO), out, *LONG)) as process:
@@ -47,7 +48,8 @@ def test_a_sweep_finishes_its_chunks_and_says_how_to_go_on(file, room):
     assert nothing_temporary(room)
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [1, 2])
 def test_workers_end_with_their_sweep(file, room, times):
     """Sent once the chunks in hand are finished, sent twice nothing is waited for."""
     out = room / "out"

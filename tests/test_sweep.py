@@ -210,6 +210,7 @@ def test_a_finished_sweep_is_not_computed_again(study, swept):
     assert sweep(study, swept.folder, resume=True, engine=Nobody()).digest == swept.digest
 
 
+@pytest.mark.slow
 def test_two_devices_change_no_bit(over_roads, file, tmp_path):
     """The command in a process of its own, as the number of devices is fixed when JAX starts."""
     command = ["sweep", file(ROADS), "--out", tmp_path / "out", "--devices", "2", "--json"]

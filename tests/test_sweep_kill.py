@@ -85,7 +85,8 @@ def contents(folder):
 # Kills
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [3, 20])
 def test_killed_again_and_again(whole, tmp_path, kills):
     """In turns between its chunks, and on its way to the first one."""
     there, survived, start, rng = chunks(whole.folder), [], 0.0, random.Random(2026)

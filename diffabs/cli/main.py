@@ -15,7 +15,7 @@ import numpy as np
 import typer
 
 from diffabs import __version__
-from diffabs.cli import compare, console, design, identify, rare, show, sweep, tune, usage
+from diffabs.cli import compare, compiled, console, design, identify, rare, show, sweep, tune, usage
 from diffabs.cli.checking import checked, said
 from diffabs.core import interrupt, provenance, values
 from diffabs.core.pytree import parameters
@@ -69,6 +69,7 @@ def setup(
 ) -> None:
     """Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers."""
     del version
+    compiled.keep()
     jax.config.update("jax_enable_x64", True)
 
 

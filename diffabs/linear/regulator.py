@@ -9,12 +9,12 @@ is told where the matrices are numbers; inside `jit` and `vmap` the flag `stabil
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from diffabs.linear.riccati import Riccati, care, dare
+from diffabs.core.compiling import SAME, compile_once
+from diffabs.linear.riccati import care, dare
 from diffabs.linear.weights import weight
 
 UNMOVED = 1e-10  # relative: a mode with no more input than this is not moved by it
@@ -41,9 +41,7 @@ def lqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
             finite, Q or R that are not symmetric, R that is not positive definite, a pair that is not stabilisable.
     """
     _check(A, B, Q, R, discrete=False)
-    found = care(A, B, Q, R, S)
-    turned = jnp.asarray(B).T @ found.P + (0.0 if S is None else jnp.asarray(S).T)
-    return _regulator(found, jnp.asarray(R, found.P.dtype), turned)
+    return _regulated(A, B, Q, R, S)
 
 
 def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
@@ -53,14 +51,22 @@ def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
 
     Raises ValueError as `lqr`."""
     _check(A, B, Q, R, discrete=True)
+    return _regulated_samples(A, B, Q, R, S)
+
+
+@compile_once(options=SAME)
+def _regulated(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
+    found = care(A, B, Q, R, S)
+    turned = jnp.asarray(B).T @ found.P + (0.0 if S is None else jnp.asarray(S).T)
+    return Regulator(-jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned), *found)
+
+
+@compile_once(options=SAME)
+def _regulated_samples(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
     found = dare(A, B, Q, R, S)
     b = jnp.asarray(B)
     turned = b.T @ found.P @ jnp.asarray(A) + (0.0 if S is None else jnp.asarray(S).T)
-    return _regulator(found, jnp.asarray(R) + b.T @ found.P @ b, turned)
-
-
-def _regulator(found: Riccati, effort: jax.Array, turned: jax.Array) -> Regulator:
-    return Regulator(-jnp.linalg.solve(effort, turned), found.P, found.residual, found.stabilising)
+    return Regulator(-jnp.linalg.solve(jnp.asarray(R) + b.T @ found.P @ b, turned), *found)
 
 
 def _check(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool) -> None:

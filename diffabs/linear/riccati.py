@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.compiling import SAME, compile_once
 from diffabs.linear.lyapunov import discrete_lyapunov as _discrete_lyapunov
 from diffabs.linear.lyapunov import lyapunov as _lyapunov
 from diffabs.linear.lyapunov import matrices
@@ -71,6 +72,11 @@ def _riccati(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Ricc
         raise ValueError(
             f"A, Q, R, S have shapes {shapes}; B of shape {(n, m)} needs {((n, n), (n, n), (m, m), (n, m))}"
         )
+    return _solved(solution, A, B, Q, R, S)
+
+
+@compile_once(static=1, options=SAME)
+def _solved(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Riccati:
     P, residual = solution(A, B, (Q + Q.T) / 2, (R + R.T) / 2, S)
     return Riccati(P, residual, jnp.all(jnp.isfinite(P)))
 

@@ -215,19 +215,19 @@ def _refined(newton: Callable, P: jax.Array, shift: Any = 0.0) -> jax.Array:
     """
 
     def going(carry: Any) -> jax.Array:
-        k, _, moved = carry
-        return (k < STEPS) & jnp.any(moved > 1e-7)
+        return ~carry[0]
 
     def step(carry: Any) -> Any:
-        k, P, _ = carry
-        D = newton(P)[1]
-        return k + 1, P + D, size(D) / size(P + D)
+        _, k, P, moved, *_ = carry
+        last = (k >= STEPS) | ~jnp.any(moved > 1e-7)
+        terms, D, X = newton(P, eye(len(P), P))  # X is of use in the last step; a copy of this for it compiles as long
+        return last, k + 1, P + D, size(D) / size(P + D), terms, size(D), size(X)
 
-    P = lax.while_loop(going, step, (0, P, jnp.ones_like(P[0, 0])))[1]
-    terms, D, X = newton(P, eye(len(P), P))
-    P = P + D
-    error, limit = jnp.finfo(P.dtype).eps * size(X) * terms, ERROR * size(P + shift)
-    return jnp.where((error <= limit) & (size(D) <= limit), P, jnp.nan)
+    none = jnp.zeros_like(P[0, 0])
+    carry = lax.while_loop(going, step, (jnp.array(False), 0, P, none + 1, none, none, none))
+    _, _, P, _, terms, moved, proof = carry
+    error, limit = jnp.finfo(P.dtype).eps * proof * terms, ERROR * size(P + shift)
+    return jnp.where((error <= limit) & (moved <= limit), P, jnp.nan)
 
 
 def _given(P: jax.Array, d: jax.Array, terms: Callable) -> tuple[jax.Array, jax.Array]:

@@ -10,6 +10,7 @@ which is the one usually plotted."""
 from collections.abc import Iterator
 
 import jax.numpy as jnp
+from jax.tree_util import Partial
 
 from diffabs.core.numerics import odd
 from diffabs.core.pytree import Scalar, param, pytree
@@ -37,7 +38,7 @@ class Burckhardt:
 
     def rules(self) -> Iterator[Rule]:
         """Friction that does not drive; the speed does not change its sign."""
-        yield opposes(lambda slip: self.friction(slip, 0.0))
+        yield opposes(Partial(type(self).friction, self, speed=0.0))
 
 
 DRY_ASPHALT = Burckhardt()

@@ -9,6 +9,8 @@ the slip of greatest friction" is not true of this curve: its local peak lies at
 from collections.abc import Iterator
 from typing import Any
 
+from jax.tree_util import Partial
+
 from diffabs.core.numerics import odd, power, quotient
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.core.rules import Rule
@@ -33,7 +35,7 @@ class RationalCurve:
 
     def rules(self) -> Iterator[Rule]:
         """Friction that does not drive."""
-        yield opposes(self.friction)
+        yield opposes(Partial(type(self).friction, self))
 
     def _curve(self, s: Any) -> Any:
         p = power(s, self.q)

@@ -1,21 +1,30 @@
 """A friction curve that a car can meet: it never drives."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from jax.core import Tracer
+from jax.tree_util import Partial
 
+from diffabs.core.compiling import QUICK, compile_once
 from diffabs.core.rules import Rule
 
 SLIPS = np.linspace(0.05, 1.0, 20)  # below them a fitted polynomial may dip under 0 by a millionth, as the rig's does
 
 
-def opposes(friction: Callable[[Any], Any]) -> Rule:
+def opposes(friction: Partial) -> Rule:
     """Return the rule that mu(s) >= 0 at slips of 0.05 to 1: friction of the other sign would speed the car up."""
-    mu = friction(SLIPS)
+    mu = _along(friction)
+    mu = mu if isinstance(mu, Tracer) else np.asarray(mu)
 
     def says() -> str:
         worst = int(np.argmin(mu))
         return f"friction = {float(mu[worst]):.3g} at slip {SLIPS[worst]:g} is negative: such a road drives"
 
     return Rule((mu >= 0).all(), "friction is negative at some slip: such a road drives", says)
+
+
+@compile_once(options=QUICK)
+def _along(friction: Partial) -> Any:
+    """Return the friction at SLIPS. Compiled as one: each operation by itself costs as much as all of them."""
+    return friction(SLIPS)

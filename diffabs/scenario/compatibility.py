@@ -17,14 +17,21 @@ from diffabs.scenario.registry import joined
 def misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
     """One line for the first part of a loop, and for each objective, that reads what the plant does not show. Nothing
     is computed: the loop is only traced."""
-    measured = _trial("", lambda: jax.eval_shape(_once, strong(loop)))
-    if isinstance(measured, str):
-        yield measured
+    arrays, measured = strong((loop, dict(objectives)))
+    if not isinstance(_trial("", lambda: jax.eval_shape(_everything, arrays, measured)), str):
+        return  # one trace is enough where all fit
+    around = _trial("", lambda: jax.eval_shape(_once, arrays))
+    if isinstance(around, str):
+        yield around
         return
-    for name, objective in objectives.items():
-        found = _trial(joined("objective", name), lambda o=objective: jax.eval_shape(_measured, strong((loop, o))))
+    for name, objective in measured.items():
+        found = _trial(joined("objective", name), lambda o=objective: jax.eval_shape(_measured, arrays, o))
         if isinstance(found, str):
             yield found
+
+
+def _everything(loop: Loop, objectives: Mapping[str, Objective]) -> Any:
+    return _once(loop), [_measured(loop, objective) for objective in objectives.values()]
 
 
 def _once(loop: Loop) -> Any:
@@ -35,8 +42,7 @@ def _once(loop: Loop) -> Any:
     return margin, loop.flow(0.0, state, signals)
 
 
-def _measured(both: Any) -> Any:
-    loop, objective = both
+def _measured(loop: Loop, objective: Objective) -> Any:
     sample = loop.signals(0.0, loop.start()).sample
     memory: Memory = objective.start(sample)
     return objective.flow(memory, sample), objective.update(memory, sample, sample, 1e-3)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from diffabs.core.compiling import QUICK, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import broken, grid_rules, replace, rules, strong
 from diffabs.core.pytree import check as check_parts
@@ -173,11 +174,17 @@ def _codes(loop: Loop | None, values: Any, *, step: float) -> Any:
     return jax.vmap(code)(values)
 
 
+@compile_once(options=QUICK)
+def _margin(plant: Any, initial: Any, stop: Any) -> jax.Array:
+    """The margin of the stop at the start. Compiled as one: each operation by itself costs as much as all of them."""
+    return stop.margin(plant.output(plant.start(initial)))
+
+
 def _begun(loop: Loop) -> Rule:
     """A run starts on this side of its stop."""
     after = ": the run would end before it starts"
-    arrays = strong(loop)  # numbers of Python raise OverflowError where arrays are infinite
-    margin = arrays.stop.margin(arrays.plant.output(arrays.plant.start(arrays.initial)))
+    margin = _margin(*strong((loop.plant, loop.initial, loop.stop)))  # a number of Python raises OverflowError
+    margin = margin if traced(margin) else np.asarray(margin)
     start, end = (getattr(part, "speed", None) for part in (loop.initial, loop.stop))
     if start is None or end is None:
         line = f"initial is at the stop or beyond{after}"

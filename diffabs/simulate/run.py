@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core import kinds
+from diffabs.core.compiling import SAME, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, misshapen, strong
@@ -100,7 +101,8 @@ def _wrong_number(solver: FixedStep, name: str) -> str:
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _simulated(room: tuple[int, int, int], run: Any, steps: Any) -> Run:
     """The run of (loop, objectives, h, key), with room for so many steps and instants of a trajectory."""
-    return _run(*run, steps, jnp.asarray(room[2]), room=room[1])
+    loop, objectives, h, key = run
+    return _run(loop, objectives, h, key, steps, jnp.asarray(room[2]), room=room[1])
 
 
 def _rule(room: tuple[int, int, int], primals: Any, tangents: Any) -> tuple[Any, Any]:
@@ -121,7 +123,7 @@ def _rule(room: tuple[int, int, int], primals: Any, tangents: Any) -> tuple[Any,
 _simulated.defjvp(_rule, symbolic_zeros=True)
 
 
-@partial(jax.jit, static_argnames="room")
+@compile_once(static=("room",), options=SAME)
 def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, every: Any, *, room: int) -> Run:
     """For values: `room` for a trajectory, 0 without."""
     loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps)

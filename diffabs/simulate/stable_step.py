@@ -18,6 +18,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.compiling import SAME, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Jump, Memory, Reference
 from diffabs.core.pytree import Scalar, part, pytree, replace, strong
@@ -32,7 +33,7 @@ RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 
 
 def stable_step(loop: Loop) -> float:
     """Largest step [s] at which RK4 damps every damped mode of the loop, between its initial speed and its stop."""
-    return float(stable_steps(jax.tree.map(lambda x: x[None], strong(loop)))[0])
+    return float(stable_steps(jax.tree.map(lambda x: np.asarray(x)[None], strong(loop)))[0])
 
 
 def stable_steps(loops: Loop) -> np.ndarray:
@@ -137,9 +138,15 @@ def _radius(direction: np.ndarray) -> np.ndarray:
 
 
 def _reach(angle: np.ndarray) -> np.ndarray:
-    z = RADII * np.exp(1j * angle[:, None])
-    grows = np.abs(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))) > 1 + 1e-9
-    return np.where(grows.any(axis=1), RADII[np.argmax(grows, axis=1)], RADII[-1])
+    """The first of RADII along each direction at which RK4 grows, or the last one: by bisection, since the region is
+    star-shaped and a table of all of them would cost every command half a second."""
+    low, high = np.zeros(angle.shape, int), np.full(angle.shape, len(RADII) - 1)
+    for _ in range(len(RADII).bit_length()):
+        middle = (low + high) // 2
+        z = RADII[middle] * np.exp(1j * angle)
+        grows = np.abs(1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))) > 1 + 1e-9
+        low, high = np.where(grows, low, np.minimum(middle + 1, high)), np.where(grows, middle, high)
+    return RADII[high]
 
 
 ANGLES = np.linspace(np.pi / 2, np.pi, 2001)
@@ -147,7 +154,7 @@ REACH = _reach(ANGLES)
 WITHIN = float(REACH.min())  # a damped mode of whatever direction is stable up to here
 
 
-@jax.jit
+@compile_once(options=SAME)
 @jax.vmap
 def _jacobians(loop: Loop) -> jax.Array:
     return _jacobians_of(loop)

@@ -1,0 +1,67 @@
+"""Compiled programs are kept between commands: in the user's cache folder, by JAX, which names them by what they are.
+
+Compiling is most of what a command costs. Who configures JAX's own cache decides; DIFFABS_NO_CACHE=1 turns it off."""
+
+import contextlib
+import hashlib
+import os
+import pathlib
+import platform
+import sys
+import warnings
+
+import jax
+
+OFF = "DIFFABS_NO_CACHE"
+WORTH = 0.05  # s of compiling, from which a program is kept
+ROOM = 256 * 2**20  # bytes on disk; beyond, the oldest half goes
+CHOSEN = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")  # by which a user has decided
+
+
+def keep() -> pathlib.Path | None:
+    """Return the folder that JAX from now on keeps compiled programs in, or None: without one everything works, and
+    compiles. Nothing is said of a folder that cannot be written or of a damaged entry."""
+    chosen = jax.config.values.get("jax_compilation_cache_dir")
+    if os.environ.get(OFF) or any(name in os.environ for name in CHOSEN) or chosen:
+        return None
+    try:
+        folder = _user_folder() / "diffabs" / f"jax-{_processor()}"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
+            return None
+        _make_room(folder)
+    except (OSError, RuntimeError):  # RuntimeError: no home
+        return None
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache", UserWarning)
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH)
+    return folder
+
+
+def _user_folder() -> pathlib.Path:
+    """Return where this system wants caches. Raises RuntimeError where the user has no home."""
+    if sys.platform == "darwin":
+        return pathlib.Path.home() / "Library" / "Caches"
+    given = pathlib.Path(os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", ""))
+    if given.is_absolute():
+        return given
+    return pathlib.Path.home() / ("AppData/Local" if sys.platform == "win32" else ".cache")
+
+
+def _processor() -> str:
+    """Return a name of this kind of processor: programs compiled for another may not run here, and homes are shared."""
+    known = f"{platform.machine()} {platform.processor()}"
+    with contextlib.suppress(OSError):
+        lines = pathlib.Path("/proc/cpuinfo").read_text(errors="replace").partition("\n\n")[0].splitlines()
+        known += "".join(sorted(line for line in lines if line.startswith(("model name", "flags", "Features", "CPU"))))
+    return hashlib.sha256(known.encode()).hexdigest()[:12]
+
+
+def _make_room(folder: pathlib.Path) -> None:
+    """Remove the oldest half where there is more than `ROOM`."""
+    files = [(entry.stat().st_mtime, entry.stat().st_size, entry.path) for entry in os.scandir(folder)]
+    if sum(size for _, size, _ in files) > ROOM:
+        for _, _, path in sorted(files)[: (len(files) + 1) // 2]:
+            with contextlib.suppress(OSError):  # another process was quicker
+                os.unlink(path)

@@ -1,0 +1,45 @@
+"""Programs that run once: compiling them is what they cost.
+
+XLA is told to compile faster where a function is called with numbers. Inside jit, and so under vmap and grad, what
+surrounds it decides."""
+
+import functools
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import jax
+from jax.core import Tracer
+
+F = TypeVar("F", bound=Callable)
+
+# JAX 0.10: its older emitters make the same numbers as the newer ones in half the time; later JAX has no such option.
+SAME: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
+QUICK: dict[str, Any] = {**SAME, "xla_backend_optimization_level": 0}  # rounds differently
+
+
+def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | None = None) -> Callable[[F], F]:
+    """Return the decorator `jax.jit` for a function that is mostly called with numbers, once for each of its shapes.
+
+    static: names of static arguments, or the number of leading ones. options: of XLA (`SAME`, `QUICK`), which apply
+    where nothing is traced."""
+    fixed: dict[str, Any] = (
+        {"static_argnums": tuple(range(static))} if isinstance(static, int) else {"static_argnames": tuple(static)}
+    )
+
+    def decorate(function: F) -> F:
+        plain = jax.jit(function, **fixed)
+        quick = jax.jit(function, **fixed, compiler_options=options or None)
+
+        @functools.wraps(function)
+        def call(*args: Any, **more: Any) -> Any:
+            return (plain if _traced((args, more)) else quick)(*args, **more)
+
+        call._cache_size = lambda: plain._cache_size() + quick._cache_size()  # pyright: ignore
+        return call  # pyright: ignore[reportReturnType]
+
+    return decorate
+
+
+def _traced(tree: Any) -> bool:
+    """Return whether a trace is under way: options are for a program, not for a part of one."""
+    return isinstance(jax.device_put(0), Tracer) or any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
