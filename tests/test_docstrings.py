@@ -1,5 +1,6 @@
 """Every function that a package exports says what it returns, and names each of its arguments."""
 
+import ast
 import importlib
 import inspect
 import re
@@ -13,14 +14,17 @@ PACKAGES = ("diffabs", *(f"diffabs.{name}" for name in PACKAGES))
 
 
 def exported():
+    """Functions and classes of ours by their names, in one order; what is exported lazily is imported for type checkers
+    in the text of the package."""
     found = {}
     for package in map(importlib.import_module, PACKAGES):
-        for name in {*vars(package), *getattr(package, "LAZY", ())}:
-            item = getattr(package, name)
+        imports = [x for x in ast.walk(ast.parse(inspect.getsource(package))) if isinstance(x, ast.ImportFrom)]
+        for name in (alias.asname or alias.name for line in imports for alias in line.names):
+            item = getattr(package, name, None)
             ours = not name.startswith("_") and getattr(item, "__module__", "").startswith("diffabs")
             if ours and (inspect.isfunction(item) or inspect.isclass(item)):
                 found[f"{item.__module__}.{item.__qualname__}"] = item
-    return found
+    return dict(sorted(found.items()))
 
 
 EXPORTED = exported()
