@@ -145,7 +145,7 @@ def test_lanes_are_estimated_together():
 
 def test_a_run_that_diverges_at_a_shorter_step_is_not_alike():
     runs = [
-        d.Run({}, jnp.asarray(stopped), jnp.asarray(diverged), None, None)  # pyright: ignore[reportArgumentType]
+        d.Run({}, jnp.asarray(stopped), jnp.asarray(diverged), jnp.asarray(False), None, None)  # pyright: ignore[reportArgumentType]
         for stopped, diverged in ((True, False), (False, False), (False, True))
     ]
     assert acc.alike(runs[0], runs[0])

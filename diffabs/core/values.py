@@ -154,7 +154,8 @@ def text(given: Any, path: str) -> str:
     return given
 
 
-def _switch(given: Any, path: str) -> bool:
+def switch(given: Any, path: str) -> bool:
+    """Return true or false. Raises ScenarioError for anything else."""
     if not isinstance(given, bool):
         raise wrong(path, given, "true or false")
     return given
@@ -171,7 +172,7 @@ def _choice(given: Any, path: str) -> float | str:
 
 READERS: dict[Any, Reader] = {
     float: any_number,
-    bool: _switch,
+    bool: switch,
     str: text,
     tuple[str, ...]: listed(text),
     tuple[float, ...]: listed(any_number),

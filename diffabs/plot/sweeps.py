@@ -137,7 +137,7 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """The share of failed runs in cells of the two variables that move it most, or that move the metric of `worst` most
     if too few failed, or did not; cells without a run are grey. None where no variable varies."""
     view = _View(found, units)
-    late = missed(found.column("stopped"), success := found.study.get("success", True))
+    late = missed(found.column("stopped"), success := found.study["success"])
     rules = [~view.good, late, *(found.column(name) > view.bounds[name] for name in view.bounds)]
     failed = np.any(rules, axis=0)[every := view.accepted]
     rows, result = every, failed

@@ -27,6 +27,7 @@ from diffabs.core.values import (
     ranged,
     read,
     shown,
+    switch,
     table_of,
     text,
     unknown,
@@ -139,6 +140,7 @@ class _Study:
     chunk: int = entry(within(*RANGES["chunk"]))
     dtype: str = entry(one_of(*DTYPES))
     failures: Mapping[str, float] = entry(table_of(ranged(FINITE)))
+    success: bool = entry(switch)
     solver: _Solver = entry(partial(read, _Solver))
     space: Space = entry(variables.read)
     loop: Mapping[str, Any] = entry(table_of(as_given))

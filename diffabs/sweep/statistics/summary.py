@@ -90,7 +90,7 @@ class _View:
 
 
 def _failures(found: Results, view: _View, confidence: float) -> Iterator[tuple[str, Any]]:
-    success = found.study.get("success", True)
+    success = found.study["success"]
     columns = {name: found.column(name) for name in found.study["failures"] | {"stopped": 0, "diverged": 0}}
     kinds = {
         "diverged": columns["diverged"] & view.accepted,
