@@ -161,8 +161,8 @@ def test_json_has_what_scripts_rely_on(tuned):
     assert document["met"] is True
     assert document["mode"] == "forward"
     assert document["reason"] == Reason.LIMIT.value
-    assert document["history"][0]["objective"] == document["objective"]["before"]
-    assert document["history"][-1]["objective"] == document["objective"]["after"]
+    ends = [document["history"][i]["objective"] for i in (0, -1)]  # with a gradient, another program of the same steps
+    assert ends == pytest.approx([document["objective"]["before"], document["objective"]["after"]], rel=1e-12)
     assert document["history"][-1]["iteration"] == 2
     assert document["evaluations"] == document["history"][-1]["evaluations"] >= 3
     assert document["gradient_norm"] == document["history"][-1]["gradient"]

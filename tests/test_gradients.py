@@ -73,7 +73,10 @@ LOOPS = {
         controller=controllers.ConstantTorque(torque=0.95),
     ),
     "relay": braking(
-        **CAR, controller=controllers.Relay(torque_max=250.0), actuator=actuators.Limits(low=5.0, high=190.0)
+        **CAR,
+        controller=controllers.Relay(torque_max=250.0),
+        reference=references.Setpoint(value=0.2),
+        actuator=actuators.Limits(low=5.0, high=190.0),
     ),
     "computer": braking(
         **CAR | {"plant": plants.QuarterCar(road=PATCHES)},

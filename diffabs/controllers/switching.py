@@ -70,7 +70,7 @@ class Relay:
         slope = excess - before
         if clock.rate is not None:
             rate = clock.rate()
-            slope = clock.h * (rate.measured.slip - rate.target)
+            slope = clock.h * (rate.measured[0] - rate.target)
         late = _crossed(side * (before - side * self.band), side * (excess - side * self.band), side * slope)
         elapsed = jnp.where(release | apply, late * clock.h, 0.0)
         now = jnp.where(release, 0.0, jnp.where(apply, 1.0, applied))

@@ -139,6 +139,13 @@ class Peak(NamedTuple):
     earlier: Scalar
 
 
+class Sided(NamedTuple):
+    """1, or -1 below a setpoint of 0; and the peak of the value on that side."""
+
+    side: Scalar
+    peak: Peak
+
+
 def _first(value: Scalar) -> Memory:
     """The greatest of one value."""
     return Memory(held=Peak(value, value, value))
@@ -179,7 +186,8 @@ class MaxSlip:
 @pytree
 class Overshoot:
     """max(0, max y/setpoint - 1), a fraction of the final setpoint [1], or of 0.01 where that is more: an estimator may
-    end at a slip of 0. Below a negative setpoint it is the same of -y. Zero derivative where there is none."""
+    end at a slip of 0. Where the first setpoint is negative, it is the same of -y. Zero derivative where there is none.
+    """
 
     unit = "1"
     physical = (0.0, math.inf)
@@ -187,20 +195,23 @@ class Overshoot:
     flow = nothing
 
     def start(self, sample: Sample) -> Memory:
-        """The first value."""
-        return _first(_side(sample) * sample.output[0])
+        """The first value, and the side on which it shall not go too far."""
+        side = _side(sample)
+        return Memory(held=Sided(side, _first(side * sample.output[0]).held))
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Peak:
+    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Sided:
         """Look for a vertex at the last sample but one."""
         del before, h
-        return _peaked(memory.held, _side(sample) * sample.output[0], highest(sample.output))
+        side, peak = memory.held
+        return Sided(side, _peaked(peak, side * sample.output[0], highest(sample.output)))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Overshoot."""
-        setpoint = _side(ending.sample) * ending.sample.setpoint
+        side, (greatest, *_) = memory.held
+        setpoint = side * ending.sample.setpoint
         usual = setpoint >= LEAST
-        fraction = memory.held.greatest / jnp.where(usual, setpoint, LEAST) - 1
-        excess = jnp.where(usual, fraction, (memory.held.greatest - setpoint) / LEAST)
+        fraction = greatest / jnp.where(usual, setpoint, LEAST) - 1
+        excess = jnp.where(usual, fraction, (greatest - setpoint) / LEAST)
         return jnp.where(excess > 0, excess, 0.0)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 
 from diffabs.core.loop import Loop
-from diffabs.core.protocols import Memory, Objective
+from diffabs.core.protocols import Clock, Memory, Objective
 from diffabs.core.pytree import strong
 from diffabs.core.values import kebab
 from diffabs.scenario.registry import joined
@@ -35,8 +35,9 @@ def _everything(loop: Loop, objectives: Mapping[str, Objective]) -> Any:
 
 
 def _once(loop: Loop) -> Any:
-    """Once around the loop."""
+    """Once around the loop, and through a jump."""
     state = loop.start()
+    loop.jump(Clock(0.0, 1e-3, 0, jax.random.key(0)), state)
     signals = loop.signals(0.0, state)
     margin = loop.stop.margin(signals.sample.output), loop.stop.rate(signals.sample.output)
     return margin, loop.flow(0.0, state, signals)
