@@ -48,7 +48,16 @@ def described(text):
 def manifest(samples, chunk, variables=("plant.mass",), objectives=("iae",), **study):
     """Of a sweep that was never run."""
     space = {"variables": {path: {"type": "uniform", "low": 0.0, "high": 1.0} for path in variables}}
-    table = {"samples": samples, "chunk": chunk, "seed": 0, "dtype": "float64", "failures": {}, "loop": {}, "parts": {}}
+    table = {
+        "samples": samples,
+        "chunk": chunk,
+        "seed": 0,
+        "dtype": "float64",
+        "failures": {},
+        "success": True,
+        "loop": {},
+        "parts": {},
+    }
     table |= {"solver": {"step": 1e-3, "duration": 1.0}, "space": {**space, "design": {"type": "random"}}}
     table["objectives"] = {name: {} for name in objectives}
     return {"format": FORMAT, "study": table | study, "versions": {}, "source": {}}
