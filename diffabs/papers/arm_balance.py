@@ -220,14 +220,15 @@ def compact(summary: Mapping[str, Any]) -> Digest:
     rows = summary["rows"]
     lines = []
     for row in rows:
-        if (first := re.split(r"\W", row["quantity"])[0]) in SHOWN:
+        nothing = row["quantity"] == "share undecided" and row["ours"] == 0
+        if (first := re.split(r"\W", row["quantity"])[0]) in SHOWN and not nothing:
             quantity = row["quantity"] if row["unit"] == "1" else f"{row['quantity']} [{row['unit']}]"
             number = ("no", "yes")[int(row["ours"])] if first == "fell" else f"{row['ours']:.4g}"
             lines.append((row["name"], quantity, number, "" if row["reference"] is None else f"{row['reference']:.4g}"))
     printed = [row for row in rows if row["published"] is not None]
     independent = [row for row in rows if row["reference"] is not None]
     where = "Spong's Acrobot"
-    return digest(summary, ("", "quantity", "ours", "SciPy"), lines, CLAIMS, (where, printed), independent)
+    return digest(summary, ("", "quantity", "ours", "known"), lines, CLAIMS, (where, printed), independent)
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str, Any]:
