@@ -296,3 +296,13 @@ def test_a_road_that_drives_is_refused(road, where):
 def test_a_road_that_only_brakes_is_accepted(road):
     """The rig's published polynomial dips to -3e-6 below slip 7e-5, which is forgiven."""
     assert check(road) is road
+
+
+def test_roads_are_checked_in_single_precision_too():
+    """A library user who leaves JAX's default alone; here, beside programs compiled in double precision."""
+    check(RIG)
+    with jax.enable_x64(False):
+        assert check(RIG) is RIG
+        assert check(Scaled(road=SNOW, scale=2.0)).scale == 2.0
+        with pytest.raises(ValueError, match="such a road drives"):
+            check(Burckhardt(c1=0.0))

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.tree_util import Partial
@@ -14,7 +15,7 @@ SLIPS = np.linspace(0.05, 1.0, 20)  # below them a fitted polynomial may dip und
 
 def opposes(friction: Partial) -> Rule:
     """Return the rule that mu(s) >= 0 at slips of 0.05 to 1: friction of the other sign would speed the car up."""
-    mu = _along(friction)
+    mu = _along(friction, jnp.asarray(SLIPS))  # of the precision in force: a constant in a program keeps its own
     mu = mu if isinstance(mu, Tracer) else np.asarray(mu)
 
     def says() -> str:
@@ -25,6 +26,6 @@ def opposes(friction: Partial) -> Rule:
 
 
 @compile_once(options=QUICK)
-def _along(friction: Partial) -> Any:
-    """Return the friction at SLIPS. Compiled as one: each operation by itself costs as much as all of them."""
-    return friction(SLIPS)
+def _along(friction: Partial, slips: Any) -> Any:
+    """Return the friction at these slips. Compiled as one: each operation by itself costs as much as all of them."""
+    return friction(slips)
