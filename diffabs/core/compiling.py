@@ -27,8 +27,10 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | Non
     )
 
     def decorate(function: F) -> F:
-        plain = jax.jit(function, **fixed)
-        quick = jax.jit(function, **fixed, compiler_options=options or None)
+        plain: Any = jax.jit(function, **fixed)
+        if not options:
+            return plain
+        quick = jax.jit(function, **fixed, compiler_options=options)
 
         @functools.wraps(function)
         def call(*args: Any, **more: Any) -> Any:
