@@ -15,7 +15,7 @@ SLIPS = np.linspace(0.05, 1.0, 20)  # below them a fitted polynomial may dip und
 
 def opposes(friction: Partial) -> Rule:
     """Return the rule that mu(s) >= 0 at slips of 0.05 to 1: friction of the other sign would speed the car up."""
-    mu = _along(friction, jnp.asarray(SLIPS))  # of the precision in force: a constant in a program keeps its own
+    mu = _along(friction, SLIPS.astype(jnp.result_type(float)))  # of the precision in force, decided by NumPy
     mu = mu if isinstance(mu, Tracer) else np.asarray(mu)
 
     def says() -> str:
