@@ -32,6 +32,27 @@ class Mutation(NamedTuple):
 
 MUTATIONS = [
     Mutation(
+        "a lever that locks itself and pushes the wheel off",
+        "plants/lab_rig.py",
+        "jnp.where(free, arm, 1.0)), jnp.inf)",
+        "jnp.where(free, arm, 1.0)), quotient(self.weight_torque + torque, arm))",
+        "test_plants.py::test_a_lever_that_locks_itself_further_on_is_no_run",
+    ),
+    Mutation(
+        "a lever that may lock itself",
+        "plants/lab_rig.py",
+        "yield stays_below(friction, limit,",
+        "yield stays_below(friction, 1e9 * limit,",
+        "test_plants.py::test_a_lever_that_locks_itself_is_refused",
+    ),
+    Mutation(
+        "a stuck wheel that no torque can hold",
+        "plants/lab_rig.py",
+        "held = arm > self.wheel_radius * mu",
+        "held = arm > -jnp.inf",
+        "test_plants.py::test_a_lab_wheel_that_no_torque_holds_turns_again",
+    ),
+    Mutation(
         "RK4 with a wrong weight",
         "simulate/rk4.py",
         "(0.5, 2.0), (0.5, 2.0)",
@@ -167,8 +188,8 @@ MUTATIONS = [
     Mutation(
         "a lever without the brake's reaction",
         "plants/lab_rig.py",
-        "return mu, quotient(self.weight_torque + torque, arm), torque",
-        "return mu, self.weight_torque / arm, torque",
+        "normal = jnp.where(free, quotient(self.weight_torque + torque, jnp",
+        "normal = jnp.where(free, quotient(self.weight_torque, jnp",
         "test_plants.py::test_lab_rig_derivative",
     ),
     Mutation(
@@ -490,7 +511,7 @@ MUTATIONS = [
     Mutation(
         "a stuck wheel that brakes with all its torque",
         "plants/lab_rig.py",
-        "stuck = smaller(asked, capacity)",
+        "stuck = jnp.where(held, smaller(asked, capacity), capacity)",
         "stuck = capacity",
         "test_oracle.py::test_lab_rig_locks_and_stops_like_scipy",
     ),

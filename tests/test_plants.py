@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from parts import PLANTS
 
+from diffabs import check
 from diffabs.core.protocols import BrakeOutput
 from diffabs.plants import GRAVITY, BrakeStart, LabRig, MirroredRig, QuarterCar
 from diffabs.plants.lab_rig import LabRigState
-from diffabs.roads import DRY_ASPHALT, RIG, SNOW, SPLINE_B, Burckhardt
+from diffabs.roads import DRY_ASPHALT, RIG, SNOW, SPLINE_B, Burckhardt, Patches
 
 NO_FRICTION = Burckhardt(c1=0.0, c3=0.0)
 MU, SLOPE = 0.39575220833898, -0.00641755652574  # of the rig's curve at slip 0.2
@@ -143,6 +144,33 @@ def test_the_brake_of_the_lab_rig_does_not_drive(command):
     """With an offset of -14 N m, b1 u + b2 is negative up to u = 0.92: the brake is then released."""
     rate = LabRig(brake_offset=-14.0).derivative(0.0, LabRigState(100.0, 140.0, 0.5, 0.0), command)
     np.testing.assert_allclose(rate.brake, 20.37 * (max(15.24 * command - 14.0, 0.0) - 0.5), rtol=1e-12)
+
+
+def test_a_lever_that_locks_itself_is_refused():
+    """tan 65.61 deg = 2.205: at that friction no finite normal force balances the lever."""
+    assert check(LabRig(road=Burckhardt(c1=2.2, c3=0.0))).road.c1 == 2.2
+    with pytest.raises(ValueError, match=r"road.friction = 2.4\d at slip 1 is not below tan\(lever_angle\) = 2.2"):
+        check(LabRig(road=Burckhardt(c1=2.41, c3=0.0)))
+    with pytest.raises(ValueError, match=r"road\.friction = .* the lever locks itself"):
+        check(LabRig(road=Burckhardt(c1=1e300)))
+
+
+def test_a_lever_that_locks_itself_further_on_is_no_run():
+    """A patch that `check` does not see. The normal force is infinite there: no number is left to be averaged."""
+    road = Patches(roads=(RIG, Burckhardt(c1=5.0, c3=0.0)), edges=(2.0,))
+    rig = LabRig(road=road)
+    ahead = LabRigState(100.0, 140.0, 9.0, 3.0)
+    assert not np.isfinite(rig.derivative(0.0, ahead, 0.9).drum)
+    assert np.isfinite(rig.derivative(0.0, ahead._replace(distance=1.0), 0.9).drum)
+
+
+def test_a_lab_wheel_that_no_torque_holds_turns_again():
+    """Friction between 1.34 and tan phi: the road's torque grows faster than the brake's, whatever the brake does."""
+    rig = LabRig(road=Burckhardt(c1=1.6, c3=0.0, c4=0.0))
+    _, normal, carried = rig.contact(LabRigState(0.0, 100.0, 9.0, 0.0))
+    np.testing.assert_allclose(carried, 9.0 + rig.wheel_stiction, rtol=1e-12)
+    assert normal > 0
+    assert rig.derivative(0.0, LabRigState(0.0, 100.0, 9.0, 0.0), 0.9).wheel > 0
 
 
 def test_stuck_lab_wheel_carries_what_the_road_asks():

@@ -11,19 +11,28 @@ of Maeda and Sugiura with tau_b + tau_1 = Mg + M1 + M10 + d1 omega1. Radii, J1 a
 that paper; the other constants are as commonly published and were not verified against the manual.
 
 A stopped wheel sticks: the brake then carries T = r1 mu Mg/(L (sin phi - mu cos phi) - r1 mu), what the road asks for,
-as long as that is below M1 + M10."""
+as long as that is below M1 + M10. Where r1 mu exceeds L (sin phi - mu cos phi) no torque holds the wheel.
+
+At mu = tan phi the lever locks itself: no finite normal force balances it. Such a road is refused; a run that meets one
+further on has diverged."""
 
 import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
 
 from diffabs.core.numerics import clamp, larger, quotient, smaller
 from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import Scalar, param, part, pytree
+from diffabs.core.rules import Rule, array
 from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import FROZEN, BrakeStart, forward, halted, probes, slip_ratio, usual_objectives, usual_parts
 from diffabs.roads import RIG
+from diffabs.roads.sign import stays_below
 
 
 class LabRigState(NamedTuple):
@@ -92,10 +101,14 @@ class LabRig:
         mu = self.road.friction(slip, self.drum_radius * state.drum, state.distance)
         arm = self.lever * (jnp.sin(self.lever_angle) - mu * jnp.cos(self.lever_angle))
         capacity = state.brake + self.wheel_stiction
-        asked = quotient(self.wheel_radius * mu * self.weight_torque, arm - self.wheel_radius * mu)
-        stuck = smaller(asked, capacity)
+        held = arm > self.wheel_radius * mu
+        spare = jnp.where(held, arm - self.wheel_radius * mu, 1.0)
+        asked = quotient(self.wheel_radius * mu * self.weight_torque, spare)
+        stuck = jnp.where(held, smaller(asked, capacity), capacity)
         torque = jnp.where(state.wheel > 0, capacity + self.wheel_friction * state.wheel, stuck)
-        return mu, quotient(self.weight_torque + torque, arm), torque
+        free = arm > 0
+        normal = jnp.where(free, quotient(self.weight_torque + torque, jnp.where(free, arm, 1.0)), jnp.inf)
+        return mu, normal, torque
 
     def project(self, state: LabRigState) -> LabRigState:
         """Neither wheel turns backwards."""
@@ -129,6 +142,13 @@ class LabRig:
     def energy(self, state: LabRigState) -> Scalar:
         """Kinetic energy of both wheels [J]."""
         return 0.5 * (self.wheel_inertia * state.wheel**2 + self.drum_inertia * state.drum**2)
+
+    def rules(self) -> Iterator[Rule]:
+        """A lever that does not lock itself where the run begins: mu < tan(phi)."""
+        friction = Partial(type(self.road).friction, self.road, speed=0.0, distance=0.0)
+        angle = array(self.lever_angle)
+        limit = jnp.tan(angle) if isinstance(angle, jax.Array) else np.tan(angle)
+        yield stays_below(friction, limit, "tan(lever_angle)", "the lever locks itself").under("road.")
 
     def _drum_torque(self, drum: Scalar, push: Scalar) -> Any:
         return push * self.drum_radius + self.drum_friction * drum + jnp.where(drum > 0, self.drum_stiction, 0.0)

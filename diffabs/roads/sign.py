@@ -1,4 +1,4 @@
-"""A friction curve that a car can meet: it never drives."""
+"""A friction curve that a car can meet: it never drives; and one that a machine can bear."""
 
 from typing import Any
 
@@ -15,14 +15,30 @@ SLIPS = np.linspace(0.05, 1.0, 20)  # below them a fitted polynomial may dip und
 
 def opposes(friction: Partial) -> Rule:
     """Return the rule that mu(s) >= 0 at slips of 0.05 to 1: friction of the other sign would speed the car up."""
-    mu = _along(friction, SLIPS.astype(jnp.result_type(float)))  # of the precision in force, decided by NumPy
-    mu = mu if isinstance(mu, Tracer) else np.asarray(mu)
+    mu = _at_slips(friction)
 
     def says() -> str:
         worst = int(np.argmin(mu))
         return f"friction = {float(mu[worst]):.3g} at slip {SLIPS[worst]:g} is negative: such a road drives"
 
     return Rule((mu >= 0).all(), "friction is negative at some slip: such a road drives", says)
+
+
+def stays_below(friction: Partial, limit: Any, name: str, then: str) -> Rule:
+    """Return the rule that mu(s) < limit at these slips; `name` is what the limit is, `then` what it means."""
+    mu = _at_slips(friction)
+
+    def says() -> str:
+        worst = int(np.argmax(mu))
+        return f"friction = {float(mu[worst]):.3g} at slip {SLIPS[worst]:g} is not below {name} = {limit:.3g}: {then}"
+
+    return Rule((mu < limit).all(), f"friction is not below {name} at some slip: {then}", says)
+
+
+def _at_slips(friction: Partial) -> Any:
+    """Return mu at SLIPS, of the precision in force, decided by NumPy."""
+    mu = _along(friction, SLIPS.astype(jnp.result_type(float)))
+    return mu if isinstance(mu, Tracer) else np.asarray(mu)
 
 
 @compile_once(options=QUICK)
