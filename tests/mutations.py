@@ -32,6 +32,13 @@ class Mutation(NamedTuple):
 
 MUTATIONS = [
     Mutation(
+        "rules of a part around a part that is not sound",
+        "core/pytree.py",
+        "found |= bool(within)",
+        "found |= False",
+        "test_plants.py::test_a_lever_on_a_broken_road_is_not_asked_for",
+    ),
+    Mutation(
         "a lever that locks itself and pushes the wheel off",
         "plants/lab_rig.py",
         "jnp.where(free, arm, 1.0)), jnp.inf)",

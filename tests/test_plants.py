@@ -12,7 +12,7 @@ from diffabs import check
 from diffabs.core.protocols import BrakeOutput
 from diffabs.plants import GRAVITY, BrakeStart, LabRig, MirroredRig, QuarterCar
 from diffabs.plants.lab_rig import LabRigState
-from diffabs.roads import DRY_ASPHALT, RIG, SNOW, SPLINE_B, Burckhardt, Patches
+from diffabs.roads import DRY_ASPHALT, RIG, SNOW, SPLINE_B, Burckhardt, Patches, Tabulated
 
 NO_FRICTION = Burckhardt(c1=0.0, c3=0.0)
 MU, SLOPE = 0.39575220833898, -0.00641755652574  # of the rig's curve at slip 0.2
@@ -153,6 +153,13 @@ def test_a_lever_that_locks_itself_is_refused():
         check(LabRig(road=Burckhardt(c1=2.41, c3=0.0)))
     with pytest.raises(ValueError, match=r"road\.friction = .* the lever locks itself"):
         check(LabRig(road=Burckhardt(c1=1e300)))
+
+
+def test_a_lever_on_a_broken_road_is_not_asked_for():
+    """Rules between parts are for parts that are sound: this spline has fewer frictions than slips."""
+    broken = Tabulated(slip=np.array([0.0, 0.1, 0.2, 1.0]), mu=np.array([0.0, 0.5, 0.6]))
+    with pytest.raises(ValueError, match=r"^road\..*(mu|slip).*shape"):
+        check(LabRig(road=broken))
 
 
 def test_a_lever_that_locks_itself_further_on_is_no_run():

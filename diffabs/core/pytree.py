@@ -188,7 +188,9 @@ def problems(part: Any, prefix: str = "", units: Units | None = None) -> Iterato
                 found = True
                 yield f"{name} = {_show(value)} is outside {spec.interval()}"
         else:
-            yield from problems(value, f"{name}.", units)
+            within = list(problems(value, f"{name}.", units))
+            found |= bool(within)
+            yield from within
     if not found:
         shapes = list(part.problems()) if hasattr(part, "problems") else []
         yield from (prefix + in_words(line, units) for line in shapes or broken(_own(part, "rules")))
