@@ -149,6 +149,7 @@ def test_the_brake_of_the_lab_rig_does_not_drive(command):
 def test_a_lever_that_locks_itself_is_refused():
     """tan 65.61 deg = 2.205: at that friction no finite normal force balances the lever."""
     assert check(LabRig(road=Burckhardt(c1=2.2, c3=0.0))).road.c1 == 2.2
+    assert check(LabRig(road=SPLINE_B)).road is SPLINE_B
     with pytest.raises(ValueError, match=r"road.friction = 2.4\d at slip 1 is not below tan\(lever_angle\) = 2.2"):
         check(LabRig(road=Burckhardt(c1=2.41, c3=0.0)))
     with pytest.raises(ValueError, match=r"road\.friction = .* the lever locks itself"):

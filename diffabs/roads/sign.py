@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -44,4 +45,4 @@ def _at_slips(friction: Partial) -> Any:
 @compile_once(options=QUICK)
 def _along(friction: Partial, slips: Any) -> Any:
     """Return the friction at these slips. Compiled as one: each operation by itself costs as much as all of them."""
-    return friction(slips)
+    return jax.vmap(friction)(slips)
