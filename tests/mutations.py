@@ -1057,8 +1057,8 @@ MUTATIONS = [
     Mutation(
         "batch: loops of any structure taken for the first",
         "simulate/batch.py",
-        "groups.setdefault((jax.tree.structure(loop), *",
-        "groups.setdefault((*",
+        "(jax.tree.structure(loop), *map",
+        "(0, *map",
         "test_batch.py::TestStacked::test_of_one_structure",
     ),
     Mutation(

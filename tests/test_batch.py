@@ -16,7 +16,7 @@ from diffabs.sensors import Noise
 from diffabs.simulate import refill
 from diffabs.simulate.batch import Batch, by_structure, grid, latin, stacked
 from diffabs.simulate.refill import ROUND
-from diffabs.stops import SpeedReached
+from diffabs.stops import SpeedReached, Standstill
 
 pytestmark = pytest.mark.xdist_group("batch")  # one worker compiles what these share
 
@@ -229,7 +229,7 @@ class TestStacked:
         np.testing.assert_array_equal(weights, [-2e4, -3e4])
 
     def test_of_one_structure(self):
-        other = replace(QUIET, {"controller": controllers.PID()})
+        other = replace(QUIET, {"stop": Standstill(speed=5.0)})  # of equal shapes
         assert by_structure([QUIET, other, replace(QUIET, {"plant.mass": 6.0})]) == [[0, 2], [1]]
         with pytest.raises(ValueError, match="loops of 2 structures are no lanes of one batch"):
             stacked([QUIET, other])

@@ -114,7 +114,7 @@ def run_batch(
     trajectories: keep them, (lanes, instants, ...), every `solver.every`-th instant
     together: True is `jax.vmap` of `measure`: all lanes step until the last has ended, and there are derivatives in
         both modes, in the loop and in the batch's values. False has no reverse mode, but a lane that has ended makes
-        room for the next: 2.6 times faster over speeds of 20 to 60 km/h. The two agree to rounding. None is True if
+        room for the next, so that few long ones do not hold up the rest. The two agree to rounding. None is True if
         the call is traced (inside jit, grad, vmap); trajectories and an empty batch are always run together
     accepted: which lanes are run (lanes,), or True for all; the others have `diverged`, and their metrics are NaN.
         None is those that `refusals` accepts, or all if the call is traced
