@@ -1256,7 +1256,7 @@ MUTATIONS = [
         "simulate/refill.py",
         "jnp.where(run & (number < count), carry.condition",
         "jnp.where(number < count, carry.condition",
-        "test_refusals.py::TestWhoeverRuns::test_a_batch_does_not_run_them",
+        "test_batch.py::TestLanes::test_that_are_not_accepted[refilled]",
     ),
     Mutation(
         "refused lanes are not told",
