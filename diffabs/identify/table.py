@@ -44,7 +44,7 @@ class Table:
         loops = [self.loops[row] for row in self.values]
         groups = by_structure(loops)
         order = [list(self.values)[i] for places in groups for i in places]
-        lanes = [stacked([loops[i] for i in places]) for places in groups]
+        lanes = (stacked([loops[i] for i in places]) for places in groups)
         batches = [(strong(one), batch.values) for one, batch in lanes]
         metrics = list(dict.fromkeys(metric for _, metric in self.labels))
         place = np.array([(order.index(row), metrics.index(metric)) for row, metric in self.labels])

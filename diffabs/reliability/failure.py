@@ -62,8 +62,7 @@ def _measured(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
     """The metric of lanes (n,) that share one sequence of noise."""
     given = study.loop, {metric: study.objectives[metric]}
     loop, objective = jax.tree.map(lambda x: np.asarray(x, study.dtype), given)
-    size = len(next(iter(values.values())))
-    keys = jax.vmap(lambda _: noise_key(study.seed, 0))(np.arange(size))
+    keys = jax.vmap(lambda _: noise_key(study.seed, 0))(np.arange(Batch(values).size))
     return run_batch(loop, Batch(values, keys), study.solver, objective, accepted=True).metrics[metric]
 
 

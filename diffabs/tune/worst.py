@@ -136,9 +136,9 @@ def worst_case(
     free, key = space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
     corners = _corners(np.array(free.ranges))
     points = np.concatenate([corners, _drawn(np.array(free.ranges), screen, seed)])
-    if line := first_line(loop, _at(free, points, points.shape[:1]), solver):
+    lanes = Batch(_at(free, points), None if key is None else np.repeat(key, len(points)))
+    if line := first_line(loop, lanes.values, solver):
         raise ValueError(f"the box has points that cannot be run; {line}")
-    lanes = Batch(_at(free, points, points.shape[:1]), None if key is None else np.repeat(key, len(points)))
     screened = jax.device_get(run_batch(loop, lanes, solver, measured, accepted=True))
     values = screened.metrics[metric]
     mode = automatic(free)
@@ -160,12 +160,12 @@ def _drawn(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
     return low + (high - low) * qmc.Sobol(len(low), rng=np.random.default_rng(seed)).random(screen)
 
 
-def _at(free: Space, point: Any, lanes: tuple[int, ...] = ()) -> dict[str, Any]:
-    """Parameters by path from their numbers in a row, or in the rows of so many lanes."""
+def _at(free: Space, point: Any) -> dict[str, Any]:
+    """Parameters by path from their numbers in a row, or in the rows of lanes."""
     found, first = {}, 0
     for entry in free.entries:
         n = len(entry.maps)
-        found[entry.path] = point[..., first : first + n].reshape((*lanes, *entry.shape))
+        found[entry.path] = point[..., first : first + n].reshape((*np.shape(point)[:-1], *entry.shape))
         first += n
     return found
 
