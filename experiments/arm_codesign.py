@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from diffabs import FixedStep, Loop, plot
+from diffabs import Batch, FixedStep, Loop, plot
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree, replace, static
 from diffabs.design import certify
 from diffabs.design.attraction import Reach, largest
@@ -42,7 +42,7 @@ from diffabs.papers import record
 from diffabs.plants import ArmBalance
 from diffabs.scenario.scenario import load
 from diffabs.simulate.run import rollout
-from diffabs.tune import Batch, Method, Stopping, tune
+from diffabs.tune import Method, Stopping, tune
 
 START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])
 CLEAR = 0.05  # m, between the hanging arm and the ground

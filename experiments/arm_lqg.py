@@ -15,14 +15,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import FixedStep, plot
+from diffabs import Batch, FixedStep, plot, run_batch
 from diffabs.core.loop import Loop
 from diffabs.linear.gaussian import lqg
 from diffabs.objectives import SoftLoss
 from diffabs.papers import record
 from diffabs.scenario.scenario import load
 from diffabs.sensors import AngleSensor
-from diffabs.simulate.refill import measure_lanes
 
 WEIGHTS, EFFORT = np.diag([1.0, 100.0, 1.0, 1.0, 1.0, 1.0]), 0.01
 FRAME = SoftLoss(weight=np.eye(6)[0], radius=1.0, softness=1.0)  # |theta|/(1 + |theta|): rises with the last lean
@@ -70,7 +69,7 @@ def share(config: Config, loop: Loop) -> tuple[np.ndarray, np.ndarray, np.ndarra
     starts = {"initial.theta": 0.5 * lanes, "initial.phi": 0.2 * lanes}
     keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(config.seed), i))(np.arange(lanes.size))
     solver = FixedStep(step=config.step, duration=config.duration)
-    runs = jax.device_get(measure_lanes(loop, starts, solver, {"frame": FRAME}, keys=keys))
+    runs = jax.device_get(run_batch(loop, Batch(starts, keys), solver, {"frame": FRAME}))
     fine = ~runs.stopped & (runs.metrics["frame"] < config.band / (1 + config.band))
     undecided = ~runs.stopped & ~runs.diverged & ~fine
     return multiples, *(x.reshape(len(multiples), config.seeds).mean(axis=1) for x in (fine, undecided))

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 from weak_spots import Box, torques, weak_spots
 
-from diffabs import BrakeStart, FixedStep, Loop, Run, plot, replace, rollout
+from diffabs import Batch, BrakeStart, FixedStep, Loop, Run, plot, replace, rollout, run_batch
 from diffabs.actuators import Lag
 from diffabs.controllers import ConstantInput, HoldingInput, ProportionalFeedback, Sampled, StateFeedback
 from diffabs.core.pytree import parameters
@@ -38,7 +38,7 @@ from diffabs.references import FilteredSlip, FixedSlip
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import load
 from diffabs.stops import SpeedReached
-from diffabs.tune import AtMost, Batch, CertifiedDecay, Method, Stopping, Tuned, grid, run, tune
+from diffabs.tune import AtMost, CertifiedDecay, Method, Stopping, Tuned, grid, tune
 
 KMH = 3.6
 
@@ -152,7 +152,7 @@ def best_lmi(config: Config, batch: Batch) -> tuple[float, float]:
     solver = FixedStep(step=config.step, duration=config.duration)
 
     def brake(gain: Any) -> Run:
-        return run(replace(one, {"controller.controller.gain": gain}), batch, solver, BRAKING)
+        return run_batch(replace(one, {"controller.controller.gain": gain}), batch, solver, BRAKING)
 
     metrics = jax.device_get(jax.jit(jax.vmap(brake))(gains)).metrics
     worst = np.nan_to_num(metrics["overshoot"].max(axis=1), nan=np.inf)
@@ -193,7 +193,7 @@ def contenders(config: Config, found: Loop, lmi: tuple[float, float]) -> dict[st
 def judged(config: Config, one: Loop, system: Polytope, batch: Batch) -> tuple[dict[str, Any], Certificate]:
     """Worst over the lanes, and what is proved of the gain."""
     solver = FixedStep(step=config.step, duration=config.duration)
-    runs = jax.device_get(jax.jit(lambda one: run(one, batch, solver, BRAKING))(one))
+    runs = jax.device_get(jax.jit(lambda one: run_batch(one, batch, solver, BRAKING))(one))
     proof = certify(feedback(one, system.states), system, fastest=True)
     worst = {name: float(np.max(values)) for name, values in runs.metrics.items()}
     row = {

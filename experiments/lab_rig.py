@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import BrakeStart, FixedStep, Loop, Run, measure, plot, rollout
+from diffabs import BrakeStart, FixedStep, Loop, Run, plot, run_batch
 from diffabs.actuators import Lag
 from diffabs.controllers import ConstantTorque, HoldingInput, StateFeedback
 from diffabs.objectives import BRAKING
@@ -30,6 +30,7 @@ from diffabs.plants import GRAVITY, LabRig, MirroredRig
 from diffabs.plants.lab_rig import LabRigState
 from diffabs.references import FixedSlip
 from diffabs.scenario.defaults import braking
+from diffabs.simulate.batch import stacked
 from diffabs.stops import SpeedReached
 
 
@@ -73,14 +74,14 @@ def checks(config: Config) -> list[dict[str, Any]]:
 def open_loop(config: Config) -> dict[str, Run]:
     """The rig at constant commands."""
     start, stop = BrakeStart(speed=config.start_kmh / 3.6), SpeedReached(speed=config.stop_kmh / 3.6)
-    batch = record.stacked(
+    lanes = stacked(
         [
             braking(plant=LabRig(), initial=start, controller=ConstantTorque(torque=u), stop=stop)
             for u in config.commands
         ]
     )
     solver = FixedStep(step=config.step, duration=config.duration, every=20)
-    runs = jax.vmap(lambda loop: rollout(loop, solver, BRAKING))(batch)
+    runs = run_batch(*lanes, solver, BRAKING, trajectories=True, accepted=True)
     return {f"command {u:g}": record.lane(runs, i) for i, u in enumerate(config.commands)}
 
 
@@ -159,9 +160,9 @@ def lag_table(config: Config) -> tuple[list[dict[str, Any]], dict[str, Run]]:
         f"0..{config.torque_max:g}": (0.0, config.torque_max),
     }
     cases = [(name, lag) for name in limits for lag in config.lags]
-    batch = record.stacked([lagged(config, lag, *limits[name]) for name, lag in cases])
+    lanes = stacked([lagged(config, lag, *limits[name]) for name, lag in cases])
     solver = FixedStep(step=config.step, duration=config.duration, every=5)
-    runs = jax.vmap(lambda loop: rollout(loop, solver, BRAKING))(batch)
+    runs = run_batch(*lanes, solver, BRAKING, trajectories=True, accepted=True)
     rows, drawn = [], {}
     for i, (name, lag) in enumerate(cases):
         run = record.lane(runs, i)
@@ -178,9 +179,9 @@ def lag_table(config: Config) -> tuple[list[dict[str, Any]], dict[str, Run]]:
 def settles(config: Config) -> list[dict[str, Any]]:
     """Does the simulation agree with the eigenvalues? Slip error that is left at the end, just below and above T*."""
     lags = [factor * bisected(config, config.start_kmh / 3.6 / MirroredRig().body_radius) for factor in (0.9, 1.1)]
-    batch = record.stacked([lagged(config, lag, -math.inf, math.inf) for lag in lags])
+    lanes = stacked([lagged(config, lag, -math.inf, math.inf) for lag in lags])
     solver = FixedStep(step=config.step, duration=config.duration)
-    metrics = jax.vmap(lambda loop: measure(loop, solver, BRAKING))(batch).metrics
+    metrics = run_batch(*lanes, solver, BRAKING, together=True, accepted=True).metrics
     return [
         {"lag [ms]": 1e3 * lag, "final slip error [1]": float(e), "max slip [1]": float(m)}
         for lag, e, m in zip(lags, metrics["final_slip_error"], metrics["max_slip"], strict=True)

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import FixedStep, Loop, measure, replace
+from diffabs import Batch, FixedStep, Loop, measure, replace, run_batch
 from diffabs.controllers import PID, BackCalculation
 from diffabs.objectives import BRAKING, Effort
 from diffabs.papers import record
@@ -25,7 +25,7 @@ from diffabs.references import FixedSlip
 from diffabs.roads import MagicFormula
 from diffabs.scenario.defaults import braking
 from diffabs.stops import Standstill
-from diffabs.tune import Batch, Method, Stopping, latin, run, tune
+from diffabs.tune import Method, Stopping, latin, tune
 
 MEASURED = {**BRAKING, "effort": Effort()}
 
@@ -88,7 +88,7 @@ def scattered(config: Config) -> tuple[np.ndarray, np.ndarray]:
     """Effort and distance of random parameters."""
     batch: Batch = latin({path: (low, high) for path, low, high in config.ranges}, config.random)
     solver = FixedStep(step=config.step, duration=config.duration)
-    metrics = jax.jit(lambda one: run(one, batch, solver, MEASURED).metrics)(car(config))
+    metrics = jax.jit(lambda one: run_batch(one, batch, solver, MEASURED).metrics)(car(config))
     return np.asarray(metrics["effort"]), np.asarray(metrics["stop_distance"])
 
 

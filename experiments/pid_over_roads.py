@@ -22,7 +22,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import qmc, t
 
-from diffabs import FixedStep, Loop, measure, plot, replace
+from diffabs import Batch, FixedStep, Loop, measure, plot, replace, run_batch
 from diffabs.controllers import PID, BackCalculation
 from diffabs.objectives import BRAKING, Effort
 from diffabs.papers import record, slip_estimator
@@ -31,9 +31,8 @@ from diffabs.references import FixedSlip, PeakRobust
 from diffabs.roads import MagicFormula, Patches
 from diffabs.scenario.defaults import braking
 from diffabs.sensors import Noise
-from diffabs.simulate.refill import measure_lanes
 from diffabs.stops import Standstill
-from diffabs.tune import Batch, Method, Stopping, Tuned, tune
+from diffabs.tune import Method, Stopping, Tuned, tune
 
 MEASURED = {**BRAKING, "effort": Effort()}
 
@@ -196,7 +195,7 @@ def screened(config: Config, one: Loop) -> Loop:
 
 def distances(one: Loop, lanes: dict[str, Any], solver: FixedStep) -> np.ndarray:
     """Of lanes that differ in these values; infinite for one that diverges."""
-    found = measure_lanes(one, lanes, solver, {"stop_distance": BRAKING["stop_distance"]})
+    found = run_batch(one, Batch(lanes), solver, {"stop_distance": BRAKING["stop_distance"]})
     return np.nan_to_num(np.asarray(found.metrics["stop_distance"]), nan=np.inf)
 
 
@@ -205,9 +204,9 @@ def judged(config: Config, one: Loop, unseen: Family, noise: float = 0.0) -> dic
     keys = None
     if noise:
         one = dataclasses.replace(one, sensor=Noise(deceleration=noise, period=1e-3))
-        keys = jax.vmap(jax.random.key)(np.arange(len(unseen.time)))
+        keys = np.arange(len(unseen.time))
     solver = FixedStep(step=config.fine, duration=config.longest)
-    done = jax.device_get(measure_lanes(one, unseen.values, solver, MEASURED, keys=keys))
+    done = jax.device_get(run_batch(one, Batch(unseen.values, keys), solver, MEASURED))
     return {**done.metrics, "stopped": done.stopped, "diverged": done.diverged}
 
 

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs import BrakeStart, FixedStep, Loop, plot
+from diffabs import Batch, BrakeStart, FixedStep, Loop, plot
 from diffabs.actuators import Lag
 from diffabs.controllers import PID, BackCalculation, ConstantInput, HoldingInput, ScheduledFeedback, StateFeedback
 from diffabs.core.pytree import Vector, param, part, pytree, replace
@@ -32,7 +32,7 @@ from diffabs.references import FilteredSlip, PeakRobust
 from diffabs.roads import MagicFormula
 from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached, Standstill
-from diffabs.tune import Batch, grid, latin
+from diffabs.tune import grid, latin
 from diffabs.tune.weights import lq_weights, regulator, robust
 
 NAMES = ("gain", "Riccati", "LMI", "schedule", "table 6", "table 12", "table 24", "together", "eight")

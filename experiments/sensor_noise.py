@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import FixedStep, Loop, measure, plot
+from diffabs import FixedStep, Loop, measure, plot, run_batch
 from diffabs.controllers import PID
 from diffabs.objectives import StopDistance
 from diffabs.papers import record
@@ -30,6 +30,7 @@ from diffabs.references import FixedSlip, PeakLatch, PeakRobust
 from diffabs.roads import MagicFormula
 from diffabs.scenario.defaults import braking
 from diffabs.sensors import IntegratedAccelerometer, Noise
+from diffabs.simulate.batch import stacked
 from diffabs.stops import Standstill
 
 
@@ -70,7 +71,8 @@ def noisy(config: Config, loops: list[Loop], duration: float) -> tuple[Any, Any]
     keys = jax.random.split(jax.random.key(config.seed), config.seeds)
     solver = FixedStep(step=config.step, duration=duration)
     one = jax.vmap(lambda loop, key: measure(loop, solver, OBJECTIVES, key=key), (None, 0))
-    run = jax.vmap(lambda loop: one(loop, keys))(record.stacked(loops))
+    first, lanes = stacked(loops)
+    run = lanes.each(first, lambda loop, key: one(loop, keys))
     stopped = np.asarray(run.stopped)
     return np.where(stopped, run.metrics["distance"], run.ending.sample.output.distance), stopped
 
@@ -131,7 +133,7 @@ def biased(config: Config) -> list[dict[str, Any]]:
             braking(sensor=IntegratedAccelerometer(bias=b, floor=f), reference=reference, controller=PID(ki=ki))
             for f, b in cases
         ]
-        run = jax.vmap(lambda loop: measure(loop, solver, OBJECTIVES))(record.stacked(loops))
+        run = run_batch(*stacked(loops), solver, OBJECTIVES, together=True, accepted=True)
         distances = np.where(run.stopped, run.metrics["distance"], np.nan).reshape(len(config.floors), -1)
         for floor, line in zip(config.floors, distances, strict=True):
             columns = {f"{b:+g}": None if np.isnan(x) else float(x) for b, x in zip(config.biases, line, strict=True)}

@@ -13,13 +13,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import FixedStep, Loop, replace, rollout
+from diffabs import Batch, FixedStep, Loop, replace, rollout, run_batch
 from diffabs.actuators import Limits
 from diffabs.core.blocks import Series
 from diffabs.core.pytree import get
 from diffabs.objectives import Overshoot
 from diffabs.sensors import Noise, SpeedScale
-from diffabs.tune import Batch, run
 
 KMH = 3.6
 OVERSHOOT = {"overshoot": Overshoot()}
@@ -93,18 +92,18 @@ def everything(box: Box, one: Loop) -> tuple[Batch, list[str]]:
 def noisy(box: Box, seeds: int) -> Batch:
     """Every lane of the box with every seed."""
     columns = {path: np.repeat(column, seeds) for path, column in box.lanes().items()}
-    return Batch(columns, seeds=list(range(seeds)) * len(box.lanes()["plant.mass"]))
+    return Batch(columns, list(range(seeds)) * len(box.lanes()["plant.mass"]))
 
 
 def weak_spots(one: Loop, box: Box, solver: FixedStep, seeds: int = 4) -> dict[str, float | None]:
     """Worst overshoot [%] by what goes wrong; None where a run diverges."""
     scaled = dataclasses.replace(one, sensor=SpeedScale())
     batch, names = everything(box, scaled)
-    runs = jax.device_get(jax.jit(lambda one: run(one, batch, solver, OVERSHOOT))(scaled))
+    runs = jax.device_get(jax.jit(lambda one: run_batch(one, batch, solver, OVERSHOOT))(scaled))
     found = {spot.name: _worst(runs, np.array(names) == spot.name) for spot in SPOTS}
     shaken = dataclasses.replace(one, sensor=Noise(slip=NOISE, period=1e-3))
     drawn = noisy(box, seeds)
-    runs = jax.device_get(jax.jit(lambda one: run(one, drawn, solver, OVERSHOOT))(shaken))
+    runs = jax.device_get(jax.jit(lambda one: run_batch(one, drawn, solver, OVERSHOOT))(shaken))
     return {**found, NOISY: _worst(runs, np.full(drawn.size, True))}
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs import FixedStep, Loop, Run, measure, plot, replace, rollout
+from diffabs import FixedStep, Loop, Run, measure, plot, replace, rollout, run_batch
 from diffabs.actuators import Lag
 from diffabs.controllers import StateFeedback
 from diffabs.design import Certificate, certify
@@ -28,7 +28,7 @@ from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_design, record
 from diffabs.references import FixedSlip
 from diffabs.scenario.scenario import load
-from diffabs.tune import WorstCase, grid, run, worst_case
+from diffabs.tune import WorstCase, grid, worst_case
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +82,7 @@ def corners(config: Config, one: Loop) -> tuple[float, dict[str, float]]:
     """Greatest overshoot at the corners of the box, and where."""
     batch = grid({path: (low, high) for path, low, high in config.box})
     solver = FixedStep(step=config.step, duration=config.duration)
-    overshoot = np.asarray(jax.jit(lambda one: run(one, batch, solver, BRAKING))(one).metrics["overshoot"])
+    overshoot = np.asarray(jax.jit(lambda one: run_batch(one, batch, solver, BRAKING))(one).metrics["overshoot"])
     i = int(np.nanargmax(overshoot))
     return float(overshoot[i]), {path: float(column[i]) for path, column in batch.values.items()}
 

@@ -14,7 +14,7 @@ from sweeping import SCENARIO, described
 
 from diffabs.reliability.failure import failure_probability
 from diffabs.scenario.scenario import load
-from diffabs.simulate.refill import measure_lanes
+from diffabs.simulate.batch import Batch, run_batch
 
 pytestmark = [pytest.mark.usefixtures("any_step_is_stable", "without_load"), pytest.mark.xdist_group("rare")]
 
@@ -87,9 +87,8 @@ def conditioned(words, count=2048):
     low, high = np.full(count, 0.3), np.full(count, 0.4)
     for _ in range(20):
         middle = (low + high) / 2
-        done = measure_lanes(
-            rig.loop, {**values, "plant.road.w4": middle}, rig.solver, {"t": rig.objectives["stop_time"]}
-        )
+        lanes = Batch({**values, "plant.road.w4": middle})
+        done = run_batch(rig.loop, lanes, rig.solver, {"t": rig.objectives["stop_time"]})
         late = np.asarray(done.metrics["t"]) >= 2.2
         low, high = np.where(late, middle, low), np.where(late, high, middle)
     return 8 / 40 * np.mean(norm.cdf((low - 0.4) / 0.01))

@@ -210,7 +210,7 @@ def test_the_section_reaches_the_tuning(small, invented):
     assert invented["free"] == {"controller.gain": ((-1e4, -60.0), (-100.0, -20.0))}
     assert invented["objective"] == {"iae": 1.0}
     assert invented["over"].values["plant.mass"].tolist() == [5.3, 6.2]
-    assert tuple(invented["over"].seeds) == (3, 3)
+    assert tuple(invented["over"].keys) == (3, 3)
     assert isinstance(invented["aggregate"], library.CVaR)
     assert invented["aggregate"].level == 0.75
     assert [(c.metric, c.bound) for c in invented["constraints"]] == [("overshoot", 0.5), ("iae", 0.5)]

@@ -149,7 +149,6 @@ def test_tuned_over_roads_no_wheel_locks_longer(tmp_path):
         few=4,
         iterations=2,
         own_step=1e-3,
-        fine=2e-3,
         out=str(tmp_path),
     )
     result = module.main(config)

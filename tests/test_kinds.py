@@ -15,7 +15,6 @@ import diffabs as d
 from diffabs import controllers, objectives, plants, roads, stops
 from diffabs.core.pytree import check, strong
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.refill import measure_lanes
 
 SOLVER = d.FixedStep(1e-3, 0.25)
 RIG = braking(
@@ -160,9 +159,9 @@ def test_one_step_may_be_the_whole_run():
         ({"controller.gain": np.ones((2, 3))}, "has shape (3,); it needs (2,)"),
     ],
 )
-def test_lanes_of_the_conveyor_are_looked_at(values, message):
+def test_lanes_are_looked_at(values, message):
     with pytest.raises(ValueError, match=re.escape(message)):
-        measure_lanes(RIG, values, SOLVER, MEASURED)
+        d.run_batch(RIG, d.Batch(values), SOLVER, MEASURED)
 
 
 def test_arrays_of_double_precision_where_single_is_the_default():

@@ -22,11 +22,10 @@ from diffabs.reliability.failure import failure_probability
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import refusals, stable_step
 from diffabs.simulate.outcome import _impossible
-from diffabs.simulate.refill import measure_lanes
 from diffabs.stops import Fallen, SpeedReached
 from diffabs.sweep import Results, sweep
 from diffabs.sweep.statistics.summary import summary
-from diffabs.tune import Batch, Method, StartError, posed, run, tune, worst_case
+from diffabs.tune import Method, StartError, posed, tune, worst_case
 
 RIG = braking(
     plant=plants.MirroredRig(),
@@ -266,11 +265,11 @@ class TestWhoeverRuns:
 
     def test_a_batch_does_not_run_them(self, any_step):
         values = {"initial.speed": np.array([8.0, 1.0, 9.0])}
-        done = measure_lanes(RIG, values, SOLVER, BRAKING)
+        done = d.run_batch(RIG, d.Batch(values), SOLVER, BRAKING)
         np.testing.assert_array_equal(done.diverged, [False, True, False])
         assert np.isnan(done.metrics["stop_time"]).tolist() == [False, True, False]
         with pytest.raises(ValueError, match=r"lane 1: initial.speed = 1 m/s is not above stop.speed"):
-            run(RIG, Batch(values), SOLVER, BRAKING)
+            d.Batch(values).check(RIG, SOLVER)
         arm = dataclasses.replace(d.balancing(), stop=Fallen(angle=0.5))
         starts = {"initial.theta": np.array([0.0, 0.6])}
         found = outcomes(arm, starts, d.FixedStep(1e-3, 0.05), band=0.1)
@@ -285,7 +284,7 @@ class TestWhoeverRuns:
         ask = {"solver": SOLVER, "measured": BRAKING}
         with pytest.raises(ValueError, match=r"the box has points that cannot be run; lane 0: initial.speed = 1 m/s"):
             worst_case(RIG, over={"initial.speed": (1.0, 9.0)}, metric="iae", **ask)
-        over = Batch({"initial.speed": [9.0, 1.0]})
+        over = d.Batch({"initial.speed": [9.0, 1.0]})
         with pytest.raises(StartError, match=r"lane 1: initial.speed = 1 m/s is not above stop.speed"):
             tune(
                 RIG, free={"controller.gain": ((-2e4, -60.0), (-9e3, -30.0))}, objective={"iae": 1.0}, over=over, **ask

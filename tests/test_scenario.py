@@ -418,7 +418,7 @@ def test_lanes_are_every_combination_with_one_noise():
     batch = load("slip-cured", ["solver.seed=4"]).tune.batch(4)
     pairs = {(m, round(3.6 * v)) for m, v in zip(*(batch.values[path].tolist() for path in batch.values), strict=True)}
     assert pairs == {(m, v) for m in (5.3, 5.75, 6.2) for v in (20, 35, 50)}
-    assert tuple(batch.seeds) == (4,) * 9
+    assert tuple(batch.keys) == (4,) * 9
 
 
 @pytest.mark.parametrize("kind", risk.KINDS)

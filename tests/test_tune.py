@@ -14,8 +14,7 @@ from scipy.optimize import minimize
 from diffabs import controllers, plants, references
 from diffabs.core.bijectors import Decades, HalfLine, Interval, Line, bijection, space
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.batch import Batch
-from diffabs.tune import CVaR, Mean, Method, Mode, Quantile, Reason, SmoothWorst, Stopping, grid, latin
+from diffabs.tune import CVaR, Mean, Method, Mode, Quantile, Reason, SmoothWorst, Stopping
 from diffabs.tune.augmented_lagrangian import Search
 from diffabs.tune.descent import Descent, Optimiser, lbfgs
 from diffabs.tune.problem import Evaluation, Multipliers, Seen, _penalty
@@ -125,46 +124,6 @@ class TestAggregates:
             away = (aggregate(x + e) - aggregate(x - e)) / (2 * h)
             np.testing.assert_allclose(slope[i], away, rtol=1e-6, atol=1e-8)
         np.testing.assert_allclose(slope @ x, aggregate(x), rtol=1e-9)  # homogeneous of the first degree
-
-
-class TestBatch:
-    def test_a_grid_has_every_combination(self):
-        batch = grid({"plant.mass": [5.0, 6.0], "initial.speed": [10.0, 12.0, 14.0]}).check(LOOP)
-        assert batch.size == 6
-        pairs = set(zip(batch.values["plant.mass"].tolist(), batch.values["initial.speed"].tolist(), strict=True))
-        assert pairs == {(m, v) for m in (5.0, 6.0) for v in (10.0, 12.0, 14.0)}
-        assert float(batch.lane(LOOP, 5).plant.mass) == 6.0
-
-    def test_a_latin_hypercube_has_one_lane_in_each_strip(self):
-        batch = latin({"plant.mass": (5.0, 6.0), "initial.speed": (10.0, 20.0)}, 50, seed=4)
-        for path, (low, width) in {"plant.mass": (5.0, 1.0), "initial.speed": (10.0, 10.0)}.items():
-            strips = np.floor((batch.values[path] - low) / width * 50).astype(int)
-            assert sorted(strips) == list(range(50))
-
-    def test_lanes_of_similar_length_run_together(self):
-        times = np.array([1.0, 9.0, 3.0, 10.0, 1.2])
-        batch = Batch({"plant.mass": np.full(5, 5.0)}, durations=times)
-        groups = batch.groups(8.0)
-        assert sorted(np.concatenate([lanes for lanes, _ in groups])) == [0, 1, 2, 3, 4]
-        for lanes, duration in groups:
-            wanted = np.minimum(times[lanes], 8.0)
-            assert duration == wanted.max() < 2 * wanted.min() * (1 + 1e-9)
-
-    @pytest.mark.parametrize(
-        ("batch", "message"),
-        [
-            (Batch({"plant.mas": [5.0]}), "plant.mas is not a parameter of the loop"),
-            (Batch({"plant.mass": [5.0], "initial.speed": [9.0, 8.0]}), "different lengths, or none: plant.mass 1"),
-            (Batch({"plant.mass": []}), "different lengths, or none"),
-            (Batch({"plant.mass": [5.0, -1.0]}), r"plant.mass = -1 ... 5 leaves \(0, inf\) kg"),
-            (Batch({"controller.gain": [1.0, 2.0]}), r"a lane has shape \(\), not \(2,\)"),
-            (Batch({"plant.mass": [5.0]}, weights=[0.0]), "weights = 0 ... 0 are not all positive"),
-            (Batch({"plant.mass": [5.0]}, durations=[np.nan]), "durations = nan"),
-        ],
-    )
-    def test_says_what_does_not_fit(self, batch, message):
-        with pytest.raises(ValueError, match=message):
-            batch.check(LOOP)
 
 
 def evaluation(function, excess=lambda z: jnp.zeros(0)):

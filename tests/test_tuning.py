@@ -20,7 +20,7 @@ from diffabs.objectives import BRAKING
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.stable_step import stable_step, stable_steps
 from diffabs.stops import SpeedReached
-from diffabs.tune import AtMost, Batch, CertifiedDecay, Method, Mode, Poles, Stopping, WorstCase, grid, tune, worst_case
+from diffabs.tune import AtMost, CertifiedDecay, Method, Mode, Poles, Stopping, WorstCase, grid, tune, worst_case
 from diffabs.tune.problem import Multipliers
 from diffabs.tune.tuning import posed
 from diffabs.tune.weights import lq_weights, regulator
@@ -114,7 +114,7 @@ def test_a_start_that_is_not_stable_is_refused():
         ({"objective": {"iea": 1.0}}, "iea is not measured; there is stop_time"),
         ({"objective": {"iae": np.nan}}, "the weight of iae is nan"),
         ({"constraints": [AtMost("overshot", 0.1)]}, "overshot is not measured"),
-        ({"over": Batch({"plant.mass": [-1.0]})}, "plant.mass = -1"),
+        ({"over": d.Batch({"plant.mass": [-1.0]})}, "plant.mass = -1"),
         ({"free": {"plant.mass": (9.0, 10.0)}}, "plant.mass = 5.3 is not inside"),
     ],
 )
@@ -130,11 +130,11 @@ def test_lanes_in_groups_are_the_lanes_together():
     values = {"initial.speed": speeds}
     ask = {"free": GAINS, "objective": {"stop_distance": 1.0}, "solver": d.FixedStep(5e-4, 0.8)}
     together, apart = (
-        jax.jit(posed(RIG, over=Batch(values, durations=t), **ask).seen)(jnp.zeros(2))
+        jax.jit(posed(RIG, over=d.Batch(values, durations=t), **ask).seen)(jnp.zeros(2))
         for t in (None, np.array([0.3, 0.8, 0.25, 0.75]))
     )
     np.testing.assert_allclose(apart.metrics["stop_distance"], together.metrics["stop_distance"], rtol=1e-12)
-    weighed = posed(RIG, over=Batch(values, weights=1 / speeds), **ask).seen(jnp.zeros(2))
+    weighed = posed(RIG, over=d.Batch(values, weights=1 / speeds), **ask).seen(jnp.zeros(2))
     np.testing.assert_allclose(weighed.objective, np.mean(together.metrics["stop_distance"] / speeds), rtol=1e-12)
 
 

@@ -12,7 +12,7 @@ import subprocess
 import sys
 
 ROOT = pathlib.Path(__file__).parent.parent
-TESTS = ("pytree", "linearize", "integrate", "rollout", "gradients", "conveyor", "checkpoints", "riccati", "blocks",
+TESTS = ("pytree", "linearize", "integrate", "rollout", "gradients", "batch", "checkpoints", "riccati", "blocks",
          "tune", "sweep")  # fmt: skip
 
 

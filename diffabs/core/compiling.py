@@ -34,7 +34,7 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | Non
 
         @functools.wraps(function)
         def call(*args: Any, **more: Any) -> Any:
-            return (plain if _traced((args, more)) else quick)(*args, **more)
+            return (plain if traced(args, more) else quick)(*args, **more)
 
         call._cache_size = lambda: plain._cache_size() + quick._cache_size()  # pyright: ignore
         return call  # pyright: ignore[reportReturnType]
@@ -42,6 +42,7 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | Non
     return decorate
 
 
-def _traced(tree: Any) -> bool:
-    """Return whether a trace is under way: options are for a program, not for a part of one."""
-    return isinstance(jax.device_put(0), Tracer) or any(isinstance(x, Tracer) for x in jax.tree.leaves(tree))
+def traced(*trees: Any) -> bool:
+    """Return whether a trace is under way (jit), or these are no numbers yet (also grad, vmap): options are for a whole
+    program, and of what is no number nothing can be asked."""
+    return isinstance(jax.device_put(0), Tracer) or any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))

@@ -26,4 +26,4 @@ def separated(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[An
         rest = iter(leaves)
         return tree.unflatten([next(rest) if on else x for x, on in zip(fixed, moves, strict=True)])
 
-    return jax.vmap(moving)(batch), whole
+    return jax.vmap(moving)(batch) if any(moves) else [], whole

@@ -24,7 +24,7 @@ import numpy as np
 from diffabs.controllers.balance import state_of
 from diffabs.core.loop import Loop
 from diffabs.design.capture import capture
-from diffabs.simulate.refill import measure_lanes
+from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.solution import FixedStep
 
 FEWEST = 256  # lanes that a core is given on its own
@@ -130,7 +130,7 @@ def outcomes(
         mine = {path: column[lanes] for path, column in starts.items()}
         own = None if keys is None else keys[lanes]
         enough = inside.of(lanes) if band is None else None
-        return jax.device_get(measure_lanes(loop, mine, solver, {}, keys=own, enough=enough))
+        return jax.device_get(run_batch(loop, Batch(mine, own), solver, enough=enough))
 
     found = Outcomes(*np.zeros((4, count), bool), time=np.zeros(count))
     slices = [slice(i, None, parts) for i in range(parts)]

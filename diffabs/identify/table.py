@@ -2,10 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,6 +13,7 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import check, get, parameters, replace, strong
 from diffabs.identify.data import Comparison, check_positive
 from diffabs.objectives import BRAKING
+from diffabs.simulate.batch import Batch, by_structure, stacked
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import FixedStep
 
@@ -41,12 +41,11 @@ class Table:
     def against(self, loop: Loop, free: Sequence[str], solver: FixedStep) -> Comparison:
         """Compare with the metrics of every row's loop."""
         self._check(loop, free)
-        groups: dict[Any, list[str]] = {}
-        for row in self.values:
-            one = strong(self.loops[row])
-            groups.setdefault((jax.tree.structure(one), tuple(map(jnp.shape, jax.tree.leaves(one)))), []).append(row)
-        batches = [_stacked([self.loops[row] for row in rows]) for rows in groups.values()]
-        order = [row for rows in groups.values() for row in rows]
+        loops = [self.loops[row] for row in self.values]
+        groups = by_structure(loops)
+        order = [list(self.values)[i] for places in groups for i in places]
+        lanes = (stacked([loops[i] for i in places]) for places in groups)
+        batches = [(strong(one), batch.values) for one, batch in lanes]
         metrics = list(dict.fromkeys(metric for _, metric in self.labels))
         place = np.array([(order.index(row), metrics.index(metric)) for row, metric in self.labels])
         target = np.array([self.values[row][metric] for row, metric in self.labels])
@@ -54,7 +53,7 @@ class Table:
         sigma = None if weights is None else np.array([weights[metric] for _, metric in self.labels])
         measured = _Measured(solver, tuple(free), tuple((name, self.measured[name]) for name in metrics))
         data = batches, place, target
-        return Comparison(measured, data, sigma, lambda part: [measured.loops(part, batch) for batch in batches])
+        return Comparison(measured, data, sigma, lambda part: measured.each(part, batches, lambda loop: loop))
 
     def _check(self, loop: Loop, free: Sequence[str]) -> None:
         for row, line in self.values.items():
@@ -91,19 +90,15 @@ class _Measured:
     shared: tuple[str, ...]
     objectives: tuple[tuple[str, Objective], ...]
 
-    def loops(self, part: Any, batch: Any) -> Any:
-        """Rows of a batch with the parameters that they share."""
+    def each(self, part: Any, batches: Any, function: Callable[[Any], Any]) -> list[Any]:
+        """`function` of the rows of each batch, with the parameters that they share."""
         values = {path: get(part, path) for path in self.shared}
-        return jax.vmap(lambda row: replace(row, values))(batch)
+        return [Batch(rows).each(loop, lambda row, key: function(replace(row, values))) for loop, rows in batches]
 
     def __call__(self, part: Any, batches: Any, place: Any, target: Any) -> Any:
         def row(loop: Any) -> Any:
             metrics = measure(loop, self.solver, dict(self.objectives)).metrics
             return jnp.stack([metrics[name] for name, _ in self.objectives])
 
-        seen = jnp.concatenate([jax.vmap(row)(self.loops(part, batch)) for batch in batches])
+        seen = jnp.concatenate(self.each(part, batches, row))
         return seen[place[:, 0], place[:, 1]] - target
-
-
-def _stacked(loops: Sequence[Loop]) -> Any:
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x, float) for x in leaves]), *loops)

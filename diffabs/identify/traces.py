@@ -11,7 +11,7 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import clamp, ratio
-from diffabs.core.pytree import replace, strong
+from diffabs.core.pytree import strong
 from diffabs.identify.data import Comparison, check_positive
 from diffabs.identify.fit import Identified
 from diffabs.simulate.batch import Batch
@@ -54,12 +54,12 @@ class Traces:
         target = np.concatenate([self._full(column) for column in self.columns.values()])[kept]
         weights = self.sigma
         sigma = None if weights is None else np.concatenate([self._full(weights[name]) for name in self.columns])[kept]
-        simulated = _Simulated(solver, tuple(self.columns), len(over) > 0)
+        simulated = _Simulated(solver, tuple(self.columns))
         return Comparison(
             simulated,
             (over, np.asarray(self.t, float), kept, target),
             sigma,
-            lambda part: [simulated.loops(part, over)],
+            lambda part: [Batch(over).each(strong(part), lambda loop, key: loop)],
         )
 
     def residuals(self, found: Identified) -> dict[str, np.ndarray]:
@@ -119,17 +119,9 @@ class _Simulated:
 
     solver: FixedStep
     fields: tuple[str, ...]
-    several: bool
-
-    def loops(self, loop: Any, over: Mapping[str, Any]) -> Any:
-        """One per run, stacked."""
-        loop = strong(loop)
-        if not self.several:
-            return jax.tree.map(lambda x: x[None], loop)
-        return jax.vmap(lambda values: replace(loop, values))(over)
 
     def __call__(self, loop: Any, over: Any, t: Any, kept: Any, target: Any) -> Any:
-        seen = jax.vmap(lambda one: self._columns(one, t))(self.loops(loop, over))
+        seen = Batch(over).each(strong(loop), lambda one, key: self._columns(one, t))
         return jnp.swapaxes(seen, 0, 1).ravel()[kept] - target
 
     def _columns(self, loop: Any, t: Any) -> Any:

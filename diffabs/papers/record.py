@@ -17,11 +17,6 @@ from diffabs.core import files, provenance
 from diffabs.simulate.solution import FixedStep, Run
 
 
-def stacked(loops: Sequence[Any]) -> Any:
-    """Loops of one structure as one batch, for `jax.vmap`."""
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, float) for x in leaves]), *loops)
-
-
 def lane(run: Run, i: int) -> Run:
     """One run out of a batch, as NumPy arrays."""
     return jax.tree.map(lambda x: np.asarray(x[i]), run)

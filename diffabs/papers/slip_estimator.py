@@ -24,6 +24,7 @@ from diffabs.plants import GRAVITY, QuarterCar
 from diffabs.references import FixedSlip, PeakLatch, PeakLiteral
 from diffabs.roads import MagicFormula, peak
 from diffabs.scenario.defaults import braking
+from diffabs.simulate.batch import run_batch, stacked
 from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import FixedStep, Run
 
@@ -90,8 +91,8 @@ def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
     locked = rollout(loop(car, FixedSlip(), ConstantTorque(torque=90.0)), solver, BRAKING)
     runs = {"no ABS": jax.tree.map(np.asarray, locked)}
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
-        batch = record.stacked([loop(car, reference, PID(kp=3893.0, ki=ki, kd=kd)) for ki, kd in GAINS.values()])
-        done = jax.vmap(lambda one: rollout(one, solver, BRAKING))(batch)
+        lanes = stacked([loop(car, reference, PID(kp=3893.0, ki=ki, kd=kd)) for ki, kd in GAINS.values()])
+        done = run_batch(*lanes, solver, BRAKING, trajectories=True, accepted=True)
         runs |= {f"{method} {name}": record.lane(done, i) for i, name in enumerate(GAINS)}
     return runs
 

@@ -23,7 +23,8 @@ from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip
 from diffabs.roads import RIG, peak
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.run import measure, rollout
+from diffabs.simulate.batch import run_batch, stacked
+from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import FixedStep, Run, Trajectory
 from diffabs.stops import SpeedReached
 
@@ -118,8 +119,7 @@ def loop(case: Case, reference: Any = None) -> Loop:
 def run() -> dict[str, Run]:
     """Every case, by name."""
     cases = CASES + GAINS
-    batch = record.stacked([loop(case) for case in cases])
-    done = jax.vmap(lambda one: rollout(one, SOLVER, BRAKING))(batch)
+    done = run_batch(*stacked([loop(case) for case in cases]), SOLVER, BRAKING, trajectories=True, accepted=True)
     return {case.name: record.lane(done, i) for i, case in enumerate(cases)}
 
 
@@ -131,9 +131,9 @@ def run_filtered() -> Run:
 
 def convergence(fine: Mapping[str, Run]) -> Errors:
     """Relative errors against a finer run at each step length, by case and quantity."""
-    batch = record.stacked([loop(case) for case in CONVERGENCE])
+    lanes = stacked([loop(case) for case in CONVERGENCE])
     solvers = [FixedStep(step=step, duration=step * HALVING_STEPS) for step in HALVINGS]
-    runs = [jax.vmap(lambda one, s=solver: measure(one, s, BRAKING))(batch) for solver in solvers]
+    runs = [run_batch(*lanes, solver, BRAKING, together=True, accepted=True) for solver in solvers]
 
     def errors(i: int, name: str, quantity: str) -> list[float]:
         exact = float(fine[name].metrics[quantity])

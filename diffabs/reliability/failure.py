@@ -13,14 +13,13 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.pytree import replace
 from diffabs.reliability.importance_sampling import STARTS, Gradient
 from diffabs.reliability.subset_simulation import RareEvent, subset_simulation
-from diffabs.simulate.refill import measure_lanes
+from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.refusals import refusals
-from diffabs.simulate.run import measure
 from diffabs.sweep.study import Study, noise_key, precision
 
 STEP = 1e-4  # of the differences in z: errors of 1e-9 and 1e-12 of the values
@@ -54,15 +53,17 @@ def failure_probability(
 def _scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
     """The metric at z (n, dimension), NaN where the run diverges. n is filled up to a power of two: few programs."""
     values = study.space.normal(_filled(z, 1 << (len(z) - 1).bit_length()))
-    size = len(next(iter(values.values())))
     _check_runnable(study, values, len(z))
     with precision(study.dtype):
-        keys = jax.vmap(lambda _: noise_key(study.seed, 0))(np.arange(size))
-        loop, objective = _typed(study, metric)
-        done = jax.device_get(
-            measure_lanes(loop, values, study.solver, objective, keys=keys, accepted=np.ones(size, bool))
-        )
-    return np.asarray(done.metrics[metric], float)[: len(z)]
+        return np.asarray(_measured(study, metric, values), float)[: len(z)]
+
+
+def _measured(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
+    """The metric of lanes (n,) that share one sequence of noise."""
+    given = study.loop, {metric: study.objectives[metric]}
+    loop, objective = jax.tree.map(lambda x: np.asarray(x, study.dtype), given)
+    keys = jax.vmap(lambda _: noise_key(study.seed, 0))(np.arange(Batch(values).size))
+    return run_batch(loop, Batch(values, keys), study.solver, objective, accepted=True).metrics[metric]
 
 
 def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) -> None:
@@ -94,11 +95,11 @@ def _gradient(study: Study, metric: str) -> Gradient:
 def _slopes(study: Study, metric: str) -> Callable[[Mapping[str, Any]], Any]:
     """The metric of a batch of values, and its derivative in each. Compiled once."""
 
-    def one(values: Mapping[str, Any]) -> Any:
-        loop, objective = _typed(study, metric)
-        return measure(replace(loop, values), study.solver, objective, key=noise_key(study.seed, 0)).metrics[metric]
+    def slopes(values: Mapping[str, Any]) -> Any:
+        scores, pull = jax.vjp(lambda values: _measured(study, metric, values), values)
+        return scores, *pull(jnp.ones_like(scores))
 
-    return jax.jit(jax.vmap(jax.value_and_grad(one)))
+    return jax.jit(slopes)
 
 
 def _steepness(study: Study, z: np.ndarray) -> dict[str, np.ndarray]:
@@ -113,7 +114,3 @@ def _steepness(study: Study, z: np.ndarray) -> dict[str, np.ndarray]:
 def _filled(z: np.ndarray, size: int) -> np.ndarray:
     """With copies of the last row."""
     return np.concatenate([z, np.repeat(z[-1:], size - len(z), axis=0)])
-
-
-def _typed(study: Study, metric: str) -> tuple[Any, Any]:
-    return jax.tree.map(lambda x: np.asarray(x, study.dtype), (study.loop, {metric: study.objectives[metric]}))

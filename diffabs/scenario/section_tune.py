@@ -112,7 +112,7 @@ class Goal:
             lanes = latin({path: (min(v), max(v)) for path, v in self.over.items()}, self.samples, self.seed)
         else:
             lanes = grid(self.over)
-        return dataclasses.replace(lanes, seeds=(seed,) * max(lanes.size, 1))
+        return dataclasses.replace(lanes, keys=(seed,) * max(lanes.size, 1))
 
     def aggregated(self) -> risk.Aggregate:
         """From a number per lane to one."""

@@ -1,17 +1,20 @@
-"""The runs that a controller is judged on: masses, speeds, roads, noise, one lane each."""
+"""Many runs at once: masses, speeds, roads, noise, one lane each."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.compiling import traced
+from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import get, parameters, replace
-from diffabs.simulate.refusals import first_line, traced
-from diffabs.simulate.run import measure
+from diffabs.core.pytree import arrayed, get, parameters, replace
+from diffabs.simulate.refill import Enough, run_refilled
+from diffabs.simulate.refusals import first_line, refusals
+from diffabs.simulate.run import arguments, measure, rollout
 from diffabs.simulate.solution import FixedStep, Run
 
 LONGER = 2.0  # lanes that run together differ by less than this factor in length
@@ -19,36 +22,35 @@ LONGER = 2.0  # lanes that run together differ by less than this factor in lengt
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """Lanes: parameters of a loop by dotted path, an array with one row per lane each. An empty batch is the loop
-    itself, one lane.
+    """Lanes: what differs between runs of a loop, a row for each. An empty batch is the loop itself, one lane.
 
-    seeds: of noisy sensors, one per lane
-    weights: positive, one per lane; the lane's objective is multiplied by it (1/the shortest distance possible, say)
-    durations: [s], in which each lane is sure to end; lanes of similar length are run together, so that the short ones
-        do not wait for the long ones. Without them all run for `solver.duration`
+    values: parameters by dotted path, in SI, (lanes, ...)
+    keys: for noisy sensors, keys of `jax.random` or whole numbers, the seeds of keys (lanes,)
+    weights: positive (lanes,); `tune` multiplies the lane's objective by it (1/the shortest distance possible, say)
+    durations: [s] (lanes,), in which each lane is sure to end; lanes that run together are then of similar length, so
+        that the short ones do not wait for the long ones. Without them all run for `solver.duration`
     """
 
     values: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    seeds: Sequence[int] | None = None
+    keys: Any = None
     weights: Any = None
     durations: Any = None
 
     @property
     def size(self) -> int:
-        """How many lanes."""
-        return next((len(column) for column in self._columns().values()), 1)
-
-    def _columns(self) -> dict[str, Any]:
-        others = {name: getattr(self, name) for name in ("seeds", "weights", "durations")}
-        return {**self.values, **{name: column for name, column in others.items() if column is not None}}
-
-    def check(self, loop: Any) -> "Batch":
-        """Raises ValueError for a path that does not exist, columns of different lengths, a value out of range."""
-        specs = {path: spec for path, spec, _ in parameters(loop)}
-        lengths = {name: np.shape(column)[0] if np.ndim(column) else 0 for name, column in self._columns().items()}
+        """How many lanes. Raises ValueError for columns of different lengths, or of none."""
+        others = {name: getattr(self, name) for name in ("keys", "weights", "durations")}
+        columns = {**self.values, **{name: column for name, column in others.items() if column is not None}}
+        lengths = {name: np.shape(column)[0] if np.ndim(column) else 0 for name, column in columns.items()}
         if len(set(lengths.values())) > 1 or 0 in lengths.values():
             listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
             raise ValueError(f"the lanes' values have different lengths, or none: {listed}")
+        return next(iter(lengths.values()), 1)
+
+    def check(self, loop: Any, solver: FixedStep | None = None) -> "Batch":
+        """Return the batch if its lanes fit the loop. Raises ValueError for a path that does not exist, columns of
+        different lengths, a value out of range, and, with a solver, a lane that must not be run: see `refusals`."""
+        specs, _ = {path: spec for path, spec, _ in parameters(loop)}, self.size
         for path, column in self.values.items():
             if path not in specs:
                 raise ValueError(f"{path} is not a parameter of the loop; there is {', '.join(specs)}")
@@ -61,60 +63,122 @@ class Batch:
             column = getattr(self, name)
             if column is not None and not (np.isfinite(column) & (np.asarray(column) > 0)).all():
                 raise ValueError(f"{name} = {np.min(column):g} ... {np.max(column):g} are not all positive and finite")
+        if solver and (line := first_line(loop, self.values, solver)):
+            raise ValueError(line)
         return self
 
     def groups(self, duration: float) -> list[tuple[np.ndarray, float]]:
-        """Lanes (their numbers) that are run together, and for how long [s]."""
-        if self.durations is None:
-            return [(np.arange(self.size), duration)]
+        """Lanes (their numbers) of similar `durations`, and for how long [s] they are run, at most `duration`."""
         wanted = np.minimum(np.asarray(self.durations, float), duration)
         classes = np.floor(np.log(wanted.max() / wanted) / np.log(LONGER)).astype(int)
         members = [np.flatnonzero(classes == i) for i in np.unique(classes)]
         return [(lanes, float(wanted[lanes].max())) for lanes in members]
 
-    def arrays(self) -> tuple[dict[str, Any], Any]:
-        """Values and keys with a leading lane axis, for `jax.vmap`; keys None without seeds."""
-        seeds = None if self.seeds is None else jax.vmap(jax.random.key)(jnp.asarray(self.seeds))
-        return {path: jnp.asarray(column, float) for path, column in self.values.items()}, seeds
-
     def lane(self, loop: Any, i: int) -> Any:
         """The loop of lane i."""
         return replace(loop, {path: np.asarray(column)[i] for path, column in self.values.items()})
 
+    def each(self, loop: Any, function: Callable[[Any, Any], Any], lanes: Any = None) -> Any:
+        """Return function(loop, key) of every lane (key None without keys), or of those of the numbers `lanes`, with a
+        leading axis: `jax.vmap`, differentiable."""
+        columns = {path: jnp.asarray(column, float) for path, column in self.values.items()}, self._keys()
+        if not jax.tree.leaves(columns):
+            return jax.tree.map(lambda x: jnp.asarray(x)[None], function(loop, None))
+        if lanes is not None:
+            columns = jax.tree.map(lambda column: column[lanes], columns)
+        return jax.vmap(lambda values, key: function(replace(loop, values), key))(*columns)
 
-def check_lanes(loop: Any, batch: Batch, solver: FixedStep) -> None:
-    """Raises ValueError, one line, for the first lane that must not be run: see `refusals`."""
-    if line := first_line(loop, batch.values, solver):
-        raise ValueError(line)
+    def _keys(self) -> Any:
+        if self.keys is None or jnp.issubdtype(jnp.asarray(self.keys).dtype, jax.dtypes.prng_key):
+            return self.keys
+        return jax.vmap(jax.random.key)(jnp.asarray(self.keys))
 
 
-def run(loop: Any, batch: Batch, solver: FixedStep, measured: Mapping[str, Objective]) -> Run:
-    """Run every lane of a batch, in order, and return the metrics (lanes,), without trajectories.
+def run_batch(
+    loop: Loop,
+    batch: Batch,
+    solver: FixedStep,
+    objectives: Mapping[str, Objective] | None = None,
+    *,
+    trajectories: bool = False,
+    together: bool | None = None,
+    accepted: Any = None,
+    enough: Enough | None = None,
+) -> Run:
+    """Run every lane of a batch and return what `measure` returns of each: a `Run` with a leading axis, in their order.
 
-    loop: a Loop, or a part with a method `closed()`; differentiable in it
-    solver: of every run
-    measured: objectives by metric
+    loop: what the lanes have in common
+    batch: what differs between them; an empty one is one lane
+    solver: step and duration [s] of every run
+    objectives: by the names of the metrics, which are (lanes,); None is none
+    trajectories: keep them, (lanes, instants, ...), every `solver.every`-th instant
+    together: True is `jax.vmap` of `measure`: all lanes step until the last has ended, and there are derivatives in
+        both modes, in the loop and in the batch's values. False has no reverse mode, but a lane that has ended makes
+        room for the next, so that few long ones do not hold up the rest. The two agree to rounding. None is True if
+        the call is traced (inside jit, grad, vmap); trajectories and an empty batch are always run together
+    accepted: which lanes are run (lanes,), or True for all; the others have `diverged`, and their metrics are NaN.
+        None is those that `refusals` accepts, or all if the call is traced
+    enough: ends runs early, which then have neither stopped, timed out nor diverged; not together
 
-    Raises ValueError for a lane that must not be run, unless the call is traced: then ask `check_lanes` before."""
-    if not traced(loop, dict(batch.values)):
-        check_lanes(loop, batch, solver)
-    columns = batch.arrays()
-    if not jax.tree.leaves(columns):
-        return jax.tree.map(lambda x: x[None], measure(loop, solver, measured))
+    Compiled once for a structure and a number of lanes, not for new values, keys or durations.
+
+    Raises:
+        ValueError: columns of different lengths; what `measure` objects to; `enough` for lanes that run together.
+        KeyError: a path that does not exist.
+    """
+    objectives, count = objectives or {}, batch.size
+    arguments(replace(loop, {path: column[0] for path, column in batch.values.items()}), solver, objectives)
+    live = traced(loop, dict(batch.values), dict(objectives))
+    if accepted is None:
+        asked = bool(batch.values) and not live
+        accepted = refusals(loop, batch.values, solver).accepted if asked else live or not first_line(loop, {}, solver)
+    if trajectories or (live if together is None else together) or (not batch.values and batch.keys is None):
+        if enough is not None:
+            raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
+        return _flagged(_together(loop, batch, solver, objectives, rollout if trajectories else measure), accepted)
+    accepted = jnp.broadcast_to(jnp.asarray(accepted, bool), count)
+    return run_refilled(loop, batch.values, batch._keys(), solver, objectives, accepted, enough)
+
+
+def _together(loop: Loop, batch: Batch, solver: FixedStep, objectives: Mapping[str, Objective], run: Any) -> Run:
+    """In groups of similar length, but trajectories have all the same instants."""
+
+    def found(lanes: Any, duration: float) -> Run:
+        like = dataclasses.replace(solver, duration=duration)
+        return batch.each(loop, lambda one, key: run(one, like, objectives, key=key), lanes)
+
+    if run is rollout or batch.durations is None:
+        return found(None, solver.duration)
     groups = batch.groups(solver.duration)
-    found = []
-    for lanes, duration in groups:
-        values, keys = jax.tree.map(lambda column: column[lanes], columns)  # noqa: B023
-        found.append(_together(loop, values, keys, dataclasses.replace(solver, duration=duration), measured))
     order = np.argsort(np.concatenate([lanes for lanes, _ in groups]))
-    return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *found)
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *(found(*group) for group in groups))
 
 
-def _together(loop: Any, values: Any, keys: Any, solver: FixedStep, measured: Mapping[str, Objective]) -> Run:
-    def lane(values: Any, key: Any) -> Run:
-        return measure(replace(loop, values), solver, measured, key=key)
+def _flagged(run: Run, accepted: Any) -> Run:
+    """With lanes that are not accepted as refilled ones are."""
+    if accepted is True:
+        return run
+    accepted = jnp.asarray(accepted, bool)
+    metrics = {name: jnp.where(accepted, value, jnp.nan) for name, value in run.metrics.items()}
+    flags = {"stopped": run.stopped & accepted, "timed_out": run.timed_out & accepted}
+    return run._replace(metrics=metrics, diverged=run.diverged | ~accepted, **flags)
 
-    return jax.vmap(lane)(values, keys)
+
+def by_structure(loops: Sequence[Any]) -> list[list[int]]:
+    """Return the places of those loops that can be lanes of one batch: of equal structure and shapes."""
+    groups: dict[Any, list[int]] = {}
+    for place, loop in enumerate(map(arrayed, loops)):
+        groups.setdefault((jax.tree.structure(loop), *map(np.shape, jax.tree.leaves(loop))), []).append(place)
+    return list(groups.values())
+
+
+def stacked(loops: Sequence[Any]) -> tuple[Any, Batch]:
+    """Return loops of one structure as lanes, for `run_batch`: the first of them, and every parameter of each (lanes,
+    ...). Raises ValueError for loops of different structures: see `by_structure`."""
+    if (kinds := len(by_structure(loops))) != 1:
+        raise ValueError(f"loops of {kinds} structures are no lanes of one batch")
+    each = [{path: value for path, _, value in parameters(loop)} for loop in loops]
+    return loops[0], Batch({path: np.stack([np.asarray(one[path], float) for one in each]) for path in each[0]})
 
 
 def grid(values: Mapping[str, Sequence[float]]) -> Batch:

@@ -9,15 +9,13 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import misshapen, replace, strong
+from diffabs.core.pytree import replace, strong
 from diffabs.core.tracing import separated
 from diffabs.simulate.hybrid_step import Carry, Condition, init_carry, step
 from diffabs.simulate.outcome import judge, prepare
-from diffabs.simulate.refusals import refusals, traced
 from diffabs.simulate.run import arguments
 from diffabs.simulate.solution import FixedStep, Run
 
@@ -33,42 +31,22 @@ class Enough(Protocol):
         ...
 
 
-def measure_lanes(
+def run_refilled(
     loop: Loop,
     values: Mapping[str, Any],
+    keys: Any,
     solver: FixedStep,
     objectives: Mapping[str, Objective],
-    *,
-    keys: Any = None,
-    width: int = WIDTH,
-    accepted: Any = None,
+    accepted: Any,
     enough: Enough | None = None,
 ) -> Run:
-    """What `jax.vmap` of `measure` computes for lanes that differ in the values (lanes,) at these paths, and in their
-    keys. Compiled once for a number of lanes and paths; not differentiable in reverse mode. With `enough` a run ends
-    besides where that is reached, looked at every ROUND steps; it then has not stopped.
+    """Return what `jax.vmap` of `measure` computes for lanes that differ in the values (lanes, ...) by path, and in
+    their keys (lanes,) or None; `batch.run_batch` says what the arguments mean. Not for reverse mode.
 
-    accepted (lanes,): lanes that are run; the others are flagged as diverged. None is those that `refusals` accepts,
-        which are asked for unless the call is itself traced: then say it
-
-    Raises ValueError without values, and for what `measure` objects to."""
-    if not values:
-        raise ValueError("no value differs between the lanes")
-    if lines := list(misshapen(replace(loop, {path: x[0] for path, x in values.items() if np.ndim(x)}))):
-        raise ValueError("; ".join(lines))
-    if accepted is None:
-        accepted = _accepted(loop, values, solver)
+    Raises ValueError for what `measure` objects to."""
     loop, objectives, h = arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, h.dtype), dict(values)))
-    return _run(
-        loop, values, objectives, h, keys, jnp.asarray(accepted, bool), enough, jnp.asarray(solver.steps), width=width
-    )
-
-
-def _accepted(loop: Loop, values: Mapping[str, Any], solver: FixedStep) -> Any:
-    if traced(loop, dict(values)):
-        return jnp.ones(len(next(iter(values.values()))), bool)
-    return refusals(loop, values, solver).accepted
+    return _run(loop, values, objectives, h, keys, accepted, enough, jnp.asarray(solver.steps), width=WIDTH)
 
 
 class _Belt(NamedTuple):
@@ -96,7 +74,7 @@ def _run(
     *,
     width: int,
 ) -> Run:
-    count = len(next(iter(values.values())))
+    count = len(accepted)
     leaves, whole = separated(lambda v: prepare(replace(loop, v)), values)
 
     def built(mine: Any) -> tuple[Loop, dict[str, Objective]]:
@@ -104,7 +82,7 @@ def _run(
         return one, objectives | audit
 
     step_all = jax.vmap(lambda mine, key, carry: step(*built(mine), h, key, steps, carry))
-    start = jax.vmap(lambda mine: init_carry(*built(mine), h))
+    start = jax.vmap(lambda mine, key: init_carry(*built(mine), h))
     over = jax.vmap(lambda mine, carry: judge(*built(mine), h, carry)[0])
 
     def early(number: Any, mine: Any, carry: Carry) -> Any:
@@ -117,7 +95,7 @@ def _run(
     def taken(number: Any) -> tuple[Any, Any, Carry]:
         """Lanes at their start; beyond the last one a copy of it that does not run."""
         mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
-        carry = start(mine)
+        carry = start(mine, key)
         condition = jnp.where(run & (number < count), carry.condition, Condition.DIVERGED)
         return mine, key, carry._replace(condition=condition.astype(carry.condition.dtype))
 

@@ -14,9 +14,8 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
-from diffabs.core.compiling import QUICK, compile_once
+from diffabs.core.compiling import QUICK, compile_once, traced
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import broken, grid_rules, replace, rules, strong
 from diffabs.core.pytree import check as check_parts
@@ -145,11 +144,6 @@ def first_line(loop: Loop, values: Mapping[str, Any], solver: FixedStep) -> str 
     except ValueError as error:
         why = str(error)
     return f"lane {i}: {why}"
-
-
-def traced(*trees: Any) -> bool:
-    """Whether these are not yet numbers, so that nothing can be asked of them: inside jit, grad or vmap."""
-    return any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 
 
 def _lane(loop: Loop | None, values: Any) -> Loop:

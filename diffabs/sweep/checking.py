@@ -1,6 +1,7 @@
 """How accurate a sweep's metrics are: a random sample of its lanes, run again with steps of half the length."""
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.simulate.accuracy import comparable, measure_finer, share
+from diffabs.simulate.batch import Batch, by_structure, stacked
 from diffabs.simulate.solution import Run
 from diffabs.sweep.results import Results
 from diffabs.sweep.study import Study, precision
@@ -73,17 +75,14 @@ def _flagged(found: Results, flag: str) -> np.ndarray:
 
 def _halved(study: Study, samples: np.ndarray) -> Iterator[tuple[list[int], Run, np.ndarray]]:
     """Lanes of one structure at a time: their places among the samples, their runs, whether they can be compared."""
-    lanes: dict[Any, list[tuple[int, Any, Any]]] = {}
-    for place, i in enumerate(samples.tolist()):
-        loop, key = study.lane(i)
-        lanes.setdefault(jax.tree.structure(loop), []).append((place, loop, key))
-    for members in lanes.values():
-        places, loops, keys = zip(*members, strict=True)
+    loops, keys = zip(*map(study.lane, samples.tolist()), strict=True) if len(samples) else ((), ())
+    for places in by_structure(loops):
+        loop, batch = stacked([loops[i] for i in places])
+        lanes = batch.values, jnp.stack([keys[i] for i in places])
         with precision(study.dtype):
-            batch = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one, study.dtype) for one in x]), *loops)
-            both = jax.jit(jax.vmap(lambda loop, key: _run(study, loop, key)))(batch, jnp.stack(keys))
+            both = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, partial(_run, study)))(*lanes)
             run, known = jax.device_get(both)
-        yield list(places), run, known
+        yield places, run, known
 
 
 def _run(study: Study, loop: Any, key: Any) -> tuple[Run, Any]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from diffabs.simulate.refill import measure_lanes
+from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.refusals import refusals
 from diffabs.sweep.study import FLAGS, Study, noise_key, numbers, precision
 
@@ -108,5 +108,5 @@ class Runner:
 def _block(study: Study, loop: Any, values: Mapping[str, Any], samples: Any, accepted: Any) -> dict[str, Any]:
     """Metrics and flags of a block of lanes, of which those run that are accepted."""
     keys = jax.vmap(lambda sample: noise_key(study.seed, sample))(samples)
-    done = measure_lanes(loop, values, study.solver, study.objectives, keys=keys, accepted=accepted)
+    done = run_batch(loop, Batch(values, keys), study.solver, study.objectives, together=False, accepted=accepted)
     return done.metrics | {"stopped": done.stopped, "diverged": done.diverged}

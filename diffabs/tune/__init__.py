@@ -6,10 +6,8 @@ from diffabs.core.exports import lazily
 
 if TYPE_CHECKING:
     from diffabs.core.reason import Reason as Reason
-    from diffabs.simulate.batch import Batch as Batch
     from diffabs.simulate.batch import grid as grid
     from diffabs.simulate.batch import latin as latin
-    from diffabs.simulate.batch import run as run
     from diffabs.tune.constraints import AtMost as AtMost
     from diffabs.tune.constraints import CertifiedDecay as CertifiedDecay
     from diffabs.tune.constraints import Poles as Poles
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
 __getattr__ = lazily(
     __name__,
     "diffabs.core.reason Reason",
-    "diffabs.simulate.batch Batch grid latin run",
+    "diffabs.simulate.batch grid latin",
     "diffabs.tune.constraints AtMost CertifiedDecay Poles",
     "diffabs.tune.descent Point Stopping",
     "diffabs.tune.problem Mode",

@@ -20,8 +20,8 @@ import numpy as np
 from diffabs.core.bijectors import Space
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import replace, strong
-from diffabs.simulate.batch import Batch, run
+from diffabs.core.pytree import strong
+from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.refusals import first_line, refusals
 from diffabs.simulate.solution import FixedStep, Run
 from diffabs.tune.constraints import Constraint
@@ -70,7 +70,7 @@ def built(subject: Any) -> Loop:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
     """A part, its free parameters, and how a choice of them is judged. `subject` is a Loop, or a part with a method
-    `loop()`, whose parameters may then be anything that a loop can be computed from (LQ weights, say)."""
+    `closed()`, whose parameters may then be anything that a loop can be computed from (LQ weights, say)."""
 
     subject: Any
     space: Space
@@ -84,7 +84,7 @@ class Problem:
 
     def runs(self, z: Any) -> Run:
         """All lanes at z, without trajectories."""
-        return run(built(self.space.at(self.subject, z)), self.batch, self.solver, self.measured)
+        return run_batch(built(self.space.at(self.subject, z)), self.batch, self.solver, self.measured, together=True)
 
     def seen(self, z: Any) -> Seen:
         """Objective and excesses at z."""
@@ -127,13 +127,9 @@ class Problem:
     def steady(self) -> Callable[[np.ndarray], np.ndarray]:
         """(starts, p) -> whether every lane may be run there (starts,): the parts' rules, and a stable step. Compiled
         once."""
-        values = self.batch.arrays()[0]
 
         def loops(z: Any) -> Loop:
-            loop = strong(built(self.space.at(self.subject, z)))
-            if not values:
-                return jax.tree.map(lambda x: x[None], loop)
-            return jax.vmap(lambda lane: strong(replace(loop, lane)))(values)
+            return self.batch.each(strong(built(self.space.at(self.subject, z))), lambda loop, key: strong(loop))
 
         compiled = jax.jit(jax.vmap(loops))
 

@@ -23,9 +23,8 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import check, replace
 from diffabs.core.reason import Reason
 from diffabs.objectives import usual
-from diffabs.simulate.batch import Batch
+from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.refusals import first_line
-from diffabs.simulate.run import measure
 from diffabs.simulate.solution import FixedStep, Run
 from diffabs.tune.descent import Descent, Lane, Stopping, lbfgs
 from diffabs.tune.problem import Mode, Multipliers, Problem, automatic
@@ -137,9 +136,10 @@ def worst_case(
     free, key = space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
     corners = _corners(np.array(free.ranges))
     points = np.concatenate([corners, _drawn(np.array(free.ranges), screen, seed)])
-    if line := first_line(loop, _at(free, points, points.shape[:1]), solver):
+    lanes = Batch(_at(free, points), None if key is None else np.repeat(key, len(points)))
+    if line := first_line(loop, lanes.values, solver):
         raise ValueError(f"the box has points that cannot be run; {line}")
-    screened = _screened(loop, free, points, solver, measured, seed_of_noise)
+    screened = jax.device_get(run_batch(loop, lanes, solver, measured, accepted=True))
     values = screened.metrics[metric]
     mode = automatic(free)
     problem = Problem(middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), mode)
@@ -160,26 +160,14 @@ def _drawn(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
     return low + (high - low) * qmc.Sobol(len(low), rng=np.random.default_rng(seed)).random(screen)
 
 
-def _at(free: Space, point: Any, lanes: tuple[int, ...] = ()) -> dict[str, Any]:
-    """Parameters by path from their numbers in a row, or in the rows of so many lanes."""
+def _at(free: Space, point: Any) -> dict[str, Any]:
+    """Parameters by path from their numbers in a row, or in the rows of lanes."""
     found, first = {}, 0
     for entry in free.entries:
         n = len(entry.maps)
-        found[entry.path] = point[..., first : first + n].reshape((*lanes, *entry.shape))
+        found[entry.path] = point[..., first : first + n].reshape((*np.shape(point)[:-1], *entry.shape))
         first += n
     return found
-
-
-def _screened(loop: Any, free: Space, points: np.ndarray, solver: FixedStep, measured: Any, seed: int | None) -> Run:
-    """All points in one call."""
-    key = None if seed is None else jax.random.key(seed)
-
-    @jax.jit
-    @jax.vmap
-    def run(point: Any) -> Run:
-        return measure(replace(loop, _at(free, point)), solver, measured, key=key)
-
-    return jax.device_get(run(jnp.asarray(points)))
 
 
 def _ascent(problem: Problem, points: np.ndarray, iterations: int) -> list[Lane]:
