@@ -47,8 +47,10 @@ SPLINE = {"plant": plants.QuarterCar(road=roads.SPLINE_B), "initial": d.BrakeSta
 LOOPS = {
     "fixed slip, P": braking(**ASPHALT, controller=controllers.PID(), reference=references.FixedSlip(slip=0.12)),
     "latch, P": braking(**ASPHALT | {"stop": REST}, controller=controllers.PID(), reference=references.PeakLatch()),
-    "relay": braking(
-        **ASPHALT, controller=controllers.Relay(torque_max=150.0), reference=references.FixedSlip(slip=0.12)
+    "relay": braking(  # ends well inside a half-wave: its settling time has a derivative
+        **ASPHALT | {"stop": SpeedReached(speed=1.3)},
+        controller=controllers.Relay(torque_max=150.0),
+        reference=references.FixedSlip(slip=0.12),
     ),
     "robust, PI": braking(**ASPHALT, controller=controllers.PID(ki=2000.0), reference=references.PeakRobust(slip=0.3)),
     "spline, latch, P": braking(**SPLINE, controller=controllers.PID(), reference=references.PeakLatch()),
