@@ -42,6 +42,7 @@ from diffabs.simulate.solution import FixedStep
 
 WIDTHS = (1e-2, 3e-3, 1e-3)
 AGREE, RIGHT, KNOWN = 1e-3, 2e-3, 1e-2  # of the scale
+KINKED = 1e-2  # by which slopes to the left and to the right differ, of the scale
 PART, LEAST = 1e-3, 1e-6  # the scale's least: of the objective, and absolute
 CLASSES = ("kink", "nearby", "curved", "scatter", "diverged")
 SHOWN = 15
@@ -85,8 +86,8 @@ class Program:
         size = np.where(np.abs(x) > 1e-6, np.abs(x), 1e-2)
         moves = [sign * width * np.diag(size) for width in WIDTHS for sign in (1, -1)]
         lanes, late = self.values(loop, measures, x + np.concatenate([np.zeros((1, len(x))), *moves]))
-        slopes, _ = self.slopes(loop, measures, x)
         lanes = np.asarray(lanes)
+        slopes, _ = self.slopes(loop, measures, x)
         sides = lanes[1:].reshape(len(WIDTHS), 2, len(x), -1).swapaxes(2, 3)
         names = [path + "".join(f"[{i}]" for i in place) for path, all in self.places.items() for place in all]
         ended = not late[0] or self.structure.objectives is random_loops.BALANCE
@@ -135,28 +136,29 @@ def judge(found: Found) -> Verdict:
     base = found.value[:, None]
     scale = np.maximum(np.max(np.abs(difference), axis=0), np.maximum(PART * np.abs(base), LEAST))
     spread = np.max(difference, axis=0) - np.min(difference, axis=0)
-    agree = spread <= AGREE * scale
+    bend = np.abs((right - base) / widths - (base - left) / widths)
+    smooth = (bend[-1] <= KINKED * scale) | (bend[-1] <= 0.6 * bend[-2])  # else left and right are two numbers
+    agree = (spread <= AGREE * scale) & smooth
     error = np.abs(found.gradient - difference[-1]) / scale
     wrong = agree & ~(error <= RIGHT)
     zero = agree & (np.max(np.abs(difference), axis=0) == 0) & (found.gradient == 0)
-    kind, limit = _kinds(difference, (right - base) / widths, (base - left) / widths, scale)
+    kind, limit = _kinds(difference, bend[-1] / scale, smooth, scale)
     kind = np.where(agree, "", kind)
     known = np.isin(kind, ("nearby", "curved")) & (np.abs(found.gradient - limit) <= KNOWN * scale)
     return Verdict(difference, scale, error, agree, wrong, zero, kind, known)
 
 
-def _kinds(difference: Any, right: Any, left: Any, scale: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Why the widths do not agree, and the derivative as far as it is known."""
+def _kinds(difference: Any, bend: Any, smooth: Any, scale: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Why the widths do not agree, and the derivative as far as it is known. `bend` is the difference of the narrowest
+    slopes to the right and to the left, in scales."""
     wide, middle, narrow = difference
     outer, inner = (WIDTHS[0] ** 2 - WIDTHS[1] ** 2), (WIDTHS[1] ** 2 - WIDTHS[2] ** 2)
-    bend = (wide - middle) / outer
-    curved = np.abs((middle - narrow) - bend * inner) <= 0.3 * np.abs(bend) * inner + 0.2 * AGREE * scale
-    smooth = np.abs(right[2] - left[2]) <= 0.05 * scale
-    beside = (np.abs(middle - narrow) <= AGREE * scale) & (np.abs(right[2] - left[2]) <= 0.2 * scale)
-    one_sided = np.abs(right[2] - left[2]) > 0.2 * scale
+    square = (wide - middle) / outer
+    curved = np.abs((middle - narrow) - square * inner) <= 0.3 * np.abs(square) * inner + 0.2 * AGREE * scale
+    beside = np.abs(middle - narrow) <= AGREE * scale
     kind = np.select(
-        [~np.isfinite(difference).all(axis=0), curved & smooth, beside, one_sided],
-        ["diverged", "curved", "nearby", "kink"],
+        [~np.isfinite(difference).all(axis=0), ~smooth & (bend > 0.2), curved & smooth, beside & smooth, ~smooth],
+        ["diverged", "kink", "curved", "nearby", "kink"],
         "scatter",
     )
     extrapolated = narrow - (middle - narrow) / inner * WIDTHS[2] ** 2

@@ -54,11 +54,13 @@ class Draw:
         share[1:] *= np.exp(self.rng.uniform(-0.01, 0.01, 7))
         return roads.Tabulated(slip=slip, mu=most * share)
 
-    def car(self, road: Any, **fields: Any) -> dict[str, Any]:
-        """A quarter car that is to stop from middling speed."""
+    def car(self, road: Any, rolling: bool = False, **fields: Any) -> dict[str, Any]:
+        """A quarter car that is to stop from middling speed. One that is rolling has no slip at the start: where the
+        torque comes late, the deceleration would fall from the first instant on, and a latch take that for a peak."""
+        slip = 0.0 if rolling else self.within(0.01, 0.04)
         parts = {
             "plant": plants.QuarterCar(road=road, inertia=self.near(0.5, 0.4)),
-            "initial": d.BrakeStart(speed=self.within(14.0, 18.0), slip=self.within(0.01, 0.04)),
+            "initial": d.BrakeStart(speed=self.within(14.0, 18.0), slip=slip),
             "stop": SpeedReached(speed=self.within(6.0, 8.0)),
         }
         return parts | fields
@@ -111,7 +113,7 @@ def latch(r: Draw) -> d.Loop:
 
 def latch_spline(r: Draw) -> d.Loop:
     return braking(
-        **r.car(r.spline(), stop=Standstill(speed=r.within(5.0, 7.0))),
+        **r.car(r.spline(), rolling=True, stop=Standstill(speed=r.within(5.0, 7.0))),
         controller=r.pid(900.0, controllers.BackCalculation(tracking_time=r.near(0.03))),
         reference=references.PeakLatch(slip=r.within(0.2, 0.3)),
         actuator=actuators.Lag(time_constant=r.near(0.004)),
@@ -129,7 +131,7 @@ def relay(r: Draw) -> d.Loop:
 
 def relay_latch(r: Draw) -> d.Loop:
     return braking(
-        **r.car(roads.DRY_CONCRETE),
+        **r.car(roads.DRY_CONCRETE, rolling=True),
         controller=r.relay(0.03),
         reference=references.PeakLatch(slip=r.within(0.2, 0.3)),
         actuator=actuators.Lag(time_constant=r.near(0.008)),
@@ -254,7 +256,7 @@ def computer(r: Draw) -> d.Loop:
 
 def computer_latch(r: Draw) -> d.Loop:
     return braking(
-        **r.car(roads.DRY_ASPHALT),
+        **r.car(roads.DRY_ASPHALT, rolling=True),
         controller=controllers.Sampled(
             controller=controllers.StateFeedback(
                 gain=np.array([-r.near(2000.0), -r.near(500.0)]), torque_min=r.within(1.0, 4.0), torque_max=r.near(90.0)
@@ -269,7 +271,7 @@ def computer_latch(r: Draw) -> d.Loop:
 
 def patches_latch(r: Draw) -> d.Loop:
     return braking(
-        **r.car(r.patches(roads.DRY_CONCRETE, roads.WET_ASPHALT, roads.MagicFormula())),
+        **r.car(r.patches(roads.DRY_CONCRETE, roads.WET_ASPHALT, roads.MagicFormula()), rolling=True),
         controller=r.pid(400.0),
         reference=references.PeakLatch(slip=r.within(0.2, 0.3)),
         actuator=Series(
@@ -284,7 +286,7 @@ def patches_latch(r: Draw) -> d.Loop:
 
 def relay_delay(r: Draw) -> d.Loop:
     return braking(
-        **r.car(r.spline()),
+        **r.car(r.spline(), rolling=True),
         controller=r.relay(0.02),
         reference=references.PeakLatch(slip=r.within(0.2, 0.3)),
         actuator=actuators.Delay(time=r.near(2.2e-3), capacity=64),
@@ -413,12 +415,13 @@ def drawn(name: str, number: int, seed: int) -> d.Loop:
 
 def numbers(loop: d.Loop, measures: Mapping[str, Any]) -> dict[str, list[tuple[int, ...]]]:
     """The tunable numbers of a loop and of what it is measured by, by path: places in their array. The knots of a
-    road at slip 0 and 1 stay where its rules have them."""
+    road at slip 0 and 1 stay where its rules have them, and a wheel that rolls does not slip."""
     found: dict[str, list[tuple[int, ...]]] = {}
     parts = [("", loop), *((f"{name}:", part) for name, part in measures.items())]
     for prefix, part in parts:
         for path, spec, value in parameters(part):
-            if not spec.tunable or not np.all(np.isfinite(value)):
+            rolls = path == "initial.slip" and value == 0
+            if not spec.tunable or rolls or not np.all(np.isfinite(value)):
                 continue
             places = list(np.ndindex(np.shape(value)))
             if path.endswith("road.slip"):
