@@ -136,29 +136,36 @@ def judge(found: Found) -> Verdict:
     base = found.value[:, None]
     scale = np.maximum(np.max(np.abs(difference), axis=0), np.maximum(PART * np.abs(base), LEAST))
     spread = np.max(difference, axis=0) - np.min(difference, axis=0)
-    bend = np.abs((right - base) / widths - (base - left) / widths)
+    slopes = np.stack([(right - base) / widths, (base - left) / widths])
+    bend = np.abs(slopes[0] - slopes[1])
     smooth = (bend[-1] <= KINKED * scale) | (bend[-1] <= 0.6 * bend[-2])  # else left and right are two numbers
     agree = (spread <= AGREE * scale) & smooth
     error = np.abs(found.gradient - difference[-1]) / scale
     wrong = agree & ~(error <= RIGHT)
     zero = agree & (np.max(np.abs(difference), axis=0) == 0) & (found.gradient == 0)
-    kind, limit = _kinds(difference, bend[-1] / scale, smooth, scale)
+    least = np.maximum(PART * np.abs(base), LEAST)
+    kind, limit = _kinds(difference, slopes, smooth, least)
     kind = np.where(agree, "", kind)
-    known = np.isin(kind, ("nearby", "curved")) & (np.abs(found.gradient - limit) <= KNOWN * scale)
+    off = np.abs(found.gradient - limit) / np.maximum(np.abs(limit), least)
+    known = np.isin(kind, ("nearby", "curved")) & (off <= KNOWN)
     return Verdict(difference, scale, error, agree, wrong, zero, kind, known)
 
 
-def _kinds(difference: Any, bend: Any, smooth: Any, scale: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Why the widths do not agree, and the derivative as far as it is known. `bend` is the difference of the narrowest
-    slopes to the right and to the left, in scales."""
+def _kinds(difference: Any, slopes: Any, smooth: Any, least: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Why the widths do not agree, and the derivative as far as it is known; slopes (2, widths, m, n) to the right and
+    to the left."""
     wide, middle, narrow = difference
+    scale = np.maximum(np.maximum(np.abs(middle), np.abs(narrow)), least)
     outer, inner = (WIDTHS[0] ** 2 - WIDTHS[1] ** 2), (WIDTHS[1] ** 2 - WIDTHS[2] ** 2)
     square = (wide - middle) / outer
     curved = np.abs((middle - narrow) - square * inner) <= 0.3 * np.abs(square) * inner + 0.2 * AGREE * scale
     beside = np.abs(middle - narrow) <= AGREE * scale
+    (_, right, nearest), (_, left, last) = slopes
+    stable = np.abs(right - nearest) + np.abs(left - last) <= 0.5 * np.abs(nearest - last)
+    jump = np.abs((nearest - last) * WIDTHS[2] - (right - left) * WIDTHS[1]) <= 0.2 * np.abs(right - left) * WIDTHS[1]
     kind = np.select(
-        [~np.isfinite(difference).all(axis=0), ~smooth & (bend > 0.2), curved & smooth, beside & smooth, ~smooth],
-        ["diverged", "kink", "curved", "nearby", "kink"],
+        [~np.isfinite(difference).all(axis=0), ~smooth & (stable | jump), curved & smooth, beside & smooth],
+        ["diverged", "kink", "curved", "nearby"],
         "scatter",
     )
     extrapolated = narrow - (middle - narrow) / inner * WIDTHS[2] ** 2
