@@ -12,7 +12,8 @@ of a piece as the root of a guard on its dense output; a jump happens there, and
 Relay: torque_max until slip > target + band, torque_min until slip < target - band. PeakLatch: the first target until
 the deceleration falls, then the slip at its maximum; a later maximum counts if it is greater by a millionth.
 PeakRobust: the same of deceleration and slip behind equal low-passes, from the moment at which the filtered
-deceleration lies below (1 - threshold) of its greatest, if that is above `arming`."""
+deceleration lies below (1 - threshold) of its greatest, if that is above `arming`. Clamping: the integral stands still
+while the torque is at a limit and the error would push it further out."""
 
 import argparse
 import dataclasses
@@ -46,6 +47,11 @@ REST = Standstill(speed=0.5)
 SPLINE = {"plant": plants.QuarterCar(road=roads.SPLINE_B), "initial": d.BrakeStart(), "stop": REST}
 LOOPS = {
     "fixed slip, P": braking(**ASPHALT, controller=controllers.PID(), reference=references.FixedSlip(slip=0.12)),
+    "fixed slip, PI, clamping": braking(
+        **ASPHALT,
+        controller=controllers.PID(kp=2000.0, ki=8000.0, torque_max=150.0, antiwindup=controllers.Clamping()),
+        reference=references.FixedSlip(slip=0.12),
+    ),
     "latch, P": braking(**ASPHALT | {"stop": REST}, controller=controllers.PID(), reference=references.PeakLatch()),
     "relay": braking(  # ends well inside a half-wave: its settling time has a derivative
         **ASPHALT | {"stop": SpeedReached(speed=1.3)},
@@ -144,7 +150,13 @@ class Brake:
         spin = 0.0 if m.locked else (p.radius * mu * p.mass * G - self.torque(z, m)) / self.inertia
         fast, slow = ((mu * G - z[AF]), (s - z[SF])) if self.robust else (0.0, 0.0)
         lag = self.reference.time_constant if self.robust else 1.0
-        return [-mu * G, spin, z[V], m.target - s, fast / lag, slow / lag, m.side * (s - m.target)]
+        error = 0.0 if self.frozen(m) else m.target - s
+        return [-mu * G, spin, z[V], error, fast / lag, slow / lag, m.side * (s - m.target)]
+
+    def frozen(self, m: Mode) -> bool:
+        """Whether the anti-windup holds the integral: at a limit, with an error that pushes further out."""
+        outward = (m.torque == "high" and m.side < 0) or (m.torque == "low" and m.side > 0)
+        return outward and isinstance(getattr(self.controller, "antiwindup", None), controllers.Clamping)
 
     def slip_rate(self, z: Any, m: Mode) -> float:
         r = self.rates(0.0, z, m)
