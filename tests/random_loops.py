@@ -1,0 +1,432 @@
+"""Random closed loops of all parts, in few structures: what is compiled once serves every loop of a structure.
+
+`drawn(number, seed)` is always the same loop. The values are such that a run has its events well within (switches,
+latches, limits, a locked wheel, an edge of the road) and stops after a second or so. Left out are the parts whose
+derivative is documented to say nothing of their jumps: quantisation, a sharp edge of a road, and the literal estimator,
+whose braking is the delay of one sample."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import diffabs as d
+from diffabs import actuators, controllers, objectives, plants, references, roads, sensors
+from diffabs.core.blocks import Direct, Series
+from diffabs.core.pytree import parameters, replace
+from diffabs.scenario.defaults import braking
+from diffabs.stops import Fallen, SpeedReached, Standstill
+
+BRAKING = {
+    **objectives.BRAKING,
+    "itae": objectives.ITAE(),
+    "quadratic": objectives.QuadraticCost(q=np.array([30.0, 20.0]), r=1e-3),
+    "effort": objectives.Effort(),
+    "variation": objectives.Variation(),
+    "torque_rate": objectives.TorqueRate(),
+}
+BALANCE = {
+    **objectives.BALANCE,
+    "balance_cost": objectives.BalanceCost(r=1e-4),
+    "soft_loss": objectives.SoftLoss(),
+}
+
+
+class Draw:
+    """Random numbers of a loop."""
+
+    def __init__(self, rng: np.random.Generator):
+        self.rng = rng
+
+    def near(self, value: float, spread: float = 0.25) -> float:
+        """A number of this size, off by up to exp(spread)."""
+        return float(value * np.exp(self.rng.uniform(-spread, spread)))
+
+    def within(self, low: float, high: float) -> float:
+        """A number between these."""
+        return float(self.rng.uniform(low, high))
+
+    def spline(self) -> roads.Tabulated:
+        """A measured road: it rises to a peak at a knot, and falls."""
+        peak, most = self.within(0.08, 0.16), self.within(0.85, 1.1)
+        slip = np.array([0.0, 0.25 * peak, 0.6 * peak, peak, 1.8 * peak, 3.0 * peak, 0.75, 1.0])
+        share = np.array([0.0, 0.5, 0.85, 1.0, 0.95, 0.88, 0.8, 0.75])
+        share[1:] *= np.exp(self.rng.uniform(-0.01, 0.01, 7))
+        return roads.Tabulated(slip=slip, mu=most * share)
+
+    def car(self, road: Any, rolling: bool = False, **fields: Any) -> dict[str, Any]:
+        """A quarter car that is to stop from middling speed. One that is rolling has no slip at the start: where the
+        torque comes late, the deceleration would fall from the first instant on, and a latch take that for a peak."""
+        slip = 0.0 if rolling else self.within(0.01, 0.04)
+        parts = {
+            "plant": plants.QuarterCar(road=road, inertia=self.near(0.5, 0.4)),
+            "initial": d.BrakeStart(speed=self.within(14.0, 18.0), slip=slip),
+            "stop": SpeedReached(speed=self.within(6.0, 8.0)),
+        }
+        return parts | fields
+
+    def rig(self) -> dict[str, Any]:
+        """The mirrored rig."""
+        return {
+            "plant": plants.MirroredRig(),
+            "initial": d.BrakeStart(speed=self.within(10.0, 12.0), slip=self.within(0.02, 0.06)),
+            "stop": SpeedReached(speed=self.within(6.0, 7.0)),
+        }
+
+    def pid(self, kp: float = 1200.0, antiwindup: Any = None, most: float = 120.0) -> controllers.PID:
+        """PID with all of its terms."""
+        return controllers.PID(
+            kp=self.near(kp),
+            ki=self.near(3.0 * kp, 0.8),
+            kd=self.near(2e-3 * kp),
+            torque_min=self.within(1.0, 4.0),
+            torque_max=self.near(most),
+            antiwindup=antiwindup or controllers.NoAntiWindup(),
+        )
+
+    def relay(self, band: float = 0.02) -> controllers.Relay:
+        """A relay whose lower torque still brakes."""
+        return controllers.Relay(
+            band=self.near(band), torque_min=self.within(2.0, 8.0), torque_max=self.near(140.0, 0.15)
+        )
+
+    def patches(self, *surfaces: Any) -> roads.Patches:
+        """Surfaces in a row, with smooth edges."""
+        edges = np.cumsum([self.within(1.5, 4.0) for _ in surfaces[1:]])
+        return roads.Patches(roads=surfaces, edges=edges, width=self.within(0.3, 0.8))
+
+
+class Structure(NamedTuple):
+    """Loops that one program runs."""
+
+    make: Callable[[Draw], d.Loop]
+    step: float = 1e-4
+    duration: float = 2.5
+    objectives: Mapping[str, Any] = BRAKING
+
+
+def latch(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.DRY_ASPHALT), controller=r.pid(), reference=references.PeakLatch(slip=r.within(0.2, 0.3))
+    )
+
+
+def latch_spline(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(r.spline(), rolling=True, stop=Standstill(speed=r.within(5.0, 7.0))),
+        controller=r.pid(900.0, controllers.BackCalculation(tracking_time=r.near(0.03))),
+        reference=references.PeakLatch(slip=r.within(0.2, 0.3)),
+        actuator=actuators.Lag(time_constant=r.near(0.004)),
+    )
+
+
+def relay(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.MagicFormula()),
+        controller=r.relay(),
+        reference=references.FixedSlip(slip=r.near(0.15)),
+        actuator=actuators.Limits(low=r.within(0.5, 1.5), high=r.near(110.0, 0.1)),
+    )
+
+
+def relay_latch(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.DRY_CONCRETE, rolling=True),
+        controller=r.relay(0.03),
+        reference=references.PeakLatch(slip=r.within(0.2, 0.3)),
+        actuator=actuators.Lag(time_constant=r.near(0.008)),
+    )
+
+
+def robust(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.WET_ASPHALT),
+        controller=r.pid(1000.0, controllers.Clamping(), 90.0),
+        reference=references.PeakRobust(
+            slip=r.within(0.25, 0.35), time_constant=r.near(0.01), threshold=r.near(0.01), arming=2.0
+        ),
+        sensor=Series(
+            blocks=(
+                sensors.Bias(slip=1e-3, speed=0.02, wheel_speed=0.01, deceleration=0.05),
+                sensors.WheelSpeed(time_constant=r.near(0.003)),
+            )
+        ),
+    )
+
+
+def robust_noise(r: Draw) -> d.Loop:
+    noise = sensors.Noise(slip=1e-3, speed=0.01, wheel_speed=0.01, deceleration=r.near(0.1), period=2e-3)
+    return braking(
+        **r.car(roads.MagicFormula()),
+        controller=controllers.SlidingMode(
+            gain=r.near(120.0), boundary=r.near(0.06), torque_min=r.within(1.0, 4.0), torque_max=r.near(90.0)
+        ),
+        feedforward=controllers.ConstantInput(value=r.near(12.0)),
+        reference=references.PeakRobust(
+            slip=r.within(0.25, 0.35), time_constant=r.near(0.02), threshold=r.near(0.02), arming=2.0
+        ),
+        sensor=Series(blocks=(noise, sensors.IntegratedAccelerometer(bias=r.within(-0.1, 0.1)))),
+    )
+
+
+def rig(r: Draw) -> d.Loop:
+    return braking(
+        **r.rig(),
+        controller=controllers.StateFeedback(
+            gain=np.array([-r.near(9000.0), -r.near(90.0)]),
+            torque_min=r.within(0.1, 0.4),
+            torque_max=r.near(3.0),
+            antiwindup=controllers.BackCalculation(tracking_time=r.near(0.02)),
+        ),
+        feedforward=controllers.HoldingInput(),
+        reference=references.FilteredSlip(slip=r.near(0.15), time_constant=r.near(0.03)),
+        actuator=actuators.Lag(time_constant=r.near(0.002)),
+    )
+
+
+def rig_scheduled(r: Draw) -> d.Loop:
+    return braking(
+        **r.rig(),
+        controller=controllers.ScheduledFeedback(
+            speeds=np.array([5.0, r.near(8.0, 0.1), 14.0]),
+            integral_gains=-np.array([r.near(900.0) for _ in range(3)]),
+            gains=-np.array([r.near(60.0) for _ in range(3)]),
+            torque_min=r.within(0.1, 0.4),
+            torque_max=r.near(4.0),
+            antiwindup=controllers.Clamping(),
+        ),
+        feedforward=controllers.ConstantInput(value=r.near(1.5)),
+        reference=references.FixedSlip(slip=r.near(0.15)),
+        actuator=actuators.Delay(time=r.near(0.00313), capacity=128),
+    )
+
+
+def rig_proportional(r: Draw) -> d.Loop:
+    return braking(
+        **r.rig(),
+        sensor=sensors.SpeedScale(factor=r.near(1.0, 0.02)),
+        controller=controllers.ProportionalFeedback(
+            gain=np.array([-r.near(2000.0), -r.near(100.0)]), torque_min=r.within(0.1, 0.4), torque_max=r.near(4.0)
+        ),
+        feedforward=controllers.HoldingInput(),
+        reference=references.FixedSlip(slip=r.near(0.15)),
+        actuator=actuators.RateLimit(rate=r.near(150.0), time_constant=r.near(0.003)),
+    )
+
+
+def lab_rig(r: Draw) -> d.Loop:
+    return braking(
+        plant=plants.LabRig(),
+        initial=d.BrakeStart(speed=r.within(10.0, 12.0), slip=r.within(0.05, 0.1)),
+        stop=SpeedReached(speed=r.within(5.0, 6.0)),
+        controller=controllers.Relay(band=r.near(0.03), torque_min=r.within(0.45, 0.5), torque_max=r.within(0.7, 0.9)),
+        reference=references.Setpoint(value=r.near(0.2)),
+    )
+
+
+def lock(r: Draw) -> d.Loop:
+    return braking(
+        plant=plants.LabRig(),
+        initial=d.BrakeStart(speed=r.within(8.0, 9.0), slip=r.within(0.05, 0.1)),
+        stop=SpeedReached(speed=r.within(4.0, 5.0)),
+        controller=controllers.ConstantTorque(torque=r.within(0.85, 1.0)),
+    )
+
+
+def lock_and_free(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.DRY_ASPHALT),
+        controller=r.relay(0.3),
+        reference=references.FixedSlip(slip=r.near(0.5, 0.1)),
+        actuator=actuators.Lag(time_constant=r.near(0.02)),
+    )
+
+
+def computer(r: Draw) -> d.Loop:
+    surface = roads.Scaled(road=r.spline(), scale=r.within(0.6, 0.8))
+    return braking(
+        **r.car(r.patches(roads.DRY_CONCRETE, surface)),
+        controller=controllers.Sampled(
+            controller=r.pid(600.0, controllers.Clamping()), period=5e-3, delay=r.within(0.6e-3, 4e-3)
+        ),
+        reference=references.FixedSlip(slip=r.near(0.15)),
+        actuator=Series(blocks=(actuators.RateLimit(rate=r.near(4000.0)), actuators.Lag(time_constant=r.near(0.003)))),
+    )
+
+
+def computer_latch(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.DRY_ASPHALT, rolling=True),
+        controller=controllers.Sampled(
+            controller=controllers.StateFeedback(
+                gain=np.array([-r.near(2000.0), -r.near(500.0)]), torque_min=r.within(1.0, 4.0), torque_max=r.near(90.0)
+            ),
+            period=2e-3,
+            delay=r.within(0.3e-3, 1.7e-3),
+        ),
+        feedforward=controllers.HoldingInput(),
+        reference=references.PeakLatch(slip=r.within(0.2, 0.3)),
+    )
+
+
+def patches_latch(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(r.patches(roads.DRY_CONCRETE, roads.WET_ASPHALT, roads.MagicFormula()), rolling=True),
+        controller=r.pid(400.0),
+        reference=references.PeakLatch(slip=r.within(0.2, 0.3)),
+        actuator=Series(
+            blocks=(
+                actuators.Delay(time=r.near(1.7e-3), capacity=64),
+                actuators.Lag(time_constant=r.near(0.003)),
+                actuators.Limits(low=r.within(0.2, 0.8), high=r.near(80.0, 0.1)),
+            )
+        ),
+    )
+
+
+def relay_delay(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(r.spline(), rolling=True),
+        controller=r.relay(0.02),
+        reference=references.PeakLatch(slip=r.within(0.2, 0.3)),
+        actuator=actuators.Delay(time=r.near(2.2e-3), capacity=64),
+    )
+
+
+def sliding(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(r.patches(roads.DRY_COBBLESTONE, roads.DRY_ASPHALT)),
+        controller=controllers.SlidingMode(
+            gain=r.near(120.0), boundary=r.near(0.05), torque_min=r.within(1.0, 4.0), torque_max=r.near(100.0)
+        ),
+        reference=references.FilteredSlip(slip=r.near(0.2), time_constant=r.near(0.05)),
+        sensor=sensors.WheelSpeed(time_constant=r.near(0.003)),
+        actuator=actuators.RateLimit(rate=r.near(2500.0), time_constant=r.near(0.003)),
+    )
+
+
+def scheduled_robust(r: Draw) -> d.Loop:
+    return braking(
+        **r.car(roads.MagicFormula()),
+        controller=controllers.ScheduledFeedback(
+            speeds=np.array([5.0, r.near(10.0, 0.1), 20.0]),
+            integral_gains=-np.array([r.near(2000.0) for _ in range(3)]),
+            gains=-np.array([r.near(500.0) for _ in range(3)]),
+            torque_min=r.within(1.0, 4.0),
+            torque_max=r.near(90.0),
+            antiwindup=controllers.BackCalculation(tracking_time=r.near(0.03)),
+        ),
+        reference=references.PeakRobust(
+            slip=r.within(0.25, 0.35), time_constant=r.near(0.005), threshold=r.near(0.01), arming=2.0
+        ),
+        sensor=sensors.IntegratedAccelerometer(bias=r.within(-0.2, 0.2)),
+    )
+
+
+def arm(r: Draw) -> d.Loop:
+    return braking(
+        plant=plants.ArmBalance(gear=1.1, rotor_inertia=0.3, current_max=r.near(40.0)),
+        initial=_leaning(r, 0.02),
+        reference=references.Upright(),
+        controller=controllers.BalanceFeedback(),
+        actuator=Series(
+            blocks=(actuators.VoltageLimit(voltage_max=r.near(100.0)), actuators.Lag(time_constant=r.near(0.002)))
+        ),
+        stop=Fallen(),
+    )
+
+
+def observed(r: Draw) -> d.Loop:
+    return braking(
+        plant=plants.PrintedArm(),
+        initial=_leaning(r, 0.1),
+        reference=references.Upright(),
+        sensor=sensors.AngleSensor(theta=1e-4, psi=1e-4, period=5e-3),
+        controller=controllers.Sampled(
+            controller=controllers.ObserverFeedback(
+                gain=np.array([90.0, -4.0, 30.0, 25.0, -3.0, 10.0]),
+                transition=0.9 * np.eye(6) + 0.01 * np.eye(6, k=3),
+                entry=np.array([0.0, 0.0, 0.0, -0.01, 0.03, 0.02]),
+                correction=np.linspace(0.05, 0.6, 12).reshape(6, 2),
+                voltage_max=r.near(12.0),
+            ),
+            period=5e-3,
+            delay=r.within(0.3e-3, 4e-3),
+        ),
+        actuator=actuators.VoltageLimit(voltage_max=r.near(9.0)),
+        stop=Fallen(),
+    )
+
+
+def fall(r: Draw) -> d.Loop:
+    return braking(
+        plant=plants.ACROBOT,
+        initial=_leaning(r, 0.1),
+        reference=references.Upright(),
+        controller=controllers.BalanceFeedback(gain=np.array([5.0, 2.0, 0.1, 2.0, 1.0, 0.1])),
+        actuator=actuators.VoltageLimit(voltage_max=r.near(1.0)),
+        sensor=Direct(),
+        stop=Fallen(angle=r.within(0.5, 0.8)),
+    )
+
+
+def _leaning(r: Draw, size: float) -> plants.BalanceStart:
+    angles = {name: r.near(size) for name in ("theta", "psi", "phi")}
+    return plants.BalanceStart(**angles, **{f"{name}_rate": r.near(0.3 * size) for name in angles})
+
+
+STRUCTURES = {
+    "latch": Structure(latch),
+    "latch, spline, lag": Structure(latch_spline),
+    "relay": Structure(relay),
+    "relay, latch, lag": Structure(relay_latch),
+    "robust latch, wheel speed": Structure(robust),
+    "robust latch, noise": Structure(robust_noise),
+    "rig, filtered": Structure(rig),
+    "rig, scheduled, delay": Structure(rig_scheduled),
+    "rig, proportional, rate limit": Structure(rig_proportional),
+    "lab rig, relay": Structure(lab_rig),
+    "lab rig, lock": Structure(lock),
+    "lock and free": Structure(lock_and_free),
+    "computer, patches": Structure(computer),
+    "computer, latch": Structure(computer_latch),
+    "patches, latch, delay": Structure(patches_latch),
+    "spline, relay, latch, delay": Structure(relay_delay),
+    "sliding mode, patches": Structure(sliding),
+    "scheduled, robust latch": Structure(scheduled_robust),
+    "arm": Structure(arm, 5e-4, 0.5, BALANCE),
+    "arm, observed": Structure(observed, 1e-3, 0.4, BALANCE),
+    "fall": Structure(fall, 1e-3, 3.0, BALANCE),
+}
+
+
+def drawn(name: str, number: int, seed: int) -> d.Loop:
+    """Loop `number` of a seed, of the structure `name`. Beyond what the structure draws itself, every tunable number
+    that is not 0 is off by up to a twentieth; not those of a tabulated road, which has an order to keep."""
+    rng = np.random.default_rng([seed, number])
+    loop = STRUCTURES[name].make(Draw(rng))
+    moved = {}
+    for path, spec, value in parameters(loop):
+        if spec.tunable and not path.endswith(("road.slip", "road.mu")):
+            value = np.asarray(value, float)
+            moved[path] = value * np.exp(rng.uniform(-0.05, 0.05, value.shape))
+    return replace(loop, moved)
+
+
+def numbers(loop: d.Loop, measures: Mapping[str, Any]) -> dict[str, list[tuple[int, ...]]]:
+    """The tunable numbers of a loop and of what it is measured by, by path: places in their array. The knots of a
+    road at slip 0 and 1 stay where its rules have them, and a wheel that rolls does not slip."""
+    found: dict[str, list[tuple[int, ...]]] = {}
+    parts = [("", loop), *((f"{name}:", part) for name, part in measures.items())]
+    for prefix, part in parts:
+        for path, spec, value in parameters(part):
+            rolls = path == "initial.slip" and value == 0
+            if not spec.tunable or rolls or not np.all(np.isfinite(value)):
+                continue
+            places = list(np.ndindex(np.shape(value)))
+            if path.endswith("road.slip"):
+                places = places[1:-1]
+            elif path.endswith("road.mu"):
+                places = places[1:]
+            found[prefix + path] = places
+    return found
