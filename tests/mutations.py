@@ -32,6 +32,48 @@ class Mutation(NamedTuple):
 
 MUTATIONS = [
     Mutation(
+        "a latch that takes rounding for a maximum",
+        "references/peak_slip.py",
+        "zero + LEAST, slip",
+        "zero, slip",
+        "test_blocks.py::test_latch_waits_for_the_brake",
+    ),
+    Mutation(
+        "a probe on the other side of the zero",
+        "simulate/landing.py",
+        "jnp.where(margin < 0, 1.0, -1.0) * h",
+        "jnp.where(margin < 0, -1.0, 1.0) * h",
+        "test_gradients.py::test_a_maximum_on_a_knot_of_the_road_has_the_slip_of_the_knot",
+    ),
+    Mutation(
+        "the later of two events in a step",
+        "simulate/landing.py",
+        "jnp.argmin(places), old.which",
+        "jnp.argmax(jnp.where(jnp.isinf(places), -1.0, places)), old.which",
+        "test_blocks.py::test_two_events_in_one_step",
+    ),
+    Mutation(
+        "a chattering relay runs on",
+        "simulate/stepper.py",
+        "verdict.fine & (extra <= steps + SPARE)",
+        "verdict.fine",
+        "test_blocks.py::test_what_switches_in_every_step_is_no_run",
+    ),
+    Mutation(
+        "noise that does not make the deceleration fall",
+        "core/loop.py",
+        "((a >= 0) & ((b < 0) | (c < 0)))",
+        "((a >= 0) & (c < 0))",
+        "test_blocks.py::test_noise_of_a_sampled_accelerometer_latches_where_it_jumps_down",
+    ),
+    Mutation(
+        "|e| without its zero",
+        "objectives/tracking.py",
+        "cubic.start * cubic.end < 0",
+        "cubic.start * cubic.end < -1e9",
+        "test_blocks.py::test_the_integral_of_an_error_that_changes_sign",
+    ),
+    Mutation(
         "rules of a part around a part that is not sound",
         "core/pytree.py",
         "found |= bool(within)",
@@ -95,15 +137,8 @@ MUTATIONS = [
         "test_checkpoints.py::test_nested_scans_make_enough_steps_and_keep_few_carries[1801]",
     ),
     Mutation(
-        "steps beyond the duration are made",
-        "simulate/checkpoint.py",
-        "(i * inner < count) & on(carry)",
-        "on(carry)",
-        "test_checkpoints.py::test_groups_beyond_the_count_are_skipped_and_have_no_derivative",
-    ),
-    Mutation(
         "a batch ends with its first lane",
-        "simulate/drivers.py",
+        "simulate/checkpoint.py",
         "jnp.any(running, axis=0)",
         "jnp.all(running, axis=0)",
         "test_rollout.py::test_a_batch_ends_with_its_last_lane",
@@ -223,8 +258,8 @@ MUTATIONS = [
     Mutation(
         "a relay without hysteresis",
         "controllers/switching.py",
-        "(excess > self.band)",
-        "(excess > 0)",
+        "return (self.band + jnp.where",
+        "return (0.0 * self.band + jnp.where",
         "test_blocks.py::test_relay_switches_on_the_far_side_of_its_band",
     ),
     Mutation(
@@ -235,10 +270,10 @@ MUTATIONS = [
         "test_blocks.py::test_sampled_is_a_zero_order_hold",
     ),
     Mutation(
-        "a latch that is never late",
-        "references/peak_slip.py",
-        "jnp.where(higher, (1 - place) * clock.h, 0.0)",
-        "0.0 * place",
+        "events at the end of the step in which they are noticed",
+        "simulate/landing.py",
+        "return search, jnp.where(enough, x + apart, guess), enough",
+        "return search, x, True",
         "test_blocks.py::test_latch_finds_the_vertex",
     ),
     Mutation(
@@ -279,8 +314,8 @@ MUTATIONS = [
     Mutation(
         "a robust latch that is always armed",
         "references/peak_slip.py",
-        "(new.greatest > self.arming) & ",
-        "",
+        "(m.latched < 0.5) & (m.greatest > self.arming)",
+        "(m.latched < 0.5)",
         "test_blocks.py::test_robust_latch",
     ),
     Mutation(
@@ -292,9 +327,9 @@ MUTATIONS = [
     ),
     Mutation(
         "noise drawn off its period",
-        "sensors/noise.py",
-        "jnp.where(draw * n == clock.k, a, b)",
-        "jnp.where(draw * n + 1 == clock.k, a, b)",
+        "core/protocols.py",
+        "self.on_grid & (self.k % n == 0)",
+        "self.on_grid & (self.k % n == 1)",
         "test_blocks.py::test_noise",
     ),
     Mutation(
@@ -410,10 +445,10 @@ MUTATIONS = [
         "test_conformance.py::test_errors_count_on_either_side[iae]",
     ),
     Mutation(
-        "a peak before the first sample",
-        "objectives/tracking.py",
-        "(last > earlier) & (last > value)",
-        "(last >= earlier) & (last > value)",
+        "a peak without a rise before it",
+        "core/cubic.py",
+        "inside = (c1 > 0) & (c1 + 2.0 * c2 + 3.0 * c3 < 0)",
+        "inside = c1 + 2.0 * c2 + 3.0 * c3 < 0",
         "test_rollout.py::test_the_peak_of_a_falling_slip_is_its_first_value",
     ),
     Mutation(
@@ -432,18 +467,11 @@ MUTATIONS = [
         "test_rollout.py::test_a_run_that_does_not_stop_is_charged_the_rest",
     ),
     Mutation(
-        "an event corrected to first order",
-        "simulate/hybrid_step.py",
-        "flow(t + e / 2, axpy(e / 2, flow(t, z, state), z), state)",
-        "flow(t, z, state)",
-        "test_order_of_events.py::test_converges_to_scipy[relay]",
-    ),
-    Mutation(
-        "a relay that switches on a straight line",
-        "controllers/switching.py",
-        "if clock.rate is not None:",
-        "if False:",
-        "test_order_of_events.py::test_converges_to_scipy[relay]",
+        "a landing near the zero",
+        "simulate/landing.py",
+        "return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf)",
+        "return search.place",
+        "test_blocks.py::test_latch_finds_the_vertex",
     ),
     Mutation(
         "a delay that takes a level for a line",
@@ -453,31 +481,31 @@ MUTATIONS = [
         "test_order_of_events.py::test_converges_to_scipy[delay]",
     ),
     Mutation(
-        "a delay that does not know when a relay switched",
+        "a delay that does not know what it was given before a jump",
         "actuators/delay.py",
-        "share, last, now = clock.late * (signal - before),",
-        "share, last, now = 0.0 * (signal - before),",
-        "test_blocks.py::test_delay_of_a_relay_that_switches_within_a_step",
+        "end = signal if clock.before is None else clock.before",
+        "end = signal",
+        "test_blocks.py::test_delay_of_a_command_that_jumps_at_an_instant",
     ),
     Mutation(
         "a stop on the grid",
-        "simulate/hybrid_step.py",
-        "jnp.where(search, clamp(carry.length + late, 0.0, h), carry.length)",
-        "jnp.where(search, h, carry.length)",
+        "simulate/stepper.py",
+        "taken = active & fine & (landing | (to_grid & ~jnp.any(jnp.stack(crossed))))",
+        "taken = active & fine & (landing | to_grid)",
         "test_rollout.py::test_speed_reached_lands_between_samples",
     ),
     Mutation(
         "a landing without derivative",
-        "simulate/hybrid_step.py",
-        "flow, tally = axpy(moved, rates,",
-        "flow, tally = axpy(jax.lax.stop_gradient(moved), rates,",
+        "simulate/landing.py",
+        "return search.place - search.margin / jnp",
+        "return search.place - jax.lax.stop_gradient(search.margin) / jnp",
         "test_gradients.py::test_gradient_of_every_objective_in_every_parameter[feedback]",
     ),
     Mutation(
-        "an event that moves nothing",
-        "simulate/hybrid_step.py",
-        "e = event.elapsed",
-        "e = 0.0 * event.elapsed",
+        "an event whose moment has no derivative",
+        "simulate/landing.py",
+        "place=x, margin=jnp.where(near, margin, 0.0)",
+        "place=x, margin=jnp.where(near, jax.lax.stop_gradient(margin), 0.0)",
         "test_gradients.py::test_gradient_through_the_latch_agrees_with_a_wide_difference[0.0-published0]",
     ),
     Mutation(
@@ -489,9 +517,9 @@ MUTATIONS = [
     ),
     Mutation(
         "a run that outlives its horizon",
-        "simulate/hybrid_step.py",
-        "jnp.where(k < steps, Condition.RUNNING, Condition.TIMED_OUT)",
-        "Condition.RUNNING",
+        "simulate/stepper.py",
+        "(on_grid & (carry.k + 1 >= steps))",
+        "(on_grid & False)",
         "test_rollout.py::test_a_run_that_does_not_stop_is_charged_the_rest",
     ),
     Mutation(
@@ -1127,8 +1155,8 @@ MUTATIONS = [
     Mutation(
         "torque rate: of a sample, not of time",
         "objectives/braking.py",
-        "jnp.abs(sample.control - last) / jnp.where(whole, h, 1.0)",
-        "jnp.abs(sample.control - last)",
+        "rates = (jnp.abs(rate.control) for rate in segment.sample_rates())",
+        "rates = (segment.step * jnp.abs(rate.control) for rate in segment.sample_rates())",
         "test_rollout.py::test_the_torque_rate_of_a_lag_is_that_of_its_exponential",
     ),
     Mutation(
@@ -1169,7 +1197,7 @@ MUTATIONS = [
     Mutation(
         "balance: an observer that predicts before its first sample",
         "controllers/balance.py",
-        "jnp.where(clock.k > 0, predicted, estimate.state)",
+        "jnp.where(number > 0, predicted, estimate.state)",
         "predicted",
         "test_arm_control.py::test_an_observer_starts_at_what_is_measured",
     ),
@@ -1202,10 +1230,10 @@ MUTATIONS = [
         "test_arm_basin.py::test_the_vertices_are_the_systems_on_the_grid",
     ),
     Mutation(
-        "balance: a fall that rises",
+        "balance: a fall of the arm",
         "stops/stops.py",
-        "return -2 * output.theta * output.theta_rate",
-        "return 2 * output.theta * output.theta_rate",
+        "return self.angle**2 - output.theta**2",
+        "return self.angle**2 - output.psi**2",
         "test_arm_basin.py::test_the_slope_of_the_time_of_a_fall_is_a_difference",
     ),
     Mutation(
@@ -1295,7 +1323,7 @@ MUTATIONS = [
     ),
     Mutation(
         "a start beyond the stop is a run",
-        "simulate/hybrid_step.py",
+        "simulate/stepper.py",
         "zero + Condition.RUNNING, zero + Condition.DIVERGED",
         "zero + Condition.RUNNING, zero + Condition.STOPPED",
         "test_refusals.py::TestAfterARun::test_a_start_beyond_the_stop_is_no_run",

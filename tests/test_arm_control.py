@@ -120,7 +120,7 @@ def seen(x):
 
 def corrected(observer, last, x, k=1):
     """The estimate after a sample of the state x."""
-    return observer.jump(Clock(0.01 * k, 1e-3, 10 * k, None), Memory(held=last), seen(x)).memory.held
+    return observer.tick(Clock(0.01 * k, 0.01, k, None), Memory(held=last), seen(x)).held
 
 
 def test_regulator_and_filter_are_those_of_the_weights():

@@ -75,12 +75,12 @@ def test_slots_leave_little_over_and_are_few(count):
     assert len({slots(n) for n in range(1000, 4000)}) <= 17
 
 
-def test_groups_beyond_the_count_are_skipped_and_have_no_derivative():
+def test_groups_after_the_end_are_skipped_and_have_no_derivative():
     def power(x, count, room):
         def step(carry):
             return carry[0] * x, carry[1] + 1
 
-        return repeated(step, (1.0, 0), room, lambda carry: carry[1] >= 0, count)
+        return repeated(step, (1.0, 0), room, lambda carry: carry[1] < count)
 
     for room in (100, 4000):
         made = levels(room)[1] * math.ceil(70 / levels(room)[1])

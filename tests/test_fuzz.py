@@ -71,7 +71,7 @@ def test_an_overshoot_over_a_setpoint_of_nothing_is_finite(setpoint, overshoot):
     ending: Any = SimpleNamespace(sample=SimpleNamespace(setpoint=jnp.asarray(setpoint)))
 
     def measured(greatest: Any) -> Any:
-        memory: Any = SimpleNamespace(held=(1.0, (greatest, 0.0, 0.0)))
+        memory: Any = SimpleNamespace(held=(1.0, greatest))
         return Overshoot().value(memory, ending)
 
     value, slope = jax.value_and_grad(measured)(0.3)

@@ -219,7 +219,7 @@ def one_period(loop, z, period):
     flow = state.controller.held.inner.flow
     flow = flow._replace(integral=z[0], filtered=z[4]) if len(z) == 5 else z[0]
     held = state.controller.held
-    held = held._replace(inner=held.inner._replace(flow=flow), after=z[3])
+    held = held._replace(inner=held.inner._replace(flow=flow), applied=z[3], next=z[3])
     state = state._replace(
         plant=z[1],
         controller=state.controller._replace(held=held),
@@ -227,7 +227,10 @@ def one_period(loop, z, period):
     )
 
     def step(state, k):
-        state, _ = loop.jump(Clock(k * h, h, k, None), state)
+        t, signals = k * h, loop.signals(k * h, state)
+        margins = loop.margins(t, state, signals, lambda: loop.flow(t, state, signals))
+        fired = jax.tree.map(lambda margin: margin < 1e-9, margins)  # the delay is a whole number of steps
+        state = loop.change(Clock(t, h, k, None), state, signals, margins, fired)
 
         def rate(t, flow):
             at = state.with_flow(flow)
@@ -239,7 +242,7 @@ def one_period(loop, z, period):
     held = state.controller.held
     inner = held.inner.flow
     own = [inner.integral, inner.filtered] if len(z) == 5 else [inner]
-    return jnp.stack([own[0], state.plant, state.actuator.flow, held.after, *own[1:]])
+    return jnp.stack([own[0], state.plant, state.actuator.flow, held.next, *own[1:]])
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.002])

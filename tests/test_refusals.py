@@ -12,7 +12,7 @@ from sweeping import described
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors
-from diffabs.core.protocols import BrakeOutput, Ending, Sample
+from diffabs.core.protocols import BrakeOutput, Ending, Sample, still
 from diffabs.core.pytree import replace, strong
 from diffabs.design.attraction import outcomes
 from diffabs.identify import Traces, identify
@@ -215,7 +215,9 @@ def test_what_no_braked_car_does(before, after, fine):
     audit = BrakeAudit(car=jnp.asarray(10.0), wheel=jnp.asarray(1.0), radius=jnp.asarray(0.2), scale=550.0)
     a, b = sample(*before), sample(*after)
     memory = audit.start(a)
-    value = audit.value(memory._replace(held=audit.update(memory, a, b, 1e-3)), Ending(b, False, 0.0, 0.0))
+    value = audit.value(
+        memory._replace(held=audit.update(memory, still(a, 1e-3)._replace(end=b))), Ending(b, False, 0.0, 0.0)
+    )
     assert bool(value <= 1) is fine
 
 

@@ -1,7 +1,7 @@
 """Pure delay: control(t) = command(t - time), and 0 before the first command has come through.
 
-Of each past step the ring keeps the command at both ends and its mean, which is integrated with the plant: a parabola
-that is the command to third order, also where the command jumps at an instant or changed in an event within the step.
+Of each past step of the grid the ring keeps the command at both ends and its mean, which is integrated with the plant:
+a parabola that is the command to third order; where the command jumped in an event within the step, its impulse.
 The step that lies ahead needs it between t - time and t - time + h, where the end of a ring's step may lie and the
 command may jump. Runge-Kutta stages would not see that, so the step uses the straight line that has the same mean and
 the same first moment: of a smooth command that costs no order, and of a jump the impulse is exact. The line does not
@@ -11,10 +11,11 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp
-from diffabs.core.protocols import Clock, Jump, Memory
+from diffabs.core.protocols import Clock, Memory
 from diffabs.core.pytree import Scalar, param, pytree, static
 from diffabs.core.rules import Rule, array
 
@@ -59,27 +60,24 @@ class Delay:
         m: DelayMemory = memory.held
         return m.level + m.rise * (t - m.middle) / m.h
 
-    def jump(self, clock: Clock, memory: Memory, signal: Scalar) -> Jump:
-        """Store the step that is over, and find the line for the one that follows.
-
-        An event in the last step changed the command `clock.late` ago. The loop adds that share to what is integrated
-        from now on; here it belongs to the last step.
-        """
-        before = signal if clock.before is None else clock.before
-        share, last, now = clock.late * (signal - before), (clock.k - 1) % self.capacity, clock.k % self.capacity
-        end = before + share / clock.h
+    def tick(self, clock: Clock, memory: Memory, signal: Scalar) -> Memory:
+        """Store the step that is over, and find the line for the one that follows."""
+        on_grid, number = clock.ticks()
+        end = signal if clock.before is None else clock.before
+        last, now = (number - 1) % self.capacity, number % self.capacity
         held: DelayMemory = memory.held
         rings = held._replace(
             start=held.start.at[now].set(signal),
             end=held.end.at[last].set(end),
-            mean=held.mean.at[last].set((memory.flow + share) / clock.h),
+            mean=held.mean.at[last].set(memory.flow / clock.h),
             middle=clock.t + 0.5 * clock.h,
             h=clock.h,
         )
         back = clamp(self.time / clock.h, 1.0, self.capacity - 2.0)
         whole = jnp.ceil(back)
-        level, rise = self._line(rings, clock.k - whole.astype(int), whole - back, clock.k)
-        return Jump(Memory(-share, rings._replace(level=level, rise=rise)))
+        level, rise = self._line(rings, number - whole.astype(int), whole - back, number)
+        new = Memory(0.0 * memory.flow, rings._replace(level=level, rise=rise))
+        return jax.tree.map(lambda a, b: jnp.where(on_grid, a, b), new, memory)
 
     def _line(self, rings: DelayMemory, first: Any, part: Any, now: Any) -> tuple[Any, Any]:
         """The delayed command in the middle of a step that begins a `part` into step `first` of the ring, and its

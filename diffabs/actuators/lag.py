@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from diffabs.core.numerics import clamp, quotient
-from diffabs.core.protocols import Memory, no_flow, no_jump, no_memory
+from diffabs.core.protocols import Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.core.rules import Rule, ordered
 
@@ -17,7 +17,6 @@ class Limits:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
         """Torque [N m]."""
@@ -34,8 +33,6 @@ class Lag:
     """time_constant control' = command - control, control(0) = 0: a brake that has to build up pressure."""
 
     time_constant: Scalar = param(default=0.01, unit="s", above=0.0)
-
-    jump = no_jump
 
     def start(self, signal: Scalar) -> Memory:
         """Brake released."""
@@ -64,7 +61,6 @@ class RateLimit:
 
     start = Lag.start
     output = Lag.output
-    jump = no_jump
 
     def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
         """control'."""

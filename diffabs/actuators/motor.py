@@ -1,7 +1,7 @@
 """The supply of a motor: what voltage it can give."""
 
 from diffabs.core.numerics import clamp
-from diffabs.core.protocols import Memory, no_flow, no_jump, no_memory
+from diffabs.core.protocols import Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
 
 
@@ -13,7 +13,6 @@ class VoltageLimit:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
         """Voltage [V]."""

@@ -121,7 +121,8 @@ def simulate(
             for line in said(found):
                 console.say(f"warning: {line}")
         if result["diverged"]:
-            console.fail(f"{chosen.name} diverged: a number became infinite or impossible: there are no metrics", 1)
+            why = "a number became infinite or impossible, or something switched in every step: there are no metrics"
+            console.fail(f"{chosen.name} diverged: {why}", 1)
         if warning := _warning(chosen, result):
             console.say(f"warning: {warning}")
 

@@ -10,11 +10,12 @@ those of one period. `diffabs.linear.lqg` computes K and L.
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.numerics import clamp
-from diffabs.core.protocols import BalanceOutput, Clock, Jump, Memory, Tracking, no_flow, no_jump, no_memory
+from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking, no_flow, no_memory
 from diffabs.core.pytree import Matrix, Scalar, Vector, param, pytree
 
 STATES = ("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate")
@@ -37,7 +38,6 @@ class BalanceFeedback:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Voltage [V]."""
@@ -60,7 +60,7 @@ class Estimate(NamedTuple):
 @pytree
 class ObserverFeedback:
     """u = K x^, x^ from theta and psi by a steady Kalman filter in discrete time; it knows the voltage's limit. It
-    jumps at every step of the integration unless it is `Sampled`."""
+    computes in every step of the integration unless it is `Sampled`."""
 
     gain: Vector = param(default=GAIN, unit="V/rad, V s/rad")
     transition: Matrix = param(default=np.eye(6), unit="1")
@@ -82,15 +82,17 @@ class ObserverFeedback:
         del t, signal
         return memory.held.voltage
 
-    def jump(self, clock: Clock, memory: Memory, signal: Tracking) -> Jump:
+    def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
         """Predict from the last sample, correct by this one."""
+        now, number = clock.ticks()
         estimate: Estimate = memory.held
         voltage = clamp(estimate.voltage, -self.voltage_max, self.voltage_max)
         predicted = self.transition @ estimate.state + self.entry * voltage
-        predicted = jnp.where(clock.k > 0, predicted, estimate.state)
+        predicted = jnp.where(number > 0, predicted, estimate.state)
         error = jnp.stack([getattr(signal.measured, name) - predicted[STATES.index(name)] for name in MEASURED])
         state = predicted + self.correction @ error
-        return Jump(Memory(held=Estimate(state, self.gain @ state)))
+        new = Estimate(state, self.gain @ state)
+        return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, estimate))
 
     def problems(self) -> Iterator[str]:
         """Arrays of the wrong shape."""

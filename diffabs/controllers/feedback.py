@@ -12,7 +12,7 @@ import numpy as np
 
 from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.core.numerics import clamp
-from diffabs.core.protocols import Memory, Tracking, no_jump
+from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree
 from diffabs.core.rules import Rule, ordered
 
@@ -39,8 +39,6 @@ class StateFeedback:
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Torque [N m]."""
         return self._torque(memory, signal)[1]
-
-    jump = no_jump
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
         error = signal.measured[0] - signal.target

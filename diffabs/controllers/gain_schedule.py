@@ -14,7 +14,7 @@ import numpy as np
 
 from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.controllers.feedback import StateFeedback
-from diffabs.core.protocols import Memory, Tracking, no_jump
+from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree
 from diffabs.core.rules import Rule, increasing
 
@@ -31,7 +31,6 @@ class ScheduledFeedback:
     antiwindup: Any = part(default=NoAntiWindup)
 
     start = StateFeedback.start
-    jump = no_jump
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Any:
         """x1' = slip - target, unless the anti-windup says otherwise."""
@@ -91,7 +90,6 @@ class ProportionalFeedback:
 
     start, problems, rules = StateFeedback.start, StateFeedback.problems, StateFeedback.rules
     flow, output = ScheduledFeedback.flow, ScheduledFeedback.output
-    jump = no_jump
 
     def _here(self, signal: Tracking) -> StateFeedback:
         """The feedback at the measured speed."""

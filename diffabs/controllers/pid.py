@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.core.numerics import clamp
-from diffabs.core.protocols import Memory, Tracking, no_jump
+from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.core.rules import Rule, ordered
 
@@ -50,8 +50,6 @@ class PID:
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Control: a brake's torque [N m]."""
         return self._torque(memory, signal)[1]
-
-    jump = no_jump
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
         error = signal.target - signal.measured[0]

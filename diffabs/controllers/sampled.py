@@ -3,31 +3,31 @@
     u(t) = u_k for t_k + delay <= t < t_(k+1) + delay,   t_k = k period,   I_(k+1) = I_k + period I'(t_k)
 
 The continuous memory of the inner controller is advanced by forward Euler at the sampling period, as such code is
-usually written. When the output changes inside an integration step, the step uses its mean: the impulse is exact, and
-the run is differentiable in the delay."""
+usually written. The change of the output after the delay is an event."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from diffabs.controllers.pid import PID
-from diffabs.core.numerics import axpy, clamp
-from diffabs.core.protocols import Block, Clock, Jump, Memory, Tracking, no_flow
+from diffabs.core.blocks import offers
+from diffabs.core.numerics import axpy
+from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.core.rules import Rule, array
-from diffabs.core.timing import steps, whole_steps
+from diffabs.core.timing import whole_steps
 
 
 class SampledMemory(NamedTuple):
-    """Inner memory; output before and after the pending change, time of that change [s]; mean over the present step."""
+    """Inner memory; output that is applied; output that waits, until when [s], and 1 while it does."""
 
     inner: Memory
-    before: Scalar
-    after: Scalar
-    change: Scalar
     applied: Scalar
+    next: Scalar
+    until: Scalar
+    waits: Scalar
 
 
 @pytree
@@ -46,21 +46,41 @@ class Sampled:
         return Memory(held=SampledMemory(self.controller.start(signal), zero, zero, zero, zero))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """The held output, averaged over the present step."""
+        """The held output."""
         del t, signal
         return memory.held.applied
 
-    def jump(self, clock: Clock, memory: Memory, signal: Tracking) -> Jump:
-        """At a sampling instant: compute; in every step: hold."""
+    def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
+        """At a sampling instant: compute. What still waits, since the delay is a whole period, is applied."""
         m: SampledMemory = memory.held
-        due = clock.k % steps(self.period, clock.h) == 0
-        inner = self.controller.jump(clock, m.inner, signal).memory
+        now, number = clock.ticks(self.period)
+        inner = self._sampled(clock._replace(h=self.period, k=number), m.inner, signal)
         output = self.controller.output(clock.t, inner, signal)
         flow = axpy(self.period, self.controller.flow(clock.t, inner, signal), inner.flow)
-        new = SampledMemory(Memory(flow, inner.held), m.after, output, clock.t + self.delay, m.applied)
-        m = jax.tree.map(lambda a, b: jnp.where(due, a, b), new, m)
-        waiting = clamp((m.change - clock.t) / clock.h, 0.0, 1.0)
-        return Jump(Memory(held=m._replace(applied=waiting * m.before + (1 - waiting) * m.after)))
+        waits = jnp.greater(self.delay, 0)
+        applied = jnp.where(waits, jnp.where(m.waits > 0.5, m.next, m.applied), output)
+        new = SampledMemory(Memory(flow, inner.held), applied, output, clock.t + self.delay, jnp.where(waits, 1.0, 0.0))
+        return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m))
+
+    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: Any) -> tuple[Any]:
+        """The time until the output changes."""
+        del signal, rate
+        return (jnp.where(memory.held.waits > 0.5, memory.held.until - t, 1.0),)
+
+    def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[Any]) -> Memory:
+        """Apply what waits."""
+        del t, signal
+        m: SampledMemory = memory.held
+        applied, waits = jnp.where(fired[0], m.next, m.applied), jnp.where(fired[0], 0.0, m.waits)
+        return Memory(held=m._replace(applied=applied, waits=waits))
+
+    def _sampled(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
+        """The inner controller's memory after its tick, or after an event that it can only notice now."""
+        inner: Any = self.controller
+        if offers(inner, "margins"):
+            late = tuple(margin < 0 for margin in inner.margins(clock.t, memory, signal, None))
+            memory = inner.event(clock.t, memory, signal, late)
+        return inner.tick(clock, memory, signal) if offers(inner, "tick") else memory
 
     def rules(self) -> Iterator[Rule]:
         """A computation takes no longer than the period."""

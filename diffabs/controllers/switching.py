@@ -1,12 +1,12 @@
 """Controllers without memory of the plant: constant torque, relay with hysteresis, sliding mode."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 
-from diffabs.core.numerics import clamp, ratio
-from diffabs.core.protocols import Clock, Jump, Memory, Tracking, no_flow, no_jump, no_memory
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import Memory, Tracking, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.core.rules import Rule, ordered
 
@@ -19,7 +19,6 @@ class ConstantTorque:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Torque [N m]."""
@@ -27,21 +26,12 @@ class ConstantTorque:
         return self.torque
 
 
-class RelayMemory(NamedTuple):
-    """1 while the brake is applied, else 0; excess of the slip over the target at the last instant."""
-
-    applied: Scalar
-    excess: Scalar
-
-
 @pytree
 class Relay:
     """torque_max until slip > target + band, then torque_min until slip < target - band.
 
-    Switches at the instants of the integration grid; the moment of the crossing inside the step is that of the parabola
-    through the excess at both ends with its rate at the later one, so that a run does not depend on the grid and is
-    differentiable.
-    """
+    Switches where the slip crosses the edge of the band: between the instants of the grid, too. It remembers 1 while
+    the brake is applied, else 0."""
 
     band: Scalar = param(default=0.02, unit="signal", above=0.0, below=1.0)
     torque_min: Scalar = param(default=0.0, unit="control")
@@ -52,42 +42,27 @@ class Relay:
     def start(self, signal: Tracking) -> Memory:
         """Applied if the slip is below the target."""
         excess = signal.measured[0] - signal.target
-        return Memory(held=RelayMemory(jnp.where(excess < 0, 1.0, 0.0) + 0.0 * excess, excess))
+        return Memory(held=jnp.where(excess < 0, 1.0, 0.0) + 0.0 * excess)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Torque [N m]."""
         del t, signal
-        applied = memory.held.applied
-        return self.torque_min + applied * (self.torque_max - self.torque_min)
+        return self.torque_min + memory.held * (self.torque_max - self.torque_min)
 
-    def jump(self, clock: Clock, memory: Memory, signal: Tracking) -> Jump:
-        """Switch at the far side of the band."""
-        applied, before = memory.held
+    def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: Any) -> tuple[Any]:
+        """How far the slip is from the far side of the band."""
+        del t, rate
         excess = signal.measured[0] - signal.target
-        release = (applied > 0.5) & (excess > self.band)
-        apply = (applied < 0.5) & (excess < -self.band)
-        side = jnp.where(release, 1.0, -1.0)
-        slope = excess - before
-        if clock.rate is not None:
-            rate = clock.rate()
-            slope = clock.h * (rate.measured[0] - rate.target)
-        late = _crossed(side * (before - side * self.band), side * (excess - side * self.band), side * slope)
-        elapsed = jnp.where(release | apply, late * clock.h, 0.0)
-        now = jnp.where(release, 0.0, jnp.where(apply, 1.0, applied))
-        return Jump(Memory(held=RelayMemory(now, excess)), elapsed)
+        return (self.band + jnp.where(memory.held > 0.5, -excess, excess),)
+
+    def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[Any]) -> Memory:
+        """Release the brake, or apply it."""
+        del t, signal
+        return Memory(held=jnp.where(fired[0], 1.0 - memory.held, memory.held))
 
     def rules(self) -> Iterator[Rule]:
         """A release torque below the applied one."""
         yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}", equal=False)
-
-
-def _crossed(before: Scalar, after: Scalar, slope: Scalar) -> Any:
-    """How long ago, in steps, a value became positive that was `before` <= 0, is `after` > 0, and now rises by `slope`
-    a step: the latest zero of the parabola after - slope r + bend r^2, in a form that does not cancel."""
-    bend = before - after + slope
-    square = slope**2 - 4.0 * bend * after
-    root = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    return clamp(ratio(2.0 * after, slope + root), 0.0, 1.0)
 
 
 @pytree
@@ -104,7 +79,6 @@ class SlidingMode:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Torque [N m]."""

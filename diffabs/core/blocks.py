@@ -1,10 +1,13 @@
 """Blocks in series, for sensors and actuators, and the block that does nothing."""
 
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
-from diffabs.core.protocols import Block, Clock, Jump, Memory, no_flow, no_jump, no_memory
+from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, part, pytree
 
 
@@ -14,7 +17,6 @@ class Direct:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: Any) -> Any:
         """The signal."""
@@ -24,7 +26,7 @@ class Direct:
 
 @pytree
 class Series:
-    """Blocks one after the other, the first nearest to the input. Events inside a series are not localised."""
+    """Blocks one after the other, the first nearest to the input."""
 
     blocks: tuple[Block, ...] = part(default=(Direct(),))
 
@@ -34,7 +36,7 @@ class Series:
         for block in self.blocks:
             memories.append(block.start(signal))
             signal = block.output(0.0, memories[-1], signal)
-        return Memory(tuple(m.flow for m in memories), tuple(m.held for m in memories))
+        return _joined(memories)
 
     def flow(self, t: Scalar, memory: Memory, signal: Any) -> Any:
         """Their rates."""
@@ -50,17 +52,60 @@ class Series:
             signal = block.output(t, m, signal)
         return signal
 
-    def jump(self, clock: Clock, memory: Memory, signal: Any) -> Jump:
-        """Their jumps, in order; each draws from its own random stream."""
+    def offers(self, hook: str) -> bool:
+        """Whether one of the blocks has this hook."""
+        return any(offers(block, hook) for block in self.blocks)
+
+    def tick(self, clock: Clock, memory: Memory, signal: Any) -> Memory:
+        """Their ticks, in order; each draws from its own random stream."""
         memories, before = [], signal if clock.before is None else clock.before
         for i, (block, m) in enumerate(self._pairs(memory)):
             key = None if clock.key is None else jax.random.fold_in(clock.key, i)
-            memories.append(block.jump(clock._replace(key=key, before=before, rate=None), m, signal).memory)
-            signal, before = block.output(clock.t, memories[-1], signal), block.output(clock.t, m, before)
-        return Jump(Memory(tuple(m.flow for m in memories), tuple(m.held for m in memories)))
+            after = block.tick(clock._replace(key=key, before=before), m, signal) if offers(block, "tick") else m
+            signal, before = block.output(clock.t, after, signal), block.output(clock.t, m, before)
+            memories.append(after)
+        return _joined(memories)
+
+    def margins(self, t: Scalar, memory: Memory, signal: Any, rate: Callable[[], Any]) -> tuple[Any, ...]:
+        """Those of all blocks, in order."""
+        found: tuple[Any, ...] = ()
+        for block, m in self._pairs(memory):
+            if offers(block, "margins"):
+                found += block.margins(t, m, signal, rate)
+            signal, rate = block.output(t, m, signal), partial(_output_rate, block, t, m, signal, rate)
+        return found
+
+    def event(self, t: Scalar, memory: Memory, signal: Any, fired: tuple[Any, ...]) -> Memory:
+        """Their events, in order."""
+        memories = []
+        for block, m in self._pairs(memory):
+            after = m
+            if offers(block, "margins"):
+                count = len(block.margins(t, m, signal, lambda signal=signal: signal))
+                after, fired = block.event(t, m, signal, fired[:count]), fired[count:]
+            memories.append(after)
+            signal = block.output(t, m, signal)
+        return _joined(memories)
 
     def _pairs(self, memory: Memory) -> Any:
         return [(b, Memory(f, h)) for b, f, h in zip(self.blocks, memory.flow, memory.held, strict=True)]
+
+
+def offers(block: Any, *hooks: str) -> bool:
+    """Whether a block has one of these hooks, by default a tick or margins; a block made of blocks says it itself."""
+    asked = getattr(block, "offers", None)
+    return any(asked(hook) if asked else hasattr(block, hook) for hook in hooks or ("tick", "margins"))
+
+
+def _joined(memories: Sequence[Memory]) -> Memory:
+    return Memory(tuple(m.flow for m in memories), tuple(m.held for m in memories))
+
+
+def _output_rate(block: Block, t: Scalar, memory: Memory, signal: Any, rate: Callable[[], Any]) -> Any:
+    """d(output)/dt of a block whose signal has this rate."""
+    t, moving = jnp.asarray(t), rate()
+    moves = (jnp.ones_like(t), block.flow(t, memory, signal), moving)
+    return jax.jvp(lambda t, z, s: block.output(t, memory._replace(flow=z), s), (t, memory.flow, signal), moves)[1]
 
 
 @pytree

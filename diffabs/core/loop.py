@@ -1,18 +1,21 @@
 """One hybrid closed loop: plant, sensor, reference, feed-forward, controller, actuator, and when it ends.
 
-    between instants   dz/dt = flow(t, z; held)      z: plant state and the blocks' continuous memories
-    at instants        (z, held) -> jump(z, held)    sensor, reference, controller, actuator, in this order
+    between instants   dz/dt = flow(t, z; held)         z: plant state and the blocks' continuous memories
+    at instants        (z, held) -> change(z, held)     sensor, reference, controller, actuator, in this order
+
+An instant is a tick of a clock, or an event: a margin of a block falls through zero.
 
 A `Loop` is one pytree: every parameter of every part is a leaf with a dotted path, `loop.plant.road.scale`.
 """
 
-from functools import partial
+from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.blocks import Direct, NoFeedforward
+from diffabs.core.blocks import Direct, NoFeedforward, offers
 from diffabs.core.protocols import Block, Clock, Feedforward, Memory, Plant, Reference, Sample, Stop, Tracking
 from diffabs.core.pytree import Scalar, part, pytree
 
@@ -43,12 +46,8 @@ class Signals(NamedTuple):
     tracking: Tracking
 
 
-class Event(NamedTuple):
-    """A jump whose cause lies `elapsed` seconds back: the state before and after it."""
-
-    before: LoopState
-    after: LoopState
-    elapsed: Scalar
+Margins = dict[str, tuple[Any, ...]]  # of the stop and of each block that has events, by name
+BLOCKS = ("sensor", "reference", "controller", "actuator")
 
 
 @pytree
@@ -99,36 +98,63 @@ class Loop:
             self.actuator.flow(t, state.actuator, sample.command),
         )
 
-    def jump(self, clock: Clock, state: LoopState, before: Signals | None = None) -> tuple[LoopState, list[Event]]:
-        """The blocks' jumps in the order of the signal, and those that are localised events. `before` are the signals
-        at (clock.t, state), if they are known."""
-        t, events, start = clock.t, [], state
-        seen = _seen(before or self.signals(t, state))
+    @property
+    def changes(self) -> bool:
+        """Whether a block has ticks or events."""
+        return any(offers(getattr(self, name)) for name in BLOCKS)
 
-        def rate(name: str) -> Any:
-            return _seen(self._signal_rates(t, start, before or self.signals(t, start)))[name]
+    @property
+    def eventful(self) -> bool:
+        """Whether a block has events."""
+        return any(offers(getattr(self, name), "margins") for name in BLOCKS)
 
-        def jumped(name: str, signal: Any) -> Memory:
-            nonlocal state, clock
-            clock = clock._replace(before=seen[name], rate=partial(rate, name))
-            memory, elapsed = getattr(self, name).jump(clock, getattr(state, name), signal)
-            after = state._replace(**{name: memory})
-            if elapsed is not None:
-                events.append(Event(state, after, elapsed))
-                clock = clock._replace(late=clock.late + elapsed)
-            state = after
+    def margins(self, t: Scalar, state: LoopState, signals: Signals, flow: Callable[[], Any]) -> Margins:
+        """The stop's margin and those of the blocks; `flow()` is d(state.flow())/dt, for those that need a rate."""
+        rates = cache(lambda: _seen(self.signal_rates(t, state, flow())))
+        seen = _seen(signals)
+
+        def of(name: str) -> tuple[Any, ...]:
+            return getattr(self, name).margins(t, getattr(state, name), seen[name], lambda: rates()[name])
+
+        found = {name: of(name) for name in BLOCKS if offers(getattr(self, name), "margins")}
+        return {"stop": (self.stop.margin(signals.sample.output),), **found}
+
+    def change(self, clock: Clock, state: LoopState, before: Signals, margins: Margins, fired: Margins) -> LoopState:
+        """The state after an instant: each block, in the order of the signal, has its events, then its tick.
+
+        before, margins: those until now. An event also happens where the change of a block before it makes a margin
+            negative, at either end of the jump of the signal and with the jump for a rate: a maximum is where it falls
+        fired: a bool for each margin, whether it has just fallen through zero
+        """
+        was, moved = _seen(before), False
+
+        def changed(name: str, signal: Any) -> Memory:
+            nonlocal state, moved
+            block, memory = getattr(self, name), getattr(state, name)
+            if name in fired:
+                happens = fired[name]
+                if moved:
+                    jump = jax.tree.map(jnp.subtract, signal, was[name])
+                    ends = (block.margins(clock.t, memory, end, lambda: jump) for end in (was[name], signal))
+                    crossed = zip(happens, margins[name], *ends, strict=True)
+                    happens = tuple(one | ((a >= 0) & ((b < 0) | (c < 0))) for one, a, b, c in crossed)
+                memory = block.event(clock.t, memory, was[name], happens)
+            if offers(block, "tick"):
+                memory = block.tick(clock._replace(before=was[name]), memory, signal)
+            moved = moved or offers(block)
+            state = state._replace(**{name: memory})
             return memory
 
-        y = self.plant.output(state.plant)
-        measured = self.sensor.output(t, jumped("sensor", y), y)
-        tracking = self._tracking(t, jumped("reference", measured), measured)
-        command = self.controller.output(t, jumped("controller", tracking), tracking)
-        jumped("actuator", command)
-        return state, events
+        t, y = clock.t, before.sample.output
+        measured = self.sensor.output(t, changed("sensor", y), y)
+        tracking = self._tracking(t, changed("reference", measured), measured)
+        command = self.controller.output(t, changed("controller", tracking), tracking)
+        changed("actuator", command)
+        return state
 
-    def _signal_rates(self, t: Scalar, state: LoopState, signals: Signals) -> Signals:
-        """d(signals)/dt where nothing jumps."""
-        moves = (jnp.ones_like(jnp.asarray(t)), self.flow(t, state, signals))
+    def signal_rates(self, t: Scalar, state: LoopState, flow: Any) -> Signals:
+        """d(signals)/dt where nothing jumps and d(state.flow())/dt is `flow`."""
+        moves = (jnp.ones_like(jnp.asarray(t)), flow)
         return jax.jvp(lambda t, z: self.signals(t, state.with_flow(z)), (jnp.asarray(t), state.flow()), moves)[1]
 
     def _tracking(self, t: Scalar, reference: Memory, measured: Any) -> Tracking:

@@ -10,9 +10,11 @@
                   |
                 Plant.derivative(t, x, control)
 
-Sensor, Reference, Controller and Actuator are `Block`s: dynamic systems with a flow and a jump. The flow is evaluated
-inside every Runge-Kutta stage, the jump once at the start of every step; that is how a continuous PID and a computer's
-relay live in one loop. Nothing here is a base class: a part satisfies a contract by its shape.
+Sensor, Reference, Controller and Actuator are `Block`s: dynamic systems with a flow, which is evaluated inside every
+Runge-Kutta stage, and, if they offer them, with ticks and events, between which the flow is smooth. At a tick the
+computer's clock strikes; an event is where a margin of the block falls through zero, and a step ends exactly there.
+That is how a continuous PID, a computer's controller and a relay live in one loop. Nothing here is a base class: a part
+satisfies a contract by its shape.
 
 A plant says what it shows, a NamedTuple of named signals with their `units`: a `BrakeOutput`, a `BalanceOutput`, or one
 of your own. The target is of the first signal. Blocks, stops and objectives that read a signal that the plant does not
@@ -26,6 +28,10 @@ What a part may offer beyond its contract, as a method or an attribute of its cl
                    cautions()                           what is allowed but hardly meant
                    prepared(), refined(times)           the part for a run; for a step that is so many times shorter
                    family = "sensor"                    which blocks from outside it is among
+    block          tick()                               what a clock changes: see Ticking
+                   margins(), event()                   what changes where a margin falls through zero: see Switching
+                   every_step = True                    it ticks in every step of the integration
+                   offers(hook)                         of a block made of blocks: whether one has tick, or margins
     plant          usual_parts(), usual_objectives()    the loop around it, and its metrics, where a scenario says none
                    audit(initial)                       an objective whose value exceeds 1 where a run cannot have been
                    probes(initial, setpoint, stop)      starts (k,) where its loop may be stiffest
@@ -47,7 +53,12 @@ from collections.abc import Callable
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.cubic import Cubic
 from diffabs.core.pytree import Scalar
+from diffabs.core.timing import steps
 
 
 class BrakeOutput(NamedTuple):
@@ -87,27 +98,30 @@ class BalanceOutput(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What a block remembers: `flow` is integrated with the plant, `held` changes only in jumps."""
+    """What a block remembers: `flow` is integrated with the plant, `held` changes only in ticks and events."""
 
     flow: Any = ()
     held: Any = ()
 
 
 class Clock(NamedTuple):
-    """The instant of a jump: time [s], step length [s], number of the step, and the run's random key (or None).
-
-    A block's signal may change in an instant, by a jump of a block before it: `before` is what the signal was until
-    then (None: the same), and `late` [s] how long ago that event happened, 0 if it happens now. `rate()`, where it is
-    known, is d(before)/dt then; it costs two evaluations of the loop, if it is asked for.
-    """
+    """An instant at which blocks may change: time [s]; step of the integration's grid [s] and number of the grid's last
+    instant; whether this is that instant, and no event between two of them; the run's random key (or None). `before` is
+    the block's signal until then (None: the same), which a block before it may have changed."""
 
     t: Scalar
     h: Scalar
     k: Any
     key: Any
+    on_grid: Any = True
     before: Any = None
-    late: Scalar = 0.0
-    rate: Callable[[], Any] | None = None
+
+    def ticks(self, period: Scalar | None = None) -> tuple[Any, Any]:
+        """Whether a clock of this period [s] (None: that of the grid) strikes now, and for how many times before."""
+        if period is None:
+            return jnp.asarray(self.on_grid), self.k
+        n = steps(period, self.h)
+        return self.on_grid & (self.k % n == 0), self.k // n
 
 
 class Tracking(NamedTuple):
@@ -138,6 +152,39 @@ class Ending(NamedTuple):
     stopped: Any
     time_left: Scalar  # [s]
     distance_left: Scalar  # [m]
+
+
+class Segment(NamedTuple):
+    """A step of a run, from one instant to the next, within which nothing jumps: the samples at both ends (the first
+    after the jumps there, the last before them), its length [s], and the step of the grid [s]. What `output` and
+    `sample` return is the cubic of something seen, from values and rates at both ends: its extrema, roots and integrals
+    are those of the run to the order of the method."""
+
+    start: Sample
+    end: Sample
+    h: Scalar
+    step: Scalar
+    output_rates: Callable[[], tuple[Any, Any]]
+    sample_rates: Callable[[], tuple[Sample, Sample]]
+
+    def output(self, read: Callable[[Any], Scalar] = lambda output: output[0]) -> Cubic:
+        """The cubic of read(output): by default of the first signal that the plant shows."""
+        return self._cubic(read, (self.start.output, self.end.output), self.output_rates())
+
+    def sample(self, read: Callable[[Sample], Scalar]) -> Cubic:
+        """The cubic of read(sample): of anything seen. It costs the rates of all signals."""
+        return self._cubic(read, (self.start, self.end), self.sample_rates())
+
+    def _cubic(self, read: Callable[[Any], Scalar], ends: tuple[Any, Any], rates: tuple[Any, Any]) -> Cubic:
+        (a, da), (b, db) = (jax.jvp(read, (end,), (rate,)) for end, rate in zip(ends, rates, strict=True))
+        return Cubic(a, b, self.h * da, self.h * db)
+
+
+def still(sample: Sample, h: Scalar) -> Segment:
+    """Return a step of length h [s] in which nothing moves."""
+    sample = jax.tree.map(jnp.asarray, sample)
+    rest = jax.tree.map(jnp.zeros_like, sample)
+    return Segment(sample, sample, h, h, lambda: (rest.output,) * 2, lambda: (rest,) * 2)
 
 
 class Road(Protocol):
@@ -200,19 +247,26 @@ class Block(Protocol):
         """The block's output. Does not change the memory."""
         ...
 
-    def jump(self, clock: Clock, memory: Memory, signal: Any) -> "Jump":
-        """The memory after the instant `clock.t`."""
+
+class Ticking(Block, Protocol):
+    """A Block with a clock."""
+
+    def tick(self, clock: Clock, memory: Memory, signal: Any) -> Memory:
+        """The memory after an instant. It need not be one of the block's own clock: `clock.ticks(period)`."""
         ...
 
 
-class Jump(NamedTuple):
-    """A memory after an instant. `elapsed` [s] is the time since the event that caused the jump, which lies between
-    instants: the loop takes the state back by that with the rates from before the event and forth with those from after
-    it, so that values and gradients do not depend on where the event falls in the step. None where a block has no
-    events."""
+class Switching(Block, Protocol):
+    """A Block with events."""
 
-    memory: Memory
-    elapsed: Scalar | None = None
+    def margins(self, t: Scalar, memory: Memory, signal: Any, rate: Callable[[], Any]) -> tuple[Scalar, ...]:
+        """Numbers that are positive until an event, which is where one falls through zero. `rate()` is d(signal)/dt;
+        it costs an evaluation of the loop and of its derivative."""
+        ...
+
+    def event(self, t: Scalar, memory: Memory, signal: Any, fired: tuple[Any, ...]) -> Memory:
+        """The memory after the events whose `fired` is true."""
+        ...
 
 
 class Reference(Block, Protocol):
@@ -243,10 +297,6 @@ class Stop(Protocol):
         """Positive while the run goes on; the run ends where it crosses zero."""
         ...
 
-    def rate(self, output: Any) -> Scalar:
-        """d(margin)/dt, negative near the end: the slope for landing on the crossing."""
-        ...
-
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """Time [s] and distance [m] that are left after the last sample."""
         ...
@@ -269,8 +319,8 @@ class Objective(Protocol):
         """d(memory.flow)/dt, integrated with the plant at the order of the method."""
         ...
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Any:
-        """`memory.held` after a step of length h from `before` (after the jump there) to `sample`."""
+    def update(self, memory: Memory, segment: Segment) -> Any:
+        """`memory.held` after a step."""
         ...
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
@@ -288,9 +338,3 @@ def no_flow(self: Any, t: Scalar, memory: Memory, signal: Any) -> Any:
     """`flow` of a block without continuous memory."""
     del self, t, memory, signal
     return ()
-
-
-def no_jump(self: Any, clock: Clock, memory: Memory, signal: Any) -> Jump:
-    """`jump` of a block without events."""
-    del self, clock, signal
-    return Jump(memory)

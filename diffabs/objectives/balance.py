@@ -6,10 +6,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.numerics import clamp
-from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample
+from diffabs.core.numerics import clamp, larger, sign
+from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, pytree
-from diffabs.objectives.tracking import FinalError, integral, nothing, unchanged
+from diffabs.objectives.tracking import FinalError, held, integral, nothing, unchanged
 
 RATES = ("theta_rate", "psi_rate", "phi_rate")
 ANGLES = ("theta", "psi", "phi")
@@ -57,45 +57,61 @@ class FinalNorm:
         return _norm(ending.sample.output)
 
 
+def _angle(name: str) -> Any:
+    """`update` of the greatest |angle|, from the cubic of every step."""
+
+    def update(self: Any, memory: Memory, segment: Segment) -> Scalar:
+        """The greatest so far."""
+        del self
+        angle = segment.output(lambda output: getattr(output, name))
+        return larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()))
+
+    return update
+
+
+@pytree
+class PeakLean:
+    """Greatest |theta| of the frame [rad]."""
+
+    unit = "rad"
+    physical = (0.0, math.inf)
+
+    flow, update, value = nothing, _angle("theta"), held
+
+    def start(self, sample: Sample) -> Memory:
+        """The first."""
+        return Memory(held=jnp.abs(sample.output.theta))
+
+
+@pytree
+class PeakArmAngle:
+    """Greatest |psi| of the arm [rad]."""
+
+    unit = "rad"
+    physical = (0.0, math.inf)
+
+    flow, update, value = nothing, _angle("psi"), held
+
+    def start(self, sample: Sample) -> Memory:
+        """The first."""
+        return Memory(held=jnp.abs(sample.output.psi))
+
+
 def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
-    """start, flow, update and value of the greatest size(sample), at either end of every step: control jumps."""
+    """start, flow, update and value of the greatest size(sample), at either end of every step: control jumps and has
+    limits, and a cubic would leave them."""
 
     def start(self: Any, sample: Sample) -> Memory:
         """The first."""
         del self
         return Memory(held=size(sample))
 
-    def update(self: Any, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Scalar:
+    def update(self: Any, memory: Memory, segment: Segment) -> Scalar:
         """The greater of what was, and of both ends of the step."""
-        del self, h
-        return jnp.maximum(memory.held, jnp.maximum(size(before), size(sample)))
+        del self
+        return larger(memory.held, larger(size(segment.start), size(segment.end)))
 
-    def value(self: Any, memory: Memory, ending: Ending) -> Scalar:
-        """The greatest."""
-        del self, ending
-        return memory.held
-
-    return start, nothing, update, value
-
-
-@pytree
-class PeakLean:
-    """Greatest |theta| of the frame [rad], at the instants of the integration."""
-
-    unit = "rad"
-    physical = (0.0, math.inf)
-
-    start, flow, update, value = _peak(lambda sample: jnp.abs(sample.output.theta))
-
-
-@pytree
-class PeakArmAngle:
-    """Greatest |psi| of the arm [rad], at the instants of the integration."""
-
-    unit = "rad"
-    physical = (0.0, math.inf)
-
-    start, flow, update, value = _peak(lambda sample: jnp.abs(sample.output.psi))
+    return start, nothing, update, held
 
 
 @pytree
@@ -155,28 +171,23 @@ class RestTime:
 
     band: Scalar = param(default=0.01, unit="rad", above=0.0)
 
-    flow = nothing
+    flow, value = nothing, held
 
     def start(self, sample: Sample) -> Memory:
         """Not yet."""
         return Memory(held=_zero(sample))
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Scalar:
-        """The crossing into the band, interpolated linearly; its end where a step ends outside."""
-        a, b = self._beyond(before), self._beyond(sample)
-        inside = jnp.less_equal(b, 0)
-        part = jnp.where((a > 0) & inside, a / jnp.where(a > b, a - b, 1.0), 0.0)
-        entered = jnp.where(a > 0, sample.t - (1 - part) * h, memory.held)
-        return jnp.where(inside, entered, sample.t)
-
-    def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Time [s]."""
-        del ending
-        return memory.held
-
-    def _beyond(self, sample: Sample) -> Any:
-        angles = [jnp.abs(getattr(sample.output, name)) for name in ANGLES]
-        return jnp.maximum(jnp.maximum(angles[0], angles[1]), angles[2]) - self.band
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
+        """The last of the angles' entries into the band, roots of the cubics of the step; its end where it ends
+        outside."""
+        entered, inside = memory.held, True
+        for name in ANGLES:
+            angle = segment.output(lambda output, name=name: getattr(output, name))
+            beyond = angle.times(sign(jax.lax.stop_gradient(angle.start))).minus(self.band)
+            entry = segment.start.t + segment.h * beyond.root()
+            entered = larger(entered, jnp.where(beyond.start > 0, entry, 0.0))
+            inside &= jnp.abs(angle.end) <= self.band
+        return jnp.where(inside, entered, segment.end.t)
 
 
 @pytree

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.core.numerics import ratio
-from diffabs.core.protocols import Ending, Memory, Sample
+from diffabs.core.numerics import larger, smaller
+from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.objectives.tracking import FinalError, from_zero, integral, nothing, unchanged
+from diffabs.objectives.tracking import FinalError, from_zero, held, held_from_zero, integral, nothing, unchanged
 
 
 @pytree
@@ -43,7 +43,7 @@ class StopDistance:
 
 @pytree
 class LockedTime:
-    """Time [s] during which the slip exceeds `threshold`. Crossings are interpolated linearly inside a step."""
+    """Time [s] during which the slip exceeds `threshold`. A crossing is the root of the cubic of a step."""
 
     unit = "s"
     failure = 0.0  # a wheel that locks
@@ -51,23 +51,14 @@ class LockedTime:
 
     threshold: Scalar = param(default=0.99, unit="1", above=0.0, below=1.0)
 
-    flow = nothing
+    start, flow, value = held_from_zero, nothing, held
 
-    def start(self, sample: Sample) -> Memory:
-        """Zero."""
-        return Memory(held=0.0 * sample.t)
-
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Scalar:
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Add the part of the step above the threshold."""
-        a, b = before.output.slip - self.threshold, sample.output.slip - self.threshold
-        crossing = ratio(jnp.maximum(a, b), jnp.abs(a - b))
-        part = jnp.where((a > 0) & (b > 0), 1.0, jnp.where((a > 0) | (b > 0), crossing, 0.0))
-        return memory.held + part * h
-
-    def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Locked time."""
-        del ending
-        return memory.held
+        slip = segment.output(lambda output: output.slip).minus(self.threshold)
+        above, below, root = slip.start > 0, slip.end <= 0, slip.root()
+        part = jnp.where(above, jnp.where(below, root, 1.0), jnp.where(below, 0.0, 1.0 - root))
+        return memory.held + part * segment.h
 
 
 @pytree
@@ -86,7 +77,7 @@ class Effort:
 
 
 class Varied(NamedTuple):
-    """Variation so far, and the last torque."""
+    """What is found so far, and the last torque."""
 
     total: Scalar
     last: Scalar
@@ -94,7 +85,7 @@ class Varied(NamedTuple):
 
 @pytree
 class Variation:
-    """Total variation of the torque, sum of |u_(k+1) - u_k| [N m]: what chattering costs."""
+    """Total variation of the torque [N m], |du| added up along the run, jumps included: what chattering costs."""
 
     unit = "control"
     physical = (0.0, math.inf)
@@ -105,11 +96,14 @@ class Variation:
         """From the first torque."""
         return Memory(held=Varied(0.0 * sample.control, sample.control))
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Varied:
-        """Add the change since the last sample, jumps between steps included."""
-        del before, h
+    def update(self, memory: Memory, segment: Segment) -> Varied:
+        """Add the jump before the step, and what the torque does in it: there and back, where it has an extremum."""
         total, last = memory.held
-        return Varied(total + jnp.abs(sample.control - last), sample.control)
+        u = segment.sample(lambda sample: sample.control)
+        top, bottom = u.greatest(), -u.times(-1.0).greatest()
+        low, high = smaller(u.start, u.end), larger(u.start, u.end)
+        inside = (high - low) + 2.0 * ((top - high) + (low - bottom))
+        return Varied(total + jnp.abs(u.start - last) + inside, u.end)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Variation."""
@@ -117,21 +111,10 @@ class Variation:
         return memory.held.total
 
 
-class Rate(NamedTuple):
-    """Greatest rate so far, the last torque, and the length of the longest step."""
-
-    greatest: Scalar
-    last: Scalar
-    step: Scalar
-
-
 @pytree
 class TorqueRate:
-    """Greatest |du/dt| [N m/s] of the torque that the actuator delivers, as a difference quotient over a step.
-
-    A shorter last step, which lands on the end of the run, does not count. Behind a lag the rate is finite; of a
-    controller's own jumps the quotient says no more than jump/step.
-    """
+    """Greatest |du/dt| [N m/s] of the torque that the actuator delivers, at the instants of the integration. A jump
+    counts as jump/step: behind a lag there is none."""
 
     unit = "control/s"
     physical = (0.0, math.inf)
@@ -140,18 +123,16 @@ class TorqueRate:
 
     def start(self, sample: Sample) -> Memory:
         """From the first torque."""
-        zero = 0.0 * sample.control
-        return Memory(held=Rate(zero, sample.control, zero))
+        return Memory(held=Varied(0.0 * sample.control, sample.control))
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Rate:
-        """Look at the step."""
-        del before
-        greatest, last, step = memory.held
-        whole = jnp.greater(h, 0.5 * step)
-        rate = jnp.where(whole, jnp.abs(sample.control - last) / jnp.where(whole, h, 1.0), 0.0)
-        return Rate(jnp.maximum(greatest, rate), sample.control, jnp.maximum(step, h))
+    def update(self, memory: Memory, segment: Segment) -> Varied:
+        """The jump before the step, and the rates at its ends."""
+        greatest, last = memory.held
+        jump = jnp.abs(segment.start.control - last) / segment.step
+        rates = (jnp.abs(rate.control) for rate in segment.sample_rates())
+        return Varied(larger(larger(greatest, jump), larger(*rates)), segment.end.control)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Greatest rate."""
         del ending
-        return memory.held.greatest
+        return memory.held.total

@@ -5,14 +5,16 @@ The error e = y - setpoint is against where the reference will settle, not again
 there."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.numerics import clamp, larger, parabola, ratio, sign, smaller
-from diffabs.core.protocols import Ending, Memory, Sample
+from diffabs.core.cubic import Cubic
+from diffabs.core.numerics import larger, sign, smaller
+from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, pytree
 
 LEAST = 0.01  # of the first signal, of which an overshoot is a fraction
@@ -24,9 +26,9 @@ def nothing(self: Any, memory: Memory, sample: Sample) -> Any:
     return ()
 
 
-def unchanged(self: Any, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Any:
+def unchanged(self: Any, memory: Memory, segment: Segment) -> Any:
     """`update` of an objective that is only an integral."""
-    del self, before, sample, h
+    del self, segment
     return memory.held
 
 
@@ -57,54 +59,43 @@ def _side(sample: Sample) -> Any:
     return jnp.where(sample.setpoint < 0, -1.0, 1.0)
 
 
-class Area(NamedTuple):
-    """Integral of the absolute value so far, and of the value itself."""
-
-    total: Scalar
-    signed: Scalar
+def error_cubic(segment: Segment) -> Cubic:
+    """The cubic of the error over a step: its setpoint does not change within one."""
+    return segment.output().minus(segment.start.setpoint)
 
 
-def _area(memory: Memory, a: Scalar, b: Scalar, left: Scalar, right: Scalar, crossing: Scalar) -> Area:
-    """Add a step. Where the value changes sign, from a to b, `left` and `right` are its integrals on either side of
-    the `crossing` (a fraction of the step) if it were linear; the whole is exact to the order of the method."""
-    total, signed = memory.held
-    whole = memory.flow - signed
-    rest = (whole - left - right) * (crossing * sign(a) + (1 - crossing) * sign(b))
-    part = jnp.where(a * b < 0, jnp.abs(left) + jnp.abs(right) + rest, jnp.abs(whole))
-    return Area(total + part, memory.flow)
+def absolute(cubic: Cubic, integral: Callable[[Any], Any]) -> Any:
+    """The integral of |p| over [0, 1], where `integral(x)` is that of p, or of p times something positive, to x."""
+    whole = integral(1.0)
+    left = integral(cubic.root())
+    return jnp.where(cubic.start * cubic.end < 0, jnp.abs(left) + jnp.abs(whole - left), jnp.abs(whole))
+
+
+def held(self: Any, memory: Memory, ending: Ending) -> Scalar:
+    """`value` of an objective that is what it remembers."""
+    del self, ending
+    return memory.held
+
+
+def held_from_zero(self: Any, sample: Sample) -> Memory:
+    """`start` of an objective that adds up what it sees."""
+    del self
+    return Memory(held=0.0 * sample.output[0])
 
 
 @pytree
 class IAE:
-    """Integral of |e| dt, e = y - setpoint: for a slip [s].
-
-    e is integrated with the plant; |e|, whose kink would cost the method its order and the derivative its smoothness,
-    is put together step by step, with the crossings of zero interpolated linearly.
-    """
+    """Integral of |e| dt, e = y - setpoint: for a slip [s]. The cubic of e is integrated on either side of its zero."""
 
     unit = "signal s"
     physical = (0.0, math.inf)
 
-    def start(self, sample: Sample) -> Memory:
-        """Zero."""
-        zero = 0.0 * sample.output[0]
-        return Memory(zero, Area(zero, zero))
+    start, flow, value = held_from_zero, nothing, held
 
-    def flow(self, memory: Memory, sample: Sample) -> Scalar:
-        """e."""
-        del memory
-        return error(sample)
-
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Area:
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Add |e| over the step."""
-        a, b = error(before), error(sample)
-        part = clamp(ratio(a, a - b), 0.0, 1.0)
-        return _area(memory, a, b, 0.5 * h * part * a, 0.5 * h * (1 - part) * b, part)
-
-    def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Integral."""
-        del ending
-        return memory.held.total
+        e = error_cubic(segment)
+        return memory.held + segment.h * absolute(e, e.integral)
 
 
 @pytree
@@ -114,73 +105,38 @@ class ITAE:
     unit = "signal s^2"
     physical = (0.0, math.inf)
 
-    start, value = IAE.start, IAE.value
+    start, flow, value = held_from_zero, nothing, held
 
-    def flow(self, memory: Memory, sample: Sample) -> Scalar:
-        """t e."""
-        del memory
-        return sample.t * error(sample)
-
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Area:
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Add t |e| over the step."""
-        a, b = error(before), error(sample)
-        part = clamp(ratio(a, a - b), 0.0, 1.0)
-        head, tail = part * h, (1 - part) * h
-        left = a * head * (before.t / 2 + head / 6)
-        right = b * tail * ((before.t + head) / 2 + tail / 3)
-        return _area(memory, a, b, left, right, part)
-
-
-class Peak(NamedTuple):
-    """Greatest value so far, and the last two samples."""
-
-    greatest: Scalar
-    last: Scalar
-    earlier: Scalar
+        e, t, h = error_cubic(segment), segment.start.t, segment.h
+        return memory.held + h * absolute(e, lambda x: t * e.integral(x) + h * e.moment(x))
 
 
 class Sided(NamedTuple):
-    """1, or -1 below a setpoint of 0; and the peak of the value on that side."""
+    """1, or -1 below a setpoint of 0; and the greatest value on that side."""
 
     side: Scalar
-    peak: Peak
-
-
-def _first(value: Scalar) -> Memory:
-    """The greatest of one value."""
-    return Memory(held=Peak(value, value, value))
-
-
-def _peaked(held: Peak, value: Scalar, most: Scalar) -> Peak:
-    """Look for a vertex, at most `most`, at the last sample but one."""
-    greatest, last, earlier = held
-    turned = (last > earlier) & (last > value)
-    vertex = jnp.where(turned, smaller(parabola(earlier, last, value)[1], most), value)
-    return Peak(larger(greatest, larger(vertex, value)), value, last)
+    greatest: Scalar
 
 
 @pytree
 class MaxSlip:
-    """Greatest slip of the run [1]: the vertex of the parabola through the three samples around it, at most 1."""
+    """Greatest slip of the run [1], at most 1. Where the greatest of two maxima changes, its derivative jumps."""
 
     unit = "1"
     physical = (-1.0, 1.0)
 
-    flow = nothing
+    flow, value = nothing, held
 
     def start(self, sample: Sample) -> Memory:
         """The first slip."""
-        return _first(sample.output.slip)
+        return Memory(held=sample.output.slip)
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Peak:
-        """Look for a vertex at the last sample but one."""
-        del before, h
-        return _peaked(memory.held, sample.output.slip, 1.0)
-
-    def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Greatest slip."""
-        del ending
-        return memory.held.greatest
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
+        """The greatest of the step, from its cubic."""
+        slip = segment.output(lambda output: output.slip).greatest()
+        return larger(memory.held, smaller(slip, 1.0))
 
 
 @pytree
@@ -197,17 +153,17 @@ class Overshoot:
     def start(self, sample: Sample) -> Memory:
         """The first value, and the side on which it shall not go too far."""
         side = _side(sample)
-        return Memory(held=Sided(side, _first(side * sample.output[0]).held))
+        return Memory(held=Sided(side, side * sample.output[0]))
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Sided:
-        """Look for a vertex at the last sample but one."""
-        del before, h
-        side, peak = memory.held
-        return Sided(side, _peaked(peak, side * sample.output[0], highest(sample.output)))
+    def update(self, memory: Memory, segment: Segment) -> Sided:
+        """The greatest of the step, from its cubic."""
+        side, greatest = memory.held
+        value = segment.output().times(side).greatest()
+        return Sided(side, larger(greatest, smaller(value, highest(segment.end.output))))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Overshoot."""
-        side, (greatest, *_) = memory.held
+        side, greatest = memory.held
         setpoint = side * ending.sample.setpoint
         usual = setpoint >= LEAST
         fraction = greatest / jnp.where(usual, setpoint, LEAST) - 1
@@ -219,7 +175,8 @@ class Overshoot:
 class SettlingTime:
     """Time [s] after which |y - setpoint| stays within `band`; the end of the run if it never does.
 
-    The entry is interpolated linearly between samples.
+    The entry is the root of the cubic of a step. A visit outside that begins and ends within one step is not seen. The
+    time jumps where a lobe just touches the band.
     """
 
     unit = "s"
@@ -227,22 +184,19 @@ class SettlingTime:
 
     band: Scalar = param(default=0.01, unit="signal", above=0.0)
 
-    flow = nothing
+    flow, value = nothing, held
 
     def start(self, sample: Sample) -> Memory:
         """Settled from the start."""
         return Memory(held=0.0 * sample.t)
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Scalar:
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Note the last entry; while outside, the present time."""
-        a, b = jnp.abs(error(before)), jnp.abs(error(sample))
-        late = clamp(ratio(self.band - b, a - b), 0.0, 1.0)
-        return jnp.where(b > self.band, sample.t, jnp.where(a > self.band, sample.t - late * h, memory.held))
-
-    def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Settling time."""
-        del ending
-        return memory.held
+        e = error_cubic(segment)
+        outside = e.times(sign(jax.lax.stop_gradient(e.start))).minus(self.band)
+        beyond = jnp.abs(e.end) > self.band
+        entered = segment.start.t + segment.h * outside.root()
+        return jnp.where(beyond, segment.end.t, jnp.where(outside.start > 0, entered, memory.held))
 
 
 @pytree

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.protocols import BalanceOutput, BrakeOutput, Ending, Memory, Sample
+from diffabs.core.protocols import BalanceOutput, BrakeOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, param, part, pytree, static
 
 FORGIVEN = 0.01  # of the energy of the start, in the whole run
@@ -58,9 +58,9 @@ class BrakeAudit:
 
     start, flow, value = _zero, _no_flow, _excess
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Any:
+    def update(self, memory: Memory, segment: Segment) -> Any:
         """Add what a step gained without work; infinite for a step that no car makes."""
-        before, sample = jax.lax.stop_gradient((before, sample))
+        before, sample, h = jax.lax.stop_gradient((segment.start, segment.end, segment.h))
         a, b = before.output, sample.output
         drive = 0.0 if self.commanded else _driving(-before.control, -sample.control)
         work = WITHIN * h * drive * jnp.maximum(a.wheel_speed, b.wheel_speed) / self.radius
@@ -89,9 +89,9 @@ class BalanceAudit:
 
     start, flow = _zero, _no_flow
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Any:
+    def update(self, memory: Memory, segment: Segment) -> Any:
         """Add the work that the motor may have done: of torques and rates in the same direction."""
-        before, sample = jax.lax.stop_gradient((before, sample))
+        before, sample, h = jax.lax.stop_gradient((segment.start, segment.end, segment.h))
         w0, w1 = before.output.psi_rate, sample.output.psi_rate
         t0, t1 = self.plant.torque(w0, before.control), self.plant.torque(w1, sample.control)
         return memory.held + WITHIN * h * (

@@ -6,32 +6,32 @@ and the car rolls on. `PeakLiteral` shows that. `PeakLatch` is the reading that 
 with the first target until |a| first falls below its maximum, then take the slip at that maximum. `PeakRobust` is the
 latch for a noisy accelerometer.
 
-The maximum lies between samples. The latch takes the vertex of the parabola through the last three decelerations, for
-the slip and for the moment, and hands the time since that moment to the loop. Without this, values would depend on the
-step and derivatives would be wrong by O(1) at every step size."""
+The maximum is an event: where the rate of the deceleration falls through zero, or where the deceleration itself jumps
+down, as the noise of a sampled accelerometer does. A step of the integration ends there, and the slip is the slip
+there: the run does not depend on the grid, and is differentiable."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
-from diffabs.core.numerics import clamp, interpolate, parabola, ratio
-from diffabs.core.protocols import BrakeOutput, Clock, Jump, Memory, no_flow
+from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree
 
 # A later maximum counts only if it exceeds the greatest by this fraction: a controller that holds the best slip keeps
 # the deceleration at its maximum to rounding, and comparisons of equal numbers would then decide on derivatives.
 MARGIN = 1e-6
+LEAST = 1e-3  # m/s^2, of a maximum: that of a wheel that still rolls, before the torque comes, is rounding
 
 
 class PeakMemory(NamedTuple):
-    """1 once latched; greatest |a| [m/s^2] and the slip [1] there; target [1]; the last two samples."""
+    """1 once latched; greatest |a| [m/s^2] and the slip [1] there; target [1]."""
 
     latched: Scalar
     greatest: Scalar
     slip: Scalar
     target: Scalar
-    deceleration: tuple[Scalar, Scalar]
-    slips: tuple[Scalar, Scalar]
 
 
 def _size(signal: BrakeOutput) -> Any:
@@ -42,7 +42,7 @@ def _size(signal: BrakeOutput) -> Any:
 
 def _fresh(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMemory:
     zero = 0.0 * deceleration
-    return PeakMemory(zero, zero, slip, target + zero, (deceleration,) * 2, (slip,) * 2)
+    return PeakMemory(zero, zero + LEAST, slip, target + zero)
 
 
 @pytree
@@ -69,15 +69,14 @@ class PeakLiteral:
         """The target as known now."""
         return memory.held.target
 
-    def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
+    def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
         """Follow the slip while |a| rises."""
-        del clock
         m: PeakMemory = memory.held
         size = _size(signal)
-        exceeds = size > m.greatest
+        exceeds = clock.ticks()[0] & (size > m.greatest)
         greatest = jnp.where(exceeds, size, m.greatest)
         target = jnp.where(exceeds, signal.slip, m.target)
-        return Jump(Memory(held=m._replace(greatest=greatest, target=target)))
+        return Memory(held=m._replace(greatest=greatest, target=target))
 
 
 @pytree
@@ -98,15 +97,18 @@ class PeakLatch:
         """No maximum yet."""
         return Memory(held=_fresh(self.slip, _size(signal), signal.slip))
 
-    def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
-        """Latch at a maximum greater than all before."""
+    def margins(self, t: Scalar, memory: Memory, signal: BrakeOutput, rate: Callable[[], BrakeOutput]) -> tuple[Any]:
+        """d|a|/dt where |a| is greater than ever, else its size."""
+        del t
         m: PeakMemory = memory.held
-        place, higher, new = _tracked(m, _size(signal), signal.slip, clock.k == 0)
-        new = new._replace(
-            latched=jnp.where(higher, 1.0, m.latched),
-            target=jnp.where(higher, new.slip, m.target),
-        )
-        return Jump(Memory(held=new), jnp.where(higher, (1 - place) * clock.h, 0.0))
+        return (_falling(_rate(_size, signal, rate()), _size(signal), m),)
+
+    def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[Any]) -> Memory:
+        """Latch at a maximum greater than all before."""
+        del t
+        m: PeakMemory = _recorded(memory.held, fired[0], _size(signal), signal.slip)
+        latched = jnp.where(fired[0], 1.0, m.latched)
+        return Memory(held=m._replace(latched=latched, target=jnp.where(fired[0], signal.slip, m.target)))
 
 
 class FilterMemory(NamedTuple):
@@ -141,38 +143,38 @@ class PeakRobust:
         a, s = memory.flow
         return FilterMemory((signal.deceleration - a) / self.time_constant, (signal.slip - s) / self.time_constant)
 
-    def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
-        """Keep the maximum, latch at the threshold below it."""
+    def margins(
+        self, t: Scalar, memory: Memory, signal: BrakeOutput, rate: Callable[[], BrakeOutput]
+    ) -> tuple[Any, Any]:
+        """The rate of the filtered deceleration where that is greater than ever, else its size; and, until it has
+        latched, how far the filtered deceleration is above the threshold."""
+        del rate
         m: PeakMemory = memory.held
+        a = memory.flow.deceleration
+        level = a - (1 - self.threshold) * m.greatest
+        waits = (m.latched < 0.5) & (m.greatest > self.arming)
+        moving = self.flow(t, memory, signal).deceleration
+        return _falling(moving, a, m), jnp.where(waits, level, jnp.abs(level))
+
+    def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[Any, Any]) -> Memory:
+        """Record the maximum; latch at the threshold below it; follow a later, greater one."""
+        del t, signal
         a, s = memory.flow
-        _, higher, new = _tracked(m, a, s, clock.k == 0)
-        level = (1 - self.threshold) * new.greatest
-        latch = (m.latched < 0.5) & (new.greatest > self.arming) & (a < level)
-        late = clamp(ratio(level - a, m.deceleration[0] - a), 0.0, 1.0)
-        moved = latch | ((m.latched > 0.5) & higher)
-        new = new._replace(
-            latched=jnp.where(latch, 1.0, m.latched),
-            target=jnp.where(moved, new.slip, m.target),
-        )
-        return Jump(Memory(memory.flow, new), jnp.where(latch, late * clock.h, 0.0))
+        m: PeakMemory = _recorded(memory.held, fired[0], a, s)
+        moves = fired[1] | (fired[0] & (m.latched > 0.5))
+        latched = jnp.where(fired[1], 1.0, m.latched)
+        return Memory(memory.flow, m._replace(latched=latched, target=jnp.where(moves, m.slip, m.target)))
 
 
-def _tracked(m: PeakMemory, deceleration: Scalar, slip: Scalar, first: Any) -> tuple[Any, Any, PeakMemory]:
-    """Look for a maximum among the last three samples, greater than all before: its place (in steps from the middle
-    one), whether there is one, and the memory with it.
+def _rate(size: Callable[[BrakeOutput], Any], signal: BrakeOutput, rate: BrakeOutput) -> Any:
+    return jax.jvp(size, (signal,), (rate,))[1]
 
-    Where the deceleration did not rise before it fell, as at the start of a run, the maximum is the middle sample. The
-    first sample decides nothing: it would be compared with itself, and compiled code may compute it twice and round it
-    differently, in the forward and in the backward pass of a gradient for instance.
-    """
-    before, last = m.deceleration[1], m.deceleration[0]
-    place = jnp.where(before < last, parabola(before, last, deceleration)[0], 0.0)
-    top = interpolate(before, last, deceleration, place)
-    higher = ~first & (deceleration < last) & (last >= before) & (top > (1 + MARGIN) * m.greatest)
-    new = m._replace(
-        greatest=jnp.where(higher, top, m.greatest),
-        slip=jnp.where(higher, interpolate(m.slips[1], m.slips[0], slip, place), m.slip),
-        deceleration=(deceleration, jnp.where(first, deceleration, last)),
-        slips=(slip, jnp.where(first, slip, m.slips[0])),
-    )
-    return place, higher, new
+
+def _falling(rate: Scalar, deceleration: Scalar, m: PeakMemory) -> Any:
+    """The rate where the deceleration is greater than ever, else the size of the rate: a margin that falls through zero
+    at a new maximum only."""
+    return jnp.where(deceleration > (1 + MARGIN) * m.greatest, rate, jnp.abs(rate))
+
+
+def _recorded(m: PeakMemory, new: Any, deceleration: Scalar, slip: Scalar) -> PeakMemory:
+    return m._replace(greatest=jnp.where(new, deceleration, m.greatest), slip=jnp.where(new, slip, m.slip))

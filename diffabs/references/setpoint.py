@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_jump, no_memory
+from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
 
 
@@ -14,7 +14,6 @@ class Setpoint:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: Any) -> Scalar:
         """The value."""
@@ -35,7 +34,6 @@ class FixedSlip:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
         """Target slip [1]."""
@@ -57,8 +55,6 @@ class FilteredSlip:
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
     time_constant: Scalar = param(default=0.035, unit="s", above=0.0)
-
-    jump = no_jump
 
     def start(self, signal: BrakeOutput) -> Memory:
         """The measured slip."""

@@ -1,6 +1,6 @@
 """The reference of a balance: upright."""
 
-from diffabs.core.protocols import BalanceOutput, Memory, no_flow, no_jump
+from diffabs.core.protocols import BalanceOutput, Memory, no_flow
 from diffabs.core.pytree import Scalar, pytree
 
 
@@ -9,7 +9,6 @@ class Upright:
     """target = 0: every angle, every rate."""
 
     flow = no_flow
-    jump = no_jump
 
     def start(self, signal: BalanceOutput) -> Memory:
         """Zero, of the signal's type."""

@@ -8,10 +8,11 @@ from typing import Any
 import jax
 
 from diffabs.core.loop import Loop
-from diffabs.core.protocols import Clock, Memory, Objective
+from diffabs.core.protocols import Clock, Memory, Objective, still
 from diffabs.core.pytree import strong
 from diffabs.core.values import kebab
 from diffabs.scenario.registry import joined
+from diffabs.simulate.advance import begin
 
 
 def misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
@@ -35,18 +36,14 @@ def _everything(loop: Loop, objectives: Mapping[str, Objective]) -> Any:
 
 
 def _once(loop: Loop) -> Any:
-    """Once around the loop, and through a jump."""
-    state = loop.start()
-    loop.jump(Clock(0.0, 1e-3, 0, jax.random.key(0)), state)
-    signals = loop.signals(0.0, state)
-    margin = loop.stop.margin(signals.sample.output), loop.stop.rate(signals.sample.output)
-    return margin, loop.flow(0.0, state, signals)
+    """Once around the loop, and through an instant."""
+    return begin(loop, {}, Clock(0.0, 1e-3, 0, jax.random.key(0)))
 
 
 def _measured(loop: Loop, objective: Objective) -> Any:
     sample = loop.signals(0.0, loop.start()).sample
     memory: Memory = objective.start(sample)
-    return objective.flow(memory, sample), objective.update(memory, sample, sample, 1e-3)
+    return objective.flow(memory, sample), objective.update(memory, still(sample, 1e-3))
 
 
 def _trial(path: str, trace: Any) -> Any:

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.protocols import BalanceOutput, Clock, Jump, Memory, no_flow
+from diffabs.core.protocols import BalanceOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.core.rules import Rule
-from diffabs.core.timing import steps, whole_steps
+from diffabs.core.timing import whole_steps
 from diffabs.sensors.noise import drawn
 
 
@@ -34,18 +34,17 @@ class AngleSensor:
         nothing = jax.tree.map(lambda x: 0.0 * x, signal)
         return nothing._replace(theta=signal.theta + memory.held[0], psi=signal.psi + memory.held[1])
 
-    def jump(self, clock: Clock, memory: Memory, signal: BalanceOutput) -> Jump:
+    def tick(self, clock: Clock, memory: Memory, signal: BalanceOutput) -> Memory:
         """Draw at the instants of the period. Raises ValueError without a key."""
         del signal
         if clock.key is None:
             raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
-        n = steps(self.period, clock.h)
-        number = clock.k // n
+        now, number = clock.ticks(self.period)
         held = tuple(
             drawn(jnp.asarray(deviation), clock.key, 2 * number + i)
             for i, deviation in enumerate((self.theta, self.psi))
         )
-        return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(number * n == clock.k, a, b), held, memory.held)))
+        return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), held, memory.held))
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """The period is on the integration grid."""

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core.numerics import axpy
-from diffabs.core.protocols import BrakeOutput, Clock, Jump, Memory, no_flow, no_jump, no_memory
+from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.core.rules import Rule
-from diffabs.core.timing import steps, whole_steps
+from diffabs.core.timing import whole_steps
 
 
 @pytree
@@ -39,16 +39,15 @@ class Noise:
         del t
         return axpy(1.0, memory.held, signal)
 
-    def jump(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Jump:
+    def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
         """Draw at the instants of the period. Raises ValueError without a key."""
         if clock.key is None:
             raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
-        n = steps(self.period, clock.h)
-        draw = clock.k // n
+        now, draw = clock.ticks(self.period)
         deviations = (self.slip, self.speed, self.wheel_speed, self.deceleration)
         noise = [drawn(jnp.asarray(d), clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
         held = BrakeOutput(noise[0], noise[1], noise[2], noise[3], 0.0 * signal.distance)
-        return Jump(Memory(held=jax.tree.map(lambda a, b: jnp.where(draw * n == clock.k, a, b), held, memory.held)))
+        return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), held, memory.held))
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """The period is on the integration grid."""
@@ -84,7 +83,6 @@ class Bias:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
         """Signal plus bias."""
@@ -112,7 +110,6 @@ class Quantisation:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
         """The nearest multiples."""

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_jump, no_memory
+from diffabs.core.protocols import BrakeOutput, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
 
 
@@ -12,8 +12,6 @@ class WheelSpeed:
 
     time_constant: Scalar = param(default=0.002, unit="s", above=0.0)
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
-
-    jump = no_jump
 
     def start(self, signal: BrakeOutput) -> Memory:
         """The filter at the true speed."""
@@ -41,8 +39,6 @@ class IntegratedAccelerometer:
 
     bias: Scalar = param(default=0.0, unit="m/s^2")
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
-
-    jump = no_jump
 
     def start(self, signal: BrakeOutput) -> Memory:
         """The speed at which braking starts is known: the wheel still rolls."""
@@ -73,7 +69,6 @@ class SpeedScale:
 
     start = no_memory
     flow = no_flow
-    jump = no_jump
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
         """Scaled speed, and the slip computed with it and the true wheel's speed."""

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.blocks import offers
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Objective
 from diffabs.core.pytree import refined
@@ -138,11 +139,12 @@ def _draws(loop: Loop, h: float, times: int, count: int, key: Any) -> Any:
     """What the sensor shows after each `times` steps (count, ...) of a run that stands still at its start."""
     signal = loop.plant.output(loop.plant.start(loop.initial))
     signal = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), signal)
-    sensor, start = loop.sensor, loop.sensor.start(signal)
+    sensor: Any = loop.sensor
+    start = sensor.start(signal)
 
     def step(memory: Memory, k: Any) -> tuple[Memory, Any]:
-        jumped = sensor.jump(Clock(k * h, h, k, key), memory, signal).memory
-        held = jax.tree.map(lambda x, old: jnp.asarray(x, jnp.result_type(old)), jumped.held, start.held)
+        ticked = sensor.tick(Clock(k * h, h, k, key), memory, signal) if offers(sensor, "tick") else memory
+        held = jax.tree.map(lambda x, old: jnp.asarray(x, jnp.result_type(old)), ticked.held, start.held)
         return Memory(start.flow, held), sensor.output(k * h, Memory(start.flow, held), signal)
 
     seen = jax.lax.scan(step, start, jnp.arange(count * times))[1]

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
+import jax.custom_batching
 import jax.numpy as jnp
 
 X = TypeVar("X")
@@ -12,22 +13,22 @@ GROUP = 32  # steps that are skipped together, where no more than SLOTS are made
 SLOTS = 1800  # carries that reverse mode keeps in one scan: some 0.2 MB for each lane of a batch
 
 
-def repeated(step: Callable[[X], X], carry: X, room: int, on: Callable[[X], Any], count: Any) -> X:
-    """Return step(step(... carry)), at least `count` times, in nested scans that have room for `room` steps.
+def repeated(step: Callable[[X], X], carry: X, room: int, on: Callable[[X], Any]) -> X:
+    """Return step(step(... carry)), in nested scans that have room for `room` steps.
 
-    Groups of steps beyond `count`, which may be traced, are skipped, and those where `on(carry)` is False; for a batch
-    under `jax.vmap` only if both are one number for all lanes. `step` must do nothing there. Reverse mode keeps the
-    carries of the steps, or, of more than SLOTS, those of groups, whose steps it then runs once more.
+    Groups of steps where `on(carry)` is False are skipped; for a batch under `jax.vmap` only if that is one number for
+    all lanes. `step` must do nothing there. Reverse mode keeps the carries of the steps, or, of more than SLOTS, those
+    of groups, whose steps it then runs once more.
     """
     outer, inner = levels(room)
 
     def group(carry: X) -> X:
         return jax.lax.scan(forgetful(lambda carry, _: (step(carry), None)), carry, length=inner)[0]
 
-    def body(carry: X, i: Any) -> tuple[X, None]:
-        return jax.lax.cond((i * inner < count) & on(carry), group, lambda carry: carry, carry), None
+    def body(carry: X, _: Any) -> tuple[X, None]:
+        return jax.lax.cond(on(carry), group, lambda carry: carry, carry), None
 
-    return jax.lax.scan(forgetful(body) if room > SLOTS else body, carry, jnp.arange(outer))[0]
+    return jax.lax.scan(forgetful(body) if room > SLOTS else body, carry, length=outer)[0]
 
 
 def levels(count: int) -> tuple[int, int]:
@@ -35,6 +36,19 @@ def levels(count: int) -> tuple[int, int]:
     are at most 3/2 SLOTS together, whatever the number of steps up to SLOTS^2/2."""
     inner = math.ceil(count / SLOTS) if count > SLOTS else min(GROUP, count)
     return math.ceil(count / inner), inner
+
+
+@jax.custom_batching.custom_vmap
+def anyone(running: Any) -> Any:
+    """Return whether any lane of a batch under `jax.vmap` still runs, the same for all of them: a step does nothing in
+    a lane that is over. A condition of each lane's own would become a selection between all carries, in every step."""
+    return running
+
+
+@anyone.def_vmap
+def _(size: int, batched: Any, running: Any) -> tuple[Any, bool]:
+    del size
+    return (anyone(jnp.any(running, axis=0)), False) if batched[0] else (anyone(running), False)
 
 
 def forgetful(body: Any) -> Any:

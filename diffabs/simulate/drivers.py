@@ -10,13 +10,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.custom_batching
 import jax.numpy as jnp
 
-from diffabs.simulate.checkpoint import forgetful, repeated
-from diffabs.simulate.hybrid_step import Carry
+from diffabs.simulate.checkpoint import anyone, forgetful, repeated
+from diffabs.simulate.stepper import Carry
 
-Step = Callable[[Carry], Carry]
+Step = Callable[..., Carry]  # of a carry, and of the instant to which it goes, `until`, where it is not the end
 BLOCK = 32  # steps between two questions whether anything still runs
 
 
@@ -24,19 +23,6 @@ def slots(count: int) -> int:
     """Return the least number of at most four significant bits that is not less than `count`: up to an eighth more."""
     unit = 1 << max((count - 1).bit_length() - 4, 0)
     return -(-count // unit) * unit
-
-
-@jax.custom_batching.custom_vmap
-def anyone(running: Any) -> Any:
-    """Return whether any lane of a batch under `jax.vmap` still runs, the same for all of them: a step does nothing in
-    a lane that is over. A condition of each lane's own would become a selection between all carries, in every step."""
-    return running
-
-
-@anyone.def_vmap
-def _(size: int, batched: Any, running: Any) -> tuple[Any, bool]:
-    del size
-    return (anyone(jnp.any(running, axis=0)), False) if batched[0] else (anyone(running), False)
 
 
 def until(step: Step, carry: Carry) -> Carry:
@@ -51,39 +37,46 @@ def until(step: Step, carry: Carry) -> Carry:
 def watch(
     step: Step, look: Callable[[Carry], Any], carry: Carry, every: Any, count: Any, room: int
 ) -> tuple[Carry, Any]:
-    """Return the carry after `count` times `every` steps, and what was seen after each `every`-th, with a leading axis
-    of `room`, at least `count`: what is beyond is zero. Not for reverse mode."""
+    """Return the carry after `count` times `every` steps of the grid, and what was seen after each `every`-th, with a
+    leading axis of `room`, at least `count`: what is beyond is zero. Not for reverse mode."""
     seen = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(look, carry))
 
-    def some(carry: Carry) -> Carry:
-        return jax.lax.fori_loop(0, every, lambda _, carry: step(carry), carry)
-
     def segment(i: Any, at: tuple[Carry, Any]) -> tuple[Carry, Any]:
-        carry = jax.lax.cond(_on(at[0]), some, lambda carry: carry, at[0])
+        until = (i + 1) * every
+
+        def some(carry: Carry) -> Carry:
+            return step(carry, until=until)
+
+        carry = jax.lax.while_loop(lambda carry: anyone(carry.running & (carry.k < until)), some, at[0])
         return carry, jax.tree.map(lambda all, x: all.at[i].set(x), at[1], look(carry))
 
     return jax.lax.fori_loop(0, count, segment, (carry, seen))
 
 
-def scan(step: Step, carry: Carry, count: Any, room: int) -> Carry:
-    """Return the carry after `count` steps, at most `room`; for derivatives."""
-    return repeated(step, carry, room, _on, count)
+def scan(step: Step, carry: Carry, room: int) -> Carry:
+    """Return the carry of a run that is over, after at most `room` tries; for derivatives."""
+    return repeated(step, carry, room, lambda carry: _on(carry.running))
 
 
 def scan_and_watch(
-    step: Step, look: Callable[[Carry], Any], carry: Carry, every: int, count: Any, room: int
+    step: Step, look: Callable[[Carry], Any], carry: Carry, every: int, count: Any, instants: int, room: int
 ) -> tuple[Carry, Any]:
-    """Return what `watch` does; for derivatives."""
+    """Return what `watch` does, `instants` for its room; each segment has room for so many tries. For derivatives."""
 
     def segment(carry: Carry, i: Any) -> tuple[Carry, Any]:
+        until = (i + 1) * every
+
+        def on(carry: Carry) -> Any:
+            return _on(carry.running & (carry.k < until))
+
         def some(carry: Carry) -> Carry:
-            return repeated(step, carry, every, _on, every)
+            return repeated(lambda carry: step(carry, until=until), carry, room, on)
 
         carry = jax.lax.cond(i < count, some, lambda carry: carry, carry)
         return carry, look(carry)
 
-    return jax.lax.scan(forgetful(segment), carry, jnp.arange(room))
+    return jax.lax.scan(forgetful(segment), carry, jnp.arange(instants))
 
 
-def _on(carry: Carry) -> Any:
-    return anyone(jax.lax.stop_gradient(carry.running))
+def _on(running: Any) -> Any:
+    return anyone(jax.lax.stop_gradient(running))

@@ -11,10 +11,9 @@ import jax.numpy as jnp
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Ending, Objective
 from diffabs.core.pytree import prepared
-from diffabs.simulate.hybrid_step import Carry, Condition, finish, observe
 from diffabs.simulate.solution import Run, Trajectory
+from diffabs.simulate.stepper import Carry, Condition
 
-MISSED = 0.1  # of the last step, by which a landing may miss the crossing: the state is still moved onto it
 ROUNDING = 1e-9  # of a metric beyond its physical range
 AUDIT = ""  # the name of a plant's audit among the objectives; no metric is called so
 
@@ -26,18 +25,23 @@ def prepare(loop: Loop) -> tuple[Loop, dict[str, Objective]]:
     return loop, {AUDIT: audit(loop.initial)} if audit else {}
 
 
-def judge(loop: Loop, objectives: dict[str, Objective], h: Any, carry: Carry) -> tuple[Run, Trajectory]:
+def judge(loop: Loop, objectives: dict[str, Objective], carry: Carry) -> tuple[Run, Trajectory]:
     """The result of a run that is over, and its last instant. `objectives` with the plant's audit."""
-    missed = carry.stopped & ~_landed(loop, h, carry)
-    carry = finish(loop, objectives, h, carry)
     last = observe(loop, carry)
     ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample, carry.stopped))
-    metrics = {name: o.value(carry.tally[name], ending) for name, o in objectives.items()}
+    metrics = {name: o.value(carry.point.tally[name], ending) for name, o in objectives.items()}
     wrong = [_impossible(name, objectives[name], value) for name, value in metrics.items()]
-    diverged = jnp.any(jnp.stack([carry.condition == Condition.DIVERGED, missed, *wrong]))
+    diverged = jnp.any(jnp.stack([carry.condition == Condition.DIVERGED, *wrong]))
     metrics = {n: jnp.where(diverged, jnp.nan, value) for n, value in metrics.items() if n != AUDIT}
     timed_out = (carry.condition == Condition.TIMED_OUT) & ~diverged
     return Run(metrics, carry.stopped & ~diverged, diverged, timed_out, ending, None), last
+
+
+def observe(loop: Loop, carry: Carry) -> Trajectory:
+    """Return what is seen of the loop at the present instant."""
+    point = carry.point
+    signals = loop.signals(point.t, point.state)
+    return Trajectory(signals.sample, signals.measured, point.state.plant, carry.condition <= Condition.LANDING)
 
 
 def _impossible(name: str, objective: Objective, value: Any) -> Any:
@@ -48,12 +52,3 @@ def _impossible(name: str, objective: Objective, value: Any) -> Any:
     if math.isinf(low) and math.isinf(high):
         return jnp.asarray(False)
     return ~((value >= low - ROUNDING) & (value <= high + ROUNDING) & jnp.isfinite(value))
-
-
-def _landed(loop: Loop, h: Any, carry: Carry) -> Any:
-    """Whether the last step ended near the crossing, in units of the margin at its beginning and of its change in h."""
-    y = loop.plant.output(carry.state.plant)
-    left, ahead = loop.stop.margin(y), loop.stop.margin(carry.before.output)
-    first = loop.stop.margin(loop.plant.output(loop.plant.start(loop.initial)))
-    rounding = 16 * jnp.finfo(h.dtype).eps * jnp.abs(first)
-    return jnp.abs(left) <= MISSED * (jnp.abs(ahead) + h * jnp.abs(loop.stop.rate(y))) + rounding

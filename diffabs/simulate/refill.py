@@ -14,10 +14,10 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import replace, strong
 from diffabs.core.tracing import separated
-from diffabs.simulate.hybrid_step import Carry, Condition, init_carry, step
 from diffabs.simulate.outcome import judge, prepare
 from diffabs.simulate.run import arguments
 from diffabs.simulate.solution import FixedStep, Run
+from diffabs.simulate.stepper import Carry, Condition, init_carry, step
 
 WIDTH = 1024  # lanes whose state stays in a processor's cache
 ROUND = 64  # steps
@@ -82,14 +82,14 @@ def _run(
         return one, objectives | audit
 
     step_all = jax.vmap(lambda mine, key, carry: step(*built(mine), h, key, steps, carry))
-    start = jax.vmap(lambda mine, key: init_carry(*built(mine), h))
-    over = jax.vmap(lambda mine, carry: judge(*built(mine), h, carry)[0])
+    start = jax.vmap(lambda mine, key: init_carry(*built(mine), h, key))
+    over = jax.vmap(lambda mine, carry: judge(*built(mine), carry)[0])
 
     def early(number: Any, mine: Any, carry: Carry) -> Any:
         """Lanes of which enough is seen."""
         if enough is None:
             return jnp.zeros_like(carry.running)
-        output = jax.vmap(lambda mine, carry: built(mine)[0].plant.output(carry.state.plant))(mine, carry)
+        output = jax.vmap(lambda mine, carry: built(mine)[0].plant.output(carry.point.state.plant))(mine, carry)
         return jax.vmap(enough.reached)(number, output)
 
     def taken(number: Any) -> tuple[Any, Any, Carry]:

@@ -1,11 +1,7 @@
 """Run a loop: a scan over Runge-Kutta steps that returns a trajectory, or only what is measured.
 
-    each step:   the objectives' update over [t_k - h, t_k];  jump at t_k;  z += elapsed (f_after - f_before) for each
-                 localised event;  RK4 over [t_k, t_k + h];  the plant's projection
-    at the end:  the objectives' last update, after the state was moved onto the crossing
-
-A step that crosses the stop is tried again, shorter, until it ends on the crossing. Stopping time, distance and every
-objective are thus exact to the order of the method and differentiable, wherever the crossing falls."""
+A step that crosses the stop, or an event of a block, is tried again, shorter, until it ends there (`stepper`). Every
+objective is thus exact to the order of the method and differentiable, wherever the crossing falls."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -22,9 +18,9 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, misshapen, strong
 from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
-from diffabs.simulate.hybrid_step import LANDINGS, Carry, init_carry, observe, step
-from diffabs.simulate.outcome import judge, prepare
+from diffabs.simulate.outcome import judge, observe, prepare
 from diffabs.simulate.solution import FixedStep, Run, Trajectory
+from diffabs.simulate.stepper import Carry, init_carry, room, step
 
 MOST_STEPS = 2**31 - 8  # that a counter in 32 bits holds, landing included
 
@@ -58,9 +54,11 @@ def measure(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], 
 def _call(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
     loop, objectives, h = arguments(loop, solver, objectives)
     steps, every = solver.steps, int(every)
-    room = slots(-(-(steps + LANDINGS) // every)) if every else 0
-    run = _simulated((slots(steps + LANDINGS), room, every), (loop, objectives, h, key), jnp.asarray(steps))
-    return run._replace(trajectory=_shortened(run.trajectory, -(-steps // every) + 1)) if every else run
+    count = -(-steps // every) if every else 0
+    tries = room(loop, min(every, steps) if every else slots(steps))
+    places = (tries, slots(count) if every else 0, every)
+    run = _simulated(places, (loop, objectives, h, key), jnp.asarray(steps))
+    return run._replace(trajectory=_shortened(run.trajectory, count + 1)) if every else run
 
 
 @partial(jax.jit, static_argnums=1)
@@ -99,13 +97,14 @@ def _wrong_number(solver: FixedStep, name: str) -> str:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _simulated(room: tuple[int, int, int], run: Any, steps: Any) -> Run:
-    """The run of (loop, objectives, h, key), with room for so many steps and instants of a trajectory."""
+def _simulated(places: tuple[int, int, int], run: Any, steps: Any) -> Run:
+    """The run of (loop, objectives, h, key), with places for so many tries (between two instants of a trajectory, if
+    there is one), and for so many instants, one in every so many steps."""
     loop, objectives, h, key = run
-    return _run(loop, objectives, h, key, steps, jnp.asarray(room[2]), room=room[1])
+    return _run(loop, objectives, h, key, steps, jnp.asarray(places[2]), places=places[1])
 
 
-def _rule(room: tuple[int, int, int], primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _rule(places: tuple[int, int, int], primals: Any, tangents: Any) -> tuple[Any, Any]:
     """Only what has a tangent is differentiated: zeros worked out would cost as much as any other."""
     values, tree = jax.tree.flatten(primals)
     moves = tree.flatten_up_to(tangents)
@@ -114,7 +113,7 @@ def _rule(room: tuple[int, int, int], primals: Any, tangents: Any) -> tuple[Any,
     def run(moving: list[Any]) -> Run:
         left = iter(moving)
         run, steps = tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)])
-        return _reversible(*run, steps, room=room)
+        return _reversible(*run, steps, places=places)
 
     moving, rates = ([x for x, on in zip(xs, live, strict=True) if on] for xs in (values, moves))
     return jax.jvp(run, (moving,), (rates,))
@@ -123,35 +122,35 @@ def _rule(room: tuple[int, int, int], primals: Any, tangents: Any) -> tuple[Any,
 _simulated.defjvp(_rule, symbolic_zeros=True)
 
 
-@compile_once(static=("room",), options=SAME)
-def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, every: Any, *, room: int) -> Run:
-    """For values: `room` for a trajectory, 0 without."""
+@compile_once(static=("places",), options=SAME)
+def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, every: Any, *, places: int) -> Run:
+    """For values: `places` for a trajectory, 0 without."""
     loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps)
-    if not room:
-        return judge(loop, objectives, h, until(stepped, carry))[0]
-    first, count = observe(loop, carry), -(-(steps + LANDINGS) // every)
-    carry, seen = watch(stepped, partial(observe, loop), carry, every, count, room)
-    return _with_trajectory(judge(loop, objectives, h, carry), first, seen)
+    if not places:
+        return judge(loop, objectives, until(stepped, carry))[0]
+    first, count = observe(loop, carry), -(-steps // every)
+    carry, seen = watch(stepped, partial(observe, loop), carry, every, count, places)
+    return _with_trajectory(judge(loop, objectives, carry), first, seen)
 
 
-@partial(jax.jit, static_argnames="room")
+@partial(jax.jit, static_argnames="places")
 def _reversible(
-    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, *, room: tuple[int, int, int]
+    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, *, places: tuple[int, int, int]
 ) -> Run:
-    """For derivatives: room for steps, and for a trajectory, of every so many steps."""
+    """For derivatives."""
     loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps)
-    most, instants, every = room
+    tries, instants, every = places
     if not every:
-        return judge(loop, objectives, h, scan(stepped, carry, steps + LANDINGS, most))[0]
-    first, count = observe(loop, carry), -(-(steps + LANDINGS) // every)
-    carry, seen = scan_and_watch(stepped, partial(observe, loop), carry, every, count, instants)
-    return _with_trajectory(judge(loop, objectives, h, carry), first, seen)
+        return judge(loop, objectives, scan(stepped, carry, tries))[0]
+    first, count = observe(loop, carry), -(-steps // every)
+    carry, seen = scan_and_watch(stepped, partial(observe, loop), carry, every, count, instants, tries)
+    return _with_trajectory(judge(loop, objectives, carry), first, seen)
 
 
 def _begun(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any) -> tuple[Loop, Any, Carry, Any]:
     loop, audit = prepare(loop)
     objectives = objectives | audit
-    return loop, objectives, init_carry(loop, objectives, h), partial(step, loop, objectives, h, key, steps)
+    return loop, objectives, init_carry(loop, objectives, h, key), partial(step, loop, objectives, h, key, steps)
 
 
 def _with_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: Any) -> Run:

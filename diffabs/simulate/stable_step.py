@@ -20,7 +20,7 @@ import numpy as np
 
 from diffabs.core.compiling import SAME, compile_once
 from diffabs.core.loop import Loop
-from diffabs.core.protocols import Clock, Jump, Memory, Reference
+from diffabs.core.protocols import Memory, Reference
 from diffabs.core.pytree import Scalar, part, pytree, replace, strong
 from diffabs.core.tracing import separated
 
@@ -191,9 +191,6 @@ class _Arrived:
     def output(self, t: Scalar, memory: Memory, signal: Any) -> Scalar:
         del t, memory
         return jax.lax.stop_gradient(signal[0])
-
-    def jump(self, clock: Clock, memory: Memory, signal: Any) -> Jump:
-        return self.reference.jump(clock, memory, signal)
 
     def setpoint(self, memory: Memory) -> Scalar:
         return self.reference.setpoint(memory)

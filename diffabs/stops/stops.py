@@ -25,10 +25,6 @@ class SpeedReached:
         """Speed above the end [m/s]."""
         return output.speed - self.speed
 
-    def rate(self, output: BrakeOutput) -> Scalar:
-        """d(margin)/dt."""
-        return -output.deceleration
-
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """Nothing after a stop; else (v - v_end)/a and (v^2 - v_end^2)/(2 a)."""
         time, distance = _braked(sample, self.speed, False)
@@ -51,10 +47,6 @@ class Standstill:
         """Speed above the end of integration [m/s]."""
         return output.speed - self.speed
 
-    def rate(self, output: BrakeOutput) -> Scalar:
-        """d(margin)/dt."""
-        return -output.deceleration
-
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """v/a and v^2/(2 a)."""
         return _braked(sample, 0.0, stopped)
@@ -73,10 +65,6 @@ class Fallen:
         """angle^2 - theta^2 [rad^2]."""
         return self.angle**2 - output.theta**2
 
-    def rate(self, output: BalanceOutput) -> Scalar:
-        """d(margin)/dt."""
-        return -2 * output.theta * output.theta_rate
-
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """Nothing is left."""
         del stopped
@@ -92,10 +80,6 @@ class NoStop:
     def margin(self, output: Any) -> Scalar:
         """1: never crossed."""
         return 1.0 + 0.0 * output[0]
-
-    def rate(self, output: Any) -> Scalar:
-        """0."""
-        return 0.0 * output[0]
 
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """Nothing is left."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from diffabs.core.numerics import clamp
-from diffabs.core.protocols import Ending, Memory, Sample
+from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, param, pytree
 
 
@@ -85,7 +85,7 @@ class DCMotor:
 
 @pytree
 class PeakCurrent:
-    """Greatest |i| at the ends of the steps."""
+    """Greatest |i|."""
 
     unit = "A"
     physical = (0.0, math.inf)
@@ -99,10 +99,10 @@ class PeakCurrent:
         del memory, sample
         return ()
 
-    def update(self, memory: Memory, before: Sample, sample: Sample, h: Scalar) -> Scalar:
-        """The greater one."""
-        del before, h
-        return jnp.maximum(memory.held, jnp.abs(sample.output.current))
+    def update(self, memory: Memory, segment: Segment) -> Scalar:
+        """The greatest of the step, from its cubic."""
+        current = segment.output(lambda output: output.current)
+        return jnp.maximum(memory.held, jnp.maximum(current.greatest(), current.times(-1.0).greatest()))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """The greatest."""

@@ -1,0 +1,85 @@
+"""The cubic through the values and the rates at both ends of a step (Hermite's): values, roots, extrema, integrals.
+
+    p(x) = a + c1 x + c2 x^2 + c3 x^3,   x = (t - t0)/h in [0, 1]
+    c1 = h a',  c2 = 3 (b - a) - h (2 a' + b'),  c3 = 2 (a - b) + h (a' + b')
+
+It differs from a smooth function by O(h^4)."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.numerics import clamp
+from diffabs.core.pytree import Scalar
+
+NEWTON = 1  # iterations from the secant, before the last: the cubic of a step is nearly a line
+
+
+class Cubic(NamedTuple):
+    """Values at both ends, and the rates there times the length of the step."""
+
+    start: Scalar
+    end: Scalar
+    start_slope: Scalar
+    end_slope: Scalar
+
+    def __call__(self, x: Scalar) -> Any:
+        """p(x)."""
+        c1, c2, c3 = self._coefficients()
+        return self.start + x * (c1 + x * (c2 + x * c3))
+
+    def slope(self, x: Scalar) -> Any:
+        """dp/dx."""
+        c1, c2, c3 = self._coefficients()
+        return c1 + x * (2.0 * c2 + x * 3.0 * c3)
+
+    def minus(self, level: Scalar) -> "Cubic":
+        """p - level."""
+        return self._replace(start=self.start - level, end=self.end - level)
+
+    def times(self, factor: Scalar) -> "Cubic":
+        """factor p."""
+        return Cubic(*(factor * x for x in self))
+
+    def integral(self, x: Scalar) -> Any:
+        """Integral of p from 0 to x, in steps."""
+        c1, c2, c3 = self._coefficients()
+        return x * (self.start + x * (c1 / 2.0 + x * (c2 / 3.0 + x * c3 / 4.0)))
+
+    def moment(self, x: Scalar) -> Any:
+        """Integral of x p from 0 to x, in steps."""
+        c1, c2, c3 = self._coefficients()
+        return x * x * (self.start / 2.0 + x * (c1 / 3.0 + x * (c2 / 4.0 + x * c3 / 5.0)))
+
+    def root(self) -> Any:
+        """The place at which p changes its sign, where its ends have different ones; else any place in [0, 1]. Its
+        derivative is the implicit function theorem's."""
+        still = jax.lax.stop_gradient(self)
+        spread = still.start - still.end
+        x = clamp(still.start / jnp.where(spread == 0, 1.0, spread), 0.0, 1.0)
+        for _ in range(NEWTON):
+            x = clamp(x - _quotient(still(x), still.slope(x)), 0.0, 1.0)
+        return x - _quotient(self(x), still.slope(x))
+
+    def greatest(self) -> Any:
+        """The greatest value of p in [0, 1]. The derivative is that of p at the place of the extremum."""
+        c1, c2, c3 = jax.lax.stop_gradient(self._coefficients())
+        inside = (c1 > 0) & (c1 + 2.0 * c2 + 3.0 * c3 < 0)
+        square = c2 * c2 - 3.0 * c1 * c3
+        bend = jnp.sqrt(jnp.where(inside & (square > 0), square, 1.0)) - c2
+        x = clamp(_quotient(c1, bend), 0.0, 1.0)
+        ends = jnp.where(self.start >= self.end, self.start, self.end)
+        top = self(x)
+        return jnp.where(inside & (top > ends), top, ends)
+
+    def _coefficients(self) -> tuple[Any, Any, Any]:
+        rise = self.end - self.start
+        c2 = 3.0 * rise - 2.0 * self.start_slope - self.end_slope
+        return self.start_slope, c2, self.start_slope + self.end_slope - 2.0 * rise
+
+
+def _quotient(x: Any, y: Any) -> Any:
+    """x/y without a derivative in y, and 0 where y is."""
+    y = jax.lax.stop_gradient(y)
+    return jnp.where(y == 0, 0.0, x / jnp.where(y == 0, 1.0, y))
