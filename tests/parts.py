@@ -245,7 +245,7 @@ def at_instant(block: Any, clock: Clock, memory: Memory, signal: Any, rate: Any,
         return block.margins(clock.t, memory, signal, lambda: rate) if offers(block, "margins") else ()
 
     if offers(block, "margins"):
-        before = before or [jnp.zeros_like(clock.t) for _ in margins(memory)]
+        before = before or [0.0 * clock.t for _ in margins(memory)]
         fired = tuple((a >= 0) & (b < 0) for a, b in zip(before, margins(memory), strict=True))
         memory = block.event(clock.t, memory, signal, fired)
     memory = block.tick(clock, memory, signal) if offers(block, "tick") else memory
@@ -254,17 +254,20 @@ def at_instant(block: Any, clock: Clock, memory: Memory, signal: Any, rate: Any,
 
 def block_run(family: str, block: Any, steps: int = 8) -> Any:
     """Outputs and continuous memories over some steps, by Euler; events at the instants only."""
-    t = H * jnp.arange(steps)
-    signals = signal_at(family, block, t)
-    memory = block.start(jax.tree.map(lambda x: x[0], signals))
-    margins, seen = None, []
-    for k in range(steps):
-        signal, rate = jax.jvp(partial(signal_at, family, block), (t[k],), (jnp.ones_like(t[k]),))
-        clock = Clock(t[k], H, jnp.asarray(k), jax.random.key(7))
-        memory, margins = at_instant(block, clock, memory, signal, rate, margins)
-        seen.append((block.output(t[k], memory, signal), memory.flow))
-        memory = Memory(axpy(H, block.flow(t[k], memory, signal), memory.flow), memory.held)
-    return jax.tree.map(lambda *x: jnp.stack(x), *seen)
+
+    def step(at: Any, k: Any) -> Any:
+        memory, margins = at
+        t = k * H
+        signal, rate = jax.jvp(partial(signal_at, family, block), (t,), (jnp.ones_like(t),))
+        memory, margins = at_instant(block, Clock(t, H, k, jax.random.key(7)), memory, signal, rate, margins)
+        seen = block.output(t, memory, signal), memory.flow
+        return (Memory(axpy(H, block.flow(t, memory, signal), memory.flow), memory.held), margins), seen
+
+    signal = signal_at(family, block, jnp.zeros(()))
+    memory = block.start(signal)
+    margins = block.margins(jnp.zeros(()), memory, signal, lambda: signal) if offers(block, "margins") else ()
+    start = memory, jax.tree.map(jnp.zeros_like, margins)
+    return jax.lax.scan(step, start, jnp.arange(steps))[1]
 
 
 def balancing_at(t: Any) -> Sample:

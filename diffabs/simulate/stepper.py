@@ -100,6 +100,7 @@ def step(loop: Loop, objectives: Objectives, h: Any, key: Any, steps: Any, carry
 
 def _apart(active: Any, work: Callable[[], Any]) -> Any:
     """work(), compiled by itself and not once more into everything that is made of it; zeros where no lane runs."""
+    work = jax.jit(work)  # traced once for its shape and for its program
     shape = jax.eval_shape(work)
     return jax.lax.cond(anyone(active), work, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape))
 
