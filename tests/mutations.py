@@ -55,7 +55,7 @@ MUTATIONS = [
     Mutation(
         "a chattering relay runs on",
         "simulate/stepper.py",
-        "verdict.fine & (extra <= steps + SPARE)",
+        "verdict.fine & (extra <= EXTRA * steps + SPARE)",
         "verdict.fine",
         "test_blocks.py::test_what_switches_in_every_step_is_no_run",
     ),

@@ -20,7 +20,7 @@ from diffabs.simulate.advance import Arrival, Objectives, Point, arrive, begin, 
 from diffabs.simulate.checkpoint import anyone
 from diffabs.simulate.landing import Search, falls_through, init_search, land, seek, select
 
-SPARE = 64  # tries beyond the steps of the grid, besides as many as there are such steps
+EXTRA, SPARE = 4, 64  # tries beyond a step of the grid for each of them, about an event; and besides
 MISSED = 0.1  # of the change of the stop's margin in the step: the most that may be left of it
 
 
@@ -65,7 +65,7 @@ class Verdict(NamedTuple):
 
 def room(loop: Loop, steps: int) -> int:
     """Return how many tries a run of so many steps of the grid may take: what a scan must have room for."""
-    return (2 * steps if loop.eventful else steps) + SPARE
+    return ((1 + EXTRA) * steps if loop.eventful else steps) + SPARE
 
 
 def init_carry(loop: Loop, objectives: Objectives, h: Any, key: Any) -> Carry:
@@ -93,7 +93,7 @@ def step(loop: Loop, objectives: Objectives, h: Any, key: Any, steps: Any, carry
     ahead = (carry.search, jnp.where(verdict.on_grid, h, (k + 1) * h - end), _ended(carry, here, verdict))
     search, length, condition = select(active, select(trying, found, ahead), plan)
     extra = carry.extra + jnp.where(active & ~verdict.on_grid, 1, 0)
-    lost = active & ~(verdict.fine & (extra <= steps + SPARE))
+    lost = active & ~(verdict.fine & (extra <= EXTRA * steps + SPARE))
     condition = jnp.where(lost, Condition.DIVERGED, condition).astype(carry.condition.dtype)
     return Carry(select(verdict.taken, point, carry.point), k, length, search, extra, condition)
 
