@@ -61,18 +61,6 @@ def sign(x: Scalar) -> Any:
     return jnp.where(jnp.greater_equal(x, 0), 1.0, -1.0)
 
 
-def parabola(left: Scalar, middle: Scalar, right: Scalar) -> tuple[Any, Any]:
-    """Place (in steps from the middle, within [-1, 1]) and value of the extremum of the parabola through three equally
-    spaced values; the middle where the three lie on a line."""
-    place = clamp(ratio(0.5 * (left - right), left - 2 * middle + right), -1.0, 1.0)
-    return place, interpolate(left, middle, right, place)
-
-
-def interpolate(left: Scalar, middle: Scalar, right: Scalar, place: Scalar) -> Any:
-    """The parabola through three equally spaced values at `place` steps from the middle one."""
-    return middle + 0.5 * place * (right - left) + 0.5 * place**2 * (left - 2 * middle + right)
-
-
 def odd(curve: Callable[[Any], Any], x: Scalar) -> Any:
     """The odd extension of a curve given for x >= 0. At 0 the slope is that of the curve (|x| would make it 0)."""
     s = sign(x)

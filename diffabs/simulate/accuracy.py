@@ -19,13 +19,12 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.blocks import offers
-from diffabs.core.loop import Loop
+from diffabs.core.loop import BLOCKS, Loop
 from diffabs.core.protocols import Clock, Memory, Objective
 from diffabs.core.pytree import refined
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import FixedStep, Run
 
-BLOCKS = ("sensor", "reference", "controller", "actuator")
 SLOW = 0.75  # q of an order of 0.4
 ROUNDING = 1e3  # times the precision of a number: differences that are none
 DRAWS = 256  # instants at which noise is compared
