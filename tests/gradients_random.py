@@ -66,7 +66,7 @@ class Program:
 
     def __init__(self, name: str, times: int = 1):
         self.name, self.structure, self.times = name, random_loops.STRUCTURES[name], times
-        solver = FixedStep(self.structure.step / times, self.structure.duration)
+        solver = FixedStep(self.structure.step / times, self.structure.duration, kinks=True)  # as derivatives have it
         self.objectives = list(self.structure.objectives)
 
         def one(loop: Any, measures: Any, x: Any) -> tuple[Any, Any]:

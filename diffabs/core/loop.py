@@ -104,6 +104,11 @@ class Loop:
         return any(offers(getattr(self, name)) for name in BLOCKS)
 
     @property
+    def ticks(self) -> bool:
+        """Whether a block has ticks."""
+        return any(offers(getattr(self, name), "tick") for name in BLOCKS)
+
+    @property
     def eventful(self) -> bool:
         """Whether a block has events."""
         return any(offers(getattr(self, name), "margins") for name in BLOCKS)

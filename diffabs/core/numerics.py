@@ -50,10 +50,20 @@ def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> An
 def power(base: Scalar, exponent: Scalar) -> Any:
     """base ** exponent for base >= 0 and exponent > 1, with slope 0 at base = 0 in both arguments.
 
-    exp(q log x): XLA's own power is three to four times slower on a CPU.
+    exp(q log x): XLA's own power is three to four times slower on a CPU. By the square of the base, so that a step that
+    goes on beyond 0 before it is tried again (`core.kinks`) finds a number there.
     """
-    positive = jnp.greater(base, 0)
-    return jnp.where(positive, jnp.exp(exponent * jnp.log(jnp.where(positive, base, 1.0))), 0.0)
+    square = base * base
+    fine = jnp.not_equal(square, 0)
+    value = jnp.where(fine, jnp.exp(exponent * (0.5 * jnp.log(jnp.where(fine, square, 1.0)))), 0.0)
+    return jnp.where(jnp.greater(base, 0), value, 0.0)
+
+
+@jax.jit
+def searchsorted(knots: Any, x: Scalar) -> Any:
+    """How many of a few knots (n,), which increase, are not above x. The name is that of JAX's, by which `core.kinks`
+    knows a search, as this function is too; that one looks for NaN among the knots, each time."""
+    return jnp.sum(x >= knots).astype(jnp.int32)
 
 
 def sign(x: Scalar) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.numerics import odd, ratio
+from diffabs.core.numerics import odd, ratio, searchsorted
 from diffabs.core.pytree import Scalar, Vector, param, pytree
 from diffabs.core.rules import Rule, array, increasing
 
@@ -115,7 +115,7 @@ class PiecewiseCubic:
         return odd(self._curve, slip)
 
     def _curve(self, s: Any) -> Any:
-        i = jnp.sum(s >= self.knots[1:-1])
+        i = searchsorted(self.knots[1:-1], s)
         x, c0, c1, c2, c3 = self.rows[i]
         z = jnp.minimum(s, self.knots[-1]) - x
         return c0 + z * (c1 + z * (c2 + z * c3))

@@ -1,108 +1,145 @@
 """What happens in one step of a run, whatever chose its length: the only place where that is said.
 
-integrate to t + h;  the plant's projection;  the objectives' update over the step;  at t + h the blocks' events and
-ticks;  the rates from there, with which the next step begins"""
+integrate to t + h, within one regime;  the plant's projection;  the objectives' update over the step;  at t + h the
+blocks' events and ticks;  the rates from there, with which the next step begins"""
 
-from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
-from diffabs.core.protocols import Clock, Memory, Objective, Sample, Segment
+from diffabs.core.protocols import Clock, Memory, Sample, Segment
+from diffabs.core.regime import Regime, Words, crossing, only
+from diffabs.simulate.checkpoint import apart
+from diffabs.simulate.dynamics import Dynamics, Objectives, Tally, dynamics, parted
 from diffabs.simulate.rk4 import rk4_step_from
-
-Objectives = dict[str, Objective]
 
 
 class Point(NamedTuple):
     """A run at an instant, after what changes there: the loop's state and the objectives' accumulators, what is seen,
-    the rates of both (of what is integrated), and the margins of the stop and of the blocks' events."""
+    the rates of both (of what is integrated), the margins of the stop and of the blocks' events, and the regime: the
+    answers to the comparisons in these rates."""
 
     t: Any
     state: LoopState
-    tally: dict[str, Memory]
+    tally: Tally
     sample: Sample
     rate: tuple[Any, Any]
     margins: Margins
+    regime: Words
+
+
+class Kink(NamedTuple):
+    """Of the comparisons at the end of a step: one other than that which is looked for, and which says something else
+    than in the step, or -1; whether that which is looked for does; the one of these to look for; and its margin."""
+
+    other: Any
+    crossed: Any
+    chosen: Any
+    margin: Any
 
 
 class Arrival(NamedTuple):
-    """The end of a step, before what changes there: time, state, accumulators, signals, rate of the state, margins."""
+    """The end of a step, before what changes there: time, state, accumulators, signals, rates, margins, comparisons,
+    and the regime from there."""
 
     t: Any
     state: LoopState
-    tally: dict[str, Memory]
+    tally: Tally
     signals: Signals
-    rate: Any
+    rate: tuple[Any, Any]
     margins: Margins
+    kink: Kink
+    regime: Words
 
 
-def begin(loop: Loop, objectives: Objectives, clock: Clock) -> Point:
+class Try(NamedTuple):
+    """A step to be made: length [s], the time at its end, the step of the grid [s]; whether it is a blunt one, over
+    whatever lies within; whether it is none, but works out anew what an event has changed; the comparison
+    that is looked for, and whether the step ends where that changes."""
+
+    h: Any
+    end: Any
+    step: Any
+    blunt: Any
+    anew: Any
+    which: Any
+    lands: Any
+
+
+def begin(loop: Loop, objectives: Objectives, clock: Clock, *, kinks: bool = False) -> Point:
     """Return the point at t = 0, after the first ticks; a block whose margin is negative has its event."""
     state = loop.start()
     signals = loop.signals(clock.t, state)
     tally = {name: objective.start(signals.sample) for name, objective in objectives.items()}
-    margins = loop.margins(clock.t, state, signals, lambda: loop.flow(clock.t, state, signals))
-    here = Arrival(clock.t, state, tally, signals, None, margins)
-    return depart(loop, objectives, clock, here, jax.tree.map(lambda margin: margin < 0, margins))
+    if loop.changes:
+        margins = loop.margins(clock.t, state, signals, lambda: loop.flow(clock.t, state, signals))
+        state = loop.change(clock, state, signals, margins, jax.tree.map(lambda margin: margin < 0, margins))
+    system = dynamics(loop, objectives, clock.t, state, tally, kinks=kinks)
+    return _leave(system, clock.t, state, tally, Regime(None))
 
 
-def arrive(loop: Loop, objectives: Objectives, point: Point, h: Any, end: Any, step: Any) -> Arrival:
-    """Return what a step of length h [s] from this point leads to, at the time `end`, by one Runge-Kutta step. The
-    grid has the `step`."""
-    z = (point.state.flow(), {name: memory.flow for name, memory in point.tally.items()})
-    held = {name: memory.held for name, memory in point.tally.items()}
+def arrive(system: Dynamics, point: Point, one: Try, active: Any) -> Arrival:
+    """Return what this step leads to, by one Runge-Kutta step."""
+    loop, (z, held) = system.loop, parted(point.state, point.tally)
 
-    def flow(t: Any, z: Any) -> Any:
-        state = point.state.with_flow(z[0])
-        signals = loop.signals(t, state)
-        return loop.flow(t, state, signals), _tally_rates(objectives, z[1], held, signals.sample)
+    def flow(t: Any, z: Any, given: tuple[Any, Regime]) -> Any:
+        return system.rates(t, z, *given)
 
-    z, last = rk4_step_from(flow, point.t, z, point.rate, h)
+    z = rk4_step_from(flow, point.t, z, point.rate, one.h, (held, Regime(point.regime, one.blunt)))
     state = point.state.with_flow(z[0])
-    state = state._replace(plant=loop.plant.project(state.plant))
-    signals = loop.signals(end, state)
-    exact = cache(lambda: loop.flow(end, state, signals))
-    rate = last[0] if loop.changes else exact()  # which is needed anyway where nothing changes: see `depart`
-    margins = loop.margins(end, state, signals, exact)
-    segment = _segment(loop, point, state, signals.sample, rate, h, step)
-    tally = {
-        name: Memory(z[1][name], o.update(Memory(z[1][name], held[name]), segment)) for name, o in objectives.items()
-    }
-    return Arrival(end, state, tally, signals, rate, margins)
+    tallied = {name: memory._replace(flow=z[1][name]) for name, memory in point.tally.items()}
+    rests = state._replace(plant=loop.plant.project(state.plant))
+    state = jax.tree.map(partial(jnp.where, one.blunt), rests, state) if system.kinks else rests
+
+    def look() -> Any:
+        seen, answers = system.look(one.end, state, tallied, _at_end(system, point.regime, one))
+        return seen, Kink(*crossing(answers, one.which, one.h)), answers.words
+
+    seen, kink, words = apart(active, look) if system.kinks else look()
+    end = (one.end, state, tallied, seen.rate)
+    segment = _segment(system, point, end, seen.signals.sample, one)
+    new = {name: Memory(z[1][name], o.update(tallied[name], segment)) for name, o in system.objectives.items()}
+    tallied = jax.tree.map(partial(jnp.where, one.anew), point.tally, new) if loop.changes and not loop.ticks else new
+    return Arrival(one.end, rests, tallied, seen.signals, seen[:2], seen.margins, kink, words)
 
 
-def depart(loop: Loop, objectives: Objectives, clock: Clock, here: Arrival, fired: Margins) -> Point:
-    """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock."""
-    _, state, tally, signals, rate, margins = here
-    if loop.changes or rate is None:
-        state = loop.change(clock, state, signals, margins, fired)
-        signals = loop.signals(clock.t, state)
-        rate = loop.flow(clock.t, state, signals)
-        margins = loop.margins(clock.t, state, signals, lambda: rate)
-    flow, held = ({name: getattr(memory, part) for name, memory in tally.items()} for part in ("flow", "held"))
-    rates = _tally_rates(objectives, flow, held, signals.sample)
-    return Point(clock.t, state, tally, signals.sample, (rate, rates), margins)
+def depart(system: Dynamics, clock: Clock, here: Arrival, fired: Margins, one: Try) -> Point:
+    """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock. In a
+    loop without ticks, what follows from an event is left to a step that does it `anew`: there are few of them."""
+    t, state, tally, signals, rate, margins, _, regime = here
+    if system.loop.changes:
+        state = system.loop.change(clock, state, signals, margins, fired)
+    if not system.loop.ticks:
+        return Point(t, state, tally, signals.sample, rate, margins, regime)
+    kept = (jnp.where(one.lands, bit, jnp.uint32(0)) for bit in only(one.which, system.words))
+    return _leave(system, t, state, tally, Regime(regime, ~one.lands, tuple(~bit for bit in kept)))
 
 
-def _segment(loop: Loop, point: Point, state: LoopState, sample: Sample, rate: Any, h: Any, step: Any) -> Segment:
-    ends = ((point.sample.t, point.state, point.rate[0]), (sample.t, state, rate))
-
-    def each(of: Callable[[Any, LoopState, Any], Any]) -> Any:
-        return cache(lambda: tuple(of(*end) for end in ends))
-
-    def output(t: Any, state: LoopState, rate: Any) -> Any:
-        del t
-        return jax.jvp(loop.plant.output, (state.plant,), (rate[0],))[1]
-
-    def seen(t: Any, state: LoopState, rate: Any) -> Sample:
-        return loop.signal_rates(t, state, rate).sample
-
-    return Segment(point.sample, sample, h, step, each(output), each(seen))
+def _leave(system: Dynamics, t: Any, state: LoopState, tally: Tally, regime: Regime) -> Point:
+    seen, answers = system.look(t, state, tally, regime)
+    return Point(t, state, tally, seen.signals.sample, seen[:2], seen.margins, answers.words)
 
 
-def _tally_rates(objectives: Objectives, flow: dict[str, Any], held: dict[str, Any], sample: Sample) -> dict[str, Any]:
-    """d/dt of the objectives' integrals."""
-    return {name: o.flow(Memory(flow[name], held[name]), sample) for name, o in objectives.items()}
+def _at_end(system: Dynamics, words: Words, one: Try) -> Regime:
+    """At the end of a step its regime still holds; where it lands on a comparison, that has changed, and all others may
+    with it."""
+    one_bit = only(one.which, system.words)
+    none, all = jnp.uint32(0), ~jnp.uint32(0)
+    flipped = tuple(word ^ jnp.where(one.lands, bit, none) for word, bit in zip(words, one_bit, strict=True))
+    loose = tuple(jnp.where(one.blunt | one.anew, all, jnp.where(one.lands, ~bit, none)) for bit in one_bit)
+    return Regime(flipped, one.blunt | one.anew, loose)
+
+
+def _segment(system: Dynamics, point: Point, end: Any, sample: Sample, one: Try) -> Segment:
+    within = Regime(point.regime, one.blunt)
+    ends = ((point.t, point.state, point.tally, point.rate[0]), end)
+
+    def each(of: Any) -> Any:
+        return cache(lambda: tuple(system.moving(of, end, within) for end in ends))
+
+    return Segment(
+        point.sample, sample, one.h, one.step, each(lambda sample: sample.output), each(lambda sample: sample)
+    )

@@ -51,6 +51,14 @@ def _(size: int, batched: Any, running: Any) -> tuple[Any, bool]:
     return (anyone(jnp.any(running, axis=0)), False) if batched[0] else (anyone(running), False)
 
 
+def apart(active: Any, work: Callable[[], X]) -> X:
+    """Return work(), compiled by itself and not once more into everything that is made of it; zeros where no lane is
+    active."""
+    work = jax.jit(work)  # traced once for its shape and for its program
+    shape = jax.eval_shape(work)
+    return jax.lax.cond(anyone(active), work, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape))
+
+
 def forgetful(body: Any) -> Any:
     """Reverse mode keeps the arguments of `body` and works everything else out again."""
     return jax.checkpoint(body, policy=jax.checkpoint_policies.nothing_saveable, prevent_cse=False)

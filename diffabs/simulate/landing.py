@@ -1,9 +1,12 @@
 """Where in a step a margin falls through zero: the lengths that are tried, and the one that ends on the zero.
 
 seek    tries shrink a bracket, by secant, Newton's step on a parabola, or halving, until one ends near the zero
-probe   one more, on the same side: how the margin falls there; on the other side a road may have another curvature
+probe   one more, on the same side: how the margin falls there
 land    place - margin(place)/fall: the last try's length. Its derivative is that of the event's moment, by the
-        implicit function theorem: the margin at the end of a try carries it"""
+        implicit function theorem: the margin at the end of a try carries it
+
+Margins are those of comparisons, then those of the stop and of the blocks' events; of the first only the end of a try
+tells them."""
 
 from typing import Any, NamedTuple
 
@@ -14,13 +17,15 @@ from diffabs.core.numerics import ratio
 
 NEAR = 1e-4  # steps: a Newton step from here misses the zero by some 1e-8 steps
 APART = 0.2  # power of the precision: the probe's distance, in steps
+BEYOND = 16  # times the precision: how far behind the zero a step ends, in steps
 TRIES = 24  # the most for an event, whose margin may have a corner or jump
 BISECT = 4  # every so many tries halve the bracket
 
 
 class Search(NamedTuple):
     """Where an event is looked for: the number of its margin; the length that was tried first [s]; the bracket; the
-    margin at these; how many times it was tried. Near the zero: the length, and the margin there."""
+    margin at these (infinite where nobody knows it); how many times it was tried. Near the zero: the length, and the
+    margin there."""
 
     which: Any
     full: Any
@@ -34,6 +39,24 @@ class Search(NamedTuple):
     margin: Any
 
 
+class Crossed(NamedTuple):
+    """A margin that a try is about: its number, what it is at the end of the try, and at the beginning."""
+
+    which: Any
+    end: Any
+    start: Any
+
+
+class Crossings(NamedTuple):
+    """What a try tells: the margin that is looked for, and whether it falls through zero within; another one that does,
+    and whether there is one."""
+
+    sought: Crossed
+    falls: Any
+    other: Crossed
+    another: Any
+
+
 def init_search(h: Any) -> Search:
     """Return a search for nothing."""
     none, zero = 0.0 * h, jnp.asarray(0)
@@ -45,64 +68,84 @@ def falls_through(before: list[Any], after: list[Any]) -> list[Any]:
     return [(a >= 0) & (b < 0) for a, b in zip(before, after, strict=True)]
 
 
-def seek(search: Search, x: Any, new: Any, before: list[Any], after: list[Any], h: Any) -> tuple[Search, Any, Any]:
+def earliest(which: Any, first: int, before: list[Any], after: list[Any]) -> Crossings:
+    """Return what a try tells of these margins, whose numbers begin with `first`."""
+    crossed = falls_through(before, after)
+    others = [one & (which != first + i) for i, one in enumerate(crossed)]
+    triples = zip(others, before, after, strict=True)
+    places = jnp.stack([jnp.where(one, a / jnp.where(one, a - b, 1.0), jnp.inf) for one, a, b in triples])
+    other = first + jnp.argmin(places).astype(which.dtype)
+    picked = [Crossed(i, _pick(i - first, after), _pick(i - first, before)) for i in (which, other)]
+    falls = _pick(which - first, crossed) & (which >= first)
+    return Crossings(picked[0], falls, picked[1], jnp.any(jnp.stack(others)))
+
+
+def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Search, Any, Any]:
     """Return the search for the earliest event after the try of length x, what to try next, and whether x is near
     enough, so that this is the probe.
 
-    new: whether nothing was looked for until now. before, after: all margins, at the beginning and at the end"""
+    new: whether nothing was looked for until now"""
     x = jax.lax.stop_gradient(x)
-    search, margin, slope = _narrowed(search, x, new, before, after)
+    changes = tells.another & ~tells.falls
+    fresh, sought = new | changes, select(changes, tells.other, tells.sought)
+    search, slope = _narrowed(search, x, fresh, sought)
+    search = search._replace(tries=jnp.where(new, 0, search.tries) + 1)
     falls = slope < 0
-    correction = jax.lax.stop_gradient(margin) / jnp.where(falls, slope, -1.0)
+    correction = jax.lax.stop_gradient(sought.end) / jnp.where(falls, slope, -1.0)
     near = falls & (jnp.abs(correction) <= NEAR * h)
-    enough = near | (search.tries >= TRIES)
+    at_once = (sought.end < 0) & (x <= 1.5 * NEAR * h)
+    enough = near | at_once | (search.tries >= TRIES)
 
     width, newton = search.far - search.near, x - correction
-    secant = search.near + ratio(search.at_near, search.at_near - search.at_far, 0.5) * width
+    share = ratio(search.at_near, search.at_near - search.at_far, 0.5)
+    first = jnp.where(jnp.isfinite(search.at_near), search.near + share * width, jnp.minimum(NEAR * h, 0.5 * width))
     inside = falls & (newton > search.near) & (newton < search.far) & (search.tries % BISECT != 0)
-    guess = jnp.where(inside, newton, jnp.where(search.tries == 1, secant, search.near + 0.5 * width))
-    apart = jnp.where(margin < 0, 1.0, -1.0) * h * jnp.finfo(h.dtype).eps ** APART
-    search = search._replace(place=x, margin=jnp.where(near, margin, 0.0))
-    return search, jnp.where(enough, x + apart, guess), enough
+    guess = jnp.where(inside, newton, jnp.where(fresh, first, search.near + 0.5 * width))
+    apart = jnp.where(sought.end < 0, 1.0, -1.0) * h * jnp.finfo(h.dtype).eps ** APART
+    search = search._replace(place=jnp.where(at_once, 0.0, x), margin=jnp.where(near & ~at_once, sought.end, 0.0))
+    # Beyond the zero another margin that falls does so before it.
+    earlier = enough & ~at_once & tells.another & ~changes & tells.falls & (search.tries < TRIES)
+    search = select(earlier, _bracket(search, x, tells.other), search)
+    return search, jnp.where(earlier, 0.5 * x, jnp.where(enough, x + apart, guess)), enough & ~earlier
 
 
-def land(search: Search, x: Any, before: list[Any], after: list[Any]) -> Any:
+def land(search: Search, x: Any, tells: Crossings, h: Any) -> Any:
     """Return the length that ends on the zero, after the probe of length x. The fall is that of the parabola through
     the place, the probe, and the end of the first try that is on the same side."""
     x = jax.lax.stop_gradient(x)
-    start, g = (jax.lax.stop_gradient(_pick(search.which, margins)) for margins in (before, after))
+    g, start = jax.lax.stop_gradient(tells.sought[1:])
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
     end, at_end = select(margin < 0, (search.full, search.at_full), (0.0 * x, start))
     fall = (g - margin) / (x - place)
     bend = ratio(ratio(at_end - g, end - x) - fall, end - place)
-    fall += jnp.where(jnp.abs(end - place) > 4 * jnp.abs(place - x), (place - x) * bend, 0.0)
+    far = (jnp.abs(end - place) > 4 * jnp.abs(place - x)) & jnp.isfinite(at_end)
+    fall += jnp.where(far, (place - x) * jnp.where(far, bend, 0.0), 0.0)
     fall = jax.lax.stop_gradient(fall)
-    return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf)
+    return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf) + BEYOND * jnp.finfo(h.dtype).eps * h
 
 
-def _narrowed(old: Search, x: Any, new: Any, before: list[Any], after: list[Any]) -> tuple[Search, Any, Any]:
-    """The search for the earliest event, whose bracket ends at the try x; the margin there; and its slope in the
-    length, of the parabola through the bracket's ends and this point, 0 for a new bracket."""
-    crossed = falls_through(before, after)
-    triples = zip(crossed, before, after, strict=True)
-    places = jnp.stack([jnp.where(one, a / jnp.where(one, a - b, 1.0), jnp.inf) for one, a, b in triples])
-    which = jnp.where(jnp.any(jnp.stack(crossed)), jnp.argmin(places), old.which).astype(old.which.dtype)
-    first = new | (which != old.which)
-    margin = _pick(which, after)
-    g, start = jax.lax.stop_gradient((margin, _pick(which, before)))
+def _narrowed(old: Search, x: Any, first: Any, sought: Crossed) -> tuple[Search, Any]:
+    """The search whose bracket ends at the try x, and the margin's slope in the length there: of the parabola through
+    the bracket's ends and this point, 0 for a new bracket."""
+    g = jax.lax.stop_gradient(sought.end)
     slope = jnp.where(first, 0.0, _slope(old, x, g))
-    near, at_near = select(first, (0.0 * x, start), (old.near, old.at_near))
-    near, at_near, far, at_far = select(first | (g < 0), (near, at_near, x, g), (x, g, old.far, old.at_far))
-    full, at_full = select(first, (x, g), (old.full, old.at_full))
-    tries = jnp.where(first, 0, old.tries) + 1
-    return Search(which, full, at_full, near, at_near, far, at_far, tries, old.place, old.margin), margin, slope
+    new = _bracket(old, x, sought)
+    closer = select(g < 0, old._replace(far=x, at_far=g), old._replace(near=x, at_near=g))
+    return select(first, new, closer), slope
+
+
+def _bracket(old: Search, x: Any, sought: Crossed) -> Search:
+    """A bracket from the beginning of the step to the try of length x."""
+    g, start = jax.lax.stop_gradient(sought[1:])
+    return old._replace(which=sought.which, full=x, at_full=g, near=0.0 * x, at_near=start, far=x, at_far=g)
 
 
 def _slope(search: Search, x: Any, g: Any) -> Any:
     """d(margin)/d(length) at x, of the parabola through the bracket's ends and (x, g)."""
+    right = jnp.where(jnp.isfinite(search.at_far), ratio(search.at_far - g, search.far - x), 0.0)
     left = ratio(g - search.at_near, x - search.near)
-    right = ratio(search.at_far - g, search.far - x)
-    return left + right - ratio(search.at_far - search.at_near, search.far - search.near)
+    bent = left + right - ratio(search.at_far - search.at_near, search.far - search.near)
+    return jnp.where(jnp.isfinite(search.at_near) & jnp.isfinite(search.at_far), bent, right)
 
 
 def _pick(which: Any, values: list[Any]) -> Any:

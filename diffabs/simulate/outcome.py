@@ -41,7 +41,7 @@ def observe(loop: Loop, carry: Carry) -> Trajectory:
     """Return what is seen of the loop at the present instant."""
     point = carry.point
     signals = loop.signals(point.t, point.state)
-    return Trajectory(signals.sample, signals.measured, point.state.plant, carry.condition <= Condition.LANDING)
+    return Trajectory(signals.sample, signals.measured, point.state.plant, carry.running)
 
 
 def _impossible(name: str, objective: Objective, value: Any) -> Any:

@@ -46,7 +46,18 @@ def run_refilled(
     Raises ValueError for what `measure` objects to."""
     loop, objectives, h = arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, h.dtype), dict(values)))
-    return _run(loop, values, objectives, h, keys, accepted, enough, jnp.asarray(solver.steps), width=WIDTH)
+    return _run(
+        loop,
+        values,
+        objectives,
+        h,
+        keys,
+        accepted,
+        enough,
+        jnp.asarray(solver.steps),
+        width=WIDTH,
+        kinks=bool(solver.kinks),
+    )
 
 
 class _Belt(NamedTuple):
@@ -61,7 +72,7 @@ class _Belt(NamedTuple):
     ended: Run
 
 
-@partial(jax.jit, static_argnames="width")
+@partial(jax.jit, static_argnames=("width", "kinks"))
 def _run(
     loop: Loop,
     values: dict[str, Any],
@@ -73,6 +84,7 @@ def _run(
     steps: Any,
     *,
     width: int,
+    kinks: bool,
 ) -> Run:
     count = len(accepted)
     leaves, whole = separated(lambda v: prepare(replace(loop, v)), values)
@@ -81,8 +93,8 @@ def _run(
         one, audit = whole(mine)
         return one, objectives | audit
 
-    step_all = jax.vmap(lambda mine, key, carry: step(*built(mine), h, key, steps, carry))
-    start = jax.vmap(lambda mine, key: init_carry(*built(mine), h, key))
+    step_all = jax.vmap(lambda mine, key, carry: step(*built(mine), h, key, steps, carry, kinks=kinks))
+    start = jax.vmap(lambda mine, key: init_carry(*built(mine), h, key, kinks=kinks))
     over = jax.vmap(lambda mine, carry: judge(*built(mine), carry)[0])
 
     def early(number: Any, mine: Any, carry: Carry) -> Any:

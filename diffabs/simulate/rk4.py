@@ -26,39 +26,40 @@ def rk4_step(derivative: Callable[[Scalar, X], X], t: Scalar, x: X, h: Scalar) -
 
     Local error O(h^5). On dx/dt = lambda x it is stable where |1 + z + z^2/2 + z^3/6 + z^4/24| <= 1, z = h lambda.
     """
-    return _written_out(derivative, t, x, derivative(t, x), h)[0]
+    return _written_out(derivative, t, x, derivative(t, x), h)
 
 
-def rk4_step_from(derivative: Callable[[Scalar, X], X], t: Scalar, x: X, rate: X, h: Scalar) -> tuple[X, X]:
-    """The same step, whose first rate k1 is known, and its last rate: dx/dt at t + h to O(h^3). For the body of a scan.
+def rk4_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, rate: X, h: Scalar, given: Any) -> X:
+    """The same step of dx/dt = derivative(t, x, given), whose first rate k1 is known. What is no real number must come
+    in by `given`. For the body of a scan.
 
     Values come from stages written out, derivatives from a scan over the stages: XLA fuses through everything but a
     loop, and written out, the tangents of the first stage are worked out anew in every later one, which makes a
     gradient two to three times as slow. For values alone the loop does not pay.
     """
-    derivative, constants = jax.closure_convert(derivative, t, x)
-    return _step(derivative, t, x, rate, h, constants)
+    derivative, constants = jax.closure_convert(derivative, t, x, given)
+    return _step(derivative, t, x, rate, h, (given, *constants))
 
 
-def _written_out(f: Any, t: Any, x: Any, rate: Any, h: Any) -> tuple[Any, Any]:
+def _written_out(f: Any, t: Any, x: Any, rate: Any, h: Any) -> Any:
     total = rate
     for place, weight in STAGES:
         rate, total = _stage(f, t, x, h, rate, total, place, weight)
-    return axpy(h / 6, total, x), rate
+    return axpy(h / 6, total, x)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _step(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> tuple[Any, Any]:
+def _step(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
     return _written_out(lambda t, x: f(t, x, *constants), t, x, rate, h)
 
 
-def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> tuple[Any, Any]:
+def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
     def stage(carry: tuple[Any, Any], at: Any) -> tuple[tuple[Any, Any], None]:
         rates = _stage(lambda t, x: f(t, x, *constants), t, x, h, *carry, *at)
         return jax.tree.map(lambda rate, zero: jnp.asarray(rate, zero.dtype), rates, carry), None
 
     (rate, total), _ = jax.lax.scan(forgetful(stage), (rate, rate), tuple(jnp.asarray(STAGES, jnp.result_type(h)).T))
-    return axpy(h / 6, total, x), rate
+    return axpy(h / 6, total, x)
 
 
 def _rule(f: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
@@ -67,7 +68,7 @@ def _rule(f: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
     moves = tree.flatten_up_to(tangents)
     live = [type(move) is not SymbolicZero for move in moves]
 
-    def step(moving: list[Any]) -> tuple[Any, Any]:
+    def step(moving: list[Any]) -> Any:
         left = iter(moving)
         return _scan(f, *tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)]))
 

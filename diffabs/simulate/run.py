@@ -6,7 +6,7 @@ objective is thus exact to the order of the method and differentiable, wherever 
 import math
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -55,10 +55,20 @@ def _call(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], ke
     loop, objectives, h = arguments(loop, solver, objectives)
     steps, every = solver.steps, int(every)
     count = -(-steps // every) if every else 0
-    tries = room(loop, min(every, steps) if every else slots(steps))
-    places = (tries, slots(count) if every else 0, every)
+    tries = room(loop, min(every, steps) if every else slots(steps), kinks=solver.kinks is not False)
+    places = Places(tries, slots(count) if every else 0, every, solver.kinks)
     run = _simulated(places, (loop, objectives, h, key), jnp.asarray(steps))
     return run._replace(trajectory=_shortened(run.trajectory, count + 1)) if every else run
+
+
+class Places(NamedTuple):
+    """What is known when a program is compiled: places for so many tries (between two instants of a trajectory, if
+    there is one), and for so many instants, one in every so many steps; whether kinks are located."""
+
+    tries: int
+    instants: int
+    every: int
+    kinks: bool | None
 
 
 @partial(jax.jit, static_argnums=1)
@@ -97,14 +107,14 @@ def _wrong_number(solver: FixedStep, name: str) -> str:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _simulated(places: tuple[int, int, int], run: Any, steps: Any) -> Run:
-    """The run of (loop, objectives, h, key), with places for so many tries (between two instants of a trajectory, if
-    there is one), and for so many instants, one in every so many steps."""
+def _simulated(places: Places, run: Any, steps: Any) -> Run:
+    """The run of (loop, objectives, h, key)."""
     loop, objectives, h, key = run
-    return _run(loop, objectives, h, key, steps, jnp.asarray(places[2]), places=places[1])
+    every = jnp.asarray(places.every)
+    return _run(loop, objectives, h, key, steps, every, places=places.instants, kinks=bool(places.kinks))
 
 
-def _rule(places: tuple[int, int, int], primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
     """Only what has a tangent is differentiated: zeros worked out would cost as much as any other."""
     values, tree = jax.tree.flatten(primals)
     moves = tree.flatten_up_to(tangents)
@@ -122,10 +132,20 @@ def _rule(places: tuple[int, int, int], primals: Any, tangents: Any) -> tuple[An
 _simulated.defjvp(_rule, symbolic_zeros=True)
 
 
-@compile_once(static=("places",), options=SAME)
-def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, every: Any, *, places: int) -> Run:
+@compile_once(static=("places", "kinks"), options=SAME)
+def _run(
+    loop: Loop,
+    objectives: dict[str, Objective],
+    h: Any,
+    key: Any,
+    steps: Any,
+    every: Any,
+    *,
+    places: int,
+    kinks: bool = False,
+) -> Run:
     """For values: `places` for a trajectory, 0 without."""
-    loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps)
+    loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps, kinks=kinks)
     if not places:
         return judge(loop, objectives, until(stepped, carry))[0]
     first, count = observe(loop, carry), -(-steps // every)
@@ -134,12 +154,10 @@ def _run(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: 
 
 
 @partial(jax.jit, static_argnames="places")
-def _reversible(
-    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, *, places: tuple[int, int, int]
-) -> Run:
+def _reversible(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, *, places: Places) -> Run:
     """For derivatives."""
-    loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps)
-    tries, instants, every = places
+    loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps, kinks=places.kinks is not False)
+    tries, instants, every, _ = places
     if not every:
         return judge(loop, objectives, scan(stepped, carry, tries))[0]
     first, count = observe(loop, carry), -(-steps // every)
@@ -147,10 +165,13 @@ def _reversible(
     return _with_trajectory(judge(loop, objectives, carry), first, seen)
 
 
-def _begun(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any) -> tuple[Loop, Any, Carry, Any]:
+def _begun(
+    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, *, kinks: bool
+) -> tuple[Loop, Any, Carry, Any]:
     loop, audit = prepare(loop)
     objectives = objectives | audit
-    return loop, objectives, init_carry(loop, objectives, h, key), partial(step, loop, objectives, h, key, steps)
+    carry = init_carry(loop, objectives, h, key, kinks=kinks)
+    return loop, objectives, carry, partial(step, loop, objectives, h, key, steps, kinks=kinks)
 
 
 def _with_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: Any) -> Run:

@@ -1,13 +1,19 @@
 """Which steps a run takes: those of the grid, cut where an event lies between.
 
-A step within which a margin falls through zero (the stop's, a block's) is tried again, shorter, until one ends on the
-zero (`landing`). So the run is a discretisation of the exact solution on both sides of the event, and nothing is
-corrected afterwards. The next step goes on to the grid.
+A step within which a margin falls through zero (the stop's, a block's, that of a comparison in the flow) is tried
+again, shorter, until one ends on the zero (`landing`). So the run is a discretisation of the exact solution on both
+sides of the event, and nothing is corrected afterwards. The next step goes on to the grid.
 
-    RUNNING  --a margin falls through zero-->  SEEKING  -->  PROBING  -->  LANDING  -->  RUNNING, or STOPPED"""
+    RUNNING  --a margin falls through zero-->  SEEKING  -->  PROBING  -->  LANDING  -->  RUNNING, or STOPPED
+
+Where a block has changed in an event, and no clock is looked at after each step anyway, the rates are worked out by a
+step of no length, REFRESHING.
+
+Where a comparison does not let itself be landed on, or its regime leads out of what can be computed, the way to the
+grid is one blunt step, in which comparisons say at each stage what the numbers say: right to the order of the kink. So
+are the steps after it, until in one of them no comparison changes."""
 
 import enum
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,19 +22,34 @@ import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, Margins
 from diffabs.core.protocols import Clock
-from diffabs.simulate.advance import Arrival, Objectives, Point, arrive, begin, depart
-from diffabs.simulate.checkpoint import anyone
-from diffabs.simulate.landing import Search, falls_through, init_search, land, seek, select
+from diffabs.simulate.advance import Arrival, Point, Try, arrive, begin, depart
+from diffabs.simulate.checkpoint import anyone, apart
+from diffabs.simulate.dynamics import Objectives, dynamics
+from diffabs.simulate.landing import (
+    TRIES,
+    Crossed,
+    Crossings,
+    Search,
+    earliest,
+    falls_through,
+    init_search,
+    land,
+    seek,
+    select,
+)
 
 EXTRA, SPARE = 4, 64  # tries beyond a step of the grid for each of them, about an event; and besides
+KINKS = 1  # tries for each step of the grid, up to now, that comparisons may take; then steps are blunt
+MOST = 32  # tries within one step of the grid, likewise
+FASTER, PART = 4, 1e-3  # times the rates at both ends of a step, and part of the state: the most that it may change
 MISSED = 0.1  # of the change of the stop's margin in the step: the most that may be left of it
 
 
 class Condition(enum.IntEnum):
     """How a run is: it goes on along the grid, or looks for an event, or for how its margin falls, or is to land on
-    it; or it is over."""
+    it, or to look around after it; or it is over."""
 
-    RUNNING, SEEKING, PROBING, LANDING, STOPPED, TIMED_OUT, DIVERGED = range(7)
+    RUNNING, SEEKING, PROBING, LANDING, REFRESHING, STOPPED, TIMED_OUT, DIVERGED = range(8)
 
 
 class Carry(NamedTuple):
@@ -39,12 +60,14 @@ class Carry(NamedTuple):
     length: Any  # of the step to try [s]
     search: Search
     extra: Any  # tries that did not end on the grid
+    here: Any  # those since its last instant
+    blunt: Any  # whether steps are
     condition: Any
 
     @property
     def running(self) -> Any:
         """Whether another step is to be made or tried."""
-        return self.condition <= Condition.LANDING
+        return self.condition <= Condition.REFRESHING
 
     @property
     def stopped(self) -> Any:
@@ -63,68 +86,119 @@ class Verdict(NamedTuple):
     over: Any
 
 
-def room(loop: Loop, steps: int) -> int:
+def room(loop: Loop, steps: int, *, kinks: bool = False) -> int:
     """Return how many tries a run of so many steps of the grid may take: what a scan must have room for."""
-    return ((1 + EXTRA) * steps if loop.eventful else steps) + SPARE
+    return (1 + (KINKS if kinks else 0) + (EXTRA if loop.eventful else 0)) * steps + 2 * SPARE
 
 
-def init_carry(loop: Loop, objectives: Objectives, h: Any, key: Any) -> Carry:
+def init_carry(loop: Loop, objectives: Objectives, h: Any, key: Any, *, kinks: bool = False) -> Carry:
     """Return the carry at t = 0."""
     zero = jnp.asarray(0)
-    point = begin(loop, objectives, Clock(0.0 * h, h, zero, key))
+    point = begin(loop, objectives, Clock(0.0 * h, h, zero, key), kinks=kinks)
     condition = jnp.where(point.margins["stop"][0] > 0, zero + Condition.RUNNING, zero + Condition.DIVERGED)
-    return _typed(Carry(point, zero, h, init_search(h), zero, condition), h.dtype)
+    return _typed(Carry(point, zero, h, init_search(h), zero, zero, jnp.asarray(False), condition), h.dtype)
 
 
-def step(loop: Loop, objectives: Objectives, h: Any, key: Any, steps: Any, carry: Carry, until: Any = None) -> Carry:
-    """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
+def step(
+    loop: Loop,
+    objectives: Objectives,
+    h: Any,
+    key: Any,
+    steps: Any,
+    carry: Carry,
+    until: Any = None,
+    *,
+    kinks: bool = False,
+) -> Carry:
+    """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`.
+
+    kinks: whether comparisons are located, as derivatives need it"""
     active = carry.running if until is None else carry.running & (carry.k < until)
-    to_grid = carry.condition == Condition.RUNNING
+    to_grid, landing, anew = (
+        carry.condition == one for one in (Condition.RUNNING, Condition.LANDING, Condition.REFRESHING)
+    )
+    system = dynamics(loop, objectives, carry.point.t, carry.point.state, carry.point.tally, kinks=kinks)
+    count, which = system.kinks, carry.search.which
     end = jnp.where(to_grid, (carry.k + 1) * h, carry.point.t + carry.length)
-    here = _apart(active, lambda: arrive(loop, objectives, carry.point, carry.length, end, h))
-    verdict = _apart(active, lambda: _judge(carry, here, active, steps))
+    one = Try(carry.length, end, h, carry.blunt, anew, which, landing & (which < count))
+    here = apart(active, lambda: arrive(system, carry.point, one, active))
+    verdict = apart(active, lambda: _judge(carry, here, count, active, steps))
     k = carry.k + jnp.where(verdict.on_grid, 1, 0)
-    leave = partial(depart, loop, objectives, Clock(end, h, k, key, verdict.on_grid), here, verdict.fired)
-    point = _apart(active, leave) if loop.changes else leave()
+    leave = partial(depart, system, Clock(end, h, k, key, verdict.on_grid), here, verdict.fired, one)
+    point = apart(active, leave) if loop.changes else leave()
     point = select(verdict.over, _last(here, point), point)
 
-    trying, plan = active & ~verdict.taken, (carry.search, carry.length, carry.condition)
-    found = jax.lax.cond(anyone(trying), lambda: _look(carry, here, h), lambda: plan)
-    ahead = (carry.search, jnp.where(verdict.on_grid, h, (k + 1) * h - end), _ended(carry, here, verdict))
-    search, length, condition = select(active, select(trying, found, ahead), plan)
+    trying, plan = active & ~verdict.taken, (carry.search, carry.length, carry.blunt, carry.condition)
+    found = jax.lax.cond(anyone(trying), lambda: _look(carry, here, verdict.fine, count, h), lambda: plan)
+    ahead = _ahead(loop, carry, here, verdict, h, (k + 1) * h - end)
+    search, length, blunt, condition = select(active, select(trying, found, ahead), plan)
     extra = carry.extra + jnp.where(active & ~verdict.on_grid, 1, 0)
-    lost = active & ~(verdict.fine & (extra <= EXTRA * steps + SPARE))
+    since = jnp.where(verdict.on_grid, 0, carry.here + extra - carry.extra)
+    lost = active & ((~verdict.fine & (carry.blunt if count else True)) | (extra > (EXTRA + KINKS) * steps + SPARE))
     condition = jnp.where(lost, Condition.DIVERGED, condition).astype(carry.condition.dtype)
-    return Carry(select(verdict.taken, point, carry.point), k, length, search, extra, condition)
+    return Carry(select(verdict.taken, point, carry.point), k, length, search, extra, since, blunt, condition)
 
 
-def _apart(active: Any, work: Callable[[], Any]) -> Any:
-    """work(), compiled by itself and not once more into everything that is made of it; zeros where no lane runs."""
-    work = jax.jit(work)  # traced once for its shape and for its program
-    shape = jax.eval_shape(work)
-    return jax.lax.cond(anyone(active), work, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape))
+def _ahead(loop: Loop, carry: Carry, here: Arrival, verdict: Verdict, h: Any, left: Any) -> tuple[Any, ...]:
+    """What a try that is taken leaves: search, next length, whether steps are blunt, and the condition; `left` to the
+    grid."""
+    ended = _ended(loop, carry, here, verdict)
+    left = jnp.where(ended == Condition.REFRESHING, 0.0, jnp.where(verdict.on_grid, h, left))
+    same = [a == b for a, b in zip(here.regime, carry.point.regime, strict=True)]
+    calm = verdict.on_grid & jnp.all(jnp.array(same))
+    return carry.search, left, carry.blunt & ~calm, ended
 
 
-def _judge(carry: Carry, here: Arrival, active: Any, steps: Any) -> Verdict:
+def _judge(carry: Carry, here: Arrival, kinks: int, active: Any, steps: Any) -> Verdict:
     to_grid, landing = carry.condition == Condition.RUNNING, carry.condition == Condition.LANDING
     fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(here.state.flow())]))
     crossed = falls_through(*_margins(carry, here))
-    taken = active & fine & (landing | (to_grid & ~jnp.any(jnp.stack(crossed))))
+    fine &= carry.blunt | _plausible(carry, here) if kinks else True
+    changes = jnp.any(jnp.stack([*crossed, here.kink.crossed, here.kink.other >= 0]))
+    taken = active & fine & (landing | (carry.condition == Condition.REFRESHING) | (to_grid & ~changes))
     on_grid = taken & to_grid
-    fired = [landing & ((carry.search.which == i) | one) for i, one in enumerate(crossed)]
+    fired = [landing & ((carry.search.which == kinks + i) | one) for i, one in enumerate(crossed)]
     fired = jax.tree.unflatten(jax.tree.structure(here.margins), fired)
     over = fired["stop"][0] | (on_grid & (carry.k + 1 >= steps))
     return Verdict(fine, taken, on_grid, fired, over)
 
 
-def _look(carry: Carry, here: Arrival, h: Any) -> tuple[Search, Any, Any]:
+def _plausible(carry: Carry, here: Arrival) -> Any:
+    """Whether the state has changed as the rates at both ends say, roughly. Within a regime, beyond its kinks, a flow
+    need not be bounded as that of the loop is, and where a step is too long for stability that is where it leads."""
+    ends = [jax.tree.leaves(point.state.flow()) for point in (carry.point, here)]
+    rates = [jax.tree.leaves(point.rate[0]) for point in (carry.point, here)]
+    sane = []
+    for a, b, p, q in zip(*ends, *rates, strict=True):
+        most = FASTER * jnp.abs(carry.length) * jnp.maximum(jnp.abs(p), jnp.abs(q))
+        sane.append(jnp.all(jnp.abs(b - a) <= most + PART * (jnp.abs(a) + jnp.abs(b))))
+    return jnp.all(jnp.array(sane))
+
+
+def _look(carry: Carry, here: Arrival, fine: Any, kinks: int, h: Any) -> tuple[Search, Any, Any, Any]:
     """What a try that is not taken tells: the search, the next length, and how that is tried."""
-    margins, new = _margins(carry, here), carry.condition == Condition.RUNNING
-    search, length, enough = seek(carry.search, carry.length, new, *margins, h)
+    tells, new = _crossings(carry, here, kinks), carry.condition == Condition.RUNNING
+    search, length, enough = seek(carry.search, carry.length, new, tells, h)
     seeking = search, length, jnp.where(enough, Condition.PROBING, Condition.SEEKING)
-    landing = carry.search, land(carry.search, carry.length, *margins), jnp.asarray(Condition.LANDING)
+    landing = carry.search, land(carry.search, carry.length, tells, h), jnp.asarray(Condition.LANDING)
     search, length, condition = select(carry.condition == Condition.PROBING, landing, seeking)
-    return search, length, condition.astype(carry.condition.dtype)
+    tired = (search.tries >= TRIES) | (carry.here >= MOST) | (carry.extra > KINKS * carry.k + SPARE)
+    blunt = carry.blunt | ~fine | (tired & (search.which < kinks))
+    begins = blunt & ~carry.blunt
+    length = jnp.where(begins, (carry.k + 1) * h - carry.point.t, length)
+    condition = jnp.where(begins, Condition.RUNNING, condition)
+    return search, length, blunt, condition.astype(carry.condition.dtype)
+
+
+def _crossings(carry: Carry, here: Arrival, kinks: int) -> Crossings:
+    """Comparisons first, then events."""
+    which, kink = carry.search.which, here.kink
+    events = earliest(which, kinks, *_margins(carry, here))
+    unknown, bends = jnp.full_like(kink.margin, jnp.inf), kink.other >= 0
+    at = [jnp.where(kink.chosen == one, kink.margin, jnp.inf) for one in (which, kink.other)]
+    sought = select(which < kinks, Crossed(which, at[0], unknown), events.sought)
+    other = select(bends, Crossed(kink.other, at[1], unknown), events.other)
+    return Crossings(sought, kink.crossed | events.falls, other, bends | events.another)
 
 
 def _margins(carry: Carry, here: Arrival) -> tuple[list[Any], list[Any]]:
@@ -132,11 +206,15 @@ def _margins(carry: Carry, here: Arrival) -> tuple[list[Any], list[Any]]:
     return jax.tree.leaves(carry.point.margins), jax.tree.leaves(here.margins)
 
 
-def _ended(carry: Carry, here: Arrival, verdict: Verdict) -> Any:
+def _ended(loop: Loop, carry: Carry, here: Arrival, verdict: Verdict) -> Any:
     """The condition after a step that is taken. A landing that does not come to rest on the stop is none."""
     left, scale = jnp.abs(here.margins["stop"][0]), carry.point.margins["stop"][0] + jnp.abs(carry.search.at_full)
     landed = jnp.where(left <= MISSED * scale, Condition.STOPPED, Condition.DIVERGED)
-    return jnp.where(verdict.fired["stop"][0], landed, jnp.where(verdict.over, Condition.TIMED_OUT, Condition.RUNNING))
+    goes_on = jnp.asarray(Condition.RUNNING)
+    if loop.eventful and not loop.ticks:
+        happened = jnp.any(jnp.stack(jax.tree.leaves(verdict.fired)))
+        goes_on = jnp.where(happened, Condition.REFRESHING, Condition.RUNNING)
+    return jnp.where(verdict.fired["stop"][0], landed, jnp.where(verdict.over, Condition.TIMED_OUT, goes_on))
 
 
 def _last(here: Arrival, point: Point) -> Point:

@@ -1,0 +1,241 @@
+"""A program whose comparisons are visible, and can be answered from outside.
+
+A limit, the knot of a spline, a wheel that stands: between comparisons of numbers that depend on the state, x > y,
+max(x, y), |x|, the flow of a loop is smooth. Its jaxpr is walked, so that no part has to declare them. The answers
+together are a regime. While they are held the program is smooth beyond its kinks, too, as one who looks for the place
+of a kink needs it; and a derivative has one side.
+
+Comparisons in loops, in conditionals, and in functions with a derivative rule of their own stay as they are."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.extend.core as jex
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.regime import WORD, Answers, Asked, Place, Regime
+
+INLINED = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint")
+SEARCH = "searchsorted"  # of `jax.numpy`, in at most WORD knots
+
+
+class _Op(NamedTuple):
+    """An operation on numbered values. Of one that compares: its name, and of each comparison the number, and whether
+    it is asked the other way round."""
+
+    apply: Callable[..., Sequence[Any]]
+    ins: tuple[int, ...]
+    outs: tuple[int, ...]
+    shape: tuple[int, ...]
+    name: str = ""
+    asks: tuple[tuple[int, bool], ...] = ()
+
+
+class Program:
+    """f(moving, fixed), of pytrees and to one. Comparisons count that depend on `moving`, and on which the outputs
+    depend that `counts` picks. Only shapes and types of the arguments matter."""
+
+    def __init__(self, f: Callable[[Any, Any], Any], moving: Any, fixed: Any, counts: Callable[[Any], Any]):
+        """Trace f for arguments of these shapes; `counts` picks outputs."""
+        closed, shape = jax.make_jaxpr(f, return_shape=True)(moving, fixed)
+        self.ops: list[_Op] = []
+        self.places: list[Place] = []
+        self._constants: dict[int, Any] = {}
+        self._names: list[Any] = []  # of values; the same for one operation on the same values
+        self._moves: list[bool] = []
+        self._known: dict[Any, int] = {}
+        self._zero = self._value("zero", False)
+        moves = [True] * len(jax.tree.leaves(moving)) + [False] * len(jax.tree.leaves(fixed))
+        self._inputs = [self._value(("in", i), on) for i, on in enumerate(moves)]
+        flat = self._flattened(closed.jaxpr, self._kept(closed.consts), self._inputs)
+        self.outputs = jax.tree.unflatten(jax.tree.structure(shape), flat)
+        self._ask(set(jax.tree.leaves(counts(self.outputs))))
+        self._orders: dict[tuple[int, ...], list[_Op]] = {}
+
+    @property
+    def answers(self) -> int:
+        """How many bits hold the answers."""
+        return max((first + int(np.prod(shape)) for first, shape in self.places), default=0)
+
+    @property
+    def words(self) -> int:
+        """How many words hold them; at least one."""
+        return max(1, -(-self.answers // WORD))
+
+    def __call__(self, pick: Callable[[Any], Any], moving: Any, fixed: Any, regime: Regime) -> Any:
+        """What `pick` picks of the outputs."""
+        return self._run(pick, moving, fixed, regime, False)[0]
+
+    def look(self, pick: Callable[[Any], Any], moving: Any, fixed: Any, regime: Regime) -> tuple[Any, Answers]:
+        """The same, and the answers to all comparisons."""
+        return self._run(pick, moving, fixed, regime, True)
+
+    def _run(self, pick: Any, moving: Any, fixed: Any, regime: Regime, look: bool) -> tuple[Any, Any]:
+        values = dict(self._constants)
+        values.update(zip(self._inputs, map(jnp.asarray, jax.tree.leaves((moving, fixed))), strict=True))
+        picked, tree = jax.tree.flatten(pick(self.outputs))
+        asked = Asked(self.places, self.words, regime, look)
+        for op in self._order(tuple(picked)):
+            ins = [values[i] for i in op.ins]
+            outs = _DECIDED[op.name](asked, op, *ins) if op.asks else op.apply(*ins)
+            values.update(zip(op.outs, outs, strict=True))
+        return tree.unflatten([values[i] for i in picked]), asked.answers() if look else None
+
+    def _order(self, wanted: tuple[int, ...]) -> list[_Op]:
+        if wanted not in self._orders:
+            self._orders[wanted] = [op for op, on in zip(self.ops, self._needed(set(wanted)), strict=True) if on]
+        return self._orders[wanted]
+
+    def _needed(self, values: set[int]) -> list[bool]:
+        """Whether these values depend on each of the operations."""
+        needed = []
+        for op in reversed(self.ops):
+            needed.append(not values.isdisjoint(op.outs))
+            values = values.union(op.ins) if needed[-1] else values
+        return needed[::-1]
+
+    def _value(self, name: Any, moves: bool) -> int:
+        self._names.append(self._known.setdefault(name, len(self._names)))
+        self._moves.append(moves)
+        return len(self._names) - 1
+
+    def _kept(self, constants: Sequence[Any]) -> list[int]:
+        found = [self._value(("constant", len(self._names) + i), False) for i in range(len(constants))]
+        self._constants.update(zip(found, constants, strict=True))
+        return found
+
+    def _literal(self, literal: Any) -> int:
+        x = np.asarray(literal.val)
+        new = self._value(("literal", str(literal.aval.dtype), x.shape, x.tobytes()), False)
+        self._constants[new] = x.astype(literal.aval.dtype)[()]
+        return new
+
+    def _flattened(self, jaxpr: Any, constants: list[int], inputs: list[int]) -> list[int]:
+        """Add the operations of a jaxpr, and return its outputs."""
+        at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
+
+        def read(atom: Any) -> int:
+            return self._literal(atom) if isinstance(atom, jex.Literal) else at[atom]
+
+        for eqn in jaxpr.eqns:
+            ins = tuple(read(atom) for atom in eqn.invars)
+            inner = eqn.params.get("jaxpr") if eqn.primitive.name in INLINED else None
+            if inner is None or _searches(eqn):
+                outs = self._operation(eqn, ins)
+            else:
+                body, kept = (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, [])
+                outs = self._flattened(body, self._kept(kept), list(ins))
+            at.update(zip(eqn.outvars, outs, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def _operation(self, eqn: Any, ins: tuple[int, ...]) -> list[int]:
+        said = tuple(sorted((key, str(value)) for key, value in eqn.params.items() if not callable(value)))
+        same = (eqn.primitive.name, said, tuple(self._names[i] for i in ins))
+        moves = any(self._moves[i] for i in ins)
+        outs = [self._value((*same, i), moves) for i in range(len(eqn.outvars))]
+        real = all(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in eqn.invars)
+        name = SEARCH if _searches(eqn) else eqn.primitive.name
+        shape = eqn.invars[0].aval.shape if name == SEARCH else eqn.outvars[0].aval.shape
+        asks = name if moves and real and name in _DECIDED else ""
+        self.ops.append(_Op(_applied(eqn), ins, tuple(outs), shape, asks))
+        return outs
+
+    def _ask(self, counted: set[int]) -> None:
+        """Number the comparisons that count."""
+        numbers: dict[Any, int] = {}
+        for i, (op, on) in enumerate(zip(self.ops, self._needed(counted), strict=True)):
+            if on and op.name:
+                asks = [
+                    self._number(numbers, x, y, strict, op.shape)
+                    for x, y, strict in _ASKED[op.name](self._zero, *op.ins)
+                ]
+                self.ops[i] = op._replace(asks=tuple(asks))
+
+    def _number(self, numbers: dict[Any, int], x: int, y: int, strict: bool, shape: Any) -> tuple[int, bool]:
+        """The number of x > y, or x >= y, and whether what has the number is its contrary, y >= x, or y > x."""
+        x, y = self._names[x], self._names[y]
+        turned = x > y
+        key = (y, x, not strict) if turned else (x, y, strict)
+        if key not in numbers:
+            numbers[key] = len(self.places)
+            first, size = self.answers, int(np.prod(shape))
+            fits = first % WORD + size <= WORD or size > WORD
+            self.places.append((first if fits else -(-first // WORD) * WORD, shape))
+        return numbers[key], turned
+
+
+def _searches(eqn: Any) -> bool:
+    """Whether this is the search of one number in a few knots."""
+    shapes = [atom.aval.shape for atom in eqn.invars]
+    named = eqn.primitive.name in INLINED and eqn.params.get("name") == SEARCH
+    return named and len(shapes) == 2 and shapes[1] == () and len(shapes[0]) == 1 and shapes[0][0] <= WORD
+
+
+def _applied(eqn: Any) -> Callable[..., Sequence[Any]]:
+    """An operation as a function. One with a function inside is run as a program of its own."""
+    if not any(callable(x) or hasattr(x, "eqns") or hasattr(x, "jaxpr") for x in eqn.params.values()):
+
+        def bind(*ins: Any) -> Sequence[Any]:
+            outs = eqn.primitive.bind(*ins, **eqn.params)
+            return outs if eqn.primitive.multiple_results else (outs,)
+
+        return bind
+    places = {atom: i for i, atom in enumerate(eqn.invars) if not isinstance(atom, jex.Literal)}
+    kept = [i for i, out in enumerate(eqn.outvars) if not isinstance(out, jex.DropVar)]
+    told = jex.DebugInfo("kinks", str(eqn.primitive), None, None)
+    body = jex.Jaxpr((), list(places), [eqn.outvars[i] for i in kept], [eqn], eqn.effects, told)
+    run = jex.jaxpr_as_fun(jex.ClosedJaxpr(body, ()))
+
+    def call(*ins: Any) -> Sequence[Any]:
+        outs: list[Any] = [None] * len(eqn.outvars)
+        for i, out in zip(kept, run(*(ins[place] for place in places.values())), strict=True):
+            outs[i] = out
+        return outs
+
+    return call
+
+
+# What an operation asks, as (x, y, strict) of its inputs after zero, and what it makes of the answers.
+_ASKED: dict[str, Callable[..., list[tuple[int, int, bool]]]] = {
+    "gt": lambda zero, x, y: [(x, y, True)],
+    "ge": lambda zero, x, y: [(x, y, False)],
+    "lt": lambda zero, x, y: [(y, x, True)],
+    "le": lambda zero, x, y: [(y, x, False)],
+    "max": lambda zero, x, y: [(x, y, False)],
+    "min": lambda zero, x, y: [(y, x, False)],
+    "abs": lambda zero, x: [(x, zero, False)],
+    "sign": lambda zero, x: [(x, zero, True), (zero, x, True)],
+    "clamp": lambda zero, low, x, high: [(low, x, True), (x, high, True)],
+    SEARCH: lambda zero, knots, x: [(x, knots, True)],
+}
+
+
+def _sign(asked: Asked, op: _Op, x: Any) -> list[Any]:
+    zero = jnp.zeros_like(x)
+    up, down = asked(op.asks[0], x, zero, True), asked(op.asks[1], zero, x, True)
+    return [jnp.where(up, 1, jnp.where(down, -1, 0)).astype(x.dtype)]
+
+
+def _clamp(asked: Asked, op: _Op, low: Any, x: Any, high: Any) -> list[Any]:
+    low, high = jnp.broadcast_to(low, jnp.shape(x)), jnp.broadcast_to(high, jnp.shape(x))
+    return [jnp.where(asked(op.asks[0], low, x, True), low, jnp.where(asked(op.asks[1], x, high, True), high, x))]
+
+
+def _search(asked: Asked, op: _Op, knots: Any, x: Any) -> list[Any]:
+    return [asked.search(op.asks[0], lambda: op.apply(knots, x)[0], knots, x)]
+
+
+_DECIDED: dict[str, Callable[..., list[Any]]] = {
+    "gt": lambda asked, op, x, y: [asked(op.asks[0], x, y, True)],
+    "ge": lambda asked, op, x, y: [asked(op.asks[0], x, y, False)],
+    "lt": lambda asked, op, x, y: [asked(op.asks[0], y, x, True)],
+    "le": lambda asked, op, x, y: [asked(op.asks[0], y, x, False)],
+    "max": lambda asked, op, x, y: [jnp.where(asked(op.asks[0], x, y, False), x, y)],
+    "min": lambda asked, op, x, y: [jnp.where(asked(op.asks[0], y, x, False), x, y)],
+    "abs": lambda asked, op, x: [jnp.where(asked(op.asks[0], x, jnp.zeros_like(x), False), x, -x)],
+    "sign": _sign,
+    "clamp": _clamp,
+    SEARCH: _search,
+}
