@@ -384,7 +384,7 @@ def ours(name: str, step: float) -> tuple[np.ndarray, np.ndarray]:
 
     def measured(log: Any) -> Any:
         moved = replace(loop, {"plant.inertia": loop.plant.inertia * jnp.exp(log)})
-        metrics = d.measure(moved, d.FixedStep(step, 4.0), objectives.BRAKING).metrics
+        metrics = d.measure(moved, d.FixedStep(step, 4.0, kinks=True), objectives.BRAKING).metrics
         return jnp.stack([metrics[one] for one in METRICS])
 
     value, slope = jax.jit(lambda: jax.jvp(measured, (0.0,), (1.0,)))()

@@ -11,9 +11,7 @@ from diffabs import controllers
 
 STEP = 1e-4
 SLOW = ("robust, PI", "spline, latch, PI")
-# The integrator's rate jumps where the torque leaves its limit, and that is not located: see docs/results.md.
-LOCATED = [name for name in event_oracle.LOOPS if "clamping" not in name]
-LOOPS = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in LOCATED]
+LOOPS = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in event_oracle.LOOPS]
 FLOOR = 0.01  # of what a metric is large: a speed of 0.01 m/s or a slip of 1e-4 matters to nobody
 
 
@@ -51,13 +49,13 @@ def test_value_across_events(name, ours):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LOCATED)
+@pytest.mark.parametrize("name", event_oracle.LOOPS)
 def test_values_converge(name, ours):
     assert misses(ours(name, STEP / 4)[0], event_oracle.values(name), 1e-9, FLOOR) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", LOCATED)
+@pytest.mark.parametrize("name", event_oracle.LOOPS)
 def test_derivatives_converge_with_the_second_order_at_least(name, ours):
     """From 4e-4 to 1e-4 the error falls by 16, or to what limits of the torque within a step leave."""
     exact = event_oracle.sensitivities(name)

@@ -17,7 +17,7 @@ from diffabs.core.numerics import ratio
 
 NEAR = 1e-4  # steps: a Newton step from here misses the zero by some 1e-8 steps
 APART = 0.2  # power of the precision: the probe's distance, in steps
-BEYOND = 16  # times the precision: how far behind the zero a step ends, in steps
+BEYOND = 0.5  # power of the precision: how far behind the zero of a comparison a step ends, in steps
 TRIES = 24  # the most for an event, whose margin may have a corner or jump
 BISECT = 4  # every so many tries halve the bracket
 
@@ -93,6 +93,7 @@ def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Se
     falls = slope < 0
     correction = jax.lax.stop_gradient(sought.end) / jnp.where(falls, slope, -1.0)
     near = falls & (jnp.abs(correction) <= NEAR * h)
+    near |= jnp.isfinite(sought.end) & ~fresh & (search.far - search.near <= 4 * NEAR * h)
     at_once = (sought.end < 0) & (x <= 1.5 * NEAR * h)
     enough = near | at_once | (search.tries >= TRIES)
 
@@ -106,12 +107,14 @@ def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Se
     # Beyond the zero another margin that falls does so before it.
     earlier = enough & ~at_once & tells.another & ~changes & tells.falls & (search.tries < TRIES)
     search = select(earlier, _bracket(search, x, tells.other), search)
-    return search, jnp.where(earlier, 0.5 * x, jnp.where(enough, x + apart, guess)), enough & ~earlier
+    before = jnp.where(x > 4 * NEAR * h, x - 2 * NEAR * h, 0.5 * x)  # often both fall at once
+    return search, jnp.where(earlier, before, jnp.where(enough, x + apart, guess)), enough & ~earlier
 
 
-def land(search: Search, x: Any, tells: Crossings, h: Any) -> Any:
-    """Return the length that ends on the zero, after the probe of length x. The fall is that of the parabola through
-    the place, the probe, and the end of the first try that is on the same side."""
+def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> Any:
+    """Return the length that ends on the zero, or so much `beyond` that its margin has changed its sign for certain,
+    after the probe of length x. The fall is that of the parabola through the place, the probe, and the end of the first
+    try that is on the same side."""
     x = jax.lax.stop_gradient(x)
     g, start = jax.lax.stop_gradient(tells.sought[1:])
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
@@ -121,7 +124,7 @@ def land(search: Search, x: Any, tells: Crossings, h: Any) -> Any:
     far = (jnp.abs(end - place) > 4 * jnp.abs(place - x)) & jnp.isfinite(at_end)
     fall += jnp.where(far, (place - x) * jnp.where(far, bend, 0.0), 0.0)
     fall = jax.lax.stop_gradient(fall)
-    return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf) + BEYOND * jnp.finfo(h.dtype).eps * h
+    return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf) + beyond
 
 
 def _narrowed(old: Search, x: Any, first: Any, sought: Crossed) -> tuple[Search, Any]:

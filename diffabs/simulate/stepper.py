@@ -26,6 +26,7 @@ from diffabs.simulate.advance import Arrival, Point, Try, arrive, begin, depart
 from diffabs.simulate.checkpoint import anyone, apart
 from diffabs.simulate.dynamics import Objectives, dynamics
 from diffabs.simulate.landing import (
+    BEYOND,
     TRIES,
     Crossed,
     Crossings,
@@ -180,7 +181,8 @@ def _look(carry: Carry, here: Arrival, fine: Any, kinks: int, h: Any) -> tuple[S
     tells, new = _crossings(carry, here, kinks), carry.condition == Condition.RUNNING
     search, length, enough = seek(carry.search, carry.length, new, tells, h)
     seeking = search, length, jnp.where(enough, Condition.PROBING, Condition.SEEKING)
-    landing = carry.search, land(carry.search, carry.length, tells, h), jnp.asarray(Condition.LANDING)
+    beyond = jnp.where(carry.search.which < kinks, h * jnp.finfo(h.dtype).eps ** BEYOND, 0.0)
+    landing = carry.search, land(carry.search, carry.length, tells, beyond), jnp.asarray(Condition.LANDING)
     search, length, condition = select(carry.condition == Condition.PROBING, landing, seeking)
     tired = (search.tries >= TRIES) | (carry.here >= MOST) | (carry.extra > KINKS * carry.k + SPARE)
     blunt = carry.blunt | ~fine | (tired & (search.which < kinks))

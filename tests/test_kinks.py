@@ -1,0 +1,235 @@
+"""Comparisons made visible, held and located: against the functions themselves, closed forms, and differences."""
+
+from collections.abc import Callable
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffabs as d
+from diffabs.controllers import ConstantTorque
+from diffabs.core.kinks import Program
+from diffabs.core.loop import Loop
+from diffabs.core.numerics import quotient, searchsorted
+from diffabs.core.pytree import param, pytree, static
+from diffabs.core.regime import Regime, crossing
+from diffabs.objectives import FinalError
+from diffabs.references import Setpoint
+
+KNOTS = np.array([-1.0, 0.0, 0.5, 2.0, 3.0])
+POINTS = (-3.0, -1.0, -0.3, 0.0, 0.2, 0.7, 1.0, 2.5, 9.0)
+KINKED: dict[str, tuple[Callable[[Any, Any], Any], int]] = {  # of x, which moves, and p; how many comparisons
+    "gt": (lambda x, p: jnp.where(x > p, x * x, x), 1),
+    "ge": (lambda x, p: jnp.where(x >= p, x * x, x), 1),
+    "lt": (lambda x, p: jnp.where(x < p, x * x, x), 1),
+    "le": (lambda x, p: jnp.where(p <= x, x * x, x), 1),
+    "one margin": (lambda x, p: jnp.where(x > p, x * x, x) + jnp.where(p < x, 1.0, 0.0), 1),
+    "a contrary": (lambda x, p: jnp.where(x > p, x * x, x) + jnp.where(x <= p, 1.0, 0.0), 1),
+    "max": (lambda x, p: jnp.maximum(x, p), 1),
+    "min": (lambda x, p: jnp.minimum(x, p), 1),
+    "abs": (lambda x, p: jnp.abs(x - p), 1),
+    "sign": (lambda x, p: jnp.sign(x - p), 2),
+    "clip": (lambda x, p: jnp.clip(x, -p, p), 2),
+    "clamp": (lambda x, p: jax.lax.clamp(-p, x, p), 2),
+    "vector": (lambda x, p: jnp.sum(x * jnp.where(x > p * KNOTS, 1.0, 0.5)), 5),
+    "many": (lambda x, p: jnp.sum(jnp.where(x > p * jnp.linspace(-2.0, 3.0, 70), 1.0, 0.5)), 70),
+    "search": (lambda x, p: jnp.arange(6.0)[searchsorted(jnp.asarray(KNOTS), x)] * p, 5),
+    "search of JAX": (lambda x, p: jnp.arange(6.0)[jnp.searchsorted(jnp.asarray(KNOTS), x, side="right")] * p, 5),
+    "a function with its own rule": (lambda x, p: quotient(jnp.maximum(x, p), p), 1),
+    "within jit": (jax.jit(lambda x, p: jnp.where(x > p, 2.0, 1.0)), 1),
+    "of what is fixed": (lambda x, p: jnp.where(p > 0.3, x, -x), 0),
+    "of equality": (lambda x, p: jnp.where(x == p, 1.0, x), 0),
+    "of integers": (lambda x, p: jnp.where(x.astype(int) > 1, 1.0, x), 0),
+    "in a loop": (lambda x, p: jax.lax.fori_loop(0, 2, lambda _, y: jnp.where(y > p, y, 2.0 * y), x), 0),
+}
+
+
+def program(f: Callable[[Any, Any], Any]) -> Program:
+    """Of the whole function."""
+    return Program(f, jnp.asarray(0.1), jnp.asarray(0.6), lambda out: out)
+
+
+def held(one: Program, x: float, p: float = 0.6) -> Regime:
+    """The answers at x."""
+    return Regime(one.look(lambda out: out, x, p, Regime(None))[1].words)
+
+
+def same(out: Any) -> Any:
+    """The output."""
+    return out
+
+
+@pytest.mark.parametrize("name", KINKED)
+def test_a_program_is_the_function(name):
+    f, count = KINKED[name]
+    one = program(f)
+    assert sum(int(np.prod(shape)) for _, shape in one.places) == count
+    for x in POINTS:
+        for regime in (Regime(None), held(one, x), held(one, 0.1)._replace(free=True)):
+            np.testing.assert_array_equal(one(same, x, 0.6, regime), f(jnp.asarray(x), jnp.asarray(0.6)))
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "beyond", "value", "slope"),
+    [("gt", 0.1, 2.0, 2.0, 1.0), ("gt", 1.0, 0.1, 0.01, 0.2), ("max", 2.0, 0.1, 0.1, 1.0), ("min", 2.0, 0.1, 0.6, 0.0)]
+    + [("abs", 1.0, 0.1, -0.5, 1.0), ("clip", 0.1, 2.0, 2.0, 1.0), ("clamp", 3.0, 0.1, 0.6, 0.0)]
+    + [("search", 0.1, 9.0, 2 * 0.6, 0.0), ("vector", 0.1, 9.0, 9.0 * (3 * 0.5 + 2.0), 3.5)],
+)
+def test_a_regime_goes_on_beyond_its_kinks(name, at, beyond, value, slope):
+    one = program(KINKED[name][0])
+    regime = held(one, at)
+    found, move = jax.jvp(lambda x: one(same, x, jnp.asarray(0.6), regime), (jnp.asarray(beyond),), (jnp.asarray(1.0),))
+    np.testing.assert_allclose([found, move], [value, slope], rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", [name for name, (_, count) in KINKED.items() if count])
+def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
+    f, _ = KINKED[name]
+    one = program(f)
+    for x in (-3.0, 0.2, 9.0):
+        regime = held(one, x)
+        answers = one.look(same, x, 0.6, regime)[1]
+        assert not any(answers.crossed)
+        assert answers.words == regime.words
+        for y in (-2.7, 0.31, 2.2, 8.0):
+            answers = one.look(same, y, 0.6, regime)[1]
+            contrary = [a ^ b for a, b in zip(regime.words, held(one, y).words, strict=True)]
+            assert any(answers.crossed) == any(contrary)
+            other, crossed, chosen, margin = crossing(answers, jnp.asarray(0), jnp.asarray(y))
+            assert bool((other >= 0) | crossed) == any(contrary)
+            if any(contrary):
+                assert int(contrary[int(chosen) // 32]) >> (int(chosen) % 32) & 1
+                assert margin < 0
+        gives_way = regime._replace(loose=(~jnp.uint32(0),) * one.words, free=jnp.asarray(True))
+        value, answers = one.look(same, 2.2, 0.6, gives_way)
+        np.testing.assert_array_equal(value, f(jnp.asarray(2.2), jnp.asarray(0.6)))
+        assert answers.words == held(one, 2.2).words
+
+
+def test_numbers_that_are_equal_to_rounding_say_nothing():
+    one = program(lambda x, p: jnp.where(x > p, 1.0, 0.0))
+    regime = held(one, 0.1)
+    for excess, sees in ((1e-14, False), (1e-9, True)):
+        assert any(one.look(same, 0.6 + excess, 0.6, regime)[1].crossed) == sees
+
+
+class Shown(NamedTuple):
+    """What a plant of two numbers shows."""
+
+    y: Any
+    x: Any
+
+    units = MappingProxyType({"y": "m", "x": "m"})
+
+
+@pytree
+class Clockwork:
+    """x' = 1, y' = rate(x): what a kink at x = place does is known."""
+
+    place: Any = param(default=0.3337, unit="m")
+    rate: Callable[[Any, Any], Any] = static(default=jnp.maximum)
+
+    shows = Shown
+    control_unit = "N"
+
+    def start(self, initial: Any) -> Shown:
+        return Shown(0.0 * initial, initial)
+
+    def derivative(self, t: Any, state: Shown, control: Any) -> Shown:
+        return Shown(self.rate(state.x, self.place), 1.0 + 0.0 * control)
+
+    def project(self, state: Shown) -> Shown:
+        return state
+
+    def output(self, state: Shown) -> Shown:
+        return state
+
+    def holding(self, output: Shown, target: Any) -> Any:
+        return 0.0 * target
+
+
+@pytree
+class Never:
+    """No stop."""
+
+    success = False
+
+    def margin(self, output: Shown) -> Any:
+        return 1.0 + 0.0 * output.y
+
+    def remainder(self, sample: Any, stopped: Any) -> tuple[Any, Any]:
+        return 0.0 * sample.t, 0.0 * sample.t
+
+
+END = 1.0
+CLOSED = {  # rate of y, y(END) as a function of the kink's place
+    "a corner": (lambda x, a: jnp.where(x > a, x - a, 0.0), lambda a: (END - a) ** 2 / 2),
+    "a jump": (lambda x, a: jnp.where(x > a, 2.0, 1.0), lambda a: a + 2 * (END - a)),
+    "two at once": (
+        lambda x, a: jnp.where(x > a, 2.0, 1.0) + jnp.abs(x - a),
+        lambda a: 2 - a + (a**2 + (1 - a) ** 2) / 2,
+    ),
+    "two in a step": (
+        lambda x, a: jnp.where(x > a, 2.0, 1.0) * jnp.where(x < a + 0.003, 1.0, 3.0),
+        lambda a: a + 2 * 0.003 + 6 * (END - a - 0.003),
+    ),
+    "a table": (lambda x, a: jnp.array([1.0, 4.0, 2.0])[searchsorted(jnp.stack([a, 2 * a]), x)], lambda a: 2 + a),
+    "of time": (lambda x, a: 1.0 + jnp.minimum(a, 0.2), lambda a: 1.0 + jnp.minimum(a, 0.2)),
+    "of a place where a number ends": (lambda x, a: jnp.where(x < a, jnp.sqrt(a - x), 0.0), lambda a: a**1.5 * 2 / 3),
+}
+
+
+def clockwork(rate: Any, place: Any) -> Loop:
+    """A loop that turns."""
+    return Loop(
+        plant=Clockwork(place=place, rate=rate),
+        initial=jnp.asarray(0.0),
+        reference=Setpoint(value=0.0),
+        controller=ConstantTorque(torque=0.0),
+        stop=Never(),
+    )
+
+
+@pytest.mark.parametrize("name", CLOSED)
+def test_a_derivative_through_a_kink_is_that_of_the_closed_form(name):
+    """However long the step: 10 ms here, and a derivative that misses a jump is 0."""
+    rate, exact = CLOSED[name]
+
+    def final(place: Any) -> Any:
+        return d.measure(clockwork(rate, place), d.FixedStep(0.01, END, kinks=True), {"y": FinalError()}).metrics["y"]
+
+    place = jnp.asarray(0.3337)
+    wanted = jax.value_and_grad(exact)(place)
+    found = jax.jvp(final, (place,), (jnp.ones_like(place),))
+    # a root has an order of three halves, its derivative one of a half
+    tolerance = [1e-3, 0.1] if name == "of a place where a number ends" else [1e-8, 1e-8]
+    assert (np.abs(np.subtract(found, wanted)) <= np.multiply(tolerance, np.maximum(np.abs(wanted), 0.1))).all()
+    if name == "two in a step":
+        np.testing.assert_allclose(final(place), wanted[0], rtol=1e-8)
+        np.testing.assert_allclose(jax.grad(final)(place), wanted[1], rtol=1e-8)
+
+
+def test_a_run_that_slides_along_a_kink_is_a_run():
+    """x' = -sign(x - a) + 0.3: nobody can follow each switch; it stays within a step of the place, and says so."""
+
+    def slides(place: Any) -> Any:
+        loop = clockwork(lambda x, a: 0.0 * x, place)
+        plant = Sliding(place=loop.plant.place)
+        return d.measure(
+            d.Loop(**{**vars(loop), "plant": plant}), d.FixedStep(0.01, END, kinks=True), {"y": FinalError()}
+        )
+
+    run = jax.vmap(slides)(jnp.array([0.2, 0.4]))
+    assert not run.diverged.any()
+    np.testing.assert_allclose(run.metrics["y"], [0.2, 0.4], atol=0.02)
+
+
+@pytree
+class Sliding(Clockwork):
+    """y' = 0.3 - sign(y - place)."""
+
+    def derivative(self, t: Any, state: Shown, control: Any) -> Shown:
+        return Shown(0.3 - jnp.where(state.y > self.place, 1.0, -1.0), 1.0 + 0.0 * control)
