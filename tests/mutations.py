@@ -138,6 +138,13 @@ MUTATIONS = [
     ),
     Mutation(
         "a batch ends with its first lane",
+        "simulate/drivers.py",
+        "jax.lax.while_loop(lambda carry: anyone(carry.running), block",
+        "jax.lax.while_loop(lambda carry: ~anyone(~carry.running), block",
+        "test_rollout.py::test_a_batch_ends_with_its_last_lane",
+    ),
+    Mutation(
+        "lanes that wait for each other's events",
         "simulate/checkpoint.py",
         "jnp.any(running, axis=0)",
         "jnp.all(running, axis=0)",
@@ -445,11 +452,11 @@ MUTATIONS = [
         "test_conformance.py::test_errors_count_on_either_side[iae]",
     ),
     Mutation(
-        "a peak without a rise before it",
+        "a peak at an instant, not between",
         "core/cubic.py",
-        "inside = (c1 > 0) & (c1 + 2.0 * c2 + 3.0 * c3 < 0)",
-        "inside = c1 + 2.0 * c2 + 3.0 * c3 < 0",
-        "test_rollout.py::test_the_peak_of_a_falling_slip_is_its_first_value",
+        "return jnp.where(inside & (top > ends), top, ends)",
+        "return ends",
+        "test_blocks.py::test_the_integral_of_an_error_that_changes_sign",
     ),
     Mutation(
         "a road that nobody lists",
@@ -471,7 +478,7 @@ MUTATIONS = [
         "simulate/landing.py",
         "return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf)",
         "return search.place",
-        "test_blocks.py::test_latch_finds_the_vertex",
+        "test_blocks.py::test_relay_switches_on_the_far_side_of_its_band",
     ),
     Mutation(
         "a delay that takes a level for a line",
