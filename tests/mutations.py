@@ -705,6 +705,13 @@ MUTATIONS = [
         "test_riccati.py::test_care_is_scipys[2]",
     ),
     Mutation(
+        "riccati: NaN in single precision",
+        "linear/riccati.py",
+        "if B.dtype != jnp.float64:",
+        "if False:",
+        "test_riccati.py::test_single_precision_is_refused[care]",
+    ),
+    Mutation(
         "riccati: derivative with the open loop",
         "linear/riccati.py",
         "closed = A - B @ jnp.linalg.solve(R, B.T @ P + S.T)",
@@ -1211,8 +1218,8 @@ MUTATIONS = [
     Mutation(
         "balance: Kalman without what disturbs",
         "linear/gaussian.py",
-        "jnp.asarray(C).T, W, V)",
-        "jnp.asarray(C).T, 0.5 * W, V)",
+        "dare(A.T, C.T, W, V)",
+        "dare(A.T, C.T, 0.5 * W, V)",
         "test_arm_control.py::test_kalman_is_scipys",
     ),
     Mutation(
