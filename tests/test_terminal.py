@@ -106,6 +106,19 @@ def test_on_80_columns_no_word_is_broken(folder, measured, tmp_path, command):
 
 
 @pytest.mark.slow
+def test_what_is_verified_fits_80_columns(tmp_path):
+    """The claim of a decay has 87 characters."""
+    proof = tmp_path / "proof.json"
+    with Terminal("certify", "slip-lmi", "--gain=-11753,-76.7", "--out", proof) as terminal:
+        assert terminal.status() == 0, terminal.text
+        assert_fits(terminal)
+    with Terminal("verify", proof) as terminal:
+        assert terminal.status() == 0, terminal.text
+        assert_fits(terminal)
+    assert re.search(r"proved\s+decay:.*however\s+the\s+system\s+varies", terminal.text, re.DOTALL)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("command", LONG)
 @pytest.mark.parametrize("moment", ["checking", "working"])
 def test_control_c_at_any_moment(folder, measured, tmp_path, command, moment):
