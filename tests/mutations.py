@@ -95,6 +95,13 @@ MUTATIONS = [
         "test_plants.py::test_a_lever_that_locks_itself_is_refused",
     ),
     Mutation(
+        "a stuck wheel that rounding turns",
+        "plants/lab_rig.py",
+        "wheel = jnp.where(rests, 0.0, wheel)",
+        "wheel = jnp.where(rests, wheel, wheel)",
+        "test_plants.py::test_a_stuck_lab_wheel_stays_at_rest",
+    ),
+    Mutation(
         "a stuck wheel that no torque can hold",
         "plants/lab_rig.py",
         "held = arm > self.wheel_radius * mu",
