@@ -95,6 +95,13 @@ MUTATIONS = [
         "test_plants.py::test_a_lever_that_locks_itself_is_refused",
     ),
     Mutation(
+        "a stuck wheel that rounding turns",
+        "plants/lab_rig.py",
+        "wheel = jnp.where(rests, 0.0, wheel)",
+        "wheel = jnp.where(rests, wheel, wheel)",
+        "test_plants.py::test_a_stuck_lab_wheel_stays_at_rest",
+    ),
+    Mutation(
         "a stuck wheel that no torque can hold",
         "plants/lab_rig.py",
         "held = arm > self.wheel_radius * mu",
@@ -138,6 +145,13 @@ MUTATIONS = [
     ),
     Mutation(
         "a batch ends with its first lane",
+        "simulate/drivers.py",
+        "jax.lax.while_loop(lambda carry: anyone(carry.running), block",
+        "jax.lax.while_loop(lambda carry: ~anyone(~carry.running), block",
+        "test_rollout.py::test_a_batch_ends_with_its_last_lane",
+    ),
+    Mutation(
+        "lanes that wait for each other's events",
         "simulate/checkpoint.py",
         "jnp.any(running, axis=0)",
         "jnp.all(running, axis=0)",
@@ -445,11 +459,11 @@ MUTATIONS = [
         "test_conformance.py::test_errors_count_on_either_side[iae]",
     ),
     Mutation(
-        "a peak without a rise before it",
+        "a peak at an instant, not between",
         "core/cubic.py",
-        "inside = (c1 > 0) & (c1 + 2.0 * c2 + 3.0 * c3 < 0)",
-        "inside = c1 + 2.0 * c2 + 3.0 * c3 < 0",
-        "test_rollout.py::test_the_peak_of_a_falling_slip_is_its_first_value",
+        "return jnp.where(inside & (top > ends), top, ends)",
+        "return ends",
+        "test_blocks.py::test_the_integral_of_an_error_that_changes_sign",
     ),
     Mutation(
         "a road that nobody lists",
@@ -471,7 +485,7 @@ MUTATIONS = [
         "simulate/landing.py",
         "return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf)",
         "return search.place",
-        "test_blocks.py::test_latch_finds_the_vertex",
+        "test_blocks.py::test_relay_switches_on_the_far_side_of_its_band",
     ),
     Mutation(
         "a delay that takes a level for a line",
@@ -696,6 +710,13 @@ MUTATIONS = [
         "return whole[:n, :n], -whole[:n, n:], whole[n:, :n]",
         "return whole[:n, :n], whole[:n, n:], -whole[n:, :n]",
         "test_riccati.py::test_care_is_scipys[2]",
+    ),
+    Mutation(
+        "riccati: NaN in single precision",
+        "linear/riccati.py",
+        "if B.dtype != jnp.float64:",
+        "if False:",
+        "test_riccati.py::test_single_precision_is_refused[care]",
     ),
     Mutation(
         "riccati: derivative with the open loop",
@@ -1204,8 +1225,8 @@ MUTATIONS = [
     Mutation(
         "balance: Kalman without what disturbs",
         "linear/gaussian.py",
-        "jnp.asarray(C).T, W, V)",
-        "jnp.asarray(C).T, 0.5 * W, V)",
+        "dare(A.T, C.T, W, V)",
+        "dare(A.T, C.T, 0.5 * W, V)",
         "test_arm_control.py::test_kalman_is_scipys",
     ),
     Mutation(

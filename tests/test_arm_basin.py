@@ -252,11 +252,13 @@ def test_the_slope_of_the_time_of_a_fall_is_a_difference():
     """In the lean that it starts with: the last step ends on the ground, wherever that is between two instants."""
     falling = closed(0.2)
 
-    def time(theta):
-        return measure(
-            replace(falling, {"initial.theta": theta}), FixedStep(step=2e-3, duration=2.0), {}
-        ).ending.sample.t
+    def end(theta):
+        return measure(replace(falling, {"initial.theta": theta}), FixedStep(step=2e-3, duration=2.0), {}).ending.sample
 
+    def time(theta):
+        return end(theta).t
+
+    assert abs(float(end(0.1).output.theta)) == pytest.approx(np.pi / 2, rel=1e-9)
     value, slope = jax.jvp(time, (0.1,), (1.0,))
     assert 0.2 < float(value) < 2
     assert float(slope) == pytest.approx(float(time(0.1 + 1e-5) - time(0.1 - 1e-5)) / 2e-5, rel=1e-5)

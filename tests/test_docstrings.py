@@ -1,12 +1,11 @@
-"""Every function that a package exports says what it returns, and names each of its arguments."""
+"""Every function that a package exports says what it returns, and names each of its arguments. Examples run."""
 
 import ast
+import doctest
 import importlib
 import inspect
 import re
 
-import jax.numpy as jnp
-import numpy as np
 import pytest
 
 PACKAGES = ("design", "identify", "linear", "reliability", "roads", "scenario", "sweep", "tune")
@@ -44,20 +43,30 @@ def test_every_argument_is_named(name):
     assert missing == []
 
 
-def test_the_example_of_lqr():
-    from diffabs.linear import lqr
+SHOWN = {
+    *("core.pytree.replace", "simulate.run.rollout", "simulate.run.measure", "simulate.batch.run_batch"),
+    *("linear.linearization.linearize", "linear.regulator.lqr", "linear.regulator.dlqr"),
+    *("design.parameter_box.polytope", "design.synthesis.design", "design.analysis.certify"),
+    *("tune.tuning.tune", "reliability.failure.failure_probability", "roads.optimum.peak"),
+    *(f"roads.{part}" for part in ("burckhardt.Burckhardt", "magic_formula.MagicFormula", "tabulated.Tabulated")),
+    "roads.patches.Patches",
+}
+EXAMPLES = {
+    test.name: test
+    for name, item in EXPORTED.items()
+    for test in doctest.DocTestFinder(recurse=False).find(item, name)
+    if test.examples
+}
 
-    (example,) = re.findall(r"^ +(lqr\(.*\)\.gain) +# (.*)$", inspect.getdoc(lqr), re.MULTILINE)
-    got, said = eval(example[0], {"lqr": lqr, "jnp": jnp}), eval(example[1], {"sqrt": np.sqrt})
-    np.testing.assert_allclose(got, said, rtol=1e-12)
+
+def test_what_is_used_most_has_an_example():
+    assert {name.removeprefix("diffabs.") for name in EXAMPLES} >= SHOWN
 
 
-def test_the_example_of_replace():
-    import diffabs as d
+DEAR = ("diffabs.tune.tuning.tune", "diffabs.reliability.failure.failure_probability")  # some seconds of compiling
 
-    (example,) = re.findall(r"^ +(replace\(.*\))$", inspect.getdoc(d.replace), re.MULTILINE)
-    from diffabs import controllers, plants
 
-    loop = d.braking(plant=plants.MirroredRig(), controller=controllers.StateFeedback(gain=(-1e4, -50.0)))
-    changed = eval(example, {"replace": d.replace, "loop": loop})
-    assert (float(changed.plant.mass), float(changed.controller.gain[0])) == (5.3, -9e3)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in DEAR else x for x in EXAMPLES])
+def test_the_example_prints_what_it_says(name):
+    told = []
+    assert doctest.DocTestRunner().run(EXAMPLES[name], out=told.append).failed == 0, "".join(told)

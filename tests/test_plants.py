@@ -12,7 +12,7 @@ from diffabs import check
 from diffabs.core.protocols import BrakeOutput
 from diffabs.plants import GRAVITY, BrakeStart, LabRig, MirroredRig, QuarterCar
 from diffabs.plants.lab_rig import LabRigState
-from diffabs.roads import DRY_ASPHALT, RIG, SNOW, SPLINE_B, Burckhardt, Patches, Tabulated
+from diffabs.roads import DRY_ASPHALT, RIG, SNOW, SPLINE_B, Burckhardt, Patches, RationalCurve, Tabulated
 
 NO_FRICTION = Burckhardt(c1=0.0, c3=0.0)
 MU, SLOPE = 0.39575220833898, -0.00641755652574  # of the rig's curve at slip 0.2
@@ -193,6 +193,17 @@ def test_stuck_lab_wheel_carries_what_the_road_asks():
     _, normal, carried, _ = rig.contact(LabRigState(0.0, 100.0, 9.0, 0.0))
     np.testing.assert_allclose(carried, torque, rtol=1e-12, atol=0)
     np.testing.assert_allclose(normal, (19.6181 + torque) / arm, rtol=1e-12, atol=0)
+
+
+def test_a_stuck_lab_wheel_stays_at_rest():
+    """Exactly, on a thousand roads: a rate of 1e-16, the rounding of a torque that balances another, would turn it,
+    and a wheel that turns feels all of the brake."""
+    grip = jnp.linspace(0.1, 0.6, 1000)
+    rates = jax.vmap(
+        lambda w4: LabRig(road=RationalCurve(w4=w4)).derivative(0.0, LabRigState(0.0, 100.0, 9.0, 0.0), 0.9)
+    )
+    assert np.all(np.asarray(rates(grip).wheel) == 0)
+    assert LabRig().derivative(0.0, LabRigState(0.0, 100.0, 0.0, 0.0), 0.0).wheel > 0  # without a brake it turns
 
 
 # Mechanics of every plant

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
+from diffabs.linear.gaussian import kalman
 from diffabs.linear.lyapunov import discrete_lyapunov, lyapunov
 from diffabs.linear.regulator import dlqr, lqr, unstabilisable
 from diffabs.linear.riccati import care, dare
@@ -209,6 +210,23 @@ def test_derivative_where_an_input_costs_nothing():
     h = 1e-4
     ends = [sl.solve_discrete_are(a, b, q + s * h * np.diag([1.0, 0.0, 2.0]), r) for s in (1, -1)]
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("solve", [care, dare, lqr, dlqr])
+def test_single_precision_is_refused(solve):
+    """Where every P would be NaN, because none is proven to 1e-7."""
+    a, b, one = (np.array([[x]], np.float32) for x in (-0.5, 1.0, 1.0))
+    with pytest.raises(ValueError, match=r"A, B, Q, R are float32: .* needs float64"):
+        solve(a, b, one, one)
+    with pytest.raises(ValueError, match="are float32"):
+        jax.vmap(lambda q: solve(jnp.asarray(a), b, q, one))(jnp.stack([one, one]))
+
+
+def test_the_filter_of_numbers_in_lists():
+    """x(k+1) = x(k) + w, y = x + v, all variances 1: P is the golden number, as of the regulator."""
+    found = kalman([[1.0]], [[1.0]], [[1.0]], [[1.0]])
+    np.testing.assert_allclose(found.P, (1 + np.sqrt(5)) / 2, rtol=1e-12)
+    np.testing.assert_allclose(found.gain, found.P / (found.P + 1), rtol=1e-12)
 
 
 def test_complex_matrices_are_refused():

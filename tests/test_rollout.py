@@ -183,16 +183,18 @@ def test_trajectories_of_other_durations_and_strides_are_of_one_program():
 
 
 def test_a_batch_ends_with_its_last_lane():
-    """Behind `vmap` the condition of the loop is one for all lanes; each lane ends as it would alone."""
+    """Behind `vmap` the condition of the loop is one for all lanes; each lane ends as it would alone, also if another
+    has no time to stop."""
     speeds = jnp.array([3.0, 12.0, 7.0])
 
-    def run(speed):
-        return d.measure(d.replace(RIG, {"initial.speed": speed}), d.FixedStep(1e-3, 1e6), BRAKING)
+    def run(speed, duration):
+        return d.measure(d.replace(RIG, {"initial.speed": speed}), d.FixedStep(1e-3, duration), BRAKING)
 
-    many = jax.vmap(jax.vmap(run))(speeds[None])  # a duration of which no batch sees the end
-    assert many.stopped.all()
-    for i, speed in enumerate(speeds):
-        np.testing.assert_allclose(many.ending.sample.t[0, i], run(speed).ending.sample.t, rtol=1e-12)
+    for duration, stopped in ((1e6, [True, True, True]), (1.0, [True, False, True])):
+        many = jax.vmap(jax.vmap(partial(run, duration=duration)))(speeds[None])
+        np.testing.assert_array_equal(many.stopped[0], stopped)
+        for i, speed in enumerate(speeds):
+            np.testing.assert_allclose(many.ending.sample.t[0, i], run(speed, duration).ending.sample.t, rtol=1e-12)
 
 
 def test_a_diverging_lane_is_flagged_and_leaves_the_others_alone():

@@ -106,6 +106,19 @@ def test_on_80_columns_no_word_is_broken(folder, measured, tmp_path, command):
 
 
 @pytest.mark.slow
+def test_what_is_verified_fits_80_columns(tmp_path):
+    """The claim of a decay has 87 characters."""
+    proof = tmp_path / "proof.json"
+    with Terminal("certify", "slip-lmi", "--gain=-11753,-76.7", "--out", proof) as terminal:
+        assert terminal.status() == 0, terminal.text
+        assert_fits(terminal)
+    with Terminal("verify", proof) as terminal:
+        assert terminal.status() == 0, terminal.text
+        assert_fits(terminal)
+    assert re.search(r"proved\s+decay:.*however\s+the\s+system\s+varies", terminal.text, re.DOTALL)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("command", LONG)
 @pytest.mark.parametrize("moment", ["checking", "working"])
 def test_control_c_at_any_moment(folder, measured, tmp_path, command, moment):
@@ -130,7 +143,7 @@ def test_control_c_at_any_moment(folder, measured, tmp_path, command, moment):
     with Terminal(*args, *longer.get(command, [])) as terminal:
         wanted = begun[command] if moment == "working" or command == "reproduce" else "checking the scenario"
         assert terminal.until(lambda: re.search(wanted, terminal.text)), terminal.text
-        time.sleep(0.3 if moment == "working" else 0.0)
+        time.sleep(0.3 if moment == "working" and command != "design" else 0.0)  # a design takes 0.3 s
         terminal.press()
         assert terminal.status() == 130, terminal.text
         assert_orderly(terminal)
@@ -139,7 +152,7 @@ def test_control_c_at_any_moment(folder, measured, tmp_path, command, moment):
     assert "interrupted" in text
     if moment == "working" and command == "sweep":
         assert chunks(tmp_path / "sweep")
-        again = text.partition("go on with:\n")[2].replace("\\\n", " ")
+        again = re.split(r"go\s+on\s+with:\n", text)[1].replace("\\\n", " ")  # folded where the folder's name has it
         assert shlex.split(again)[1:] == [*map(str, args), *longer["sweep"], "--resume"]
     if moment == "working" and command == "tune":
         assert "this is the best so far, not a minimum" in text

@@ -143,8 +143,10 @@ def verified(result: dict[str, Any], json_wanted: bool) -> None:
     """A line for each claim."""
     if json_wanted:
         return as_json(result)
+    console = _console()
     for claim in result["claims"]:
-        typer.echo(f"{'proved' if claim['proved'] else 'NOT PROVED'}  {claim['kind']}: {claim['says']}")
+        line = f"{'proved' if claim['proved'] else 'NOT PROVED'}  {claim['kind']}: {claim['says']}"
+        console.print(line, soft_wrap=not console.is_terminal)
     return None
 
 

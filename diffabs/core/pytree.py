@@ -301,7 +301,10 @@ def _names(part: Any) -> list[str]:
 def replace(part: T, values: Mapping[str, Any]) -> T:
     """Return a copy of `part` with the parameters in `values`, by dotted path, replaced.
 
-        replace(loop, {"plant.mass": 5.3, "controller.gain.0": -9e3})
+    >>> import diffabs as d
+    >>> loop = d.replace(d.braking(), {"plant.mass": 12.0, "plant.road.mu.2": 0.8})
+    >>> loop.plant.mass, round(float(loop.plant.road.mu[2]), 3)
+    (12.0, 0.8)
 
     Works under jit, grad and vmap. Raises KeyError for a path that does not exist.
     """

@@ -42,6 +42,11 @@ def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *,
 
     Raises ValueError for shapes that do not fit, ModuleNotFoundError without cvxpy. That something cannot be proved is
     no error: the certificate says so.
+
+    >>> from diffabs.design import Polytope, certify
+    >>> box = Polytope(A=[[[0.0, 1.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, -2.0]]], B=[[[0.0], [1.0]]] * 2)
+    >>> [certify(gain, box).quadratically_stable for gain in ((-1.0, -1.0), (1.0, -1.0))]
+    [True, False]
     """
     spec = Spec() if spec is None else spec
     if isinstance(system, Schedule):

@@ -50,6 +50,12 @@ def polytope(model: Any, over: Mapping[str, Sequence[float]], *, grid: int = 9, 
     one parameter: factor inf), the vertices are those of a box along the systems' principal directions, and `corners`
     is empty. Vertices inside the hull of the others are dropped. Covered means to 1e-9 of the range of an entry.
 
+    >>> from diffabs.design import polytope
+    >>> from diffabs.linear import SlipModel
+    >>> box = polytope(SlipModel(), {"plant.mass": (5.3, 6.2), "speed": (1.4, 13.9)})
+    >>> box.A.shape, box.B.shape, box.coverage.spread
+    ((4, 2, 2), (4, 2, 1), 1.0)
+
     Raises:
         ValueError: a path that is no parameter of the model, an interval that is inverted, not finite or outside of the
             parameter's range, a period that varies, more than 2^12 vertices, matrices that are not finite.

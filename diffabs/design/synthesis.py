@@ -67,6 +67,12 @@ def design(system: Polytope | Schedule, spec: Spec) -> Design:
     Every answer is checked: exact proof of every specification (`certify`), duality gap, lower bound. A failed check
     tries other coordinates, then other solvers.
 
+    >>> from diffabs.design import Polytope, Spec, design
+    >>> box = Polytope(A=[[[0.0, 1.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, -2.0]]], B=[[[0.0], [1.0]]] * 2)
+    >>> found = design(box, Spec(Q=(1.0, 1.0), R=1.0, decay=0.5))
+    >>> found.certificate.verified_exactly, found.certificate.decay_rate > 0.5
+    (True, True)
+
     Raises:
         ValueError: a specification that does not fit, nothing to minimise, a vertex that is not stabilisable.
         DesignError: no gain passes; says for each attempt why.

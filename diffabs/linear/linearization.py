@@ -35,7 +35,14 @@ def linearize(plant: Plant, state: Any, control: Any) -> StateSpace:
     """Return df/dx (n, n) and df/du (n, m) of a plant, x' = f(x, u), at a state and a control.
 
     plant: its `derivative` is f
-    state, control: the point, which need not be an equilibrium; the components of x are the leaves of the state"""
+    state, control: the point, which need not be an equilibrium; the components of x are the leaves of the state
+
+    >>> from diffabs import BrakeStart, plants, roads
+    >>> from diffabs.linear import linearize
+    >>> car = plants.QuarterCar(inertia=0.8, road=roads.DRY_ASPHALT)
+    >>> linearize(car, car.start(BrakeStart(speed=20.0, slip=0.1)), 90.0).B.shape  # speed, spin, distance
+    (3, 1)
+    """
     flow, x, u = _flat(plant, state, control)
     return StateSpace(*jax.jacfwd(flow, (0, 1))(x, u))
 

@@ -34,11 +34,17 @@ def lqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
 
     A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m) or none
 
-        lqr([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], jnp.eye(2), [[1.0]]).gain       # [[-1, -sqrt(3)]]
+    >>> import jax
+    >>> from diffabs.linear import lqr
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> A, B = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]
+    >>> print(lqr(A, B, [[1.0, 0.0], [0.0, 1.0]], [[1.0]]).gain.round(4))  # -1 and -sqrt(3)
+    [[-1.     -1.7321]]
 
     Raises:
-        ValueError: shapes that do not fit; and, for matrices that are numbers and not traced, entries that are not
-            finite, Q or R that are not symmetric, R that is not positive definite, a pair that is not stabilisable.
+        ValueError: shapes that do not fit; float32, in which no P can be proven; and, for matrices that are numbers and
+            not traced, entries that are not finite, Q or R that are not symmetric, R that is not positive definite, a
+            pair that is not stabilisable.
     """
     _check(A, B, Q, R, discrete=False)
     return _regulated(A, B, Q, R, S)
@@ -48,6 +54,12 @@ def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
     """Return the gain that minimises the sum of x'Q x + 2 x'S u + u'R u of x(k+1) = A x(k) + B u(k).
 
     A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m) or none; R may be singular where R + B'P B > 0
+
+    >>> import jax
+    >>> from diffabs.linear import dlqr
+    >>> jax.config.update("jax_enable_x64", True)
+    >>> print(dlqr([[1.0]], [[1.0]], [[1.0]], [[1.0]]).gain.round(4))  # (1 - sqrt(5))/2
+    [[-0.618]]
 
     Raises ValueError as `lqr`."""
     _check(A, B, Q, R, discrete=True)

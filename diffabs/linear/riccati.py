@@ -25,6 +25,8 @@ from diffabs.linear.lyapunov import lyapunov as _lyapunov
 from diffabs.linear.lyapunov import matrices
 from diffabs.linear.riccati_batched import one, solve_care, solve_dare
 
+DOUBLE = 'a proven P needs float64, for which JAX is asked by jax.config.update("jax_enable_x64", True)'
+
 
 class Riccati(NamedTuple):
     """P (n, n), its relative residual, and whether it is proven to be the stabilising solution. If not, P is NaN.
@@ -48,6 +50,8 @@ def care(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
     A (n, n), B (n, m), Q (n, n), R (m, m) > 0, S (n, m) or none; of Q and R the symmetric part counts. Q may be
     indefinite: P then too, if there is a stabilising one. Works under jit, vmap, and both modes of differentiation, in
     all arguments; the residual counts as constant. The feedback is u = -R^-1 (B' P + S') x.
+
+    Raises ValueError for shapes that do not fit, complex matrices, and float32.
     """
     return _riccati(_continuous, A, B, Q, R, S)
 
@@ -56,7 +60,7 @@ def dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
     """Return the stabilising P of A' P A - P - (A' P B + S) (R + B' P B)^-1 (A' P B + S)' + Q = 0.
 
     A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m) or none. As `care`, but R may be singular, R >= 0, where
-    R + B' P B > 0. The feedback is u = -(R + B' P B)^-1 (B' P A + S') x.
+    R + B' P B > 0. The feedback is u = -(R + B' P B)^-1 (B' P A + S') x. Raises ValueError as `care`.
     """
     return _riccati(_discrete, A, B, Q, R, S)
 
@@ -72,6 +76,8 @@ def _riccati(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Ricc
         raise ValueError(
             f"A, Q, R, S have shapes {shapes}; B of shape {(n, m)} needs {((n, n), (n, n), (m, m), (n, m))}"
         )
+    if B.dtype != jnp.float64:
+        raise ValueError(f"A, B, Q, R are {B.dtype}: {DOUBLE}")
     return _solved(solution, A, B, Q, R, S)
 
 

@@ -46,7 +46,7 @@ def _claim(seen: Mapping[str, Run]) -> Any:
         trajectory = seen[name].trajectory
         assert trajectory is not None
         plot.angle_lines(ax, trajectory)
-        plot.label(ax, "time [s]", "" if i else "angle [rad]", title, legend=i == 0)
+        plot.label(ax, "time [s]", "angle [rad]", title, legend=i == 0)
         ax.set_xlim(0, 6.0 if i == 0 else float(trajectory.sample.t[-1]) * 1.05)
     return figure
 
@@ -56,8 +56,10 @@ def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
         1, len(basins), title="Hanging arm at 48 V: which starts are recovered", size=(5.0, 4.4), sharey=True
     )
     (theta,), (phi,) = (mode_bounds(hanging.A, hanging.B, np.eye(6)[i], 48.0).values() for i in (0, 2))
+    shades, undecided = [], any(basin.undecided for basin in basins.values())
     for i, (ax, (name, basin)) in enumerate(zip(axes, basins.items(), strict=True)):
-        plot.region(ax, basin.first.centres, basin.second.centres, basin.outcomes.recovered, basin.outcomes.undecided)
+        outcomes = basin.outcomes
+        shades = plot.region(ax, basin.first.centres, basin.second.centres, outcomes.recovered, outcomes.undecided)
         ends = np.array([basin.first.low, basin.first.high])
         for sign in (-1, 1):
             words = "no control beyond (linear)" if sign > 0 else None
@@ -68,7 +70,12 @@ def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
         ax.locator_params(axis="x", nbins=5)
         title = f"{name}: {100 * basin.share:.1f} % of the box"
         title += f", {100 * basin.undecided:.1f} % undecided" if basin.undecided else ""
-        plot.label(ax, "frame theta0 [rad]", "" if i else "rider phi0 [rad]", title, legend=i == 0)
+        plot.label(ax, "frame theta0 [rad]", "" if i else "rider phi0 [rad]", title, legend=False)
+    lines, words = axes[0].get_legend_handles_labels()
+    named = dict(zip(("recovered", "undecided", "falls"), shades, strict=True))
+    named = {name: shade for name, shade in named.items() if undecided or name != "undecided"}
+    handles, words = [*named.values(), *lines], [*named, *words]
+    figure.legend(handles, words, loc="outside lower center", ncols=len(words), frameon=False, fontsize=9.5)
     return figure
 
 

@@ -217,6 +217,7 @@ def _poles(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Any:
         for j in (0, 1):
             drawn = ax.scatter(np.real(poles[:, j]), np.imag(poles[:, j]), c=plot.KMH * speeds, s=9, cmap="viridis")
         ax.axhline(0, color=plot.GREY, linewidth=0.8)
+        ax.locator_params(axis="x", nbins=5)
         plot.label(ax, "real part [1/s]", "imaginary part [rad/s]" if ax is axes[0] else "", name)
     figure.colorbar(drawn, ax=axes, label="speed [km/h]")
     return figure

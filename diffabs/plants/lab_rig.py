@@ -84,6 +84,8 @@ class LabRig:
         del t
         mu, normal, torque, sticks = self.contact(state)
         wheel = quotient(normal * self.wheel_radius * mu - torque, self.wheel_inertia)
+        rests = (state.wheel <= 0) & (torque < state.brake + self.wheel_stiction)
+        wheel = jnp.where(rests, 0.0, wheel)  # and not the rounding of it, from which a stuck wheel would turn
         drum = -quotient(self._drum_torque(state.drum, normal * mu), self.drum_inertia)
         u = clamp(control, 0.0, 1.0)
         brake = larger(self.brake_gain * u + self.brake_offset, 0.0)  # a brake does not drive

@@ -22,6 +22,7 @@ try:
     from matplotlib.axes import Axes
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError('figures need matplotlib: pip install "diffabs[plot]"', name=error.name) from error
 
@@ -168,12 +169,14 @@ def angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
         ax.plot(np.asarray(seen.sample.t), values, DASHES[i], color=COLOURS[i], label=f"{words} {name}")
 
 
-def region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> None:
+def region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> list[Patch]:
     """Shade the cells of a grid, given their centres, first axis to the right: those whose value is true, those that
-    are `unknown`, and the rest."""
-    colours = ListedColormap(["#F3E3D7", "#9A9A9A", COLOURS[0]])
-    value = np.where(inside, 2, 0 if unknown is None else np.where(unknown, 1, 0))
+    are `unknown`, and the rest. Return a patch of each shade, in this order, for a legend."""
+    shades = (COLOURS[0], "#9A9A9A", "#F3E3D7")
+    value = np.where(inside, 0, 2 if unknown is None else np.where(unknown, 1, 2))
+    colours = ListedColormap(shades)
     ax.pcolormesh(np.asarray(first), np.asarray(second), value.T, cmap=colours, vmin=0, vmax=2, rasterized=True)
+    return [Patch(color=shade) for shade in shades]
 
 
 def slips(runs: Mapping[str, Trajectory], *, title: str = "", until: float | None = None) -> Figure:
@@ -200,6 +203,7 @@ def speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
         _speeds(ax, seen)
         label(ax, "time [s]", "" if i else "speed [km/h]", name)
         ax.set_xlim(0, None)
+    axes[0].set_ylim(min(axes[0].get_ylim()[0], 0.0), None)  # below 0 where a locked wheel's line would hide the axis
     return figure
 
 
@@ -266,7 +270,8 @@ def convergence(
     h = np.asarray(steps)
     for i, (ax, order, (name, curves)) in enumerate(zip(axes, orders, panels.items(), strict=True)):
         for j, (quantity, errors) in enumerate(curves.items()):
-            ax.loglog(h, errors, "o" + DASHES[j], color=COLOURS[j], markersize=4.5, label=quantity.replace("_", " "))
+            words = "IAE" if quantity == "iae" else _words(quantity)
+            ax.loglog(h, errors, "o" + DASHES[j], color=COLOURS[j], markersize=4.5, label=words)
         top = 3.0 * np.max([np.max(e) for e in curves.values()])
         ax.loglog(h, top * (h / h.max()) ** order, color=GREY, linewidth=0.9, label=f"slope {order}")
         label(ax, "step [s]", "" if i else "relative error [1]", name, legend=False)

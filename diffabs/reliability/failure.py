@@ -34,6 +34,16 @@ def failure_probability(
     gradients: also draw around design points, found by gradients through the run
     options: those of `subset_simulation`; runs that diverge do not count as failures and are reported
 
+    >>> import diffabs as d
+    >>> from diffabs import controllers, reliability, stops, sweep
+    >>> parts = {"initial": d.BrakeStart(speed=10.0, slip=1.0), "stop": stops.SpeedReached(speed=5.0)}
+    >>> loop = d.braking(controller=controllers.ConstantTorque(torque=500.0), **parts)  # a locked wheel
+    >>> space = sweep.Space({"initial.speed": sweep.Normal(10.0, 0.5, low=6.0, high=14.0)})
+    >>> study = sweep.Study(loop, space, samples=1, solver=d.FixedStep(5e-3, 6.0))
+    >>> found = reliability.failure_probability(study, "stop_time", 0.878)
+    >>> print(f"{found.probability:.0e}")  # 1.1e-3 in closed form
+    1e-03
+
     Raises ValueError for a metric that is not measured, for a study that draws parts, for a bound that is not finite,
     for a point that is drawn and cannot be run, and (`importance_sampling.Diverged`) where too many runs diverge.
     """

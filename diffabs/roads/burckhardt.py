@@ -20,7 +20,12 @@ from diffabs.roads.sign import opposes
 
 @pytree
 class Burckhardt:
-    """mu(s, v) = (c1 (1 - exp(-c2 s)) - c3 s) exp(-c4 s v); the defaults are dry asphalt."""
+    """mu(s, v) = (c1 (1 - exp(-c2 s)) - c3 s) exp(-c4 s v); the defaults are dry asphalt.
+
+    >>> from diffabs.roads import DRY_ASPHALT, ICE
+    >>> print(f"{DRY_ASPHALT.friction(0.15, speed=20.0):.3f} {ICE.friction(0.15, speed=20.0):.3f}")
+    1.067 0.046
+    """
 
     c1: Scalar = param(default=1.2801, unit="1", low=0.0)
     c2: Scalar = param(default=23.99, unit="1", above=0.0)

@@ -16,6 +16,10 @@ class MagicFormula:
 
     The defaults reproduce Tables 1 and 2 of Aoki and Nakamura within 0.01 s and 0.06 m; they were identified from those
     tables (with J = 1.0539 kg m^2), since the paper does not give its curve.
+
+    >>> from diffabs.roads import MagicFormula
+    >>> print(f"{MagicFormula(D=0.5).friction(0.1):.3f}")
+    0.500
     """
 
     B: Scalar = param(default=13.00891, unit="1", above=0.0)

@@ -27,7 +27,13 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
 
     It is the first maximum that a braking wheel meets, not always the greatest: the rig's curve rises again towards
     lock. Bracketed on a grid, bisected on the slope, and polished by one Newton step s - mu'/mu'' whose derivative is
-    that of the implicit function theorem, so slip and mu are differentiable in every parameter of the road."""
+    that of the implicit function theorem, so slip and mu are differentiable in every parameter of the road.
+
+    >>> from diffabs.roads import DRY_ASPHALT, peak
+    >>> slip, mu = peak(DRY_ASPHALT)
+    >>> print(f"{mu:.2f} at {slip:.2f}")
+    1.17 at 0.17
+    """
 
     def mu(s: Any) -> Any:
         return road.friction(s, speed, distance)

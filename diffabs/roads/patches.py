@@ -33,7 +33,13 @@ class Patches:
 
     A width of about 0.1 m is the length of a tyre's contact patch. With width 0 the jump is sharp: values are right,
     but a derivative through the run misses what moving the moment of the jump does. Differentiate with a width of a few
-    steps."""
+    steps.
+
+    >>> from diffabs.roads import DRY_ASPHALT, ICE, Patches
+    >>> road = Patches(roads=(DRY_ASPHALT, ICE), edges=(10.0,))
+    >>> print(*(f"{road.friction(0.1, 20.0, at):.2f}" for at in (9.0, 10.0, 11.0)))
+    1.05 0.55 0.05
+    """
 
     roads: tuple[Road, ...] = part(default=(DRY_ASPHALT, SNOW))
     edges: Vector = param(default=(10.0,), unit="m", low=0.0, free=True)

@@ -23,7 +23,13 @@ class Tabulated:
 
     The defaults are the spline identified from Tables 1 and 2 of Aoki and Nakamura, with J = 1.04456 kg m^2, which
     reproduces all twenty numbers to the printed digit. The paper does not give its curve, and the true one stays
-    unknown."""
+    unknown.
+
+    >>> from diffabs.roads import Tabulated
+    >>> wet = Tabulated(slip=(0.0, 0.1, 0.3, 1.0), mu=(0.0, 0.7, 0.6, 0.5))
+    >>> print(f"{wet.friction(0.1):.2f} {wet.friction(0.2):.3f}")
+    0.70 0.656
+    """
 
     slip: Vector = param(
         default=(

@@ -122,11 +122,20 @@ def run_batch(
 
     Compiled once for a structure and a number of lanes, not for new values, keys or durations.
 
+    >>> import diffabs as d
+    >>> from diffabs.objectives import StopDistance
+    >>> masses = d.Batch({"plant.mass": [12.0, 18.0]})
+    >>> run = d.run_batch(d.braking(), masses, d.FixedStep(1e-4, 4.0), {"distance": StopDistance()})
+    >>> print(*(f"{distance:.1f}" for distance in run.metrics["distance"]))
+    43.9 43.8
+
     Raises:
         ValueError: columns of different lengths; what `measure` objects to; `enough` for lanes that run together.
         KeyError: a path that does not exist.
     """
     objectives, count = objectives or {}, batch.size
+    columns = {path: jnp.asarray(x) if isinstance(x, list | tuple) else x for path, x in batch.values.items()}
+    batch = dataclasses.replace(batch, values=columns)
     arguments(replace(loop, {path: column[0] for path, column in batch.values.items()}), solver, objectives)
     live = traced(loop, dict(batch.values), dict(objectives))
     if accepted is None:

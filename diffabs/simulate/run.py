@@ -35,6 +35,11 @@ def rollout(
     objectives: by the names of the metrics
     key: of `jax.random`, for noisy sensors
 
+    >>> import diffabs as d
+    >>> run = d.rollout(d.braking(), d.FixedStep(1e-4, 3.0, every=10000))
+    >>> print(*(f"{speed:.1f}" for speed in run.trajectory.sample.output.speed))  # after 0, 1, 2, 3 s
+    27.8 19.1 10.0 1.0
+
     Pure and jit-compiled, once per structure of the loop: new values and another duration do not compile again, but for
     the length of a trajectory, and of a derivative, in steps of an eighth.
     Raises ValueError for a step, duration or stride that is not positive, a step longer than the duration, and
@@ -47,6 +52,12 @@ def measure(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], 
     """Run a loop and return only what is measured: memory does not grow with the number of steps.
 
     loop, solver, objectives, key: as in `rollout`, whose ValueErrors it raises
+
+    >>> import diffabs as d
+    >>> from diffabs.objectives import StopDistance
+    >>> run = d.measure(d.braking(), d.FixedStep(1e-4, 4.0), {"distance": StopDistance()})
+    >>> print(f"{run.metrics['distance']:.2f} m")
+    43.85 m
     """
     return _call(loop, solver, objectives, key, 0)
 

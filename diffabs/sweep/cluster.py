@@ -57,6 +57,7 @@ class Dask:
     @contextlib.contextmanager
     def _client(self) -> Iterator[Client]:
         with contextlib.ExitStack() as opened:
+            opened.enter_context(_quiet())
             if self.scheduler is None:
                 where: Any = opened.enter_context(_started(self.workers))
             else:
@@ -69,6 +70,19 @@ class Dask:
                 why = str(error).splitlines()[0] if str(error) else f"no answer within {TIMEOUT:g} s"
                 raise SweepError(f"the scheduler at {where} cannot be reached: {why}") from None
             yield client
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what Dask logs on stderr, a traceback where a scheduler goes away: what concerns the caller is raised."""
+    handlers = {handler: handler.level for handler in logging.getLogger("distributed").handlers}
+    try:
+        for handler in handlers:
+            handler.setLevel(logging.CRITICAL)
+        yield
+    finally:
+        for handler, level in handlers.items():
+            handler.setLevel(level)
 
 
 @contextlib.contextmanager

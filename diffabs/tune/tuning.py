@@ -46,6 +46,16 @@ def tune(
     progress: told the best so far after every iteration
     stopping: asked after every evaluation; True ends the search with the best that it has met so far
 
+    >>> import diffabs as d
+    >>> from diffabs import controllers, objectives, plants, roads, stops, tune
+    >>> parts = {"plant": plants.QuarterCar(road=roads.DRY_ASPHALT), "stop": stops.SpeedReached(speed=5.0)}
+    >>> loop = d.braking(controller=controllers.ConstantTorque(torque=20.0), **parts)
+    >>> free, measured = {"controller.torque": (10.0, 100.0)}, {"iae": objectives.IAE()}
+    >>> solver = d.FixedStep(1e-3, 6.0)
+    >>> found = tune.tune(loop, free=free, objective={"iae": 1.0}, measured=measured, solver=solver)
+    >>> print(f"{found.values['controller.torque']:.1f} N m, {found.objective[0]:.2f} to {found.objective[1]:.2f} s")
+    85.6 N m, 1.14 to 0.18 s
+
     Raises:
         ValueError: a path, range, metric or batch that does not fit; a lane that must not be run whatever is tuned.
         StartError: a start that diverges, or at which the integration step is not stable, if there is no other.
