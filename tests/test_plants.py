@@ -118,7 +118,7 @@ def test_slip_in_driving_and_at_standstill():
 def test_lab_rig_static_load():
     """All at rest and no friction: the weight on its lever, Mg/(L sin phi)."""
     rig = LabRig(road=NO_FRICTION, wheel_stiction=0.0, drum_stiction=0.0, wheel_friction=0.0, drum_friction=0.0)
-    mu, normal, torque, _ = rig.contact(LabRigState(0.0, 0.0, 0.0, 0.0))
+    mu, normal, torque = rig.contact(LabRigState(0.0, 0.0, 0.0, 0.0))
     np.testing.assert_allclose(normal, 58.217466, rtol=1e-8, atol=0)
     assert mu == 0
     assert torque == 0
@@ -175,7 +175,7 @@ def test_a_lever_that_locks_itself_further_on_is_no_run():
 def test_a_lab_wheel_that_no_torque_holds_turns_again():
     """Friction between 1.34 and tan phi: the road's torque grows faster than the brake's, whatever the brake does."""
     rig = LabRig(road=Burckhardt(c1=1.6, c3=0.0, c4=0.0))
-    _, normal, carried, _ = rig.contact(LabRigState(0.0, 100.0, 9.0, 0.0))
+    _, normal, carried = rig.contact(LabRigState(0.0, 100.0, 9.0, 0.0))
     np.testing.assert_allclose(carried, 9.0 + rig.wheel_stiction, rtol=1e-12)
     assert normal > 0
     assert rig.derivative(0.0, LabRigState(0.0, 100.0, 9.0, 0.0), 0.9).wheel > 0
@@ -190,7 +190,7 @@ def test_stuck_lab_wheel_carries_what_the_road_asks():
     torque = 0.0
     for _ in range(200):
         torque = 0.0995 * mu * (19.6181 + torque) / arm
-    _, normal, carried, _ = rig.contact(LabRigState(0.0, 100.0, 9.0, 0.0))
+    _, normal, carried = rig.contact(LabRigState(0.0, 100.0, 9.0, 0.0))
     np.testing.assert_allclose(carried, torque, rtol=1e-12, atol=0)
     np.testing.assert_allclose(normal, (19.6181 + torque) / arm, rtol=1e-12, atol=0)
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from diffabs.core.numerics import clamp, larger, quotient
+from diffabs.core.numerics import clamp, larger, quotient, smaller
 from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.core.rules import Rule, array
@@ -82,7 +82,7 @@ class LabRig:
     def derivative(self, t: Scalar, state: LabRigState, control: Scalar) -> LabRigState:
         """dx/dt under the brake command `control` [1], limited to [0, 1]."""
         del t
-        mu, normal, torque, sticks = self.contact(state)
+        mu, normal, torque = self.contact(state)
         wheel = quotient(normal * self.wheel_radius * mu - torque, self.wheel_inertia)
         rests = (state.wheel <= 0) & (torque < state.brake + self.wheel_stiction)
         wheel = jnp.where(rests, 0.0, wheel)  # and not the rounding of it, from which a stuck wheel would turn
@@ -91,15 +91,14 @@ class LabRig:
         brake = larger(self.brake_gain * u + self.brake_offset, 0.0)  # a brake does not drive
         target = jnp.where(u >= self.brake_threshold, brake, 0.0)
         return LabRigState(
-            jnp.where(sticks, 0.0, halted(state.wheel, wheel)),
+            halted(state.wheel, wheel),
             halted(state.drum, drum),
             self.brake_rate * (target - state.brake),
             self.drum_radius * state.drum,
         )
 
-    def contact(self, state: LabRigState) -> tuple[Any, Any, Any, Any]:
-        """Friction coefficient [1], normal force [N], the torque that brakes the wheel [N m], bearing included, and
-        whether the wheel sticks."""
+    def contact(self, state: LabRigState) -> tuple[Any, Any, Any]:
+        """Friction coefficient [1], normal force [N], and the torque that brakes the wheel [N m], bearing included."""
         slip = slip_ratio(self.drum_radius * state.drum, self.wheel_radius * state.wheel, self.crawl_speed)
         mu = self.road.friction(slip, self.drum_radius * state.drum, state.distance)
         arm = self.lever * (jnp.sin(self.lever_angle) - mu * jnp.cos(self.lever_angle))
@@ -107,12 +106,11 @@ class LabRig:
         held = arm > self.wheel_radius * mu
         spare = jnp.where(held, arm - self.wheel_radius * mu, 1.0)
         asked = quotient(self.wheel_radius * mu * self.weight_torque, spare)
-        turns, holds = state.wheel > 0, held & (asked <= capacity)
-        stuck = jnp.where(holds, asked, capacity)
-        torque = jnp.where(turns, capacity + self.wheel_friction * state.wheel, stuck)
+        stuck = jnp.where(held, smaller(asked, capacity), capacity)
+        torque = jnp.where(state.wheel > 0, capacity + self.wheel_friction * state.wheel, stuck)
         free = arm > 0
         normal = jnp.where(free, quotient(self.weight_torque + torque, jnp.where(free, arm, 1.0)), jnp.inf)
-        return mu, normal, torque, holds & ~turns
+        return mu, normal, torque
 
     def project(self, state: LabRigState) -> LabRigState:
         """Neither wheel turns backwards."""
@@ -121,7 +119,7 @@ class LabRig:
     def output(self, state: LabRigState) -> BrakeOutput:
         """Slip, rim speeds, deceleration of the road wheel's rim, distance."""
         v, w = self.drum_radius * state.drum, self.wheel_radius * state.wheel
-        mu, normal, _, _ = self.contact(state)
+        mu, normal, _ = self.contact(state)
         deceleration = self.drum_radius * quotient(self._drum_torque(state.drum, normal * mu), self.drum_inertia)
         return BrakeOutput(slip_ratio(v, w, self.crawl_speed), v, w, deceleration, state.distance)
 
