@@ -1,13 +1,15 @@
 """Every test runs in float64 unless it says otherwise, and compiled functions are kept between runs.
 
 Compiling is what the tests cost and running is next to nothing, so XLA optimises nothing, here and in the processes
-that are started: two to three times as fast. DIFFABS_TEST_XLA=default is the compiler that users have."""
+that are started: two to three times as fast. Nor does it split a program into parts that cores compile at the same
+time: they are busy, and each part costs. DIFFABS_TEST_XLA=default is the compiler that users have."""
 
+import gc
 import importlib.metadata
 import os
 import pathlib
 
-QUICK = ["--xla_backend_optimization_level=0"]
+QUICK = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
 if importlib.metadata.version("jaxlib").startswith("0.10."):  # later ones end the process that names it
     QUICK.append("--xla_cpu_use_fusion_emitters=false")
 CACHE = str(pathlib.Path(__file__).parent.parent / ".jax_cache")
@@ -16,12 +18,20 @@ if os.environ.get("DIFFABS_TEST_XLA") != "default" and "XLA_FLAGS" not in os.env
     os.environ["XLA_FLAGS"] = " ".join(QUICK)
 os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("DIFFABS_JAX_CACHE", CACHE)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
+os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"  # programs without the lines of Python that each operation is from
 
 import jax  # noqa: E402  after its environment
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
+
+
+def pytest_collection_finish():
+    """A worker's heap is large and nearly all of it stays: looking through it for cycles took a tenth of the time."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 50)
 
 
 @pytest.fixture(autouse=True)

@@ -1302,8 +1302,8 @@ MUTATIONS = [
     Mutation(
         "batch: who has seen enough rides on",
         "simulate/refill.py",
-        "free = ~carry.running | early(belt.number, belt.leaves, carry)",
-        "free = ~carry.running",
+        "free = ~belt.carry.running | _seen_enough(enough, built, belt)",
+        "free = ~belt.carry.running",
         "test_batch.py::test_a_lane_of_which_enough_is_seen_is_taken_off",
     ),
     *(Mutation(*each) for each in SWEEP),

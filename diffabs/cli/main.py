@@ -99,15 +99,12 @@ def simulate(
     with console.guarded():
         _check_source(scenario, from_sweep, sample, changes, seed)
         _check_targets(csv, plot)
+        kept = bool(csv or plot)
         with contextlib.ExitStack() as files:
             csv_file = files.enter_context(console.new_file(csv, "--csv"))
             picture = files.enter_context(console.new_file(plot, "--plot"))
-            if from_sweep and sample is not None:
-                chosen, key = console.waited(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
-            else:
-                chosen = console.loaded(scenario or "", console.changed(changes, "solver", seed=seed))
-                key = chosen.key()
-            run = console.waited(lambda: _run(chosen, key, keep=bool(csv or plot)), f"simulating {chosen.name}")
+            chosen, key = _source(scenario, from_sweep, sample, changes, seed)
+            run = console.waited(lambda: _run(chosen, key, keep=kept), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
                 show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
             if picture:
@@ -115,16 +112,30 @@ def simulate(
             found = console.waited(lambda: checked(chosen, key), "shortening the step") if check else None
         result = _result(chosen, run, {"csv": csv, "plot": plot}) | ({"accuracy": found} if found else {})
         show.as_json(result) if as_json else show.run(result, chosen)
-        if found:
-            if not as_json:
-                show.accuracy(found)
-            for line in said(found):
-                console.say(f"warning: {line}")
-        if result["diverged"]:
-            why = "a number became infinite or impossible, or something switched in every step: there are no metrics"
-            console.fail(f"{chosen.name} diverged: {why}", 1)
-        if warning := _warning(chosen, result):
-            console.say(f"warning: {warning}")
+        if found and not as_json:
+            show.accuracy(found)
+        for line in said(found) if found else ():
+            console.say(f"warning: {line}")
+        _judge(chosen, result)
+
+
+def _source(
+    scenario: str | None, from_sweep: pathlib.Path | None, sample: int | None, changes: Any, seed: int | None
+) -> tuple[Scenario, Any]:
+    """What is run, and the key of its noise."""
+    if from_sweep and sample is not None:
+        return console.waited(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
+    chosen = console.loaded(scenario or "", console.changed(changes, "solver", seed=seed))
+    return chosen, chosen.key()
+
+
+def _judge(chosen: Scenario, result: dict[str, Any]) -> None:
+    """Say what must be known of the metrics. Raises typer.Exit for a run without any."""
+    if result["diverged"]:
+        why = "a number became infinite or impossible, or something switched in every step: there are no metrics"
+        console.fail(f"{chosen.name} diverged: {why}", 1)
+    if warning := _warning(chosen, result):
+        console.say(f"warning: {warning}")
 
 
 def _warning(chosen: Scenario, result: dict[str, Any]) -> str:

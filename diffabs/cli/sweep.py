@@ -56,8 +56,7 @@ def sweep(
     """Run a scenario for many values of what [sweep.over] varies, and show statistics with confidence intervals."""
     with console.guarded():
         _check_options(engine, scheduler, workers, devices, figures)
-        if samples is not None and samples < 1:
-            console.fail(f"--samples {samples} is not positive")
+        _check_samples(samples)
         if devices:
             jax.config.update("jax_num_cpu_devices", devices)
         chosen = console.loaded(scenario, console.changed(changes, "sweep", samples=samples, seed=seed))
@@ -75,9 +74,14 @@ def sweep(
             result = console.waited(lambda: _result(found, study, out, kept, figures, check), "computing statistics")
         show.as_json(result) if as_json else show.swept(result, chosen)
         _warn(result["accuracy"])
-        if result["refused"]["count"] == result["samples"]:
-            why = next(iter(result["refused"]["reasons"]))
-            console.fail(f"{chosen.name}: no sample could be run: {why}", console.FAILED)
+        _check_any(result, chosen)
+
+
+def _check_any(result: dict[str, Any], chosen: Scenario) -> None:
+    """Raises typer.Exit if no sample could be run."""
+    if result["refused"]["count"] == result["samples"]:
+        why = next(iter(result["refused"]["reasons"]))
+        console.fail(f"{chosen.name}: no sample could be run: {why}", console.FAILED)
 
 
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
@@ -153,6 +157,11 @@ def _check_options(engine: str, scheduler: str | None, workers: int | None, devi
         console.fail(f"--workers {workers}: the scheduler at {scheduler} has its own workers")
     if figures:
         console.need_matplotlib()
+
+
+def _check_samples(samples: int | None) -> None:
+    if samples is not None and samples < 1:
+        console.fail(f"--samples {samples} is not positive")
 
 
 def _numbers(keep: str | None, samples: int) -> list[int]:

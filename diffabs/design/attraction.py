@@ -121,15 +121,23 @@ def outcomes(
     """
     starts = {path: np.asarray(column) for path, column in starts.items()}
     count = len(next(iter(starts.values())))
+    inside = _ellipsoids(loop, starts, count) if band is None else _ball(band, count)
+    return _outcomes(loop, starts, solver, inside, band is None, key)
+
+
+def _outcomes(
+    loop: Loop, starts: dict[str, np.ndarray], solver: FixedStep, inside: "_Ellipsoids", early: bool, key: Any
+) -> Outcomes:
+    """early: a run that comes inside ends there."""
+    count = len(inside.system)
     keys = None if key is None else jax.vmap(lambda i: jax.random.fold_in(key, i))(np.arange(count))
     parts = max(1, min(os.cpu_count() or 1, count // FEWEST))
-    inside = _ellipsoids(loop, starts, count) if band is None else _ball(band, count)
 
     def part(lanes: slice) -> Any:
         """Every so many lanes: neighbours take equally long."""
         mine = {path: column[lanes] for path, column in starts.items()}
         own = None if keys is None else keys[lanes]
-        enough = inside.of(lanes) if band is None else None
+        enough = inside.of(lanes) if early else None
         return jax.device_get(run_batch(loop, Batch(mine, own), solver, enough=enough))
 
     found = Outcomes(*np.zeros((4, count), bool), time=np.zeros(count))
@@ -190,12 +198,18 @@ def recoverable(
     key: Any = None,
 ) -> Reach:
     """The greatest c in [0, most] such that the loop recovers from c' times `direction` (values by path of the initial
-    state) for every c' up to c that is tried; to a relative width of 1e-4. Every refinement is one batch."""
+    state) for every c' up to c that is tried; to a relative width of 1e-4. Every refinement is one batch.
+
+    Raises ValueError for other paths, and as `outcomes` does."""
+    if others := [path for path in direction if not path.startswith(START)]:
+        raise ValueError(f"{', '.join(others)}: a direction is one of the initial state")
+    alike = {path: np.full(POINTS, value) for path, value in direction.items()}
+    inside = _ellipsoids(loop, alike, POINTS) if band is None else _ball(band, POINTS)  # wherever the runs start
     low, high, undecided = 0.0, float(most), False
     while high - low > FINEST * high:
         tried = np.linspace(low, high, POINTS + 1)[1:]
         starts = {path: value * tried for path, value in direction.items()}
-        found = outcomes(loop, starts, solver, band=band, key=key)
+        found = _outcomes(loop, starts, solver, inside, band is None, key)
         good = POINTS if found.recovered.all() else int(np.argmin(found.recovered))
         if good == POINTS:
             return Reach(high, undecided)

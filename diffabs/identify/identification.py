@@ -14,7 +14,7 @@ import jax
 from diffabs.core.bijectors import Range
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import check, replace, strong
-from diffabs.identify.data import Data
+from diffabs.identify.data import Comparison, Data
 from diffabs.identify.fit import Identified, Tolerances, fit
 from diffabs.identify.residuals import Prior
 from diffabs.simulate.refusals import refusals
@@ -50,16 +50,7 @@ def identify(
     """
     check(loop)
     against = data.against(loop, list(free), solver)
-
-    def refused(part: Any) -> str | None:
-        """Why the first run that must not be run must not."""
-        asked = (refusals(None, jax.device_get(strong(batch)), solver) for batch in against.loops(part))
-        return next((next(filter(None, found.texts)) for found in asked if found.number), None)
-
-    for start in starts or ({},):
-        if why := refused(first := replace(loop, dict(start))):
-            most = min(float(stable_steps(strong(batch)).min()) for batch in against.loops(first))
-            raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
+    _check_starts(loop, starts or ({},), against, solver)
     return fit(
         loop,
         free,
@@ -71,7 +62,21 @@ def identify(
         starts=starts,
         norm=norm,
         tolerances=tolerances,
-        usable=lambda part: refused(part) is None,
+        usable=lambda part: _refused(part, against, solver) is None,
         progress=progress,
         stopping=stopping,
     )
+
+
+def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], against: Comparison, solver: FixedStep) -> None:
+    """Raises ValueError for a start from which a run must not be run, with the longest step that may."""
+    for start in starts:
+        if why := _refused(first := replace(loop, dict(start)), against, solver):
+            most = min(float(stable_steps(strong(batch)).min()) for batch in against.loops(first))
+            raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
+
+
+def _refused(loop: Any, against: Comparison, solver: FixedStep) -> str | None:
+    """Why the first run that must not be run must not."""
+    asked = (refusals(None, jax.device_get(strong(batch)), solver) for batch in against.loops(loop))
+    return next((next(filter(None, found.texts)) for found in asked if found.number), None)

@@ -3,7 +3,7 @@
 A batch under `jax.vmap` runs until its slowest lane ends. Here `width` lanes run at a time, like boxes on a belt: every
 ROUND steps what has ended is taken off and the next lanes are put in its place."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -97,13 +97,6 @@ def _run(
     start = jax.vmap(lambda mine, key: init_carry(*built(mine), h, key, kinks=kinks))
     over = jax.vmap(lambda mine, carry: judge(*built(mine), carry)[0])
 
-    def early(number: Any, mine: Any, carry: Carry) -> Any:
-        """Lanes of which enough is seen."""
-        if enough is None:
-            return jnp.zeros_like(carry.running)
-        output = jax.vmap(lambda mine, carry: built(mine)[0].plant.output(carry.point.state.plant))(mine, carry)
-        return jax.vmap(enough.reached)(number, output)
-
     def taken(number: Any) -> tuple[Any, Any, Carry]:
         """Lanes at their start; beyond the last one a copy of it that does not run."""
         mine, key, run = jax.tree.map(lambda x: x[jnp.minimum(number, count - 1)], (leaves, keys, accepted))
@@ -115,14 +108,9 @@ def _run(
         def some(carry: Carry, _: Any) -> tuple[Carry, None]:
             return step_all(belt.leaves, belt.keys, carry), None
 
-        carry = jax.lax.scan(some, belt.carry, length=ROUND)[0]
-        free = ~carry.running | early(belt.number, belt.leaves, carry)
-        place = jnp.where(free, belt.number, count)
-        ended = jax.tree.map(lambda all, x: all.at[place].set(x, mode="drop"), belt.ended, over(belt.leaves, carry))
-        number = jnp.where(free, belt.next + jnp.cumsum(free) - 1, belt.number)
-        old = (belt.leaves, belt.keys, carry)
-        mine, key, carry = jax.tree.map(partial(_by_lane, free), taken(number), old)
-        return _Belt(mine, key, carry, jnp.minimum(number, count), belt.next + jnp.sum(free), ended)
+        belt = belt._replace(carry=jax.lax.scan(some, belt.carry, length=ROUND)[0])
+        free = ~belt.carry.running | _seen_enough(enough, built, belt)
+        return _exchanged(belt, free, over, taken, count)
 
     number = jnp.arange(min(width, count))
     first = taken(number)
@@ -130,6 +118,26 @@ def _run(
     ended = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), shapes)
     belt = _Belt(*first, number, number[-1] + 1, ended)
     return jax.lax.while_loop(lambda belt: jnp.any(belt.number < count), round_, belt).ended
+
+
+def _seen_enough(enough: Enough | None, built: Callable[[Any], Any], belt: _Belt) -> Any:
+    """Lanes of which enough is seen; `built` makes the loop of one of what is its own."""
+    if enough is None:
+        return jnp.zeros_like(belt.carry.running)
+    output = jax.vmap(lambda mine, at: built(mine)[0].plant.output(at.point.state.plant))(belt.leaves, belt.carry)
+    return jax.vmap(enough.reached)(belt.number, output)
+
+
+def _exchanged(
+    belt: _Belt, free: Any, over: Callable[[Any, Carry], Run], taken: Callable[[Any], Any], count: int
+) -> _Belt:
+    """Put by the runs of lanes that are free (`over`), and take the next ones in their place (`taken`)."""
+    place, runs = jnp.where(free, belt.number, count), over(belt.leaves, belt.carry)
+    ended = jax.tree.map(lambda all, x: all.at[place].set(x, mode="drop"), belt.ended, runs)
+    number = jnp.where(free, belt.next + jnp.cumsum(free) - 1, belt.number)
+    old = (belt.leaves, belt.keys, belt.carry)
+    mine, key, carry = jax.tree.map(partial(_by_lane, free), taken(number), old)
+    return _Belt(mine, key, carry, jnp.minimum(number, count), belt.next + jnp.sum(free), ended)
 
 
 def _by_lane(which: Any, a: Any, b: Any) -> Any:

@@ -137,9 +137,7 @@ def worst_case(
     corners = _corners(np.array(free.ranges))
     points = np.concatenate([corners, _drawn(np.array(free.ranges), screen, seed)])
     lanes = Batch(_at(free, points), None if key is None else np.repeat(key, len(points)))
-    if line := first_line(loop, lanes.values, solver):
-        raise ValueError(f"the box has points that cannot be run; {line}")
-    screened = jax.device_get(run_batch(loop, lanes, solver, measured, accepted=True))
+    screened = _screened(loop, lanes, solver, measured)
     values = screened.metrics[metric]
     mode = automatic(free)
     problem = Problem(middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), mode)
@@ -147,6 +145,13 @@ def worst_case(
     each = price or (1 + 1.5 * free.size if mode is Mode.FORWARD else 6.0)
     gradients = sum(lane.evaluations for lane in lanes)
     return _found(loop, free, metric, bound, points, len(corners), screened, lanes, len(points) + each * gradients)
+
+
+def _screened(loop: Any, lanes: Batch, solver: FixedStep, measured: Mapping[str, Objective]) -> Run:
+    """Run every point. Raises ValueError for one that cannot be run."""
+    if line := first_line(loop, lanes.values, solver):
+        raise ValueError(f"the box has points that cannot be run; {line}")
+    return jax.device_get(run_batch(loop, lanes, solver, measured, accepted=True))
 
 
 def _corners(ranges: np.ndarray) -> np.ndarray:
