@@ -32,6 +32,69 @@ class Mutation(NamedTuple):
 
 MUTATIONS = [
     Mutation(
+        "a comparison that nobody looks at",
+        "core/regime.py",
+        "against = margin < -_rounding(x)",
+        "against = margin < -jnp.inf",
+        "test_kinks.py::test_who_looks_sees_what_is_contradicted_and_by_how_much[gt]",
+    ),
+    Mutation(
+        "a search that nobody looks at",
+        "core/regime.py",
+        "next = below + jnp.where(high < -_rounding(x), 1, 0) - jnp.where(low < -_rounding(x), 1, 0)",
+        "next = below",
+        "test_kinks.py::test_a_derivative_through_a_kink_is_that_of_the_closed_form[a table]",
+    ),
+    Mutation(
+        "rounding that is taken for a crossing",
+        "core/regime.py",
+        "most.eps**ROUNDING *",
+        "0.0 *",
+        "test_kinks.py::test_numbers_that_are_equal_to_rounding_say_nothing",
+    ),
+    Mutation(
+        "a contrary with a number of its own",
+        "core/kinks.py",
+        "key = (y, x, not strict) if turned else (x, y, strict)",
+        "key = (x, y, strict)",
+        "test_kinks.py::test_a_program_is_the_function[a contrary]",
+    ),
+    Mutation(
+        "comparisons of what is fixed",
+        "core/kinks.py",
+        "asks = name if moves and real",
+        "asks = name if real",
+        "test_kinks.py::test_a_program_is_the_function[of what is fixed]",
+    ),
+    Mutation(
+        "two comparisons at once, of which one is lost",
+        "simulate/advance.py",
+        "jnp.where(one.lands, ~bit, none)) for bit",
+        "none) for bit",
+        "test_kinks.py::test_a_derivative_through_a_kink_is_that_of_the_closed_form[two at once]",
+    ),
+    Mutation(
+        "derivatives without kinks",
+        "simulate/run.py",
+        "kinks=places.kinks is not False",
+        "kinks=False",
+        "test_kinks.py::test_a_derivative_through_a_kink_is_that_of_the_closed_form[a jump]",
+    ),
+    Mutation(
+        "a regime that leads to no number ends the run",
+        "simulate/stepper.py",
+        "blunt = carry.blunt | ~fine | (tired",
+        "blunt = carry.blunt | (tired",
+        "test_kinks.py::test_a_derivative_through_a_kink_is_that_of_the_closed_form[of a place where a number ends]",
+    ),
+    Mutation(
+        "a slide that nobody gives up",
+        "simulate/stepper.py",
+        "tired & (search.which < kinks)",
+        "tired & False",
+        "test_kinks.py::test_a_run_that_slides_along_a_kink_is_a_run",
+    ),
+    Mutation(
         "a latch that takes rounding for a maximum",
         "references/peak_slip.py",
         "zero + LEAST, slip",
@@ -41,22 +104,22 @@ MUTATIONS = [
     Mutation(
         "a probe on the other side of the zero",
         "simulate/landing.py",
-        "jnp.where(margin < 0, 1.0, -1.0) * h",
-        "jnp.where(margin < 0, -1.0, 1.0) * h",
+        "jnp.where(sought.end < 0, 1.0, -1.0) * h",
+        "jnp.where(sought.end < 0, -1.0, 1.0) * h",
         "test_gradients.py::test_a_maximum_on_a_knot_of_the_road_has_the_slip_of_the_knot",
     ),
     Mutation(
         "the later of two events in a step",
         "simulate/landing.py",
-        "jnp.argmin(places), old.which",
-        "jnp.argmax(jnp.where(jnp.isinf(places), -1.0, places)), old.which",
+        "jnp.argmin(places).astype",
+        "jnp.argmax(jnp.where(jnp.isinf(places), -1.0, places)).astype",
         "test_blocks.py::test_two_events_in_one_step",
     ),
     Mutation(
         "a chattering relay runs on",
         "simulate/stepper.py",
-        "verdict.fine & (extra <= EXTRA * steps + SPARE)",
-        "verdict.fine",
+        " | (extra > (EXTRA + KINKS) * steps + SPARE))",
+        ")",
         "test_blocks.py::test_what_switches_in_every_step_is_no_run",
     ),
     Mutation(
@@ -188,8 +251,8 @@ MUTATIONS = [
     Mutation(
         "a power with an infinite gradient at 0",
         "core/numerics.py",
-        "jnp.exp(exponent * jnp.log(jnp.where(positive, base, 1.0)))",
-        "jnp.exp(exponent * jnp.log(base))",
+        "jnp.log(jnp.where(fine, square, 1.0))",
+        "jnp.log(square)",
         "test_conformance.py::test_road[RIG]",
     ),
     Mutation(
@@ -286,8 +349,8 @@ MUTATIONS = [
     Mutation(
         "events at the end of the step in which they are noticed",
         "simulate/landing.py",
-        "return search, jnp.where(enough, x + apart, guess), enough",
-        "return search, x, True",
+        "jnp.where(earlier, before, jnp.where(enough, x + apart, guess)), enough & ~earlier",
+        "x, True",
         "test_blocks.py::test_latch_finds_the_vertex",
     ),
     Mutation(
@@ -504,8 +567,8 @@ MUTATIONS = [
     Mutation(
         "a stop on the grid",
         "simulate/stepper.py",
-        "taken = active & fine & (landing | (to_grid & ~jnp.any(jnp.stack(crossed))))",
-        "taken = active & fine & (landing | to_grid)",
+        "| (to_grid & ~changes))",
+        "| to_grid)",
         "test_rollout.py::test_speed_reached_lands_between_samples",
     ),
     Mutation(
@@ -518,8 +581,8 @@ MUTATIONS = [
     Mutation(
         "an event whose moment has no derivative",
         "simulate/landing.py",
-        "place=x, margin=jnp.where(near, margin, 0.0)",
-        "place=x, margin=jnp.where(near, jax.lax.stop_gradient(margin), 0.0)",
+        "margin=jnp.where(near & ~at_once, sought.end, 0.0)",
+        "margin=jnp.where(near & ~at_once, jax.lax.stop_gradient(sought.end), 0.0)",
         "test_gradients.py::test_gradient_through_the_latch_agrees_with_a_wide_difference[0.0-published0]",
     ),
     Mutation(

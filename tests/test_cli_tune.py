@@ -182,8 +182,8 @@ def test_what_is_written_loads_and_simulates_to_what_was_reported(tuned):
         for name in chosen.objectives:
             found = [float(metrics[name]) for metrics in each]
             # the same numbers, batched and differentiated: rounding only, of runs of 150 steps
-            np.testing.assert_allclose(document["metrics"][when]["mean"][name], np.mean(found), rtol=1e-9, atol=1e-12)
-            np.testing.assert_allclose(document["metrics"][when]["worst"][name], max(found), rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(document["metrics"][when]["mean"][name], np.mean(found), rtol=1e-7, atol=1e-12)
+            np.testing.assert_allclose(document["metrics"][when]["worst"][name], max(found), rtol=1e-7, atol=1e-12)
     assert after.tune == before.tune
     loaded = {path: np.asarray(value, float) for path, value in values(after.loop)}
     assert set(document["parameters"]) == set(loaded)

@@ -163,9 +163,11 @@ def flat(name):
     values, unravel = jax.flatten_util.ravel_pytree([get(loop, p) for p in paths])
     names = [f"{p}[{i}]" for p in paths for i in range(np.size(get(loop, p)))]
 
+    solver = dataclasses.replace(SOLVERS[name], kinks=True)  # values as derivatives have them
+
     @jax.jit
     def measured(x):
-        run = d.measure(replace(loop, dict(zip(paths, unravel(x), strict=True))), SOLVERS[name], measures, key=KEY)
+        run = d.measure(replace(loop, dict(zip(paths, unravel(x), strict=True))), solver, measures, key=KEY)
         return jnp.stack([run.metrics[one] for one in measures])
 
     return names, values, measured, list(measures)

@@ -46,7 +46,7 @@ def test_slopes_are_differences_of_runs():
         {**SPACE.variables, "controller.gain.0": Triangular(-13e3, -12e3, -11e3)},
         Correlation(("plant.road.w4", "plant.mass"), [[1.0, 0.6], [0.6, 1.0]]),
     )
-    study = dataclasses.replace(STUDY, space=space)
+    study = dataclasses.replace(STUDY, space=space, solver=dataclasses.replace(STUDY.solver, kinks=True))
     z = np.array([[0.0, 0.0, 0.3], [-2.0, 1.0, -1.0], [1.0, -1.0, 2.0]])
     for metric in ("stop_distance", "max_slip"):
         score, slope = _gradient(study, metric)(z)

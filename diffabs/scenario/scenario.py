@@ -25,7 +25,7 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import Spec, cautions, problems
 from diffabs.core.units import units_of
 from diffabs.core.values import ScenarioError as ScenarioError
-from diffabs.core.values import entry, members, plain, ranged, shown, text, unknown, within, wrong
+from diffabs.core.values import entry, members, plain, ranged, shown, switch, text, unknown, within, wrong
 from diffabs.core.values import read as read_table
 from diffabs.objectives import BRAKING, usual
 from diffabs.scenario import parameter_paths, section_design, section_sweep, section_tune, toml
@@ -240,7 +240,7 @@ def _assembled(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenar
         name=name,
         **texts,
         loop=loop,
-        solver=FixedStep(solver.step, solver.duration, solver.every),
+        solver=FixedStep(solver.step, solver.duration, solver.every, solver.kinks),
         objectives=objectives,
         seed=solver.seed,
         design=section_design.read(table.get("design", {}), loop),
@@ -256,6 +256,7 @@ class _Solver:
     step: float = entry(ranged(TIME), FixedStep.step)
     duration: float = entry(ranged(TIME), FixedStep.duration)
     every: int = entry(within(1, int(MOST_STEPS)), FixedStep.every)
+    kinks: bool | None = entry(switch, FixedStep.kinks)
     seed: int = entry(within(0, 2**32 - 1), 0)
 
 
@@ -271,7 +272,8 @@ def dump(scenario: Scenario) -> str:
     sections = {field.name: plain(getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)}
     if "road" in sections["plant"]:
         sections["road"] = sections["plant"].pop("road")
-    sections["solver"] = {**members(scenario.solver), "seed": scenario.seed}
+    said = {name: value for name, value in members(scenario.solver).items() if value is not None}
+    sections["solver"] = {**said, "seed": scenario.seed}
     sections["objective"] = plain(scenario.objectives)
     sections |= {name: getattr(scenario, name).table() for name in ("design", "tune", "sweep")}
     return toml.document({key: getattr(scenario, key) for key in TEXTS}, sections)
