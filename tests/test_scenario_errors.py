@@ -58,7 +58,7 @@ BAD = [
     ("initial={speed=9.0,speed_kmh=9.0}", "initial.speed is given twice", "m/s", "km/h"),
     ("stop.speed=-1", "stop.speed = -1 is outside (0, inf) m/s"),
     ("solver.stp=1", "solver.stp is not a field of solver", "did you mean step?"),
-    ("solver=rk4", 'solver = "rk4" is text', "a table of step, duration, every, seed"),
+    ("solver=rk4", 'solver = "rk4" is text', "a table of step, duration, every, kinks, seed"),
     ("solver.step=0", "solver.step = 0 is outside (0, inf) s"),
     ("solver.step=nan", "solver.step = nan is outside (0, inf) s"),
     ("solver.duration=inf", "solver.duration = inf is outside (0, inf) s"),
