@@ -17,7 +17,11 @@ from diffabs.core.numerics import quotient, searchsorted
 from diffabs.core.pytree import param, pytree, static
 from diffabs.core.regime import Regime, crossing
 from diffabs.objectives import FinalError
+from diffabs.plants import LabRig
 from diffabs.references import Setpoint
+from diffabs.roads import DRY_ASPHALT
+from diffabs.scenario.defaults import braking
+from diffabs.stops import SpeedReached
 
 KNOTS = np.array([-1.0, 0.0, 0.5, 2.0, 3.0])
 POINTS = (-3.0, -1.0, -0.3, 0.0, 0.2, 0.7, 1.0, 2.5, 9.0)
@@ -225,6 +229,21 @@ def test_a_run_that_slides_along_a_kink_is_a_run():
     run = jax.vmap(slides)(jnp.array([0.2, 0.4]))
     assert not run.diverged.any()
     np.testing.assert_allclose(run.metrics["y"], [0.2, 0.4], atol=0.02)
+
+
+def test_where_a_step_is_too_long_a_regime_is_not_believed():
+    """Below its crawl speed a wheel is stiffer than any step, and a curve of friction beyond its kinks has no bound."""
+    loop = braking(
+        plant=LabRig(road=DRY_ASPHALT),
+        initial=d.BrakeStart(speed=3.0),
+        controller=ConstantTorque(torque=0.8),
+        stop=SpeedReached(speed=1e-9),
+    )
+    run = d.rollout(loop, d.FixedStep(1e-4, 0.4, every=5, kinks=True))
+    energy = np.asarray(jax.vmap(loop.plant.energy)(run.trajectory.state))
+    assert not run.diverged
+    assert energy[-1] < 1e-3 * energy[0]
+    assert np.all(np.diff(energy) <= 1e-6 * energy[0])
 
 
 @pytree
