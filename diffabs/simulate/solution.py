@@ -16,7 +16,7 @@ class FixedStep:
 
     kinks: whether a step ends where a comparison in the flow changes (a limit, the knot of a measured road, a wheel
     that locks) as it does on events. None: where a derivative is asked for. A value is exact to h^2 in such a step
-    without, a derivative only to h; it costs half as much again."""
+    without, a derivative only to h; it costs up to twice as much."""
 
     step: float = 1e-3
     duration: float = 10.0
