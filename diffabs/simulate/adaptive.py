@@ -10,11 +10,10 @@
 The grid of `Adaptive.step` is only where clocks strike and what a trajectory keeps: no step has to end on it."""
 
 import dataclasses
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 
 from diffabs.core.cubic import Cubic
@@ -25,7 +24,7 @@ from diffabs.core.regime import Words
 from diffabs.simulate.checkpoint import anyone, apart
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.dynamics import FREE, Dynamics, Objectives, Tally, dynamics, parted
-from diffabs.simulate.foresight import DERIVATIVES, VALUES, Care, since_first, until_next
+from diffabs.simulate.foresight import DERIVATIVES, VALUES, Care, kinks
 from diffabs.simulate.landing import Search, earliest, falls_through, init_search, land, seek, select
 from diffabs.simulate.outcome import observe
 from diffabs.simulate.rk4 import rk4_pair
@@ -38,7 +37,7 @@ SHRINK, GROW = 0.25, 2.5  # times the last step, at least and at most
 LEAST = 1e-9  # of the duration: the shortest step; or 4 times its rounding
 SHORT = 1.2  # times the present length: a kink so near is reached in two steps
 ROUND = 16  # tries between two looks at what is stable
-SQUARINGS, TINY = 4, 1e-20
+MULTIPLIED, TINY = 12, 1e-20
 STABLE = 2.4  # times the spectral radius: the longest step
 
 
@@ -241,6 +240,10 @@ def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry,
         (packed(verdict.fired), here.middle) if pace.notes else (),
         condition,
     )
+    if until is None:  # of a run that is over, the rest does not matter
+        return new._replace(
+            tries=jnp.where(active, tries, carry.tries), condition=jnp.where(active, condition, carry.condition)
+        )
     return select(active, new, carry)
 
 
@@ -269,13 +272,13 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
     tally = {name: Memory(z[1][name], o.update(tallied[name], segment)) for name, o in system.objectives.items()}
     if loop.changes and not loop.ticks:
         tally = select(anew, point.tally, tally)
-    ahead = until_next(comparisons, carry.natural, pace.care)
+    changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
+    ahead, late = kinks(comparisons, carry.natural, pace.care, changed, h)
     new = Point(end, state, tally, sample, moving, seen[:2], seen.margins, words, ahead)
     scale = jax.tree.map(jnp.maximum, carry.scale, _sizes(state, sample))
     error = _error(loop, state, point.state.with_flow(coarse[0]), scale, sample) / pace.rtol
-    changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
     middle = _middle(system, point, new, h) if pace.notes else ()
-    return Arrival(new, seen.signals, error, scale, since_first(changed, comparisons, h, pace.care), middle)
+    return Arrival(new, seen.signals, error, scale, late, middle)
 
 
 def _middle(system: Dynamics, start: Point, end: Point, h: Any) -> Words:
@@ -312,28 +315,38 @@ def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
 
 
 def longest_stable(loop: Loop, point: Point, scale: Any) -> Any:
-    """Return 2.4/rho [s], rho = |(D^-1 J D)^16|^(1/16) of the Jacobian J of the flow; D are the largest values so far,
-    so that no unit counts."""
-    z, tree = jax.flatten_util.ravel_pytree(point.state.flow())
-    size = jax.flatten_util.ravel_pytree(scale[1])[0]
-    size = jnp.where(size > 0, size, 1.0)
+    """Return 2.4/rho [s], rho about the spectral radius of the flow's Jacobian: how much longer a vector becomes each
+    time that it is multiplied by that, measured in the largest values so far."""
+    flow, tree = jax.tree.flatten(point.state.flow())
+    leaves = [jnp.ravel(x) for x in flow]
+    sizes = [jnp.where(x > 0, x, 1.0) for leaf in jax.tree.leaves(scale[1]) for x in jnp.ravel(leaf)]
+    places = [(i, k) for i, leaf in enumerate(leaves) for k in range(leaf.size)]
 
-    def flow(z: Any) -> Any:
-        state = point.state.with_flow(tree(size * z))
-        return jax.flatten_util.ravel_pytree(loop.flow(point.t, state, loop.signals(point.t, state)))[0] / size
+    def rates(flow: list[Any]) -> list[Any]:
+        state = point.state.with_flow(tree.unflatten(flow))
+        found = loop.flow(point.t, state, loop.signals(point.t, state))
+        return [x for leaf in jax.tree.leaves(found) for x in jnp.ravel(leaf)]
 
-    matrix, log = jax.jacfwd(flow)(z / size), 0.0
-    for i in range(SQUARINGS):
-        norm = jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + TINY
-        matrix, log = matrix / norm, log + jnp.log(norm) / 2**i
-        matrix = jnp.sum(matrix[:, :, None] * matrix[None, :, :], axis=1)
-    norm = jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + TINY
-    return STABLE * jnp.exp(-(log + jnp.log(norm) / 2**SQUARINGS))
+    def column(i: int, k: int) -> list[Any]:
+        one = [jnp.zeros_like(x) for x in leaves]
+        one[i] = one[i].at[k].set(1.0)
+        moves = [jnp.reshape(x, jnp.shape(leaf)) for x, leaf in zip(one, flow, strict=True)]
+        return jax.jvp(rates, (flow,), (moves,))[1]
+
+    matrix = [column(*place) for place in places]
+    vector, log = [jnp.ones_like(x) for x in sizes], 0.0 * point.t
+    for i in range(MULTIPLIED):
+        terms = [[a * b * x for a, b, x in zip(row, sizes, vector, strict=True)] for row in zip(*matrix, strict=True)]
+        vector = [sum(row) / size for row, size in zip(terms, sizes, strict=True)]
+        norm = reduce(jnp.maximum, map(jnp.abs, vector)) + TINY
+        vector = [x / norm for x in vector]
+        log += jnp.log(norm) if i >= MULTIPLIED // 2 else 0.0
+    return STABLE * jnp.exp(-log / (MULTIPLIED - MULTIPLIED // 2))
 
 
 def _point(system: Dynamics, pace: Pace, t: Any, state: LoopState, tally: Tally, length: Any) -> Point:
     seen, moving, _, words, comparisons = system.ahead(t, state, tally)
-    ahead = until_next(comparisons, length, pace.care)
+    ahead, _ = kinks(comparisons, length, pace.care, words, 0.0 * length)
     return Point(t, state, tally, seen.signals.sample, moving, seen[:2], seen.margins, words, ahead)
 
 
@@ -356,8 +369,7 @@ def _sizes(state: LoopState, sample: Sample) -> Any:
 def _judge(carry: Carry, here: Arrival, active: Any, last: Any, pace: Pace) -> Verdict:
     running, landing = carry.condition == Condition.RUNNING, carry.condition == Condition.LANDING
     anew = carry.condition == Condition.REFRESHING
-    leaves = jax.tree.leaves(here.point.state.flow())
-    fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves])) & jnp.isfinite(here.error)
+    fine = jnp.isfinite(here.error)  # the greatest of those of all states
     short = carry.length <= pace.least
     exact = fine & (((here.error <= 1) & (here.late <= 0)) | short)
     crossed = falls_through(*_margins(carry, here))

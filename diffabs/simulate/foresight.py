@@ -35,31 +35,28 @@ class Margin(NamedTuple):
     rate: Any
 
 
-def until_next(margins: Sequence[Margin], length: Any, care: Care) -> Any:
-    """Return in how many seconds the first of the comparisons will change; a great number if none does.
+class Kinks(NamedTuple):
+    """In how many seconds the first of the comparisons will change, a great number if none does; and how many seconds
+    before the end of a step the first of those changed whose answers have, 0 if none did but at its ends."""
 
-    length: of the present step [s]"""
-    least, soonest = care.now * length, jnp.full_like(length, FAR)
-    for one in margins:
-        for value, rate in zip(*(jnp.ravel(jnp.asarray(x)) for x in one[1:]), strict=True):
-            ahead = -value / rate
-            soonest = jnp.minimum(soonest, jnp.where(ahead > least, ahead, FAR))
-    return soonest
+    ahead: Any
+    late: Any
 
 
-def since_first(changed: Words, margins: Sequence[Margin], length: Any, care: Care) -> Any:
-    """Return how many seconds before the end of a step the first of those comparisons changed whose answers have; 0 if
-    none did, but at the ends.
+def kinks(margins: Sequence[Margin], natural: Any, care: Care, changed: Words, length: Any) -> Kinks:
+    """Return what the margins at the end of a step say.
 
-    margins: at the end. length: of the step [s]"""
-    low, high = (1 - care.end) * length, (1 - care.start) * length
-    longest = jnp.zeros_like(length)
+    natural: the length that the error allows [s], of which `care` has fractions
+    changed: bits of the comparisons whose answers are others than at the beginning of the step
+    length: of the step [s]"""
+    least, low, high = care.now * natural, (1 - care.end) * length, (1 - care.start) * length
+    ahead, late = jnp.full_like(length, FAR), jnp.zeros_like(length)
     for one in margins:
         was = bit(changed, one.numbers)
-        for on, value, rate in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, *one[1:])), strict=True):
-            back = value / rate
-            longest = jnp.maximum(longest, jnp.where(on & (back > low) & (back < high), back, 0.0))
-    return longest
+        for on, since in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, one.value / one.rate)), strict=True):
+            ahead = jnp.minimum(ahead, jnp.where(since < -least, -since, FAR))
+            late = jnp.maximum(late, jnp.where(on & (since > low) & (since < high), since, 0.0))
+    return Kinks(ahead, late)
 
 
 def bit(words: Words, numbers: Any) -> Any:

@@ -31,15 +31,17 @@ from diffabs.simulate.stepper import typed
 
 MOST, TICKED = 2048, 2  # tries that can be noted at an error of 1e-5, and for each instant of a grid with clocks
 FAR = 0.5  # of a step: no comparison that changes at its end is so far from changing there
+NEAR = 1e-3  # of the length that the error allows: nor is an event, or a comparison that changes with one
 
 
 class Notes(NamedTuple):
-    """Of every try (tries, ...): whether it led on; the time at its end, and the number of the instant of the grid at
-    which a clock has struck last; a bit for each event at its end; the regime in its middle, and in that of the next
-    that led on."""
+    """Of every try (tries, ...): whether it led on; the time at its end, the length that the error allowed, and the
+    number of the instant of the grid at which a clock has struck last; a bit for each event at its end; the regime in
+    its middle, and in that of the next that led on."""
 
     moved: Any
     t: Any
+    natural: Any
     k: Any
     fired: Any
     words: Words
@@ -82,7 +84,8 @@ def note(loop: Loop, objectives: Objectives, pace: Pace, key: Any, tries: int) -
 
     def entry(old: Carry, new: Carry) -> Notes:
         fired, words = new.note
-        return Notes(new.point.t > old.point.t, new.point.t, new.k, fired, words, words)
+        moved = (new.point.t > old.point.t) | (fired != 0)
+        return Notes(moved, new.point.t, old.natural, new.k, fired, words, words)
 
     def block(at: tuple[Any, Carry, Notes]) -> tuple[Any, Carry, Notes]:
         first, carry, notes = at
@@ -146,7 +149,7 @@ def _step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, place: Place
     end = system.ahead(one.t, state, tally, within)
     changed = tuple(a ^ b for a, b in zip(one.words, one.next, strict=True))
     strikes = (one.k != place.k) & (one.k < pace.steps)
-    shift = _shift(end, changed, one.fired, h, one.k != place.k)
+    shift = _shift(end, changed, one, h, one.k != place.k)
     t = one.t + shift
     z = axpy(shift, end.seen[:2], z)
     state, tally = _whole(loop, place, z)
@@ -172,23 +175,27 @@ def _whole(loop: Loop, place: Place, z: Any) -> tuple[LoopState, Tally]:
     return state, {name: memory._replace(flow=z[1][name]) for name, memory in place.tally.items()}
 
 
-def _shift(end: Ahead, changed: Words, fired: Any, h: Any, strikes: Any) -> Any:
-    """How much later [s] than its noted end a step has come to its event, or to the comparison that changes there; 0
-    where there is none, or a clock decides."""
-    shift, most = jnp.zeros_like(h), FAR * h
-    nearest = most
-    for one in end.comparisons:
-        was = bit(changed, one.numbers)
-        for on, value, rate in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, *one[1:])), strict=True):
-            falls = on & (jnp.abs(value) < jnp.abs(nearest * rate))
-            later = -value / jnp.where(falls, rate, 1.0)
-            shift, nearest = jnp.where(falls, later, shift), jnp.where(falls, jnp.abs(later), nearest)
-    shift = jnp.where(strikes, 0.0, shift)
-    margins, falls = jax.tree.leaves(end.seen.margins), jax.tree.leaves(end.falls)
-    for i, (margin, fall) in reversed(list(enumerate(zip(margins, falls, strict=True)))):
-        happens = ((fired >> i) & 1 != 0) & (jnp.abs(margin) < jnp.abs(most * fall))
-        shift = jnp.where(happens, -margin / jnp.where(happens, fall, 1.0), shift)
+def _shift(end: Ahead, changed: Words, one: Notes, h: Any, strikes: Any) -> Any:
+    """How much later [s] than its noted end a step has come to its event, or to the comparison that changes there, with
+    which an event may come whose margin jumps; 0 where there is none, or a clock decides."""
+    happens = one.fired != 0
+    shift, nearest = jnp.zeros_like(h), jnp.where(happens, NEAR * one.natural, FAR * h)
+    for comparison in end.comparisons:
+        was = bit(changed, comparison.numbers)
+        for on, *line in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, *comparison[1:])), strict=True):
+            close, later = _until(on, *line, nearest)
+            shift, nearest = jnp.where(close, later, shift), jnp.where(close, jnp.abs(later), nearest)
+    shift = jnp.where(strikes & ~happens, 0.0, shift)
+    for i, line in reversed(list(enumerate(zip(*map(jax.tree.leaves, (end.seen.margins, end.falls)), strict=True)))):
+        close, later = _until((one.fired >> i) & 1 != 0, *line, NEAR * one.natural)
+        shift = jnp.where(close, later, shift)
     return shift
+
+
+def _until(on: Any, margin: Any, fall: Any, most: Any) -> tuple[Any, Any]:
+    """Whether a margin is zero within so many seconds, and in how many."""
+    close = on & (jnp.abs(margin) < jnp.abs(jax.lax.stop_gradient(most) * fall))
+    return close, -margin / jnp.where(close, fall, 1.0)
 
 
 def _changed(system: Dynamics, clock: Clock, state: LoopState, margins: Margins, fired: Any) -> LoopState:
