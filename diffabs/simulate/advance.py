@@ -69,14 +69,20 @@ class Try(NamedTuple):
     lands: Any
 
 
-def begin(loop: Loop, objectives: Objectives, clock: Clock, *, kinks: bool = False) -> Point:
-    """Return the point at t = 0, after the first ticks; a block whose margin is negative has its event."""
+def start(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopState, Tally]:
+    """Return state and accumulators at t = 0, after the first ticks; a block whose margin is negative has its event."""
     state = loop.start()
     signals = loop.signals(clock.t, state)
     tally = {name: objective.start(signals.sample) for name, objective in objectives.items()}
     if loop.changes:
         margins = loop.margins(clock.t, state, signals, lambda: loop.flow(clock.t, state, signals))
         state = loop.change(clock, state, signals, margins, jax.tree.map(lambda margin: margin < 0, margins))
+    return state, tally
+
+
+def begin(loop: Loop, objectives: Objectives, clock: Clock, *, kinks: bool = False) -> Point:
+    """Return the point at t = 0."""
+    state, tally = start(loop, objectives, clock)
     system = dynamics(loop, objectives, clock.t, state, tally, kinks=kinks)
     return _leave(system, clock.t, state, tally, Regime(None))
 
