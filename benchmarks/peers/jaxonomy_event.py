@@ -1,5 +1,5 @@
-"""jaxonomy: a LeafSystem whose zero crossings are the stop, which ends the run, the peaks of the slip, whose reset keeps
-the greatest, and the kinks of torque and |error|, where a major step ends; Dopri5, one compiled `advance_to` under vmap."""
+"""jaxonomy: a LeafSystem and its zero crossings under vmap. They are the stop, which ends the run, the peaks of the
+slip, whose reset keeps the greatest, and the kinks of torque and |error|, where a major step ends. Dopri5."""
 
 import jax
 import jax.numpy as jnp

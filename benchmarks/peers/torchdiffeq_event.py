@@ -1,5 +1,5 @@
-"""torchdiffeq: dopri5 by `odeint_event`, one lane at a time, because the event and the step are those of the whole state.
-The slip is seen again around its peak by a second `odeint`."""
+"""torchdiffeq: dopri5 by `odeint_event`, one lane at a time: the event and the step are those of the whole state. The
+slip is seen again around its peak by a second `odeint`."""
 
 import numpy as np
 import torch
