@@ -14,6 +14,7 @@ from diffabs.simulate.batch import run_batch as run_batch
 from diffabs.simulate.refusals import check as check
 from diffabs.simulate.run import measure as measure
 from diffabs.simulate.run import rollout as rollout
+from diffabs.simulate.solution import Adaptive as Adaptive
 from diffabs.simulate.solution import FixedStep as FixedStep
 from diffabs.simulate.solution import Run as Run
 

@@ -16,7 +16,7 @@ from diffabs.scenario.defaults import braking
 from diffabs.simulate.outcome import judge, prepare
 from diffabs.simulate.run import _run, arguments
 from diffabs.simulate.stable_step import stable_step
-from diffabs.simulate.stepper import init_carry, room, step
+from diffabs.simulate.stepper import room
 from diffabs.stops import SpeedReached, Standstill
 
 RIG = braking(
@@ -144,23 +144,25 @@ def test_new_values_do_not_compile_again():
     assert _run._cache_size() == before
 
 
+@pytest.mark.parametrize("like", [d.FixedStep(1e-3), d.Adaptive()], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize("duration", [0.02, 0.3, 3.0])
-def test_another_duration_is_the_same_program_and_the_same_steps(duration):
-    """Against the steps one after the other, without any driver."""
-    solver = d.FixedStep(1e-3, duration)
-    d.measure(RIG, d.FixedStep(1e-3, 0.5), BRAKING)
+def test_another_duration_is_the_same_program_and_the_same_steps(duration, like):
+    """Against the steps one after the other, without any driver but what renews the longest stable step."""
+    solver = dataclasses.replace(like, duration=duration)
+    d.measure(RIG, dataclasses.replace(like, duration=0.5), BRAKING)
     before = _run._cache_size()
     run = d.measure(RIG, solver, BRAKING)
     assert _run._cache_size() == before
-    loop, objectives, h = arguments(RIG, solver, BRAKING)
+    loop, objectives, method = arguments(RIG, solver, BRAKING)
 
     @jax.jit
     def plainly(loop, objectives):
         loop, audit = prepare(loop)
         objectives = objectives | audit
-        carry = init_carry(loop, objectives, h, None)
+        carry = method.start(loop, objectives, None)
+        tries = room(loop, solver.steps)
         over = jax.lax.fori_loop(
-            0, room(loop, solver.steps), lambda _, carry: step(loop, objectives, h, None, solver.steps, carry), carry
+            0, tries, lambda _, carry: method.step(loop, objectives, None, method.renew(loop, carry)), carry
         )
         return judge(loop, objectives, over)[0]
 

@@ -8,8 +8,9 @@ import jax
 import numpy as np
 
 from diffabs.core.values import ScenarioError
-from diffabs.scenario.scenario import MOST_STEPS, Scenario
+from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.accuracy import accuracy, needs_key, reasons
+from diffabs.simulate.refusals import MOST_STEPS
 from diffabs.simulate.run import measure
 
 SMALL = 1e-6  # of a value: below, nobody asks for its order

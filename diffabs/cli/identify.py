@@ -19,7 +19,7 @@ from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import Readings, read
 from diffabs.scenario.parameter_paths import flat
 from diffabs.scenario.scenario import Scenario, dump
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Solver
 
 if TYPE_CHECKING:
     from diffabs.identify.fit import Identified
@@ -183,7 +183,7 @@ def _identified(
     return dataclasses.replace(found, evaluations=evaluations), noise
 
 
-def _solver(solver: FixedStep, readings: Readings) -> FixedStep:
+def _solver(solver: Solver, readings: Readings) -> Solver:
     """As long as the data, with as many instants as memory allows."""
     steps = math.ceil(float(readings.t[-1]) / solver.step) + SPARE
     if steps * solver.step >= solver.duration:

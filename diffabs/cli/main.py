@@ -23,7 +23,7 @@ from diffabs.core.units import units_of
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import Scenario, dump, header, names
 from diffabs.simulate.run import measure, rollout
-from diffabs.simulate.solution import Run
+from diffabs.simulate.solution import Run, described
 
 if TYPE_CHECKING:
     from diffabs.papers import Reproduction
@@ -190,7 +190,7 @@ def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -
         "title": chosen.title,
         "parts": _parts(chosen),
         "parameters": _parameters(chosen),
-        "solver": {"step": chosen.solver.step, "duration": chosen.solver.duration, "seed": chosen.seed},
+        "solver": {**described(chosen.solver), "seed": chosen.seed},
         "versions": provenance.versions(),
         "files": {name: str(path) for name, path in files.items() if path},
     }

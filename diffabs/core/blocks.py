@@ -1,7 +1,7 @@
 """Blocks in series, for sensors and actuators, and the block that does nothing."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, part, pytree
+from diffabs.core.timing import steps
 
 
 @pytree
@@ -95,6 +96,14 @@ def offers(block: Any, *hooks: str) -> bool:
     """Whether a block has one of these hooks, by default a tick or margins; a block made of blocks says it itself."""
     asked = getattr(block, "offers", None)
     return any(asked(hook) if asked else hasattr(block, hook) for hook in hooks or ("tick", "margins"))
+
+
+def next_tick(block: Any, k: Any, h: Scalar) -> Any:
+    """Return the number of the first instant after the k-th of a grid of step h [s] at which a block ticks, that of a
+    block made of blocks at which one does."""
+    ticking = [one for one in getattr(block, "blocks", (block,)) if offers(one, "tick")]
+    lengths = [steps(one.period, h) if hasattr(one, "period") else 1 for one in ticking]
+    return reduce(jnp.minimum, ((k // n + 1) * n for n in lengths))
 
 
 def _joined(memories: Sequence[Memory]) -> Memory:

@@ -60,7 +60,7 @@ class Cubic(NamedTuple):
         x = clamp(still.start / jnp.where(spread == 0, 1.0, spread), 0.0, 1.0)
         for _ in range(NEWTON):
             x = clamp(x - _quotient(still(x), still.slope(x)), 0.0, 1.0)
-        return x - _quotient(self(x), still.slope(x))
+        return clamp(x - _quotient(self(x), still.slope(x)), 0.0, 1.0)
 
     def greatest(self) -> Any:
         """The greatest value of p in [0, 1]. The derivative is that of p at the place of the extremum."""

@@ -9,13 +9,13 @@ A `Loop` is one pytree: every parameter of every part is a leaf with a dotted pa
 """
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, reduce
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.blocks import Direct, NoFeedforward, offers
+from diffabs.core.blocks import Direct, NoFeedforward, next_tick, offers
 from diffabs.core.protocols import Block, Clock, Feedforward, Memory, Plant, Reference, Sample, Stop, Tracking
 from diffabs.core.pytree import Scalar, part, pytree
 
@@ -107,6 +107,11 @@ class Loop:
     def ticks(self) -> bool:
         """Whether a block has ticks."""
         return any(offers(getattr(self, name), "tick") for name in BLOCKS)
+
+    def next_tick(self, k: Any, h: Scalar) -> Any:
+        """The number of the first instant after the k-th of a grid of step h [s] at which a block ticks."""
+        blocks = (getattr(self, name) for name in BLOCKS)
+        return reduce(jnp.minimum, (next_tick(block, k, h) for block in blocks if offers(block, "tick")))
 
     @property
     def eventful(self) -> bool:

@@ -25,7 +25,8 @@ class Regime(NamedTuple):
 
 class Answers(NamedTuple):
     """The answers that were taken; those that the numbers contradict, by more than rounding, and that did not give way;
-    the margins until they do, negative then, each with the numbers of its bits."""
+    the margins until they do, negative then, each with the numbers of its bits. Of answers as the numbers say it, the
+    margins are x - y, with either sign."""
 
     words: Words
     crossed: Words
@@ -84,6 +85,7 @@ class Asked:
 
         if self.regime.words is None:
             self._pack(self.said, first, says())
+            self._add(first, shape, x - y)
             return says()
         taken = bits(self.regime.words, first, shape)
         if not self.look:
@@ -91,7 +93,7 @@ class Asked:
         margin = jnp.where(taken, x - y, y - x)
         against = margin < -_rounding(x)
         self._pack(self.against, first, against)
-        self.margins.append((first + np.arange(np.prod(shape)).reshape(shape) if shape else first, margin))
+        self._add(first, shape, margin)
         if self.regime.loose is not None:
             taken ^= against & bits(self.regime.loose, first, shape)
         return taken
@@ -102,15 +104,15 @@ class Asked:
         first = self.places[number][0]
         word, shift, all = first // WORD, np.uint32(first % WORD), np.uint32((1 << count) - 1)
         if self.regime.words is None:
-            self.said[word] |= _ones(says()) << shift
-            return says()
+            below = says()
+            self.said[word] |= _ones(below) << shift
+            self._between(first, below, knots, x)
+            return below
         field = (self.regime.words[word] >> shift) & all
         below = jax.lax.population_count(field).astype(np.int32)
         if not self.look:
             return below if self.regime.free is None else jnp.where(self.regime.free, says(), below)
-        low = jnp.where(below > 0, x - knots[jnp.maximum(below - 1, 0)], jnp.inf)
-        high = jnp.where(below < count, knots[jnp.minimum(below, count - 1)] - x, jnp.inf)
-        self.margins += [(first + below - 1, low), (first + below, high)]
+        low, high = self._between(first, below, knots, x)
         next = below + jnp.where(high < -_rounding(x), 1, 0) - jnp.where(low < -_rounding(x), 1, 0)
         if self.regime.free is not None:
             next = jnp.where(self.regime.free, says(), next)
@@ -118,6 +120,17 @@ class Asked:
         self.against[word] |= against << shift
         loose = np.uint32(0) if self.regime.loose is None else self.regime.loose[word] >> shift
         return jax.lax.population_count(field ^ (against & loose)).astype(np.int32)
+
+    def _add(self, first: int, shape: tuple[int, ...], margin: Any) -> None:
+        self.margins.append((first + np.arange(np.prod(shape)).reshape(shape) if shape else first, margin))
+
+    def _between(self, first: int, below: Any, knots: Any, x: Any) -> tuple[Any, Any]:
+        """How far x is from the knots on either side of it."""
+        count = len(knots)
+        low = jnp.where(below > 0, x - knots[jnp.maximum(below - 1, 0)], jnp.inf)
+        high = jnp.where(below < count, knots[jnp.minimum(below, count - 1)] - x, jnp.inf)
+        self.margins += [(first + below - 1, low), (first + below, high)]
+        return low, high
 
     def _pack(self, words: list[Any], first: int, answer: Any) -> None:
         if not jnp.ndim(answer):
@@ -131,7 +144,7 @@ class Asked:
         """What was found."""
         against = self.against
         if self.regime.words is None:
-            return Answers(tuple(self.said), tuple(against), [])
+            return Answers(tuple(self.said), tuple(against), self.margins)
         loose = self.regime.loose or (np.uint32(0),) * len(against)
         taken = (was ^ (now & give) for was, now, give in zip(self.regime.words, against, loose, strict=True))
         return Answers(tuple(taken), tuple(now & ~give for now, give in zip(against, loose, strict=True)), self.margins)

@@ -25,7 +25,7 @@ from diffabs.controllers.balance import state_of
 from diffabs.core.loop import Loop
 from diffabs.design.capture import capture
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Solver
 
 FEWEST = 256  # lanes that a core is given on its own
 FINEST, POINTS = 1e-4, 33  # of a search for the greatest multiple: relative width of its last interval; runs at once
@@ -109,7 +109,7 @@ class _Ellipsoids(NamedTuple):
 
 
 def outcomes(
-    loop: Loop, starts: Mapping[str, Any], solver: FixedStep, *, band: float | None = None, key: Any = None
+    loop: Loop, starts: Mapping[str, Any], solver: Solver, *, band: float | None = None, key: Any = None
 ) -> Outcomes:
     """Of lanes that differ in the values (lanes,) at these paths: what becomes of each within the solver's duration.
 
@@ -126,7 +126,7 @@ def outcomes(
 
 
 def _outcomes(
-    loop: Loop, starts: dict[str, np.ndarray], solver: FixedStep, inside: "_Ellipsoids", early: bool, key: Any
+    loop: Loop, starts: dict[str, np.ndarray], solver: Solver, inside: "_Ellipsoids", early: bool, key: Any
 ) -> Outcomes:
     """early: a run that comes inside ends there."""
     count = len(inside.system)
@@ -156,7 +156,7 @@ def attraction(
     loop: Loop,
     first: Cells,
     second: Cells,
-    solver: FixedStep,
+    solver: Solver,
     *,
     paths: tuple[str, str] = ("initial.theta", "initial.phi"),
     band: float | None = None,
@@ -174,7 +174,7 @@ def largest(
     rows: Mapping[str, Any],
     direction: Mapping[str, float],
     multiples: np.ndarray,
-    solver: FixedStep,
+    solver: Solver,
 ) -> list[Reach]:
     """For each of the values (rows,) at these paths the greatest of the rising `multiples` of `direction` (values by
     path of the initial state) up to which all are recovered, 0 if none is. One batch."""
@@ -191,7 +191,7 @@ def largest(
 def recoverable(
     loop: Loop,
     direction: Mapping[str, float],
-    solver: FixedStep,
+    solver: Solver,
     *,
     most: float = 1.0,
     band: float | None = None,

@@ -7,7 +7,7 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.identify.residuals import Residuals
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Solver
 
 
 class Comparison(NamedTuple):
@@ -22,7 +22,7 @@ class Comparison(NamedTuple):
 class Data(Protocol):
     """`Traces`, `Table`."""
 
-    def against(self, loop: Loop, free: Sequence[str], solver: FixedStep) -> Comparison:
+    def against(self, loop: Loop, free: Sequence[str], solver: Solver) -> Comparison:
         """Set up the comparison. Raises ValueError for data that do not fit the loop, the solver or each other."""
         ...
 

@@ -18,7 +18,7 @@ from diffabs.identify.data import Comparison, Data
 from diffabs.identify.fit import Identified, Tolerances, fit
 from diffabs.identify.residuals import Prior
 from diffabs.simulate.refusals import refusals
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Solver
 from diffabs.simulate.stable_step import stable_steps
 
 
@@ -27,7 +27,7 @@ def identify(
     data: Data,
     free: Sequence[str] | Mapping[str, Range | None],
     *,
-    solver: FixedStep,
+    solver: Solver,
     absolute: bool = True,
     prior: Prior | None = None,
     starts: Sequence[Mapping[str, Any]] = (),
@@ -68,7 +68,7 @@ def identify(
     )
 
 
-def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], against: Comparison, solver: FixedStep) -> None:
+def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], against: Comparison, solver: Solver) -> None:
     """Raises ValueError for a start from which a run must not be run, with the longest step that may."""
     for start in starts:
         if why := _refused(first := replace(loop, dict(start)), against, solver):
@@ -76,7 +76,7 @@ def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], against: Comp
             raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
 
 
-def _refused(loop: Any, against: Comparison, solver: FixedStep) -> str | None:
+def _refused(loop: Any, against: Comparison, solver: Solver) -> str | None:
     """Why the first run that must not be run must not."""
     asked = (refusals(None, jax.device_get(strong(batch)), solver) for batch in against.loops(loop))
     return next((next(filter(None, found.texts)) for found in asked if found.number), None)

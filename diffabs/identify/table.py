@@ -15,7 +15,7 @@ from diffabs.identify.data import Comparison, check_positive
 from diffabs.objectives import BRAKING
 from diffabs.simulate.batch import Batch, by_structure, stacked
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Solver
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Table:
         """(row, metric) of each residual."""
         return [(row, metric) for row, line in self.values.items() for metric in line]
 
-    def against(self, loop: Loop, free: Sequence[str], solver: FixedStep) -> Comparison:
+    def against(self, loop: Loop, free: Sequence[str], solver: Solver) -> Comparison:
         """Compare with the metrics of every row's loop."""
         self._check(loop, free)
         loops = [self.loops[row] for row in self.values]
@@ -86,7 +86,7 @@ class Table:
 class _Measured:
     """Metrics of rows of loops minus data. Equal ones are compiled once."""
 
-    solver: FixedStep
+    solver: Solver
     shared: tuple[str, ...]
     objectives: tuple[tuple[str, Objective], ...]
 

@@ -16,7 +16,7 @@ from diffabs.identify.data import Comparison, check_positive
 from diffabs.identify.fit import Identified
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.run import rollout
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Solver
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Traces:
         """Runs and instants."""
         return Batch(self.over).size, np.size(self.t)
 
-    def against(self, loop: Loop, free: Sequence[str], solver: FixedStep) -> Comparison:
+    def against(self, loop: Loop, free: Sequence[str], solver: Solver) -> Comparison:
         """Compare with runs of the loop."""
         self._check(loop, free, solver)
         kept = np.flatnonzero(self._kept())
@@ -76,7 +76,7 @@ class Traces:
         kept = np.asarray(self.t, float) <= np.broadcast_to(until, self.shape[:1])[:, None]
         return np.tile(kept.ravel(), len(self.columns))
 
-    def _check(self, loop: Loop, free: Sequence[str], solver: FixedStep) -> None:
+    def _check(self, loop: Loop, free: Sequence[str], solver: Solver) -> None:
         Batch(self.over).check(loop)
         if both := set(free) & set(self.over):
             raise ValueError(f"{', '.join(sorted(both))}: both free and given for each run (over)")
@@ -117,7 +117,7 @@ def _shown(loop: Loop) -> tuple[str, ...]:
 class _Simulated:
     """Traces of a loop minus data. Equal ones are compiled once."""
 
-    solver: FixedStep
+    solver: Solver
     fields: tuple[str, ...]
 
     def __call__(self, loop: Any, over: Any, t: Any, kept: Any, target: Any) -> Any:

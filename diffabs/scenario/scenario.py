@@ -1,7 +1,8 @@
 """A scenario: a TOML file, or the name of a packaged one, that says what is run.
 
     [plant] [road] [initial] [sensor] [reference] [feedforward] [controller] [actuator] [stop]    a part each: `type`
-    [solver]       step [s], duration [s], every (trajectories keep every so many steps), seed (of noisy sensors)
+    [solver]       type (fixed, adaptive), step [s], duration [s], every (trajectories keep every so many steps), rtol
+                   (of adaptive steps), kinks (of fixed ones), seed (of noisy sensors)
     [objective]    name = a part; adds to, or changes, those of every report on such a plant
     [design]       what a robust gain is asked for, and over which ranges: see `robust`
     [tune]         which parameters are free, what is made small, and over which runs: see `goal`
@@ -22,23 +23,21 @@ import jax
 from diffabs.core import files
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import Spec, cautions, problems
+from diffabs.core.pytree import cautions, problems
 from diffabs.core.units import units_of
 from diffabs.core.values import ScenarioError as ScenarioError
-from diffabs.core.values import entry, members, plain, ranged, shown, switch, text, unknown, within, wrong
-from diffabs.core.values import read as read_table
+from diffabs.core.values import plain, shown, text, unknown, wrong
 from diffabs.objectives import BRAKING, usual
-from diffabs.scenario import parameter_paths, section_design, section_sweep, section_tune, toml
+from diffabs.scenario import parameter_paths, section_design, section_solver, section_sweep, section_tune, toml
 from diffabs.scenario.compatibility import misfits
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.registry import OTHERS, build, joined, loop_of
-from diffabs.simulate.refusals import MOST_STEPS, together, unstable
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.refusals import together, unstable
+from diffabs.simulate.solution import FixedStep, Solver
 
 LARGEST_FILE = 1_000_000  # bytes
 LONGEST_PATH = 4096  # characters of it in a message
 TEXTS = ("title", "description")
-TIME = Spec("s", low=0.0, open_low=True)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Scenario:
     title: str = ""
     description: str = ""
     loop: Loop = dataclasses.field(default_factory=braking)
-    solver: FixedStep = dataclasses.field(default_factory=FixedStep)
+    solver: Solver = dataclasses.field(default_factory=FixedStep)
     objectives: Mapping[str, Objective] = dataclasses.field(default_factory=lambda: dict(BRAKING))
     seed: int = 0
     design: section_design.Task = dataclasses.field(default_factory=section_design.Task)
@@ -224,7 +223,7 @@ def _assembled(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenar
         plant = sections.get("plant", {})
         plant = {"type": plant} if isinstance(plant, str) else plant
         sections["plant"] = {**plant, "road": table["road"]} if isinstance(plant, dict) else plant
-    solver: _Solver = read_table(_Solver, table.get("solver", {}), "solver")
+    solver, seed = section_solver.read(table.get("solver", {}))
     given = table.get("objective", {})
     if not isinstance(given, dict):
         raise wrong("objective", given, "a table of objectives")
@@ -240,24 +239,13 @@ def _assembled(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenar
         name=name,
         **texts,
         loop=loop,
-        solver=FixedStep(solver.step, solver.duration, solver.every, solver.kinks),
+        solver=solver,
         objectives=objectives,
-        seed=solver.seed,
+        seed=seed,
         design=section_design.read(table.get("design", {}), loop),
         tune=section_tune.read(table.get("tune", {}), loop, objectives),
         sweep=section_sweep.read(table.get("sweep", {}), loop, objectives, folder),
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class _Solver:
-    """The section [solver]: the fields of a solver, and the seed of the noise."""
-
-    step: float = entry(ranged(TIME), FixedStep.step)
-    duration: float = entry(ranged(TIME), FixedStep.duration)
-    every: int = entry(within(1, int(MOST_STEPS)), FixedStep.every)
-    kinks: bool | None = entry(switch, FixedStep.kinks)
-    seed: int = entry(within(0, 2**32 - 1), 0)
 
 
 def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
@@ -272,8 +260,7 @@ def dump(scenario: Scenario) -> str:
     sections = {field.name: plain(getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)}
     if "road" in sections["plant"]:
         sections["road"] = sections["plant"].pop("road")
-    said = {name: value for name, value in members(scenario.solver).items() if value is not None}
-    sections["solver"] = {**said, "seed": scenario.seed}
+    sections["solver"] = section_solver.table(scenario.solver, scenario.seed)
     sections["objective"] = plain(scenario.objectives)
     sections |= {name: getattr(scenario, name).table() for name in ("design", "tune", "sweep")}
     return toml.document({key: getattr(scenario, key) for key in TEXTS}, sections)

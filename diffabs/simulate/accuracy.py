@@ -11,7 +11,6 @@ sampled controller computes, by the period; a delay's ring is made longer (`refi
 found by drawing it at both steps; a block that works once in every step (`every_step`) is another block with another
 step. Then there is nothing to compare, and every number is NaN."""
 
-import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -23,7 +22,7 @@ from diffabs.core.loop import BLOCKS, Loop
 from diffabs.core.protocols import Clock, Memory, Objective
 from diffabs.core.pytree import refined
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import FixedStep, Run
+from diffabs.simulate.solution import Run, Solver, finer
 
 SLOW = 0.75  # q of an order of 0.4
 ROUNDING = 1e3  # times the precision of a number: differences that are none
@@ -56,7 +55,7 @@ class Accuracy(NamedTuple):
     alike: Any
 
 
-def accuracy(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], *, key: Any = None) -> Accuracy:
+def accuracy(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Any = None) -> Accuracy:
     """Estimate the errors of what `measure` returns for the same arguments, at the price of seven such runs.
 
     Pure; batch it with `jax.vmap`. Every period must be on the grid of `solver.step`. Raises what `measure` raises.
@@ -69,12 +68,10 @@ def accuracy(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective],
 
 
 def measure_finer(
-    loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], times: int, *, key: Any = None
+    loop: Loop, solver: Solver, objectives: Mapping[str, Objective], times: int, *, key: Any = None
 ) -> Run:
     """What `measure` returns with steps that are `times` shorter, over the same whole steps."""
-    step = solver.step / times
-    finer = dataclasses.replace(solver, step=step, duration=solver.steps * times * step)
-    return measure(refined(loop, times), finer, objectives, key=key)
+    return measure(refined(loop, times), finer(solver, times), objectives, key=key)
 
 
 def alike(*runs: Run) -> Any:
@@ -89,13 +86,13 @@ def share(difference: Any, value: Any) -> Any:
     return jnp.where(size == 0, 0.0, size / jnp.where(of > 0, of, 1.0) + jnp.where(of > 0, 0.0, jnp.inf))
 
 
-def comparable(loop: Loop, solver: FixedStep, key: Any = None) -> Any:
+def comparable(loop: Loop, solver: Solver, key: Any = None) -> Any:
     """Whether a shorter step leaves the loop what it is: its noise, and what it computes."""
     steady = not any(True for _ in paced(loop))
     return steady & (same_noise(loop, solver, 2, key) & same_noise(loop, solver, 4, key))
 
 
-def reasons(loop: Loop, solver: FixedStep, key: Any = None) -> list[str]:
+def reasons(loop: Loop, solver: Solver, key: Any = None) -> list[str]:
     """Why runs with other steps cannot be compared, a line each; none if they can. Not for traced loops."""
     lines = [f"{name} computes once in every step: with another step it is another {name}" for name in paced(loop)]
     if not (same_noise(loop, solver, 2, key) and same_noise(loop, solver, 4, key)):
@@ -121,7 +118,7 @@ def needs_key(loop: Loop) -> bool:
     return False
 
 
-def same_noise(loop: Loop, solver: FixedStep, times: int, key: Any) -> Any:
+def same_noise(loop: Loop, solver: Solver, times: int, key: Any) -> Any:
     """Whether the sensor shows the same at the common instants with steps that are `times` shorter, of a signal that
     does not move. Noise is all that can differ then."""
     if key is None:

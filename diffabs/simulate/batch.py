@@ -15,7 +15,7 @@ from diffabs.core.pytree import arrayed, get, parameters, replace
 from diffabs.simulate.refill import Enough, run_refilled
 from diffabs.simulate.refusals import first_line, refusals
 from diffabs.simulate.run import arguments, measure, rollout
-from diffabs.simulate.solution import FixedStep, Run
+from diffabs.simulate.solution import Run, Solver
 
 LONGER = 2.0  # lanes that run together differ by less than this factor in length
 
@@ -47,7 +47,7 @@ class Batch:
             raise ValueError(f"the lanes' values have different lengths, or none: {listed}")
         return next(iter(lengths.values()), 1)
 
-    def check(self, loop: Any, solver: FixedStep | None = None) -> "Batch":
+    def check(self, loop: Any, solver: Solver | None = None) -> "Batch":
         """Return the batch if its lanes fit the loop. Raises ValueError for a path that does not exist, columns of
         different lengths, a value out of range, and, with a solver, a lane that must not be run: see `refusals`."""
         specs, _ = {path: spec for path, spec, _ in parameters(loop)}, self.size
@@ -97,7 +97,7 @@ class Batch:
 def run_batch(
     loop: Loop,
     batch: Batch,
-    solver: FixedStep,
+    solver: Solver,
     objectives: Mapping[str, Objective] | None = None,
     *,
     trajectories: bool = False,
@@ -149,7 +149,7 @@ def run_batch(
     return run_refilled(loop, batch.values, batch._keys(), solver, objectives, accepted, enough)
 
 
-def _together(loop: Loop, batch: Batch, solver: FixedStep, objectives: Mapping[str, Objective], run: Any) -> Run:
+def _together(loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], run: Any) -> Run:
     """In groups of similar length, but trajectories have all the same instants."""
 
     def found(lanes: Any, duration: float) -> Run:

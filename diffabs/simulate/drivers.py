@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.simulate.checkpoint import anyone, forgetful, repeated
-from diffabs.simulate.stepper import Carry
 
+Carry = Any  # of whatever chooses the steps; it says whether it is `running`
 Step = Callable[..., Carry]  # of a carry, and of the instant to which it goes, `until`, where it is not the end
-BLOCK = 32  # steps between two questions whether anything still runs
+BLOCK = 16  # steps between two questions whether anything still runs
 
 
 def slots(count: int) -> int:
@@ -25,30 +25,39 @@ def slots(count: int) -> int:
     return -(-count // unit) * unit
 
 
-def until(step: Step, carry: Carry) -> Carry:
-    """Return the carry (one run, or a batch under `jax.vmap`) of a run that is over. Not for reverse mode."""
+def until(step: Step, renew: Step, carry: Carry) -> Carry:
+    """Return the carry (one run, or a batch under `jax.vmap`) of a run that is over; `renew` is called once for a block
+    of steps. Not for reverse mode."""
 
     def block(carry: Carry) -> Carry:
-        return jax.lax.scan(lambda carry, _: (step(carry), None), carry, length=BLOCK)[0]
+        return jax.lax.scan(lambda carry, _: (step(carry), None), renew(carry), length=BLOCK)[0]
 
     return jax.lax.while_loop(lambda carry: anyone(carry.running), block, carry)
 
 
 def watch(
-    step: Step, look: Callable[[Carry], Any], carry: Carry, every: Any, count: Any, room: int
+    step: Step,
+    renew: Step,
+    before: Callable[[Carry, Any], Any],
+    look: Callable[[Carry, Any], Any],
+    carry: Carry,
+    every: Any,
+    count: Any,
+    room: int,
 ) -> tuple[Carry, Any]:
     """Return the carry after `count` times `every` steps of the grid, and what was seen after each `every`-th, with a
-    leading axis of `room`, at least `count`: what is beyond is zero. Not for reverse mode."""
-    seen = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(look, carry))
+    leading axis of `room`, at least `count`: what is beyond is zero. `before` says whether a run goes on, and has not
+    come to an instant. Not for reverse mode."""
+    seen = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), jax.eval_shape(look, carry, count))
 
     def segment(i: Any, at: tuple[Carry, Any]) -> tuple[Carry, Any]:
         until = (i + 1) * every
 
         def some(carry: Carry) -> Carry:
-            return step(carry, until=until)
+            return step(renew(carry), until=until)
 
-        carry = jax.lax.while_loop(lambda carry: anyone(carry.running & (carry.k < until)), some, at[0])
-        return carry, jax.tree.map(lambda all, x: all.at[i].set(x), at[1], look(carry))
+        carry = jax.lax.while_loop(lambda carry: anyone(before(carry, until)), some, at[0])
+        return carry, jax.tree.map(lambda all, x: all.at[i].set(x), at[1], look(carry, until))
 
     return jax.lax.fori_loop(0, count, segment, (carry, seen))
 
@@ -59,7 +68,14 @@ def scan(step: Step, carry: Carry, room: int) -> Carry:
 
 
 def scan_and_watch(
-    step: Step, look: Callable[[Carry], Any], carry: Carry, every: int, count: Any, instants: int, room: int
+    step: Step,
+    before: Callable[[Carry, Any], Any],
+    look: Callable[[Carry, Any], Any],
+    carry: Carry,
+    every: int,
+    count: Any,
+    instants: int,
+    room: int,
 ) -> tuple[Carry, Any]:
     """Return what `watch` does, `instants` for its room; each segment has room for so many tries. For derivatives."""
 
@@ -67,13 +83,13 @@ def scan_and_watch(
         until = (i + 1) * every
 
         def on(carry: Carry) -> Any:
-            return _on(carry.running & (carry.k < until))
+            return _on(before(carry, until))
 
         def some(carry: Carry) -> Carry:
             return repeated(lambda carry: step(carry, until=until), carry, room, on)
 
         carry = jax.lax.cond(i < count, some, lambda carry: carry, carry)
-        return carry, look(carry)
+        return carry, look(carry, until)
 
     return jax.lax.scan(forgetful(segment), carry, jnp.arange(instants))
 

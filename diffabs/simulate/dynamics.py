@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from diffabs.core.kinks import Program
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.protocols import Memory, Objective, Sample
-from diffabs.core.regime import Answers, Regime
+from diffabs.core.regime import Answers, Regime, Words
+from diffabs.simulate.foresight import Margin
 
 Objectives = dict[str, Objective]
 Tally = dict[str, Memory]
@@ -59,6 +60,22 @@ class Dynamics(NamedTuple):
         if self.program is None:
             return _seen(moving, fixed), Answers((), (), [])
         return self.program.look(lambda seen: seen, moving, fixed, regime)
+
+    def ahead(self, t: Any, state: LoopState, tally: Tally) -> tuple[Seen, Sample, Words, list[Margin]]:
+        """Everything at an instant, as the numbers say it: what is seen, the rates of the sample, and the answers to
+        the comparisons, with their margins and the rates of these."""
+        z, held = parted(state, tally)
+        assert self.program is not None
+        fixed = (held, self.loop, self.objectives)
+        now = self.program.look(lambda seen: seen, (t, *z), fixed, Regime(None))[0]
+
+        def moves(t: Any, z: Any) -> Any:
+            one, answers = self.program.look(lambda seen: seen, (t, *z), fixed, Regime(None))
+            return (one.signals.sample, [value for _, value in answers.margins]), answers
+
+        (_, values), (sample, rates), answers = jax.jvp(moves, (t, z), (jnp.ones_like(t), now[:2]), has_aux=True)
+        numbers = [number for number, _ in answers.margins]
+        return now, sample, answers.words, [Margin(*one) for one in zip(numbers, values, rates, strict=True)]
 
     def moving(self, of: Callable[[Sample], Any], end: tuple[Any, LoopState, Tally, Any], regime: Regime) -> Any:
         """d(of(sample))/dt within a regime, at a time, state and tally where d(state.flow())/dt is the last one."""

@@ -8,11 +8,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from diffabs.core.loop import Loop
+from diffabs.core.loop import Loop, LoopState
 from diffabs.core.protocols import Ending, Objective
 from diffabs.core.pytree import prepared
+from diffabs.simulate.condition import Condition
 from diffabs.simulate.solution import Run, Trajectory
-from diffabs.simulate.stepper import Carry, Condition
 
 ROUNDING = 1e-9  # of a metric beyond its physical range
 AUDIT = ""  # the name of a plant's audit among the objectives; no metric is called so
@@ -25,9 +25,10 @@ def prepare(loop: Loop) -> tuple[Loop, dict[str, Objective]]:
     return loop, {AUDIT: audit(loop.initial)} if audit else {}
 
 
-def judge(loop: Loop, objectives: dict[str, Objective], carry: Carry) -> tuple[Run, Trajectory]:
-    """The result of a run that is over, and its last instant. `objectives` with the plant's audit."""
-    last = observe(loop, carry)
+def judge(loop: Loop, objectives: dict[str, Objective], carry: Any) -> tuple[Run, Trajectory]:
+    """The result of a run that is over, and its last instant; of the carry of whatever chose its steps. `objectives`
+    with the plant's audit."""
+    last = observe(loop, carry.point.t, carry.point.state, carry.running)
     ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample, carry.stopped))
     metrics = {name: o.value(carry.point.tally[name], ending) for name, o in objectives.items()}
     wrong = [_impossible(name, objectives[name], value) for name, value in metrics.items()]
@@ -37,11 +38,10 @@ def judge(loop: Loop, objectives: dict[str, Objective], carry: Carry) -> tuple[R
     return Run(metrics, carry.stopped & ~diverged, diverged, timed_out, ending, None), last
 
 
-def observe(loop: Loop, carry: Carry) -> Trajectory:
-    """Return what is seen of the loop at the present instant."""
-    point = carry.point
-    signals = loop.signals(point.t, point.state)
-    return Trajectory(signals.sample, signals.measured, point.state.plant, carry.running)
+def observe(loop: Loop, t: Any, state: LoopState, running: Any) -> Trajectory:
+    """Return what is seen of the loop at an instant."""
+    signals = loop.signals(t, state)
+    return Trajectory(signals.sample, signals.measured, state.plant, running)
 
 
 def _impossible(name: str, objective: Objective, value: Any) -> Any:

@@ -14,10 +14,11 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import replace, strong
 from diffabs.core.tracing import separated
+from diffabs.simulate.condition import Condition
+from diffabs.simulate.drivers import BLOCK, Carry
 from diffabs.simulate.outcome import judge, prepare
 from diffabs.simulate.run import arguments
-from diffabs.simulate.solution import FixedStep, Run
-from diffabs.simulate.stepper import Carry, Condition, init_carry, step
+from diffabs.simulate.solution import Run, Solver
 
 WIDTH = 1024  # lanes whose state stays in a processor's cache
 ROUND = 64  # steps
@@ -35,7 +36,7 @@ def run_refilled(
     loop: Loop,
     values: Mapping[str, Any],
     keys: Any,
-    solver: FixedStep,
+    solver: Solver,
     objectives: Mapping[str, Objective],
     accepted: Any,
     enough: Enough | None = None,
@@ -44,20 +45,9 @@ def run_refilled(
     their keys (lanes,) or None; `batch.run_batch` says what the arguments mean. Not for reverse mode.
 
     Raises ValueError for what `measure` objects to."""
-    loop, objectives, h = arguments(loop, solver, objectives)
-    values = strong(jax.tree.map(lambda x: jnp.asarray(x, h.dtype), dict(values)))
-    return _run(
-        loop,
-        values,
-        objectives,
-        h,
-        keys,
-        accepted,
-        enough,
-        jnp.asarray(solver.steps),
-        width=WIDTH,
-        kinks=bool(solver.kinks),
-    )
+    loop, objectives, method = arguments(loop, solver, objectives)
+    values = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
+    return _run(loop, values, objectives, method, keys, accepted, enough, width=WIDTH)
 
 
 class _Belt(NamedTuple):
@@ -72,19 +62,17 @@ class _Belt(NamedTuple):
     ended: Run
 
 
-@partial(jax.jit, static_argnames=("width", "kinks"))
+@partial(jax.jit, static_argnames="width")
 def _run(
     loop: Loop,
     values: dict[str, Any],
     objectives: dict[str, Objective],
-    h: Any,
+    method: Any,
     keys: Any,
     accepted: Any,
     enough: Enough | None,
-    steps: Any,
     *,
     width: int,
-    kinks: bool,
 ) -> Run:
     count = len(accepted)
     leaves, whole = separated(lambda v: prepare(replace(loop, v)), values)
@@ -93,8 +81,9 @@ def _run(
         one, audit = whole(mine)
         return one, objectives | audit
 
-    step_all = jax.vmap(lambda mine, key, carry: step(*built(mine), h, key, steps, carry, kinks=kinks))
-    start = jax.vmap(lambda mine, key: init_carry(*built(mine), h, key, kinks=kinks))
+    step_all = jax.vmap(lambda mine, key, carry: method.step(*built(mine), key, carry))
+    renew_all = jax.vmap(lambda mine, carry: method.renew(built(mine)[0], carry))
+    start = jax.vmap(lambda mine, key: method.start(*built(mine), key))
     over = jax.vmap(lambda mine, carry: judge(*built(mine), carry)[0])
 
     def taken(number: Any) -> tuple[Any, Any, Carry]:
@@ -108,7 +97,10 @@ def _run(
         def some(carry: Carry, _: Any) -> tuple[Carry, None]:
             return step_all(belt.leaves, belt.keys, carry), None
 
-        belt = belt._replace(carry=jax.lax.scan(some, belt.carry, length=ROUND)[0])
+        def rounds(carry: Any, _: Any) -> tuple[Any, None]:
+            return jax.lax.scan(some, renew_all(belt.leaves, carry), length=BLOCK)[0], None
+
+        belt = belt._replace(carry=jax.lax.scan(rounds, belt.carry, length=ROUND // BLOCK)[0])
         free = ~belt.carry.running | _seen_enough(enough, built, belt)
         return _exchanged(belt, free, over, taken, count)
 

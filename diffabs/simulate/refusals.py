@@ -20,7 +20,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.pytree import broken, grid_rules, replace, rules, strong
 from diffabs.core.pytree import check as check_parts
 from diffabs.core.rules import Rule
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Adaptive, Solver
 from diffabs.simulate.stable_step import stable, stable_step
 
 MOST_STEPS = 1e8
@@ -49,7 +49,7 @@ class Refusals(NamedTuple):
         return int(np.count_nonzero(self.codes))
 
 
-def check(part: T, solver: FixedStep | None = None) -> T:
+def check(part: T, solver: Solver | None = None) -> T:
     """The part itself if its parameters are in their ranges; with a solver, if this loop may be run with it, too.
 
     Raises:
@@ -64,7 +64,7 @@ def check(part: T, solver: FixedStep | None = None) -> T:
     return part
 
 
-def together(loop: Loop, solver: FixedStep) -> Iterator[str]:
+def together(loop: Loop, solver: Solver) -> Iterator[str]:
     """What does not go together: start and stop, parts and step; a line each."""
     begun = _begun(loop)
     if not begun.holds:
@@ -73,7 +73,7 @@ def together(loop: Loop, solver: FixedStep) -> Iterator[str]:
     yield from ill(solver) or broken(grid_rules(loop, solver.step))
 
 
-def ill(solver: FixedStep) -> list[str]:
+def ill(solver: Solver) -> list[str]:
     """What is wrong with the solver itself, whatever it integrates."""
     step, duration = solver.step, solver.duration
     if step > duration:
@@ -84,8 +84,10 @@ def ill(solver: FixedStep) -> list[str]:
     return []
 
 
-def unstable(loop: Loop, solver: FixedStep) -> Iterator[str]:
-    """A line for a step that is too long for the loop."""
+def unstable(loop: Loop, solver: Solver) -> Iterator[str]:
+    """A line for a step that is too long for the loop; `Adaptive` finds its steps by itself."""
+    if isinstance(solver, Adaptive):
+        return
     largest, end = stable_step(loop), getattr(loop.stop, "speed", None)
     where = "" if end is None else f", between the initial speed and {end:g} m/s,"
     if solver.step > largest:
@@ -97,7 +99,7 @@ def unstable(loop: Loop, solver: FixedStep) -> Iterator[str]:
         )
 
 
-def refusals(loop: Loop | None, values: Any, solver: FixedStep) -> Refusals:
+def refusals(loop: Loop | None, values: Any, solver: Solver) -> Refusals:
     """The lanes of a loop that differ in the values (lanes,) at these paths: what `check` says of each, in one compiled
     call for all. Without a loop (None) `values` is a batch of loops, whose leaves have a leading axis.
 
@@ -108,7 +110,7 @@ def refusals(loop: Loop | None, values: Any, solver: FixedStep) -> Refusals:
     loop, values = jax.tree.map(lambda x: np.asarray(x, float), (loop, values))
     with jax.enable_x64(True):
         codes = np.array(_codes(loop, values, step=solver.step))
-    if not codes.all():
+    if not codes.all() and not isinstance(solver, Adaptive):
         fine = np.flatnonzero(codes == 0)
         asked = values if len(fine) == len(codes) else jax.tree.map(lambda x: x[np.resize(fine, len(codes))], values)
         codes[fine[~stable(loop, asked, solver.step)[: len(fine)]]] = -1
@@ -127,7 +129,7 @@ def _named(loop: Loop | None, values: Any, step: float, codes: np.ndarray) -> Re
     return Refusals(numbers, ("", *(named[code] for code in there)))
 
 
-def first_line(loop: Loop, values: Mapping[str, Any], solver: FixedStep) -> str | None:
+def first_line(loop: Loop, values: Mapping[str, Any], solver: Solver) -> str | None:
     """The first refused lane and why, in a line with its numbers; None if all lanes are accepted. Without values the
     loop is the lane."""
     if not values:

@@ -17,17 +17,17 @@ from diffabs.core.compiling import SAME, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, misshapen, strong
+from diffabs.simulate.adaptive import Pace
 from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
-from diffabs.simulate.outcome import judge, observe, prepare
-from diffabs.simulate.solution import FixedStep, Run, Trajectory
-from diffabs.simulate.stepper import Carry, init_carry, room, step
+from diffabs.simulate.outcome import judge, prepare
+from diffabs.simulate.solution import Adaptive, Run, Solver, Trajectory
+from diffabs.simulate.stepper import Grid
 
+ROUNDING = 32  # times the precision of a number: the least error that is asked of a step
 MOST_STEPS = 2**31 - 8  # that a counter in 32 bits holds, landing included
 
 
-def rollout(
-    loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective] | None = None, *, key: Any = None
-) -> Run:
+def rollout(loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | None = None, *, key: Any = None) -> Run:
     """Run a loop and return its trajectory and what is measured.
 
     loop: every part and parameter; differentiable in each leaf, and batched by `jax.vmap` over any
@@ -48,7 +48,7 @@ def rollout(
     return _call(loop, solver, objectives or {}, key, solver.every)
 
 
-def measure(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], *, key: Any = None) -> Run:
+def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Any = None) -> Run:
     """Run a loop and return only what is measured: memory does not grow with the number of steps.
 
     loop, solver, objectives, key: as in `rollout`, whose ValueErrors it raises
@@ -62,24 +62,24 @@ def measure(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], 
     return _call(loop, solver, objectives, key, 0)
 
 
-def _call(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
-    loop, objectives, h = arguments(loop, solver, objectives)
+def _call(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
+    loop, objectives, method = arguments(loop, solver, objectives)
     steps, every = solver.steps, int(every)
     count = -(-steps // every) if every else 0
-    tries = room(loop, min(every, steps) if every else slots(steps), kinks=solver.kinks is not False)
-    places = Places(tries, slots(count) if every else 0, every, solver.kinks)
-    run = _simulated(places, (loop, objectives, h, key), jnp.asarray(steps))
+    tries = method.room(loop, min(every, steps) if every else slots(steps))
+    method = method.watched() if every else method
+    places = Places(tries, slots(count) if every else 0, every)
+    run = _simulated(places, (loop, objectives, method, key))
     return run._replace(trajectory=_shortened(run.trajectory, count + 1)) if every else run
 
 
 class Places(NamedTuple):
     """What is known when a program is compiled: places for so many tries (between two instants of a trajectory, if
-    there is one), and for so many instants, one in every so many steps; whether kinks are located."""
+    there is one), and for so many instants, one in every so many steps."""
 
     tries: int
     instants: int
     every: int
-    kinks: bool | None
 
 
 @partial(jax.jit, static_argnums=1)
@@ -87,19 +87,25 @@ def _shortened(trajectory: Any, count: int) -> Any:
     return jax.tree.map(lambda x: x[:count], trajectory)
 
 
-def arguments(loop: Loop, solver: FixedStep, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
-    """Loop, objectives and step, of one data type. Raises ValueError."""
+def arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
+    """Loop, objectives, and what chooses the steps, of one data type. Raises ValueError."""
     lines = [*_wrong_solver(solver), *misshapen(loop)]
     lines += [line for name, part in objectives.items() for line in misshapen(part, f"objectives.{name}.")]
     if lines:
         raise ValueError("; ".join(lines))
     loop, objectives = strong((arrayed(loop), {name: arrayed(part) for name, part in objectives.items()}))
-    return loop, objectives, jnp.asarray(solver.step, jax.tree.leaves(loop)[0].dtype)
+    dtype = jax.tree.leaves(loop)[0].dtype
+    h, steps = jnp.asarray(solver.step, dtype), jnp.asarray(solver.steps)
+    if isinstance(solver, Adaptive):
+        rounding = ROUNDING * jnp.finfo(dtype).eps
+        return loop, objectives, Pace(h, steps, jnp.maximum(jnp.asarray(solver.rtol, dtype), rounding))
+    return loop, objectives, Grid(h, steps, solver.kinks)
 
 
-def _wrong_solver(solver: FixedStep) -> Iterator[str]:
+def _wrong_solver(solver: Solver) -> Iterator[str]:
     """One line for each field that no run can have."""
-    lines = [f"solver.{name} {line}" for name in ("step", "duration", "every") if (line := _wrong_number(solver, name))]
+    names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
+    lines = [f"solver.{name} {line}" for name in names if (line := _wrong_number(solver, name))]
     if lines:
         yield from lines
     elif solver.step > solver.duration:
@@ -108,7 +114,7 @@ def _wrong_solver(solver: FixedStep) -> Iterator[str]:
         yield f"solver.step = {solver.step} s takes more than {MOST_STEPS} steps of {solver.duration} s"
 
 
-def _wrong_number(solver: FixedStep, name: str) -> str:
+def _wrong_number(solver: Solver, name: str) -> str:
     value = getattr(solver, name)
     if line := kinds.objection(value) or (kinds.shape(value) and f"has shape {kinds.shape(value)}"):
         return f"= {kinds.shown(value)} {line}; a number is needed"
@@ -118,11 +124,9 @@ def _wrong_number(solver: FixedStep, name: str) -> str:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _simulated(places: Places, run: Any, steps: Any) -> Run:
-    """The run of (loop, objectives, h, key)."""
-    loop, objectives, h, key = run
-    every = jnp.asarray(places.every)
-    return _run(loop, objectives, h, key, steps, every, places=places.instants, kinks=bool(places.kinks))
+def _simulated(places: Places, run: Any) -> Run:
+    """The run of (loop, objectives, method, key)."""
+    return _run(*run, jnp.asarray(places.every), places=places.instants)
 
 
 def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
@@ -133,8 +137,8 @@ def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
 
     def run(moving: list[Any]) -> Run:
         left = iter(moving)
-        run, steps = tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)])
-        return _reversible(*run, steps, places=places)
+        (run,) = tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)])
+        return _reversible(*run, places=places)
 
     moving, rates = ([x for x, on in zip(xs, live, strict=True) if on] for xs in (values, moves))
     return jax.jvp(run, (moving,), (rates,))
@@ -143,46 +147,38 @@ def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
 _simulated.defjvp(_rule, symbolic_zeros=True)
 
 
-@compile_once(static=("places", "kinks"), options=SAME)
-def _run(
-    loop: Loop,
-    objectives: dict[str, Objective],
-    h: Any,
-    key: Any,
-    steps: Any,
-    every: Any,
-    *,
-    places: int,
-    kinks: bool = False,
-) -> Run:
+@compile_once(static=("places",), options=SAME)
+def _run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, every: Any, *, places: int) -> Run:
     """For values: `places` for a trajectory, 0 without."""
-    loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps, kinks=kinks)
+    loop, objectives, stepped = _prepared(loop, objectives, method, key)
+    carry = method.start(loop, objectives, key)
     if not places:
-        return judge(loop, objectives, until(stepped, carry))[0]
-    first, count = observe(loop, carry), -(-steps // every)
-    carry, seen = watch(stepped, partial(observe, loop), carry, every, count, places)
+        return judge(loop, objectives, until(stepped, partial(method.renew, loop), carry))[0]
+    first, count = method.seen(loop, carry, 0), -(-method.steps // every)
+    seen = partial(method.seen, loop)
+    carry, seen = watch(stepped, partial(method.renew, loop), method.before, seen, carry, every, count, places)
     return _with_trajectory(judge(loop, objectives, carry), first, seen)
 
 
 @partial(jax.jit, static_argnames="places")
-def _reversible(loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, *, places: Places) -> Run:
+def _reversible(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, *, places: Places) -> Run:
     """For derivatives."""
-    loop, objectives, carry, stepped = _begun(loop, objectives, h, key, steps, kinks=places.kinks is not False)
-    tries, instants, every, _ = places
+    method = method.located()
+    loop, objectives, stepped = _prepared(loop, objectives, method, key)
+    carry, (tries, instants, every) = method.start(loop, objectives, key), places
     if not every:
         return judge(loop, objectives, scan(stepped, carry, tries))[0]
-    first, count = observe(loop, carry), -(-steps // every)
-    carry, seen = scan_and_watch(stepped, partial(observe, loop), carry, every, count, instants, tries)
+    first, count = method.seen(loop, carry, 0), -(-method.steps // every)
+    carry, seen = scan_and_watch(
+        stepped, method.before, partial(method.seen, loop), carry, every, count, instants, tries
+    )
     return _with_trajectory(judge(loop, objectives, carry), first, seen)
 
 
-def _begun(
-    loop: Loop, objectives: dict[str, Objective], h: Any, key: Any, steps: Any, *, kinks: bool
-) -> tuple[Loop, Any, Carry, Any]:
+def _prepared(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any) -> tuple[Loop, Any, Any]:
     loop, audit = prepare(loop)
     objectives = objectives | audit
-    carry = init_carry(loop, objectives, h, key, kinks=kinks)
-    return loop, objectives, carry, partial(step, loop, objectives, h, key, steps, kinks=kinks)
+    return loop, objectives, partial(method.step, loop, objectives, key)
 
 
 def _with_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: Any) -> Run:

@@ -29,6 +29,48 @@ class FixedStep:
         return math.ceil(self.duration / self.step * (1 - 1e-12))
 
 
+@dataclasses.dataclass(frozen=True)
+class Adaptive:
+    """Steps as long as their error allows, up to `duration` [s]; they end where a comparison in the flow changes (a
+    limit, the knot of a measured road, a wheel that locks), on events, and where a clock strikes. Runge-Kutta's method
+    of fourth order, whose reference fixed steps remain.
+
+    rtol: the error of a step, as a fraction of the greatest value so far of each state and of the first signal that the
+        plant shows. What a run measures is off by some ten times as much: at 1e-5 by less than 1e-4
+    step: of a grid [s] on which clocks strike, delays remember, and of which a trajectory keeps every `every`-th
+        instant, by interpolation. No step of the integration has to end there"""
+
+    rtol: float = 1e-5
+    duration: float = 10.0
+    step: float = 1e-3
+    every: int = 1
+
+    @property
+    def steps(self) -> int:
+        """How many instants the grid has after the first."""
+        return math.ceil(self.duration / self.step * (1 - 1e-12))
+
+
+Solver = FixedStep | Adaptive
+TYPES: dict[str, type[Any]] = {"fixed": FixedStep, "adaptive": Adaptive}  # by their names in a scenario
+ORDER = 3  # of the error of an adaptive step, in its length
+
+
+def finer(solver: Solver, times: int) -> Solver:
+    """Return the solver whose steps, and those of its grid, are so many times shorter, over the same whole ones."""
+    step = solver.step / times
+    shorter = dataclasses.replace(solver, step=step, duration=solver.steps * times * step)
+    if isinstance(shorter, Adaptive):
+        return dataclasses.replace(shorter, rtol=shorter.rtol / times**ORDER)
+    return shorter
+
+
+def described(solver: Solver) -> dict[str, Any]:
+    """Return what decides a run's results, for a file."""
+    said = {"step": solver.step, "duration": solver.duration}
+    return said | ({"type": "adaptive", "rtol": solver.rtol} if isinstance(solver, Adaptive) else {})
+
+
 class Trajectory(NamedTuple):
     """What was seen, with a leading time axis. After the end of a run its last sample is repeated."""
 

@@ -13,7 +13,7 @@ Where a comparison does not let itself be landed on, or its regime leads out of 
 grid is one blunt step, in which comparisons say at each stage what the numbers say: right to the order of the kink. So
 are the steps after it, until in one of them no comparison changes."""
 
-import enum
+import dataclasses
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from diffabs.core.loop import Loop, Margins
 from diffabs.core.protocols import Clock
 from diffabs.simulate.advance import Arrival, Point, Try, arrive, begin, depart
 from diffabs.simulate.checkpoint import anyone, apart
+from diffabs.simulate.condition import Condition
 from diffabs.simulate.dynamics import Objectives, dynamics
 from diffabs.simulate.landing import (
     BEYOND,
@@ -38,19 +39,14 @@ from diffabs.simulate.landing import (
     seek,
     select,
 )
+from diffabs.simulate.outcome import observe
+from diffabs.simulate.solution import Trajectory
 
 EXTRA, SPARE = 4, 64  # tries beyond a step of the grid for each of them, about an event; and besides
 KINKS = 1  # tries for each step of the grid, up to now, that comparisons may take; then steps are blunt
 MOST = 32  # tries within one step of the grid, likewise
 FASTER, PART = 4, 1e-3  # times the rates at both ends of a step, and part of the state: the most that it may change
 MISSED = 0.1  # of the change of the stop's margin in the step: the most that may be left of it
-
-
-class Condition(enum.IntEnum):
-    """How a run is: it goes on along the grid, or looks for an event, or for how its margin falls, or is to land on
-    it, or to look around after it; or it is over."""
-
-    RUNNING, SEEKING, PROBING, LANDING, REFRESHING, STOPPED, TIMED_OUT, DIVERGED = range(8)
 
 
 class Carry(NamedTuple):
@@ -76,6 +72,51 @@ class Carry(NamedTuple):
         return self.condition == Condition.STOPPED
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["kinks"])
+@dataclasses.dataclass(frozen=True)
+class Grid:
+    """The steps of a `FixedStep`: their length [s], how many there are, and whether comparisons are located; None for
+    derivatives only."""
+
+    h: Any
+    steps: Any
+    kinks: bool | None = None
+
+    def watched(self) -> "Grid":
+        """Return the method for a run that is seen on its way."""
+        return self
+
+    def located(self) -> "Grid":
+        """Return the method for derivatives."""
+        return dataclasses.replace(self, kinks=self.kinks is not False)
+
+    def room(self, loop: Loop, steps: int) -> int:
+        """Return how many tries so many steps of the grid may take."""
+        return room(loop, steps, kinks=self.kinks is not False)
+
+    def start(self, loop: Loop, objectives: Objectives, key: Any) -> Carry:
+        """Return the carry at t = 0."""
+        return init_carry(loop, objectives, self.h, key, kinks=bool(self.kinks))
+
+    def step(self, loop: Loop, objectives: Objectives, key: Any, carry: Carry, until: Any = None) -> Carry:
+        """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
+        return step(loop, objectives, self.h, key, self.steps, carry, until, kinks=bool(self.kinks))
+
+    def renew(self, loop: Loop, carry: Carry) -> Carry:
+        """Return the carry: nothing has to be looked at but in the steps."""
+        del loop
+        return carry
+
+    def seen(self, loop: Loop, carry: Carry, instant: Any) -> Trajectory:
+        """Return what is seen at this instant of the grid, to which the run has come."""
+        del instant
+        return observe(loop, carry.point.t, carry.point.state, carry.running)
+
+    def before(self, carry: Carry, instant: Any) -> Any:
+        """Return whether the run goes on, and has not come to this instant."""
+        return carry.running & (carry.k < instant)
+
+
 class Verdict(NamedTuple):
     """What is made of a try: whether its numbers are finite, whether it is taken, whether it then ends on the grid;
     which events happen at its end, and whether the run is over there."""
@@ -97,7 +138,7 @@ def init_carry(loop: Loop, objectives: Objectives, h: Any, key: Any, *, kinks: b
     zero = jnp.asarray(0)
     point = begin(loop, objectives, Clock(0.0 * h, h, zero, key), kinks=kinks)
     condition = jnp.where(point.margins["stop"][0] > 0, zero + Condition.RUNNING, zero + Condition.DIVERGED)
-    return _typed(Carry(point, zero, h, init_search(h), zero, zero, jnp.asarray(False), condition), h.dtype)
+    return typed(Carry(point, zero, h, init_search(h), zero, zero, jnp.asarray(False), condition), h.dtype)
 
 
 def step(
@@ -224,7 +265,7 @@ def _last(here: Arrival, point: Point) -> Point:
     return point._replace(state=here.state, tally=here.tally, sample=here.signals.sample)
 
 
-def _typed(tree: Any, dtype: Any) -> Any:
+def typed(tree: Any, dtype: Any) -> Any:
     """Strong types throughout: a scan refuses a carry whose type weakens or strengthens."""
 
     def typed(x: Any) -> Any:

@@ -18,7 +18,7 @@ from diffabs.core.pytree import elements, get, problems, replace
 from diffabs.core.values import plain, unknown
 from diffabs.objectives import usual
 from diffabs.simulate.refusals import ill
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Solver, described
 from diffabs.sweep.discrete import Categorical
 from diffabs.sweep.variables import Space
 
@@ -43,7 +43,7 @@ class Study:
     loop: Loop
     space: Space
     samples: int
-    solver: FixedStep
+    solver: Solver
     objectives: Mapping[str, Objective] = dataclasses.field(default_factory=dict)
     seed: int = 0
     chunk: int = 4096
@@ -108,7 +108,7 @@ class Study:
             json.dumps(
                 {
                     **own,
-                    "solver": {"step": self.solver.step, "duration": self.solver.duration},
+                    "solver": described(self.solver),
                     "space": self.space.table(),
                     "loop": plain(self.loop),
                     "parts": plain(self.parts),

@@ -23,7 +23,7 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.refusals import first_line, refusals
-from diffabs.simulate.solution import FixedStep, Run
+from diffabs.simulate.solution import Run, Solver
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.risk import Aggregate
 
@@ -74,7 +74,7 @@ class Problem:
 
     subject: Any
     space: Space
-    solver: FixedStep
+    solver: Solver
     measured: Mapping[str, Objective]
     weights: Mapping[str, float]
     batch: Batch

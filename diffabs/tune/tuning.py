@@ -10,7 +10,7 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import check
 from diffabs.objectives import usual
 from diffabs.simulate.batch import Batch
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Solver
 from diffabs.tune.augmented_lagrangian import Search
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.problem import Mode, Problem, automatic, built
@@ -24,7 +24,7 @@ def tune(
     free: Sequence[str] | Mapping[str, Range | None],
     objective: Mapping[str, float],
     over: Batch | None = None,
-    solver: FixedStep,
+    solver: Solver,
     measured: Mapping[str, Objective] | None = None,
     aggregate: Aggregate | None = None,
     constraints: Sequence[Constraint] = (),
@@ -81,7 +81,7 @@ def posed(
     free: Sequence[str] | Mapping[str, Range | None],
     objective: Mapping[str, float],
     over: Batch | None = None,
-    solver: FixedStep,
+    solver: Solver,
     measured: Mapping[str, Objective] | None = None,
     aggregate: Aggregate | None = None,
     constraints: Sequence[Constraint] = (),

@@ -25,7 +25,7 @@ from diffabs.core.reason import Reason
 from diffabs.objectives import usual
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.refusals import first_line
-from diffabs.simulate.solution import FixedStep, Run
+from diffabs.simulate.solution import Run, Solver
 from diffabs.tune.descent import Descent, Lane, Stopping, lbfgs
 from diffabs.tune.problem import Mode, Multipliers, Problem, automatic
 from diffabs.tune.risk import Mean
@@ -101,7 +101,7 @@ def worst_case(
     *,
     over: Mapping[str, Range],
     metric: str,
-    solver: FixedStep,
+    solver: Solver,
     measured: Mapping[str, Objective] | None = None,
     bound: float | None = None,
     screen: int = 64,
@@ -147,7 +147,7 @@ def worst_case(
     return _found(loop, free, metric, bound, points, len(corners), screened, lanes, len(points) + each * gradients)
 
 
-def _screened(loop: Any, lanes: Batch, solver: FixedStep, measured: Mapping[str, Objective]) -> Run:
+def _screened(loop: Any, lanes: Batch, solver: Solver, measured: Mapping[str, Objective]) -> Run:
     """Run every point. Raises ValueError for one that cannot be run."""
     if line := first_line(loop, lanes.values, solver):
         raise ValueError(f"the box has points that cannot be run; {line}")

@@ -1,0 +1,410 @@
+"""Steps as long as an error allows, of one lane each: how a run under `Adaptive` goes on.
+
+    length     0.85 r^(-5/16) times the last, r = |error|/rtol: the error is that of the embedded second-order
+               solution, which goes as h^3; at most 2.4/rho, rho the spectral radius of the loop's Jacobian
+    kinks      a step ends where a comparison in the flow is predicted to change (`foresight`); one within which
+               another did is tried again, up to there
+    events     a step within which a margin falls through zero is tried again until one ends on it (`landing`)
+    clocks     a step ends where a block's clock strikes
+
+The grid of `Adaptive.step` is only where clocks strike and what a trajectory keeps: no step has to end on it."""
+
+import dataclasses
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+
+from diffabs.core.cubic import Cubic
+from diffabs.core.loop import Loop, LoopState, Margins, Signals
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import Clock, Memory, Sample, Segment
+from diffabs.core.regime import Regime, Words
+from diffabs.simulate.checkpoint import anyone, apart
+from diffabs.simulate.condition import Condition
+from diffabs.simulate.dynamics import Dynamics, Objectives, Tally, dynamics, parted
+from diffabs.simulate.foresight import since_first, until_next
+from diffabs.simulate.landing import Search, earliest, falls_through, init_search, land, seek, select
+from diffabs.simulate.outcome import observe
+from diffabs.simulate.rk4 import rk4_pair
+from diffabs.simulate.solution import Trajectory
+from diffabs.simulate.stepper import MISSED, typed
+
+REGIME = Regime(None)
+FIRST = 1e-4  # s, the first step
+SAFETY, LITTLE = 0.85, 1e-6
+SHRINK, GROW = 0.25, 2.5  # times the last step, at least and at most
+LEAST = 1e-9  # of the duration: the shortest step; or 4 times its rounding
+KINK = 4e-3  # of the present length: the shortest step that ends on a comparison
+SHORT = 1.2  # times the present length: a kink so near is reached in two steps
+ROUND = 16  # tries between two looks at what is stable
+SQUARINGS, TINY = 4, 1e-20
+STABLE = 2.4  # times the spectral radius: the longest step
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps"])
+@dataclasses.dataclass(frozen=True)
+class Pace:
+    """The steps of `Adaptive`: step of the grid [s], the number of its last instant, and the error of a step; whether
+    what is between two instants of a run is to be seen."""
+
+    h: Any
+    steps: Any
+    rtol: Any
+    keeps: bool = False
+
+    @property
+    def least(self) -> Any:
+        """The shortest step [s]."""
+        return self.h * self.steps * jnp.maximum(LEAST, 4 * jnp.finfo(self.h.dtype).eps)
+
+    def start(self, loop: Loop, objectives: Objectives, key: Any) -> "Carry":
+        """Return the carry at t = 0."""
+        return init_carry(loop, objectives, self, key)
+
+    def step(self, loop: Loop, objectives: Objectives, key: Any, carry: "Carry", until: Any = None) -> "Carry":
+        """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
+        return step(loop, objectives, self, key, carry, until)
+
+    def renew(self, loop: Loop, carry: "Carry") -> "Carry":
+        """Return the carry with the longest stable step, if that was not looked at for ROUND tries."""
+        due = carry.running & (carry.tries - carry.renewed >= ROUND)
+        limit = jax.lax.cond(anyone(due), lambda: longest_stable(loop, carry.point, carry.scale), lambda: carry.limit)
+        return carry._replace(limit=limit, renewed=jnp.where(due, carry.tries, carry.renewed))
+
+    def before(self, carry: "Carry", instant: Any) -> Any:
+        """Return whether the run goes on, and has not come to this instant."""
+        return carry.running & (carry.point.t < instant * self.h)
+
+    def seen(self, loop: Loop, carry: "Carry", instant: Any) -> Trajectory:
+        """Return what is seen at this instant of the grid, which lies within the last step."""
+        t, state = between(carry, instant * self.h)
+        return observe(loop, t, state, carry.running | (t < carry.point.t))
+
+    def watched(self) -> "Pace":
+        """Return the method for a run that is seen on its way."""
+        return dataclasses.replace(self, keeps=True)
+
+    def located(self) -> "Pace":
+        """Return the method for derivatives."""
+        raise NotImplementedError
+
+    def room(self, loop: Loop, steps: int) -> int:
+        """Return how many tries so many steps of the grid may take."""
+        return 0
+
+
+class Point(NamedTuple):
+    """A run at an instant, after what changes there: the loop's state and the objectives' accumulators, what is seen,
+    the rates of this, the rates of what is integrated, the margins of the stop and of the blocks' events, the answers
+    to the comparisons, and in how many seconds the first of them will change."""
+
+    t: Any
+    state: LoopState
+    tally: Tally
+    sample: Sample
+    moving: Sample
+    rate: tuple[Any, Any]
+    margins: Margins
+    words: Words
+    ahead: Any
+
+
+class Arrival(NamedTuple):
+    """The end of a try, before what changes there: the point, its signals, the error as a multiple of what is allowed,
+    the largest values of the states so far, and for how many seconds a comparison has been another one."""
+
+    point: Point
+    signals: Signals
+    error: Any
+    scale: Any
+    late: Any
+
+
+class Carry(NamedTuple):
+    """A run on its way."""
+
+    point: Point
+    k: Any  # number of the last instant of the grid at which a clock struck
+    natural: Any  # the length that the error allows [s]
+    length: Any  # of the step to try [s]
+    ends: Any  # whether that ends where a clock strikes, or with the run
+    limit: Any  # the longest stable step [s]
+    scale: Any  # the largest values of the states so far
+    base: Any  # length of the try that an event was first seen in [s]
+    search: Search
+    tries: Any
+    renewed: Any  # how many of these there were when the longest stable step was last looked at
+    past: Any  # the last point but one that the run came to: time, state, rates; () where nobody asks
+    condition: Any
+
+    @property
+    def running(self) -> Any:
+        """Whether another step is to be made or tried."""
+        return self.condition <= Condition.REFRESHING
+
+    @property
+    def stopped(self) -> Any:
+        """Whether the stop was reached."""
+        return self.condition == Condition.STOPPED
+
+
+class Verdict(NamedTuple):
+    """What is made of a try: whether its numbers are finite; whether it is taken; whether an event was seen in it, and
+    is to be looked for; which events happen at its end, and whether the run is over there."""
+
+    fine: Any
+    taken: Any
+    seeks: Any
+    fired: Margins
+    over: Any
+
+
+def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carry:
+    """Return the carry at t = 0."""
+    zero, none = jnp.asarray(0), 0.0 * pace.h
+    state = loop.start()
+    signals = loop.signals(none, state)
+    tally = {name: objective.start(signals.sample) for name, objective in objectives.items()}
+    if loop.changes:
+        margins = loop.margins(none, state, signals, lambda: loop.flow(none, state, signals))
+        fired = jax.tree.map(lambda margin: margin < 0, margins)
+        state = loop.change(Clock(none, pace.h, zero, key), state, signals, margins, fired)
+    natural = jnp.minimum(FIRST, pace.h * pace.steps) + none
+    point = _point(dynamics(loop, objectives, none, state, tally, kinks=True), none, state, tally, natural)
+    scale = _sizes(state, point.sample)
+    condition = jnp.where(point.margins["stop"][0] > 0, zero + Condition.RUNNING, zero + Condition.DIVERGED)
+    limit = longest_stable(loop, point, scale)
+    length, ends = _plan(loop, pace, point, zero, jnp.minimum(natural, limit))
+    search = init_search(pace.h)
+    past = (point.t, state, point.rate[0]) if pace.keeps else ()
+    carry = Carry(point, zero, natural, length, ends, limit, scale, length, search, zero, zero, past, condition)
+    return typed(carry, pace.h.dtype)
+
+
+def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry, until: Any = None) -> Carry:
+    """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
+    active = carry.running if until is None else pace.before(carry, until)
+    system = dynamics(loop, objectives, carry.point.t, carry.point.state, carry.point.tally, kinks=True)
+    strike = _strike(loop, pace, carry.k)
+    end = jnp.where(carry.ends, strike * pace.h, carry.point.t + carry.length)
+    anew = carry.condition == Condition.REFRESHING
+    here = apart(active, lambda: arrive(system, carry, end, anew, pace))
+    verdict = apart(active, lambda: _judge(carry, here, active, strike >= pace.steps, pace))
+    strikes = verdict.taken & carry.ends
+    k = jnp.where(strikes, strike, carry.k)
+    clock = Clock(end, pace.h, k, key, strikes)
+    point = depart(system, clock, here, verdict.fired, carry.natural)
+    point = select(verdict.over, here.point, point)
+
+    natural = _natural(carry, here, verdict, pace)
+    trying = active & ~verdict.taken
+    found = jax.lax.cond(
+        anyone(trying & (verdict.seeks | (carry.condition != Condition.RUNNING))),
+        lambda: _look(carry, here),
+        lambda: (carry.search, carry.length, carry.condition),
+    )
+    ended = jnp.where(verdict.taken, _ended(loop, carry, here, verdict), carry.condition)
+    planned, ends = _plan(loop, pace, select(verdict.taken, point, carry.point), k, jnp.minimum(natural, carry.limit))
+    late = trying & (here.late > 0) & verdict.fine
+    planned = jnp.where(late, jnp.maximum(carry.length - here.late, pace.least), planned)
+    planned = jnp.where(ended == Condition.REFRESHING, 0.0, planned)
+    looking = trying & verdict.seeks
+    search, length, condition = select(looking, found, (carry.search, planned, ended))
+    ends = ends & ~looking & ~late & (ended != Condition.REFRESHING)
+    base = jnp.where(looking & (carry.condition == Condition.RUNNING), carry.length, carry.base)
+    tries = carry.tries + 1
+    lost = active & ~verdict.fine & (carry.length <= pace.least)
+    condition = jnp.where(lost, Condition.DIVERGED, condition).astype(carry.condition.dtype)
+    scale = select(verdict.taken, here.scale, carry.scale)
+    new = Carry(
+        select(verdict.taken, point, carry.point),
+        k,
+        natural,
+        length,
+        ends,
+        carry.limit,
+        scale,
+        base,
+        search,
+        tries,
+        carry.renewed,
+        select(verdict.taken, (carry.point.t, carry.point.state, carry.point.rate[0]), carry.past)
+        if pace.keeps
+        else (),
+        condition,
+    )
+    return select(active, new, carry)
+
+
+def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> Arrival:
+    """Return what a try leads to."""
+    loop, point, h = system.loop, carry.point, carry.length
+    z, held = parted(point.state, point.tally)
+
+    def flow(t: Any, z: Any) -> Any:
+        return system.rates(t, z, held, REGIME)
+
+    z, coarse = rk4_pair(flow, point.t, z, point.rate, h)
+    state = point.state.with_flow(z[0])
+    state = state._replace(plant=loop.plant.project(state.plant))
+    tallied = {name: memory._replace(flow=z[1][name]) for name, memory in point.tally.items()}
+    seen, moving, words, margins = system.ahead(end, state, tallied)
+    sample = seen.signals.sample
+    segment = Segment(
+        point.sample,
+        sample,
+        h,
+        pace.h,
+        lambda: (point.moving.output, moving.output),
+        lambda: (point.moving, moving),
+    )
+    tally = {name: Memory(z[1][name], o.update(tallied[name], segment)) for name, o in system.objectives.items()}
+    if loop.changes and not loop.ticks:
+        tally = select(anew, point.tally, tally)
+    ahead = until_next(margins, carry.natural)
+    new = Point(end, state, tally, sample, moving, seen[:2], seen.margins, words, ahead)
+    scale = jax.tree.map(jnp.maximum, carry.scale, _sizes(state, sample))
+    error = _error(loop, state, point.state.with_flow(coarse[0]), scale, sample) / pace.rtol
+    changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
+    return Arrival(new, seen.signals, error, scale, since_first(changed, margins, h))
+
+
+def depart(system: Dynamics, clock: Clock, here: Arrival, fired: Margins, natural: Any) -> Point:
+    """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock. In a
+    loop without ticks, what follows from an event is left to a step of no length: there are few of them."""
+    loop, point = system.loop, here.point
+    if not loop.changes:
+        return point
+    state = loop.change(clock, point.state, here.signals, point.margins, fired)
+    if not loop.ticks:
+        return point._replace(state=state)
+    return _point(system, point.t, state, point.tally, natural)
+
+
+def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
+    """Return this time, or that of the last point where the run has not come to it, and the loop's state there: the
+    cubic through the last two points."""
+    now, (start, state, rate) = carry.point, carry.past
+    h = now.t - start
+    x = clamp((t - start) / jnp.where(h > 0, h, 1.0), 0.0, 1.0)
+    ends = (state.flow(), now.state.flow(), rate, now.rate[0])
+    flow = jax.tree.map(lambda a, b, p, q: Cubic(a, b, h * p, h * q)(x), *ends)
+    inside = (t < now.t) & (h > 0)
+    return jnp.where(inside, t, now.t), select(inside, state.with_flow(flow), now.state)
+
+
+def longest_stable(loop: Loop, point: Point, scale: Any) -> Any:
+    """Return 2.4/rho [s], rho = |(D^-1 J D)^16|^(1/16) of the Jacobian J of the flow; D are the largest values so far,
+    so that no unit counts."""
+    z, tree = jax.flatten_util.ravel_pytree(point.state.flow())
+    size = jax.flatten_util.ravel_pytree(scale[1])[0]
+    size = jnp.where(size > 0, size, 1.0)
+
+    def flow(z: Any) -> Any:
+        state = point.state.with_flow(tree(size * z))
+        return jax.flatten_util.ravel_pytree(loop.flow(point.t, state, loop.signals(point.t, state)))[0] / size
+
+    matrix, log = jax.jacfwd(flow)(z / size), 0.0
+    for i in range(SQUARINGS):
+        norm = jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + TINY
+        matrix, log = matrix / norm, log + jnp.log(norm) / 2**i
+        matrix = jnp.sum(matrix[:, :, None] * matrix[None, :, :], axis=1)
+    norm = jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + TINY
+    return STABLE * jnp.exp(-(log + jnp.log(norm) / 2**SQUARINGS))
+
+
+def _point(system: Dynamics, t: Any, state: LoopState, tally: Tally, length: Any) -> Point:
+    seen, moving, words, margins = system.ahead(t, state, tally)
+    ahead = until_next(margins, length)
+    return Point(t, state, tally, seen.signals.sample, moving, seen[:2], seen.margins, words, ahead)
+
+
+def _error(loop: Loop, state: LoopState, coarse: LoopState, scale: Any, sample: Sample) -> Any:
+    """How far the embedded solution is off, as a fraction of the largest values so far: of the first signal, and of
+    every state."""
+    first = loop.plant.output(coarse.plant)[0]
+    pairs = ((sample.output[0], *jax.tree.leaves(state.flow())), (first, *jax.tree.leaves(coarse.flow())))
+    triples = zip(*pairs, jax.tree.leaves(scale), strict=True)
+    off = [jnp.max(jnp.abs(a - b) / jnp.where(c > 0, c, 1.0)) for a, b, c in triples if jnp.size(c)]
+    return 0.5 * jnp.max(jnp.stack(off))
+
+
+def _sizes(state: LoopState, sample: Sample) -> Any:
+    """Of the first signal, or of where it shall go, and of every state."""
+    first = jnp.maximum(jnp.abs(sample.output[0]), jnp.abs(sample.setpoint))
+    return first, jax.tree.map(jnp.abs, state.flow())
+
+
+def _judge(carry: Carry, here: Arrival, active: Any, last: Any, pace: Pace) -> Verdict:
+    running, landing = carry.condition == Condition.RUNNING, carry.condition == Condition.LANDING
+    anew = carry.condition == Condition.REFRESHING
+    leaves = jax.tree.leaves(here.point.state.flow())
+    fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves])) & jnp.isfinite(here.error)
+    short = carry.length <= pace.least
+    exact = fine & (((here.error <= 1) & (here.late <= 0)) | short)
+    crossed = falls_through(*_margins(carry, here))
+    crosses = jnp.any(jnp.stack(crossed))
+    taken = active & fine & (landing | anew | (running & exact & ~crosses))
+    seeks = ~landing & ~anew & (~running | (exact & crosses))
+    fired = [taken & landing & ((carry.search.which == i) | one) for i, one in enumerate(crossed)]
+    fired = jax.tree.unflatten(jax.tree.structure(here.point.margins), fired)
+    over = fired["stop"][0] | (taken & carry.ends & last)
+    return Verdict(fine, taken, seeks, fired, over)
+
+
+def _natural(carry: Carry, here: Arrival, verdict: Verdict, pace: Pace) -> Any:
+    """The length that the error allows; a step that was cut short says nothing against it."""
+    fourth = jnp.sqrt(jnp.sqrt(here.error + LITTLE))
+    factor = clamp(SAFETY / (fourth * jnp.sqrt(jnp.sqrt(fourth))), SHRINK, GROW)  # 1/error^(5/16), of roots only
+    longer = jnp.where(verdict.fine, carry.length * factor, carry.length * SHRINK)
+    cut = verdict.taken & (carry.length < carry.natural)
+    tried = carry.condition == Condition.RUNNING
+    judged = tried & (verdict.taken | ~verdict.fine | (here.error > 1))
+    natural = jnp.where(judged, jnp.where(cut, jnp.maximum(longer, carry.natural), longer), carry.natural)
+    return jnp.maximum(natural, pace.least)
+
+
+def _plan(loop: Loop, pace: Pace, point: Point, k: Any, length: Any) -> tuple[Any, Any]:
+    """The next length [s], and whether it ends where a clock strikes."""
+    ahead = point.ahead
+    near = jnp.where(ahead < SHORT * length, 0.5 * SHORT * length, length)
+    length = jnp.where(ahead < length, jnp.maximum(ahead, KINK * length), near)
+    left = _strike(loop, pace, k) * pace.h - point.t
+    ends = length > 0.99 * left
+    return jnp.where(ends, left, jnp.where(2 * length > left, 0.5 * left, length)), ends
+
+
+def _strike(loop: Loop, pace: Pace, k: Any) -> Any:
+    """The number of the next instant of the grid at which a clock strikes, or the run ends."""
+    return jnp.minimum(loop.next_tick(k, pace.h), pace.steps) if loop.ticks else pace.steps
+
+
+def _look(carry: Carry, here: Arrival) -> tuple[Search, Any, Any]:
+    """What a try that is not taken tells about an event: the search, the next length, and how that is tried."""
+    new = carry.condition == Condition.RUNNING
+    base = jnp.where(new, carry.length, carry.base)
+    tells = earliest(carry.search.which, 0, *_margins(carry, here))
+    search, length, enough = seek(carry.search, carry.length, new, tells, base)
+    seeking = search, length, jnp.where(enough, Condition.PROBING, Condition.SEEKING)
+    landing = carry.search, land(carry.search, carry.length, tells, 0.0 * base), jnp.asarray(Condition.LANDING)
+    search, length, condition = select(carry.condition == Condition.PROBING, landing, seeking)
+    return search, length, condition.astype(carry.condition.dtype)
+
+
+def _margins(carry: Carry, here: Arrival) -> tuple[list[Any], list[Any]]:
+    """At the beginning and at the end of the try."""
+    return jax.tree.leaves(carry.point.margins), jax.tree.leaves(here.point.margins)
+
+
+def _ended(loop: Loop, carry: Carry, here: Arrival, verdict: Verdict) -> Any:
+    """The condition after a step that is taken. A landing that does not come to rest on the stop is none."""
+    left, scale = jnp.abs(here.point.margins["stop"][0]), carry.point.margins["stop"][0] + jnp.abs(carry.search.at_full)
+    landed = jnp.where(left <= MISSED * scale, Condition.STOPPED, Condition.DIVERGED)
+    goes_on = jnp.asarray(Condition.RUNNING)
+    if loop.eventful and not loop.ticks:
+        happened = jnp.any(jnp.stack(jax.tree.leaves(verdict.fired)))
+        goes_on = jnp.where(happened, Condition.REFRESHING, Condition.RUNNING)
+    return jnp.where(verdict.fired["stop"][0], landed, jnp.where(verdict.over, Condition.TIMED_OUT, goes_on))
