@@ -32,7 +32,7 @@ from rich.console import Console
 from rich.table import Table
 
 HERE = pathlib.Path(__file__).parent
-PEERS = ("diffabs_fixed", "c_adaptive", "c_fixed", "jax_scan", "numba_adaptive", "diffrax_event")
+PEERS = ("diffabs_adaptive", "diffabs_fixed", "c_adaptive", "c_fixed", "jax_scan", "numba_adaptive", "diffrax_event")
 PEERS += ("jaxonomy_event", "scipy_loop", "torchdiffeq_event")
 PATIENCE = 300.0  # seconds for one answer
 FACTOR = 10.0  # a setting so many times finer in error than asked ends the ladder
@@ -98,7 +98,8 @@ def paths(python: str) -> list[str]:
 def measured(options: Any) -> dict[str, Any]:
     """The record: reference, peers, points."""
     answers, apart = reference.answers(*problem.lanes(options.lanes))
-    pythons = dict(pair.split("=", 1) for pair in options.python)
+    pairs = (pair.partition("=") for pair in options.python)
+    pythons = {name: os.path.abspath(path) for name, _, path in pairs}
     peers = []
     try:
         with tempfile.TemporaryDirectory() as folder:

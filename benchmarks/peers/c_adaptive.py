@@ -3,7 +3,7 @@
 from peers import c
 
 TITLE, PACKAGES, MANY = "C, adaptive RK4 (gcc -O3, OpenMP)", (), None
-LADDER = (1e-5, 3e-6, 1e-6, 3e-7, 1e-7)
+LADDER = (1e-5, 5e-6, 3e-6, 1e-6, 3e-7, 1e-7)
 
 
 def prepared(masses, speeds, tolerance, dtype, threads):

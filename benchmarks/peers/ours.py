@@ -16,7 +16,7 @@ LOOP = braking(
     controller=controllers.StateFeedback(torque_min=0.0, torque_max=problem.U),
     feedforward=controllers.HoldingInput(),
 )
-KINDS = ("fixed", "adaptive") if hasattr(diffabs, "Adaptive") else ("fixed",)
+KINDS = ("fixed", "adaptive")
 
 
 def solver(kind, setting, duration):

@@ -44,7 +44,12 @@ def main() -> None:
         peer = importlib.import_module(f"peers.{options.peer}")
         print(json.dumps(described(peer)), file=replies)
     except ImportError as missing:
-        print(json.dumps({"refused": f"not installed here: {missing}"}), file=replies)
+        print(
+            json.dumps(
+                {"refused": f"{missing}: not installed in this environment, see the groups bench of pyproject.toml"}
+            ),
+            file=replies,
+        )
         return
     solvers = {}
     for line in sys.stdin:
