@@ -32,6 +32,7 @@ import diffabs
 
 NAMES = ("lmi", "est-pi", "est-latch", "slip-cured", "arm", "lmi-noisy")
 ASKED = 1e-4  # relative, on every lane
+FINER = 30.0  # a setting so many times better than asked ends the ladder
 
 
 def child(options: Any) -> dict[str, Any]:
@@ -44,7 +45,10 @@ def child(options: Any) -> dict[str, Any]:
 def one(name: str, problem: problems.Problem, options: Any) -> dict[str, Any]:
     """Return the points of one problem, and how far its references are apart."""
     exact, apart = reference(name, problem, options)
-    points = [point for count in options.lanes for point in measured(problem, count, exact, options)]
+    points = []
+    for count in options.lanes:
+        points += measured(problem, count, exact, options)
+        print(f"{options.dtype}, {name}, {count:,} lanes", file=sys.stderr)
     return {"title": problem.title, "exact_step": problem.exact / 2, "apart": apart, "points": points}
 
 
@@ -87,6 +91,8 @@ def measured(problem: problems.Problem, count: int, exact: Any, options: Any) ->
             point = {"solver": kind, "setting": setting, "lanes": count, "error": max(each.values()), "errors": each}
             points.append(point)
             takers[kind, setting] = lambda run=run: record.timed(run)
+            if point["error"] <= ASKED / FINER:
+                break
             rate = takers[kind, setting]() / count * 2  # the next one costs about twice as much
     taken = record.in_turn(takers, options.rounds)
     for point in points:

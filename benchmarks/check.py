@@ -35,7 +35,7 @@ RUNS = {
     "riccati": ("--part", "300"),
     "design": ("--weights", "15"),
     "peers": ("--lanes", f"{LANES}", "--peers", "diffabs_adaptive", "diffabs_fixed", "c_adaptive", "diffrax_event"),
-    "work-precision": ("--quick", "--problems", "est-pi", "est-latch", "slip-cured", "arm"),
+    "work-precision": ("--lanes", f"{LANES}", "--distinct", "64", "--problems", "est-latch", "slip-cured", "arm"),
 }
 FILES = {"peers": f"peers-{LANES}-float32"}  # records that are not called like their benchmark
 
@@ -96,8 +96,8 @@ def measured(name: str, records: pathlib.Path | None) -> dict[str, float]:
 
 
 def compared(found: dict[str, float], stored: dict[str, float], factor: float) -> list[tuple[str, str, str, str]]:
-    """Return a line for each ratio that is found or stored: its name, value, what is stored, and the verdict, "worse" for
-    more than `factor` times as much (or for no number)."""
+    """Return a line for each ratio found or stored: its name, value, what is stored, and the verdict, "worse" for more
+    than `factor` times as much (or for no number)."""
     lines = []
     for name in {**stored, **found}:
         value, before = found.get(name), stored.get(name)
@@ -133,10 +133,8 @@ def main() -> int:
         stored[name] = found
     Console(width=80).print(table)
     if options.store:
-        text = json.dumps(
-            {name: {key: float(f"{x:.3g}") for key, x in each.items()} for name, each in stored.items()}, indent=2
-        )
-        options.stored.write_text(text + "\n", encoding="utf-8")
+        rounded = {name: {key: float(f"{x:.3g}") for key, x in each.items()} for name, each in stored.items()}
+        options.stored.write_text(json.dumps(rounded, indent=2) + "\n", encoding="utf-8")
         return 0
     for line in worse:
         print(f"worse: {line}", file=sys.stderr)

@@ -80,7 +80,7 @@ def problems() -> dict[str, Problem]:
     same_noise()
     cured, arm = load("slip-cured").loop, load("arm-hanging").loop
     noisy = dataclasses.replace(ours.LOOP, sensor=sensors.Noise(slip=0.005))
-    stiff = (1e-4, 5e-5, 2e-5)  # stable at the end of a stop, at 0.05 m/s
+    stiff = (1e-4, 5e-5)  # stable at the end of a stop, at 0.05 m/s
     return {
         "lmi": Problem("lmi, limited", ours.LOOP, RIG, 2.1, (2e-3, 1e-3, 5e-4, 2e-4, 1e-4), 1e-4),
         "est-pi": Problem("est, PI", estimator(references.FixedSlip()), CAR, 4.0, stiff, 5e-5),
