@@ -28,6 +28,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from typing import Any, NamedTuple
 
@@ -38,13 +39,14 @@ import random_loops
 
 from diffabs.core.pytree import get, refined, replace, strong
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Adaptive, FixedStep
 
 WIDTHS = (1e-2, 3e-3, 1e-3)
 AGREE, RIGHT, KNOWN = 1e-3, 2e-3, 1e-2  # of the scale
 KINKED = 1e-2  # by which slopes to the left and to the right differ, of the scale
 PART, LEAST = 1e-3, 1e-6  # the scale's least: of the objective, and absolute
 CLASSES = ("kink", "nearby", "curved", "scatter", "diverged")
+SURE = 1e-10  # of the differences of adaptive runs
 SHOWN = 15
 
 
@@ -64,18 +66,21 @@ class Found(NamedTuple):
 class Program:
     """What is compiled for a structure: values of many loops, and the gradient of one."""
 
-    def __init__(self, name: str, times: int = 1):
+    def __init__(self, name: str, times: int = 1, rtol: float | None = None):
         self.name, self.structure, self.times = name, random_loops.STRUCTURES[name], times
-        solver = FixedStep(self.structure.step / times, self.structure.duration, kinks=True)  # as derivatives have it
+        step, duration = self.structure.step / times, self.structure.duration
+        solver = slow = FixedStep(step, duration, kinks=True)  # as derivatives have it
+        if rtol is not None:
+            solver, slow = (Adaptive(error, duration, step) for error in (rtol, SURE))
         self.objectives = list(self.structure.objectives)
 
-        def one(loop: Any, measures: Any, x: Any) -> tuple[Any, Any]:
+        def one(solver: Any, loop: Any, measures: Any, x: Any) -> tuple[Any, Any]:
             loop, measures = _moved(loop, measures, self.places, x)
             run = measure(loop, solver, measures, key=jax.random.key(3))
             return jnp.stack([run.metrics[one] for one in self.objectives]), run.diverged | run.timed_out
 
-        self.values = jax.jit(jax.vmap(one, (None, None, 0)))
-        self.slopes = jax.jit(jax.jacfwd(one, argnums=2, has_aux=True))
+        self.values = jax.jit(jax.vmap(partial(one, slow), (None, None, 0)))
+        self.slopes = jax.jit(jax.jacfwd(partial(one, solver), argnums=2, has_aux=True))
 
     def study(self, number: int, seed: int) -> Found:
         """Gradients and differences of a loop."""
@@ -172,9 +177,11 @@ def _kinds(difference: Any, slopes: Any, smooth: Any, least: Any) -> tuple[np.nd
     return kind, np.where(kind == "curved", extrapolated, narrow)
 
 
-def studied(name: str, loops: Sequence[int], seed: int, times: int = 1, told: bool = True) -> list[Found]:
+def studied(
+    name: str, loops: Sequence[int], seed: int, times: int = 1, told: bool = True, rtol: float | None = None
+) -> list[Found]:
     """The loops of one structure, compiled once."""
-    program, all, begun = Program(name, times), [], time.monotonic()
+    program, all, begun = Program(name, times, rtol), [], time.monotonic()
     for number in loops:
         all.append(program.study(number, seed))
         if told:
@@ -183,15 +190,19 @@ def studied(name: str, loops: Sequence[int], seed: int, times: int = 1, told: bo
     return all
 
 
-def _job(task: tuple[str, list[int], int, int]) -> list[Found]:
+def _job(task: tuple[str, list[int], int, int, bool, float | None]) -> list[Found]:
     jax.config.update("jax_enable_x64", True)
     return studied(*task)
 
 
-def run(loops: int, seed: int, jobs: int = 1, names: Sequence[str] | None = None) -> list[Found]:
+def run(
+    loops: int, seed: int, jobs: int = 1, names: Sequence[str] | None = None, rtol: float | None = None
+) -> list[Found]:
     """So many loops of a seed, a structure after the other, in so many processes."""
     names = list(names or random_loops.STRUCTURES)
-    tasks = [(name, list(range(i, loops, len(names))), seed, 1) for i, name in enumerate(names) if i < loops]
+    tasks = [
+        (name, list(range(i, loops, len(names))), seed, 1, True, rtol) for i, name in enumerate(names) if i < loops
+    ]
     if jobs == 1:
         return [found for task in tasks for found in studied(*task)]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
@@ -296,18 +307,21 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--only", type=int, help="this loop alone")
     parser.add_argument("--structure", help="loops of structures whose name contains this alone")
+    parser.add_argument("--rtol", type=float, help="gradients of adaptive steps with this error")
     parser.add_argument("--refine", action="store_true", help="run loops with wrong entries again, with h/4")
     parser.add_argument("--json", help="write the counts and all wrong entries to this file")
     asked = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     names = list(random_loops.STRUCTURES)
     if asked.only is not None:
-        founds = studied(names[asked.only % len(names)], [asked.only], asked.seed)
+        founds = studied(names[asked.only % len(names)], [asked.only], asked.seed, rtol=asked.rtol)
     elif asked.structure:
         chosen = [(i, name) for i, name in enumerate(names) if asked.structure in name]
-        founds = [f for i, n in chosen for f in studied(n, range(i, asked.loops, len(names)), asked.seed)]
+        founds = [
+            f for i, n in chosen for f in studied(n, range(i, asked.loops, len(names)), asked.seed, rtol=asked.rtol)
+        ]
     else:
-        founds = run(asked.loops, asked.seed, asked.jobs)
+        founds = run(asked.loops, asked.seed, asked.jobs, rtol=asked.rtol)
     print(report(founds))
     if asked.refine:
         print("\n".join(refine(founds, asked.seed)))

@@ -10,55 +10,58 @@
 The grid of `Adaptive.step` is only where clocks strike and what a trajectory keeps: no step has to end on it."""
 
 import dataclasses
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
-import jax.flatten_util
 import jax.numpy as jnp
 
 from diffabs.core.cubic import Cubic
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Clock, Memory, Sample, Segment
-from diffabs.core.regime import Regime, Words
+from diffabs.core.regime import Words
 from diffabs.simulate.checkpoint import anyone, apart
 from diffabs.simulate.condition import Condition
-from diffabs.simulate.dynamics import Dynamics, Objectives, Tally, dynamics, parted
-from diffabs.simulate.foresight import since_first, until_next
+from diffabs.simulate.dynamics import FREE, Dynamics, Objectives, Tally, dynamics, parted
+from diffabs.simulate.foresight import DERIVATIVES, VALUES, Care, kinks
 from diffabs.simulate.landing import Search, earliest, falls_through, init_search, land, seek, select
 from diffabs.simulate.outcome import observe
 from diffabs.simulate.rk4 import rk4_pair
 from diffabs.simulate.solution import Trajectory
 from diffabs.simulate.stepper import MISSED, typed
 
-REGIME = Regime(None)
 FIRST = 1e-4  # s, the first step
 SAFETY, LITTLE = 0.85, 1e-6
 SHRINK, GROW = 0.25, 2.5  # times the last step, at least and at most
 LEAST = 1e-9  # of the duration: the shortest step; or 4 times its rounding
-KINK = 4e-3  # of the present length: the shortest step that ends on a comparison
 SHORT = 1.2  # times the present length: a kink so near is reached in two steps
 ROUND = 16  # tries between two looks at what is stable
-SQUARINGS, TINY = 4, 1e-20
+MULTIPLIED, TINY = 12, 1e-20
 STABLE = 2.4  # times the spectral radius: the longest step
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps"])
+@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps", "notes"])
 @dataclasses.dataclass(frozen=True)
 class Pace:
     """The steps of `Adaptive`: step of the grid [s], the number of its last instant, and the error of a step; whether
-    what is between two instants of a run is to be seen."""
+    what is between two instants of a run is to be seen, and whether what is needed to repeat it is noted."""
 
     h: Any
     steps: Any
     rtol: Any
     keeps: bool = False
+    notes: bool = False
 
     @property
     def least(self) -> Any:
         """The shortest step [s]."""
         return self.h * self.steps * jnp.maximum(LEAST, 4 * jnp.finfo(self.h.dtype).eps)
+
+    @property
+    def care(self) -> Care:
+        """How exactly steps end on comparisons."""
+        return DERIVATIVES if self.notes else VALUES
 
     def start(self, loop: Loop, objectives: Objectives, key: Any) -> "Carry":
         """Return the carry at t = 0."""
@@ -87,13 +90,9 @@ class Pace:
         """Return the method for a run that is seen on its way."""
         return dataclasses.replace(self, keeps=True)
 
-    def located(self) -> "Pace":
-        """Return the method for derivatives."""
-        raise NotImplementedError
-
-    def room(self, loop: Loop, steps: int) -> int:
-        """Return how many tries so many steps of the grid may take."""
-        return 0
+    def noted(self) -> "Pace":
+        """Return the method for a run that is to be repeated."""
+        return dataclasses.replace(self, notes=True)
 
 
 class Point(NamedTuple):
@@ -114,13 +113,15 @@ class Point(NamedTuple):
 
 class Arrival(NamedTuple):
     """The end of a try, before what changes there: the point, its signals, the error as a multiple of what is allowed,
-    the largest values of the states so far, and for how many seconds a comparison has been another one."""
+    the largest values of the states so far, for how many seconds a comparison has been another one, and, where it is
+    noted, the regime in the middle."""
 
     point: Point
     signals: Signals
     error: Any
     scale: Any
     late: Any
+    middle: Any
 
 
 class Carry(NamedTuple):
@@ -138,6 +139,7 @@ class Carry(NamedTuple):
     tries: Any
     renewed: Any  # how many of these there were when the longest stable step was last looked at
     past: Any  # the last point but one that the run came to: time, state, rates; () where nobody asks
+    note: Any  # of the last try: a bit for each event at its end, and the regime in its middle; () likewise
     condition: Any
 
     @property
@@ -173,14 +175,15 @@ def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carr
         fired = jax.tree.map(lambda margin: margin < 0, margins)
         state = loop.change(Clock(none, pace.h, zero, key), state, signals, margins, fired)
     natural = jnp.minimum(FIRST, pace.h * pace.steps) + none
-    point = _point(dynamics(loop, objectives, none, state, tally, kinks=True), none, state, tally, natural)
+    point = _point(dynamics(loop, objectives, none, state, tally, kinks=True), pace, none, state, tally, natural)
     scale = _sizes(state, point.sample)
     condition = jnp.where(point.margins["stop"][0] > 0, zero + Condition.RUNNING, zero + Condition.DIVERGED)
     limit = longest_stable(loop, point, scale)
     length, ends = _plan(loop, pace, point, zero, jnp.minimum(natural, limit))
     search = init_search(pace.h)
     past = (point.t, state, point.rate[0]) if pace.keeps else ()
-    carry = Carry(point, zero, natural, length, ends, limit, scale, length, search, zero, zero, past, condition)
+    note = (zero, point.words) if pace.notes else ()
+    carry = Carry(point, zero, natural, length, ends, limit, scale, length, search, zero, zero, past, note, condition)
     return typed(carry, pace.h.dtype)
 
 
@@ -196,7 +199,7 @@ def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry,
     strikes = verdict.taken & carry.ends
     k = jnp.where(strikes, strike, carry.k)
     clock = Clock(end, pace.h, k, key, strikes)
-    point = depart(system, clock, here, verdict.fired, carry.natural)
+    point = depart(system, pace, clock, here, verdict.fired, carry.natural)
     point = select(verdict.over, here.point, point)
 
     natural = _natural(carry, here, verdict, pace)
@@ -234,8 +237,13 @@ def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry,
         select(verdict.taken, (carry.point.t, carry.point.state, carry.point.rate[0]), carry.past)
         if pace.keeps
         else (),
+        (packed(verdict.fired), here.middle) if pace.notes else (),
         condition,
     )
+    if until is None:  # of a run that is over, the rest does not matter
+        return new._replace(
+            tries=jnp.where(active, tries, carry.tries), condition=jnp.where(active, condition, carry.condition)
+        )
     return select(active, new, carry)
 
 
@@ -245,13 +253,13 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
     z, held = parted(point.state, point.tally)
 
     def flow(t: Any, z: Any) -> Any:
-        return system.rates(t, z, held, REGIME)
+        return system.rates(t, z, held, FREE)
 
     z, coarse = rk4_pair(flow, point.t, z, point.rate, h)
     state = point.state.with_flow(z[0])
     state = state._replace(plant=loop.plant.project(state.plant))
     tallied = {name: memory._replace(flow=z[1][name]) for name, memory in point.tally.items()}
-    seen, moving, words, margins = system.ahead(end, state, tallied)
+    seen, moving, _, words, comparisons = system.ahead(end, state, tallied)
     sample = seen.signals.sample
     segment = Segment(
         point.sample,
@@ -264,15 +272,25 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
     tally = {name: Memory(z[1][name], o.update(tallied[name], segment)) for name, o in system.objectives.items()}
     if loop.changes and not loop.ticks:
         tally = select(anew, point.tally, tally)
-    ahead = until_next(margins, carry.natural)
+    changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
+    ahead, late = kinks(comparisons, carry.natural, pace.care, changed, h)
     new = Point(end, state, tally, sample, moving, seen[:2], seen.margins, words, ahead)
     scale = jax.tree.map(jnp.maximum, carry.scale, _sizes(state, sample))
     error = _error(loop, state, point.state.with_flow(coarse[0]), scale, sample) / pace.rtol
-    changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
-    return Arrival(new, seen.signals, error, scale, since_first(changed, margins, h))
+    middle = _middle(system, point, new, h) if pace.notes else ()
+    return Arrival(new, seen.signals, error, scale, late, middle)
 
 
-def depart(system: Dynamics, clock: Clock, here: Arrival, fired: Margins, natural: Any) -> Point:
+def _middle(system: Dynamics, start: Point, end: Point, h: Any) -> Words:
+    """The answers to the comparisons in the middle of a step."""
+    ends = (parted(one.state, one.tally)[0] for one in (start, end))
+    z = jax.tree.map(lambda a, b, p, q: Cubic(a, b, h * p, h * q)(0.5), *ends, start.rate, end.rate)
+    state = start.state.with_flow(z[0])
+    tally = {name: memory._replace(flow=z[1][name]) for name, memory in start.tally.items()}
+    return system.look(start.t + 0.5 * h, state, tally, FREE)[1].words
+
+
+def depart(system: Dynamics, pace: Pace, clock: Clock, here: Arrival, fired: Margins, natural: Any) -> Point:
     """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock. In a
     loop without ticks, what follows from an event is left to a step of no length: there are few of them."""
     loop, point = system.loop, here.point
@@ -281,7 +299,7 @@ def depart(system: Dynamics, clock: Clock, here: Arrival, fired: Margins, natura
     state = loop.change(clock, point.state, here.signals, point.margins, fired)
     if not loop.ticks:
         return point._replace(state=state)
-    return _point(system, point.t, state, point.tally, natural)
+    return _point(system, pace, point.t, state, point.tally, natural)
 
 
 def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
@@ -297,28 +315,38 @@ def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
 
 
 def longest_stable(loop: Loop, point: Point, scale: Any) -> Any:
-    """Return 2.4/rho [s], rho = |(D^-1 J D)^16|^(1/16) of the Jacobian J of the flow; D are the largest values so far,
-    so that no unit counts."""
-    z, tree = jax.flatten_util.ravel_pytree(point.state.flow())
-    size = jax.flatten_util.ravel_pytree(scale[1])[0]
-    size = jnp.where(size > 0, size, 1.0)
+    """Return 2.4/rho [s], rho about the spectral radius of the flow's Jacobian: how much longer a vector becomes each
+    time that it is multiplied by that, measured in the largest values so far."""
+    flow, tree = jax.tree.flatten(point.state.flow())
+    leaves = [jnp.ravel(x) for x in flow]
+    sizes = [jnp.where(x > 0, x, 1.0) for leaf in jax.tree.leaves(scale[1]) for x in jnp.ravel(leaf)]
+    places = [(i, k) for i, leaf in enumerate(leaves) for k in range(leaf.size)]
 
-    def flow(z: Any) -> Any:
-        state = point.state.with_flow(tree(size * z))
-        return jax.flatten_util.ravel_pytree(loop.flow(point.t, state, loop.signals(point.t, state)))[0] / size
+    def rates(flow: list[Any]) -> list[Any]:
+        state = point.state.with_flow(tree.unflatten(flow))
+        found = loop.flow(point.t, state, loop.signals(point.t, state))
+        return [x for leaf in jax.tree.leaves(found) for x in jnp.ravel(leaf)]
 
-    matrix, log = jax.jacfwd(flow)(z / size), 0.0
-    for i in range(SQUARINGS):
-        norm = jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + TINY
-        matrix, log = matrix / norm, log + jnp.log(norm) / 2**i
-        matrix = jnp.sum(matrix[:, :, None] * matrix[None, :, :], axis=1)
-    norm = jnp.max(jnp.sum(jnp.abs(matrix), axis=1)) + TINY
-    return STABLE * jnp.exp(-(log + jnp.log(norm) / 2**SQUARINGS))
+    def column(i: int, k: int) -> list[Any]:
+        one = [jnp.zeros_like(x) for x in leaves]
+        one[i] = one[i].at[k].set(1.0)
+        moves = [jnp.reshape(x, jnp.shape(leaf)) for x, leaf in zip(one, flow, strict=True)]
+        return jax.jvp(rates, (flow,), (moves,))[1]
+
+    matrix = [column(*place) for place in places]
+    vector, log = [jnp.ones_like(x) for x in sizes], 0.0 * point.t
+    for i in range(MULTIPLIED):
+        terms = [[a * b * x for a, b, x in zip(row, sizes, vector, strict=True)] for row in zip(*matrix, strict=True)]
+        vector = [sum(row) / size for row, size in zip(terms, sizes, strict=True)]
+        norm = reduce(jnp.maximum, map(jnp.abs, vector)) + TINY
+        vector = [x / norm for x in vector]
+        log += jnp.log(norm) if i >= MULTIPLIED // 2 else 0.0
+    return STABLE * jnp.exp(-log / (MULTIPLIED - MULTIPLIED // 2))
 
 
-def _point(system: Dynamics, t: Any, state: LoopState, tally: Tally, length: Any) -> Point:
-    seen, moving, words, margins = system.ahead(t, state, tally)
-    ahead = until_next(margins, length)
+def _point(system: Dynamics, pace: Pace, t: Any, state: LoopState, tally: Tally, length: Any) -> Point:
+    seen, moving, _, words, comparisons = system.ahead(t, state, tally)
+    ahead, _ = kinks(comparisons, length, pace.care, words, 0.0 * length)
     return Point(t, state, tally, seen.signals.sample, moving, seen[:2], seen.margins, words, ahead)
 
 
@@ -341,8 +369,7 @@ def _sizes(state: LoopState, sample: Sample) -> Any:
 def _judge(carry: Carry, here: Arrival, active: Any, last: Any, pace: Pace) -> Verdict:
     running, landing = carry.condition == Condition.RUNNING, carry.condition == Condition.LANDING
     anew = carry.condition == Condition.REFRESHING
-    leaves = jax.tree.leaves(here.point.state.flow())
-    fine = jnp.all(jnp.array([jnp.all(jnp.isfinite(x)) for x in leaves])) & jnp.isfinite(here.error)
+    fine = jnp.isfinite(here.error)  # the greatest of those of all states
     short = carry.length <= pace.least
     exact = fine & (((here.error <= 1) & (here.late <= 0)) | short)
     crossed = falls_through(*_margins(carry, here))
@@ -353,6 +380,11 @@ def _judge(carry: Carry, here: Arrival, active: Any, last: Any, pace: Pace) -> V
     fired = jax.tree.unflatten(jax.tree.structure(here.point.margins), fired)
     over = fired["stop"][0] | (taken & carry.ends & last)
     return Verdict(fine, taken, seeks, fired, over)
+
+
+def packed(fired: Margins) -> Any:
+    """Return a bit for each event."""
+    return sum((jnp.where(one, 1 << i, 0) for i, one in enumerate(jax.tree.leaves(fired))), jnp.asarray(0))
 
 
 def _natural(carry: Carry, here: Arrival, verdict: Verdict, pace: Pace) -> Any:
@@ -371,7 +403,7 @@ def _plan(loop: Loop, pace: Pace, point: Point, k: Any, length: Any) -> tuple[An
     """The next length [s], and whether it ends where a clock strikes."""
     ahead = point.ahead
     near = jnp.where(ahead < SHORT * length, 0.5 * SHORT * length, length)
-    length = jnp.where(ahead < length, jnp.maximum(ahead, KINK * length), near)
+    length = jnp.where(ahead < length, jnp.maximum(ahead, pace.care.least * length), near)
     left = _strike(loop, pace, k) * pace.h - point.t
     ends = length > 0.99 * left
     return jnp.where(ends, left, jnp.where(2 * length > left, 0.5 * left, length)), ends

@@ -19,6 +19,7 @@ from diffabs.simulate.foresight import Margin
 Objectives = dict[str, Objective]
 Tally = dict[str, Memory]
 
+FREE = Regime(None)  # as the numbers say
 PROGRAMS = 256  # that are kept
 _programs: dict[Any, Program] = {}
 
@@ -30,6 +31,17 @@ class Seen(NamedTuple):
     tally_rates: Any
     signals: Signals
     margins: Margins
+
+
+class Ahead(NamedTuple):
+    """At an instant: what is seen, the rates of the sample and of the margins of the events, the answers to the
+    comparisons, and their margins with the rates of these."""
+
+    seen: Seen
+    moving: Sample
+    falls: Margins
+    words: Words
+    comparisons: list[Margin]
 
 
 class Dynamics(NamedTuple):
@@ -61,21 +73,22 @@ class Dynamics(NamedTuple):
             return _seen(moving, fixed), Answers((), (), [])
         return self.program.look(lambda seen: seen, moving, fixed, regime)
 
-    def ahead(self, t: Any, state: LoopState, tally: Tally) -> tuple[Seen, Sample, Words, list[Margin]]:
-        """Everything at an instant, as the numbers say it: what is seen, the rates of the sample, and the answers to
-        the comparisons, with their margins and the rates of these."""
-        z, held = parted(state, tally)
+    def ahead(self, t: Any, state: LoopState, tally: Tally, regime: Regime = FREE) -> "Ahead":
+        """Everything at an instant, within a regime or as the numbers say, and how it moves from there."""
         assert self.program is not None
+        program, (z, held) = self.program, parted(state, tally)
         fixed = (held, self.loop, self.objectives)
-        now = self.program.look(lambda seen: seen, (t, *z), fixed, Regime(None))[0]
+        now = program.look(lambda seen: seen, (t, *z), fixed, regime)[0]
 
         def moves(t: Any, z: Any) -> Any:
-            one, answers = self.program.look(lambda seen: seen, (t, *z), fixed, Regime(None))
-            return (one.signals.sample, [value for _, value in answers.margins]), answers
+            one, answers = program.look(lambda seen: seen, (t, *z), fixed, regime)
+            return (one.signals.sample, one.margins, [value for _, value in answers.margins]), answers
 
-        (_, values), (sample, rates), answers = jax.jvp(moves, (t, z), (jnp.ones_like(t), now[:2]), has_aux=True)
+        moving = (jnp.ones_like(t), now[:2])
+        (_, _, values), (sample, falls, rates), answers = jax.jvp(moves, (t, z), moving, has_aux=True)
         numbers = [number for number, _ in answers.margins]
-        return now, sample, answers.words, [Margin(*one) for one in zip(numbers, values, rates, strict=True)]
+        comparisons = [Margin(*one) for one in zip(numbers, values, rates, strict=True)]
+        return Ahead(now, sample, falls, answers.words, comparisons)
 
     def moving(self, of: Callable[[Sample], Any], end: tuple[Any, LoopState, Tally, Any], regime: Regime) -> Any:
         """d(of(sample))/dt within a regime, at a time, state and tally where d(state.flow())/dt is the last one."""

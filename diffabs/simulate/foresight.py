@@ -10,9 +10,21 @@ import jax.numpy as jnp
 
 from diffabs.core.regime import WORD, Words
 
-AT_ONCE = 2e-4  # of the present length of a step: a comparison changes now, and not ahead
 FAR = 1e9  # s, as good as never
-SINCE = 0.02, 0.95  # of a step: outside of these it changed at one of the ends
+
+
+class Care(NamedTuple):
+    """How exactly steps end on comparisons. As fractions of the present length of a step: what changes so soon changes
+    now; the shortest step that ends there. And of a step: outside of these two a comparison changed at one end."""
+
+    now: float
+    least: float
+    start: float
+    end: float
+
+
+VALUES = Care(2e-4, 4e-3, 0.02, 0.95)
+DERIVATIVES = Care(2e-6, 1e-5, 1e-3, 0.999)  # as exactly as an event, in two or three steps
 
 
 class Margin(NamedTuple):
@@ -23,34 +35,32 @@ class Margin(NamedTuple):
     rate: Any
 
 
-def until_next(margins: Sequence[Margin], length: Any) -> Any:
-    """Return in how many seconds the first of the comparisons will change; a great number if none does.
+class Kinks(NamedTuple):
+    """In how many seconds the first of the comparisons will change, a great number if none does; and how many seconds
+    before the end of a step the first of those changed whose answers have, 0 if none did but at its ends."""
 
-    length: of the present step [s]"""
-    least, soonest = AT_ONCE * length, jnp.full_like(length, FAR)
+    ahead: Any
+    late: Any
+
+
+def kinks(margins: Sequence[Margin], natural: Any, care: Care, changed: Words, length: Any) -> Kinks:
+    """Return what the margins at the end of a step say.
+
+    natural: the length that the error allows [s], of which `care` has fractions
+    changed: bits of the comparisons whose answers are others than at the beginning of the step
+    length: of the step [s]"""
+    least, low, high = care.now * natural, (1 - care.end) * length, (1 - care.start) * length
+    ahead, late = jnp.full_like(length, FAR), jnp.zeros_like(length)
     for one in margins:
-        for value, rate in zip(*(jnp.ravel(jnp.asarray(x)) for x in one[1:]), strict=True):
-            ahead = -value / rate
-            soonest = jnp.minimum(soonest, jnp.where(ahead > least, ahead, FAR))
-    return soonest
+        was = bit(changed, one.numbers)
+        for on, since in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, one.value / one.rate)), strict=True):
+            ahead = jnp.minimum(ahead, jnp.where(since < -least, -since, FAR))
+            late = jnp.maximum(late, jnp.where(on & (since > low) & (since < high), since, 0.0))
+    return Kinks(ahead, late)
 
 
-def since_first(changed: Words, margins: Sequence[Margin], length: Any) -> Any:
-    """Return how many seconds before the end of a step the first of those comparisons changed whose answers have; 0 if
-    none did, but at the ends.
-
-    margins: at the end. length: of the step [s]"""
-    low, high = ((1 - share) * length for share in reversed(SINCE))
-    longest = jnp.zeros_like(length)
-    for one in margins:
-        was = _bit(changed, one.numbers)
-        for bit, value, rate in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, *one[1:])), strict=True):
-            back = value / rate
-            longest = jnp.maximum(longest, jnp.where(bit & (back > low) & (back < high), back, 0.0))
-    return longest
-
-
-def _bit(words: Words, numbers: Any) -> Any:
+def bit(words: Words, numbers: Any) -> Any:
+    """Return the bits of these numbers."""
     numbers = jnp.asarray(numbers)
     word = sum(jnp.where(numbers // WORD == i, one, jnp.uint32(0)) for i, one in enumerate(words))
     return (word >> (numbers % WORD).astype(jnp.uint32)) & 1 != 0

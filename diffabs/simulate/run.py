@@ -20,6 +20,7 @@ from diffabs.core.pytree import arrayed, misshapen, strong
 from diffabs.simulate.adaptive import Pace
 from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
 from diffabs.simulate.outcome import judge, prepare
+from diffabs.simulate.replay import note, repeat, room
 from diffabs.simulate.solution import Adaptive, Run, Solver, Trajectory
 from diffabs.simulate.stepper import Grid
 
@@ -66,7 +67,8 @@ def _call(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: 
     loop, objectives, method = arguments(loop, solver, objectives)
     steps, every = solver.steps, int(every)
     count = -(-steps // every) if every else 0
-    tries = method.room(loop, min(every, steps) if every else slots(steps))
+    between = min(every, steps) if every else slots(steps)
+    tries = room(loop, solver) if isinstance(solver, Adaptive) else method.room(loop, between)
     method = method.watched() if every else method
     places = Places(tries, slots(count) if every else 0, every)
     run = _simulated(places, (loop, objectives, method, key))
@@ -163,6 +165,8 @@ def _run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, ev
 @partial(jax.jit, static_argnames="places")
 def _reversible(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, *, places: Places) -> Run:
     """For derivatives."""
+    if isinstance(method, Pace):
+        return _repeated(loop, objectives, method.noted(), key, places)
     method = method.located()
     loop, objectives, stepped = _prepared(loop, objectives, method, key)
     carry, (tries, instants, every) = method.start(loop, objectives, key), places
@@ -173,6 +177,17 @@ def _reversible(loop: Loop, objectives: dict[str, Objective], method: Any, key: 
         stepped, method.before, partial(method.seen, loop), carry, every, count, instants, tries
     )
     return _with_trajectory(judge(loop, objectives, carry), first, seen)
+
+
+def _repeated(loop: Loop, objectives: dict[str, Objective], method: Pace, key: Any, places: Places) -> Run:
+    """Raises ValueError for a trajectory."""
+    if places.every:
+        raise ValueError("no derivative of a trajectory with Adaptive steps: take FixedStep, or what is measured")
+    loop, audit = prepare(loop)
+    objectives = objectives | audit
+    still = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
+    notes, condition = note(*still, method, key, places.tries)
+    return judge(loop, objectives, repeat(loop, objectives, method, key, notes, condition))[0]
 
 
 def _prepared(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any) -> tuple[Loop, Any, Any]:
