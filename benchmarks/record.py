@@ -1,15 +1,15 @@
 """What benchmarks have in common: times taken in turn, and a file with the machine and the versions."""
 
-import importlib.metadata
 import json
 import os
 import pathlib
 import platform
 import statistics
-import subprocess
 import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
+
+from diffabs.core import provenance
 
 OUT = pathlib.Path("out/benchmarks")
 
@@ -43,31 +43,22 @@ def best(points: Iterable[dict[str, Any]], accuracy: float) -> dict[str, Any] | 
     return next(good, min(points, key=lambda point: point["error"], default=None))
 
 
-def written(name: str, record: Mapping[str, Any], out: pathlib.Path | None = None) -> pathlib.Path:
-    """Write a record with machine, versions and commit; return where."""
+def written(
+    name: str, record: Mapping[str, Any], out: pathlib.Path | None = None, packages: Iterable[str] = ("jaxlib", "numpy")
+) -> pathlib.Path:
+    """Write a record with the machine and the versions of diffabs, JAX and `packages`; return where."""
     path = out or OUT / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({**record, **circumstances()}, indent=2) + "\n"
+    machine = {"processor": processor(), "system": platform.system(), "cores": os.cpu_count(), "load": load()}
+    versions = {**provenance.origin(*packages), **provenance.commit()}
+    text = json.dumps({**record, "machine": machine, "versions": versions}, indent=2) + "\n"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def circumstances() -> dict[str, Any]:
-    """Return machine, load, versions and commit."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
-    commit = subprocess.run(command, capture_output=True, text=True, check=False, cwd=pathlib.Path(__file__).parent)
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-    return {
-        "machine": {
-            "processor": processor(),
-            "system": platform.system(),
-            "cores": os.cpu_count(),
-            "load": load,
-        },
-        "versions": {name: importlib.metadata.version(name) for name in ("diffabs", "jax", "jaxlib", "numpy")},
-        "python": platform.python_version(),
-        "commit": commit.stdout.strip(),
-    }
+def load() -> tuple[float, float, float] | None:
+    """Return how many processes wanted to run, in the last 1, 5 and 15 minutes, where the system tells."""
+    return os.getloadavg() if hasattr(os, "getloadavg") else None
 
 
 def processor() -> str:
