@@ -41,7 +41,8 @@ def panels(found: dict[str, Any], peers: dict[str, Any] | None, lanes: int, dtyp
     if lanes not in found["lanes"]:
         raise ValueError(f"{lanes} lanes were not run, but {', '.join(map(str, found['lanes']))}")
     rows = -(-len(problems) // COLUMNS)
-    figure, grid = plt.subplots(rows, COLUMNS, figsize=(10, 3.1 * rows), squeeze=False, layout="constrained")
+    size = {"figsize": (10, 3.1 * rows), "layout": "constrained"}
+    figure, grid = plt.subplots(rows, COLUMNS, squeeze=False, sharex=True, sharey=True, **size)
     for axes, (name, problem) in zip(grid.flat, problems.items(), strict=False):
         for kind, look in OURS.items():
             points = [p for p in problem["points"] if p["solver"] == kind and p["lanes"] == lanes]
@@ -51,14 +52,14 @@ def panels(found: dict[str, Any], peers: dict[str, Any] | None, lanes: int, dtyp
                 points = peers["points"].get(peer, [])
                 curve(axes, points, [1 / p["runs_per_s"] for p in points], look)
         axes.axhline(found["asked"], color="0.6", lw=0.8, ls="--")
-        axes.set(title=problem["title"], ylim=(1e-8, 1))
+        axes.set(title=problem["title"], ylim=(1e-9, 0.1))
         axes.grid(alpha=0.3)
     for axes in grid.flat[len(problems) :]:
         axes.remove()
     figure.supxlabel(f"time per run [s], {lanes:,} runs at once, {dtype}")
     figure.supylabel("worst relative error of all metrics and runs")
     legend = {line.get_label(): line for axes in figure.axes for line in axes.lines if line.get_marker() != "None"}
-    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(legend.values(), legend.keys(), loc="outside upper center", ncols=4, frameon=False)
     return figure
 
 
