@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow coverage versions lint bench bench-guard mutations fuzz clean
+.PHONY: demo test test-slow coverage versions lint bench bench-peers bench-check bench-figure mutations fuzz clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -26,16 +26,32 @@ lint: $(VENV)/.lint
 	$(BIN)/lint-imports
 
 bench: $(VENV)/.bench
-	$(BIN)/python benchmarks/bench_rollout.py
+	$(BIN)/python benchmarks/bench_peers.py
+	$(BIN)/python benchmarks/bench_work_precision.py
 	$(BIN)/python benchmarks/bench_gradient.py
 	$(BIN)/python benchmarks/bench_riccati.py
 	$(BIN)/python benchmarks/bench_design.py
 	$(BIN)/python benchmarks/bench_sweep.py
 	$(BIN)/python benchmarks/bench_basin.py
 
-# have the ratios that are claimed become worse?
-bench-guard: $(VENV)/.bench
-	$(BIN)/python benchmarks/guard.py
+# the same with the peers that need environments of their own
+bench-peers: $(VENV)/.bench $(VENV)-torch/.installed $(VENV)-jaxonomy/.installed
+	$(BIN)/python benchmarks/bench_peers.py --python \
+	  torchdiffeq_event=$(VENV)-torch/bin/python jaxonomy_event=$(VENV)-jaxonomy/bin/python
+
+$(VENV)-torch/.installed $(VENV)-jaxonomy/.installed: $(VENV)-%/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)-$*
+	$(VENV)-$*/bin/python -m pip install --quiet "pip>=25.1"
+	$(VENV)-$*/bin/python -m pip install --quiet --group bench-$*
+	touch $@
+
+# have ratios become worse than those stored in benchmarks/ratios.json?
+bench-check: $(VENV)/.bench
+	$(BIN)/python benchmarks/check.py
+
+# error against time, from what `make bench` has written
+bench-figure: $(VENV)/.bench
+	$(BIN)/python benchmarks/draw_work_precision.py --out docs/figures/work-precision.png
 
 mutations: $(VENV)/.test
 	$(BIN)/python tests/mutations.py
@@ -50,7 +66,7 @@ fuzz: $(VENV)/.test
 	$(BIN)/python tests/fuzz_files.py --count 2000 --seed 0
 
 clean:
-	rm -rf $(VENV) .jax_cache out
+	rm -rf $(VENV) $(VENV)-torch $(VENV)-jaxonomy .jax_cache out
 
 $(VENV)/.python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "diffabs needs Python 3.11 or newer; set PYTHON=...")'

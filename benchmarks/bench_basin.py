@@ -9,7 +9,6 @@ process of its own; times include everything but compilation, which is shown bes
 
 import argparse
 import json
-import os
 import pathlib
 import statistics
 import subprocess
@@ -18,11 +17,11 @@ import time
 
 import jax
 import numpy as np
+import record
 from rich.console import Console
 from rich.table import Table
 
 from diffabs import FixedStep
-from diffabs.core import provenance
 from diffabs.core.pytree import replace
 from diffabs.design.attraction import Cells, attraction
 from diffabs.scenario.scenario import load
@@ -60,7 +59,7 @@ def main():
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--points", type=int, default=100)
     parser.add_argument("--gain", choices=("LQR", "slow"), default="LQR")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/benchmarks/basin.json"))
+    parser.add_argument("--out", type=pathlib.Path)
     parser.add_argument("--dtype", choices=DTYPES, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.dtype:
@@ -79,15 +78,8 @@ def main():
         shares = (f"{one['share']:.4f}", f"{one['undecided']:.4f}", str(one["diverged"]))
         table.add_row(dtype, f"{median:.1f}", f"{one['first']:.1f}", *shares)
     Console().print(table)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    record = {
-        **found,
-        "cells that agree": agree,
-        "machine": {"cores": os.cpu_count(), "load": os.getloadavg()},
-        "versions": {**provenance.origin("jaxlib", "numpy"), **provenance.commit()},
-    }
-    options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    Console().print(f"{100 * agree:.2f} % of the cells agree; written to {options.out}")
+    path = record.written("basin", {**found, "cells that agree": agree}, options.out)
+    Console().print(f"{100 * agree:.2f} % of the cells agree; written to {path}")
     return 0
 
 

@@ -12,17 +12,15 @@ with Clarabel in good units, and agree on the cost to the accuracy shown.
 """
 
 import argparse
-import importlib.metadata
 import json
-import os
 import pathlib
-import platform
 import statistics
 import time
 import warnings
 
 import cvxpy as cp
 import numpy as np
+import record
 from rich.console import Console
 from rich.table import Table
 
@@ -87,7 +85,7 @@ def main():
     """Time the four, print a table, write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--weights", type=int, default=40)
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/benchmarks/design.json"))
+    parser.add_argument("--out", type=pathlib.Path)
     options = parser.parse_args()
     random = np.random.default_rng(0)
     draws = 10.0 ** np.stack([random.uniform(0, 8, options.weights), random.uniform(0, 4, options.weights)], 1)
@@ -123,16 +121,9 @@ def report(rows, options):
             name, f"{row['median_ms']:.2f}", f"{ratio:.1f}", "" if difference is None else f"{difference:.1e}"
         )
     Console().print(table)
-    names = ("numpy", "scipy", "cvxpy", "clarabel")
-    result = {
-        "rows": rows,
-        "weights": options.weights,
-        "machine": {"processor": platform.processor() or platform.machine(), "cores": os.cpu_count()},
-        "versions": {"python": platform.python_version(), **{n: importlib.metadata.version(n) for n in names}},
-    }
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-    print(json.dumps(rows["certify"]), f"by hand, failed: {rows['by hand']['failed']};", options.out)
+    found = {"rows": rows, "weights": options.weights}
+    path = record.written("design", found, options.out, ("numpy", "scipy", "cvxpy", "clarabel"))
+    print(json.dumps(rows["certify"]), f"by hand, failed: {rows['by hand']['failed']};", path)
 
 
 if __name__ == "__main__":

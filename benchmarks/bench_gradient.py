@@ -15,17 +15,13 @@ with machine, versions and commit.
 
 import argparse
 import dataclasses
-import importlib.metadata
-import json
-import os
 import pathlib
-import platform
 import statistics
-import subprocess
 import time
 
 import jax
 import jax.numpy as jnp
+import record
 from rich.console import Console
 from rich.table import Table
 
@@ -146,7 +142,7 @@ def main():
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--loops", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--quick", action="store_true", help="leave the memory out")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/benchmarks/gradient.json"))
+    parser.add_argument("--out", type=pathlib.Path)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     found = {}
@@ -185,22 +181,9 @@ def show(name, found, options):
 
 def write(found, options):
     """JSON with machine, versions and commit."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
-    commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-    record = {
-        "loops": found,
-        "lanes": options.lanes,
-        "step_s": options.step,
-        "rounds": options.rounds,
-        "device": str(jax.devices()[0]),
-        "machine": {"processor": platform.machine(), "system": platform.system(), "cores": os.cpu_count()},
-        "versions": {name: importlib.metadata.version(name) for name in ("diffabs", "jax", "jaxlib", "numpy")},
-        "python": platform.python_version(),
-        "commit": commit,
-    }
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    Console().print(f"written to {options.out}")
+    kept = {"loops": found, "lanes": options.lanes, "step_s": options.step, "rounds": options.rounds}
+    path = record.written("gradient", {**kept, "device": str(jax.devices()[0])}, options.out)
+    Console().print(f"written to {path}")
 
 
 if __name__ == "__main__":

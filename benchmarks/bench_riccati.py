@@ -8,16 +8,14 @@ threads, which mostly get in its way. Prints a table, writes JSON with machine a
 """
 
 import argparse
-import importlib.metadata
-import json
 import os
 import pathlib
-import platform
 import statistics
 import time
 
 import jax
 import numpy as np
+import record
 from rich.console import Console
 from rich.table import Table
 from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
@@ -41,7 +39,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lanes", type=int, default=10_000)
     parser.add_argument("--part", type=int, default=1000)
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/benchmarks/riccati.json"))
+    parser.add_argument("--out", type=pathlib.Path)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     random = np.random.default_rng(0)
@@ -79,17 +77,8 @@ def report(rows, refused, options):
     for name, row in rows.items():
         table.add_row(name, f"{row['seconds']:.3f}", f"{loop / row['seconds']:.1f}", f"{row['worst_error']:.1e}")
     Console().print(table, f"{refused} of {options.lanes} reported as not solved")
-    record = {
-        "rows": rows,
-        "lanes": options.lanes,
-        "reported": refused,
-        "threads": os.environ.get("OMP_NUM_THREADS"),
-        "machine": {"processor": platform.machine(), "cores": os.cpu_count()},
-        "versions": {name: importlib.metadata.version(name) for name in ("jax", "jaxlib", "numpy", "scipy")},
-    }
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    print(options.out)
+    found = {"rows": rows, "lanes": options.lanes, "reported": refused, "threads": os.environ.get("OMP_NUM_THREADS")}
+    print(record.written("riccati", found, options.out, ("jaxlib", "numpy", "scipy")))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ ratios within a round. All cases must end with the same table: digests are compa
 
 import argparse
 import json
-import os
 import pathlib
 import resource
 import shutil
@@ -22,10 +21,10 @@ import tempfile
 import time
 
 import jax
+import record
 from rich.console import Console
 from rich.table import Table
 
-from diffabs.core import provenance
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import load
 
@@ -90,7 +89,7 @@ def main():
     parser.add_argument("--dtype", default="float64", choices=("float32", "float64"))
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out/benchmarks/sweep.json"))
+    parser.add_argument("--out", type=pathlib.Path)
     parser.add_argument("--case", help=argparse.SUPPRESS)
     parser.add_argument("--folder", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -99,16 +98,10 @@ def main():
     rounds = [{case: measured(case, options) for case in options.cases} for _ in range(options.rounds)]
     show(rounds, options)
     tables = {one["table"] for each in rounds for one in each.values()}
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    record = {
-        "rounds": rounds,
-        "options": {name: str(value) for name, value in vars(options).items()},
-        "machine": {"cores": os.cpu_count(), "load": os.getloadavg()},
-        "versions": {**provenance.origin("jaxlib", "numpy", "pyarrow"), **provenance.commit()},
-        "same table": len(tables) == 1,
-    }
-    options.out.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    Console().print(f"{'the same table' if len(tables) == 1 else 'DIFFERENT TABLES'}; written to {options.out}")
+    said = {name: str(value) for name, value in vars(options).items()}
+    found = {"rounds": rounds, "options": said, "same table": len(tables) == 1}
+    path = record.written("sweep", found, options.out, ("jaxlib", "numpy", "pyarrow"))
+    Console().print(f"{'the same table' if len(tables) == 1 else 'DIFFERENT TABLES'}; written to {path}")
     return 0 if len(tables) == 1 else 1
 
 

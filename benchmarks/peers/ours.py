@@ -1,0 +1,38 @@
+"""diffabs itself: its parts, `run_batch` as a user calls it, and the one place where a solver is chosen."""
+
+import jax.numpy as jnp
+
+import diffabs
+from diffabs import controllers, objectives, plants, stops
+from diffabs.scenario.defaults import braking
+from peers import on_devices, problem
+
+PACKAGES, MANY = ("diffabs", "jax", "jaxlib"), None
+MEASURED = {name: objectives.BRAKING[name] for name in problem.METRICS}
+LOOP = braking(
+    plant=plants.MirroredRig(),
+    initial=diffabs.BrakeStart(speed=50 / 3.6),
+    stop=stops.SpeedReached(speed=problem.STOP),
+    controller=controllers.StateFeedback(torque_min=0.0, torque_max=problem.U),
+    feedforward=controllers.HoldingInput(),
+)
+KINDS = ("fixed", "adaptive")
+
+
+def solver(kind, setting, duration):
+    """Return the solver of a kind, whose setting is a step [s] or a relative tolerance."""
+    if kind == "adaptive":
+        return diffabs.Adaptive(rtol=setting, duration=duration)
+    return diffabs.FixedStep(setting, duration)
+
+
+def prepared_with(kind, masses, speeds, setting, dtype):
+    """What `prepared` of a peer returns, for a solver of diffabs."""
+    chosen = solver(kind, setting, problem.DURATION)
+
+    def solve(m, v):
+        batch = diffabs.Batch({"plant.mass": m, "initial.speed": v})
+        metrics = diffabs.run_batch(LOOP, batch, chosen, MEASURED).metrics
+        return tuple(jnp.asarray(metrics[name]) for name in problem.METRICS)
+
+    return on_devices.spread(solve, masses, speeds, dtype, compiled=False)
