@@ -2,14 +2,17 @@
 
     python tests/mutations.py [part of a name ...]
 
-Exit status 1 if a mutation survives, if its text is no longer in the file, or if a named test fails without it. Not
+A mutation whose test does not end within LIMIT_S is dead too, and it is said. Exit status 1 if a mutation survives, if
+its text is no longer in the file, or if a named test fails without it. Not
 collected by pytest; run it weekly, and when a test is added: add a line to MUTATIONS (of
 sweeps: in mutations_sweep.py).
 """
 
+import contextlib
 import os
 import pathlib
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -18,6 +21,7 @@ from typing import NamedTuple
 from mutations_sweep import SWEEP
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
+LIMIT_S = 300.0  # for the test of a mutation; the slowest takes a minute when nothing is compiled yet
 
 
 class Mutation(NamedTuple):
@@ -1436,8 +1440,9 @@ MUTATIONS = [
 ]
 
 
-def passes(tests: list[str], folder: pathlib.Path) -> bool:
-    """Whether the tests pass against the package in `folder`. Stops at the first failure."""
+def outcome(tests: list[str], folder: pathlib.Path, limit: float | None = None) -> str:
+    """What the tests do against the package in `folder`: "pass", "fail", of which the first ends it, or "take too
+    long", more than the limit [s]."""
     environment = {
         **os.environ,
         "PYTHONPATH": str(folder),
@@ -1445,10 +1450,23 @@ def passes(tests: list[str], folder: pathlib.Path) -> bool:
         "PYTHONDONTWRITEBYTECODE": "1",
     }
     command = [sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *(f"tests/{test}" for test in tests)]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode > 1:  # neither passed nor failed: the test does not exist, or nothing could be imported
-        raise SystemExit(done.stdout + done.stderr)
-    return done.returncode == 0
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, cwd=folder, env=environment, start_new_session=True, **pipes) as running:
+        try:
+            said, _ = running.communicate(timeout=limit)
+        except subprocess.TimeoutExpired:
+            return "take too long"
+        finally:
+            _end(running)
+    if running.returncode > 1:  # neither passed nor failed: the test does not exist, or nothing could be imported
+        raise SystemExit(said)
+    return "fail" if running.returncode else "pass"
+
+
+def _end(running: subprocess.Popen[str]) -> None:
+    """End the processes that a test has started, with the test."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(running.pid, signal.SIGKILL)
 
 
 def copied(folder: pathlib.Path) -> None:
@@ -1463,6 +1481,20 @@ def copied(folder: pathlib.Path) -> None:
         raise SystemExit(f"the tests would import {found.strip()}, not the copy in {folder}")
 
 
+def judged(mutation: Mutation, folder: pathlib.Path, limit: float = LIMIT_S) -> str:
+    """What becomes of a mutation of the package in `folder`, which is left as it was."""
+    path = folder / "diffabs" / mutation.file
+    source = path.read_text()
+    if source.count(mutation.old) == 0:
+        return "IS OUT OF DATE: its text is not in the file"
+    path.write_text(source.replace(mutation.old, mutation.new))
+    try:
+        found = outcome([mutation.test], folder, limit)
+    finally:
+        path.write_text(source)
+    return {"pass": "SURVIVES", "fail": "dies", "take too long": f"dies: no end after {limit:g} s"}[found]
+
+
 def main(wanted: list[str]) -> int:
     """Run the mutations whose names contain one of the words."""
     chosen = [m for m in MUTATIONS if not wanted or any(word in m.name for word in wanted)]
@@ -1470,18 +1502,11 @@ def main(wanted: list[str]) -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name).resolve()
         copied(folder)
-        if not passes(sorted({m.test for m in chosen}), folder):
+        if outcome(sorted({m.test for m in chosen}), folder) != "pass":
             raise SystemExit("a named test fails without any mutation")
         for mutation in chosen:
-            path = folder / "diffabs" / mutation.file
-            source = path.read_text()
-            if source.count(mutation.old) == 0:
-                verdict = "IS OUT OF DATE: its text is not in the file"
-            else:
-                path.write_text(source.replace(mutation.old, mutation.new))
-                verdict = "SURVIVES" if passes([mutation.test], folder) else "dies"
-                path.write_text(source)
-            bad += [mutation.name] if verdict != "dies" else []
+            verdict = judged(mutation, folder)
+            bad += [] if verdict.startswith("dies") else [mutation.name]
             print(f"{mutation.name}: {verdict}", flush=True)
     print(f"{len(chosen) - len(bad)} of {len(chosen)} mutations die")
     return 1 if bad else 0
