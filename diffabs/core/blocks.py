@@ -2,13 +2,23 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, part, pytree
+
+
+class Passage(NamedTuple):
+    """A block's signal over a step, within which nothing jumps: time [s], value and rate at both ends; the first after
+    what changes there, the last before that."""
+
+    start: Scalar
+    end: Scalar
+    values: tuple[Any, Any]
+    rates: tuple[Any, Any]
 
 
 @pytree
@@ -87,6 +97,26 @@ class Series:
             signal = block.output(t, m, signal)
         return _joined(memories)
 
+    def recorded(self, t: Scalar, memory: Memory, signal: Any) -> tuple[Any, ...]:
+        """The signals of the blocks that record them, in order."""
+        found: tuple[Any, ...] = ()
+        for block, m in self._pairs(memory):
+            found += (recorded(block, t, m, signal),) if offers(block, "record") else ()
+            signal = block.output(t, m, signal)
+        return found
+
+    def record(self, memory: Memory, passage: Passage) -> Memory:
+        """Each records its own."""
+        (starts, ends), (rates, last) = passage.values, passage.rates
+        each = zip(starts, ends, rates, last, strict=True)
+        memories = []
+        for block, m in self._pairs(memory):
+            if offers(block, "record"):
+                a, b, da, db = next(each)
+                m = block.record(m, passage._replace(values=(a, b), rates=(da, db)))
+            memories.append(m)
+        return _joined(memories)
+
     def _pairs(self, memory: Memory) -> Any:
         return [(b, Memory(f, h)) for b, f, h in zip(self.blocks, memory.flow, memory.held, strict=True)]
 
@@ -95,6 +125,12 @@ def offers(block: Any, *hooks: str) -> bool:
     """Whether a block has one of these hooks, by default a tick or margins; a block made of blocks says it itself."""
     asked = getattr(block, "offers", None)
     return any(asked(hook) if asked else hasattr(block, hook) for hook in hooks or ("tick", "margins"))
+
+
+def recorded(block: Any, t: Scalar, memory: Memory, signal: Any) -> Any:
+    """Return what a block records of its signal: all of it; of blocks in series, the signal of each that records."""
+    inner = getattr(block, "recorded", None)
+    return inner(t, memory, signal) if inner else signal
 
 
 def _joined(memories: Sequence[Memory]) -> Memory:

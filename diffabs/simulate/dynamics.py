@@ -87,7 +87,7 @@ def dynamics(loop: Loop, objectives: Objectives, t: Any, state: LoopState, tally
     if key not in _programs:
         while len(_programs) >= PROGRAMS:
             _programs.pop(next(iter(_programs)))
-        _programs[key] = Program(_seen, *args, counts=lambda seen: seen[:2])
+        _programs[key] = Program(_seen, *args, counts=lambda seen: (seen[:2], seen.signals.recorded))
     return Dynamics(_programs[key], loop, objectives)
 
 
