@@ -580,7 +580,7 @@ MUTATIONS = [
         "actuators/delay.py",
         "window = jnp.where(count < size, rows, jnp.nan)",
         "window = rows",
-        "test_delay.py::test_a_delay_that_has_no_room_has_no_value[0.00021-True]",
+        "test_delay.py::test_a_delay_that_has_no_room_has_no_value[0.0009-True]",
     ),
     Mutation(
         "a delay that sees no further than its window",
