@@ -43,6 +43,13 @@ MUTATIONS = [
         "test_kinks.py::test_who_looks_sees_what_is_contradicted_and_by_how_much[gt]",
     ),
     Mutation(
+        "an integral that stays clamped where comparisons are held",
+        "controllers/antiwindup.py",
+        "jnp.not_equal(raw, limited) & ",
+        "",
+        "test_kinks.py::test_an_integral_that_was_clamped_goes_on",
+    ),
+    Mutation(
         "a search that nobody looks at",
         "core/regime.py",
         "next = below + jnp.where(high < -_rounding(x), 1, 0) - jnp.where(low < -_rounding(x), 1, 0)",
