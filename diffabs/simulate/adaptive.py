@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.blocks import Passage
 from diffabs.core.cubic import Cubic
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.numerics import clamp
@@ -104,15 +105,16 @@ class Pace:
 
 
 class Point(NamedTuple):
-    """A run at an instant, after what changes there: the loop's state and the objectives' accumulators, what is seen,
-    the rates of this, the rates of what is integrated, the margins of the stop and of the blocks' events, the answers
-    to the comparisons, and in how many seconds the first of them will change."""
+    """A run at an instant, after what changes there: the loop's state and the objectives' accumulators; what is seen,
+    and its rates; what blocks record, and its rates; the rates of what is integrated; the margins of the stop and of
+    the blocks' events; the answers to the comparisons, and in how many seconds the first of them will change."""
 
     t: Any
     state: LoopState
     tally: Tally
     sample: Sample
     moving: Sample
+    recorded: tuple[dict[str, Any], dict[str, Any]]
     rate: tuple[Any, Any]
     margins: Margins
     words: Words
@@ -201,7 +203,7 @@ def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry,
     strikes = verdict.taken & carry.ends
     k = jnp.where(strikes, strike, carry.k)
     clock = Clock(end, pace.h, k, key, strikes)
-    point = depart(system, pace, clock, here, verdict.fired, carry.natural)
+    point = depart(system, pace, clock, carry.point, here, verdict.fired, carry.natural)
     point = select(verdict.over, here.point, point)
 
     natural = _natural(carry, here, verdict, pace)
@@ -261,8 +263,8 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
     state = point.state.with_flow(z[0])
     state = state._replace(plant=loop.plant.project(state.plant))
     tallied = {name: memory._replace(flow=z[1][name]) for name, memory in point.tally.items()}
-    seen, moving, _, words, comparisons = system.ahead(end, state, tallied)
-    sample = seen.signals.sample
+    seen, moving, recording, _, words, comparisons = system.ahead(end, state, tallied)
+    sample, recorded = seen.signals.sample, (seen.signals.recorded, recording)
     segment = Segment(
         point.sample,
         sample,
@@ -276,7 +278,7 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
         tally = select(anew, point.tally, tally)
     changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
     ahead, late = kinks(comparisons, carry.natural, pace.care, changed, h)
-    new = Point(end, state, tally, sample, moving, seen[:2], seen.margins, words, ahead)
+    new = Point(end, state, tally, sample, moving, recorded, seen[:2], seen.margins, words, ahead)
     scale = jax.tree.map(jnp.maximum, carry.scale, _sizes(state, sample))
     error = _error(loop, state, point.state.with_flow(coarse[0]), scale, sample) / pace.rtol
     middle = _middle(system, point, new, h) if pace.notes else ()
@@ -292,16 +294,24 @@ def _middle(system: Dynamics, start: Point, end: Point, h: Any) -> Words:
     return system.look(start.t + 0.5 * h, state, tally, FREE)[1].words
 
 
-def depart(system: Dynamics, pace: Pace, clock: Clock, here: Arrival, fired: Margins, natural: Any) -> Point:
+def depart(
+    system: Dynamics, pace: Pace, clock: Clock, begun: Point, here: Arrival, fired: Margins, natural: Any
+) -> Point:
     """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock. In a
     loop without ticks, what follows from an event is left to a step of no length: there are few of them."""
     loop, point = system.loop, here.point
     if not loop.changes:
         return point
-    state = loop.change(clock, point.state, here.signals, point.margins, fired)
+    state = loop.change(clock, point.state, here.signals, point.margins, fired, passed(begun, point))
     if not loop.ticks:
         return point._replace(state=state)
     return _point(system, pace, point.t, state, point.tally, natural)
+
+
+def passed(start: Any, end: Any) -> dict[str, Passage]:
+    """Return the step between two points for the blocks that record it."""
+    (values, rates), (last, falls) = start.recorded, end.recorded
+    return {n: Passage(start.t, end.t, (values[n], last[n]), (rates[n], falls[n])) for n in values}
 
 
 def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
@@ -347,9 +357,10 @@ def longest_stable(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any:
 
 
 def _point(system: Dynamics, pace: Pace, t: Any, state: LoopState, tally: Tally, length: Any) -> Point:
-    seen, moving, _, words, comparisons = system.ahead(t, state, tally)
+    seen, moving, recording, _, words, comparisons = system.ahead(t, state, tally)
+    recorded = (seen.signals.recorded, recording)
     ahead, _ = kinks(comparisons, length, pace.care, words, 0.0 * length)
-    return Point(t, state, tally, seen.signals.sample, moving, seen[:2], seen.margins, words, ahead)
+    return Point(t, state, tally, seen.signals.sample, moving, recorded, seen[:2], seen.margins, words, ahead)
 
 
 def _error(loop: Loop, state: LoopState, coarse: LoopState, scale: Any, sample: Sample) -> Any:

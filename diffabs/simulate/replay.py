@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.blocks import Passage
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment
 from diffabs.core.regime import Regime, Words
-from diffabs.simulate.adaptive import Carry, Pace
+from diffabs.simulate.adaptive import Carry, Pace, passed
 from diffabs.simulate.advance import start
 from diffabs.simulate.checkpoint import anyone, forgetful
 from diffabs.simulate.condition import Condition
@@ -56,6 +57,13 @@ class Place(NamedTuple):
     state: LoopState
     tally: Tally
     k: Any
+
+
+class Recorded(NamedTuple):
+    """What blocks record at an instant, and its rates."""
+
+    t: Any
+    recorded: tuple[dict[str, Any], dict[str, Any]]
 
 
 class Repeated(NamedTuple):
@@ -173,7 +181,10 @@ def _step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, place: Place
     )
     tally = {name: Memory(tally[name].flow, o.update(tally[name], segment)) for name, o in objectives.items()}
     if loop.changes:
-        state = _changed(system, Clock(t, pace.h, one.k, key, strikes), state, end.seen.margins, one.fired)
+        late = axpy(shift, end.recorded, end.seen.signals.recorded)
+        ends = (begin.seen.signals.recorded, begin.recorded), (late, end.recorded)
+        step = passed(*(Recorded(*both) for both in zip((place.t, t), ends, strict=True)))
+        state = _changed(system, Clock(t, pace.h, one.k, key, strikes), state, end.seen.margins, one.fired, step)
     return Place(t, state, tally, one.k)
 
 
@@ -206,9 +217,11 @@ def _until(on: Any, margin: Any, fall: Any, most: Any) -> tuple[Any, Any]:
     return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))  # the margin is 0, but for rounding
 
 
-def _changed(system: Dynamics, clock: Clock, state: LoopState, margins: Margins, fired: Any) -> LoopState:
+def _changed(
+    system: Dynamics, clock: Clock, state: LoopState, margins: Margins, fired: Any, step: dict[str, Passage]
+) -> LoopState:
     """The state after the events and the ticks at the end of a step."""
     signals = system.loop.signals(clock.t, state)
     leaves, tree = jax.tree.flatten(margins)
     happens = tree.unflatten([(fired >> i) & 1 != 0 for i in range(len(leaves))])
-    return system.loop.change(clock, state, signals, margins, happens)
+    return system.loop.change(clock, state, signals, margins, happens, step)
