@@ -202,12 +202,14 @@ def _shift(end: Ahead, changed: Words, one: Notes, h: Any, strikes: Any) -> Any:
     shift, nearest = jnp.zeros_like(h), jnp.where(happens, NEAR * one.natural, FAR * h)
     for comparison in end.comparisons:
         was = bit(changed, comparison.numbers)
-        for on, *line in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, *comparison[1:])), strict=True):
-            close, later = _until(on, *line, nearest)
+        each = (jnp.ravel(jnp.asarray(x)) for x in (was, comparison.value, comparison.rate))
+        for on, margin, rate in zip(*each, strict=True):
+            close, later = _until(on, margin, rate, nearest)
             shift, nearest = jnp.where(close, later, shift), jnp.where(close, jnp.abs(later), nearest)
     shift = jnp.where(strikes & ~happens, 0.0, shift)
-    for i, line in reversed(list(enumerate(zip(*map(jax.tree.leaves, (end.seen.margins, end.falls)), strict=True)))):
-        close, later = _until((one.fired >> i) & 1 != 0, *line, NEAR * one.natural)
+    events = zip(jax.tree.leaves(end.seen.margins), jax.tree.leaves(end.falls), strict=True)
+    for i, (margin, fall) in reversed(list(enumerate(events))):
+        close, later = _until((one.fired >> i) & 1 != 0, margin, fall, NEAR * one.natural)
         shift = jnp.where(close, later, shift)
     return shift
 

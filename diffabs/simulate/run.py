@@ -121,7 +121,8 @@ def _wrong_number(solver: Solver, name: str) -> str:
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _simulated(places: Places, run: Any) -> Run:
     """The run of (loop, objectives, method, key)."""
-    return _run(*run, jnp.asarray(places.every), places=places.instants)
+    loop, objectives, method, key = run
+    return _run(loop, objectives, method, key, jnp.asarray(places.every), places=places.instants)
 
 
 def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
@@ -178,8 +179,8 @@ def _repeated(loop: Loop, objectives: dict[str, Objective], method: AtPace, key:
         raise ValueError("no derivative of a trajectory with Adaptive steps: take FixedStep, or what is measured")
     loop, audit = prepare(loop)
     objectives = objectives | audit
-    still = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
-    notes, condition = note(*still, method, key, places.tries)
+    still, measures = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
+    notes, condition = note(still, measures, method, key, places.tries)
     return judge(loop, objectives, repeat(loop, objectives, method, key, notes, condition))[0]
 
 
