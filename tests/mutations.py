@@ -2,14 +2,17 @@
 
     python tests/mutations.py [part of a name ...]
 
-Exit status 1 if a mutation survives, if its text is no longer in the file, or if a named test fails without it. Not
+A mutation whose test does not end within LIMIT_S is dead too, and it is said. Exit status 1 if a mutation survives, if
+its text is no longer in the file, or if a named test fails without it. Not
 collected by pytest; run it weekly, and when a test is added: add a line to MUTATIONS (of
 sweeps: in mutations_sweep.py).
 """
 
+import contextlib
 import os
 import pathlib
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -18,6 +21,7 @@ from typing import NamedTuple
 from mutations_sweep import SWEEP
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
+LIMIT_S = 300.0  # for the test of a mutation; the slowest takes a minute when nothing is compiled yet
 
 
 class Mutation(NamedTuple):
@@ -37,6 +41,13 @@ MUTATIONS = [
         "against = margin < -_rounding(x)",
         "against = margin < -jnp.inf",
         "test_kinks.py::test_who_looks_sees_what_is_contradicted_and_by_how_much[gt]",
+    ),
+    Mutation(
+        "an integral that stays clamped where comparisons are held",
+        "controllers/antiwindup.py",
+        "jnp.not_equal(raw, limited) & ",
+        "",
+        "test_kinks.py::test_an_integral_that_was_clamped_goes_on",
     ),
     Mutation(
         "a search that nobody looks at",
@@ -382,11 +393,11 @@ MUTATIONS = [
         "test_blocks.py::test_robust_latch",
     ),
     Mutation(
-        "a delay that forgets the running segment",
+        "a delay whose jumps nobody looks for",
         "actuators/delay.py",
-        "0.0, part, 1.0 - part))",
-        "0.0, 0.0 * part, 1.0 - part))",
-        "test_blocks.py::test_delay_shifts_a_ramp",
+        "(m.window[i, -1] > 0.5)",
+        "(m.window[i, -1] > 2.0)",
+        "test_delay.py::test_a_jump_comes_out_at_its_moment[0.0073-0.0026-False]",
     ),
     Mutation(
         "noise drawn off its period",
@@ -537,18 +548,60 @@ MUTATIONS = [
         "test_blocks.py::test_relay_switches_on_the_far_side_of_its_band",
     ),
     Mutation(
-        "a delay that takes a level for a line",
+        "a delay that knows no rates",
         "actuators/delay.py",
-        "return mean, clamp(12.0 * (moment - 0.5 * mean), -most, most)",
-        "return mean, 0.0 * moment",
+        "(h * rate for rate in passage.rates)",
+        "(0.0 * rate for rate in passage.rates)",
         "test_order_of_events.py::test_converges_to_scipy[delay]",
     ),
     Mutation(
-        "a delay that does not know what it was given before a jump",
+        "a delay whose kinks nobody looks for",
         "actuators/delay.py",
-        "end = signal if clock.before is None else clock.before",
-        "end = signal",
-        "test_blocks.py::test_delay_of_a_command_that_jumps_at_an_instant",
+        "return jnp.any(jnp.stack(jumps))",
+        "return jumps[0]",
+        "test_delay.py::test_what_bends_comes_out_bent[True]",
+    ),
+    Mutation(
+        "kinks of what is recorded do not count",
+        "simulate/dynamics.py",
+        "(seen[:2], seen.signals.recorded)",
+        "seen[:2]",
+        "test_delay.py::test_what_bends_comes_out_bent[True]",
+    ),
+    Mutation(
+        "a jump that comes out on the grid, after its end",
+        "actuators/delay.py",
+        "jnp.where(newest, 1.0, -1.0) * _rounding(until + self.time)",
+        "_rounding(until + self.time)",
+        "test_delay.py::test_what_a_computer_says_comes_out_later[0.002]",
+    ),
+    Mutation(
+        "a delay whose smooth pieces are kinks",
+        "actuators/delay.py",
+        "return _count([m.window[i, 1] for i in range(WINDOW)], t - self.time, m.place, m.last)",
+        "return jnp.clip(jnp.sum(t - self.time >= m.window[:, 1]).astype(m.last.dtype), m.place, m.last)",
+        "test_delay.py::test_nobody_looks_for_the_ends_of_smooth_pieces",
+    ),
+    Mutation(
+        "a delay that overwrites what is still to come out",
+        "actuators/delay.py",
+        "window = jnp.where(count < size, rows, jnp.nan)",
+        "window = rows",
+        "test_delay.py::test_a_delay_that_has_no_room_has_no_value[0.0009-True]",
+    ),
+    Mutation(
+        "a delay that sees no further than its window",
+        "actuators/delay.py",
+        "_piece(m.window, last).end)",
+        "_piece(m.window, last).end + jnp.where(m.known == m.count, 0.0, 1.0))",
+        "test_delay.py::test_steps_of_any_length",
+    ),
+    Mutation(
+        "a series that records the first signal for all",
+        "core/blocks.py",
+        "            signal = block.output(t, m, signal)\n        return found\n\n    def record",
+        "        return found\n\n    def record",
+        "test_delay.py::test_what_bends_comes_out_bent[True]",
     ),
     Mutation(
         "a stop on the grid",
@@ -1436,8 +1489,9 @@ MUTATIONS = [
 ]
 
 
-def passes(tests: list[str], folder: pathlib.Path) -> bool:
-    """Whether the tests pass against the package in `folder`. Stops at the first failure."""
+def outcome(tests: list[str], folder: pathlib.Path, limit: float | None = None) -> str:
+    """What the tests do against the package in `folder`: "pass", "fail", of which the first ends it, or "take too
+    long", more than the limit [s]."""
     environment = {
         **os.environ,
         "PYTHONPATH": str(folder),
@@ -1445,10 +1499,23 @@ def passes(tests: list[str], folder: pathlib.Path) -> bool:
         "PYTHONDONTWRITEBYTECODE": "1",
     }
     command = [sys.executable, "-m", "pytest", "-qx", "-p", "no:cacheprovider", *(f"tests/{test}" for test in tests)]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    if done.returncode > 1:  # neither passed nor failed: the test does not exist, or nothing could be imported
-        raise SystemExit(done.stdout + done.stderr)
-    return done.returncode == 0
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    with subprocess.Popen(command, cwd=folder, env=environment, start_new_session=True, **pipes) as running:
+        try:
+            said, _ = running.communicate(timeout=limit)
+        except subprocess.TimeoutExpired:
+            return "take too long"
+        finally:
+            _end(running)
+    if running.returncode > 1:  # neither passed nor failed: the test does not exist, or nothing could be imported
+        raise SystemExit(said)
+    return "fail" if running.returncode else "pass"
+
+
+def _end(running: subprocess.Popen[str]) -> None:
+    """End the processes that a test has started, with the test."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(running.pid, signal.SIGKILL)
 
 
 def copied(folder: pathlib.Path) -> None:
@@ -1463,6 +1530,20 @@ def copied(folder: pathlib.Path) -> None:
         raise SystemExit(f"the tests would import {found.strip()}, not the copy in {folder}")
 
 
+def judged(mutation: Mutation, folder: pathlib.Path, limit: float = LIMIT_S) -> str:
+    """What becomes of a mutation of the package in `folder`, which is left as it was."""
+    path = folder / "diffabs" / mutation.file
+    source = path.read_text()
+    if source.count(mutation.old) == 0:
+        return "IS OUT OF DATE: its text is not in the file"
+    path.write_text(source.replace(mutation.old, mutation.new))
+    try:
+        found = outcome([mutation.test], folder, limit)
+    finally:
+        path.write_text(source)
+    return {"pass": "SURVIVES", "fail": "dies", "take too long": f"dies: no end after {limit:g} s"}[found]
+
+
 def main(wanted: list[str]) -> int:
     """Run the mutations whose names contain one of the words."""
     chosen = [m for m in MUTATIONS if not wanted or any(word in m.name for word in wanted)]
@@ -1470,18 +1551,11 @@ def main(wanted: list[str]) -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name).resolve()
         copied(folder)
-        if not passes(sorted({m.test for m in chosen}), folder):
+        if outcome(sorted({m.test for m in chosen}), folder) != "pass":
             raise SystemExit("a named test fails without any mutation")
         for mutation in chosen:
-            path = folder / "diffabs" / mutation.file
-            source = path.read_text()
-            if source.count(mutation.old) == 0:
-                verdict = "IS OUT OF DATE: its text is not in the file"
-            else:
-                path.write_text(source.replace(mutation.old, mutation.new))
-                verdict = "SURVIVES" if passes([mutation.test], folder) else "dies"
-                path.write_text(source)
-            bad += [mutation.name] if verdict != "dies" else []
+            verdict = judged(mutation, folder)
+            bad += [] if verdict.startswith("dies") else [mutation.name]
             print(f"{mutation.name}: {verdict}", flush=True)
     print(f"{len(chosen) - len(bad)} of {len(chosen)} mutations die")
     return 1 if bad else 0

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors, stops
 from diffabs.core import blocks
-from diffabs.core.blocks import offers
+from diffabs.core.blocks import Passage, offers, recorded
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import BalanceOutput, BrakeOutput, Clock, Ending, Memory, Sample, Segment, Tracking
 from diffabs.core.pytree import strong
@@ -237,9 +237,11 @@ def braking_at(t: Any) -> Sample:
     return Sample(t, y, 0.2 + 0.0 * t, 0.2 + 0.0 * t, 10.0 + 0.0 * t, 10.0 + 5.0 * excess, 10.0 + 5.0 * excess)
 
 
-def at_instant(block: Any, clock: Clock, memory: Memory, signal: Any, rate: Any, before: Any) -> tuple[Memory, Any]:
+def at_instant(
+    block: Any, clock: Clock, memory: Memory, signal: Any, rate: Any, before: Any, passage: Passage | None = None
+) -> tuple[Memory, Any]:
     """A block's memory after an instant, and its margins there: an event where one has become negative since `before`,
-    which are None at first; then its tick."""
+    which are None at first; the step that ends there; then its tick."""
 
     def margins(memory: Memory) -> Any:
         return block.margins(clock.t, memory, signal, lambda: rate) if offers(block, "margins") else ()
@@ -248,8 +250,21 @@ def at_instant(block: Any, clock: Clock, memory: Memory, signal: Any, rate: Any,
         before = before or [0.0 * clock.t for _ in margins(memory)]
         fired = tuple((a >= 0) & (b < 0) for a, b in zip(before, margins(memory), strict=True))
         memory = block.event(clock.t, memory, signal, fired)
+    if passage is not None:
+        memory = block.record(memory, passage)
     memory = block.tick(clock, memory, signal) if offers(block, "tick") else memory
     return memory, margins(memory)
+
+
+def passed(family: str, block: Any, memory: Memory, t: Any) -> Passage:
+    """The step that ends at t; before the first there is none."""
+
+    def seen(t: Any) -> Any:
+        return recorded(block, t, memory, signal_at(family, block, t))
+
+    start = jnp.maximum(t - H, 0.0)
+    (first, rate), (last, final) = (jax.jvp(seen, (at,), (jnp.ones_like(at),)) for at in (start, t))
+    return Passage(start, t, (first, last), (rate, final))
 
 
 def block_run(family: str, block: Any, steps: int = 8) -> Any:
@@ -259,7 +274,8 @@ def block_run(family: str, block: Any, steps: int = 8) -> Any:
         memory, margins = at
         t = k * H
         signal, rate = jax.jvp(partial(signal_at, family, block), (t,), (jnp.ones_like(t),))
-        memory, margins = at_instant(block, Clock(t, H, k, jax.random.key(7)), memory, signal, rate, margins)
+        passage = passed(family, block, memory, t) if offers(block, "record") else None
+        memory, margins = at_instant(block, Clock(t, H, k, jax.random.key(7)), memory, signal, rate, margins, passage)
         seen = block.output(t, memory, signal), memory.flow
         return (Memory(axpy(H, block.flow(t, memory, signal), memory.flow), memory.held), margins), seen
 

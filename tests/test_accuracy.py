@@ -81,9 +81,9 @@ def test_events_and_delays_are_estimated_to_their_size(make, step):
 
 
 def test_a_delay_keeps_its_time_at_a_shorter_step():
-    """A ring of 16 steps of 1 ms holds 6.1 ms, one of 16 steps of 0.25 ms does not."""
-    finer = acc.measure_finer(delayed(), d.FixedStep(1e-3, 2.0), OBJECTIVES, 4).metrics
-    longer = dataclasses.replace(delayed(), actuator=actuators.Delay(time=0.0061, capacity=256))
+    """A ring of 16 steps of 1 ms holds 13.1 ms, one of 16 steps of 0.25 ms does not."""
+    finer = acc.measure_finer(delayed(0.0131), d.FixedStep(1e-3, 2.0), OBJECTIVES, 4).metrics
+    longer = dataclasses.replace(delayed(), actuator=actuators.Delay(time=0.0131, capacity=256))
     expected = d.measure(longer, d.FixedStep(2.5e-4, 2.0), OBJECTIVES).metrics
     for name, value in expected.items():
         assert finer[name] == pytest.approx(float(value), rel=1e-12), name

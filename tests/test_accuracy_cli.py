@@ -34,7 +34,7 @@ def test_simulate_check_says_how_accurate_each_metric_is(file):
     path = file(RELAY)
     result = json.loads(run("simulate", path, "--check", "--json").stdout)
     found, chosen = result["accuracy"], load(path)
-    assert found["steps"] == [2e-3, 1e-3, 5e-4]
+    assert [one["step"] for one in found["solvers"]] == [2e-3, 1e-3, 5e-4]
     assert found["comparable"]
     assert list(found["metrics"]) == list(chosen.objectives)
     half = d.measure(chosen.loop, d.FixedStep(1e-3, 1.0), chosen.objectives).metrics

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 import diffabs as d
 from diffabs import check
-from diffabs.actuators import Delay, Lag, Limits, RateLimit
+from diffabs.actuators import Lag, Limits, RateLimit
 from diffabs.controllers import (
     PID,
     BackCalculation,
@@ -446,93 +446,6 @@ def test_two_lags_in_series():
     series = Series(blocks=(Lag(time_constant=t1), Lag(time_constant=t2)))
     u = run(series, lambda t: 1.0 + 0.0 * t, 60)
     close(u, 1 - (t1 * np.exp(-t / t1) - t2 * np.exp(-t / t2)) / (t1 - t2), rtol=0, atol=2e-6)
-
-
-def lines(block, signal, steps, h=H):
-    """The delayed command at both ends of each step, (steps, 2)."""
-
-    def step(memory, k):
-        t = k * h
-        memory = block.tick(Clock(t, h, k, None), memory, signal(t))
-        flow = rk4_step(lambda t, z: block.flow(t, Memory(z, memory.held), signal(t)), t, memory.flow, h)
-        ends = jnp.array([block.output(at, memory, signal(at)) for at in (t, t + h)])
-        return Memory(flow, memory.held), ends
-
-    start = jax.tree.map(jnp.asarray, block.start(jnp.asarray(signal(0.0))))
-    return np.asarray(jax.jit(lambda start: jax.lax.scan(step, start, jnp.arange(steps))[1])(start))
-
-
-@pytest.mark.parametrize("back", [1.0, 2.0, 2.7, 5.5])
-def test_delay_shifts_a_ramp(back):
-    """Exact within and at the ends of a step; so is the impulse of the first step, in which the command comes."""
-    u = lines(Delay(time=back * H, capacity=9), lambda t: 3.0 + 1000.0 * t, 25)
-    came = (np.arange(25)[:, None] + [0, 1] - back) * H
-    whole = came[:, 0] > -1e-9
-    close(u[whole], 3.0 + 1000.0 * came[whole], rtol=1e-11)
-    come = came[-1, 1]  # of the command, by the end of the last step
-    close(H * np.sum(u.mean(1)), 3.0 * come + 500.0 * come**2, rtol=1e-11)
-
-
-def test_delay_of_a_sine_has_its_moments_to_fourth_order():
-    """Mean and first moment of each step, against closed forms."""
-
-    def errors(n):
-        h, w = 0.05 / n, 200.0
-        u = lines(Delay(time=0.0123, capacity=n + 4), lambda t: jnp.sin(w * t), n, h=h)
-        a = h * np.arange(n) - 0.0123
-        b = a + h
-        mean = (np.cos(w * a) - np.cos(w * b)) / (w * h)
-        middle = 0.5 * (a + b)  # integral of sin(w t) (t - middle)
-        moment = [(np.sin(w * t) / w - (t - middle) * np.cos(w * t)) / w for t in (b, a)]
-        rise = 12.0 * (moment[0] - moment[1]) / h**2
-        whole = a > 0
-        return np.max(np.abs(u.mean(1) - mean)[whole]), np.max(np.abs(u[:, 1] - u[:, 0] - rise)[whole])
-
-    counts = np.array([100, 200, 400])
-    found = np.log([errors(int(n)) for n in counts])
-    orders = -np.polyfit(np.log(counts), found, 1)[0]
-    assert orders[0] > 3.8, orders
-    assert orders[1] > 2.8, orders
-
-
-def test_delay_of_a_command_that_jumps_at_an_instant():
-    """From 5 to 2 at the beginning of step 7: the past step ends on 5, and the impulse that comes out is exact."""
-    delay = Delay(time=2.6 * H, capacity=9)
-    memory, seen = jax.tree.map(jnp.asarray, delay.start(jnp.asarray(5.0))), []
-    for k in range(14):
-        before, now = (5.0 if k <= 7 else 2.0), (5.0 if k < 7 else 2.0)
-        memory = delay.tick(Clock(k * H, H, k, None, True, before), memory, now)
-        seen.append([delay.output(t, memory, now) for t in (k * H, (k + 1) * H)])
-        memory = Memory(memory.flow + H * now, memory.held)
-    seen = np.asarray(seen)[3:]
-    close(np.sum(seen.mean(1)), (7.0 + 2.6 - 3.0) * 5.0 + (14 - 7.0 - 2.6) * 2.0, rtol=1e-12)
-    close(seen[:6], 5.0)
-
-
-def test_delay_of_a_command_that_jumps_within_a_step():
-    """A command that falls from 5 to 2 at 0.3 of step 7: the impulse that comes out is exact, and the command hardly
-    leaves 2 ... 5."""
-    delay, share = Delay(time=2.6 * H, capacity=9), 0.3
-    memory, seen = jax.tree.map(jnp.asarray, delay.start(jnp.asarray(5.0))), []
-    for k in range(14):
-        before, now = (5.0 if k <= 7 else 2.0), (5.0 if k <= 7 else 2.0)
-        memory = delay.tick(Clock(k * H, H, k, None, True, before), memory, now)
-        mean = share * 5.0 + (1 - share) * 2.0 if k == 7 else now  # of two steps, cut at the event
-        seen.append([delay.output(t, memory, now) for t in (k * H, (k + 1) * H)])
-        memory = Memory(memory.flow + H * mean, memory.held)
-    seen = np.asarray(seen)[3:]  # all that has come through in whole steps
-    assert seen.min() >= 1.8
-    assert seen.max() <= 5.0 + 1e-12
-    close(np.sum(seen.mean(1)), (7.3 + 2.6 - 3.0) * 5.0 + (14 - 7.3 - 2.6) * 2.0, rtol=1e-12)
-
-
-def test_delay_is_differentiable_in_its_time():
-    """-1000 per second of delay on a ramp, at a whole number of steps and between."""
-
-    def late(time):
-        return run(Delay(time=time, capacity=9), lambda t: 3.0 + 1000.0 * t, 12)[-1]
-
-    close(jax.vmap(jax.grad(late))(jnp.array([2e-3, 2.7e-3])), -1000.0, rtol=1e-9)
 
 
 # Sensors

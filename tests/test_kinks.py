@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 import diffabs as d
-from diffabs.controllers import ConstantTorque
+from diffabs.controllers import Clamping, ConstantTorque, StateFeedback
 from diffabs.core.kinks import Program
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import quotient, searchsorted
 from diffabs.core.pytree import param, pytree, static
 from diffabs.core.regime import Regime, crossing
-from diffabs.objectives import FinalError
-from diffabs.plants import LabRig
-from diffabs.references import Setpoint
+from diffabs.objectives import IAE, FinalError
+from diffabs.plants import LabRig, MirroredRig
+from diffabs.references import FixedSlip, Setpoint
 from diffabs.roads import DRY_ASPHALT
 from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached
@@ -252,3 +252,21 @@ class Sliding(Clockwork):
 
     def derivative(self, t: Any, state: Shown, control: Any) -> Shown:
         return Shown(0.3 - jnp.where(state.y > self.place, 1.0, -1.0), 1.0 + 0.0 * control)
+
+
+def test_an_integral_that_was_clamped_goes_on():
+    """Beside a derivative the run is that of the values, to the kinks' own error: the torque leaves its limit, and the
+    integral moves again."""
+    loop = braking(
+        plant=MirroredRig(),
+        initial=d.BrakeStart(speed=11.0, slip=0.03),
+        reference=FixedSlip(slip=0.15),
+        controller=StateFeedback(
+            gain=np.array([-3000.0, -60.0]), torque_min=0.2, torque_max=4.3, antiwindup=Clamping()
+        ),
+        stop=SpeedReached(speed=6.5),
+    )
+    plain, located = (
+        d.measure(loop, d.FixedStep(1e-4, 1.0, kinks=kinks), {"iae": IAE()}).metrics["iae"] for kinks in (False, True)
+    )
+    np.testing.assert_allclose(located, plain, rtol=1e-3)

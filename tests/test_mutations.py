@@ -1,10 +1,12 @@
 """The list of mutations is true: each file, text and test that it names exists."""
 
 import ast
+import os
 import pathlib
+import time
 
 import pytest
-from mutations import MUTATIONS
+from mutations import MUTATIONS, Mutation, judged
 
 ROOT = pathlib.Path(__file__).parent.parent
 
@@ -24,3 +26,56 @@ def test_a_mutation_finds_its_text_and_its_test(mutation):
     assert mutation.old != mutation.new
     file, _, test = mutation.test.partition("::")
     assert not test or test.partition("[")[0] in defined(file)
+
+
+TESTS = """
+import subprocess, sys, pathlib
+from made import number
+
+def test_number():
+    if number < 0:
+        sleeper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+        pathlib.Path("pid").write_text(str(sleeper.pid))
+    while number < 0:
+        pass
+    assert number == 1
+"""
+
+
+@pytest.fixture
+def small(tmp_path):
+    """A package of one number, and a test of it that never ends where that is negative."""
+    for name in ("diffabs", "tests"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "diffabs" / "made.py").write_text("number = 1\n")
+    (tmp_path / "tests" / "test_made.py").write_text(f"import sys\nsys.path.insert(0, 'diffabs')\n{TESTS}")
+    (tmp_path / "pytest.ini").write_text("[pytest]\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("new", "verdict"), [("= 2", "dies"), ("= 1.0", "SURVIVES"), ("= -1", "dies: no end after 5 s")]
+)
+def test_a_mutation_has_so_much_time(small, new, verdict):
+    """One that never ends is dead, and so is what it has started; the file is left as it was."""
+    begun = time.monotonic()
+    assert judged(Mutation("", "made.py", "= 1", new, "test_made.py"), small, limit=5.0) == verdict
+    assert time.monotonic() - begun < 30.0
+    assert (small / "diffabs" / "made.py").read_text() == "number = 1\n"
+    if "no end" in verdict:
+        started = int((small / "pid").read_text())
+        assert not _runs(started)
+
+
+def _runs(process):
+    """Whether a process is still there, other than as a dead one that nobody has asked for."""
+    for _ in range(50):
+        try:
+            os.kill(process, 0)
+            state = pathlib.Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return False
+        if state == "Z":
+            return False
+        time.sleep(0.1)
+    return True

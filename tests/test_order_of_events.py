@@ -127,7 +127,7 @@ def rate_limit(loop):
 STEPS = (1e-3, 5e-4, 2.5e-4)
 
 
-BOUNDS = {"relay": (1e-6, 2.0), "delay": (2e-6, 1.5), "rate limit": (1e-5, 1.4)}  # error at 1 ms, order
+BOUNDS = {"relay": (1e-6, 2.0), "delay": (2e-9, 1.5), "rate limit": (1e-5, 1.4)}  # error at 1 ms, order
 
 
 @pytest.mark.parametrize("name", BOUNDS)

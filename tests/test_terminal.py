@@ -1,5 +1,6 @@
 """The long commands on a terminal of 80 columns: progress, Ctrl-C at any moment, TERM=dumb."""
 
+import contextlib
 import io
 import random
 import re
@@ -8,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 
 import pytest
 from rich.console import Console
@@ -188,6 +190,24 @@ def test_a_dumb_terminal_gets_lines(folder, tmp_path, command):
 
 
 # In this process
+
+
+LINES = {
+    "a line": ("word " * 16, True),
+    "one word more": ("word " * 16 + "word", False),
+    "a long path": ("  /tmp/" + 80 * "x", True),
+    "where a command goes on": ("    /tmp/" + 80 * "x" + " \\", True),
+    "a long path and a word": ("in /tmp/" + 80 * "x", False),
+    "a long word": (81 * "x", False),
+}
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_what_fits(name):
+    """A path of somebody who has long ones cannot be folded; it stands alone."""
+    line, fits = LINES[name]
+    with contextlib.nullcontext() if fits else pytest.raises(AssertionError):
+        assert_fits(types.SimpleNamespace(raw=f"before\r\n{line}\r\n"))
 
 
 @pytest.fixture

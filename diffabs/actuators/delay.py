@@ -1,11 +1,13 @@
 """Pure delay: control(t) = command(t - time), and 0 before the first command has come through.
 
-Of each past step of the grid the ring keeps the command at both ends and its mean, which is integrated with the plant:
-a parabola that is the command to third order; where the command jumped in an event within the step, its impulse.
-The step that lies ahead needs it between t - time and t - time + h, where the end of a ring's step may lie and the
-command may jump. Runge-Kutta stages would not see that, so the step uses the straight line that has the same mean and
-the same first moment: of a smooth command that costs no order, and of a jump the impulse is exact. The line does not
-leave the range of the commands that it stands for."""
+Of each past step, whatever its length, the delay keeps the times of both ends and the cubic of the command between
+them, from values and rates there. So a smooth command comes out to the order of the method. Where one step's end and
+the next one's beginning are not the same, in value or in rate, the command has jumped or bent: a step of the run ends
+where that comes out, and the moment of it carries the derivatives of the moment at which it went in, and of `time`.
+(To a delay of exactly one step the jump is known only when it comes out: that has no derivative in `time`.)
+
+In Runge-Kutta stages the delayed command must be smooth, also beyond such an end. So a step uses the pieces between
+two ends alone, from a window of those that come out next, which is moved on after every step."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -14,82 +16,135 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.numerics import clamp
-from diffabs.core.protocols import Clock, Memory
+from diffabs.core.blocks import Passage
+from diffabs.core.cubic import Cubic
+from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree, static
 from diffabs.core.rules import Rule, array
 
-ROUNDING = 1e-6  # relative
+ROUNDING = 1e-6  # relative, of single precision
+WINDOW = 6  # pieces: a step that spans more is cut
+CLOSE = 16.0  # precisions of the time: instants that are one
+SAME = 0.5  # power of the precision: a relative difference that is no jump
+SPARE, CUTS = 16, 4  # pieces beyond the capacity, and one more for so many steps: for steps that are cut
+
+
+class Piece(NamedTuple):
+    """A past step: times of its ends [s], the cubic of the command between them, and 1 where the command does not go on
+    smoothly from the piece before."""
+
+    start: Scalar
+    end: Scalar
+    command: Cubic
+    breaks: Scalar
+
+    @classmethod
+    def of(cls, row: Any) -> "Piece":
+        """The piece of a row."""
+        start, end, *command, breaks = row
+        return cls(start, end, Cubic(*command), breaks)
+
+    @property
+    def rate(self) -> Any:
+        """Of the command, at the end."""
+        return self.command.end_slope / (self.end - self.start)
 
 
 class DelayMemory(NamedTuple):
-    """Rings of the past steps: command at the start, at the end, and mean. Of the present step: the delayed command in
-    its middle, its change over the step, that middle [s], and the step's length [s]."""
+    """A ring of past steps, a row for each `Piece`. The window: rows of the pieces that come out next, how many of them
+    there are; between `place` and `last`, those of which the present step may use; and until when [s] it may, less the
+    delay. Where the window begins in the ring, and how many pieces there are from there on. Whole numbers are of the
+    type of the signal."""
 
-    start: Any
-    end: Any
-    mean: Any
-    level: Scalar
-    rise: Scalar
-    middle: Scalar
-    h: Scalar
+    ring: Any
+    window: Any
+    known: Any
+    place: Any
+    last: Any
+    until: Any
+    first: Any
+    count: Any
 
 
 @pytree
 class Delay:
-    """control(t) = command(t - time). `capacity` is how many steps the ring holds; the delay is at least one step and
-    at most capacity - 2 of them."""
+    """control(t) = command(t - time). The delay is at least one step and at most capacity - 2 of them. There is room
+    for events that cut every fourth of these steps; a run with more of them within one delay has diverged."""
 
     time: Scalar = param(default=0.01, unit="s", above=0.0)
     capacity: int = static(default=1024)
 
+    flow = no_flow
+
     def start(self, signal: Scalar) -> Memory:
-        """Nothing on the way yet."""
+        """Nothing on the way yet: one piece that is 0, until t = 0."""
         zero = 0.0 * jnp.asarray(signal)
-        ring = jnp.zeros(self.capacity, zero.dtype) + zero
-        return Memory(zero, DelayMemory(ring, ring, ring, zero, zero, zero, zero + 1.0))
+        row = _row(Piece(zero - self.time, zero, Cubic(zero, zero, zero, zero), zero))
+        window = jnp.broadcast_to(row, (WINDOW, *row.shape))
+        ring = jnp.zeros((self.capacity + self.capacity // CUTS + SPARE, *row.shape), row.dtype).at[0].set(row)
+        return Memory((), self._aimed(DelayMemory(ring, window, zero + 1, zero, zero, zero, zero, zero + 1)))
 
-    def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """The command: what is integrated over the present step is its mean."""
-        del t, memory
-        return signal
-
-    def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """The line that stands for the delayed command."""
+    def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Any:
+        """The delayed command; beyond a break that has not come out, straight on."""
         del signal
         m: DelayMemory = memory.held
-        return m.level + m.rise * (t - m.middle) / m.h
+        piece = _piece(m.window, self._place(t, m))
+        x = (t - self.time - piece.start) / (piece.end - piece.start)
+        within = _at_most_one(x)
+        return piece.command(within) + (x - within) * piece.command.end_slope
+
+    def margins(self, t: Scalar, memory: Memory, signal: Scalar, rate: Any) -> tuple[Any]:
+        """The time until the command that comes out breaks, or until more must be known of it."""
+        del signal, rate
+        return (memory.held.until + self.time - t,)
+
+    def event(self, t: Scalar, memory: Memory, signal: Scalar, fired: tuple[Any]) -> Memory:
+        """The break has come out."""
+        del t, signal
+        m: DelayMemory = memory.held
+        out = fired[0] & (m.last + 1 < m.known)
+        return memory._replace(held=self._aimed(m._replace(place=jnp.where(out, m.last + 1, m.place))))
+
+    def record(self, memory: Memory, passage: Passage) -> Memory:
+        """Store the step that is over; one without a length is none."""
+        m: DelayMemory = memory.held
+        size, h = len(m.ring), passage.end - passage.start
+        newest, free = (_around(m.first + m.count + i, size).astype(int) for i in (-1, 0))
+        before = Piece.of(jax.lax.stop_gradient(m.ring[newest]))
+        cubic = Cubic(*passage.values, *(h * rate for rate in passage.rates))
+        after = passage.values[0], self.time * passage.rates[0]
+        breaks = jnp.where(_differ((before.command.end, before.rate * self.time), after), 1.0, 0.0).astype(h.dtype)
+        ring = m.ring.at[free].set(_row(Piece(passage.start, passage.end, cubic, breaks)))
+        some = jnp.where(h > _rounding(passage.end), 1.0, 0.0)
+        return memory._replace(held=m._replace(ring=ring, count=m.count + some))
 
     def tick(self, clock: Clock, memory: Memory, signal: Scalar) -> Memory:
-        """Store the step that is over, and find the line for the one that follows."""
-        on_grid, number = clock.ticks()
-        end = signal if clock.before is None else clock.before
-        last, now = (number - 1) % self.capacity, number % self.capacity
-        held: DelayMemory = memory.held
-        rings = held._replace(
-            start=held.start.at[now].set(signal),
-            end=held.end.at[last].set(end),
-            mean=held.mean.at[last].set(memory.flow / clock.h),
-            middle=clock.t + 0.5 * clock.h,
-            h=clock.h,
-        )
-        back = clamp(self.time / clock.h, 1.0, self.capacity - 2.0)
-        whole = jnp.ceil(back)
-        level, rise = self._line(rings, number - whole.astype(int), whole - back, number)
-        new = Memory(0.0 * memory.flow, rings._replace(level=level, rise=rise))
-        return jax.tree.map(lambda a, b: jnp.where(on_grid, a, b), new, memory)
+        """The window from here. What breaks at this very instant has come out."""
+        del signal
+        m: DelayMemory = memory.held
+        size, over = len(m.ring), self._place(clock.t, m)
+        first, count = _around(m.first + over, size), m.count - over
+        rows = m.ring[_around(first.astype(int) + jnp.arange(WINDOW), size)]
+        window = jnp.where(count < size, rows, jnp.nan)  # else a piece that is still to come out is overwritten
+        known, none = jnp.minimum(count, WINDOW), jnp.zeros_like(count)
+        new = self._aimed(DelayMemory(m.ring, window, known, none, none, none, first, count))
+        out = (new.last + 1 < known) & (new.until + self.time <= clock.t)
+        return memory._replace(held=self._aimed(new._replace(place=jnp.where(out, new.last + 1, none))))
 
-    def _line(self, rings: DelayMemory, first: Any, part: Any, now: Any) -> tuple[Any, Any]:
-        """The delayed command in the middle of a step that begins a `part` into step `first` of the ring, and its
-        change. With a delay of one step, the second piece has no length, and is not known yet."""
-        pieces = ((first, part, 1.0, -part), (jnp.minimum(first + 1, now - 1), 0.0, part, 1.0 - part))
-        found = [_moments(rings, i % self.capacity, *place) for i, *place in pieces]
-        found = [[jnp.where(i >= 0, x, 0.0) for x in one] for (i, *_), one in zip(pieces, found, strict=True)]
-        mean, moment = (found[0][n] + found[1][n] for n in (0, 1))
-        low = jnp.minimum(found[0][2], jnp.where(part > 0, found[1][2], jnp.inf))
-        high = jnp.maximum(found[0][3], jnp.where(part > 0, found[1][3], -jnp.inf))
-        most = 2.0 * jnp.maximum(jnp.minimum(mean - low, high - mean), 0.0)
-        return mean, clamp(12.0 * (moment - 0.5 * mean), -most, most)
+    def _place(self, t: Scalar, m: DelayMemory) -> Any:
+        """Which piece of the window comes out at time t, up to the next break."""
+        return _count([m.window[i, 1] for i in range(WINDOW)], t - self.time, m.place, m.last)
+
+    def _aimed(self, m: DelayMemory) -> DelayMemory:
+        """With the last piece before the next break, and the time of that."""
+        last = m.known - 1
+        for i in reversed(range(1, WINDOW)):
+            last = jnp.where((i > m.place) & (i < m.known) & (m.window[i, -1] > 0.5), i - 1.0, last)
+        breaks = last + 1 < m.known
+        until = jnp.where(breaks, _piece(m.window, last + 1).start, _piece(m.window, last).end)
+        # Before what happens on the grid, or the moment would lose its derivatives; but no step is cut at its own end.
+        newest = ~breaks & (m.known == m.count)
+        return m._replace(last=last, until=until + jnp.where(newest, 1.0, -1.0) * _rounding(until + self.time))
 
     def refined(self, times: int) -> "Delay":
         """The same delay in so many more steps."""
@@ -106,18 +161,57 @@ class Delay:
         )
 
 
-def _moments(rings: DelayMemory, i: Any, left: Any, right: Any, shift: Any) -> tuple[Any, Any, Any, Any]:
-    """Of the parabola of step i of a ring: integrals over [left, right] of the command, and of the command times the
-    place + shift, in steps; the least and the greatest command that the whole of it stands for."""
-    start, end, mean = rings.start[i], rings.end[i], rings.mean[i]
-    bend = 3.0 * (start + end) - 6.0 * mean
-    slope = end - start - bend
+def _row(piece: Piece) -> Any:
+    return jnp.stack([jnp.asarray(x) for x in jax.tree.leaves(piece)])
 
-    def integral(power: int) -> Any:
-        terms = ((start, power + 1), (slope, power + 2), (bend, power + 3))
-        return sum(c * (right**n - left**n) / n for c, n in terms)
 
-    # The line of a smooth command leaves the range of its ends on the side to which it bends, by this at most.
-    low = jnp.minimum(start, end) - jnp.maximum(bend, 0.0) / 2.0
-    high = jnp.maximum(start, end) - jnp.minimum(bend, 0.0) / 2.0
-    return integral(0), integral(1) + shift * integral(0), low, high
+def _piece(window: Any, place: Any) -> Piece:
+    """The piece at a place. By selections: a slice whose place is computed would take the stages of a step apart."""
+    row, place = [window[0, j] for j in range(window.shape[1])], place.astype(int)  # whole numbers have no kinks
+    for i in range(1, WINDOW):
+        row = [jnp.where(place >= i, window[i, j], x) for j, x in enumerate(row)]
+    return Piece.of(row)
+
+
+def _around(place: Any, size: int) -> Any:
+    """A place in a ring of this size, for one less than twice as far."""
+    return jnp.where(place >= size, place - size, place)
+
+
+def _differ(before: tuple[Any, Any], after: tuple[Any, Any]) -> Any:
+    """Whether a command does not go on as a smooth one does: value, and change within the delay, at one instant."""
+    size = jnp.abs(before[0]) + jnp.abs(before[1]) + jnp.abs(after[0]) + jnp.abs(after[1])
+    jumps = [jnp.abs(x - y) > jnp.finfo(size.dtype).eps ** SAME * size for x, y in zip(before, after, strict=True)]
+    return jnp.any(jnp.stack(jumps))
+
+
+def _rounding(t: Any) -> Any:
+    """By how much two computations of the time t may differ."""
+    return CLOSE * jnp.finfo(jnp.result_type(t)).eps * jax.lax.stop_gradient(t)
+
+
+# Rules of their own, so that nobody looks for the places where these change: the command does not break there.
+
+
+@jax.custom_jvp
+def _count(ends: list[Any], t: Any, low: Any, high: Any) -> Any:
+    """How many pieces are over at t, within these limits."""
+    over = sum(jnp.where((i < high) & (t >= end), 1.0, 0.0) for i, end in enumerate(ends))
+    return jnp.maximum(jnp.minimum(jnp.asarray(over, t.dtype), high), low)
+
+
+@_count.defjvp
+def _constant(at: Any, moves: Any) -> tuple[Any, Any]:
+    del moves
+    count = _count(*at)
+    return count, jnp.zeros_like(count)
+
+
+@jax.custom_jvp
+def _at_most_one(x: Any) -> Any:
+    return jnp.minimum(x, 1.0)
+
+
+@_at_most_one.defjvp
+def _slope(at: Any, moves: Any) -> tuple[Any, Any]:
+    return _at_most_one(*at), jnp.where(at[0] <= 1.0, moves[0], 0.0)

@@ -12,6 +12,7 @@ from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.accuracy import accuracy, needs_key, reasons
 from diffabs.simulate.refusals import MOST_STEPS
 from diffabs.simulate.run import measure
+from diffabs.simulate.solution import described, finer
 
 SMALL = 1e-6  # of a value: below, nobody asks for its order
 FINEST = 4  # the shortest step is this part of the scenario's
@@ -46,7 +47,7 @@ def checked(chosen: Scenario, key: Any) -> dict[str, Any]:
             "float32 difference": None if low is None else low - value,
         }
     return {
-        "steps": [solver.step, solver.step / 2, solver.step / FINEST],
+        "solvers": [described(finer(solver, times)) for times in (1, 2, FINEST)],
         "comparable": not why,
         "reasons": why,
         "ended alike": bool(found.alike),

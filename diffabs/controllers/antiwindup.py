@@ -25,7 +25,9 @@ class Clamping:
 
     def rate(self, error: Scalar, gain: Scalar, raw: Scalar, limited: Scalar) -> Scalar:
         """I'."""
-        outward = (raw - limited) * gain * error > 0
+        # Within the limits the product is 0 whatever the sign was, so who holds comparisons (`core.kinks`) would hold
+        # this one for ever; an equality is never held.
+        outward = jnp.not_equal(raw, limited) & ((raw - limited) * gain * error > 0)
         return jnp.where(outward, 0.0, error)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,16 @@ import jax.numpy as jnp
 from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, part, pytree
 from diffabs.core.timing import steps
+
+
+class Passage(NamedTuple):
+    """A block's signal over a step, within which nothing jumps: time [s], value and rate at both ends; the first after
+    what changes there, the last before that."""
+
+    start: Scalar
+    end: Scalar
+    values: tuple[Any, Any]
+    rates: tuple[Any, Any]
 
 
 @pytree
@@ -88,6 +98,26 @@ class Series:
             signal = block.output(t, m, signal)
         return _joined(memories)
 
+    def recorded(self, t: Scalar, memory: Memory, signal: Any) -> tuple[Any, ...]:
+        """The signals of the blocks that record them, in order."""
+        found: tuple[Any, ...] = ()
+        for block, m in self._pairs(memory):
+            found += (recorded(block, t, m, signal),) if offers(block, "record") else ()
+            signal = block.output(t, m, signal)
+        return found
+
+    def record(self, memory: Memory, passage: Passage) -> Memory:
+        """Each records its own."""
+        (starts, ends), (rates, last) = passage.values, passage.rates
+        each = zip(starts, ends, rates, last, strict=True)
+        memories = []
+        for block, m in self._pairs(memory):
+            if offers(block, "record"):
+                a, b, da, db = next(each)
+                m = block.record(m, passage._replace(values=(a, b), rates=(da, db)))
+            memories.append(m)
+        return _joined(memories)
+
     def _pairs(self, memory: Memory) -> Any:
         return [(b, Memory(f, h)) for b, f, h in zip(self.blocks, memory.flow, memory.held, strict=True)]
 
@@ -104,6 +134,12 @@ def next_tick(block: Any, k: Any, h: Scalar) -> Any:
     ticking = [one for one in getattr(block, "blocks", (block,)) if offers(one, "tick")]
     lengths = [steps(one.period, h) if hasattr(one, "period") else 1 for one in ticking]
     return reduce(jnp.minimum, ((k // n + 1) * n for n in lengths))
+
+
+def recorded(block: Any, t: Scalar, memory: Memory, signal: Any) -> Any:
+    """Return what a block records of its signal: all of it; of blocks in series, the signal of each that records."""
+    inner = getattr(block, "recorded", None)
+    return inner(t, memory, signal) if inner else signal
 
 
 def _joined(memories: Sequence[Memory]) -> Memory:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.blocks import Direct, NoFeedforward, next_tick, offers
+from diffabs.core.blocks import Direct, NoFeedforward, Passage, next_tick, offers, recorded
 from diffabs.core.protocols import Block, Clock, Feedforward, Memory, Plant, Reference, Sample, Stop, Tracking
 from diffabs.core.pytree import Scalar, part, pytree
 
@@ -39,11 +39,12 @@ class LoopState(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """Every signal of the loop at an instant."""
+    """Every signal of the loop at an instant; once more, by the name of the block, those that a block records."""
 
     sample: Sample
     measured: Any
     tracking: Tracking
+    recorded: dict[str, Any]
 
 
 Margins = dict[str, tuple[Any, ...]]  # of the stop and of each block that has events, by name
@@ -83,13 +84,14 @@ class Loop:
         command = self.controller.output(t, state.controller, tracking)
         control = self.actuator.output(t, state.actuator, command)
         setpoint = self.reference.setpoint(state.reference)
-        return Signals(
-            Sample(t, y, tracking.target, setpoint, tracking.feedforward, command, control), measured, tracking
-        )
+        sample = Sample(t, y, tracking.target, setpoint, tracking.feedforward, command, control)
+        given = _seen(Signals(sample, measured, tracking, {}))
+        kept = {name: recorded(getattr(self, name), t, getattr(state, name), given[name]) for name in self.recorders}
+        return Signals(sample, measured, tracking, kept)
 
     def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[Any, ...]:
         """d(state.flow())/dt, from the signals at (t, state)."""
-        sample, measured, tracking = signals
+        sample, measured, tracking, _ = signals
         return (
             self.plant.derivative(t, state.plant, sample.control),
             self.sensor.flow(t, state.sensor, sample.output),
@@ -118,6 +120,11 @@ class Loop:
         """Whether a block has events."""
         return any(offers(getattr(self, name), "margins") for name in BLOCKS)
 
+    @property
+    def recorders(self) -> tuple[str, ...]:
+        """The blocks that record their signal, by name."""
+        return tuple(name for name in BLOCKS if offers(getattr(self, name), "record"))
+
     def margins(self, t: Scalar, state: LoopState, signals: Signals, flow: Callable[[], Any]) -> Margins:
         """The stop's margin and those of the blocks; `flow()` is d(state.flow())/dt, for those that need a rate."""
         rates = cache(lambda: _seen(self.signal_rates(t, state, flow())))
@@ -129,12 +136,22 @@ class Loop:
         found = {name: of(name) for name in BLOCKS if offers(getattr(self, name), "margins")}
         return {"stop": (self.stop.margin(signals.sample.output),), **found}
 
-    def change(self, clock: Clock, state: LoopState, before: Signals, margins: Margins, fired: Margins) -> LoopState:
-        """The state after an instant: each block, in the order of the signal, has its events, then its tick.
+    def change(
+        self,
+        clock: Clock,
+        state: LoopState,
+        before: Signals,
+        margins: Margins,
+        fired: Margins,
+        passed: dict[str, Passage] | None = None,
+    ) -> LoopState:
+        """The state after an instant: each block, in the order of the signal, has its events, records the step that
+        ends here, and has its tick.
 
         before, margins: those until now. An event also happens where the change of a block before it makes a margin
             negative, at either end of the jump of the signal and with the jump for a rate: a maximum is where it falls
         fired: a bool for each margin, whether it has just fallen through zero
+        passed: the step that ends here, for the blocks that record it; none does at the start of a run
         """
         was, moved = _seen(before), False
 
@@ -149,6 +166,8 @@ class Loop:
                     crossed = zip(happens, margins[name], *ends, strict=True)
                     happens = tuple(one | ((a >= 0) & ((b < 0) | (c < 0))) for one, a, b, c in crossed)
                 memory = block.event(clock.t, memory, was[name], happens)
+            if passed and name in passed:
+                memory = block.record(memory, passed[name])
             if offers(block, "tick"):
                 memory = block.tick(clock._replace(before=was[name]), memory, signal)
             moved = moved or offers(block)
@@ -175,7 +194,7 @@ class Loop:
 
 def _seen(signals: Signals) -> dict[str, Any]:
     """What each block is given."""
-    sample, measured, tracking = signals
+    sample, measured, tracking, _ = signals
     return {"sensor": sample.output, "reference": measured, "controller": tracking, "actuator": sample.command}
 
 

@@ -16,11 +16,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.blocks import Passage
 from diffabs.core.cubic import Cubic
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Clock, Memory, Sample, Segment
 from diffabs.core.regime import Words
+from diffabs.simulate.advance import start
 from diffabs.simulate.checkpoint import anyone, apart
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.dynamics import FREE, Dynamics, Objectives, Tally, dynamics, parted
@@ -32,6 +34,8 @@ from diffabs.simulate.solution import Trajectory
 from diffabs.simulate.stepper import MISSED, typed
 
 FIRST = 1e-4  # s, the first step
+PART = 0.25  # of the error that a step may have, where a derivative is asked for
+COUNTED = ("tries", "condition")
 SAFETY, LITTLE = 0.85, 1e-6
 SHRINK, GROW = 0.25, 2.5  # times the last step, at least and at most
 LEAST = 1e-9  # of the duration: the shortest step; or 4 times its rounding
@@ -74,7 +78,11 @@ class Pace:
     def renew(self, loop: Loop, carry: "Carry") -> "Carry":
         """Return the carry with the longest stable step, if that was not looked at for ROUND tries."""
         due = carry.running & (carry.tries - carry.renewed >= ROUND)
-        limit = jax.lax.cond(anyone(due), lambda: longest_stable(loop, carry.point, carry.scale), lambda: carry.limit)
+        limit = jax.lax.cond(
+            anyone(due),
+            lambda: longest_stable(loop, carry.point.t, carry.point.state, carry.scale),
+            lambda: carry.limit,
+        )
         return carry._replace(limit=limit, renewed=jnp.where(due, carry.tries, carry.renewed))
 
     def before(self, carry: "Carry", instant: Any) -> Any:
@@ -91,20 +99,22 @@ class Pace:
         return dataclasses.replace(self, keeps=True)
 
     def noted(self) -> "Pace":
-        """Return the method for a run that is to be repeated."""
-        return dataclasses.replace(self, notes=True)
+        """Return the method for a run that is to be repeated. Its derivative changes faster than the run, so the error
+        of a step is a part of what it is for values."""
+        return dataclasses.replace(self, notes=True, rtol=PART * self.rtol)
 
 
 class Point(NamedTuple):
-    """A run at an instant, after what changes there: the loop's state and the objectives' accumulators, what is seen,
-    the rates of this, the rates of what is integrated, the margins of the stop and of the blocks' events, the answers
-    to the comparisons, and in how many seconds the first of them will change."""
+    """A run at an instant, after what changes there: the loop's state and the objectives' accumulators; what is seen,
+    and its rates; what blocks record, and its rates; the rates of what is integrated; the margins of the stop and of
+    the blocks' events; the answers to the comparisons, and in how many seconds the first of them will change."""
 
     t: Any
     state: LoopState
     tally: Tally
     sample: Sample
     moving: Sample
+    recorded: tuple[dict[str, Any], dict[str, Any]]
     rate: tuple[Any, Any]
     margins: Margins
     words: Words
@@ -167,18 +177,12 @@ class Verdict(NamedTuple):
 def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carry:
     """Return the carry at t = 0."""
     zero, none = jnp.asarray(0), 0.0 * pace.h
-    state = loop.start()
-    signals = loop.signals(none, state)
-    tally = {name: objective.start(signals.sample) for name, objective in objectives.items()}
-    if loop.changes:
-        margins = loop.margins(none, state, signals, lambda: loop.flow(none, state, signals))
-        fired = jax.tree.map(lambda margin: margin < 0, margins)
-        state = loop.change(Clock(none, pace.h, zero, key), state, signals, margins, fired)
+    state, tally = start(loop, objectives, Clock(none, pace.h, zero, key))
     natural = jnp.minimum(FIRST, pace.h * pace.steps) + none
     point = _point(dynamics(loop, objectives, none, state, tally, kinks=True), pace, none, state, tally, natural)
     scale = _sizes(state, point.sample)
     condition = jnp.where(point.margins["stop"][0] > 0, zero + Condition.RUNNING, zero + Condition.DIVERGED)
-    limit = longest_stable(loop, point, scale)
+    limit = longest_stable(loop, none, state, scale)
     length, ends = _plan(loop, pace, point, zero, jnp.minimum(natural, limit))
     search = init_search(pace.h)
     past = (point.t, state, point.rate[0]) if pace.keeps else ()
@@ -199,7 +203,7 @@ def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry,
     strikes = verdict.taken & carry.ends
     k = jnp.where(strikes, strike, carry.k)
     clock = Clock(end, pace.h, k, key, strikes)
-    point = depart(system, pace, clock, here, verdict.fired, carry.natural)
+    point = depart(system, pace, clock, carry.point, here, verdict.fired, carry.natural)
     point = select(verdict.over, here.point, point)
 
     natural = _natural(carry, here, verdict, pace)
@@ -259,8 +263,8 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
     state = point.state.with_flow(z[0])
     state = state._replace(plant=loop.plant.project(state.plant))
     tallied = {name: memory._replace(flow=z[1][name]) for name, memory in point.tally.items()}
-    seen, moving, _, words, comparisons = system.ahead(end, state, tallied)
-    sample = seen.signals.sample
+    seen, moving, recording, _, words, comparisons = system.ahead(end, state, tallied)
+    sample, recorded = seen.signals.sample, (seen.signals.recorded, recording)
     segment = Segment(
         point.sample,
         sample,
@@ -274,7 +278,7 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
         tally = select(anew, point.tally, tally)
     changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
     ahead, late = kinks(comparisons, carry.natural, pace.care, changed, h)
-    new = Point(end, state, tally, sample, moving, seen[:2], seen.margins, words, ahead)
+    new = Point(end, state, tally, sample, moving, recorded, seen[:2], seen.margins, words, ahead)
     scale = jax.tree.map(jnp.maximum, carry.scale, _sizes(state, sample))
     error = _error(loop, state, point.state.with_flow(coarse[0]), scale, sample) / pace.rtol
     middle = _middle(system, point, new, h) if pace.notes else ()
@@ -290,16 +294,24 @@ def _middle(system: Dynamics, start: Point, end: Point, h: Any) -> Words:
     return system.look(start.t + 0.5 * h, state, tally, FREE)[1].words
 
 
-def depart(system: Dynamics, pace: Pace, clock: Clock, here: Arrival, fired: Margins, natural: Any) -> Point:
+def depart(
+    system: Dynamics, pace: Pace, clock: Clock, begun: Point, here: Arrival, fired: Margins, natural: Any
+) -> Point:
     """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock. In a
     loop without ticks, what follows from an event is left to a step of no length: there are few of them."""
     loop, point = system.loop, here.point
     if not loop.changes:
         return point
-    state = loop.change(clock, point.state, here.signals, point.margins, fired)
+    state = loop.change(clock, point.state, here.signals, point.margins, fired, passed(begun, point))
     if not loop.ticks:
         return point._replace(state=state)
     return _point(system, pace, point.t, state, point.tally, natural)
+
+
+def passed(start: Any, end: Any) -> dict[str, Passage]:
+    """Return the step between two points for the blocks that record it."""
+    (values, rates), (last, falls) = start.recorded, end.recorded
+    return {n: Passage(start.t, end.t, (values[n], last[n]), (rates[n], falls[n])) for n in values}
 
 
 def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
@@ -314,17 +326,17 @@ def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
     return jnp.where(inside, t, now.t), select(inside, state.with_flow(flow), now.state)
 
 
-def longest_stable(loop: Loop, point: Point, scale: Any) -> Any:
+def longest_stable(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any:
     """Return 2.4/rho [s], rho about the spectral radius of the flow's Jacobian: how much longer a vector becomes each
     time that it is multiplied by that, measured in the largest values so far."""
-    flow, tree = jax.tree.flatten(point.state.flow())
+    flow, tree = jax.tree.flatten(state.flow())
     leaves = [jnp.ravel(x) for x in flow]
     sizes = [jnp.where(x > 0, x, 1.0) for leaf in jax.tree.leaves(scale[1]) for x in jnp.ravel(leaf)]
     places = [(i, k) for i, leaf in enumerate(leaves) for k in range(leaf.size)]
 
     def rates(flow: list[Any]) -> list[Any]:
-        state = point.state.with_flow(tree.unflatten(flow))
-        found = loop.flow(point.t, state, loop.signals(point.t, state))
+        at = state.with_flow(tree.unflatten(flow))
+        found = loop.flow(t, at, loop.signals(t, at))
         return [x for leaf in jax.tree.leaves(found) for x in jnp.ravel(leaf)]
 
     def column(i: int, k: int) -> list[Any]:
@@ -334,7 +346,7 @@ def longest_stable(loop: Loop, point: Point, scale: Any) -> Any:
         return jax.jvp(rates, (flow,), (moves,))[1]
 
     matrix = [column(*place) for place in places]
-    vector, log = [jnp.ones_like(x) for x in sizes], 0.0 * point.t
+    vector, log = [jnp.ones_like(x) for x in sizes], 0.0 * t
     for i in range(MULTIPLIED):
         terms = [[a * b * x for a, b, x in zip(row, sizes, vector, strict=True)] for row in zip(*matrix, strict=True)]
         vector = [sum(row) / size for row, size in zip(terms, sizes, strict=True)]
@@ -345,9 +357,10 @@ def longest_stable(loop: Loop, point: Point, scale: Any) -> Any:
 
 
 def _point(system: Dynamics, pace: Pace, t: Any, state: LoopState, tally: Tally, length: Any) -> Point:
-    seen, moving, _, words, comparisons = system.ahead(t, state, tally)
+    seen, moving, recording, _, words, comparisons = system.ahead(t, state, tally)
+    recorded = (seen.signals.recorded, recording)
     ahead, _ = kinks(comparisons, length, pace.care, words, 0.0 * length)
-    return Point(t, state, tally, seen.signals.sample, moving, seen[:2], seen.margins, words, ahead)
+    return Point(t, state, tally, seen.signals.sample, moving, recorded, seen[:2], seen.margins, words, ahead)
 
 
 def _error(loop: Loop, state: LoopState, coarse: LoopState, scale: Any, sample: Sample) -> Any:

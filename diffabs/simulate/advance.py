@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.blocks import Passage
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.protocols import Clock, Memory, Sample, Segment
 from diffabs.core.regime import Regime, Words, crossing, only
@@ -43,7 +44,7 @@ class Kink(NamedTuple):
 
 class Arrival(NamedTuple):
     """The end of a step, before what changes there: time, state, accumulators, signals, rates, margins, comparisons,
-    and the regime from there."""
+    the regime from there, and the step itself for the blocks that record it."""
 
     t: Any
     state: LoopState
@@ -53,6 +54,7 @@ class Arrival(NamedTuple):
     margins: Margins
     kink: Kink
     regime: Words
+    passed: dict[str, Passage]
 
 
 class Try(NamedTuple):
@@ -69,14 +71,20 @@ class Try(NamedTuple):
     lands: Any
 
 
-def begin(loop: Loop, objectives: Objectives, clock: Clock, *, kinks: bool = False) -> Point:
-    """Return the point at t = 0, after the first ticks; a block whose margin is negative has its event."""
+def start(loop: Loop, objectives: Objectives, clock: Clock) -> tuple[LoopState, Tally]:
+    """Return state and accumulators at t = 0, after the first ticks; a block whose margin is negative has its event."""
     state = loop.start()
     signals = loop.signals(clock.t, state)
     tally = {name: objective.start(signals.sample) for name, objective in objectives.items()}
     if loop.changes:
         margins = loop.margins(clock.t, state, signals, lambda: loop.flow(clock.t, state, signals))
         state = loop.change(clock, state, signals, margins, jax.tree.map(lambda margin: margin < 0, margins))
+    return state, tally
+
+
+def begin(loop: Loop, objectives: Objectives, clock: Clock, *, kinks: bool = False) -> Point:
+    """Return the point at t = 0."""
+    state, tally = start(loop, objectives, clock)
     system = dynamics(loop, objectives, clock.t, state, tally, kinks=kinks)
     return _leave(system, clock.t, state, tally, Regime(None))
 
@@ -103,15 +111,16 @@ def arrive(system: Dynamics, point: Point, one: Try, active: Any) -> Arrival:
     segment = _segment(system, point, end, seen.signals.sample, one)
     new = {name: Memory(z[1][name], o.update(tallied[name], segment)) for name, o in system.objectives.items()}
     tallied = jax.tree.map(partial(jnp.where, one.anew), point.tally, new) if loop.changes and not loop.ticks else new
-    return Arrival(one.end, rests, tallied, seen.signals, seen[:2], seen.margins, kink, words)
+    passed = _passed(system, point, end, one)
+    return Arrival(one.end, rests, tallied, seen.signals, seen[:2], seen.margins, kink, words, passed)
 
 
 def depart(system: Dynamics, clock: Clock, here: Arrival, fired: Margins, one: Try) -> Point:
     """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock. In a
     loop without ticks, what follows from an event is left to a step that does it `anew`: there are few of them."""
-    t, state, tally, signals, rate, margins, _, regime = here
+    t, state, tally, signals, rate, margins, _, regime, passed = here
     if system.loop.changes:
-        state = system.loop.change(clock, state, signals, margins, fired)
+        state = system.loop.change(clock, state, signals, margins, fired, passed)
     if not system.loop.ticks:
         return Point(t, state, tally, signals.sample, rate, margins, regime)
     kept = (jnp.where(one.lands, bit, jnp.uint32(0)) for bit in only(one.which, system.words))
@@ -143,3 +152,24 @@ def _segment(system: Dynamics, point: Point, end: Any, sample: Sample, one: Try)
     return Segment(
         point.sample, sample, one.h, one.step, each(lambda sample: sample.output), each(lambda sample: sample)
     )
+
+
+def _passed(system: Dynamics, point: Point, end: Any, one: Try) -> dict[str, Passage]:
+    """What blocks record of a step: their signals at both ends, and the rates, within its regime."""
+    loop, within = system.loop, Regime(point.regime, one.blunt)
+
+    def moving(t: Any, state: LoopState, tally: Tally, rate: Any) -> Any:
+        (flow, still), held = parted(state, tally)
+
+        def seen(t: Any, flow: Any) -> Any:
+            if system.program is None:
+                return loop.signals(t, state.with_flow(flow)).recorded
+            fixed = (held, loop, system.objectives)
+            return system.program(lambda seen: seen.signals.recorded, (t, flow, still), fixed, within)
+
+        return jax.jvp(seen, (t, flow), (jnp.ones_like(t), rate))
+
+    if not loop.recorders:
+        return {}
+    (starts, rates), (ends, last) = moving(point.t, point.state, point.tally, point.rate[0]), moving(*end)
+    return {name: Passage(point.t, one.end, (starts[name], ends[name]), (rates[name], last[name])) for name in starts}

@@ -34,11 +34,12 @@ class Seen(NamedTuple):
 
 
 class Ahead(NamedTuple):
-    """At an instant: what is seen, the rates of the sample and of the margins of the events, the answers to the
-    comparisons, and their margins with the rates of these."""
+    """At an instant: what is seen, the rates of the sample, of what blocks record and of the margins of the events, the
+    answers to the comparisons, and their margins with the rates of these."""
 
     seen: Seen
     moving: Sample
+    recorded: dict[str, Any]
     falls: Margins
     words: Words
     comparisons: list[Margin]
@@ -82,13 +83,14 @@ class Dynamics(NamedTuple):
 
         def moves(t: Any, z: Any) -> Any:
             one, answers = program.look(lambda seen: seen, (t, *z), fixed, regime)
-            return (one.signals.sample, one.margins, [value for _, value in answers.margins]), answers
+            values = [value for _, value in answers.margins]
+            return (one.signals.sample, one.signals.recorded, one.margins, values), answers
 
         moving = (jnp.ones_like(t), now[:2])
-        (_, _, values), (sample, falls, rates), answers = jax.jvp(moves, (t, z), moving, has_aux=True)
+        (*_, values), (sample, recorded, falls, rates), answers = jax.jvp(moves, (t, z), moving, has_aux=True)
         numbers = [number for number, _ in answers.margins]
         comparisons = [Margin(*one) for one in zip(numbers, values, rates, strict=True)]
-        return Ahead(now, sample, falls, answers.words, comparisons)
+        return Ahead(now, sample, recorded, falls, answers.words, comparisons)
 
     def moving(self, of: Callable[[Sample], Any], end: tuple[Any, LoopState, Tally, Any], regime: Regime) -> Any:
         """d(of(sample))/dt within a regime, at a time, state and tally where d(state.flow())/dt is the last one."""
@@ -117,7 +119,7 @@ def dynamics(loop: Loop, objectives: Objectives, t: Any, state: LoopState, tally
     if key not in _programs:
         while len(_programs) >= PROGRAMS:
             _programs.pop(next(iter(_programs)))
-        _programs[key] = Program(_seen, *args, counts=lambda seen: seen[:2])
+        _programs[key] = Program(_seen, *args, counts=lambda seen: (seen[:2], seen.signals.recorded))
     return Dynamics(_programs[key], loop, objectives)
 
 

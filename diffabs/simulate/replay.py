@@ -14,12 +14,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.blocks import Passage
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment
 from diffabs.core.regime import Regime, Words
-from diffabs.simulate.adaptive import Carry, Pace
-from diffabs.simulate.checkpoint import anyone, repeated
+from diffabs.simulate.adaptive import Carry, Pace, passed
+from diffabs.simulate.advance import start
+from diffabs.simulate.checkpoint import anyone, forgetful
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.drivers import BLOCK
 from diffabs.simulate.dynamics import Ahead, Dynamics, Objectives, Tally, dynamics, parted
@@ -35,9 +37,9 @@ NEAR = 1e-3  # of the length that the error allows: nor is an event, or a compar
 
 
 class Notes(NamedTuple):
-    """Of every try (tries, ...): whether it led on; the time at its end, the length that the error allowed, and the
-    number of the instant of the grid at which a clock has struck last; a bit for each event at its end; the regime in
-    its middle, and in that of the next that led on."""
+    """Of every try, in blocks (blocks, BLOCK, ...): whether it led on; the time at its end, the length that the error
+    allowed, and the number of the instant of the grid at which a clock has struck last; a bit for each event at its
+    end; the regime in its middle, and in that of the next that led on."""
 
     moved: Any
     t: Any
@@ -55,6 +57,13 @@ class Place(NamedTuple):
     state: LoopState
     tally: Tally
     k: Any
+
+
+class Recorded(NamedTuple):
+    """What blocks record at an instant, and its rates."""
+
+    t: Any
+    recorded: tuple[dict[str, Any], dict[str, Any]]
 
 
 class Repeated(NamedTuple):
@@ -87,64 +96,71 @@ def note(loop: Loop, objectives: Objectives, pace: Pace, key: Any, tries: int) -
         moved = (new.point.t > old.point.t) | (fired != 0)
         return Notes(moved, new.point.t, old.natural, new.k, fired, words, words)
 
-    def block(at: tuple[Any, Carry, Notes]) -> tuple[Any, Carry, Notes]:
-        first, carry, notes = at
+    def one(carry: Carry, _: Any) -> tuple[Carry, Notes]:
+        new = pace.step(loop, objectives, key, carry)
+        return new, entry(carry, new)
 
-        def one(i: Any, at: tuple[Carry, Notes]) -> tuple[Carry, Notes]:
-            new = pace.step(loop, objectives, key, at[0])
-            said = entry(at[0], new)
-            return new, jax.tree.map(lambda all, x: all.at[first + i].set(x), at[1], said)
+    def some(carry: Carry) -> tuple[Carry, Notes]:
+        return jax.lax.scan(one, pace.renew(loop, carry), length=BLOCK)
 
-        return first + BLOCK, *jax.lax.fori_loop(0, BLOCK, one, (pace.renew(loop, carry), notes))
+    def back(words: Words, note: Notes) -> tuple[Words, Words]:
+        return select(note.moved, note.words, words), words
 
     carry = pace.start(loop, objectives, key)
-    shapes = jax.eval_shape(entry, carry, carry)
-    room = -(-tries // BLOCK) * BLOCK
-    notes = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), shapes)
-    _, carry, notes = jax.lax.while_loop(lambda at: (at[0] < room) & anyone(at[1].running), block, (0, carry, notes))
+    carry, notes = _skipping(some, lambda carry, _: carry.running, carry, None, -(-tries // BLOCK))
 
-    def back(words: Words, at: tuple[Any, Words]) -> tuple[Words, Words]:
-        return select(at[0], at[1], words), words
+    def followed(words: Words, block: Notes) -> tuple[Words, Words]:
+        return jax.lax.scan(back, words, block, reverse=True)
 
-    last = jax.tree.map(lambda x: x[-1], notes.words)
-    following = jax.lax.scan(back, last, (notes.moved, notes.words), reverse=True)[1]
-    return notes._replace(next=following), jnp.where(carry.running, Condition.DIVERGED, carry.condition)
+    nothing = jax.tree.map(lambda x: x[-1, -1], notes.words)
+    following = _skipping(followed, lambda _, block: jnp.any(block.moved), nothing, notes, reverse=True)[1]
+    notes = jax.tree.map(jax.lax.stop_gradient, notes._replace(next=following))
+    return notes, jnp.where(carry.running, Condition.DIVERGED, carry.condition)
+
+
+def _skipping(work: Any, on: Any, carry: Any, xs: Any, length: int | None = None, reverse: bool = False) -> Any:
+    """A scan of work(carry) or, with xs, work(carry, x), which is skipped where no lane of a batch is on(carry, x):
+    it leaves zeros there."""
+
+    def body(carry: Any, x: Any) -> tuple[Any, Any]:
+        def run() -> tuple[Any, Any]:
+            return work(carry) if x is None else work(carry, x)
+
+        def skip() -> tuple[Any, Any]:
+            return carry, jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(run)[1])
+
+        return jax.lax.cond(anyone(on(carry, x)), run, skip)
+
+    return jax.lax.scan(body, carry, xs, length=length, reverse=reverse)
 
 
 def repeat(loop: Loop, objectives: Objectives, pace: Pace, key: Any, notes: Notes, condition: Any) -> Repeated:
     """Return the run of these notes once more, which can be differentiated in every leaf of loop and objectives."""
-    room, zero = len(notes.t), 0.0 * pace.h
-    state = loop.start()
-    signals = loop.signals(zero, state)
-    tally = {name: objective.start(signals.sample) for name, objective in objectives.items()}
-    if loop.changes:
-        margins = loop.margins(zero, state, signals, lambda: loop.flow(zero, state, signals))
-        fired = jax.tree.map(lambda margin: margin < 0, margins)
-        state = loop.change(Clock(zero, pace.h, 0, key), state, signals, margins, fired)
-    last = jnp.max(jnp.where(notes.moved, jnp.arange(1, room + 1), 0))
-
-    def step(at: tuple[Any, Place]) -> tuple[Any, Place]:
-        i, place = at
-        one = jax.tree.map(lambda x: x[jnp.minimum(i, room - 1)], notes)
-        new = _step(loop, objectives, pace, key, place, one)
-        return i + 1, select(one.moved & (i < room), new, place)
-
+    zero = 0.0 * pace.h
+    state, tally = start(loop, objectives, Clock(zero, pace.h, 0, key))
     begun = typed(Place(zero, state, tally, jnp.asarray(0)), pace.h.dtype)
-    place = repeated(step, (0, begun), room, lambda at: anyone(at[0] < last))[1]
-    return Repeated(place, condition)
+
+    def step(place: Place, one: Notes) -> tuple[Place, None]:
+        return select(one.moved, _step(loop, objectives, pace, key, place, one), place), None
+
+    @forgetful
+    def block(place: Place, some: Notes) -> tuple[Place, None]:
+        return jax.lax.scan(forgetful(step), place, some)
+
+    return Repeated(_skipping(block, lambda _, some: jnp.any(some.moved), begun, notes)[0], condition)
 
 
 def _step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, place: Place, one: Notes) -> Place:
     """One step within its regime, and what happens at its end."""
     system = dynamics(loop, objectives, place.t, place.state, place.tally, kinks=True)
     within, h = Regime(one.words), one.t - place.t
-    start = system.ahead(place.t, place.state, place.tally, within)
+    begin = system.ahead(place.t, place.state, place.tally, within)
     z, held = parted(place.state, place.tally)
 
     def flow(t: Any, z: Any, given: tuple[Any, Regime]) -> Any:
         return system.rates(t, z, *given)
 
-    z = rk4_step_from(flow, place.t, z, start.seen[:2], h, (held, within))
+    z = rk4_step_from(flow, place.t, z, begin.seen[:2], h, (held, within))
     state, tally = _whole(loop, place, z)
     end = system.ahead(one.t, state, tally, within)
     changed = tuple(a ^ b for a, b in zip(one.words, one.next, strict=True))
@@ -156,16 +172,19 @@ def _step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, place: Place
     sample = axpy(shift, end.moving, end.seen.signals.sample)
     sample = sample._replace(t=t)
     segment = Segment(
-        start.seen.signals.sample,
+        begin.seen.signals.sample,
         sample,
         h + shift,
         pace.h,
-        lambda: (start.moving.output, end.moving.output),
-        lambda: (start.moving, end.moving),
+        lambda: (begin.moving.output, end.moving.output),
+        lambda: (begin.moving, end.moving),
     )
     tally = {name: Memory(tally[name].flow, o.update(tally[name], segment)) for name, o in objectives.items()}
     if loop.changes:
-        state = _changed(system, Clock(t, pace.h, one.k, key, strikes), state, end.seen.margins, one.fired)
+        late = axpy(shift, end.recorded, end.seen.signals.recorded)
+        ends = (begin.seen.signals.recorded, begin.recorded), (late, end.recorded)
+        step = passed(*(Recorded(*both) for both in zip((place.t, t), ends, strict=True)))
+        state = _changed(system, Clock(t, pace.h, one.k, key, strikes), state, end.seen.margins, one.fired, step)
     return Place(t, state, tally, one.k)
 
 
@@ -195,12 +214,14 @@ def _shift(end: Ahead, changed: Words, one: Notes, h: Any, strikes: Any) -> Any:
 def _until(on: Any, margin: Any, fall: Any, most: Any) -> tuple[Any, Any]:
     """Whether a margin is zero within so many seconds, and in how many."""
     close = on & (jnp.abs(margin) < jnp.abs(jax.lax.stop_gradient(most) * fall))
-    return close, -margin / jnp.where(close, fall, 1.0)
+    return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))  # the margin is 0, but for rounding
 
 
-def _changed(system: Dynamics, clock: Clock, state: LoopState, margins: Margins, fired: Any) -> LoopState:
+def _changed(
+    system: Dynamics, clock: Clock, state: LoopState, margins: Margins, fired: Any, step: dict[str, Passage]
+) -> LoopState:
     """The state after the events and the ticks at the end of a step."""
     signals = system.loop.signals(clock.t, state)
     leaves, tree = jax.tree.flatten(margins)
     happens = tree.unflatten([(fired >> i) & 1 != 0 for i in range(len(leaves))])
-    return system.loop.change(clock, state, signals, margins, happens)
+    return system.loop.change(clock, state, signals, margins, happens, step)

@@ -10,12 +10,13 @@ import numpy as np
 
 from diffabs.simulate.accuracy import comparable, measure_finer, share
 from diffabs.simulate.batch import Batch, by_structure, stacked
-from diffabs.simulate.solution import Run
+from diffabs.simulate.solution import Run, described
 from diffabs.sweep.results import Results
 from diffabs.sweep.study import Study, precision
 
 STREAM = 0x0ACC  # of random numbers, beside those of the designs
 EXCLUDED = ("diverged", "refused")  # flags of lanes whose metrics are none
+NOTHING = 1e-9  # in the unit of the metric: a change that is none
 LOOSE = 0.01  # relative: a metric that a half step changes by more
 
 
@@ -37,6 +38,7 @@ def checked(study: Study, found: Results, count: int) -> dict[str, Any]:
     return {
         "samples": rows.tolist(),
         "step": study.solver.step / 2,
+        "solver": described(study.solver),
         "ended otherwise": int((fine & ~alike).sum()),
         "not comparable": int((~fine).sum()),
         "metrics": {name: row for name, row in changes.items() if row},
@@ -46,10 +48,12 @@ def checked(study: Study, found: Results, count: int) -> dict[str, Any]:
 def said(result: dict[str, Any]) -> list[str]:
     """What a reader of the statistics must know, a line each."""
     lines = []
-    loose = {name: row for name, row in result["metrics"].items() if row["largest"] > LOOSE}
+    rows = result["metrics"].items()
+    loose = {name: row for name, row in rows if row["largest"] > LOOSE and row["difference"] > NOTHING}
     if loose:
         each = (f"{name} by up to {100 * row['largest']:.3g} % (sample {row['sample']})" for name, row in loose.items())
-        lines.append(f"a half step changes {', '.join(each)}: shorten solver.step")
+        cure = "lower solver.rtol" if "rtol" in result.get("solver", {}) else "shorten solver.step"
+        lines.append(f"a half step changes {', '.join(each)}: {cure}")
     if result["ended otherwise"]:
         lines.append(f"with a half step {result['ended otherwise']} of the lanes looked at ended in another way")
     if result["not comparable"]:

@@ -26,6 +26,7 @@ from diffabs.core.values import (
     one_of,
     ranged,
     read,
+    read_one,
     shown,
     switch,
     table_of,
@@ -132,6 +133,16 @@ class _Solver:
 
 
 @dataclasses.dataclass(frozen=True)
+class _Adaptive(_Solver):
+    rtol: float = entry(ranged(FINITE))
+
+
+def _solver(given: Any, path: str) -> _Solver:
+    table = {"type": "fixed", **given} if isinstance(given, Mapping) else given
+    return read_one({"fixed": _Solver, "adaptive": _Adaptive}, table, path)
+
+
+@dataclasses.dataclass(frozen=True)
 class _Study:
     """What must be of a study (`Study.table`) for its results to be read; the parts are for the reader of the file."""
 
@@ -141,7 +152,7 @@ class _Study:
     dtype: str = entry(one_of(*DTYPES))
     failures: Mapping[str, float] = entry(table_of(ranged(FINITE)))
     success: bool = entry(switch)
-    solver: _Solver = entry(partial(read, _Solver))
+    solver: _Solver = entry(_solver)
     space: Space = entry(variables.read)
     loop: Mapping[str, Any] = entry(table_of(as_given))
     parts: Mapping[str, Any] = entry(table_of(table_of(as_given)))

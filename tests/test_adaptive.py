@@ -1,0 +1,240 @@
+"""Adaptive steps: what they measure against fixed steps small enough, on kinks, events and clocks; trajectories;
+derivatives against differences; lanes that diverge."""
+
+import dataclasses
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import random_loops
+
+import diffabs as d
+from diffabs.core.pytree import arrayed, prepared, refined, strong
+from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
+from diffabs.scenario.scenario import load
+from diffabs.simulate import adaptive
+from diffabs.simulate.foresight import VALUES, Margin, bit, kinks
+from diffabs.simulate.replay import MOST, room
+from diffabs.simulate.run import arguments
+
+LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
+FINE = 4  # times shorter than a scenario's are the fixed steps that are compared with
+EVERYWHERE = [name for name in random_loops.STRUCTURES if "delay" not in name]
+QUICK = ("relay, latch, lag", "rig, proportional, rate limit", "computer, patches")
+
+
+def rig(*changes: str):
+    return load("slip-lmi", list(LIMITS + changes))
+
+
+def close(run, reference, tolerance, least=1e-6):
+    for name in set(reference.metrics) - {"final_slip_error"}:  # it is 0, to rounding
+        value = reference.metrics[name]
+        off = np.abs(np.asarray(run.metrics[name]) - value)
+        assert np.all(off <= tolerance * np.maximum(np.abs(value), least)), (name, run.metrics[name], value)
+
+
+@pytest.mark.parametrize("name", ["lab-rig", "slip-estimator", "arm-hanging"])
+def test_what_a_packaged_scenario_measures_is_what_fixed_steps_measure(name):
+    chosen = load(name)
+    run = d.measure(chosen.loop, d.Adaptive(1e-5, chosen.solver.duration, chosen.solver.step), chosen.objectives)
+    reference = d.measure(chosen.loop, chosen.solver, chosen.objectives)
+    assert (run.stopped, run.diverged, run.timed_out) == (reference.stopped, reference.diverged, reference.timed_out)
+    close(run, reference, 1e-4)
+
+
+def test_every_lane_of_a_box_is_right_on_limits_that_no_part_declares():
+    chosen = rig()
+    mass, speed = (x.ravel() for x in np.meshgrid(np.linspace(5.3, 6.2, 12), np.linspace(8.5, 16.5, 12)))
+    lanes = d.Batch({"plant.mass": mass, "initial.speed": speed})
+    measured = {"iae": IAE(), "max_slip": MaxSlip(), "stop_distance": StopDistance()}
+    run = d.run_batch(chosen.loop, lanes, d.Adaptive(1e-5, 2.5), measured)
+    close(run, d.run_batch(chosen.loop, lanes, d.FixedStep(5e-5, 2.5), measured), 1e-4)
+
+
+def test_a_smaller_error_of_a_step_makes_a_smaller_error_of_the_run():
+    chosen = rig()
+    exact = d.measure(chosen.loop, d.FixedStep(1e-5, 2.5), {"iae": IAE()}).metrics["iae"]
+    errors = [
+        abs(d.measure(chosen.loop, d.Adaptive(rtol, 2.5), {"iae": IAE()}).metrics["iae"] / exact - 1)
+        for rtol in (1e-4, 1e-6, 1e-8)
+    ]
+    assert errors[0] < 5e-3
+    assert errors[1] < errors[0] / 20
+    assert errors[2] < 2e-7
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in EVERYWHERE])
+def test_random_loops_of_any_parts_are_right_to_1e_4(name):
+    structure, key = random_loops.STRUCTURES[name], jax.random.key(1)
+    measured = {n: one for n, one in structure.objectives.items() if n != "torque_rate"}  # a jump counts by the grid
+    loop = random_loops.drawn(name, 0, 0)
+    run = d.measure(loop, d.Adaptive(1e-5, structure.duration, structure.step), measured, key=key)
+    fixed = d.FixedStep(structure.step / FINE, structure.duration, kinks=True)
+    close(run, d.measure(refined(loop, FINE), fixed, measured, key=key), 1e-4, 1e-3)
+
+
+def test_a_computer_strikes_on_its_own_clock_and_not_on_the_grid():
+    chosen = load("slip-cured", ["sensor=noise", "sensor.slip=0.002"])
+    key = jax.random.key(4)
+    coarse, fine = (
+        d.measure(chosen.loop, d.Adaptive(1e-6, 3.0, step), chosen.objectives, key=key) for step in (1e-3, 1e-4)
+    )
+    for name in chosen.objectives:
+        np.testing.assert_allclose(coarse.metrics[name], fine.metrics[name], rtol=1e-9, atol=1e-12)
+    close(fine, d.measure(chosen.loop, d.FixedStep(1e-4, 3.0), chosen.objectives, key=key), 1e-4, 1e-3)
+
+
+def test_a_trajectory_is_kept_on_the_grid_and_changes_nothing():
+    chosen = rig()
+    solver = d.Adaptive(1e-6, 2.5, 1e-3, every=7)
+    seen = d.rollout(chosen.loop, solver, BRAKING)
+    reference = d.rollout(chosen.loop, d.FixedStep(1e-4, 2.5, every=70), BRAKING)
+    alone = d.measure(chosen.loop, solver, BRAKING)
+    for name, value in alone.metrics.items():
+        np.testing.assert_array_equal(seen.metrics[name], value)
+    trajectory, like = seen.trajectory.sample, reference.trajectory.sample
+    np.testing.assert_allclose(trajectory.t, like.t, atol=1e-6)
+    np.testing.assert_allclose(trajectory.output.slip, like.output.slip, atol=2e-5)
+    np.testing.assert_allclose(trajectory.control, like.control, atol=0.05)  # it has kinks between two points
+    np.testing.assert_array_equal(seen.trajectory.running, reference.trajectory.running)
+
+
+def test_neither_the_order_of_lanes_nor_their_company_changes_a_number():
+    """As many lanes each time, so that one program runs them. Those without a speed, or that begin beyond their stop,
+    have diverged."""
+    speed = np.linspace(8.0, 16.0, 40)
+
+    def run(speeds, together=False):
+        lanes = d.Batch({"initial.speed": speeds})
+        return d.run_batch(rig().loop, lanes, d.Adaptive(1e-5, 2.5), {"iae": IAE()}, together=together, accepted=True)
+
+    whole = run(speed).metrics["iae"]
+    np.testing.assert_allclose(run(speed[::-1]).metrics["iae"][::-1], whole, rtol=1e-9)
+    np.testing.assert_allclose(run(speed, True).metrics["iae"], whole, rtol=1e-9)
+    others = run(np.concatenate([[np.nan, 0.5], np.tile(speed[3:22], 2)]))
+    np.testing.assert_allclose(others.metrics["iae"][2:], np.tile(whole[3:22], 2), rtol=1e-9)
+    np.testing.assert_array_equal(others.diverged, np.arange(40) < 2)
+    np.testing.assert_array_equal(np.isnan(others.metrics["iae"]), np.arange(40) < 2)
+
+
+def test_single_precision_asks_for_no_smaller_error_than_it_has():
+    chosen = rig()
+    exact = d.measure(chosen.loop, d.Adaptive(1e-9, 2.5), {"iae": IAE()})
+    with jax.enable_x64(False):
+        loop = jax.tree.map(lambda x: np.asarray(x, np.float32), chosen.loop)
+        assert arguments(loop, d.Adaptive(1e-9, 2.5), {})[2].rtol == np.float32(32 * np.finfo(np.float32).eps)
+        run = d.measure(loop, d.Adaptive(1e-9, 2.5), {"iae": IAE()})
+    np.testing.assert_allclose(run.metrics["iae"], exact.metrics["iae"], rtol=1e-4)
+
+
+def test_derivatives_on_limits_agree_with_differences_of_three_widths():
+    chosen = rig()
+    gain = jnp.asarray(chosen.loop.controller.gain)
+    measured = {"iae": IAE(), "max_slip": MaxSlip(), "stop_distance": StopDistance()}
+
+    def of(solver):
+        def metrics(scale):
+            run = d.measure(d.replace(chosen.loop, {"controller.gain": gain * (1 + scale)}), solver, measured)
+            return jnp.stack([run.metrics[name] for name in measured])
+
+        return metrics
+
+    slopes = jax.jacfwd(of(d.Adaptive(1e-5, 2.5)))(jnp.zeros(2))
+    np.testing.assert_allclose(jax.jacrev(of(d.Adaptive(1e-5, 2.5)))(jnp.zeros(2)), slopes, rtol=1e-5)
+    exact = jax.jit(jax.vmap(of(d.Adaptive(1e-9, 2.5))))
+    widths = np.array([1e-2, 3e-3, 1e-3])
+    moved = exact(np.concatenate([sign * width * np.eye(2) for width in widths for sign in (1, -1)]))
+    right, left = np.moveaxis(np.asarray(moved).reshape(3, 2, 2, 3), 1, 0)
+    for width, difference in zip(widths, (right - left) / (2 * widths[:, None, None]), strict=True):
+        np.testing.assert_allclose(slopes, difference.T, rtol=2e-3 if width > 5e-3 else 5e-4)
+
+
+def test_a_derivative_through_a_relay_and_a_latch_is_that_of_fixed_steps():
+    structure, loop = random_loops.STRUCTURES["relay, latch, lag"], random_loops.drawn("relay, latch, lag", 3, 0)
+
+    def slope(solver):
+        def measured(mass):
+            run = d.measure(d.replace(loop, {"plant.mass": mass}), solver, {"d": StopDistance(), "iae": IAE()})
+            return jnp.stack([run.metrics["d"], run.metrics["iae"]])
+
+        return jax.jacfwd(measured)(jnp.asarray(float(loop.plant.mass)))
+
+    fixed = slope(d.FixedStep(structure.step, structure.duration))
+    np.testing.assert_allclose(slope(d.Adaptive(1e-6, structure.duration)), fixed, rtol=2e-3)
+
+
+def test_there_is_no_derivative_of_a_trajectory():
+    chosen = rig()
+
+    def last(mass):
+        run = d.rollout(d.replace(chosen.loop, {"plant.mass": mass}), d.Adaptive(1e-5, 0.2), {})
+        return run.trajectory.sample.output.slip[-1]
+
+    with pytest.raises(ValueError, match="no derivative of a trajectory with Adaptive steps"):
+        jax.grad(last)(5.7)
+
+
+def test_there_is_room_for_smaller_steps():
+    loop, sampled = rig().loop, load("slip-cured").loop
+    assert room(loop, d.Adaptive(1e-5, 2.5)) == MOST
+    assert room(loop, d.Adaptive(1e-8, 2.5)) == 10 * MOST
+    assert room(sampled, d.Adaptive(1e-5, 2.0, 1e-3)) == MOST + 2 * 2000
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"rtol": 0.0}, "solver.rtol = 0.0 is not positive and finite"),
+        ({"rtol": "1e-5"}, "solver.rtol = '1e-5'"),
+        ({"duration": -1.0}, "solver.duration = -1.0 is not positive and finite"),
+        ({"step": 20.0}, "solver.step = 20.0 s is longer than solver.duration = 10.0 s"),
+    ],
+)
+def test_a_solver_that_no_run_can_have_is_refused(change, line):
+    with pytest.raises(ValueError, match=re.escape(line)):
+        d.measure(rig().loop, dataclasses.replace(d.Adaptive(), **change), {})
+
+
+def test_steps_that_find_themselves_are_never_unstable():
+    """The same step of a grid is refused for fixed steps, and is no step of the integration for the others."""
+    loop = load("slip-estimator").loop
+    with pytest.raises(ValueError, match="not stable"):
+        d.check(loop, d.FixedStep(1e-2, 4.0))
+    d.check(loop, d.Adaptive(1e-5, 4.0, 1e-2))
+
+
+def test_lines_say_when_comparisons_change_and_when_they_did():
+    numbers = [0, 1, 33, np.array([2, 3])]
+    values = [jnp.asarray(3.0), jnp.asarray(-2.0), jnp.asarray(1.0), jnp.array([0.5, 4.0])]
+    rates = [jnp.asarray(-1.0), jnp.asarray(1.0), jnp.asarray(4.0), jnp.array([1.0, -40.0])]
+    margins = [Margin(*one) for one in zip(numbers, values, rates, strict=True)]
+    words = (jnp.uint32(0b1100), jnp.uint32(0b10))
+    np.testing.assert_array_equal(bit(words, np.array([2, 3, 33, 1])), [True, True, True, False])
+    found = kinks(margins, jnp.asarray(1.0), VALUES, words, jnp.asarray(1.0))
+    assert found.ahead == pytest.approx(0.1)  # 4 falls by 40/s
+    assert found.late == pytest.approx(0.5)  # of bits 2 and 33, 0.5 s and 0.25 s ago
+    none = kinks(margins, jnp.asarray(1.0), VALUES, (jnp.uint32(0),) * 2, jnp.asarray(1.0))
+    assert none.late == 0
+
+
+@pytest.mark.parametrize("name", ["slip-lmi", "arm-hanging"])
+def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
+    loop = prepared(strong(arrayed(load(name).loop)))
+    state = loop.start()
+    z, tree = jax.flatten_util.ravel_pytree(state.flow())
+
+    @jax.jit
+    def both():
+        def flow(z):
+            at = state.with_flow(tree(z))
+            return jax.flatten_util.ravel_pytree(loop.flow(0.0, at, loop.signals(0.0, at)))[0]
+
+        sizes = adaptive._sizes(state, loop.signals(0.0, state).sample)
+        return jax.jacfwd(flow)(z), adaptive.longest_stable(loop, jnp.asarray(0.0), state, sizes)
+
+    jacobian, longest = both()
+    radius = np.max(np.abs(np.linalg.eigvals(jacobian)))
+    assert 0.7 < float(longest) * radius / adaptive.STABLE < 1.4
