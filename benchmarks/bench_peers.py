@@ -84,6 +84,12 @@ class Peer:
             if self.points[setting]["error"] <= self.options.accuracy / FACTOR:
                 return
 
+    def end(self) -> None:
+        """End its process."""
+        self.process.kill()
+        with contextlib.suppress(BrokenPipeError):
+            self.process.communicate()
+
     def best(self) -> dict[str, Any] | None:
         """The point of the first setting that is accurate, or of the most accurate; None if there is none."""
         return record.best(self.points.values(), self.options.accuracy)
@@ -114,7 +120,7 @@ def measured(options: Any) -> dict[str, Any]:
         taken = record.in_turn(takers, options.rounds)
     finally:
         for peer in peers:
-            peer.process.kill()
+            peer.end()
     return summary(peers, taken, apart, options)
 
 

@@ -14,6 +14,7 @@ A peer that is not installed is not compared. `--store` keeps what was found ins
 
 import argparse
 import json
+import os
 import pathlib
 import statistics
 import subprocess
@@ -27,17 +28,27 @@ from rich.table import Table
 
 HERE = pathlib.Path(__file__).parent
 STORED = HERE / "ratios.json"
-FACTOR = 1.35  # a machine that does something else moves a ratio by a quarter
-LANES = 1024  # of peers, and of work-precision
+FACTOR = 1.5  # a machine that does something else moves a ratio by as much
+LANES = {"peers": 4096, "work-precision": 1024}
 ASKED = 1e-4
 RUNS = {
     "gradient": ("--quick", "--rounds", "5", "--loops", "lmi", "latch"),
     "riccati": ("--part", "300"),
     "design": ("--weights", "15"),
-    "peers": ("--lanes", f"{LANES}", "--peers", "diffabs_adaptive", "diffabs_fixed", "c_adaptive", "diffrax_event"),
-    "work-precision": ("--lanes", f"{LANES}", "--distinct", "64", "--problems", "est-latch", "slip-cured", "arm"),
+    "peers": ("--rounds", "3", "--peers", "diffabs_adaptive", "diffabs_fixed", "c_adaptive", "diffrax_event"),
+    "work-precision": (
+        "--lanes",
+        f"{LANES['work-precision']}",
+        "--distinct",
+        "64",
+        "--problems",
+        "est-latch",
+        "slip-cured",
+        "arm",
+    ),
 }
-FILES = {"peers": f"peers-{LANES}-float32"}  # records that are not called like their benchmark
+ENVIRONMENTS = {"riccati": {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}}  # SciPy at its best
+FILES = {"peers": f"peers-{LANES['peers']}-float32"}  # records that are not called like their benchmark
 
 
 def gradient(found: dict[str, Any]) -> Iterator[tuple[str, float]]:
@@ -69,7 +80,7 @@ def work_precision(found: dict[str, Any]) -> Iterator[tuple[str, float]]:
     for name, problem in found["found"]["float64"].items():
         best = {}
         for kind in ("adaptive", "fixed"):
-            points = [p for p in problem["points"] if p["solver"] == kind and p["lanes"] == LANES]
+            points = [p for p in problem["points"] if p["solver"] == kind and p["lanes"] == LANES["work-precision"]]
             point = record.best(points, ASKED)
             if point and point["error"] <= ASKED:
                 best[kind] = statistics.median(point["seconds"])
@@ -90,7 +101,8 @@ def measured(name: str, records: pathlib.Path | None) -> dict[str, float]:
     """Return the ratios of a benchmark: of a run now, or of the record in a folder."""
     if records is None:
         script = HERE / f"bench_{name.replace('-', '_')}.py"
-        subprocess.run([sys.executable, script, *RUNS[name]], check=True, stdout=subprocess.DEVNULL)
+        environment = {**os.environ, **ENVIRONMENTS.get(name, {})}
+        subprocess.run([sys.executable, script, *RUNS[name]], check=True, stdout=subprocess.DEVNULL, env=environment)
     path = (records or record.OUT) / f"{FILES.get(name, name)}.json"
     return dict(READERS[name](json.loads(path.read_text(encoding="utf-8"))))
 

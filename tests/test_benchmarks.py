@@ -3,7 +3,6 @@
 import importlib
 import json
 import pathlib
-import subprocess
 import sys
 
 import numpy as np
@@ -102,16 +101,27 @@ def test_times_are_taken_in_turn_and_ratios_within_a_round():
     assert record.ratio([2.0, 30.0, 4.0], [1.0, 10.0, 4.0]) == 2.0
 
 
-def test_a_peer_that_is_not_there_says_so_and_the_others_go_on(tmp_path):
-    peers = ["--peers", "scipy_loop", "nobody", "--lanes", "4", "--rounds", "2", "--threads", "1"]
-    script = (FOLDER / "bench_peers.py").read_text(encoding="utf-8").replace('PEERS = ("', 'PEERS = ("nobody", "')
-    copy = FOLDER / "bench_peers.py"
-    out = tmp_path / "peers.json"
-    program = f"import sys; sys.path.insert(0, {str(FOLDER)!r}); exec(compile(sys.stdin.read(), {str(copy)!r}, 'exec'))"
-    command = [sys.executable, "-c", f"__file__ = {str(copy)!r}; {program}", *peers, "--out", str(out)]
-    done = subprocess.run(command, input=script, capture_output=True, text=True, check=True)
-    assert "nobody: No module named 'peers.nobody'" in done.stdout
-    assert all(len(line) <= 80 for line in done.stdout.splitlines() if "│" in line)
+def test_a_peer_that_is_not_there_says_so_and_the_others_go_on(tmp_path, monkeypatch, capsys):
+    bench, out = module("bench_peers"), tmp_path / "peers.json"
+    monkeypatch.setattr(bench, "PEERS", ("scipy_loop", "nobody"))
+    arguments = [
+        "--peers",
+        "scipy_loop",
+        "nobody",
+        "--lanes",
+        "4",
+        "--rounds",
+        "2",
+        "--threads",
+        "1",
+        "--out",
+        str(out),
+    ]
+    monkeypatch.setattr(sys, "argv", ["bench_peers.py", *arguments])
+    bench.main()
+    said = capsys.readouterr().out
+    assert "nobody: No module named 'peers.nobody'" in said
+    assert all(len(line) <= 80 for line in said.splitlines() if "│" in line)
     rows = json.loads(out.read_text())["rows"]
     assert rows["scipy_loop"]["accurate"]
     assert rows["scipy_loop"]["of_first"] == 1.0
@@ -121,28 +131,22 @@ def test_a_peer_that_is_not_there_says_so_and_the_others_go_on(tmp_path):
 RECORD = {"loops": {"lmi": {"rows": {"forward 1": {"ratio": 2.0}, "reverse": {"ratio": 6.0}}}}}
 
 
-@pytest.mark.parametrize(("reverse", "status"), [(6.0, 0), (8.0, 0), (8.2, 1), (float("nan"), 1)])
-def test_a_ratio_that_became_worse_is_named_and_is_the_exit_status(tmp_path, reverse, status):
+@pytest.mark.parametrize(("reverse", "status"), [(6.0, 0), (8.9, 0), (9.1, 1), (float("nan"), 1)])
+def test_a_ratio_that_became_worse_is_named_and_is_the_exit_status(tmp_path, monkeypatch, capsys, reverse, status):
     RECORD["loops"]["lmi"]["rows"]["reverse"]["ratio"] = reverse
     (tmp_path / "gradient.json").write_text(json.dumps(RECORD))
-    stored = tmp_path / "ratios.json"
+    stored, check = tmp_path / "ratios.json", module("check")
     stored.write_text(json.dumps({"gradient": {"lmi: forward 1 over value": 2.0, "lmi: reverse over value": 6.0}}))
-    command = [
-        sys.executable,
-        str(FOLDER / "check.py"),
-        "gradient",
-        "--records",
-        str(tmp_path),
-        "--stored",
-        str(stored),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == status
-    assert ("worse: gradient, lmi: reverse over value" in done.stderr) == bool(status)
-    assert "forward" not in done.stderr
-    kept = subprocess.run([*command, "--store"], capture_output=True, text=True, check=False)
-    assert kept.returncode == 0
-    assert subprocess.run(command, capture_output=True, check=False).returncode == int(reverse != reverse)
+    command = ["check.py", "gradient", "--records", str(tmp_path), "--stored", str(stored)]
+    monkeypatch.setattr(sys, "argv", command)
+    assert check.main() == status
+    said = capsys.readouterr().err
+    assert ("worse: gradient, lmi: reverse over value" in said) == bool(status)
+    assert "forward" not in said
+    monkeypatch.setattr(sys, "argv", [*command, "--store"])
+    assert check.main() == 0
+    monkeypatch.setattr(sys, "argv", command)
+    assert check.main() == int(reverse != reverse)
 
 
 def test_ratios_that_are_new_or_missing_are_not_worse():
