@@ -29,7 +29,7 @@ from rich.table import Table
 HERE = pathlib.Path(__file__).parent
 STORED = HERE / "ratios.json"
 FACTOR = 1.5  # a machine that does something else moves a ratio by as much
-LANES = {"peers": 4096, "work-precision": 1024}
+LANES = 1024  # of work-precision
 ASKED = 1e-4
 RUNS = {
     "gradient": ("--quick", "--rounds", "5", "--loops", "lmi", "latch"),
@@ -38,7 +38,7 @@ RUNS = {
     "peers": ("--rounds", "3", "--peers", "diffabs_adaptive", "diffabs_fixed", "c_adaptive", "diffrax_event"),
     "work-precision": (
         "--lanes",
-        f"{LANES['work-precision']}",
+        f"{LANES}",
         "--distinct",
         "64",
         "--problems",
@@ -48,7 +48,6 @@ RUNS = {
     ),
 }
 ENVIRONMENTS = {"riccati": {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}}  # SciPy at its best
-FILES = {"peers": f"peers-{LANES['peers']}-float32"}  # records that are not called like their benchmark
 
 
 def gradient(found: dict[str, Any]) -> Iterator[tuple[str, float]]:
@@ -80,7 +79,7 @@ def work_precision(found: dict[str, Any]) -> Iterator[tuple[str, float]]:
     for name, problem in found["found"]["float64"].items():
         best = {}
         for kind in ("adaptive", "fixed"):
-            points = [p for p in problem["points"] if p["solver"] == kind and p["lanes"] == LANES["work-precision"]]
+            points = [p for p in problem["points"] if p["solver"] == kind and p["lanes"] == LANES]
             point = record.best(points, ASKED)
             if point and point["error"] <= ASKED:
                 best[kind] = statistics.median(point["seconds"])
@@ -99,11 +98,11 @@ READERS: dict[str, Callable[[dict[str, Any]], Iterator[tuple[str, float]]]] = {
 
 def measured(name: str, records: pathlib.Path | None) -> dict[str, float]:
     """Return the ratios of a benchmark: of a run now, or of the record in a folder."""
+    path = (records or record.OUT / "check") / f"{name}.json"
     if records is None:
-        script = HERE / f"bench_{name.replace('-', '_')}.py"
+        command = [sys.executable, HERE / f"bench_{name.replace('-', '_')}.py", *RUNS[name], "--out", path]
         environment = {**os.environ, **ENVIRONMENTS.get(name, {})}
-        subprocess.run([sys.executable, script, *RUNS[name]], check=True, stdout=subprocess.DEVNULL, env=environment)
-    path = (records or record.OUT) / f"{FILES.get(name, name)}.json"
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
     return dict(READERS[name](json.loads(path.read_text(encoding="utf-8"))))
 
 
