@@ -78,11 +78,18 @@ MUTATIONS = [
         "test_kinks.py::test_a_program_is_the_function[of what is fixed]",
     ),
     Mutation(
+        "an answer that contradicts nobody is held for ever",
+        "core/regime.py",
+        "against |= gives & (margin == 0) & (says() != taken)",
+        "pass",
+        "test_kinks.py::test_a_product_that_has_become_0_is_held_by_nobody",
+    ),
+    Mutation(
         "adaptive steps look at the first signal alone",
         "simulate/lengths.py",
         "    return 0.5 * jnp.max(jnp.stack(off))",
         "    return 0.5 * off[0]",
-        "test_adaptive.py::test_random_loops_of_any_parts_are_right_to_1e_4[rig, proportional, rate limit]",
+        "test_adaptive.py::test_the_error_of_a_step_is_that_of_the_worst_state",
     ),
     Mutation(
         "kinks that were not predicted stay in a step",

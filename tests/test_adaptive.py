@@ -220,6 +220,17 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
     assert none.late == 0
 
 
+def test_the_error_of_a_step_is_that_of_the_worst_state():
+    loop = prepared(strong(arrayed(load("slip-lmi", ["actuator=lag", "actuator.time_constant=0.01"]).loop)))
+    state = loop.start()
+    state = state.with_flow(jax.tree.map(lambda x: x + 2.0, state.flow()))
+    sample = loop.signals(0.0, state).sample
+    scale = lengths.sizes(state, sample)
+    assert lengths.error(loop, state, state, scale, sample) == 0
+    coarse = state._replace(actuator=state.actuator._replace(flow=1.01 * state.actuator.flow))
+    assert lengths.error(loop, state, coarse, scale, sample) == pytest.approx(0.5 * 0.01)
+
+
 @pytest.mark.parametrize("name", ["slip-lmi", "arm-hanging"])
 def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
     loop = prepared(strong(arrayed(load(name).loop)))

@@ -32,6 +32,7 @@ What a part may offer beyond its contract, as a method or an attribute of its cl
                    margins(), event()                   what changes where a margin falls through zero: see Switching
                    period                               of its clock [s]; without it, it ticks on the whole grid
                    every_step = True                    it ticks in every step of the integration
+                   record(memory, passage)              told of every step, when it is over: `core.blocks.Passage`
                    offers(hook)                         of a block made of blocks: whether one has tick, or margins
     plant          usual_parts(), usual_objectives()    the loop around it, and its metrics, where a scenario says none
                    audit(initial)                       an objective whose value exceeds 1 where a run cannot have been

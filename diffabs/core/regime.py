@@ -92,10 +92,12 @@ class Asked:
             return taken if self.regime.free is None else jnp.where(self.regime.free, says(), taken)
         margin = jnp.where(taken, x - y, y - x)
         against = margin < -_rounding(x)
+        if self.regime.loose is not None:  # a product that has become 0 contradicts nobody, and would be held for ever
+            gives = bits(self.regime.loose, first, shape)
+            against |= gives & (margin == 0) & (says() != taken)
+            taken ^= against & gives
         self._pack(self.against, first, against)
         self._add(first, shape, margin)
-        if self.regime.loose is not None:
-            taken ^= against & bits(self.regime.loose, first, shape)
         return taken
 
     def search(self, ask: tuple[int, bool], says: Callable[[], Any], knots: Any, x: Any) -> Any:
