@@ -120,6 +120,18 @@ def test_numbers_that_are_equal_to_rounding_say_nothing():
         assert any(one.look(same, 0.6 + excess, 0.6, regime)[1].crossed) == sees
 
 
+def test_a_product_that_has_become_0_is_held_by_nobody():
+    """(x - min(x, p)) x > 0 above p, and 0 > 0 below, which contradicts nobody: it gives way all the same."""
+    one = program(lambda x, p: jnp.where((x - jnp.minimum(x, p)) * x > 0, 1.0, 0.0))
+    above = held(one, 2.0)
+    gives_way = above._replace(loose=(~jnp.uint32(0),) * one.words)
+    assert one.look(same, 2.1, 0.6, gives_way)[0] == 1
+    value, answers = one.look(same, 0.5, 0.6, gives_way)
+    assert value == 0
+    assert answers.words == held(one, 0.5).words
+    assert not any(answers.crossed)
+
+
 class Shown(NamedTuple):
     """What a plant of two numbers shows."""
 
