@@ -121,8 +121,14 @@ def test_what_is_said():
     assert said(nothing) == []
     loose = {
         **nothing,
-        "metrics": {"iae": {"largest": 0.03, "sample": 7}, "stop_time": {"largest": 0.009, "sample": 8}},
+        "metrics": {
+            "iae": {"largest": 0.03, "difference": 1e-4, "sample": 7},
+            "stop_time": {"largest": 0.009, "difference": 0.02, "sample": 8},
+            "final_slip_error": {"largest": 0.5, "difference": 1e-10, "sample": 9},
+        },
     }
-    assert said(loose) == ["a half step changes iae by up to 3 % (sample 7): shorten solver.step"]
+    line = "a half step changes iae by up to 3 % (sample 7): "
+    assert said(loose) == [f"{line}shorten solver.step"]
+    assert said({**loose, "solver": {"rtol": 1e-5}}) == [f"{line}lower solver.rtol"]
     assert "2 of the lanes" in said({**nothing, "ended otherwise": 2})[0]
     assert "accuracy unknown" in said({**nothing, "not comparable": 1})[0]

@@ -14,7 +14,7 @@ import diffabs as d
 from diffabs.core.pytree import arrayed, prepared, refined, strong
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
-from diffabs.simulate import adaptive
+from diffabs.simulate import lengths
 from diffabs.simulate.foresight import VALUES, Margin, bit, kinks
 from diffabs.simulate.replay import MOST, room
 from diffabs.simulate.run import arguments
@@ -232,9 +232,9 @@ def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
             at = state.with_flow(tree(z))
             return jax.flatten_util.ravel_pytree(loop.flow(0.0, at, loop.signals(0.0, at)))[0]
 
-        sizes = adaptive._sizes(state, loop.signals(0.0, state).sample)
-        return jax.jacfwd(flow)(z), adaptive.longest_stable(loop, jnp.asarray(0.0), state, sizes)
+        sizes = lengths.sizes(state, loop.signals(0.0, state).sample)
+        return jax.jacfwd(flow)(z), lengths.longest_stable(loop, jnp.asarray(0.0), state, sizes)
 
     jacobian, longest = both()
     radius = np.max(np.abs(np.linalg.eigvals(jacobian)))
-    assert 0.7 < float(longest) * radius / adaptive.STABLE < 1.4
+    assert 0.7 < float(longest) * radius / lengths.STABLE < 1.4

@@ -9,8 +9,6 @@
 
 The grid of `Adaptive.step` is only where clocks strike and what a trajectory keeps: no step has to end on it."""
 
-import dataclasses
-from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -26,82 +24,14 @@ from diffabs.simulate.advance import start
 from diffabs.simulate.checkpoint import anyone, apart
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.dynamics import FREE, Dynamics, Objectives, Tally, dynamics, parted
-from diffabs.simulate.foresight import DERIVATIVES, VALUES, Care, kinks
+from diffabs.simulate.foresight import kinks
 from diffabs.simulate.landing import Search, earliest, falls_through, init_search, land, seek, select
-from diffabs.simulate.outcome import observe
+from diffabs.simulate.lengths import FIRST, SHRINK, Pace, allowed, error, longest_stable, planned, sizes
 from diffabs.simulate.rk4 import rk4_pair
-from diffabs.simulate.solution import Trajectory
 from diffabs.simulate.stepper import MISSED, typed
 
-FIRST = 1e-4  # s, the first step
-PART = 0.25  # of the error that a step may have, where a derivative is asked for
-COUNTED = ("tries", "condition")
-SAFETY, LITTLE = 0.85, 1e-6
-SHRINK, GROW = 0.25, 2.5  # times the last step, at least and at most
-LEAST = 1e-9  # of the duration: the shortest step; or 4 times its rounding
-SHORT = 1.2  # times the present length: a kink so near is reached in two steps
-ROUND = 16  # tries between two looks at what is stable
-MULTIPLIED, TINY = 12, 1e-20
-STABLE = 2.4  # times the spectral radius: the longest step
-
-
-@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps", "notes"])
-@dataclasses.dataclass(frozen=True)
-class Pace:
-    """The steps of `Adaptive`: step of the grid [s], the number of its last instant, and the error of a step; whether
-    what is between two instants of a run is to be seen, and whether what is needed to repeat it is noted."""
-
-    h: Any
-    steps: Any
-    rtol: Any
-    keeps: bool = False
-    notes: bool = False
-
-    @property
-    def least(self) -> Any:
-        """The shortest step [s]."""
-        return self.h * self.steps * jnp.maximum(LEAST, 4 * jnp.finfo(self.h.dtype).eps)
-
-    @property
-    def care(self) -> Care:
-        """How exactly steps end on comparisons."""
-        return DERIVATIVES if self.notes else VALUES
-
-    def start(self, loop: Loop, objectives: Objectives, key: Any) -> "Carry":
-        """Return the carry at t = 0."""
-        return init_carry(loop, objectives, self, key)
-
-    def step(self, loop: Loop, objectives: Objectives, key: Any, carry: "Carry", until: Any = None) -> "Carry":
-        """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
-        return step(loop, objectives, self, key, carry, until)
-
-    def renew(self, loop: Loop, carry: "Carry") -> "Carry":
-        """Return the carry with the longest stable step, if that was not looked at for ROUND tries."""
-        due = carry.running & (carry.tries - carry.renewed >= ROUND)
-        limit = jax.lax.cond(
-            anyone(due),
-            lambda: longest_stable(loop, carry.point.t, carry.point.state, carry.scale),
-            lambda: carry.limit,
-        )
-        return carry._replace(limit=limit, renewed=jnp.where(due, carry.tries, carry.renewed))
-
-    def before(self, carry: "Carry", instant: Any) -> Any:
-        """Return whether the run goes on, and has not come to this instant."""
-        return carry.running & (carry.point.t < instant * self.h)
-
-    def seen(self, loop: Loop, carry: "Carry", instant: Any) -> Trajectory:
-        """Return what is seen at this instant of the grid, which lies within the last step."""
-        t, state = between(carry, instant * self.h)
-        return observe(loop, t, state, carry.running | (t < carry.point.t))
-
-    def watched(self) -> "Pace":
-        """Return the method for a run that is seen on its way."""
-        return dataclasses.replace(self, keeps=True)
-
-    def noted(self) -> "Pace":
-        """Return the method for a run that is to be repeated. Its derivative changes faster than the run, so the error
-        of a step is a part of what it is for values."""
-        return dataclasses.replace(self, notes=True, rtol=PART * self.rtol)
+MOST, EACH = 100_000, 16  # tries of a run, and for each instant of its grid: more of them lead nowhere
+COUNTED = ("tries", "condition")  # what is still looked at when a run is over
 
 
 class Point(NamedTuple):
@@ -180,10 +110,11 @@ def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carr
     state, tally = start(loop, objectives, Clock(none, pace.h, zero, key))
     natural = jnp.minimum(FIRST, pace.h * pace.steps) + none
     point = _point(dynamics(loop, objectives, none, state, tally, kinks=True), pace, none, state, tally, natural)
-    scale = _sizes(state, point.sample)
+    scale = sizes(state, point.sample)
     condition = jnp.where(point.margins["stop"][0] > 0, zero + Condition.RUNNING, zero + Condition.DIVERGED)
     limit = longest_stable(loop, none, state, scale)
-    length, ends = _plan(loop, pace, point, zero, jnp.minimum(natural, limit))
+    left = pace.strike(loop, zero) * pace.h
+    length, ends = planned(jnp.minimum(natural, limit), point.ahead, left, pace.care)
     search = init_search(pace.h)
     past = (point.t, state, point.rate[0]) if pace.keeps else ()
     note = (zero, point.words) if pace.notes else ()
@@ -193,9 +124,9 @@ def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carr
 
 def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry, until: Any = None) -> Carry:
     """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
-    active = carry.running if until is None else pace.before(carry, until)
+    active = carry.running if until is None else before(pace, carry, until)
     system = dynamics(loop, objectives, carry.point.t, carry.point.state, carry.point.tally, kinks=True)
-    strike = _strike(loop, pace, carry.k)
+    strike = pace.strike(loop, carry.k)
     end = jnp.where(carry.ends, strike * pace.h, carry.point.t + carry.length)
     anew = carry.condition == Condition.REFRESHING
     here = apart(active, lambda: arrive(system, carry, end, anew, pace))
@@ -206,49 +137,45 @@ def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry,
     point = depart(system, pace, clock, carry.point, here, verdict.fired, carry.natural)
     point = select(verdict.over, here.point, point)
 
-    natural = _natural(carry, here, verdict, pace)
-    trying = active & ~verdict.taken
-    found = jax.lax.cond(
-        anyone(trying & (verdict.seeks | (carry.condition != Condition.RUNNING))),
-        lambda: _look(carry, here),
-        lambda: (carry.search, carry.length, carry.condition),
-    )
-    ended = jnp.where(verdict.taken, _ended(loop, carry, here, verdict), carry.condition)
-    planned, ends = _plan(loop, pace, select(verdict.taken, point, carry.point), k, jnp.minimum(natural, carry.limit))
-    late = trying & (here.late > 0) & verdict.fine
-    planned = jnp.where(late, jnp.maximum(carry.length - here.late, pace.least), planned)
-    planned = jnp.where(ended == Condition.REFRESHING, 0.0, planned)
-    looking = trying & verdict.seeks
-    search, length, condition = select(looking, found, (carry.search, planned, ended))
-    ends = ends & ~looking & ~late & (ended != Condition.REFRESHING)
-    base = jnp.where(looking & (carry.condition == Condition.RUNNING), carry.length, carry.base)
-    tries = carry.tries + 1
-    lost = active & ~verdict.fine & (carry.length <= pace.least)
-    condition = jnp.where(lost, Condition.DIVERGED, condition).astype(carry.condition.dtype)
-    scale = select(verdict.taken, here.scale, carry.scale)
-    new = Carry(
-        select(verdict.taken, point, carry.point),
-        k,
-        natural,
-        length,
-        ends,
-        carry.limit,
-        scale,
-        base,
-        search,
-        tries,
-        carry.renewed,
-        select(verdict.taken, (carry.point.t, carry.point.state, carry.point.rate[0]), carry.past)
-        if pace.keeps
-        else (),
-        (packed(verdict.fired), here.middle) if pace.notes else (),
-        condition,
-    )
+    after = _after(loop, pace, carry, here, verdict, select(verdict.taken, point, carry.point), k)
     if until is None:  # of a run that is over, the rest does not matter
-        return new._replace(
-            tries=jnp.where(active, tries, carry.tries), condition=jnp.where(active, condition, carry.condition)
+        return after._replace(
+            **{name: jnp.where(active, getattr(after, name), getattr(carry, name)) for name in COUNTED}
         )
-    return select(active, new, carry)
+    return select(active, after, carry)
+
+
+def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict, point: Point, k: Any) -> Carry:
+    """The carry after a try, which has led to this point, or is to be tried again from there."""
+    trying, new = ~verdict.taken, carry.condition == Condition.RUNNING
+    natural = _natural(carry, here, verdict, pace)
+    left = pace.strike(loop, k) * pace.h - point.t
+    length, ends = planned(jnp.minimum(natural, carry.limit), point.ahead, left, pace.care)
+    late = trying & (here.late > 0) & verdict.fine
+    length = jnp.where(late, jnp.maximum(carry.length - here.late, pace.least), length)
+    condition = jnp.where(verdict.taken, _ended(loop, carry, here, verdict), carry.condition)
+    refreshes = condition == Condition.REFRESHING
+    length = jnp.where(refreshes, 0.0, length)
+    looking = trying & verdict.seeks
+    plan = (carry.search, length, condition)
+    found = jax.lax.cond(anyone(looking), lambda: _look(carry, here), lambda: plan)
+    search, length, condition = select(looking, found, plan)
+    lost = (~verdict.fine & (carry.length <= pace.least)) | (carry.tries > MOST + EACH * pace.steps)
+    last = (carry.point.t, carry.point.state, carry.point.rate[0])
+    return carry._replace(
+        point=point,
+        k=k,
+        natural=natural,
+        length=length,
+        ends=ends & ~looking & ~late & ~refreshes,
+        scale=select(verdict.taken, here.scale, carry.scale),
+        base=jnp.where(looking & new, carry.length, carry.base),
+        search=search,
+        tries=carry.tries + 1,
+        past=select(verdict.taken, last, carry.past) if pace.keeps else (),
+        note=(packed(verdict.fired), here.middle) if pace.notes else (),
+        condition=jnp.where(lost, Condition.DIVERGED, condition).astype(carry.condition.dtype),
+    )
 
 
 def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> Arrival:
@@ -279,10 +206,10 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
     changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
     ahead, late = kinks(comparisons, carry.natural, pace.care, changed, h)
     new = Point(end, state, tally, sample, moving, recorded, seen[:2], seen.margins, words, ahead)
-    scale = jax.tree.map(jnp.maximum, carry.scale, _sizes(state, sample))
-    error = _error(loop, state, point.state.with_flow(coarse[0]), scale, sample) / pace.rtol
+    scale = jax.tree.map(jnp.maximum, carry.scale, sizes(state, sample))
+    off = error(loop, state, point.state.with_flow(coarse[0]), scale, sample) / pace.rtol
     middle = _middle(system, point, new, h) if pace.notes else ()
-    return Arrival(new, seen.signals, error, scale, late, middle)
+    return Arrival(new, seen.signals, off, scale, late, middle)
 
 
 def _middle(system: Dynamics, start: Point, end: Point, h: Any) -> Words:
@@ -314,6 +241,11 @@ def passed(start: Any, end: Any) -> dict[str, Passage]:
     return {n: Passage(start.t, end.t, (values[n], last[n]), (rates[n], falls[n])) for n in values}
 
 
+def before(pace: Pace, carry: Carry, instant: Any) -> Any:
+    """Return whether a run goes on, and has not come to this instant of the grid."""
+    return carry.running & (carry.point.t < instant * pace.h)
+
+
 def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
     """Return this time, or that of the last point where the run has not come to it, and the loop's state there: the
     cubic through the last two points."""
@@ -326,57 +258,11 @@ def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
     return jnp.where(inside, t, now.t), select(inside, state.with_flow(flow), now.state)
 
 
-def longest_stable(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any:
-    """Return 2.4/rho [s], rho about the spectral radius of the flow's Jacobian: how much longer a vector becomes each
-    time that it is multiplied by that, measured in the largest values so far."""
-    flow, tree = jax.tree.flatten(state.flow())
-    leaves = [jnp.ravel(x) for x in flow]
-    sizes = [jnp.where(x > 0, x, 1.0) for leaf in jax.tree.leaves(scale[1]) for x in jnp.ravel(leaf)]
-    places = [(i, k) for i, leaf in enumerate(leaves) for k in range(leaf.size)]
-
-    def rates(flow: list[Any]) -> list[Any]:
-        at = state.with_flow(tree.unflatten(flow))
-        found = loop.flow(t, at, loop.signals(t, at))
-        return [x for leaf in jax.tree.leaves(found) for x in jnp.ravel(leaf)]
-
-    def column(i: int, k: int) -> list[Any]:
-        one = [jnp.zeros_like(x) for x in leaves]
-        one[i] = one[i].at[k].set(1.0)
-        moves = [jnp.reshape(x, jnp.shape(leaf)) for x, leaf in zip(one, flow, strict=True)]
-        return jax.jvp(rates, (flow,), (moves,))[1]
-
-    matrix = [column(*place) for place in places]
-    vector, log = [jnp.ones_like(x) for x in sizes], 0.0 * t
-    for i in range(MULTIPLIED):
-        terms = [[a * b * x for a, b, x in zip(row, sizes, vector, strict=True)] for row in zip(*matrix, strict=True)]
-        vector = [sum(row) / size for row, size in zip(terms, sizes, strict=True)]
-        norm = reduce(jnp.maximum, map(jnp.abs, vector)) + TINY
-        vector = [x / norm for x in vector]
-        log += jnp.log(norm) if i >= MULTIPLIED // 2 else 0.0
-    return STABLE * jnp.exp(-log / (MULTIPLIED - MULTIPLIED // 2))
-
-
 def _point(system: Dynamics, pace: Pace, t: Any, state: LoopState, tally: Tally, length: Any) -> Point:
     seen, moving, recording, _, words, comparisons = system.ahead(t, state, tally)
     recorded = (seen.signals.recorded, recording)
     ahead, _ = kinks(comparisons, length, pace.care, words, 0.0 * length)
     return Point(t, state, tally, seen.signals.sample, moving, recorded, seen[:2], seen.margins, words, ahead)
-
-
-def _error(loop: Loop, state: LoopState, coarse: LoopState, scale: Any, sample: Sample) -> Any:
-    """How far the embedded solution is off, as a fraction of the largest values so far: of the first signal, and of
-    every state."""
-    first = loop.plant.output(coarse.plant)[0]
-    pairs = ((sample.output[0], *jax.tree.leaves(state.flow())), (first, *jax.tree.leaves(coarse.flow())))
-    triples = zip(*pairs, jax.tree.leaves(scale), strict=True)
-    off = [jnp.max(jnp.abs(a - b) / jnp.where(c > 0, c, 1.0)) for a, b, c in triples if jnp.size(c)]
-    return 0.5 * jnp.max(jnp.stack(off))
-
-
-def _sizes(state: LoopState, sample: Sample) -> Any:
-    """Of the first signal, or of where it shall go, and of every state."""
-    first = jnp.maximum(jnp.abs(sample.output[0]), jnp.abs(sample.setpoint))
-    return first, jax.tree.map(jnp.abs, state.flow())
 
 
 def _judge(carry: Carry, here: Arrival, active: Any, last: Any, pace: Pace) -> Verdict:
@@ -401,30 +287,13 @@ def packed(fired: Margins) -> Any:
 
 
 def _natural(carry: Carry, here: Arrival, verdict: Verdict, pace: Pace) -> Any:
-    """The length that the error allows; a step that was cut short says nothing against it."""
-    fourth = jnp.sqrt(jnp.sqrt(here.error + LITTLE))
-    factor = clamp(SAFETY / (fourth * jnp.sqrt(jnp.sqrt(fourth))), SHRINK, GROW)  # 1/error^(5/16), of roots only
-    longer = jnp.where(verdict.fine, carry.length * factor, carry.length * SHRINK)
+    """The length that the error allows. A step that was cut short says nothing against it, nor does one with a kink."""
+    longer = jnp.where(verdict.fine, allowed(carry.length, here.error), SHRINK * carry.length)
     cut = verdict.taken & (carry.length < carry.natural)
-    tried = carry.condition == Condition.RUNNING
-    judged = tried & (verdict.taken | ~verdict.fine | (here.error > 1))
+    wrong = ~verdict.fine | ((here.error > 1) & (here.late <= 0))
+    judged = (carry.condition == Condition.RUNNING) & (verdict.taken | wrong)
     natural = jnp.where(judged, jnp.where(cut, jnp.maximum(longer, carry.natural), longer), carry.natural)
     return jnp.maximum(natural, pace.least)
-
-
-def _plan(loop: Loop, pace: Pace, point: Point, k: Any, length: Any) -> tuple[Any, Any]:
-    """The next length [s], and whether it ends where a clock strikes."""
-    ahead = point.ahead
-    near = jnp.where(ahead < SHORT * length, 0.5 * SHORT * length, length)
-    length = jnp.where(ahead < length, jnp.maximum(ahead, pace.care.least * length), near)
-    left = _strike(loop, pace, k) * pace.h - point.t
-    ends = length > 0.99 * left
-    return jnp.where(ends, left, jnp.where(2 * length > left, 0.5 * left, length)), ends
-
-
-def _strike(loop: Loop, pace: Pace, k: Any) -> Any:
-    """The number of the next instant of the grid at which a clock strikes, or the run ends."""
-    return jnp.minimum(loop.next_tick(k, pace.h), pace.steps) if loop.ticks else pace.steps
 
 
 def _look(carry: Carry, here: Arrival) -> tuple[Search, Any, Any]:

@@ -19,7 +19,7 @@ from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment
 from diffabs.core.regime import Regime, Words
-from diffabs.simulate.adaptive import Carry, Pace, passed
+from diffabs.simulate.adaptive import Carry, passed
 from diffabs.simulate.advance import start
 from diffabs.simulate.checkpoint import anyone, forgetful
 from diffabs.simulate.condition import Condition
@@ -27,6 +27,7 @@ from diffabs.simulate.drivers import BLOCK
 from diffabs.simulate.dynamics import Ahead, Dynamics, Objectives, Tally, dynamics, parted
 from diffabs.simulate.foresight import bit
 from diffabs.simulate.landing import select
+from diffabs.simulate.methods import AtPace
 from diffabs.simulate.rk4 import rk4_step_from
 from diffabs.simulate.solution import ORDER, Adaptive
 from diffabs.simulate.stepper import typed
@@ -88,7 +89,7 @@ def room(loop: Loop, solver: Adaptive) -> int:
     return math.ceil(MOST * max(1.0, 1e-5 / solver.rtol) ** (1 / ORDER)) + (TICKED * solver.steps if loop.ticks else 0)
 
 
-def note(loop: Loop, objectives: Objectives, pace: Pace, key: Any, tries: int) -> tuple[Notes, Any]:
+def note(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, tries: int) -> tuple[Notes, Any]:
     """Return the notes of a run, with room for so many tries, and how it ended: it has diverged if it took more."""
 
     def entry(old: Carry, new: Carry) -> Notes:
@@ -134,7 +135,7 @@ def _skipping(work: Any, on: Any, carry: Any, xs: Any, length: int | None = None
     return jax.lax.scan(body, carry, xs, length=length, reverse=reverse)
 
 
-def repeat(loop: Loop, objectives: Objectives, pace: Pace, key: Any, notes: Notes, condition: Any) -> Repeated:
+def repeat(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes: Notes, condition: Any) -> Repeated:
     """Return the run of these notes once more, which can be differentiated in every leaf of loop and objectives."""
     zero = 0.0 * pace.h
     state, tally = start(loop, objectives, Clock(zero, pace.h, 0, key))
@@ -150,7 +151,7 @@ def repeat(loop: Loop, objectives: Objectives, pace: Pace, key: Any, notes: Note
     return Repeated(_skipping(block, lambda _, some: jnp.any(some.moved), begun, notes)[0], condition)
 
 
-def _step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, place: Place, one: Notes) -> Place:
+def _step(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes) -> Place:
     """One step within its regime, and what happens at its end."""
     system = dynamics(loop, objectives, place.t, place.state, place.tally, kinks=True)
     within, h = Regime(one.words), one.t - place.t
@@ -201,12 +202,14 @@ def _shift(end: Ahead, changed: Words, one: Notes, h: Any, strikes: Any) -> Any:
     shift, nearest = jnp.zeros_like(h), jnp.where(happens, NEAR * one.natural, FAR * h)
     for comparison in end.comparisons:
         was = bit(changed, comparison.numbers)
-        for on, *line in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, *comparison[1:])), strict=True):
-            close, later = _until(on, *line, nearest)
+        each = (jnp.ravel(jnp.asarray(x)) for x in (was, comparison.value, comparison.rate))
+        for on, margin, rate in zip(*each, strict=True):
+            close, later = _until(on, margin, rate, nearest)
             shift, nearest = jnp.where(close, later, shift), jnp.where(close, jnp.abs(later), nearest)
     shift = jnp.where(strikes & ~happens, 0.0, shift)
-    for i, line in reversed(list(enumerate(zip(*map(jax.tree.leaves, (end.seen.margins, end.falls)), strict=True)))):
-        close, later = _until((one.fired >> i) & 1 != 0, *line, NEAR * one.natural)
+    events = zip(jax.tree.leaves(end.seen.margins), jax.tree.leaves(end.falls), strict=True)
+    for i, (margin, fall) in reversed(list(enumerate(events))):
+        close, later = _until((one.fired >> i) & 1 != 0, margin, fall, NEAR * one.natural)
         shift = jnp.where(close, later, shift)
     return shift
 

@@ -17,14 +17,12 @@ from diffabs.core.compiling import SAME, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, misshapen, strong
-from diffabs.simulate.adaptive import Pace
 from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
+from diffabs.simulate.methods import AtPace, method_of
 from diffabs.simulate.outcome import judge, prepare
 from diffabs.simulate.replay import note, repeat, room
 from diffabs.simulate.solution import Adaptive, Run, Solver, Trajectory
-from diffabs.simulate.stepper import Grid
 
-ROUNDING = 32  # times the precision of a number: the least error that is asked of a step
 MOST_STEPS = 2**31 - 8  # that a counter in 32 bits holds, landing included
 
 
@@ -96,12 +94,7 @@ def arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -
     if lines:
         raise ValueError("; ".join(lines))
     loop, objectives = strong((arrayed(loop), {name: arrayed(part) for name, part in objectives.items()}))
-    dtype = jax.tree.leaves(loop)[0].dtype
-    h, steps = jnp.asarray(solver.step, dtype), jnp.asarray(solver.steps)
-    if isinstance(solver, Adaptive):
-        rounding = ROUNDING * jnp.finfo(dtype).eps
-        return loop, objectives, Pace(h, steps, jnp.maximum(jnp.asarray(solver.rtol, dtype), rounding))
-    return loop, objectives, Grid(h, steps, solver.kinks)
+    return loop, objectives, method_of(solver, jax.tree.leaves(loop)[0].dtype)
 
 
 def _wrong_solver(solver: Solver) -> Iterator[str]:
@@ -128,7 +121,8 @@ def _wrong_number(solver: Solver, name: str) -> str:
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _simulated(places: Places, run: Any) -> Run:
     """The run of (loop, objectives, method, key)."""
-    return _run(*run, jnp.asarray(places.every), places=places.instants)
+    loop, objectives, method, key = run
+    return _run(loop, objectives, method, key, jnp.asarray(places.every), places=places.instants)
 
 
 def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
@@ -165,7 +159,7 @@ def _run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, ev
 @partial(jax.jit, static_argnames="places")
 def _reversible(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, *, places: Places) -> Run:
     """For derivatives."""
-    if isinstance(method, Pace):
+    if isinstance(method, AtPace):
         return _repeated(loop, objectives, method.noted(), key, places)
     method = method.located()
     loop, objectives, stepped = _prepared(loop, objectives, method, key)
@@ -179,14 +173,14 @@ def _reversible(loop: Loop, objectives: dict[str, Objective], method: Any, key: 
     return _with_trajectory(judge(loop, objectives, carry), first, seen)
 
 
-def _repeated(loop: Loop, objectives: dict[str, Objective], method: Pace, key: Any, places: Places) -> Run:
+def _repeated(loop: Loop, objectives: dict[str, Objective], method: AtPace, key: Any, places: Places) -> Run:
     """Raises ValueError for a trajectory."""
     if places.every:
         raise ValueError("no derivative of a trajectory with Adaptive steps: take FixedStep, or what is measured")
     loop, audit = prepare(loop)
     objectives = objectives | audit
-    still = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
-    notes, condition = note(*still, method, key, places.tries)
+    still, measures = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
+    notes, condition = note(still, measures, method, key, places.tries)
     return judge(loop, objectives, repeat(loop, objectives, method, key, notes, condition))[0]
 
 

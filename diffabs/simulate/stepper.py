@@ -13,7 +13,6 @@ Where a comparison does not let itself be landed on, or its regime leads out of 
 grid is one blunt step, in which comparisons say at each stage what the numbers say: right to the order of the kink. So
 are the steps after it, until in one of them no comparison changes."""
 
-import dataclasses
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -39,8 +38,6 @@ from diffabs.simulate.landing import (
     seek,
     select,
 )
-from diffabs.simulate.outcome import observe
-from diffabs.simulate.solution import Trajectory
 
 EXTRA, SPARE = 4, 64  # tries beyond a step of the grid for each of them, about an event; and besides
 KINKS = 1  # tries for each step of the grid, up to now, that comparisons may take; then steps are blunt
@@ -70,51 +67,6 @@ class Carry(NamedTuple):
     def stopped(self) -> Any:
         """Whether the stop was reached."""
         return self.condition == Condition.STOPPED
-
-
-@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["kinks"])
-@dataclasses.dataclass(frozen=True)
-class Grid:
-    """The steps of a `FixedStep`: their length [s], how many there are, and whether comparisons are located; None for
-    derivatives only."""
-
-    h: Any
-    steps: Any
-    kinks: bool | None = None
-
-    def watched(self) -> "Grid":
-        """Return the method for a run that is seen on its way."""
-        return self
-
-    def located(self) -> "Grid":
-        """Return the method for derivatives."""
-        return dataclasses.replace(self, kinks=self.kinks is not False)
-
-    def room(self, loop: Loop, steps: int) -> int:
-        """Return how many tries so many steps of the grid may take."""
-        return room(loop, steps, kinks=self.kinks is not False)
-
-    def start(self, loop: Loop, objectives: Objectives, key: Any) -> Carry:
-        """Return the carry at t = 0."""
-        return init_carry(loop, objectives, self.h, key, kinks=bool(self.kinks))
-
-    def step(self, loop: Loop, objectives: Objectives, key: Any, carry: Carry, until: Any = None) -> Carry:
-        """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
-        return step(loop, objectives, self.h, key, self.steps, carry, until, kinks=bool(self.kinks))
-
-    def renew(self, loop: Loop, carry: Carry) -> Carry:
-        """Return the carry: nothing has to be looked at but in the steps."""
-        del loop
-        return carry
-
-    def seen(self, loop: Loop, carry: Carry, instant: Any) -> Trajectory:
-        """Return what is seen at this instant of the grid, to which the run has come."""
-        del instant
-        return observe(loop, carry.point.t, carry.point.state, carry.running)
-
-    def before(self, carry: Carry, instant: Any) -> Any:
-        """Return whether the run goes on, and has not come to this instant."""
-        return carry.running & (carry.k < instant)
 
 
 class Verdict(NamedTuple):

@@ -1,0 +1,112 @@
+"""How long an adaptive step may be: by its error, by stability, by the kinks and clocks ahead."""
+
+import dataclasses
+from functools import partial, reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.loop import Loop, LoopState
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import Sample
+from diffabs.simulate.foresight import DERIVATIVES, VALUES, Care
+
+FIRST = 1e-4  # s, the first step
+SAFETY, LITTLE = 0.85, 1e-6  # of the length that the error asks for; an error below which none counts
+SHRINK, GROW = 0.25, 2.5  # times the last step, at least and at most
+LEAST = 1e-9  # of the duration: the shortest step; or 4 times its rounding
+SHORT = 1.2  # times the present length: a kink so near is reached in two steps
+FULL = 0.99  # of the way to a clock's instant: a step so long goes there
+STABLE = 2.4  # times the inverse of the spectral radius: the longest step
+MULTIPLIED, TINY = 12, 1e-20
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps", "notes"])
+@dataclasses.dataclass(frozen=True)
+class Pace:
+    """What `Adaptive` asks for: step of the grid [s], the number of its last instant, and the error of a step; whether
+    what is between two instants of a run is to be seen, and whether what is needed to repeat it is noted."""
+
+    h: Any
+    steps: Any
+    rtol: Any
+    keeps: bool = False
+    notes: bool = False
+
+    @property
+    def least(self) -> Any:
+        """The shortest step [s]."""
+        return self.h * self.steps * jnp.maximum(LEAST, 4 * jnp.finfo(self.h.dtype).eps)
+
+    @property
+    def care(self) -> Care:
+        """How exactly steps end on comparisons."""
+        return DERIVATIVES if self.notes else VALUES
+
+    def strike(self, loop: Loop, k: Any) -> Any:
+        """The number of the first instant after the k-th at which a clock strikes, or the run ends."""
+        return jnp.minimum(loop.next_tick(k, self.h), self.steps) if loop.ticks else self.steps
+
+
+def sizes(state: LoopState, sample: Sample) -> Any:
+    """Return how large the first signal is, or where it shall go, and every state."""
+    first = jnp.maximum(jnp.abs(sample.output[0]), jnp.abs(sample.setpoint))
+    return first, jax.tree.map(jnp.abs, state.flow())
+
+
+def error(loop: Loop, state: LoopState, coarse: LoopState, scale: Any, sample: Sample) -> Any:
+    """Return half of how far the embedded solution is off, as a fraction of the largest values so far: the greatest of
+    the first signal and of every state."""
+    first = loop.plant.output(coarse.plant)[0]
+    pairs = ((sample.output[0], *jax.tree.leaves(state.flow())), (first, *jax.tree.leaves(coarse.flow())))
+    triples = zip(*pairs, jax.tree.leaves(scale), strict=True)
+    off = [jnp.max(jnp.abs(a - b) / jnp.where(c > 0, c, 1.0)) for a, b, c in triples if jnp.size(c)]
+    return 0.5 * jnp.max(jnp.stack(off))
+
+
+def allowed(length: Any, error: Any) -> Any:
+    """Return the length that an error allows, which is 1 in a step as long as it may be: 0.85/error^(5/16) times the
+    present one, by roots alone."""
+    fourth = jnp.sqrt(jnp.sqrt(error + LITTLE))
+    return length * clamp(SAFETY / (fourth * jnp.sqrt(jnp.sqrt(fourth))), SHRINK, GROW)
+
+
+def planned(length: Any, ahead: Any, left: Any, care: Care) -> tuple[Any, Any]:
+    """Return the length of the next step [s], and whether it ends where a clock strikes.
+
+    length: that the error and stability allow; ahead, left: seconds to the next kink, and to the clock's instant"""
+    near = jnp.where(ahead < SHORT * length, 0.5 * SHORT * length, length)
+    length = jnp.where(ahead < length, jnp.maximum(ahead, care.least * length), near)
+    ends = length > FULL * left
+    return jnp.where(ends, left, jnp.where(2 * length > left, 0.5 * left, length)), ends
+
+
+def longest_stable(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any:
+    """Return 2.4/rho [s], rho about the spectral radius of the flow's Jacobian: how much longer a vector becomes each
+    time that it is multiplied by that, measured in the largest values so far."""
+    flow, tree = jax.tree.flatten(state.flow())
+    leaves = [jnp.ravel(x) for x in flow]
+    sizes = [jnp.where(x > 0, x, 1.0) for leaf in jax.tree.leaves(scale[1]) for x in jnp.ravel(leaf)]
+    places = [(i, k) for i, leaf in enumerate(leaves) for k in range(leaf.size)]
+
+    def rates(flow: list[Any]) -> list[Any]:
+        at = state.with_flow(tree.unflatten(flow))
+        found = loop.flow(t, at, loop.signals(t, at))
+        return [x for leaf in jax.tree.leaves(found) for x in jnp.ravel(leaf)]
+
+    def column(i: int, k: int) -> list[Any]:
+        one = [jnp.zeros_like(x) for x in leaves]
+        one[i] = one[i].at[k].set(1.0)
+        moves = [jnp.reshape(x, jnp.shape(leaf)) for x, leaf in zip(one, flow, strict=True)]
+        return jax.jvp(rates, (flow,), (moves,))[1]
+
+    matrix = [column(*place) for place in places]
+    vector, log = [jnp.ones_like(x) for x in sizes], 0.0 * t
+    for i in range(MULTIPLIED):
+        terms = [[a * b * x for a, b, x in zip(row, sizes, vector, strict=True)] for row in zip(*matrix, strict=True)]
+        vector = [sum(row) / size for row, size in zip(terms, sizes, strict=True)]
+        norm = reduce(jnp.maximum, map(jnp.abs, vector)) + TINY
+        vector = [x / norm for x in vector]
+        log += jnp.log(norm) if i >= MULTIPLIED // 2 else 0.0
+    return STABLE * jnp.exp(-log / (MULTIPLIED - MULTIPLIED // 2))
