@@ -49,8 +49,9 @@ $(VENV)-torch/.installed $(VENV)-jaxonomy/.installed: $(VENV)-%/.installed: pypr
 bench-check: $(VENV)/.bench
 	$(BIN)/python benchmarks/check.py
 
-# error against time, from what `make bench` has written
+# error against time: the peers in float64, beside what bench_work_precision.py has written
 bench-figure: $(VENV)/.bench
+	$(BIN)/python benchmarks/bench_peers.py --dtype float64
 	$(BIN)/python benchmarks/draw_work_precision.py --out docs/figures/work-precision.png
 
 mutations: $(VENV)/.test

@@ -1,5 +1,5 @@
-"""Error against time per run, one panel for each problem, from what bench_work_precision.py has written; the panel of
-[lmi] also has the peers of bench_peers.py, if that has been run with as many lanes.
+"""Error against time per run, one panel for each problem, from what bench_work_precision.py has written. The panel of
+[lmi] is that of bench_peers.py, with the peers, if that has been run with as many lanes.
 
     python benchmarks/draw_work_precision.py [--lanes 4096] [--dtype float64] [--out docs/figures/work-precision.png]
 """
@@ -17,6 +17,8 @@ import record
 
 OURS = {"fixed": ("diffabs, FixedStep", "C0", "o"), "adaptive": ("diffabs, Adaptive", "C3", "s")}
 PEERS = {
+    "diffabs_fixed": OURS["fixed"],
+    "diffabs_adaptive": OURS["adaptive"],
     "c_adaptive": ("C, adaptive", "black", "^"),
     "numba_adaptive": ("Numba, adaptive", "C4", "v"),
     "diffrax_event": ("diffrax Tsit5", "C2", "D"),
@@ -44,15 +46,16 @@ def panels(found: dict[str, Any], peers: dict[str, Any] | None, lanes: int, dtyp
     size = {"figsize": (10, 3.1 * rows), "layout": "constrained"}
     figure, grid = plt.subplots(rows, COLUMNS, squeeze=False, sharex=True, sharey=True, **size)
     for axes, (name, problem) in zip(grid.flat, problems.items(), strict=False):
+        beside = peers if name == "lmi" else None  # then all curves of a panel are of one run
         for kind, look in OURS.items():
-            points = [p for p in problem["points"] if p["solver"] == kind and p["lanes"] == lanes]
-            curve(axes, points, [p["run_s"] / lanes for p in points], look)
-        if name == "lmi" and peers is not None:
-            for peer, look in PEERS.items():
-                points = peers["points"].get(peer, [])
-                curve(axes, points, [1 / p["runs_per_s"] for p in points], look)
+            mine = [p for p in problem["points"] if p["solver"] == kind and p["lanes"] == lanes and not beside]
+            curve(axes, mine, [p["run_s"] / lanes for p in mine], look)
+        for peer, look in PEERS.items():
+            points = beside["points"].get(peer, []) if beside else []
+            curve(axes, points, [1 / p["runs_per_s"] for p in points], look)
         axes.axhline(found["asked"], color="0.6", lw=0.8, ls="--")
-        axes.set(title=problem["title"], ylim=(1e-9, 0.1))
+        title = f"{problem['title']}: {beside['threads']} threads" if beside else problem["title"]
+        axes.set(title=title, ylim=(1e-9, 0.1))
         axes.grid(alpha=0.3)
     for axes in grid.flat[len(problems) :]:
         axes.remove()

@@ -171,10 +171,12 @@ def test_the_figure_has_a_panel_for_each_problem(tmp_path):
     ]
     found = {"float64": {name: {"title": name, "points": points} for name in ("lmi", "arm")}}
     whole = {"found": found, "asked": 1e-4, "lanes": [64]}
-    peers = {"points": {"c_adaptive": [{"error": 1e-4, "runs_per_s": 1e5}]}}
+    point = {"error": 1e-4, "runs_per_s": 1e5}
+    peers = {"threads": 2, "points": {"c_adaptive": [point], "diffabs_adaptive": [point]}}
     figure = draw.panels(whole, peers, 64, "float64")
-    assert [len(axes.lines) for axes in figure.axes] == [4, 3]  # with the line of what is asked
-    assert figure.axes[0].lines[0].get_xdata()[0] == pytest.approx(100 / 64)
+    assert [len(axes.lines) for axes in figure.axes] == [3, 3]  # with the line of what is asked
+    assert figure.axes[0].lines[0].get_xdata()[0] == pytest.approx(1e-5)
+    assert figure.axes[1].lines[0].get_xdata()[0] == pytest.approx(100 / 64)
     with pytest.raises(ValueError, match="3 lanes were not run"):
         draw.panels(whole, None, 3, "float64")
     matplotlib.pyplot.close(figure)
