@@ -120,6 +120,17 @@ def test_neither_the_order_of_lanes_nor_their_company_changes_a_number():
     np.testing.assert_array_equal(np.isnan(others.metrics["iae"]), np.arange(40) < 2)
 
 
+def test_a_computer_in_single_precision_keeps_its_time():
+    """Between two instants of a clock, times are known to a ten-thousandth of a period."""
+    chosen = load("slip-cured")
+    measured = {"iae": IAE(), "max_slip": MaxSlip()}
+    solver = d.Adaptive(4e-6, 1.6, 1e-3)
+    exact = d.measure(chosen.loop, solver, measured)
+    with jax.enable_x64(False):
+        run = d.measure(jax.tree.map(lambda x: np.asarray(x, np.float32), chosen.loop), solver, measured)
+    close(run, exact, 2e-4)
+
+
 def test_single_precision_asks_for_no_smaller_error_than_it_has():
     chosen = rig()
     exact = d.measure(chosen.loop, d.Adaptive(1e-9, 2.5), {"iae": IAE()})

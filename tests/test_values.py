@@ -2,12 +2,14 @@
 
 import dataclasses
 import os
+import pathlib
+import subprocess
 from typing import Any
 
 import numpy as np
 import pytest
 
-from diffabs.core import files, values
+from diffabs.core import files, provenance, values
 from diffabs.core.exports import lazily
 from diffabs.core.pytree import Spec
 from diffabs.core.values import ScenarioError, entry, inside, one_of, plain, ranged, table_of, within
@@ -139,3 +141,12 @@ def test_a_folder_is_the_old_one_or_the_whole_new_one(tmp_path):
         raise KeyError
     assert [each.name for each in path.iterdir()] == ["new"]
     assert [each.name for each in path.parent.iterdir()] == ["f"]
+
+
+def test_a_working_copy_knows_its_commit():
+    root = pathlib.Path(__file__).parents[1]
+    if not (root / ".git").exists():
+        pytest.skip("not a working copy")
+    command = ["git", "-C", str(root), "rev-parse", "--short=12", "HEAD"]
+    head = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    assert provenance.commit()["commit"].removesuffix("-dirty") == head

@@ -21,7 +21,7 @@ def origin(*packages: str) -> dict[str, str]:
 
 def commit() -> dict[str, str]:
     """The commit of a working copy, marked where files differ from it; nothing for an installed package."""
-    root = pathlib.Path(__file__).parent.parent
+    root = pathlib.Path(__file__).parents[2]
     if not (root / ".git").exists():
         return {}
     command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"]

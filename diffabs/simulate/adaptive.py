@@ -69,6 +69,7 @@ class Carry(NamedTuple):
 
     point: Point
     k: Any  # number of the last instant of the grid at which a clock struck
+    since: Any  # for how long [s]: differences of times would lose digits
     natural: Any  # the length that the error allows [s]
     length: Any  # of the step to try [s]
     ends: Any  # whether that ends where a clock strikes, or with the run
@@ -118,8 +119,8 @@ def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carr
     search = init_search(pace.h)
     past = (point.t, state, point.rate[0]) if pace.keeps else ()
     note = (zero, point.words) if pace.notes else ()
-    carry = Carry(point, zero, natural, length, ends, limit, scale, length, search, zero, zero, past, note, condition)
-    return typed(carry, pace.h.dtype)
+    lengths = (natural, length, ends, limit, scale, length)
+    return typed(Carry(point, zero, none, *lengths, search, zero, zero, past, note, condition), pace.h.dtype)
 
 
 def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry, until: Any = None) -> Carry:
@@ -137,7 +138,9 @@ def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry,
     point = depart(system, pace, clock, carry.point, here, verdict.fired, carry.natural)
     point = select(verdict.over, here.point, point)
 
-    after = _after(loop, pace, carry, here, verdict, select(verdict.taken, point, carry.point), k)
+    since = jnp.where(strikes, 0.0, jnp.where(verdict.taken, carry.since + carry.length, carry.since))
+    carry = carry._replace(k=k, since=since)
+    after = _after(loop, pace, carry, here, verdict, select(verdict.taken, point, carry.point))
     if until is None:  # of a run that is over, the rest does not matter
         return after._replace(
             **{name: jnp.where(active, getattr(after, name), getattr(carry, name)) for name in COUNTED}
@@ -145,11 +148,11 @@ def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry,
     return select(active, after, carry)
 
 
-def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict, point: Point, k: Any) -> Carry:
+def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict, point: Point) -> Carry:
     """The carry after a try, which has led to this point, or is to be tried again from there."""
     trying, new = ~verdict.taken, carry.condition == Condition.RUNNING
     natural = _natural(carry, here, verdict, pace)
-    left = pace.strike(loop, k) * pace.h - point.t
+    left = (pace.strike(loop, carry.k) - carry.k) * pace.h - carry.since
     length, ends = planned(jnp.minimum(natural, carry.limit), point.ahead, left, pace.care)
     late = trying & (here.late > 0) & verdict.fine
     length = jnp.where(late, jnp.maximum(carry.length - here.late, pace.least), length)
@@ -164,7 +167,6 @@ def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict
     last = (carry.point.t, carry.point.state, carry.point.rate[0])
     return carry._replace(
         point=point,
-        k=k,
         natural=natural,
         length=length,
         ends=ends & ~looking & ~late & ~refreshes,

@@ -38,12 +38,13 @@ NEAR = 1e-3  # of the length that the error allows: nor is an event, or a compar
 
 
 class Notes(NamedTuple):
-    """Of every try, in blocks (blocks, BLOCK, ...): whether it led on; the time at its end, the length that the error
-    allowed, and the number of the instant of the grid at which a clock has struck last; a bit for each event at its
-    end; the regime in its middle, and in that of the next that led on."""
+    """Of every try, in blocks (blocks, BLOCK, ...): whether it led on; the time at its end, its length, and that which
+    the error allowed; the number of the instant of the grid at which a clock has struck last; a bit for each event at
+    its end; the regime in its middle, and in that of the next that led on."""
 
     moved: Any
     t: Any
+    length: Any
     natural: Any
     k: Any
     fired: Any
@@ -52,9 +53,11 @@ class Notes(NamedTuple):
 
 
 class Place(NamedTuple):
-    """A run on its way: time, state, accumulators, and the number of the clock's last instant."""
+    """A run on its way: time, how much later that is than its noted one, state, accumulators, and the number of the
+    clock's last instant."""
 
     t: Any
+    late: Any
     state: LoopState
     tally: Tally
     k: Any
@@ -95,7 +98,7 @@ def note(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, tries: int)
     def entry(old: Carry, new: Carry) -> Notes:
         fired, words = new.note
         moved = (new.point.t > old.point.t) | (fired != 0)
-        return Notes(moved, new.point.t, old.natural, new.k, fired, words, words)
+        return Notes(moved, new.point.t, old.length, old.natural, new.k, fired, words, words)
 
     def one(carry: Carry, _: Any) -> tuple[Carry, Notes]:
         new = pace.step(loop, objectives, key, carry)
@@ -139,7 +142,7 @@ def repeat(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes: No
     """Return the run of these notes once more, which can be differentiated in every leaf of loop and objectives."""
     zero = 0.0 * pace.h
     state, tally = start(loop, objectives, Clock(zero, pace.h, 0, key))
-    begun = typed(Place(zero, state, tally, jnp.asarray(0)), pace.h.dtype)
+    begun = typed(Place(zero, zero, state, tally, jnp.asarray(0)), pace.h.dtype)
 
     def step(place: Place, one: Notes) -> tuple[Place, None]:
         return select(one.moved, _step(loop, objectives, pace, key, place, one), place), None
@@ -154,7 +157,7 @@ def repeat(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes: No
 def _step(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes) -> Place:
     """One step within its regime, and what happens at its end."""
     system = dynamics(loop, objectives, place.t, place.state, place.tally, kinks=True)
-    within, h = Regime(one.words), one.t - place.t
+    within, h = Regime(one.words), one.length - place.late
     begin = system.ahead(place.t, place.state, place.tally, within)
     z, held = parted(place.state, place.tally)
 
@@ -186,7 +189,7 @@ def _step(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Pla
         ends = (begin.seen.signals.recorded, begin.recorded), (late, end.recorded)
         step = passed(*(Recorded(*both) for both in zip((place.t, t), ends, strict=True)))
         state = _changed(system, Clock(t, pace.h, one.k, key, strikes), state, end.seen.margins, one.fired, step)
-    return Place(t, state, tally, one.k)
+    return Place(t, shift, state, tally, one.k)
 
 
 def _whole(loop: Loop, place: Place, z: Any) -> tuple[LoopState, Tally]:
