@@ -22,7 +22,7 @@ from diffabs.simulate.run import arguments
 LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
 FINE = 4  # times shorter than a scenario's are the fixed steps that are compared with
 EVERYWHERE = [name for name in random_loops.STRUCTURES if "delay" not in name]
-QUICK = ("relay, latch, lag", "rig, proportional, rate limit", "computer, patches")
+QUICK = ("relay, latch, lag", "rig, proportional, rate limit")
 
 
 def rig(*changes: str):
@@ -36,7 +36,7 @@ def close(run, reference, tolerance, least=1e-6):
         assert np.all(off <= tolerance * np.maximum(np.abs(value), least)), (name, run.metrics[name], value)
 
 
-@pytest.mark.parametrize("name", ["lab-rig", "slip-estimator", "arm-hanging"])
+@pytest.mark.parametrize("name", ["lab-rig", "slip-estimator", pytest.param("arm-hanging", marks=pytest.mark.slow)])
 def test_what_a_packaged_scenario_measures_is_what_fixed_steps_measure(name):
     chosen = load(name)
     run = d.measure(chosen.loop, d.Adaptive(1e-5, chosen.solver.duration, chosen.solver.step), chosen.objectives)
@@ -47,7 +47,7 @@ def test_what_a_packaged_scenario_measures_is_what_fixed_steps_measure(name):
 
 def test_every_lane_of_a_box_is_right_on_limits_that_no_part_declares():
     chosen = rig()
-    mass, speed = (x.ravel() for x in np.meshgrid(np.linspace(5.3, 6.2, 12), np.linspace(8.5, 16.5, 12)))
+    mass, speed = (x.ravel() for x in np.meshgrid(np.linspace(5.3, 6.2, 6), np.linspace(8.5, 16.5, 6)))
     lanes = d.Batch({"plant.mass": mass, "initial.speed": speed})
     measured = {"iae": IAE(), "max_slip": MaxSlip(), "stop_distance": StopDistance()}
     run = d.run_batch(chosen.loop, lanes, d.Adaptive(1e-5, 2.5), measured)

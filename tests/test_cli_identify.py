@@ -17,6 +17,7 @@ from diffabs.identify.uncertainty import uncertainty
 from diffabs.scenario.measurements import read
 from diffabs.scenario.scenario import ScenarioError, load
 from diffabs.simulate import refusals
+from diffabs.simulate.solution import FixedStep
 from diffabs.tune import Reason
 
 pytestmark = pytest.mark.xdist_group("cli-identify")  # one worker compiles what these share
@@ -323,7 +324,7 @@ def test_without_the_extra(small, csv, monkeypatch):
 def test_a_trajectory_is_as_long_as_the_data_and_fits_into_memory(small, csv):
     solver, readings = load(small).solver, read(csv(HEADER, *ROWS), UNITS)
     assert commands_identify._solver(solver, readings).steps == 302
-    long = commands_identify._solver(commands_identify.FixedStep(1e-6, 1.0), readings)
+    long = commands_identify._solver(FixedStep(1e-6, 1.0), readings)
     assert long.steps == 300_002
     assert long.every == 16
-    assert commands_identify._solver(commands_identify.FixedStep(0.1, 0.3), readings).duration == pytest.approx(0.3)
+    assert commands_identify._solver(FixedStep(0.1, 0.3), readings).duration == pytest.approx(0.3)

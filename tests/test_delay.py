@@ -166,7 +166,7 @@ def test_converges_to_the_method_of_steps(kinks):
 
 
 @pytest.mark.parametrize("late", [0.0317, 0.03])
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 def test_derivatives_of_the_method_of_steps(late, derivative):
     """With respect to gain and delay; also of a delay that is a whole number of steps, whose second derivatives jump on
     the grid: to second order there."""
@@ -197,7 +197,7 @@ def test_a_jump_comes_out_at_its_moment(first, late, kinks):
     close(u[clear], np.where(t < late - 1e-9, 0.0, np.where(t < first + late, 2.0, 5.0))[clear], rtol=1e-12)
 
 
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("first", "late"), [(7.3e-3, 2.6e-3), (7.3e-3, 2.7e-3), (7.25e-3, 0.75e-3 + H)])
 def test_the_moment_of_a_jump_is_differentiable(first, late, derivative):
     """d(mean)/d(first) = -3/duration, d/d(late) = -5/duration; so on the grid, too."""
