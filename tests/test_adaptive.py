@@ -224,10 +224,10 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
     margins = [Margin(*one) for one in zip(numbers, values, rates, strict=True)]
     words = (jnp.uint32(0b1100), jnp.uint32(0b10))
     np.testing.assert_array_equal(bit(words, np.array([2, 3, 33, 1])), [True, True, True, False])
-    found = kinks(margins, jnp.asarray(1.0), VALUES, words, jnp.asarray(1.0))
+    found = kinks(margins, jnp.asarray(1.0), 0.0, VALUES, words, jnp.asarray(1.0))
     assert found.ahead == pytest.approx(0.1)  # 4 falls by 40/s
     assert found.late == pytest.approx(0.5)  # of bits 2 and 33, 0.5 s and 0.25 s ago
-    none = kinks(margins, jnp.asarray(1.0), VALUES, (jnp.uint32(0),) * 2, jnp.asarray(1.0))
+    none = kinks(margins, jnp.asarray(1.0), 0.0, VALUES, (jnp.uint32(0),) * 2, jnp.asarray(1.0))
     assert none.late == 0
 
 

@@ -115,7 +115,7 @@ def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carr
     condition = jnp.where(point.margins["stop"][0] > 0, zero + Condition.RUNNING, zero + Condition.DIVERGED)
     limit = longest_stable(loop, none, state, scale)
     left = pace.strike(loop, zero) * pace.h
-    length, ends = planned(jnp.minimum(natural, limit), point.ahead, left, pace.care)
+    length, ends = planned(jnp.minimum(natural, limit), point.ahead, left, pace)
     search = init_search(pace.h)
     past = (point.t, state, point.rate[0]) if pace.keeps else ()
     note = (zero, point.words) if pace.notes else ()
@@ -153,7 +153,7 @@ def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict
     trying, new = ~verdict.taken, carry.condition == Condition.RUNNING
     natural = _natural(carry, here, verdict, pace)
     left = (pace.strike(loop, carry.k) - carry.k) * pace.h - carry.since
-    length, ends = planned(jnp.minimum(natural, carry.limit), point.ahead, left, pace.care)
+    length, ends = planned(jnp.minimum(natural, carry.limit), point.ahead, left, pace)
     late = trying & (here.late > 0) & verdict.fine
     length = jnp.where(late, jnp.maximum(carry.length - here.late, pace.least), length)
     condition = jnp.where(verdict.taken, _ended(loop, carry, here, verdict), carry.condition)
@@ -206,7 +206,7 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
     if loop.changes and not loop.ticks:
         tally = select(anew, point.tally, tally)
     changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
-    ahead, late = kinks(comparisons, carry.natural, pace.care, changed, h)
+    ahead, late = kinks(comparisons, carry.natural, pace.least, pace.care, changed, h)
     new = Point(end, state, tally, sample, moving, recorded, seen[:2], seen.margins, words, ahead)
     scale = jax.tree.map(jnp.maximum, carry.scale, sizes(state, sample))
     off = error(loop, state, point.state.with_flow(coarse[0]), scale, sample) / pace.rtol
@@ -263,7 +263,7 @@ def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
 def _point(system: Dynamics, pace: Pace, t: Any, state: LoopState, tally: Tally, length: Any) -> Point:
     seen, moving, recording, _, words, comparisons = system.ahead(t, state, tally)
     recorded = (seen.signals.recorded, recording)
-    ahead, _ = kinks(comparisons, length, pace.care, words, 0.0 * length)
+    ahead, _ = kinks(comparisons, length, pace.least, pace.care, words, 0.0 * length)
     return Point(t, state, tally, seen.signals.sample, moving, recorded, seen[:2], seen.margins, words, ahead)
 
 

@@ -43,13 +43,13 @@ class Kinks(NamedTuple):
     late: Any
 
 
-def kinks(margins: Sequence[Margin], natural: Any, care: Care, changed: Words, length: Any) -> Kinks:
+def kinks(margins: Sequence[Margin], natural: Any, shortest: Any, care: Care, changed: Words, length: Any) -> Kinks:
     """Return what the margins at the end of a step say.
 
-    natural: the length that the error allows [s], of which `care` has fractions
+    natural: the length that the error allows [s], of which `care` has fractions; shortest: that of any step [s]
     changed: bits of the comparisons whose answers are others than at the beginning of the step
     length: of the step [s]"""
-    least, low, high = care.now * natural, (1 - care.end) * length, (1 - care.start) * length
+    least, low, high = jnp.maximum(care.now * natural, shortest), (1 - care.end) * length, (1 - care.start) * length
     ahead, late = jnp.full_like(length, FAR), jnp.zeros_like(length)
     for one in margins:
         was = bit(changed, one.numbers)

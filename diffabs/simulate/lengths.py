@@ -72,12 +72,12 @@ def allowed(length: Any, error: Any) -> Any:
     return length * clamp(SAFETY / (fourth * jnp.sqrt(jnp.sqrt(fourth))), SHRINK, GROW)
 
 
-def planned(length: Any, ahead: Any, left: Any, care: Care) -> tuple[Any, Any]:
+def planned(length: Any, ahead: Any, left: Any, pace: Pace) -> tuple[Any, Any]:
     """Return the length of the next step [s], and whether it ends where a clock strikes.
 
     length: that the error and stability allow; ahead, left: seconds to the next kink, and to the clock's instant"""
     near = jnp.where(ahead < SHORT * length, 0.5 * SHORT * length, length)
-    length = jnp.where(ahead < length, jnp.maximum(ahead, care.least * length), near)
+    length = jnp.where(ahead < length, jnp.maximum(ahead, jnp.maximum(pace.care.least * length, pace.least)), near)
     ends = length > FULL * left
     return jnp.where(ends, left, jnp.where(2 * length > left, 0.5 * left, length)), ends
 

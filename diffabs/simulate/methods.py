@@ -106,12 +106,17 @@ class AtPace(Pace):
     def noted(self) -> "AtPace":
         """Return the method for a run that is to be repeated. Its derivative changes faster than the run, so the error
         of a step is a part of what it is for values."""
-        return dataclasses.replace(self, notes=True, rtol=PART * self.rtol)
+        return dataclasses.replace(self, notes=True, rtol=_possible(PART * self.rtol))
 
 
 def method_of(solver: Solver, dtype: Any) -> OnGrid | AtPace:
     """Return what chooses the steps of a solver, its numbers of this type."""
     h, steps = jnp.asarray(solver.step, dtype), jnp.asarray(solver.steps)
     if isinstance(solver, Adaptive):
-        return AtPace(h, steps, jnp.maximum(jnp.asarray(solver.rtol, dtype), ROUNDING * jnp.finfo(dtype).eps))
+        return AtPace(h, steps, _possible(jnp.asarray(solver.rtol, dtype)))
     return OnGrid(h, steps, solver.kinks)
+
+
+def _possible(rtol: Any) -> Any:
+    """No less than the precision of its type allows."""
+    return jnp.maximum(rtol, ROUNDING * jnp.finfo(rtol.dtype).eps)
