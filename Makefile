@@ -10,7 +10,7 @@ demo: $(VENV)/.installed
 	$(BIN)/diffabs reproduce all --out out
 
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow" --durations=25
 
 # the share of lines and branches that the fast tests run; the last line is the number
 coverage: $(VENV)/.test

@@ -99,6 +99,13 @@ MUTATIONS = [
         "test_adaptive.py::test_derivatives_on_limits_agree_with_differences_of_three_widths",
     ),
     Mutation(
+        "what was not taken is repeated in no regime",
+        "simulate/replay.py",
+        "words = select(notes.moved, notes.words, following)",
+        "words = notes.words",
+        "test_adaptive.py::test_reverse_mode_is_forward_mode[slip-lmi]",
+    ),
+    Mutation(
         "a repeated step ends where it was noted",
         "simulate/replay.py",
         "    t = one.t + shift\n",

@@ -150,7 +150,7 @@ def delayed_decay(t, k, late):
     return sum((-k) ** n * max(t - n * late, 0.0) ** n / factorial(n) for n in range(1, 40)) + 1.0
 
 
-@pytest.mark.parametrize("kinks", [False, True])
+@pytest.mark.parametrize("kinks", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_converges_to_the_method_of_steps(kinks):
     """The command's second derivative jumps, once, in the midst of a step: third order."""
     k, late, end = 40.0, 0.03137, 0.25
@@ -165,7 +165,7 @@ def test_converges_to_the_method_of_steps(kinks):
     assert np.log2(errors[0] / errors[-1]) / 3 > 2.7, errors
 
 
-@pytest.mark.parametrize("late", [0.0317, 0.03])
+@pytest.mark.parametrize("late", [0.0317, pytest.param(0.03, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 def test_derivatives_of_the_method_of_steps(late, derivative):
     """With respect to gain and delay; also of a delay that is a whole number of steps, whose second derivatives jump on
@@ -209,7 +209,7 @@ def test_the_moment_of_a_jump_is_differentiable(first, late, derivative):
     close(derivative(mean)(np.array([first, late])) * 14 * H, [-3.0, -5.0], rtol=1e-7)
 
 
-@pytest.mark.parametrize("late", [2e-3, 2.4e-3])
+@pytest.mark.parametrize("late", [2e-3, pytest.param(2.4e-3, marks=pytest.mark.slow)])
 def test_what_a_computer_says_comes_out_later(late):
     """It says the time, each 2 ms. The control is a staircase; its mean falls with the delay as the last level."""
 
@@ -242,6 +242,7 @@ def limit_cycle(band, late, force):
     return 4.0 * (band / force + late), band + force * late
 
 
+@pytest.mark.slow
 def test_a_relay_behind_a_delay_has_its_limit_cycle():
     """Period and amplitude of an integrator, and their derivatives."""
     band, late, force = 0.05, 3.37e-3, 20.0

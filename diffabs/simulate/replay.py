@@ -116,9 +116,10 @@ def note(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, tries: int)
     def followed(words: Words, block: Notes) -> tuple[Words, Words]:
         return jax.lax.scan(back, words, block, reverse=True)
 
-    nothing = jax.tree.map(lambda x: x[-1, -1], notes.words)
-    following = _skipping(followed, lambda _, block: jnp.any(block.moved), nothing, notes, reverse=True)[1]
-    notes = jax.tree.map(jax.lax.stop_gradient, notes._replace(next=following))
+    following = _skipping(followed, lambda _, block: jnp.any(block.moved), carry.point.words, notes, reverse=True)[1]
+    # A step that was not taken is repeated, too, for nobody: in a regime of its place, so that it has numbers.
+    words = select(notes.moved, notes.words, following)
+    notes = jax.tree.map(jax.lax.stop_gradient, notes._replace(words=words, next=following))
     return notes, jnp.where(carry.running, Condition.DIVERGED, carry.condition)
 
 
