@@ -36,7 +36,7 @@ class Adaptive:
     of fourth order, whose reference fixed steps remain.
 
     rtol: the error of a step, as a fraction of the greatest value so far of each state and of the first signal that the
-        plant shows. What a run measures is off by some ten times as much: at 1e-5 by less than 1e-4
+        plant shows. What a run measures is off by some ten times as much (`accuracy` estimates it)
     step: of a grid [s] on which clocks strike, delays remember, and of which a trajectory keeps every `every`-th
         instant, by interpolation. No step of the integration has to end there"""
 
