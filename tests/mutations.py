@@ -128,10 +128,24 @@ MUTATIONS = [
     ),
     Mutation(
         "a trajectory shows the end of the step",
-        "simulate/adaptive.py",
-        "    inside = (t < now.t) & (h > 0)",
-        "    inside = (t < now.t) & (h < 0)",
+        "simulate/methods.py",
+        "        inside = (t < now.t) & (carry.past.until > carry.past.t)",
+        "        inside = (t < now.t) & (carry.past.until < carry.past.t)",
         "test_adaptive.py::test_a_trajectory_is_kept_on_the_grid_and_changes_nothing",
+    ),
+    Mutation(
+        "a trajectory takes the rates after a computer's instant for those before",
+        "simulate/adaptive.py",
+        "    return point.t, point.state.flow(), point.rate[0]",
+        "    return point.t, point.state.flow(), jax.tree.map(lambda x: 0.0 * x, point.rate[0])",
+        "test_adaptive.py::test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps",
+    ),
+    Mutation(
+        "a repeated step has the rates of its beginning at its end",
+        "simulate/replay.py",
+        "system.rates(t, z, held, within)[0]) if pace.keeps",
+        "begin.seen.rate) if pace.keeps",
+        "test_adaptive.py::test_the_derivative_of_a_trajectory_is_that_of_fixed_steps[limits]",
     ),
     Mutation(
         "comparisons are seen a step too late",
@@ -150,8 +164,8 @@ MUTATIONS = [
     Mutation(
         "the Jacobian has one column",
         "simulate/lengths.py",
-        "one[i] = one[i].at[k].set(1.0)",
-        "one[0] = one[0].at[0].set(1.0)",
+        "(jnp.diag(size))",
+        "(jnp.diag(size) * 0.0 + size[0])",
         "test_adaptive.py::test_the_longest_stable_step_is_that_of_the_eigenvalues[arm-hanging]",
     ),
     Mutation(

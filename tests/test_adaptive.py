@@ -21,8 +21,8 @@ from diffabs.simulate.run import arguments
 
 LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
 FINE = 4  # times shorter than a scenario's are the fixed steps that are compared with
-EVERYWHERE = [name for name in random_loops.STRUCTURES if "delay" not in name]
 QUICK = ("relay, latch, lag", "rig, proportional, rate limit")
+SOME = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in random_loops.STRUCTURES]
 
 
 def rig(*changes: str):
@@ -33,7 +33,8 @@ def close(run, reference, tolerance, least=1e-6):
     for name in set(reference.metrics) - {"final_slip_error"}:  # it is 0, to rounding
         value = reference.metrics[name]
         off = np.abs(np.asarray(run.metrics[name]) - value)
-        assert np.all(off <= tolerance * np.maximum(np.abs(value), least)), (name, run.metrics[name], value)
+        scale = 0.1 if name == "overshoot" else least  # it is the small difference of a peak and the set point
+        assert np.all(off <= tolerance * np.maximum(np.abs(value), scale)), (name, run.metrics[name], value)
 
 
 @pytest.mark.parametrize("name", ["lab-rig", "slip-estimator", pytest.param("arm-hanging", marks=pytest.mark.slow)])
@@ -66,7 +67,7 @@ def test_a_smaller_error_of_a_step_makes_a_smaller_error_of_the_run():
     assert errors[2] < 2e-7
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in EVERYWHERE])
+@pytest.mark.parametrize("name", SOME)
 def test_random_loops_of_any_parts_are_right_to_1e_4(name):
     structure, key = random_loops.STRUCTURES[name], jax.random.key(1)
     measured = {n: one for n, one in structure.objectives.items() if n != "torque_rate"}  # a jump counts by the grid
@@ -188,15 +189,35 @@ def test_a_derivative_through_a_relay_and_a_latch_is_that_of_fixed_steps():
     np.testing.assert_allclose(slope(d.Adaptive(1e-6, structure.duration)), fixed, rtol=2e-3)
 
 
-def test_there_is_no_derivative_of_a_trajectory():
-    chosen = rig()
+def test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps():
+    chosen = load("slip-lmi", ["controller=sampled", "controller.period=0.005"])
+    solvers = d.Adaptive(1e-6, 0.03), d.FixedStep(1e-4, 0.03, every=10)
+    seen, reference = (d.rollout(chosen.loop, one, {}).trajectory.sample.output.slip for one in solvers)
+    np.testing.assert_allclose(seen, reference, atol=1e-6)
 
-    def last(mass):
-        run = d.rollout(d.replace(chosen.loop, {"plant.mass": mass}), d.Adaptive(1e-5, 0.2), {})
-        return run.trajectory.sample.output.slip[-1]
 
-    with pytest.raises(ValueError, match="no derivative of a trajectory with Adaptive steps"):
-        jax.grad(last)(5.7)
+@pytest.mark.parametrize(
+    "more",
+    [
+        pytest.param([], id="limits"),
+        pytest.param(["controller=sampled", "controller.period=0.005"], id="sampled", marks=pytest.mark.slow),
+    ],
+)
+def test_the_derivative_of_a_trajectory_is_that_of_fixed_steps(more):
+    chosen = load("slip-lmi", ["controller.torque_min=0", "controller.torque_max=9.03", *more])
+
+    def slip(solver):
+        return lambda mass: (
+            d.rollout(d.replace(chosen.loop, {"plant.mass": mass}), solver, {}).trajectory.sample.output.slip
+        )
+
+    mass, solver = jnp.asarray(5.7), d.Adaptive(1e-5, 0.1, 5e-4)
+    slope = jax.jacfwd(slip(solver))(mass)
+    fixed = jax.jacfwd(slip(d.FixedStep(1e-4, 0.1, every=5)))(mass)
+    np.testing.assert_allclose(slope, fixed, atol=1e-4 * np.abs(fixed).max())
+    weights = jnp.arange(float(len(slope)))
+    reverse = jax.grad(lambda mass: weights @ slip(solver)(mass))(mass)
+    np.testing.assert_allclose(reverse, weights @ slope, rtol=1e-7)
 
 
 def test_there_is_room_for_smaller_steps():
