@@ -12,12 +12,14 @@ import random_loops
 
 import diffabs as d
 from diffabs.core.pytree import arrayed, prepared, refined, strong
+from diffabs.design.attraction import Cells, attraction
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
 from diffabs.simulate import lengths
 from diffabs.simulate.foresight import VALUES, Margin, bit, kinks
 from diffabs.simulate.replay import MOST, room
 from diffabs.simulate.run import arguments
+from diffabs.tune import worst_case
 
 LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
 FINE = 4  # times shorter than a scenario's are the fixed steps that are compared with
@@ -218,6 +220,28 @@ def test_the_derivative_of_a_trajectory_is_that_of_fixed_steps(more):
     weights = jnp.arange(float(len(slope)))
     reverse = jax.grad(lambda mass: weights @ slip(solver)(mass))(mass)
     np.testing.assert_allclose(reverse, weights @ slope, rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_the_worst_case_is_that_of_fixed_steps():
+    box = {"plant.mass": (5.3, 6.2), "initial.speed": (8.0, 16.0)}
+    found, fixed = (
+        worst_case(rig().loop, over=box, metric="max_slip", solver=solver, iterations=10)
+        for solver in (d.Adaptive(1e-5, 2.5), d.FixedStep(5e-4, 2.5))
+    )
+    np.testing.assert_allclose(found.value, fixed.value, rtol=1e-6)
+    for path, value in fixed.values.items():
+        np.testing.assert_allclose(found.values[path], value, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_region_of_attraction_is_that_of_fixed_steps():
+    chosen, cells = load("arm-hanging"), Cells(-0.1, 0.1, 12)
+    solvers = d.Adaptive(1e-5, 60.0), d.FixedStep(1e-3, 60.0)
+    found, fixed = (attraction(chosen.loop, cells, cells, solver) for solver in solvers)
+    for name in ("recovered", "fell", "unstable", "diverged"):
+        np.testing.assert_array_equal(getattr(found.outcomes, name), getattr(fixed.outcomes, name))
+    assert 0.2 < found.share < 0.8
 
 
 def test_there_is_room_for_smaller_steps():
