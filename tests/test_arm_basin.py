@@ -23,8 +23,6 @@ from diffabs.plants.arm_balance import ArmState
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import FixedStep
 
-pytestmark = pytest.mark.xdist_group("arm-basin")  # one worker compiles what these share
-
 OVER = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "plant.damping": (70.0, 130.0)}
 
 

@@ -22,8 +22,6 @@ from diffabs.sensors import AngleSensor
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import FixedStep
 
-pytestmark = pytest.mark.xdist_group("arm-control")  # one worker compiles what these share
-
 SOLVER, MEASURED = FixedStep(step=1e-3, duration=10.0), {"final_norm": FinalNorm()}
 
 # What any control can do

@@ -18,8 +18,6 @@ from diffabs.simulate.batch import Batch, by_structure, grid, latin, stacked
 from diffabs.simulate.refill import ROUND
 from diffabs.stops import SpeedReached, Standstill
 
-pytestmark = pytest.mark.xdist_group("batch")  # one worker compiles what these share
-
 LOOP = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=30 / 3.6),

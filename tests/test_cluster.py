@@ -25,7 +25,6 @@ from diffabs.sweep import SweepError, cluster, sweep
 from diffabs.sweep.cluster import Dask
 
 pytestmark = [
-    pytest.mark.xdist_group("cluster"),  # they share two workers
     pytest.mark.usefixtures("without_load", "any_step_is_stable", "compiled_before"),
 ]
 
