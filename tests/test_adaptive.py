@@ -22,7 +22,7 @@ from diffabs.simulate.run import arguments
 LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
 FINE = 4  # times shorter than a scenario's are the fixed steps that are compared with
 EVERYWHERE = [name for name in random_loops.STRUCTURES if "delay" not in name]
-QUICK = ("relay, latch, lag", "rig, proportional, rate limit")
+QUICK = ("relay, latch, lag",)
 
 
 def rig(*changes: str):
@@ -36,7 +36,9 @@ def close(run, reference, tolerance, least=1e-6):
         assert np.all(off <= tolerance * np.maximum(np.abs(value), least)), (name, run.metrics[name], value)
 
 
-@pytest.mark.parametrize("name", ["lab-rig", "slip-estimator", pytest.param("arm-hanging", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["lab-rig", *(pytest.param(n, marks=pytest.mark.slow) for n in ("slip-estimator", "arm-hanging"))]
+)
 def test_what_a_packaged_scenario_measures_is_what_fixed_steps_measure(name):
     chosen = load(name)
     run = d.measure(chosen.loop, d.Adaptive(1e-5, chosen.solver.duration, chosen.solver.step), chosen.objectives)
