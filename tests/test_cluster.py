@@ -24,9 +24,7 @@ from sweeping import PATIENCE, SCENARIO, chunks, command, described, environment
 from diffabs.sweep import SweepError, cluster, sweep
 from diffabs.sweep.cluster import Dask
 
-pytestmark = [
-    pytest.mark.usefixtures("without_load", "any_step_is_stable", "compiled_before"),
-]
+pytestmark = pytest.mark.usefixtures("without_load", "any_step_is_stable", "compiled_before")
 
 
 @pytest.fixture(scope="module")
