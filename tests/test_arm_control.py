@@ -29,7 +29,7 @@ SOLVER, MEASURED = FixedStep(step=1e-3, duration=10.0), {"final_norm": FinalNorm
 
 def by_eigenvectors(a, b, start, limit):
     """|w'B| U/(s |w'd|) of the one unstable pole."""
-    poles, left = scipy.linalg.eig(a, left=True, right=False)
+    poles, left = scipy.linalg.eig(a, left=True, right=False)  # pyright: ignore[reportAssignmentType]
     (place,) = np.flatnonzero(poles.real > 0)
     w = left[:, place].real
     return abs(w @ b[:, 0]) * limit / (poles[place].real * abs(w @ start))

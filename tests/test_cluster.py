@@ -12,7 +12,7 @@ import threading
 import time
 from types import SimpleNamespace
 
-import dask
+import dask.config
 import jax
 import jax.numpy as jnp
 import psutil
