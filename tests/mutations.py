@@ -620,8 +620,8 @@ MUTATIONS = [
     Mutation(
         "a landing near the zero",
         "simulate/landing.py",
-        "return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf)",
-        "return search.place",
+        "length = search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf)",
+        "length = search.place",
         "test_blocks.py::test_relay_switches_on_the_far_side_of_its_band",
     ),
     Mutation(
@@ -690,15 +690,22 @@ MUTATIONS = [
     Mutation(
         "a landing without derivative",
         "simulate/landing.py",
-        "return search.place - search.margin / jnp",
-        "return search.place - jax.lax.stop_gradient(search.margin) / jnp",
+        "length = search.place - search.margin / jnp",
+        "length = search.place - jax.lax.stop_gradient(search.margin) / jnp",
         "test_gradients.py::test_gradient_of_every_objective_in_every_parameter[feedback]",
+    ),
+    Mutation(
+        "an event at once whose moment has no derivative",
+        "simulate/landing.py",
+        "smooth & steep, length -",
+        "smooth & steep & False, length -",
+        "test_delay.py::test_the_moment_of_an_event_on_the_grid_is_differentiable[0.002]",
     ),
     Mutation(
         "an event whose moment has no derivative",
         "simulate/landing.py",
-        "margin=jnp.where(near & ~at_once, sought.end, 0.0)",
-        "margin=jnp.where(near & ~at_once, jax.lax.stop_gradient(sought.end), 0.0)",
+        "margin = jnp.where(near | at_once, sought.end, 0.0)",
+        "margin = jnp.where(near | at_once, jax.lax.stop_gradient(sought.end), 0.0)",
         "test_gradients.py::test_gradient_through_the_latch_agrees_with_a_wide_difference[0.0-published0]",
     ),
     Mutation(

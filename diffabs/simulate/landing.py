@@ -20,12 +20,14 @@ APART = 0.2  # power of the precision: the probe's distance, in steps
 BEYOND = 0.5  # power of the precision: how far behind the zero of a comparison a step ends, in steps
 TRIES = 24  # the most for an event, whose margin may have a corner or jump
 BISECT = 4  # every so many tries halve the bracket
+GRAZES = 1e-2  # of the margin's mean rate in the step: a margin that falls more slowly at the beginning only touches
+PART = 0.5  # of the fall within so short a step: the most by which the margin there may be off from a line
 
 
 class Search(NamedTuple):
     """Where an event is looked for: the number of its margin; the length that was tried first [s]; the bracket; the
-    margin at these (infinite where nobody knows it); how many times it was tried. Near the zero: the length, and the
-    margin there."""
+    margin at these (infinite where nobody knows it); how many times it was tried. Near the zero: the length, the
+    margin there, and whether that is where the step begins."""
 
     which: Any
     full: Any
@@ -37,6 +39,7 @@ class Search(NamedTuple):
     tries: Any
     place: Any
     margin: Any
+    at_once: Any
 
 
 class Crossed(NamedTuple):
@@ -60,7 +63,7 @@ class Crossings(NamedTuple):
 def init_search(h: Any) -> Search:
     """Return a search for nothing."""
     none, zero = 0.0 * h, jnp.asarray(0)
-    return Search(zero, h, none, none, none, h, none, zero, h, none)
+    return Search(zero, h, none, none, none, h, none, zero, h, none, jnp.asarray(False))
 
 
 def falls_through(before: list[Any], after: list[Any]) -> list[Any]:
@@ -99,11 +102,13 @@ def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Se
 
     width, newton = search.far - search.near, x - correction
     share = ratio(search.at_near, search.at_near - search.at_far, 0.5)
-    first = jnp.where(jnp.isfinite(search.at_near), search.near + share * width, jnp.minimum(NEAR * h, 0.5 * width))
+    least = jnp.minimum(NEAR * h, 0.5 * width)  # where the margin has begun to fall
+    first = jnp.where(jnp.isfinite(search.at_near), jnp.maximum(search.near + share * width, least), least)
     inside = falls & (newton > search.near) & (newton < search.far) & (search.tries % BISECT != 0)
     guess = jnp.where(inside, newton, jnp.where(fresh, first, search.near + 0.5 * width))
     apart = jnp.where(sought.end < 0, 1.0, -1.0) * h * jnp.finfo(h.dtype).eps ** APART
-    search = search._replace(place=jnp.where(at_once, 0.0, x), margin=jnp.where(near & ~at_once, sought.end, 0.0))
+    margin = jnp.where(near | at_once, sought.end, 0.0)
+    search = search._replace(place=x, margin=margin, at_once=at_once)
     # Beyond the zero another margin that falls does so before it.
     earlier = enough & ~at_once & tells.another & ~changes & tells.falls & (search.tries < TRIES)
     search = select(earlier, _bracket(search, x, tells.other), search)
@@ -124,7 +129,18 @@ def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> Any:
     far = (jnp.abs(end - place) > 4 * jnp.abs(place - x)) & jnp.isfinite(at_end)
     fall += jnp.where(far, (place - x) * jnp.where(far, bend, 0.0), 0.0)
     fall = jax.lax.stop_gradient(fall)
-    return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf) + beyond
+    length = search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf)
+    return jnp.where(search.at_once, _at_once(search, fall, start, length), length) + beyond
+
+
+def _at_once(search: Search, fall: Any, start: Any, length: Any) -> Any:
+    """The length of a step at whose beginning the event happens. It has a derivative if the margin falls there as
+    steeply as it does on the whole; not if it jumps, or has its maximum there."""
+    place, margin = jax.lax.stop_gradient((search.place, search.margin))
+    smooth = jnp.where(jnp.isfinite(start), jnp.abs(margin - fall * place - start) <= -PART * fall * place, True)
+    mean = jnp.where(jnp.isfinite(search.at_full), search.at_full / search.full, 0.0)
+    steep = (fall < 0) & (fall <= GRAZES * jax.lax.stop_gradient(mean))
+    return jnp.where(smooth & steep, length - jax.lax.stop_gradient(jnp.minimum(length, 0.0)), 0.0)
 
 
 def _narrowed(old: Search, x: Any, first: Any, sought: Crossed) -> tuple[Search, Any]:
