@@ -61,6 +61,8 @@ class Found(NamedTuple):
     gradient: np.ndarray  # (m, n), in units of the numbers' sizes
     sides: np.ndarray  # (widths, 2, m, n), objectives at +width and -width
     ended: bool  # the run itself reached its stop, or the end of its time if it has none
+    beside: np.ndarray  # (m,), values that come with the gradient
+    plain: np.ndarray  # (m,), values of runs that locate no kinks
 
 
 class Program:
@@ -79,8 +81,16 @@ class Program:
             run = measure(loop, solver, measures, key=jax.random.key(3))
             return jnp.stack([run.metrics[one] for one in self.objectives]), run.diverged | run.timed_out
 
+        def with_slopes(*args: Any) -> tuple[Any, Any]:
+            def twice(*args: Any) -> tuple[Any, Any]:
+                values, _ = one(solver, *args)
+                return values, values
+
+            return jax.jacfwd(twice, argnums=2, has_aux=True)(*args)
+
         self.values = jax.jit(jax.vmap(partial(one, slow), (None, None, 0)))
-        self.slopes = jax.jit(jax.jacfwd(partial(one, solver), argnums=2, has_aux=True))
+        self.plain = jax.jit(partial(one, FixedStep(step, duration, kinks=False)))
+        self.slopes = jax.jit(with_slopes)
 
     def study(self, number: int, seed: int) -> Found:
         """Gradients and differences of a loop."""
@@ -92,12 +102,14 @@ class Program:
         moves = [sign * width * np.diag(size) for width in WIDTHS for sign in (1, -1)]
         lanes, late = self.values(loop, measures, x + np.concatenate([np.zeros((1, len(x))), *moves]))
         lanes = np.asarray(lanes)
-        slopes, _ = self.slopes(loop, measures, x)
+        slopes, beside = self.slopes(loop, measures, x)
+        plain, _ = self.plain(loop, measures, x)
         sides = lanes[1:].reshape(len(WIDTHS), 2, len(x), -1).swapaxes(2, 3)
         names = [path + "".join(f"[{i}]" for i in place) for path, all in self.places.items() for place in all]
         ended = not late[0] or self.structure.objectives is random_loops.BALANCE
         gradient = np.asarray(slopes) * size
-        return Found(self.name, number, self.objectives, names, lanes[0], gradient, sides, bool(ended))
+        both = np.asarray(beside), np.asarray(plain)
+        return Found(self.name, number, self.objectives, names, lanes[0], gradient, sides, bool(ended), *both)
 
 
 def _at(loop: Any, measures: Any, path: str) -> np.ndarray:

@@ -699,7 +699,7 @@ MUTATIONS = [
         "simulate/landing.py",
         "smooth & steep, length -",
         "smooth & steep & False, length -",
-        "test_delay.py::test_the_moment_of_an_event_on_the_grid_is_differentiable[0.002]",
+        "test_landing.py::test_the_moment_of_an_event_on_the_grid_is_differentiable[0.002]",
     ),
     Mutation(
         "an event whose moment has no derivative",

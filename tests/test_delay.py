@@ -14,7 +14,7 @@ from test_blocks import Mean, Script, close, seen
 import diffabs as d
 from diffabs.actuators import Delay, Lag, Limits
 from diffabs.controllers import ConstantTorque, Relay, Sampled
-from diffabs.core.blocks import Direct, Passage, Series
+from diffabs.core.blocks import Passage, Series
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import param, pytree, static, strong
 from diffabs.objectives import TorqueRate
@@ -222,22 +222,6 @@ def test_what_a_computer_says_comes_out_later(late):
     lengths = np.clip(end - 2e-3 * np.arange(8), 0.0, 2e-3)
     close(mean(late) * 15e-3, levels @ lengths, rtol=1e-11)
     close(jax.grad(mean)(late) * 15e-3, -levels[lengths > 1e-9][-1], rtol=1e-7)
-
-
-@pytest.mark.parametrize("late", [2e-3, pytest.param(4e-3, marks=pytest.mark.slow), 2.3e-3])
-def test_the_moment_of_an_event_on_the_grid_is_differentiable(late):
-    """A computer says the time, each 5 ms, and takes a while for it. Some of these moments are a rounding after the
-    beginning of a step: an event at once has its derivatives as any other."""
-
-    def mean(late):
-        sampled = Sampled(controller=Says(read=lambda t: 1.0 + 100.0 * t), period=5e-3, delay=late)
-        return d.measure(loop(sampled, Direct()), d.FixedStep(H, 0.03), {"mean": Mean()}).metrics["mean"][1]
-
-    levels = 1.0 + 100.0 * 5e-3 * np.arange(6)
-    lengths = np.append(np.full(5, 5e-3), 5e-3 - late)
-    value, slope = jax.value_and_grad(mean)(late)
-    close(value * 0.03, levels @ lengths, rtol=1e-11)
-    close(slope * 0.03, -levels[-1], rtol=1e-7)
 
 
 @pytest.mark.parametrize("kinks", [None, True])
