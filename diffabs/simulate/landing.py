@@ -22,7 +22,7 @@ TRIES = 24  # the most for an event, whose margin may have a corner or jump
 BISECT = 4  # every so many tries halve the bracket
 GRAZES = 1e-2  # of the margin's mean rate in the step: a margin that falls more slowly at the beginning only touches
 SMOOTH = 1e-4  # of the slope: the most by which both ends of a step together know it better; more is a kink between
-PART = 0.5  # of the fall within so short a step: the most by which the margin there may be off from a line
+PART = 0.5  # of the fall: the most by which it may change where the margin is smooth, or has other signs on either side
 
 
 class Search(NamedTuple):
@@ -121,7 +121,7 @@ def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Se
 def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> Any:
     """Return the length that ends on the zero, or so much `beyond` that its margin has changed its sign for certain,
     after the probe of length x. The fall is that of the parabola through the place, the probe, and an end of the first
-    try: that on the same side, unless it is too close or its margin unknown."""
+    try: that on the same side, or where that says nothing the other, if the margin is smooth up to there."""
     x = jax.lax.stop_gradient(x)
     g, start = jax.lax.stop_gradient(tells.sought[1:])
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
@@ -129,9 +129,10 @@ def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> Any:
     side, other = select(margin < 0, ends, ends[::-1])
     near = _tells(side, place, x)
     end, at_end = third = select(near, side, other)
-    far = _tells(third, place, x)
     fall = (g - margin) / (x - place)
-    bend = jnp.where(far, ratio(ratio(at_end - g, end - x) - fall, end - place), 0.0)
+    changes = ratio(at_end - g, end - x) - fall
+    far = near | (_tells(third, place, x) & (jnp.abs(changes) <= PART * jnp.abs(fall)))
+    bend = jnp.where(far, ratio(changes, end - place), 0.0)
     at_place = fall + (place - x) * bend
     length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)
     slope = at_place + 2.0 * (length - place) * bend
