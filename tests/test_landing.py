@@ -1,6 +1,7 @@
-"""The moment of an event and its derivatives, against closed forms: on the grid, and where the margin is bent."""
+"""The moment of an event and its derivatives, against closed forms: on the grid; where the margin is bent, or flat."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_blocks import Mean, close
@@ -9,6 +10,7 @@ from test_delay import H, Integrator, Proportional, Says, loop
 import diffabs as d
 from diffabs.controllers import Sampled
 from diffabs.core.blocks import Direct
+from diffabs.core.protocols import Memory, no_flow
 from diffabs.core.pytree import param, pytree, replace
 from diffabs.stops import NoStop
 
@@ -21,6 +23,43 @@ class Below(NoStop):
 
     def margin(self, output):
         return output.slip - self.level
+
+
+@pytree
+class Slips:
+    """From 2 to 5, where a margin that hardly falls goes through zero at last: a level less exp((t - end)/rise)."""
+
+    level: float = param(default=1e-6, unit="1")
+    end: float = param(default=8e-3, unit="s")
+    rise: float = param(default=6e-5, unit="s")
+
+    flow = no_flow
+
+    def start(self, signal):
+        return Memory(held=2.0 + 0.0 * signal.target)
+
+    def output(self, t, memory, signal):
+        return memory.held
+
+    def margins(self, t, memory, signal, rate):
+        return (jnp.where(memory.held < 3.0, self.level - jnp.exp((t - self.end) / self.rise), 1.0),)
+
+    def event(self, t, memory, signal, fired):
+        return Memory(held=jnp.where(fired[0], 5.0, memory.held))
+
+
+def test_a_margin_that_falls_all_at_once_is_landed_on():
+    """Where it is still flat, a parabola through three tries may take it for near its zero, and its fall there leads
+    hundreds of steps away."""
+
+    @jax.jit
+    def mean(level):
+        there = loop(Slips(level=level), Direct())
+        return d.measure(there, d.FixedStep(H, 0.01, kinks=False), {"mean": Mean()}).metrics["mean"][1]
+
+    for level in np.geomspace(1e-7, 1e-5, 9):
+        moment = 8e-3 + 6e-5 * np.log(level)
+        close(mean(level) * 0.01, 2.0 * moment + 5.0 * (0.01 - moment), rtol=2e-5)
 
 
 @pytest.mark.parametrize("late", [2e-3, pytest.param(4e-3, marks=pytest.mark.slow), 2.3e-3])

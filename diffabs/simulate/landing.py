@@ -140,8 +140,18 @@ def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> Any:
     more = ratio(ratio(ratio(at_last - g, last - x) - fall, last - place) - bend, last - end)
     more *= (length - place) * (length - x) + (length - place + length - x) * (length - end)
     slope += jnp.where(jnp.abs(more) <= SMOOTH * jnp.abs(slope), more, 0.0)
-    moved = length + _moves(search, x, tells.sought.end, length, slope)
+    far = jnp.abs(length - place) > jnp.abs(x - place)
+    length = jnp.where(far, jnp.maximum(jnp.minimum(length, search.far), search.near), length)
+    moved = length + jnp.where(far, 0.0, _moves(search, x, tells.sought.end, length, slope))
     return jnp.where(search.at_once, _at_once(search, at_place, start, moved), moved) + beyond
+
+
+def strays(search: Search, x: Any, length: Any) -> Any:
+    """Return whether a step of this length, after the probe of length x, would end so far from where the zero seemed to
+    be that it is to be looked for again: a margin that hardly falls there, and then all at once."""
+    probe = jnp.abs(x - search.place)
+    missed = (jnp.abs(length - search.place) > probe) & (search.far - search.near > probe)
+    return jax.lax.stop_gradient(missed & ~search.at_once & (search.tries < TRIES))
 
 
 def _moves(search: Search, x: Any, g: Any, zero: Any, fall: Any) -> Any:
