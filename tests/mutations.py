@@ -634,8 +634,8 @@ MUTATIONS = [
     Mutation(
         "a landing near the zero",
         "simulate/landing.py",
-        "return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf)",
-        "return search.place",
+        "length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)",
+        "length = place",
         "test_blocks.py::test_relay_switches_on_the_far_side_of_its_band",
     ),
     Mutation(
@@ -704,15 +704,36 @@ MUTATIONS = [
     Mutation(
         "a landing without derivative",
         "simulate/landing.py",
-        "return search.place - search.margin / jnp",
-        "return search.place - jax.lax.stop_gradient(search.margin) / jnp",
+        "return -rises / jnp",
+        "return 0.0 * rises / jnp",
         "test_gradients.py::test_gradient_of_every_objective_in_every_parameter[feedback]",
+    ),
+    Mutation(
+        "derivatives of a moment that are those of a while before it",
+        "simulate/landing.py",
+        "share = ratio(zero - search.place, x - search.place)",
+        "share = 0.0 * zero",
+        "test_landing.py::test_derivatives_of_a_moment_are_those_at_the_zero[jacfwd]",
+    ),
+    Mutation(
+        "a landing hundreds of steps away",
+        "simulate/landing.py",
+        "(search.tries < TRIES))\n\n\ndef _moves",
+        "False)\n\n\ndef _moves",
+        "test_landing.py::test_a_margin_that_falls_all_at_once_is_landed_on",
+    ),
+    Mutation(
+        "an event at once whose moment has no derivative",
+        "simulate/landing.py",
+        "smooth & steep, length -",
+        "smooth & steep & False, length -",
+        "test_landing.py::test_the_moment_of_an_event_on_the_grid_is_differentiable[0.002]",
     ),
     Mutation(
         "an event whose moment has no derivative",
         "simulate/landing.py",
-        "margin=jnp.where(near & ~at_once, sought.end, 0.0)",
-        "margin=jnp.where(near & ~at_once, jax.lax.stop_gradient(sought.end), 0.0)",
+        "found = near | at_once",
+        "found = at_once",
         "test_gradients.py::test_gradient_through_the_latch_agrees_with_a_wide_difference[0.0-published0]",
     ),
     Mutation(

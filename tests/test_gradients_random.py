@@ -47,7 +47,8 @@ def found(function, gradient, at=1.0):
     """A study of one entry: a function of one number."""
     sides = [[[[function(at + sign * width)]] for sign in (1, -1)] for width in WIDTHS]
     names = (["objective"], ["number"])
-    return Found("", 0, *names, np.array([function(at)]), np.array([[gradient]]), np.array(sides), True)
+    value = np.array([function(at)])
+    return Found("", 0, *names, value, np.array([[gradient]]), np.array(sides), True, value, value)
 
 
 JUDGED = {
