@@ -14,11 +14,11 @@ from diffabs.kernel.program import Block, Branch, Place, Program, live, ordered
 
 SHORT = 24  # operations in a branch: fewer are worked out anyway
 TYPES = {
-    "float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "uint32": "u32", "uint64": "u64", "bool": "mask",
+    "float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "uint32": "u32", "uint64": "u64",
 }  # fmt: skip
 INFIX = {
-    "add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/", "and": "&", "or": "|", "xor": "^", "shift_left": "<<",
-    "shift_right_logical": ">>",
+    "add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/", "and": "&", "or": "|", "xor": "^",
+    "shift_left": "<<", "shift_right_logical": ">>",
 }  # fmt: skip
 PREFIX = {"neg": "-", "not": "~"}
 NAMED = {
@@ -44,14 +44,19 @@ def text(program: Program, shape: Shape) -> str:
     return "\n".join(_Text(program, shape).parts()) + "\n"
 
 
+def truth(dtype: np.dtype) -> bool:
+    """Return whether numbers of this type are truths."""
+    return dtype.kind == "b"
+
+
 def kind(dtype: np.dtype) -> str:
     """Return the type of one number."""
-    return "u8" if dtype == bool else TYPES[dtype.name]
+    return "u8" if truth(dtype) else TYPES[dtype.name]
 
 
 def vector(dtype: np.dtype) -> str:
     """Return the type of a vector of them."""
-    return "mask" if dtype == bool else "v" + TYPES[dtype.name]
+    return "mask" if truth(dtype) else "v" + TYPES[dtype.name]
 
 
 def reads(node: Node) -> tuple[Node, ...]:
@@ -61,12 +66,15 @@ def reads(node: Node) -> tuple[Node, ...]:
 
 def literal(node: Node) -> str:
     """Return a known number in every lane."""
-    x, name = node.attr, TYPES[node.dtype.name]
-    if node.dtype == bool:
+    x = node.attr
+    if truth(node.dtype):
         return f"all({'true' if x else 'false'})"
+    name = TYPES[node.dtype.name]
     if not real(node.dtype):
         ends = {"i32": "", "u32": "u", "i64": "ll", "u64": "ull"}[name]
-        number = f"INT{x.itemsize * 8}_MIN" if node.dtype.kind == "i" and x == np.iinfo(x.dtype).min else f"{int(x)}{ends}"
+        number = (
+            f"INT{x.itemsize * 8}_MIN" if node.dtype.kind == "i" and x == np.iinfo(x.dtype).min else f"{int(x)}{ends}"
+        )
         return f"all(({name}){number})"
     if np.isnan(x):
         return f"all(({name})NAN)"
@@ -119,7 +127,11 @@ class _Text:
         yield '#include "drive.h"'
 
     def _given(self, level: Level) -> list[tuple[Place, Node]]:
-        return [(p, n) for p, n in self.program.inputs.items() if p.level == level and (level == Level.STEP or n.id in self.alive)]
+        return [
+            (p, n)
+            for p, n in self.program.inputs.items()
+            if p.level == level and (level == Level.STEP or n.id in self.alive)
+        ]
 
     def _structures(self) -> Iterator[str]:
         """What all lanes share, and a block of lanes: carry, inputs of the lanes, and what follows from these."""
@@ -136,7 +148,7 @@ class _Text:
         yield "static void prepare(Shared& s, const Array* uniform) { (void)s; (void)uniform;"
         for place, node in self._given(Level.UNIFORM):
             value = f"((const {kind(node.dtype)}*)uniform[{place.array}].data)[{place.entry}]"
-            yield f"  const {vector(node.dtype)} v{node.id} = all({'(bool)' if node.dtype == bool else ''}{value});"
+            yield "  " + _spread(node, value)
         columns = [x for _, node in self.columns.values() for x in node.args[1:]]
         wanted = [node for node in [*self.shared, *columns] if node.level == Level.UNIFORM]
         yield from self._lines(ordered(wanted, Level.UNIFORM), 0, "  ")
@@ -184,7 +196,8 @@ class _Text:
         own = {node.id for node in nodes}
         steps = [node for node in nodes if node.level == Level.STEP]
         yield from self._uniform([*steps, *roots])
-        lanes = {x.id: x for node in [*steps, *roots] for x in (node, *reads(node)) if x.level == Level.LANE}
+        read = [*roots, *(x for node in steps for x in reads(node))]
+        lanes = {x.id: x for x in read if x.level == Level.LANE}
         for q in range(self.shape.vectors):
             for node in self.program.carried():
                 if node.id in own:
@@ -198,7 +211,7 @@ class _Text:
         shared = {node.id for node in self.shared}
         read = {x.id: x for node in readers for x in (node, *reads(node)) if x.id in shared}
         for node in read.values():
-            yield f"  const {vector(node.dtype)} v{node.id} = all({'(bool)' if node.dtype == bool else ''}s.v{node.id});"
+            yield "  " + _spread(node, f"s.v{node.id}")
 
     def _moves(self) -> Iterator[str]:
         """Functions that put a lane into a place of the block, and take its carry out."""
@@ -209,11 +222,12 @@ class _Text:
                 size = self.program.sizes[places][place.array]
                 value = f"((const {kind(node.dtype)}*){array}[{place.array}].data)[j*{size} + {place.entry}]"
                 target = f"b.{name}{node.id}[i]"
-                yield f"  set({target}, q, {value});" if node.dtype == bool else f"  {target}[q] = {value};"
-        yield "}\nstatic void take(const Block& b, int p, i64 j, const Array* carry) {\n  const int i = p/LANES, q = p%LANES;"
+                yield f"  set({target}, q, {value});" if truth(node.dtype) else f"  {target}[q] = {value};"
+        yield "}\nstatic void take(const Block& b, int p, i64 j, const Array* carry) {"
+        yield "  const int i = p/LANES, q = p%LANES;"
         for place, node in self._given(Level.STEP):
             size, value = self.program.sizes[Level.STEP][place.array], f"b.c{node.id}[i]"
-            value = f"get({value}, q)" if node.dtype == bool else f"{value}[q]"
+            value = f"get({value}, q)" if truth(node.dtype) else f"{value}[q]"
             yield f"  (({kind(node.dtype)}*)carry[{place.array}].data)[j*{size} + {place.entry}] = {value};"
         yield "}"
 
@@ -278,6 +292,11 @@ class _Text:
             return args[0]
         assert node.op == "table", node.op
         return f"entry(s.{self.columns[tuple(x.id for x in node.args[1:])][0]}, {args[0]})"
+
+
+def _spread(node: Node, value: str) -> str:
+    """A number of all lanes, in every lane."""
+    return f"const {vector(node.dtype)} v{node.id} = all({'(bool)' if truth(node.dtype) else ''}{value});"
 
 
 def operations(source: str) -> int:

@@ -5,18 +5,20 @@ from typing import Any
 
 import jax
 import jax.extend.random as jer
+import jax.numpy as jnp
 import numpy as np
 
 from diffabs.kernel.graph import Array, Graph, Node
-from diffabs.kernel.primitives import Unsupported, called, each, rule
+from diffabs.kernel.primitives import Unsupported, called, each, known, rule
 
+MANY = 16  # numbers that are drawn at once, at most
 PARITY = 0x1BD11BDA  # of Threefry's key schedule
 TURNS = ((13, 15, 26, 6), (17, 29, 16, 24))  # places by which its words are turned, in rounds of four
 
 
 def key_shape(aval: Any) -> tuple[tuple[int, ...], np.dtype]:
     """Return shape and type of an array, of the data of a key if it is one. Raises Unsupported for other generators."""
-    if not jax.dtypes.issubdtype(aval.dtype, jax.dtypes.prng_key):
+    if not jnp.issubdtype(aval.dtype, jax.dtypes.prng_key):
         return aval.shape, np.dtype(aval.dtype)
     if str(aval.dtype) != "key<fry>":
         raise Unsupported("random_bits", f"of the generator {aval.dtype}")
@@ -42,10 +44,17 @@ def _fold_in(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 @rule("random_bits", "bit_width shape")
 def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     width, shape = eqn.params["bit_width"], eqn.params["shape"]
-    if key_shape(eqn.invars[0].aval)[0] != (2,) or math.prod(shape) > 16:
+    if key_shape(eqn.invars[0].aval)[0] != (2,) or math.prod(shape) > MANY:
         raise Unsupported("random_bits", f"of {math.prod(shape)} numbers at once, or of several keys")
     draw = jax.make_jaxpr(lambda key: jer.threefry_prng_impl.random_bits(key, width, shape))
     return called(graph, draw(jax.ShapeDtypeStruct((2,), np.uint32)), ins)
+
+
+@rule("iota_2x32_shape", "shape")
+def _counted(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """The places of an array, in two words each."""
+    places = np.arange(math.prod(eqn.params["shape"]), dtype=np.uint32).reshape(eqn.params["shape"])
+    return [known(graph, 0 * places), known(graph, places)]
 
 
 @rule("threefry2x32")
@@ -65,7 +74,10 @@ def threefry(graph: Graph, k0: Node, k1: Node, x0: Node, x1: Node) -> tuple[Node
     for i in range(5):
         for places in TURNS[i % 2]:
             x0 = graph.op("add", x0, x1)
-            high, low = (graph.op("shift_left", x1, word(places)), graph.op("shift_right_logical", x1, word(32 - places)))
+            high, low = (
+                graph.op("shift_left", x1, word(places)),
+                graph.op("shift_right_logical", x1, word(32 - places)),
+            )
             x1 = graph.op("xor", graph.op("or", high, low), x0)
         x0 = graph.op("add", x0, keys[(i + 1) % 3])
         x1 = graph.op("add", graph.op("add", x1, keys[(i + 2) % 3]), word(i + 1))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-Array = np.ndarray  # of nodes
+Array = Any  # of nodes, of NumPy
 
 
 class Level(enum.IntEnum):
@@ -170,7 +170,7 @@ class Graph:
         if x.op == "const":
             with np.errstate(all="ignore"):
                 return self.const(np.asarray(x.attr).astype(dtype)[()])
-        if dtype == bool:
+        if dtype.kind == "b":
             return self.op("ne", x, self.const(0, x.dtype))
         return self._make("convert", (x,), dtype)
 

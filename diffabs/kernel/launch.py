@@ -38,7 +38,8 @@ def run_lanes(
 
     Works under jit and vmap; no derivatives. Raises Unsupported for an operation that has no rule, NoCompiler."""
     shape = cpp.Shape(VECTORS, steps, rounds)
-    made = compiled(renew, step, running, *jax.tree.map(_one, (lane, carry)), shape)
+    functions = {"renew": renew, "step": step, "running": running}
+    made = compiled(functions, jax.tree.map(_one, lane), jax.tree.map(_one, carry), shape)
     leaves, tree = jax.tree.flatten(carry)
     given = [_data(x) for x in (*made.uniform, *jax.tree.leaves(lane), *leaves)]
     first = len(given) - len(leaves)
@@ -61,10 +62,9 @@ class Compiled:
         self.target, self.uniform, self.source = target, uniform, source
 
 
-def compiled(renew: Any, step: Any, running: Any, lane: Any, carry: Any, shape: cpp.Shape) -> Compiled:
-    """Return functions of one lane as a program that XLA can call; lane and carry of these shapes. Raises Unsupported,
-    NoCompiler."""
-    functions = {"renew": renew, "step": step, "running": running}
+def compiled(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any, shape: cpp.Shape) -> Compiled:
+    """Return the functions `renew`, `step` and `running` of one lane as a program that XLA can call; lane and carry of
+    these shapes. Raises Unsupported, NoCompiler."""
     found = program.build(functions, lane, carry)
     source = cpp.text(found, shape)
     count = cpp.operations(source)
@@ -110,4 +110,4 @@ def _like(x: Any, leaf: Any) -> Any:
 
 
 def _is_key(x: Any) -> bool:
-    return hasattr(x, "dtype") and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

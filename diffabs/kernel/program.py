@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from diffabs.kernel import draws
+from diffabs.kernel import arrays, draws, elementwise, indexing, nested
 from diffabs.kernel.graph import Array, Graph, Level, Node, real
 from diffabs.kernel.primitives import Unsupported, translate
 
+RULES = (arrays, draws, elementwise, indexing, nested)  # which they register
 LARGEST = 60_000  # operations of a step; a compiler would take minutes
 
 

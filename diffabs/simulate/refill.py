@@ -50,7 +50,9 @@ def run_refilled(
     return _run(loop, values, objectives, method, keys, accepted, enough, width=WIDTH)
 
 
-def by_lane(loop: Loop, values: dict[str, Any], objectives: dict[str, Objective]) -> tuple[Any, Any]:
+def by_lane(
+    loop: Loop, values: dict[str, Any], objectives: dict[str, Objective]
+) -> tuple[Any, Callable[[Any], tuple[Any, Any]]]:
     """Return what is a lane's own of the loops with these values (lanes, ...), and a function from that of one lane to
     its loop, prepared, and what is measured."""
     leaves, whole = separated(lambda v: prepare(replace(loop, v)), values)

@@ -40,11 +40,11 @@ template<class V, class T> FN V exp_of(V x, T least, T most, T beyond) {
 FN vf64 k_exp(vf64 x) { return exp_of(x, -750.0, 710.0, 709.782712893383996843); }
 FN vf32 k_exp(vf32 x) { return exp_of(x, -105.f, 89.f, 88.7228391f); }
 
-FN vf64 k_expm1(vf64 x) {
+FN vf64 k_expm1(vf64 x) {   /* (2^n - 1) + 2^n r, what its rounding lost, and 2^n (e^r - 1 - r) */
   vf64 n, low;
   const vf64 y = lower(sel(lt(all(-50.0), x), x, all(-50.0)), all(50.0)), r = reduced_exp(y, n, low);
-  const vf64 p = (r*r*tail_of_exp(r) + low) + r, power = scaled(all(1.0), n);
-  const vf64 found = sel(eq(n, vf64{}), p, (power - 1.0) + power*p);
+  const vf64 power = scaled(all(1.0), n), whole = power - 1.0, sum = whole + power*r, lost = (whole - sum) + power*r;
+  const vf64 found = sum + (power*(r*r*tail_of_exp(r) + low) + lost);
   return sel(lt(all(50.0), x), k_exp(x) - 1.0, sel(ne(x, x) | eq(x, vf64{}), x, found)); }
 
 /* log(m 2^e + error): m between sqrt(1/2) and sqrt(2), s = (m - 1)/(m + 1), log(m) = 2 (s + s^3/3 + s^5/5 ...) */
