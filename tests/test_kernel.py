@@ -1,5 +1,7 @@
 """A kernel makes the runs that XLA makes, says why it cannot, and its library is there for several processes."""
 
+import dataclasses
+import json
 import logging
 import os
 import pathlib
@@ -11,17 +13,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from commands import run
 from kernels import FOLDER, applied, both, same
 
 import diffabs as d
-from diffabs import controllers, plants, sensors
+from diffabs import controllers, plants, scenario, sensors
 from diffabs.kernel import compilers, launch
 from diffabs.kernel.graph import Graph, Level
 from diffabs.kernel.primitives import Unsupported, known, translate
 from diffabs.objectives import BRAKING
+from diffabs.scenario import section_sweep
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import native
 from diffabs.stops import SpeedReached
+from diffabs.sweep import SweepError, sweep
 
 pytestmark = pytest.mark.xdist_group("kernel")  # one worker compiles what these share
 
@@ -191,6 +196,44 @@ class TestObjections:
         new = jaxpr.replace(eqns=[eqn.replace(params=eqn.params | {"colour": "red"})])
         with pytest.raises(Unsupported, match="exp: its parameter colour is not known"):
             translate(Graph(), new, [], [known(Graph(), 1.0)])
+
+
+class TestSweep:
+    SETTINGS = ("sweep.samples=40", "sweep.chunk=16", "solver.step=2e-3", "solver.duration=0.4", "stop.speed_kmh=40.0")
+
+    def test_is_that_of_xla_and_says_what_made_it(self, tmp_path):
+        """Another engine does not go on with it."""
+        study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
+        tables = {}
+        for engine in ("xla", "kernel"):
+            one = dataclasses.replace(study, engine=engine)
+            tables[engine] = sweep(one, tmp_path / engine).table().to_pandas().sort_values("sample")
+        for name in study.objectives:
+            columns = [table[name].to_numpy() for table in tables.values()]
+            np.testing.assert_allclose(*columns, rtol=1e-12, atol=1e-14, err_msg=name)
+        written = json.loads((tmp_path / "kernel" / "manifest.json").read_text())["study"]["engine"]
+        assert written == {"name": "kernel", **compilers.described()}
+        assert "engine" not in json.loads((tmp_path / "xla" / "manifest.json").read_text())["study"]
+        with pytest.raises(SweepError, match="engine"):
+            sweep(study, tmp_path / "kernel", resume=True)
+
+    def test_is_refused_before_anything_is_written(self, tmp_path, monkeypatch):
+        monkeypatch.setenv(compilers.COMPILER, "")
+        native._run.clear_cache()
+        study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
+        with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {compilers.COMPILER} is empty"):
+            sweep(dataclasses.replace(study, engine="kernel"), tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA: "), ("kernel", "")])
+    def test_by_the_command(self, engine, line, tmp_path, monkeypatch):
+        monkeypatch.setenv(compilers.COMPILER, "")
+        changes = [part for setting in self.SETTINGS for part in ("--set", setting)]
+        status = 0 if line else 2
+        done = run("sweep", "slip-lmi", *changes, "--out", tmp_path / "out", "--engine", engine, status=status)
+        assert f"{line}engine = 'kernel' is not possible: {compilers.COMPILER} is empty" in done.stderr
+        assert (tmp_path / "out").exists() == bool(line)
 
 
 class TestGraph:

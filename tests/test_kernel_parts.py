@@ -38,7 +38,7 @@ def with_part(family, name):
     part = parts.PARTS[family][name]
     if family == "road":
         return braking(plant=dataclasses.replace(braking().plant, road=part)), "initial.speed"
-    balance = name in OF_BALANCES or family == "stop" and name == "fallen"
+    balance = name in OF_BALANCES or (family == "stop" and name == "fallen")
     loop = balancing() if balance else braking()
     return dataclasses.replace(loop, **{family: part}), "initial.theta" if balance else "initial.speed"
 
