@@ -134,7 +134,11 @@ class Graph:
             return self._decided(which, no, yes)
         yes = yes.args[2] if yes.op == "select" and yes.args[0] is which else yes
         no = no.args[1] if no.op == "select" and no.args[0] is which else no
-        return yes if no is yes else self._make("select", (which, no, yes), yes.dtype)
+        if no is yes:
+            return yes
+        if which.op == "lt" and {yes, no} == set(which.args):
+            return self._make("lower" if yes is which.args[0] else "higher", (yes, no), yes.dtype)
+        return self._make("select", (which, no, yes), yes.dtype)
 
     def _decided(self, which: Node, no: Node, yes: Node) -> Node:
         """A selection of truths is a truth."""

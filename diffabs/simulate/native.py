@@ -22,7 +22,7 @@ from diffabs.kernel.primitives import Unsupported
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.drivers import BLOCK
 from diffabs.simulate.outcome import judge
-from diffabs.simulate.refill import ROUND, by_lane
+from diffabs.simulate.refill import by_lane
 from diffabs.simulate.run import arguments
 from diffabs.simulate.solution import Run, Solver
 
@@ -64,7 +64,7 @@ def _run(
         (leaves, keys),
         carry._replace(condition=condition),
         steps=BLOCK,
-        rounds=ROUND // BLOCK,
+        rounds=1,
     )
     return jax.vmap(lambda mine, carry: judge(*built(mine), carry)[0])(leaves, carry)
 

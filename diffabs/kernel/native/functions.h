@@ -3,13 +3,36 @@
 #pragma once
 #include "lanes.h"
 
-/* x * 2^n, n a whole number: in two halves, so that what is beyond the normal numbers is rounded, or infinite, once */
+/* Without an instruction for it. x * 2^n, n a whole number: in two halves, so that what is beyond the normal numbers is
+   rounded, or infinite, once. */
+#if !defined(WIDE) || defined(SINGLE)
 FN vf64 scaled(vf64 x, vf64 n) {
   const vi64 k = CAST(vi64, n), half = k >> 1;
   return x*(vf64)((half + 1023) << 52)*(vf64)((k - half + 1023) << 52); }
+FN vf64 parted(vf64 x, vf64& n) {
+  const mask small = lt(size(x), all(2.2250738585072014e-308));
+  const vf64 normal = sel(small, x*0x1p54, x);
+  const vu64 b = (vu64)normal + (0x3ff0000000000000ull - 0x3fe8000000000000ull);
+  const vf64 e = CAST(vf64, (vi64)(b >> 52 & 0x7ff)) - sel(small, all(1023.0 + 54.0), all(1023.0));
+  const vf64 m = (vf64)((b & 0x000fffffffffffffull) + 0x3fe8000000000000ull);
+  const mask end = eq(x, vf64{}) | ~lt(size(x), all((f64)INFINITY));
+  n = sel(end, sel(eq(x, vf64{}), all((f64)-INFINITY), size(x)), e);
+  return sel(end, all(1.0), sel(lt(x, vf64{}), -m, m)); }
+#endif
+#if !defined(WIDE) || !defined(SINGLE)
 FN vf32 scaled(vf32 x, vf32 n) {
   const vi32 k = CAST(vi32, n), half = k >> 1;
   return x*(vf32)((half + 127) << 23)*(vf32)((k - half + 127) << 23); }
+FN vf32 parted(vf32 x, vf32& n) {
+  const mask small = lt(size(x), all(1.17549435e-38f));
+  const vf32 normal = sel(small, x*0x1p25f, x);
+  const vu32 b = (vu32)normal + (0x3f800000u - 0x3f400000u);
+  const vf32 e = CAST(vf32, (vi32)(b >> 23 & 0xff)) - sel(small, all(127.f + 25.f), all(127.f));
+  const vf32 m = (vf32)((b & 0x007fffffu) + 0x3f400000u);
+  const mask end = eq(x, vf32{}) | ~lt(size(x), all((f32)INFINITY));
+  n = sel(end, sel(eq(x, vf32{}), all((f32)-INFINITY), size(x)), e);
+  return sel(end, all(1.f), sel(lt(x, vf32{}), -m, m)); }
+#endif
 
 /* e^x - 1 = r + r^2 q(r) for |r| <= log(2)/2 */
 FN vf64 tail_of_exp(vf64 r) {
@@ -32,13 +55,13 @@ FN vf32 reduced_exp(vf32 x, vf32& n, vf32& low) {
   const vf32 high = x - n*0x1.62e0p-1f, part = n*0x1.0bfbe8p-15f, r = high - part;
   low = (high - r) - part;
   return r; }
-template<class V, class T> FN V exp_of(V x, T least, T most, T beyond) {
+/* Between where nothing is left and where it is infinite; NaN is the second of two numbers, and stays. */
+template<class V, class T> FN V exp_of(V x, T least, T most) {
   V n, low;
-  const V y = sel(lt(all(least), x), x, all(least)), r = reduced_exp(lower(y, all(most)), n, low);
-  const V found = scaled((r*r*tail_of_exp(r) + low) + r + (T)1, n);
-  return sel(ne(x, x), x, sel(lt(all(beyond), x), all((T)INFINITY), found)); }
-FN vf64 k_exp(vf64 x) { return exp_of(x, -750.0, 710.0, 709.782712893383996843); }
-FN vf32 k_exp(vf32 x) { return exp_of(x, -105.f, 89.f, 88.7228391f); }
+  const V r = reduced_exp(lower(all(most), higher(all(least), x)), n, low);
+  return scaled((r*r*tail_of_exp(r) + low) + r + (T)1, n); }
+FN vf64 k_exp(vf64 x) { return exp_of(x, -750.0, 710.0); }
+FN vf32 k_exp(vf32 x) { return exp_of(x, -105.f, 89.f); }
 
 FN vf64 k_expm1(vf64 x) {   /* (2^n - 1) + 2^n r, what its rounding lost, and 2^n (e^r - 1 - r) */
   vf64 n, low;
@@ -47,48 +70,35 @@ FN vf64 k_expm1(vf64 x) {   /* (2^n - 1) + 2^n r, what its rounding lost, and 2^
   const vf64 found = sum + (power*(r*r*tail_of_exp(r) + low) + lost);
   return sel(lt(all(50.0), x), k_exp(x) - 1.0, sel(ne(x, x) | eq(x, vf64{}), x, found)); }
 
-/* log(m 2^e + error): m between sqrt(1/2) and sqrt(2), s = (m - 1)/(m + 1), log(m) = 2 (s + s^3/3 + s^5/5 ...) */
+/* log(m 2^e) + error: m between 3/4 and 3/2, s = (m - 1)/(m + 1), log(m) = 2 (s + s^3/3 + s^5/5 ...) */
 FN vf64 series_of_log(vf64 z) {
-  vf64 p = z*(2/23.0) + 2/21.0;
+  vf64 p = z*(2/25.0) + 2/23.0;
+  p = p*z + 2/21.0;
   p = p*z + 2/19.0; p = p*z + 2/17.0; p = p*z + 2/15.0; p = p*z + 2/13.0; p = p*z + 2/11.0; p = p*z + 2/9.0;
   p = p*z + 2/7.0; p = p*z + 2/5.0; p = p*z + 2/3.0;
   return p*z; }
 FN vf32 series_of_log(vf32 z) {
-  vf32 p = z*(2/9.f) + 2/7.f;
-  p = p*z + 2/5.f; p = p*z + 2/3.f;
+  vf32 p = z*(2/11.f) + 2/9.f;
+  p = p*z + 2/7.f; p = p*z + 2/5.f; p = p*z + 2/3.f;
   return p*z; }
-FN vf64 parted(vf64 x, vf64& e) {
-  const vu64 b = (vu64)x + (0x3ff0000000000000ull - 0x3fe6a09e667f3bcdull);
-  e = CAST(vf64, (vi64)(b >> 52)) - 1023.0;
-  return (vf64)((b & 0x000fffffffffffffull) + 0x3fe6a09e667f3bcdull); }
-FN vf32 parted(vf32 x, vf32& e) {
-  const vu32 b = (vu32)x + (0x3f800000u - 0x3f3504f3u);
-  e = CAST(vf32, (vi32)(b >> 23)) - 127.f;
-  return (vf32)((b & 0x007fffffu) + 0x3f3504f3u); }
 FN vf64 log_parts(vf64 m, vf64 e, vf64 error) {
   const vf64 f = m - 1.0, s = f/(m + 1.0), half = 0.5*f*f, p = series_of_log(s*s);
   return e*0x1.62e42feep-1 - ((half - (s*(half + p) + (e*0x1.a39ef35793c76p-33 + error))) - f); }
 FN vf32 log_parts(vf32 m, vf32 e, vf32 error) {
   const vf32 f = m - 1.f, s = f/(m + 1.f), half = 0.5f*f*f, p = series_of_log(s*s);
   return e*0x1.62e0p-1f - ((half - (s*(half + p) + (e*0x1.0bfbe8p-15f + error))) - f); }
-template<class V, class T> FN V log_ends(V x, V found, T infinity) {
-  const V low = sel(eq(x, V{}), all(-infinity), all((T)NAN));
-  return sel(lt(V{}, x), sel(eq(x, all(infinity)), x, found), sel(ne(x, x), x, low)); }
-FN vf64 k_log(vf64 x) {
-  const mask small = lt(x, all(2.2250738585072014e-308));
-  vf64 e;
-  const vf64 m = parted(sel(small, x*0x1p54, x), e);
-  return log_ends(x, log_parts(m, e - sel(small, all(54.0), vf64{}), vf64{}), (f64)INFINITY); }
-FN vf32 k_log(vf32 x) {
-  const mask small = lt(x, all(1.17549435e-38f));
-  vf32 e;
-  const vf32 m = parted(sel(small, x*0x1p25f, x), e);
-  return log_ends(x, log_parts(m, e - sel(small, all(25.f), vf32{}), vf32{}), (f32)INFINITY); }
+/* Of 0 and of infinity the part is 1 and n infinite, and so is the sum. */
+template<class V, class T> FN V log_of(V x, T nan) {
+  V e;
+  const V m = parted(x, e), found = log_parts(m, e, V{});
+  return sel(le(V{}, x), found, all(nan)); }
+FN vf64 k_log(vf64 x) { return log_of(x, (f64)NAN); }
+FN vf32 k_log(vf32 x) { return log_of(x, (f32)NAN); }
 FN vf64 k_log1p(vf64 x) {   /* what 1 + x lost is put back by the slope there */
   const vf64 u = 1.0 + x, lost = sel(lt(x, all(1.0)), x - (u - 1.0), 1.0 - (u - x));
   vf64 e;
-  const vf64 m = parted(u, e), found = log_parts(m, e, lost/u);
-  return sel(eq(x, vf64{}), x, log_ends(u, found, (f64)INFINITY)); }
+  const vf64 m = parted(u, e), found = log_parts(m, e, sel(lt(vf64{}, u) & finite(u), lost/u, vf64{}));
+  return sel(eq(x, vf64{}), x, sel(le(vf64{}, u), found, all((f64)NAN))); }
 
 /* sine and cosine: x = n pi/2 + r; of large x by the C library */
 FN vf64 sin_series(vf64 r, vf64 low) {

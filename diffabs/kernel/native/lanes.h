@@ -18,10 +18,11 @@
 #define BYTES 16
 #endif
 #ifdef SINGLE
-#define LANES (BYTES/4)
+#define REAL float
 #else
-#define LANES (BYTES/8)
+#define REAL double
 #endif
+#define LANES (BYTES/sizeof(REAL))
 #define FN static inline __attribute__((always_inline, unused))
 
 typedef float f32;
@@ -95,6 +96,8 @@ template<class V> FN mask lt(V a, V b) { return packed((WHOLE(V))(a < b)); }
 template<class V> FN mask le(V a, V b) { return packed((WHOLE(V))(a <= b)); }
 template<class V> FN mask eq(V a, V b) { return packed((WHOLE(V))(a == b)); }
 template<class V> FN mask ne(V a, V b) { return packed((WHOLE(V))(a != b)); }
+FN vf32 size(vf32 x) { return (vf32)((vu32)x & 0x7fffffffu); }
+FN vf64 size(vf64 x) { return (vf64)((vu64)x & 0x7fffffffffffffffull); }
 FN mask eq(mask a, mask b) { return ~(a ^ b); }
 FN mask ne(mask a, mask b) { return a ^ b; }
 
@@ -125,16 +128,29 @@ FN vint sel(mask a, vint yes, vint no) { return (vint)BLENDED(a.m, (__m512i)no, 
 FN vnat sel(mask a, vnat yes, vnat no) { return (vnat)BLENDED(a.m, (__m512i)no, (__m512i)yes); }
 FN vreal higher(vreal a, vreal b) { return (vreal)REALLY(max)((register_of_reals)a, (register_of_reals)b); }
 FN vreal lower(vreal a, vreal b) { return (vreal)REALLY(min)((register_of_reals)a, (register_of_reals)b); }
+FN vreal most(vreal a, vreal b) {
+  const register_of_reals x = (register_of_reals)a, y = (register_of_reals)b;
+  return (vreal)REALLY(mask_max)(x, R_MASK(cmpeq)(x, x), x, y); }
+FN vreal least(vreal a, vreal b) {
+  const register_of_reals x = (register_of_reals)a, y = (register_of_reals)b;
+  return (vreal)REALLY(mask_min)(x, R_MASK(cmpeq)(x, x), x, y); }
 FN vreal root(vreal x) { return (vreal)REALLY(sqrt)((register_of_reals)x); }
 FN vreal whole(vreal x) { return (vreal)REALLY(roundscale)((register_of_reals)x, 8); }
 FN vreal down(vreal x) { return (vreal)REALLY(roundscale)((register_of_reals)x, 9); }
 FN vreal up(vreal x) { return (vreal)REALLY(roundscale)((register_of_reals)x, 10); }
+/* x * 2^n; the part of x between 3/4 and 3/2, NaN below zero, and n so that it is that part * 2^n */
+FN vreal scaled(vreal x, vreal n) { return (vreal)REALLY(scalef)((register_of_reals)x, (register_of_reals)n); }
+FN vreal parted(vreal x, vreal& n) {
+  const vreal m = (vreal)REALLY(getmant)((register_of_reals)x, _MM_MANT_NORM_p75_1p5, _MM_MANT_SIGN_src);
+  const vreal e = (vreal)REALLY(getexp)((register_of_reals)x);
+  n = sel(lt(size(m), all((REAL)1)), e + (REAL)1, e);
+  return m; }
 #endif
 FN mask sel(mask a, mask yes, mask no) { return (a & yes) | (~a & no); }
 template<class V> FN V higher(V a, V b) { return sel(lt(b, a), a, b); }   /* b where either is NaN */
 template<class V> FN V lower(V a, V b) { return sel(lt(a, b), a, b); }
-template<class V> FN V most(V a, V b) { return sel(ne(a, a), a, higher(a, b)); }   /* NaN where either is */
-template<class V> FN V least(V a, V b) { return sel(ne(a, a), a, lower(a, b)); }
+template<class V> FN V most(V a, V b) { return sel(eq(a, a), higher(a, b), a); }   /* NaN where either is */
+template<class V> FN V least(V a, V b) { return sel(eq(a, a), lower(a, b), a); }
 
 /* each lane by itself */
 template<class V> FN V root(V x) { for (int q = 0; q < LANES; q++) x[q] = sqrt(x[q]); return x; }
@@ -150,8 +166,6 @@ FN vi64 rest(vi64 x, vi64 y) { return x % y; }
 FN vu32 rest(vu32 x, vu32 y) { return x % y; }
 FN vu64 rest(vu64 x, vu64 y) { return x % y; }
 
-FN vf32 size(vf32 x) { return (vf32)((vu32)x & 0x7fffffffu); }
-FN vf64 size(vf64 x) { return (vf64)((vu64)x & 0x7fffffffffffffffull); }
 FN vi32 size(vi32 x) { return sel(lt(x, vi32{}), -x, x); }
 FN vi64 size(vi64 x) { return sel(lt(x, vi64{}), -x, x); }
 FN vu32 size(vu32 x) { return x; }
