@@ -64,7 +64,7 @@ static void run(const Array* uniform, const Array* lanes, const Array* carry, i6
 
 /* The arrays: UNIFORM of all lanes, OF_LANES and CARRIED with a leading axis of lanes. The results are the last. */
 extern "C" XLA_FFI_Error* diffabs_kernel(XLA_FFI_CallFrame* call) {
-  XLA_FFI_Extension_Base* more = call->extension_start;
+  auto* more = call->extension_start;   // its name differs between versions of jaxlib
   if (more && more->type == XLA_FFI_Extension_Metadata) {
     XLA_FFI_Metadata* told = ((XLA_FFI_Metadata_Extension*)more)->metadata;
     told->api_version.major_version = XLA_FFI_API_MAJOR;
