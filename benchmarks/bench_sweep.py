@@ -50,7 +50,7 @@ def child(options):
     found = sweep(
         study,
         options.folder,
-        engine=engine,
+        on=engine,
         progress=lambda at: seen.append((time.perf_counter(), at.here, at.failed, at.diverged)),
     )
     first = next(point for point in seen if point[1] > 0)

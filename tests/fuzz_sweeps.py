@@ -135,7 +135,7 @@ class Folders:
 
     def resume(self, folder):
         try:
-            found = sweep(self.study, folder, resume=True, engine=self.engine)
+            found = sweep(self.study, folder, resume=True, on=self.engine)
         except OSError as error:  # which the command says in a line
             return in_a_line(error)
         assert found.complete, "not complete after resume"

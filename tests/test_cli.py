@@ -336,7 +336,7 @@ def test_every_help_has_an_example_that_is_right(command, monkeypatch):
 
 
 USAGE = [
-    (("sweep", "slip-lmi", "--workers", "0", "--engine", "dask"), "--workers 0 is outside [1, 8]"),
+    (("sweep", "slip-lmi", "--workers", "0", "--on", "dask"), "--workers 0 is outside [1, 8]"),
     (("sweep", "slip-lmi", "--devices", "0"), "--devices 0 is outside [1, 8]"),
     (("rare", "slip-lmi", "iae", "--samples", "many"), "--samples: "),
     (("simulate", "--nonsense"), "no such option: --nonsense"),

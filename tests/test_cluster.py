@@ -91,7 +91,7 @@ def pids(address):
 
 
 def test_a_worker_makes_the_same_table(study, alone, inside, tmp_path):
-    found = sweep(study, tmp_path / "out", engine=Dask(inside))
+    found = sweep(study, tmp_path / "out", on=Dask(inside))
     assert found.complete
     assert found.digest == alone.digest
 
@@ -109,7 +109,7 @@ def test_workers_that_are_killed_change_no_bit(study, alone, address, tmp_path, 
             killed.append(pids(address)[0])
             os.kill(killed[-1], signal.SIGKILL)
 
-    found = sweep(study, tmp_path / "out", engine=Dask(address), progress=kill)
+    found = sweep(study, tmp_path / "out", on=Dask(address), progress=kill)
     assert len(set(killed)) == kills
     assert not due
     assert found.complete
@@ -121,7 +121,7 @@ def test_workers_that_are_killed_change_no_bit(study, alone, address, tmp_path, 
 def test_arrays_of_jax_reach_the_workers_whole(study, alone, address, tmp_path):
     """The default of their processes is float32."""
     loop = jax.tree.map(jnp.asarray, study.loop)
-    found = sweep(dataclasses.replace(study, loop=loop), tmp_path / "out", engine=Dask(address))
+    found = sweep(dataclasses.replace(study, loop=loop), tmp_path / "out", on=Dask(address))
     assert found.digest == alone.digest
 
 
@@ -129,14 +129,14 @@ def test_arrays_of_jax_reach_the_workers_whole(study, alone, address, tmp_path):
 def test_two_sweeps_at_once_do_not_exchange_chunks(study, alone, address, tmp_path):
     other = Dask(address).run(dataclasses.replace(study, seed=4), range(50), lambda: False)
     next(other)  # it has chunks in hand, and some are done
-    found = sweep(study, tmp_path / "out", engine=Dask(address))
+    found = sweep(study, tmp_path / "out", on=Dask(address))
     other.close()
     assert found.digest == alone.digest
 
 
 @pytest.mark.slow
 def test_stopped_and_continued_by_the_other_engine(study, alone, address, tmp_path):
-    part = sweep(study, tmp_path / "out", engine=Dask(address), stopping=lambda: True)
+    part = sweep(study, tmp_path / "out", on=Dask(address), stopping=lambda: True)
     assert 0 < len(part.files) <= 4
     assert sweep(study, tmp_path / "out", resume=True).digest == alone.digest
 
@@ -148,7 +148,7 @@ def scenario(file):
 
 @pytest.mark.slow
 def test_the_command_with_workers_of_its_own(scenario, alone, tmp_path):
-    result = run("sweep", scenario, "--out", tmp_path / "out", "--engine", "dask", "--workers", "2", "--json")
+    result = run("sweep", scenario, "--out", tmp_path / "out", "--on", "dask", "--workers", "2", "--json")
     assert json.loads(result.stdout)["digest"] == alone.digest
     assert result.stderr == ""
 
@@ -187,7 +187,7 @@ class Processes:
 
 
 def by_command(scenario, out, address, *args, status=0):
-    return run("sweep", scenario, "--out", out, "--engine", "dask", "--scheduler", address, "--json", *args,
+    return run("sweep", scenario, "--out", out, "--on", "dask", "--scheduler", address, "--json", *args,
                status=status)  # fmt: skip
 
 
@@ -209,7 +209,7 @@ def test_a_scheduler_that_dies_ends_it_with_one_line(scenario, alone, tmp_path, 
     out = tmp_path / "out"
     with Processes(tmp_path) as processes:
         processes.worker()
-        args = ["--engine", "dask", "--scheduler", processes.address, "--samples", "64000"]
+        args = ["--on", "dask", "--scheduler", processes.address, "--samples", "64000"]
         with started(*command(scenario, out, *args)) as process:
             assert until(lambda: chunks(out), process)
             processes.running[0].kill()
@@ -227,7 +227,7 @@ def test_a_scheduler_that_dies_ends_it_with_one_line(scenario, alone, tmp_path, 
 
 def by_itself(scenario, out):
     """The command with two workers, in a session of its own, after its first chunk; and its workers."""
-    args = ["--engine", "dask", "--workers", "2", "--samples", "32000"]
+    args = ["--on", "dask", "--workers", "2", "--samples", "32000"]
     process = started(*command(scenario, out, *args), start_new_session=True)
     assert until(lambda: chunks(out), process)
     children = psutil.Process(process.pid).children(recursive=True)
@@ -301,7 +301,7 @@ def test_a_worker_that_is_killed_while_it_starts_is_one_line(scenario, tmp_path)
     killer = threading.Thread(target=kill)
     killer.start()
     try:
-        result = run("sweep", scenario, "--out", tmp_path / "o", "--engine", "dask", "--workers", "2", status=2)
+        result = run("sweep", scenario, "--out", tmp_path / "o", "--on", "dask", "--workers", "2", status=2)
     finally:
         ended.set()
         killer.join()
@@ -343,9 +343,9 @@ def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tm
     """No thread of a client that would block the next one, and no folder that only `resume` would take."""
     before = set(threading.enumerate())
     with pytest.raises(SweepError, match="cannot be reached: Timed out trying to connect"):
-        sweep(study, tmp_path, engine=Dask("tcp://127.0.0.1:1"))
+        sweep(study, tmp_path, on=Dask("tcp://127.0.0.1:1"))
     assert set(threading.enumerate()) == before
-    assert sweep(study, tmp_path, engine=Dask(inside)).digest == alone.digest
+    assert sweep(study, tmp_path, on=Dask(inside)).digest == alone.digest
 
 
 def test_what_listens_but_is_no_scheduler(study, tmp_path, impatient):
@@ -356,7 +356,7 @@ def test_what_listens_but_is_no_scheduler(study, tmp_path, impatient):
         where = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
         try:
             with pytest.raises(SweepError, match=f"the scheduler at {where} cannot be reached: no answer within 1 s"):
-                sweep(study, tmp_path / "none", engine=Dask(where))
+                sweep(study, tmp_path / "none", on=Dask(where))
             assert end.is_alive()
         finally:
             end.cancel()

@@ -334,7 +334,7 @@ def test_workers_know_the_parts_and_rare_events_are_found(tmp_path):
     """A process of its own imports the module too; the sweep is the same to the bit."""
     pytest.importorskip("distributed")
     tables = []
-    for name, engine in (("here", ()), ("there", ("--engine", "dask", "--workers", 1))):
+    for name, engine in (("here", ()), ("there", ("--on", "dask", "--workers", 1))):
         out = ("--samples", 32, "--out", tmp_path / name, "--json")
         tables.append(json.loads(run("sweep", "servo.toml", *PARTS, *FAST, *engine, *out).stdout)["digest"])
     assert tables[0] == tables[1]

@@ -51,7 +51,7 @@ def test_a_sweep_finishes_its_chunks_and_says_how_to_go_on(file, room):
 def test_workers_end_with_their_sweep(file, room, times):
     """Sent once the chunks in hand are finished, sent twice nothing is waited for."""
     out = room / "out"
-    with started(*command(file(SCENARIO), out, *LONG, "--engine", "dask", "--workers", "2")) as process:
+    with started(*command(file(SCENARIO), out, *LONG, "--on", "dask", "--workers", "2")) as process:
         assert until(lambda: chunks(out), process)
         children = psutil.Process(process.pid).children(recursive=True)
         assert len(children) >= 2

@@ -207,7 +207,7 @@ def test_a_finished_sweep_is_not_computed_again(study, swept):
         def run(self, *_):
             raise AssertionError
 
-    assert sweep(study, swept.folder, resume=True, engine=Nobody()).digest == swept.digest
+    assert sweep(study, swept.folder, resume=True, on=Nobody()).digest == swept.digest
 
 
 @pytest.mark.slow
@@ -348,8 +348,9 @@ BAD = [
     (("--set", 'sweep.over.road=["glass"]'), "sweep.over.road.0"),
     (("--set", "sweep.failures.overshot=1"), "sweep.failures.overshot is not measured; did you mean overshoot?"),
     (("--engine", "spark"), "--engine spark is unknown"),
-    (("--scheduler", "tcp://127.0.0.1:1"), "--scheduler tcp://127.0.0.1:1 needs --engine dask"),
-    (("--devices", "2", "--engine", "dask"), "--devices 2 needs --engine local"),
+    (("--on", "mars"), "--on mars is unknown"),
+    (("--scheduler", "tcp://127.0.0.1:1"), "--scheduler tcp://127.0.0.1:1 needs --on dask"),
+    (("--devices", "2", "--on", "dask"), "--devices 2 needs --on local"),
     (("--keep", "1,150"), "--keep 150 is outside [0, 149]"),
     (("--keep", "first"), "--keep first is no list of sample numbers"),
 ]
@@ -412,7 +413,7 @@ def test_a_sweep_without_a_chunk_is_begun_anew(study, tmp_path):
             raise SweepError("nobody computes")
 
     with pytest.raises(SweepError, match="nobody computes"):
-        sweep(dataclasses.replace(study, seed=study.seed + 1), tmp_path, engine=Absent())
+        sweep(dataclasses.replace(study, seed=study.seed + 1), tmp_path, on=Absent())
     assert sweep(study, tmp_path).manifest["study"]["seed"] == study.seed
 
 

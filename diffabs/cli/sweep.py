@@ -22,13 +22,14 @@ from diffabs.core.values import ScenarioError, unknown
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads
+from diffabs.simulate.native import ENGINES
 from diffabs.simulate.refusals import first_line
 
 if TYPE_CHECKING:
     from diffabs.sweep import Progress as Told
     from diffabs.sweep import Results, Study
 
-ENGINES = ("local", "dask")
+PLACES = ("local", "dask")
 SUMMARY, FIGURES = "summary.json", "figures"
 
 
@@ -41,7 +42,10 @@ def sweep(
     samples: Annotated[int | None, typer.Option(help="The same as --set sweep.samples=N.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as --set sweep.seed=N.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep that is in the folder.")] = False,
-    engine: Annotated[str, typer.Option(help="local or dask.")] = "local",
+    engine: Annotated[
+        str, typer.Option(help="xla, kernel (a program of this machine, by its C++ compiler), or auto.")
+    ] = "xla",
+    on: Annotated[str, typer.Option(help="local or dask.")] = "local",
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port.")
     ] = None,
@@ -55,18 +59,18 @@ def sweep(
 ) -> None:
     """Run a scenario for many values of what [sweep.over] varies, and show statistics with confidence intervals."""
     with console.guarded():
-        _check_options(engine, scheduler, workers, devices, figures)
+        _check_options(engine, on, scheduler, workers, devices, figures)
         _check_samples(samples)
         if devices:
             jax.config.update("jax_num_cpu_devices", devices)
         chosen = console.loaded(scenario, console.changed(changes, "sweep", samples=samples, seed=seed))
         out = out or pathlib.Path("out") / f"sweep-{chosen.name}"
-        study = section_sweep.study(chosen)
+        study = _with_engine(section_sweep.study(chosen), engine)
         kept = _numbers(keep, study.samples)
         for number in kept:
             _check_runnable(study, number)
         with _continued(out, resume):
-            found = _run(study, chosen, out, resume, lambda: _engine(engine, scheduler, workers))
+            found = _run(study, chosen, out, resume, lambda: _computer(on, scheduler, workers))
             warn_of_strays(found)
             if not found.complete:
                 raise KeyboardInterrupt
@@ -95,7 +99,8 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
         raise SweepError(f"{folder} was not swept from a scenario; Study.lane({number}) is this sample")
     chosen = loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
     study = section_sweep.study(chosen)
-    for line in differences(manifest["study"], study.table(), "study"):
+    swept = {name: value for name, value in manifest["study"].items() if name != "engine"}  # a sample is run by XLA
+    for line in differences(swept, study.table(), "study"):
         raise SweepError(f"{folder}: the scenario in its manifest is not what was swept: {line}")
     if not 0 <= number < study.samples:
         console.fail(f"--sample {number} is outside [0, {study.samples - 1}]")
@@ -135,19 +140,22 @@ def _continued(out: pathlib.Path, resume: bool) -> Iterator[None]:
         raise typer.Exit(console.INTERRUPTED) from None
 
 
-def _check_options(engine: str, scheduler: str | None, workers: int | None, devices: int | None, figures: bool) -> None:
+def _check_options(
+    engine: str, on: str, scheduler: str | None, workers: int | None, devices: int | None, figures: bool
+) -> None:
     console.need_extra("sweep")
-    if engine not in ENGINES:
-        raise unknown(f"--engine {engine} is unknown", engine, ENGINES)
-    if engine == "dask":
+    for option, value, possible in (("--engine", engine, ENGINES), ("--on", on, PLACES)):
+        if value not in possible:
+            raise unknown(f"{option} {value} is unknown", value, possible)
+    if on == "dask":
         console.need_extra("cluster")
     for option, value, needed in (
         ("--scheduler", scheduler, "dask"),
         ("--workers", workers, "dask"),
         ("--devices", devices, "local"),
     ):
-        if value is not None and engine != needed:
-            console.fail(f"{option} {value} needs --engine {needed}")
+        if value is not None and on != needed:
+            console.fail(f"{option} {value} needs --on {needed}")
     most = max(8, 2 * (os.cpu_count() or 1))
     for option, value in (("--workers", workers), ("--devices", devices)):
         if value is not None and not 1 <= value <= most:
@@ -176,7 +184,22 @@ def _numbers(keep: str | None, samples: int) -> list[int]:
     return numbers
 
 
-def _engine(name: str, scheduler: str | None, workers: int | None) -> Any:
+def _with_engine(study: "Study", engine: str) -> "Study":
+    """The study, whose engine is "kernel" if that is asked for, or possible and left to us."""
+    if engine == "xla":
+        return study
+    from diffabs.sweep.runner import objection
+
+    by_kernel = dataclasses.replace(study.check(), engine="kernel")
+    line = console.waited(lambda: objection(by_kernel), "compiling a kernel")
+    if line and engine == "kernel":
+        console.fail(line)
+    if line:
+        console.say(f"note: runs are made by XLA: {line}")
+    return study if line else by_kernel
+
+
+def _computer(name: str, scheduler: str | None, workers: int | None) -> Any:
     from diffabs.sweep.engines import Local
 
     if name == "local":
@@ -186,7 +209,7 @@ def _engine(name: str, scheduler: str | None, workers: int | None) -> Any:
     return Dask(scheduler, workers)
 
 
-def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, engine: Callable[[], Any]) -> "Results":
+def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], Any]) -> "Results":
     """Raises KeyboardInterrupt, after the chunks in hand or at once."""
     far = [progress.Far("compiling")]
     ending = console.Ending("the chunks in hand")
@@ -200,7 +223,7 @@ def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, engi
         from diffabs.sweep import sweep as run
 
         source = {"scenario": dump(chosen), "name": chosen.name}
-        return run(study, out, resume=resume, engine=engine(), progress=told, stopping=ending, source=source)
+        return run(study, out, resume=resume, on=on(), progress=told, stopping=ending, source=source)
 
     return console.waited(run, f"sweeping {chosen.name}", lambda: far[0], ending)
 

@@ -12,6 +12,7 @@ from diffabs.core.compiling import traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, get, parameters, replace
+from diffabs.simulate.native import by_engine, run_native
 from diffabs.simulate.refill import Enough, run_refilled
 from diffabs.simulate.refusals import first_line, refusals
 from diffabs.simulate.run import arguments, measure, rollout
@@ -104,6 +105,7 @@ def run_batch(
     together: bool | None = None,
     accepted: Any = None,
     enough: Enough | None = None,
+    engine: str = "xla",
 ) -> Run:
     """Run every lane of a batch and return what `measure` returns of each: a `Run` with a leading axis, in their order.
 
@@ -119,6 +121,8 @@ def run_batch(
     accepted: which lanes are run (lanes,), or True for all; the others have `diverged`, and their metrics are NaN.
         None is those that `refusals` accepts, or all if the call is traced
     enough: ends runs early, which then have neither stopped, timed out nor diverged; not together
+    engine: "kernel" makes of the loop's step a program of this machine (a C++ compiler is needed): no derivatives, no
+        trajectories, the same numbers to rounding. "auto" does so where it can, and otherwise what "xla" does
 
     Compiled once for a structure and a number of lanes, not for new values, keys or durations.
 
@@ -130,7 +134,8 @@ def run_batch(
     43.9 43.8
 
     Raises:
-        ValueError: columns of different lengths; what `measure` objects to; `enough` for lanes that run together.
+        ValueError: columns of different lengths; what `measure` objects to; `enough` for lanes that run together; what
+            stands against the engine "kernel" (`simulate.native.objection` says it without running anything).
         KeyError: a path that does not exist.
     """
     objectives, count = objectives or {}, batch.size
@@ -144,9 +149,16 @@ def run_batch(
     if trajectories or (live if together is None else together) or (not batch.values and batch.keys is None):
         if enough is not None:
             raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
-        return _flagged(_together(loop, batch, solver, objectives, rollout if trajectories else measure), accepted)
+
+        def together_() -> Run:
+            run = rollout if trajectories else measure
+            return _flagged(_together(loop, batch, solver, objectives, run), accepted)
+
+        return by_engine(engine, together_, together_, "lanes run together, for trajectories or for derivatives")
     accepted = jnp.broadcast_to(jnp.asarray(accepted, bool), count)
-    return run_refilled(loop, batch.values, batch._keys(), solver, objectives, accepted, enough)
+    given = (loop, batch.values, batch._keys(), solver, objectives, accepted)
+    why_not = "" if enough is None else "runs are to end early, when enough is seen"
+    return by_engine(engine, lambda: run_native(*given), lambda: run_refilled(*given, enough), why_not)
 
 
 def _together(loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], run: Any) -> Run:

@@ -50,6 +50,20 @@ def run_refilled(
     return _run(loop, values, objectives, method, keys, accepted, enough, width=WIDTH)
 
 
+def by_lane(
+    loop: Loop, values: dict[str, Any], objectives: dict[str, Objective]
+) -> tuple[Any, Callable[[Any], tuple[Any, Any]]]:
+    """Return what is a lane's own of the loops with these values (lanes, ...), and a function from that of one lane to
+    its loop, prepared, and what is measured."""
+    leaves, whole = separated(lambda v: prepare(replace(loop, v)), values)
+
+    def built(mine: Any) -> tuple[Loop, dict[str, Objective]]:
+        one, audit = whole(mine)
+        return one, objectives | audit
+
+    return leaves, built
+
+
 class _Belt(NamedTuple):
     """Lanes on their way: what is their own of their loops, key and carry of each; its number (how many lanes there are
     if it has none), the next number; and what has ended, by number."""
@@ -75,12 +89,7 @@ def _run(
     width: int,
 ) -> Run:
     count = len(accepted)
-    leaves, whole = separated(lambda v: prepare(replace(loop, v)), values)
-
-    def built(mine: Any) -> tuple[Loop, dict[str, Objective]]:
-        one, audit = whole(mine)
-        return one, objectives | audit
-
+    leaves, built = by_lane(loop, values, objectives)
     step_all = jax.vmap(lambda mine, key, carry: method.step(*built(mine), key, carry))
     renew_all = jax.vmap(lambda mine, carry: method.renew(built(mine)[0], carry))
     start = jax.vmap(lambda mine, key: method.start(*built(mine), key))

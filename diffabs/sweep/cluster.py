@@ -26,6 +26,7 @@ from distributed import Client, KilledWorker, LocalCluster, Security, as_complet
 from distributed.comm.core import connect
 
 from diffabs.core import files, provenance
+from diffabs.kernel import compilers
 from diffabs.sweep.engines import DECISIVE, Done, done
 from diffabs.sweep.manifest import Seals, described
 from diffabs.sweep.runner import Runner
@@ -51,7 +52,7 @@ class Dask:
         """As they are finished. Raises SweepError for a scheduler that does not answer, has no workers, or has some
         with other versions; and for a chunk that all workers die of."""
         with self._client() as client:
-            _check(client)
+            _check(client, study.engine)
             yield from _completed(client, _portable(study), chunks, stopping)
 
     @contextlib.contextmanager
@@ -129,19 +130,24 @@ def _call(scheduler: str) -> None:
         apart.submit(lambda: asyncio.run(patient())).result()
 
 
-def _check(client: Client) -> None:
+def _check(client: Client, engine: str) -> None:
     try:
         client.wait_for_workers(1, timeout=TIMEOUT)
     except TimeoutError:
         raise SweepError(f"the scheduler has no worker within {TIMEOUT:g} s") from None
-    here = provenance.origin(*DECISIVE)
+    here = _origin(engine)
     try:
-        answers: Any = client.run(provenance.origin, *DECISIVE)
+        answers: Any = client.run(_origin, engine)
     except Exception as error:  # that is all Dask says of a worker without diffabs
         raise SweepError(f"a worker cannot say its versions: {str(error).splitlines()[0]}") from None
     for worker, there in answers.items():
         for line in differences(there, here):
             raise SweepError(f"worker {worker}: {line}; results would not be those of one run")
+
+
+def _origin(engine: str) -> dict[str, str]:
+    """What can change a bit of the results, here: versions; of a kernel, the compiler and the processor."""
+    return provenance.origin(*DECISIVE) | (compilers.described() if engine == "kernel" else {})
 
 
 def _completed(client: Client, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Iterator[Done]:

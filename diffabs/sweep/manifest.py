@@ -157,6 +157,7 @@ class _Study:
     loop: Mapping[str, Any] = entry(table_of(as_given))
     parts: Mapping[str, Any] = entry(table_of(table_of(as_given)))
     objectives: Mapping[str, Any] = entry(table_of(as_given))
+    engine: Mapping[str, str] = entry(table_of(text), dict)  # none is XLA
 
 
 @dataclasses.dataclass(frozen=True)

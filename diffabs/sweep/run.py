@@ -14,6 +14,7 @@ from diffabs.core import provenance
 from diffabs.sweep.engines import Engine, Local
 from diffabs.sweep.manifest import Seals, described
 from diffabs.sweep.results import Results
+from diffabs.sweep.runner import objection
 from diffabs.sweep.store import Store, SweepError
 from diffabs.sweep.study import Study
 
@@ -44,7 +45,7 @@ def sweep(
     out: str | pathlib.Path,
     *,
     resume: bool = False,
-    engine: Engine | None = None,
+    on: Engine | None = None,
     progress: Callable[[Progress], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
     source: Mapping[str, Any] | None = None,
@@ -57,22 +58,24 @@ def sweep(
 
     out: the folder; it is made
     resume: go on with a folder that has chunks of this study already
-    engine: who computes; None is every device of this process
+    on: who computes; None is every device of this process
     progress: told after every chunk how many runs are done
     stopping: asked after every chunk; True ends the run, and `resume` goes on later
     source: put into the manifest, for whoever reads it
 
     Raises:
-        ValueError: a study that cannot be run.
+        ValueError: a study that cannot be run, or not by its engine.
         SweepError: a folder that holds something else, is in use, or cannot be written; another process died.
         OSError: a full disk; what is there stays, and `resume` goes on.
     """
     study.check()
+    if study.engine != "xla" and (line := objection(study)):
+        raise ValueError(line)
     store = Store(pathlib.Path(out))
     with _begun(store, study, resume, source or {}) as (missing, damaged):
         tally = _Tally(study, missing, tuple(damaged), progress)
         if missing:
-            with contextlib.closing((engine or Local()).run(study, missing, stopping)) as finished:
+            with contextlib.closing((on or Local()).run(study, missing, stopping)) as finished:
                 for done in finished:
                     store.write(done.chunk, done.data)
                     tally.add(done)

@@ -6,6 +6,7 @@ always the same, so a lane's result does not depend on D. Without alternatives o
 them a chunk is sorted into blocks of an eighth, the last of each structure filled up with copies."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -87,10 +88,18 @@ class Runner:
         with jax.default_device(device):
             asked = refusals(loop, block.values, self.study.solver)
         with precision(self.study.dtype):
-            values = {path: column.astype(self.study.dtype) for path, column in block.values.items()}
-            given = (values, block.samples.astype(np.uint32), asked.accepted)
+            given = self._arguments(block, asked.accepted)
             found = jax.device_get(program(*jax.device_put(given, device)))
         return found | {"refused": asked.texts.astype(object)}
+
+    def _arguments(self, block: _Block, accepted: Any) -> tuple[Any, ...]:
+        values = {path: column.astype(self.study.dtype) for path, column in block.values.items()}
+        return values, block.samples.astype(np.uint32), accepted
+
+    def _compiled(self, names: tuple[str, ...], block: _Block) -> None:
+        """Have the program of some parts traced, and its kernel compiled."""
+        with precision(self.study.dtype):
+            self._program(names).lower(*self._arguments(block, np.ones(self.size, bool)))
 
     def _variant(self, names: tuple[str, ...]) -> Any:
         return self.study.variant(dict(zip(self.study.parts, names, strict=True)))
@@ -105,8 +114,22 @@ class Runner:
         return self._programs[names]
 
 
+@functools.lru_cache(maxsize=4)
+def objection(study: Study) -> str | None:
+    """Return why its engine cannot make the runs of a study, those of the first chunk, or None. Nothing is run, but
+    what makes them is compiled."""
+    runner = Runner(study, jax.local_devices()[:1])
+    try:
+        for names, blocks in runner._sorted([runner._drawn(0)]).items():
+            runner._compiled(names, blocks[0])
+    except ValueError as error:
+        return str(error)
+    return None
+
+
 def _block(study: Study, loop: Any, values: Mapping[str, Any], samples: Any, accepted: Any) -> dict[str, Any]:
     """Metrics and flags of a block of lanes, of which those run that are accepted."""
     keys = jax.vmap(lambda sample: noise_key(study.seed, sample))(samples)
-    done = run_batch(loop, Batch(values, keys), study.solver, study.objectives, together=False, accepted=accepted)
+    given = (loop, Batch(values, keys), study.solver, study.objectives)
+    done = run_batch(*given, together=False, accepted=accepted, engine=study.engine)
     return done.metrics | {"stopped": done.stopped, "diverged": done.diverged}

@@ -16,6 +16,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, problems, replace
 from diffabs.core.values import plain, unknown
+from diffabs.kernel import compilers
 from diffabs.objectives import usual
 from diffabs.simulate.refusals import ill
 from diffabs.simulate.solution import Solver, described
@@ -23,6 +24,7 @@ from diffabs.sweep.discrete import Categorical
 from diffabs.sweep.variables import Space
 
 DTYPES = ("float32", "float64")
+ENGINES = ("xla", "kernel")
 RANGES = {"samples": (1, 2**32 - 1), "chunk": (1, 2**20), "seed": (0, 2**32 - 1)}  # keys are folded with 32 bits
 NOISE = 2**32 - 1  # of the stream of keys, folded into the seed where the random design folds the number of a sample
 FLAGS = ("stopped", "diverged", "refused")
@@ -38,6 +40,8 @@ class Study:
     failures: metrics whose excess over a bound counts as a failure; so do, always, diverging, an end that the stop does
         not call a success, and the bounds that objectives have of their own (`failure`)
     chunk: lanes that are computed and stored together; results are the same to the bit for the same chunk
+    engine: "xla" or "kernel", what makes the runs (`simulate.batch.run_batch`); the bits differ, and for a kernel they
+        are those of a compiler and a processor, which are part of what the sweep is
     """
 
     loop: Loop
@@ -48,6 +52,7 @@ class Study:
     seed: int = 0
     chunk: int = 4096
     dtype: str = "float64"
+    engine: str = "xla"
     parts: Mapping[str, Mapping[str, Any]] = dataclasses.field(default_factory=dict)
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
@@ -101,9 +106,11 @@ class Study:
         return replace(self.loop, {path: self.parts[path][str(values[path])] for path in self.parts})
 
     def table(self) -> dict[str, Any]:
-        """Everything that decides the results, as values of JSON."""
+        """Everything that decides the results, as values of JSON. Raises NoCompiler for a kernel without one."""
         own: dict[str, Any] = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
         own |= {"failures": self.bounded, "success": self.success}
+        if self.engine != "xla":
+            own |= {"engine": {"name": self.engine, **compilers.described()}}
         return json.loads(
             json.dumps(
                 {
@@ -126,6 +133,8 @@ class Study:
                 yield f"{name} = {value} is outside [{least}, {most}]"
         if self.dtype not in DTYPES:
             yield f"dtype = {self.dtype} is neither {' nor '.join(DTYPES)}"
+        if self.engine not in ENGINES:
+            yield f"engine = {self.engine} is neither {' nor '.join(ENGINES)}"
         for name in ("step", "duration"):
             if not 0 < getattr(self.solver, name) < np.inf:
                 yield f"solver.{name} = {getattr(self.solver, name)} is not positive and finite"

@@ -1,0 +1,1 @@
+"""Functions of one lane as native code for many."""

@@ -1,0 +1,152 @@
+"""Rules of what moves the entries of an array, or makes one number of several."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from diffabs.kernel.elementwise import extreme
+from diffabs.kernel.graph import Array, Graph, Node
+from diffabs.kernel.primitives import Unsupported, each, entry, known, rule
+
+
+@rule("broadcast_in_dim", "shape broadcast_dimensions sharding")
+def _broadcast(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    shape = eqn.params["shape"]
+    wide = [1] * len(shape)
+    for i, dimension in enumerate(eqn.params["broadcast_dimensions"]):
+        wide[dimension] = ins[0].shape[i]
+    return [np.broadcast_to(ins[0].reshape(wide), shape)]
+
+
+@rule("reshape", "new_sizes dimensions sharding")
+@rule("squeeze", "dimensions")
+@rule("expand_dims", "dimensions")
+def _reshape(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    if eqn.primitive.name == "reshape" and eqn.params["dimensions"] is not None:
+        raise Unsupported("reshape", "in another order of dimensions")
+    return [ins[0].reshape(eqn.outvars[0].aval.shape)]
+
+
+@rule("slice", "start_indices limit_indices strides")
+def _slice(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    p = eqn.params
+    strides = p["strides"] or [1] * ins[0].ndim
+    return [ins[0][tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]]
+
+
+@rule("concatenate", "dimension")
+def _concatenate(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return [np.concatenate(ins, eqn.params["dimension"])]
+
+
+@rule("transpose", "permutation")
+def _transpose(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return [ins[0].transpose(eqn.params["permutation"])]
+
+
+@rule("rev", "dimensions")
+def _rev(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return [np.flip(ins[0], eqn.params["dimensions"])]
+
+
+@rule("stack", "axis")
+def _stack(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return [np.stack(ins, eqn.params["axis"])]
+
+
+@rule("unstack", "axis")
+def _unstack(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return [entry(x) for x in np.moveaxis(ins[0], eqn.params["axis"], 0)]
+
+
+@rule("split", "axis sizes")
+def _split(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return list(np.split(ins[0], np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"]))
+
+
+@rule("iota", "dtype shape dimension sharding")
+def _iota(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    shape, dimension = eqn.params["shape"], eqn.params["dimension"]
+    along = np.arange(shape[dimension], dtype=eqn.params["dtype"])
+    along = along.reshape([-1 if i == dimension else 1 for i in range(len(shape))])
+    return [known(graph, np.broadcast_to(along, shape))]
+
+
+JOINED: dict[str, str] = {"sum": "add", "prod": "mul"}
+
+
+@rule("reduce_sum", "axes out_sharding")
+@rule("reduce_prod", "axes out_sharding")
+@rule("reduce_max", "axes out_sharding")
+@rule("reduce_min", "axes out_sharding")
+@rule("reduce_and reduce_or", "axes")
+def _reduce(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """In pairs: a short chain."""
+    kind, x = eqn.primitive.name.removeprefix("reduce_"), ins[0]
+    name: Any = JOINED.get(kind, kind)
+
+    def join(a: Node, b: Node) -> Node:
+        return extreme(graph, name, a, b) if name in ("max", "min") else graph.op(name, a, b)
+
+    for axis in sorted(eqn.params["axes"], reverse=True):
+        rows = list(np.moveaxis(x, axis, 0)) or [_of_nothing(graph, eqn, np.delete(x.shape, axis))]
+        while len(rows) > 1:
+            pairs = [each(join, *rows[i : i + 2]) for i in range(0, len(rows) - 1, 2)]
+            rows = pairs + rows[2 * len(pairs) :]
+        x = entry(rows[0])
+    return [x]
+
+
+def _of_nothing(graph: Graph, eqn: Any, shape: Any) -> Array:
+    whole = {"reduce_sum": 0, "reduce_prod": 1, "reduce_and": True, "reduce_or": False}
+    if eqn.primitive.name not in whole:
+        raise Unsupported(eqn.primitive.name, "of nothing")
+    return known(graph, np.full(shape, whole[eqn.primitive.name], eqn.outvars[0].aval.dtype))
+
+
+@rule("cumsum", "axis reverse")
+def _cumsum(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    order = slice(None, None, -1 if eqn.params["reverse"] else 1)
+    rows = list(np.moveaxis(ins[0], eqn.params["axis"], 0)[order])
+    for i in range(1, len(rows)):
+        rows[i] = each(lambda a, b: graph.op("add", a, b), rows[i - 1], rows[i])
+    return [np.moveaxis(np.stack(rows)[order], 0, eqn.params["axis"])]
+
+
+@rule("argmin argmax", "axes index_dtype")
+def _first_extreme(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """The first of equal ones, or the first NaN."""
+    if len(eqn.params["axes"]) != 1:
+        raise Unsupported(eqn.primitive.name, "over several axes")
+    beyond = "lt" if eqn.primitive.name == "argmin" else "gt"
+    rows = np.moveaxis(ins[0], eqn.params["axes"][0], 0)
+    dtype = eqn.params["index_dtype"]
+
+    def first(*column: Node) -> Node:
+        place, best = graph.const(0, dtype), column[0]
+        for i, x in enumerate(column[1:], 1):
+            nan = graph.op("and", graph.op("ne", x, x), graph.op("eq", best, best))
+            better = graph.op("or", graph.op(beyond, x, best), nan)
+            place = graph.select(better, place, graph.const(i, dtype))
+            best = graph.select(better, best, x)
+        return place
+
+    return [each(first, *(entry(row) for row in rows))]
+
+
+@rule("dot_general", "dimension_numbers precision preferred_element_type out_sharding")
+def _dot(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    (left, right), batch = eqn.params["dimension_numbers"]
+    if any(batch):
+        raise Unsupported("dot_general", "of stacked arrays")
+    count = math.prod(ins[0].shape[i] for i in left)
+    a = np.moveaxis(ins[0], left, range(len(left))).reshape(count, -1)
+    b = np.moveaxis(ins[1], right, range(len(right))).reshape(count, -1)
+    out: Any = np.empty((a.shape[1], b.shape[1]), object)
+    for i, j in np.ndindex(out.shape):
+        terms = [graph.op("mul", a[k, i], b[k, j]) for k in range(count)]
+        out[i, j] = terms[0]
+        for term in terms[1:]:
+            out[i, j] = graph.op("add", out[i, j], term)
+    return [out.reshape(eqn.outvars[0].aval.shape)]

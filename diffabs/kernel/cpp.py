@@ -1,0 +1,304 @@
+"""A program as C++: a block of a few vectors of lanes, from their start to their end.
+
+Each line stands there once for every vector of the block, one after the other: while one waits for a result there is
+something to do for the next. A lane that has ended makes room for the next one, every so many steps."""
+
+import re
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from diffabs.kernel.graph import Level, Node, real
+from diffabs.kernel.program import Block, Branch, Place, Program, live, ordered
+
+SHORT = 24  # operations in a branch: fewer are worked out anyway
+TYPES = {
+    "float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "uint32": "u32", "uint64": "u64",
+}  # fmt: skip
+INFIX = {
+    "add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/", "and": "&", "or": "|", "xor": "^",
+    "shift_left": "<<", "shift_right_logical": ">>",
+}  # fmt: skip
+PREFIX = {"neg": "-", "not": "~"}
+NAMED = {
+    "lt": "lt", "le": "le", "eq": "eq", "ne": "ne", "max": "most", "min": "least", "lower": "lower", "higher": "higher", "abs": "size", "sqrt": "root",
+    "rint": "whole", "floor": "down", "ceil": "up", "rem": "rest", "is_finite": "finite",
+    **{name: f"k_{name}" for name in (
+        "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan", "asin", "acos", "sinh", "cosh", "atan2",
+        "pow")},
+}  # fmt: skip
+
+
+class Shape(NamedTuple):
+    """How a program is run: vectors in a block; steps between two calls of `renew`; of these, rounds between two looks
+    for lanes that have ended."""
+
+    vectors: int
+    steps: int
+    rounds: int
+
+
+def text(program: Program, shape: Shape) -> str:
+    """Return the C++ of a program with the functions `renew`, `step` (carry to carry) and `running` (to one truth)."""
+    return "\n".join(_Text(program, shape).parts()) + "\n"
+
+
+def truth(dtype: np.dtype) -> bool:
+    """Return whether numbers of this type are truths."""
+    return dtype.kind == "b"
+
+
+def kind(dtype: np.dtype) -> str:
+    """Return the type of one number."""
+    return "u8" if truth(dtype) else TYPES[dtype.name]
+
+
+def vector(dtype: np.dtype) -> str:
+    """Return the type of a vector of them."""
+    return "mask" if truth(dtype) else "v" + TYPES[dtype.name]
+
+
+def reads(node: Node) -> tuple[Node, ...]:
+    """Return what an operation reads by name; the entries of a table lie in a column."""
+    return node.args[:1] if node.op == "table" else node.args
+
+
+def literal(node: Node) -> str:
+    """Return a known number in every lane."""
+    x = node.attr
+    if truth(node.dtype):
+        return f"all({'true' if x else 'false'})"
+    name = TYPES[node.dtype.name]
+    if not real(node.dtype):
+        ends = {"i32": "", "u32": "u", "i64": "ll", "u64": "ull"}[name]
+        number = (
+            f"INT{x.itemsize * 8}_MIN" if node.dtype.kind == "i" and x == np.iinfo(x.dtype).min else f"{int(x)}{ends}"
+        )
+        return f"all(({name}){number})"
+    if np.isnan(x):
+        return f"all(({name})NAN)"
+    if np.isinf(x):
+        return f"all(({name}){'-' if x < 0 else ''}INFINITY)"
+    return f"all(({name}){float(x).hex()})"
+
+
+class _Text:
+    def __init__(self, program: Program, shape: Shape):
+        self.program, self.shape = program, shape
+        self.roots = [node for nodes in program.results.values() for node in nodes]
+        nodes = live(self.roots)
+        self.alive = {node.id for node in nodes}
+        self.columns: dict[tuple[int, ...], tuple[str, Node]] = {}
+        for node in nodes:
+            if node.op == "table":
+                key = tuple(x.id for x in node.args[1:])
+                self.columns.setdefault(key, (f"t{len(self.columns)}", node))
+        lanes = self._read([node for node in nodes if node.level == Level.STEP], self.roots, Level.LANE)
+        self.lanes = [node for node in nodes if node.id in lanes]
+        below = [node for node in nodes if node.level >= Level.LANE]
+        shared = self._read(below, self.roots, Level.UNIFORM)
+        self.shared = [node for node in nodes if node.id in shared and node.op != "const"]
+
+    @staticmethod
+    def _read(readers: list[Node], roots: list[Node], level: Level) -> set[int]:
+        """The numbers of a level's nodes that are read from elsewhere."""
+        read = {arg.id for node in readers if node.level > level for arg in reads(node) if arg.level == level}
+        return read | {root.id for root in roots if root.level == level}
+
+    def parts(self) -> Iterator[str]:
+        """The parts of the text, in their order."""
+        single = "#define SINGLE\n" if self.program.dtype == np.float32 else ""
+        yield f'{single}#include "functions.h"\nenum {{ VECTORS = {self.shape.vectors}, SLOTS = VECTORS*LANES }};'
+        sizes = self.program.sizes
+        counts = zip(("UNIFORM", "OF_LANES", "CARRIED"), (len(sizes[level]) for level in sizes), strict=True)
+        yield "enum { " + ", ".join(f"{name} = {count}" for name, count in counts) + " };"
+        kinds = {place.array: kind(node.dtype) for place, node in self._given(Level.STEP)}
+        widths = [f"{size}*sizeof({kinds.get(i, 'u8')})" for i, size in enumerate(sizes[Level.STEP])]
+        yield f"static const i64 WIDTHS[] = {{{', '.join(map(str, widths))}}};"
+        yield from self._structures()
+        yield from self._prepare()
+        yield from self._begin()
+        for name in ("renew", "step"):
+            yield from self._function(name)
+        yield from self._running()
+        yield from self._moves()
+        yield f"enum {{ STEPS = {self.shape.steps}, ROUNDS = {self.shape.rounds} }};"
+        yield '#include "drive.h"'
+
+    def _given(self, level: Level) -> list[tuple[Place, Node]]:
+        return [
+            (p, n)
+            for p, n in self.program.inputs.items()
+            if p.level == level and (level == Level.STEP or n.id in self.alive)
+        ]
+
+    def _structures(self) -> Iterator[str]:
+        """What all lanes share, and a block of lanes: carry, inputs of the lanes, and what follows from these."""
+        shared = [f"{kind(node.dtype)} v{node.id};" for node in self.shared]
+        tables = [f"{kind(n.args[1].dtype)} {name}[{len(n.args) - 1}];" for name, n in self.columns.values()]
+        yield "struct Shared { " + " ".join([*shared, *tables]) + " int none; };"
+        carried = [f"{vector(n.dtype)} c{n.id}[VECTORS];" for _, n in self._given(Level.STEP)]
+        lanes = {n.id: n for n in [*(n for _, n in self._given(Level.LANE)), *self.lanes]}
+        own = [f"{vector(n.dtype)} l{n.id}[VECTORS];" for n in lanes.values() if n.op != "const"]
+        yield "struct Block { " + " ".join([*carried, *own]) + " int none; };"
+
+    def _prepare(self) -> Iterator[str]:
+        """static void prepare(Shared&, arrays): what is the same for all lanes."""
+        yield "static void prepare(Shared& s, const Array* uniform) { (void)s; (void)uniform;"
+        for place, node in self._given(Level.UNIFORM):
+            value = f"((const {kind(node.dtype)}*)uniform[{place.array}].data)[{place.entry}]"
+            yield "  " + _spread(node, value)
+        columns = [x for _, node in self.columns.values() for x in node.args[1:]]
+        wanted = [node for node in [*self.shared, *columns] if node.level == Level.UNIFORM]
+        yield from self._lines(ordered(wanted, Level.UNIFORM), 0, "  ")
+        for node in self.shared:
+            yield f"  s.v{node.id} = first(v{node.id});"
+        for name, node in self.columns.values():
+            for i, x in enumerate(node.args[1:]):
+                yield f"  s.{name}[{i}] = first({self._name(x, 0)});"
+        yield "}"
+
+    def _begin(self) -> Iterator[str]:
+        """static void begin(Block&, const Shared&, int q): what follows from the inputs of the lanes of vector q."""
+        yield "static void begin(Block& b, const Shared& s, int q) { (void)b; (void)s; (void)q;"
+        yield from self._uniform([node for node in live(self.lanes) if node.level == Level.LANE])
+        for _, node in self._given(Level.LANE):
+            yield f"  const {vector(node.dtype)} v{node.id}_0 = b.l{node.id}[q];"
+        yield from self._lines(ordered(self.lanes, Level.LANE), 0, "  ")
+        for node in self.lanes:
+            if node.op not in ("input", "const"):
+                yield f"  b.l{node.id}[q] = v{node.id}_0;"
+        yield "}"
+
+    def _function(self, name: str) -> Iterator[str]:
+        """static void NAME(Block&, const Shared&): a function of the carry, of all vectors."""
+        carried, results = self.program.carried(), self.program.results[name]
+        changed = [(c, r) for c, r in zip(carried, results, strict=True) if c is not r]
+        yield f"static __attribute__((noinline)) void {name}(Block& b, const Shared& s) {{ (void)b; (void)s;"
+        yield from self._body([r for _, r in changed])
+        for q in range(self.shape.vectors):
+            for c, r in changed:
+                yield f"  b.c{c.id}[{q}] = {self._name(r, q)};"
+        yield "}"
+
+    def _running(self) -> Iterator[str]:
+        """static void running(const Block&, const Shared&, mask*): whether each lane goes on."""
+        (root,) = self.program.results["running"]
+        yield "static void running(const Block& b, const Shared& s, mask* on) { (void)b; (void)s;"
+        yield from self._body([root])
+        for q in range(self.shape.vectors):
+            yield f"  on[{q}] = {self._name(root, q)};"
+        yield "}"
+
+    def _body(self, roots: list[Node]) -> Iterator[str]:
+        nodes = live(roots)
+        own = {node.id for node in nodes}
+        steps = [node for node in nodes if node.level == Level.STEP]
+        yield from self._uniform([*steps, *roots])
+        read = [*roots, *(x for node in steps for x in reads(node))]
+        lanes = {x.id: x for x in read if x.level == Level.LANE}
+        for q in range(self.shape.vectors):
+            for node in self.program.carried():
+                if node.id in own:
+                    yield f"  const {vector(node.dtype)} v{node.id}_{q} = b.c{node.id}[{q}];"
+            for node in lanes.values():
+                yield f"  const {vector(node.dtype)} v{node.id}_{q} = b.l{node.id}[{q}];"
+        yield from self._lines(ordered(roots, Level.STEP), self.shape.vectors, "  ")
+
+    def _uniform(self, readers: list[Node]) -> Iterator[str]:
+        """What all lanes share of what these read."""
+        shared = {node.id for node in self.shared}
+        read = {x.id: x for node in readers for x in (node, *reads(node)) if x.id in shared}
+        for node in read.values():
+            yield "  " + _spread(node, f"s.v{node.id}")
+
+    def _moves(self) -> Iterator[str]:
+        """Functions that put a lane into a place of the block, and take its carry out."""
+        yield "static void put(Block& b, int p, i64 j, const Array* lanes, const Array* carry) {"
+        yield "  const int i = p/LANES, q = p%LANES; (void)lanes;"
+        for places, name, array in ((Level.LANE, "l", "lanes"), (Level.STEP, "c", "carry")):
+            for place, node in self._given(places):
+                size = self.program.sizes[places][place.array]
+                value = f"((const {kind(node.dtype)}*){array}[{place.array}].data)[j*{size} + {place.entry}]"
+                target = f"b.{name}{node.id}[i]"
+                yield f"  set({target}, q, {value});" if truth(node.dtype) else f"  {target}[q] = {value};"
+        yield "}\nstatic void take(const Block& b, int p, i64 j, const Array* carry) {"
+        yield "  const int i = p/LANES, q = p%LANES;"
+        for place, node in self._given(Level.STEP):
+            size, value = self.program.sizes[Level.STEP][place.array], f"b.c{node.id}[i]"
+            value = f"get({value}, q)" if truth(node.dtype) else f"{value}[q]"
+            yield f"  (({kind(node.dtype)}*)carry[{place.array}].data)[j*{size} + {place.entry}] = {value};"
+        yield "}"
+
+    # operations -------------------------------------------------------------------------------------------------------
+
+    def _lines(self, block: Block, vectors: int, indent: str) -> Iterator[str]:
+        """The lines of a block, for so many vectors; 0 where there is one."""
+        for item in block:
+            if isinstance(item, Branch):
+                yield from self._branch(item, vectors, indent)
+            else:
+                for q in range(max(vectors, 1)):
+                    yield f"{indent}const {vector(item.dtype)} {self._name(item, q)} = {self._expression(item, q)};"
+
+    def _branch(self, branch: Branch, vectors: int, indent: str) -> Iterator[str]:
+        """A branch that is worth a jump, if any lane goes there; in the lanes that do not, its results do not count."""
+        count = max(vectors, 1)
+        if branch.size < SHORT + len(branch.gates):
+            yield from self._lines(branch.no, vectors, indent)
+            yield from self._lines(branch.yes, vectors, indent)
+            for gate in branch.gates:
+                for q in range(count):
+                    which, no, yes = (self._name(x, q) for x in gate.args)
+                    yield f"{indent}const {vector(gate.dtype)} {self._name(gate, q)} = sel({which}, {yes}, {no});"
+            return
+        for gate in branch.gates:
+            yield indent + f"{vector(gate.dtype)} " + ", ".join(self._name(gate, q) for q in range(count)) + ";"
+        which = [self._name(branch.which, q) for q in range(count)]
+        yield from self._lines(branch.no, vectors, indent)
+        yield f"{indent}if (any({' | '.join(which)})) {{"
+        yield from self._lines(branch.yes, vectors, indent + "  ")
+        for gate in branch.gates:
+            for q in range(count):
+                one, no, yes = (self._name(x, q) for x in gate.args)
+                yield f"{indent}  {self._name(gate, q)} = sel({one}, {yes}, {no});"
+        yield indent + "} else {"
+        for gate in branch.gates:
+            for q in range(count):
+                yield f"{indent}  {self._name(gate, q)} = {self._name(gate.args[1], q)};"
+        yield indent + "}"
+
+    def _name(self, node: Node, q: int) -> str:
+        if node.op == "const":
+            return literal(node)
+        return f"v{node.id}" if node.level == Level.UNIFORM else f"v{node.id}_{q}"
+
+    def _expression(self, node: Node, q: int) -> str:
+        args = [self._name(x, q) for x in node.args]
+        if node.op in INFIX:
+            return f"{args[0]} {INFIX[node.op]} {args[1]}"
+        if node.op in PREFIX:
+            return PREFIX[node.op] + args[0]
+        if node.op in NAMED:
+            return f"{NAMED[node.op]}({', '.join(args)})"
+        if node.op == "select":
+            return f"sel({args[0]}, {args[2]}, {args[1]})"
+        if node.op == "convert":
+            return f"to({args[0]}, {vector(node.dtype)}{{}})"
+        if node.op == "bits":
+            return f"({vector(node.dtype)}){args[0]}"
+        if node.op == "any":
+            return args[0]
+        assert node.op == "table", node.op
+        return f"entry(s.{self.columns[tuple(x.id for x in node.args[1:])][0]}, {args[0]})"
+
+
+def _spread(node: Node, value: str) -> str:
+    """A number of all lanes, in every lane."""
+    return f"const {vector(node.dtype)} v{node.id} = all({'(bool)' if truth(node.dtype) else ''}{value});"
+
+
+def operations(source: str) -> int:
+    """Return how many operations a text has for each vector of lanes."""
+    return len(re.findall(r"^ +(?:const )?\w+ v\d+_0 = ", source, re.MULTILINE))

@@ -1,0 +1,136 @@
+"""Random numbers, as JAX draws them: its own functions of a key, of which only the hash is written out here."""
+
+import math
+from typing import Any
+
+import jax
+import jax.extend.random as jer
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.kernel.graph import Array, Graph, Node
+from diffabs.kernel.primitives import Unsupported, called, each, known, rule
+
+MANY = 16  # numbers that are drawn at once, at most
+PARITY = 0x1BD11BDA  # of Threefry's key schedule
+TURNS = ((13, 15, 26, 6), (17, 29, 16, 24))  # places by which its words are turned, in rounds of four
+
+
+def key_shape(aval: Any) -> tuple[tuple[int, ...], np.dtype]:
+    """Return shape and type of an array, of the data of a key if it is one. Raises Unsupported for other generators."""
+    if not jnp.issubdtype(aval.dtype, jax.dtypes.prng_key):
+        return aval.shape, np.dtype(aval.dtype)
+    if str(aval.dtype) != "key<fry>":
+        raise Unsupported("random_bits", f"of the generator {aval.dtype}")
+    return (*aval.shape, 2), np.dtype(np.uint32)
+
+
+@rule("random_wrap", "impl")
+@rule("random_unwrap")
+def _wrapped(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    key_shape((eqn.outvars if eqn.primitive.name == "random_wrap" else eqn.invars)[0].aval)
+    return ins
+
+
+@rule("random_fold_in")
+def _fold_in(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    if key_shape(eqn.invars[0].aval)[0] != (2,) or ins[1].ndim:
+        raise Unsupported("random_fold_in", "of several keys")
+    fold = jer.threefry_prng_impl.fold_in
+    program = jax.make_jaxpr(fold)(*(jax.ShapeDtypeStruct(*one) for one in (((2,), np.uint32), ((), np.uint32))))
+    return called(graph, program, [ins[0], each(lambda x: graph.convert(x, np.uint32), ins[1])])
+
+
+@rule("random_bits", "bit_width shape")
+def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    width, shape = eqn.params["bit_width"], eqn.params["shape"]
+    if key_shape(eqn.invars[0].aval)[0] != (2,) or math.prod(shape) > MANY:
+        raise Unsupported("random_bits", f"of {math.prod(shape)} numbers at once, or of several keys")
+    draw = jax.make_jaxpr(lambda key: jer.threefry_prng_impl.random_bits(key, width, shape))
+    return called(graph, draw(jax.ShapeDtypeStruct((2,), np.uint32)), ins)
+
+
+@rule("iota_2x32_shape", "shape")
+def _counted(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """The places of an array, in two words each."""
+    places = np.arange(math.prod(eqn.params["shape"]), dtype=np.uint32).reshape(eqn.params["shape"])
+    return [known(graph, 0 * places), known(graph, places)]
+
+
+@rule("threefry2x32")
+def _threefry(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """Salmon, Moraes, Dror and Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011), 20 rounds."""
+    return [each(lambda *words, i=i: threefry(graph, *words)[i], *ins) for i in range(2)]
+
+
+def threefry(graph: Graph, k0: Node, k1: Node, x0: Node, x1: Node) -> tuple[Node, Node]:
+    """Return the two words that the key (k0, k1) makes of (x0, x1)."""
+
+    def word(value: int) -> Node:
+        return graph.const(value, np.uint32)
+
+    keys = [k0, k1, graph.op("xor", graph.op("xor", k0, k1), word(PARITY))]
+    x0, x1 = graph.op("add", x0, keys[0]), graph.op("add", x1, keys[1])
+    for i in range(5):
+        for places in TURNS[i % 2]:
+            x0 = graph.op("add", x0, x1)
+            high, low = (
+                graph.op("shift_left", x1, word(places)),
+                graph.op("shift_right_logical", x1, word(32 - places)),
+            )
+            x1 = graph.op("xor", graph.op("or", high, low), x0)
+        x0 = graph.op("add", x0, keys[(i + 1) % 3])
+        x1 = graph.op("add", graph.op("add", x1, keys[(i + 2) % 3]), word(i + 1))
+    return x0, x1
+
+
+# M. Giles, Approximating the erfinv function (2012): polynomials in w = -log(1 - x^2), highest power first, each for a
+# range of w, in the variable of the range. These are those that XLA has.
+SINGLE = (
+    (5.0, lambda graph, w: graph.op("sub", w, graph.const(2.5, w.dtype)), (
+        2.81022636e-08, 3.43273939e-07, -3.5233877e-06, -4.39150654e-06, 0.00021858087, -0.00125372503, -0.00417768164,
+        0.246640727, 1.50140941)),
+    (math.inf, lambda graph, w: graph.op("sub", graph.op("sqrt", w), graph.const(3.0, w.dtype)), (
+        -0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773, -0.0076224613, 0.00943887047,
+        1.00167406, 2.83297682)),
+)  # fmt: skip
+DOUBLE = (
+    (6.25, lambda graph, w: graph.op("sub", w, graph.const(3.125, w.dtype)), (
+        -3.6444120640178196996e-21, -1.685059138182016589e-19, 1.2858480715256400167e-18, 1.115787767802518096e-17,
+        -1.333171662854620906e-16, 2.0972767875968561637e-17, 6.6376381343583238325e-15, -4.0545662729752068639e-14,
+        -8.1519341976054721522e-14, 2.6335093153082322977e-12, -1.2975133253453532498e-11, -5.4154120542946279317e-11,
+        1.051212273321532285e-09, -4.1126339803469836976e-09, -2.9070369957882005086e-08, 4.2347877827932403518e-07,
+        -1.3654692000834678645e-06, -1.3882523362786468719e-05, 0.0001867342080340571352, -0.00074070253416626697512,
+        -0.0060336708714301490533, 0.24015818242558961693, 1.6536545626831027356)),
+    (16.0, lambda graph, w: graph.op("sub", graph.op("sqrt", w), graph.const(3.25, w.dtype)), (
+        2.2137376921775787049e-09, 9.0756561938885390979e-08, -2.7517406297064545428e-07, 1.8239629214389227755e-08,
+        1.5027403968909827627e-06, -4.013867526981545969e-06, 2.9234449089955446044e-06, 1.2475304481671778723e-05,
+        -4.7318229009055733981e-05, 6.8284851459573175448e-05, 2.4031110387097893999e-05, -0.0003550375203628474796,
+        0.00095328937973738049703, -0.0016882755560235047313, 0.0024914420961078508066, -0.0037512085075692412107,
+        0.005370914553590063617, 1.0052589676941592334, 3.0838856104922207635)),
+    (math.inf, lambda graph, w: graph.op("sub", graph.op("sqrt", w), graph.const(5.0, w.dtype)), (
+        -2.7109920616438573243e-11, -2.5556418169965252055e-10, 1.5076572693500548083e-09, -3.7894654401267369937e-09,
+        7.6157012080783393804e-09, -1.4960026627149240478e-08, 2.9147953450901080826e-08, -6.7711997758452339498e-08,
+        2.2900482228026654717e-07, -9.9298272942317002539e-07, 4.5260625972231537039e-06, -1.9681778105531670567e-05,
+        7.5995277030017761139e-05, -0.00021503011930044477347, -0.00013871931833623122026, 1.0103004648645343977,
+        4.8499064014085844221)),
+)  # fmt: skip
+
+
+@rule("erf_inv", "accuracy")
+def _erf_inv(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return [each(lambda x: erf_inv(graph, x), *ins)]
+
+
+def erf_inv(graph: Graph, x: Node) -> Node:
+    """Return y with erf(y) = x: infinite at the ends of [-1, 1], NaN beyond."""
+    w = graph.op("neg", graph.op("log1p", graph.op("neg", graph.op("mul", x, x))))
+    found: Node | None = None
+    for most, shifted, powers in reversed(SINGLE if x.dtype == np.float32 else DOUBLE):
+        at, y = shifted(graph, w), graph.const(powers[0], x.dtype)
+        for power in powers[1:]:
+            y = graph.op("add", graph.op("mul", y, at), graph.const(power, x.dtype))
+        found = y if found is None else graph.select(graph.op("lt", w, graph.const(most, x.dtype)), found, y)
+    assert found is not None
+    ends = graph.op("eq", graph.op("abs", x), graph.const(1, x.dtype))
+    return graph.select(ends, graph.op("mul", found, x), graph.op("mul", x, graph.const(np.inf, x.dtype)))

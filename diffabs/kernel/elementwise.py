@@ -1,0 +1,183 @@
+"""Rules of operations on arrays, number by number."""
+
+from typing import Any
+
+import numpy as np
+
+from diffabs.kernel.graph import Array, Graph, Node, real
+from diffabs.kernel.primitives import Unsupported, each, rule
+
+
+@rule("and or xor not neg sqrt exp log log1p expm1 sin cos tan tanh atan asin acos sinh cosh atan2", "accuracy")
+@rule("div sub is_finite floor ceil eq ne lt le gt ge pow", "accuracy")
+@rule("add mul", "out_dtype")
+def _same(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    name = eqn.primitive.name
+    if eqn.params.get("accuracy") is not None:
+        raise Unsupported(name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
+    if eqn.params.get("out_dtype") not in (None, eqn.outvars[0].aval.dtype):
+        raise Unsupported(name, f"its result is to be {eqn.params['out_dtype']}")
+    if name == "div" and not real(eqn.outvars[0].aval.dtype):
+        return [each(lambda x, y: _quotient(graph, x, y), *ins)]
+    return [each(lambda *x: graph.op(name, *x), *ins)]
+
+
+def _quotient(graph: Graph, x: Node, y: Node) -> Node:
+    """Of whole numbers, towards zero; as XLA has it by 0, where a processor ends the process, -1, and all bits."""
+    zero, one = graph.const(0, y.dtype), graph.const(1, y.dtype)
+    nothing, turned = graph.op("eq", y, zero), graph.const(False)
+    if y.dtype.kind == "i":
+        turned = graph.op("eq", y, graph.const(-1, y.dtype))  # of the least number that, too, ends the process
+    found = graph.op("quotient", x, graph.select(graph.op("or", nothing, turned), y, one))
+    found = graph.select(turned, found, graph.op("neg", x) if y.dtype.kind == "i" else x)
+    return graph.select(nothing, found, graph.op("not", zero))
+
+
+@rule("add_any")
+def _sum_of_tangents(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return [each(lambda x, y: graph.op("add", x, y), *ins)]
+
+
+@rule("stop_gradient copy copy_p optimization_barrier pvary")
+def _unchanged(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return ins
+
+
+@rule("max min")
+def _extreme(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """NaN if either is."""
+    return [each(lambda x, y: extreme(graph, eqn.primitive.name, x, y), *ins)]
+
+
+def extreme(graph: Graph, name: str, x: Node, y: Node) -> Node:
+    """Return the larger or smaller of two numbers; NaN if either is."""
+    if x is y:
+        return x
+    if x.dtype == bool:
+        return graph.op("or" if name == "max" else "and", x, y)
+    return graph.op(name, x, y)
+
+
+@rule("abs")
+def _abs(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return [each(lambda x: graph.op("abs", x), *ins)]
+
+
+@rule("sign")
+def _sign(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """NaN and zeros are their own sign."""
+
+    def sign(x: Node) -> Node:
+        zero, one, less = (graph.const(value, x.dtype) for value in (0, 1, -1 if x.dtype.kind != "u" else 0))
+        low = graph.select(graph.op("lt", x, zero), x, less)
+        return graph.select(graph.op("gt", x, zero), low, one)
+
+    return [each(sign, *ins)]
+
+
+@rule("square")
+def _square(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return [each(lambda x: graph.op("mul", x, x), *ins)]
+
+
+@rule("integer_pow", "y")
+def _integer_pow(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    def power(x: Node) -> Node:
+        n, result = abs(eqn.params["y"]), None
+        while n:
+            if n & 1:
+                result = x if result is None else graph.op("mul", result, x)
+            n >>= 1
+            x = graph.op("mul", x, x) if n else x
+        one = graph.const(1, x.dtype)
+        return (result or one) if eqn.params["y"] >= 0 else graph.op("div", one, result or one)
+
+    return [each(power, *ins)]
+
+
+@rule("rsqrt logistic", "accuracy")
+def _inverse(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    if eqn.params["accuracy"] is not None:
+        raise Unsupported(eqn.primitive.name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
+
+    def inverse(x: Node) -> Node:
+        one = graph.const(1, x.dtype)
+        if eqn.primitive.name == "rsqrt":
+            return graph.op("div", one, graph.op("sqrt", x))
+        return graph.op("div", one, graph.op("add", one, graph.op("exp", graph.op("neg", x))))
+
+    return [each(inverse, *ins)]
+
+
+@rule("rem")
+def _rem(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    if ins[1].size and not real(ins[1].flat[0].dtype) and any(x.op != "const" or x.attr == 0 for x in ins[1].flat):
+        return [each(lambda x, y: _whole_rest(graph, x, y), *ins)]
+    return [each(lambda x, y: graph.op("rem", x, y), *ins)]
+
+
+def _whole_rest(graph: Graph, x: Node, y: Node) -> Node:
+    """By 0 the rest is the number itself, and not the end of the process."""
+    zero = graph.op("eq", y, graph.const(0, y.dtype))
+    return graph.select(zero, graph.op("rem", x, graph.select(zero, y, graph.const(1, y.dtype))), x)
+
+
+@rule("round", "rounding_method")
+def _round(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    if eqn.params["rounding_method"].name == "TO_NEAREST_EVEN":
+        return [each(lambda x: graph.op("rint", x), *ins)]
+
+    def away(x: Node) -> Node:
+        """A half goes away from zero. What the size lacks to its whole part is exact, and its half plus 1/2 is not."""
+        size = graph.op("abs", x)
+        down = graph.op("floor", size)
+        up = graph.op("ge", graph.op("sub", size, down), graph.const(0.5, x.dtype))
+        size = graph.select(up, down, graph.op("add", down, graph.const(1, x.dtype)))
+        return graph.select(graph.op("lt", x, graph.const(0, x.dtype)), size, graph.op("neg", size))
+
+    return [each(away, *ins)]
+
+
+@rule("select_n")
+def _select(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    which, *cases = ins
+    if len(cases) != 2 or eqn.invars[0].aval.dtype != bool:
+        raise Unsupported("select_n", f"between {len(cases)} cases")
+    return [each(graph.select, which, *cases)]
+
+
+@rule("clamp")
+def _clamp(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    low, x, high = ins
+    return [each(lambda a, b, c: extreme(graph, "min", extreme(graph, "max", a, b), c), low, x, high)]
+
+
+@rule("convert_element_type", "new_dtype weak_type sharding")
+def _convert(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return [each(lambda x: graph.convert(x, eqn.params["new_dtype"]), *ins)]
+
+
+@rule("bitcast_convert_type", "new_dtype")
+def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    if eqn.invars[0].aval.dtype.itemsize != np.dtype(eqn.params["new_dtype"]).itemsize:
+        raise Unsupported("bitcast_convert_type", "between types of different sizes")
+    return [each(lambda x: graph.bits(x, eqn.params["new_dtype"]), *ins)]
+
+
+@rule("shift_left shift_right_logical")
+def _shift(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """By as many places as there are, or more, nothing is left."""
+    name = eqn.primitive.name
+
+    def shift(x: Node, by: Node) -> Node:
+        if name == "shift_right_logical" and x.dtype.kind == "i":
+            raise Unsupported(name, "of a number with a sign")
+        count, zero = 8 * x.dtype.itemsize, graph.const(0, x.dtype)
+        if by.op == "const":
+            return graph.op(name, x, by) if 0 <= by.attr < count else zero
+        inside = graph.op("lt", by, graph.const(count, by.dtype))
+        if by.dtype.kind == "i":
+            inside = graph.op("and", inside, graph.op("ge", by, graph.const(0, by.dtype)))
+        return graph.select(inside, zero, graph.op(name, x, graph.select(inside, graph.const(0, by.dtype), by)))
+
+    return [each(shift, *ins)]

@@ -1,0 +1,296 @@
+"""A program of single numbers: operations that are numbered by what they compute, so that nothing is computed twice.
+
+A node has a level: how often its value changes. What is known now is folded; what is the same for all lanes is worked
+out once, what belongs to a lane once when that begins, and only the rest in every step."""
+
+import enum
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Array = Any  # of nodes, of NumPy
+
+
+class Level(enum.IntEnum):
+    """How often a value changes: never, with the launch, with the lane, with the step."""
+
+    KNOWN, UNIFORM, LANE, STEP = range(4)
+
+
+class Node:
+    """A number: an operation on others. `attr` is what is particular to it: a constant's value, an input's place."""
+
+    __slots__ = ("args", "attr", "dtype", "id", "level", "op")
+
+    def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: Any, level: Level):
+        """Made by a `Graph` alone."""
+        self.id, self.op, self.args, self.dtype, self.attr, self.level = id, op, args, dtype, attr, level
+
+    def is_number(self, value: float) -> bool:
+        """Whether it is known to be this number."""
+        return self.op == "const" and bool(self.attr == value)
+
+
+class Gate(NamedTuple):
+    """A conditional: its number, and whether it is enough to know that any lane takes it."""
+
+    number: int
+    any: bool
+
+
+COMPARED: dict[str, Any] = {
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+}
+FOLDED: dict[str, Any] = COMPARED | {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "rem": np.fmod,
+    "quotient": lambda x, y: (np.abs(x) // np.abs(y)) * np.sign(x) * np.sign(y),
+    "max": np.maximum,
+    "min": np.minimum,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+    "not": np.invert,
+    "neg": np.negative,
+    "abs": np.abs,
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "log": np.log,
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "rint": np.rint,
+    "is_finite": np.isfinite,
+    "shift_left": np.left_shift,
+    "shift_right_logical": np.right_shift,
+}
+SYMMETRIC = {"add", "mul", "and", "or", "xor", "eq", "ne"}
+MIRRORED = {"gt": "lt", "ge": "le"}  # of the other operands in turn
+CONTRARY = {"eq": "ne", "ne": "eq"}  # of the ordered ones NaN is not the contrary
+
+
+class Graph:
+    """Nodes, numbered from arguments to results; equal ones are one."""
+
+    def __init__(self) -> None:
+        """Without nodes."""
+        self.nodes: list[Node] = []
+        self._known: dict[Any, Node] = {}
+        self._gates = 0
+
+    def _make(self, op: str, args: tuple[Node, ...], dtype: Any, attr: Any = None, level: Level | None = None) -> Node:
+        dtype = np.dtype(dtype)
+        key = (op, tuple(arg.id for arg in args), dtype, attr)
+        if key not in self._known:
+            most = max((Level.UNIFORM, *(arg.level for arg in args))) if level is None else level
+            self.nodes.append(Node(len(self.nodes), op, args, dtype, attr, most))
+            self._known[key] = self.nodes[-1]
+        return self._known[key]
+
+    def const(self, value: Any, dtype: Any = None) -> Node:
+        """Return a known number."""
+        x = np.asarray(value, dtype)[()]
+        key = ("const", x.dtype, x.tobytes())
+        if key not in self._known:
+            self.nodes.append(Node(len(self.nodes), "const", (), x.dtype, x, Level.KNOWN))
+            self._known[key] = self.nodes[-1]
+        return self._known[key]
+
+    def input(self, dtype: Any, level: Level, place: Any) -> Node:
+        """Return a number that comes from outside, from this place."""
+        return self._make("input", (), dtype, place, level)
+
+    def op(self, name: str, *args: Node) -> Node:
+        """Return an operation on numbers of one type: one of `FOLDED`, or a function that a back end has."""
+        boolean = name in COMPARED or name == "is_finite"
+        dtype = np.dtype(bool) if boolean else args[0].dtype
+        if name in FOLDED and all(arg.op == "const" for arg in args):
+            with np.errstate(all="ignore"):
+                return self.const(FOLDED[name](*(arg.attr for arg in args)), dtype)
+        if name in MIRRORED:
+            name, args = MIRRORED[name], args[::-1]
+        found = _SIMPLER[name](self, *args) if name in _SIMPLER else None
+        if found is not None:
+            return found
+        if name in SYMMETRIC and args[0].id > args[1].id:
+            args = args[::-1]
+        return self._make(name, args, dtype)
+
+    def select(self, which: Node, no: Node, yes: Node) -> Node:
+        """Return yes where `which`, else no."""
+        if which.op == "const" or no is yes:
+            return yes if no is yes or which.attr else no
+        if which.op == "not":
+            return self.select(which.args[0], yes, no)
+        if no.dtype == bool:
+            return self._decided(which, no, yes)
+        yes = yes.args[2] if yes.op == "select" and yes.args[0] is which else yes
+        no = no.args[1] if no.op == "select" and no.args[0] is which else no
+        if no is yes:
+            return yes
+        if which.op == "lt" and {yes, no} == set(which.args):
+            return self._make("lower" if yes is which.args[0] else "higher", (yes, no), yes.dtype)
+        return self._make("select", (which, no, yes), yes.dtype)
+
+    def _decided(self, which: Node, no: Node, yes: Node) -> Node:
+        """A selection of truths is a truth."""
+        if yes.op == "const":
+            return self.op("or", which, no) if yes.attr else self.op("and", self.op("not", which), no)
+        if no.op == "const":
+            return self.op("or", self.op("not", which), yes) if no.attr else self.op("and", which, yes)
+        return self.op("or", self.op("and", which, yes), self.op("and", self.op("not", which), no))
+
+    def gate(self, which: Node, no: Iterable[Node], yes: Iterable[Node]) -> list[Node]:
+        """Return a selection that a program may make by going one way only: `which`, or whether any lane does."""
+        pairs = list(zip(no, yes, strict=True))
+        asked = which.args[0] if which.op == "any" else which
+        if asked.op == "const":
+            return [b if asked.attr else a for a, b in pairs]
+        gate, self._gates = Gate(self._gates, which.op == "any"), self._gates + 1
+        return [b if a is b else self._gated(gate, asked, a, b) for a, b in pairs]
+
+    def _gated(self, gate: Gate, which: Node, no: Node, yes: Node) -> Node:
+        if gate.any and no.op == "const":  # a placeholder: the lanes that ask get what is computed
+            return yes
+        return self._make("gate", (which, no, yes), yes.dtype, gate)
+
+    def any(self, which: Node) -> Node:
+        """Return a truth of a lane, of which it matters whether it is that of any lane."""
+        return which if which.op in ("const", "any") else self._make("any", (which,), bool)
+
+    def convert(self, x: Node, dtype: Any) -> Node:
+        """Return a number as one of another type; of a number, whether it is not 0."""
+        dtype = np.dtype(dtype)
+        if x.dtype == dtype:
+            return x
+        if x.op == "const":
+            with np.errstate(all="ignore"):
+                return self.const(np.asarray(x.attr).astype(dtype)[()])
+        if dtype.kind == "b":
+            return self.op("ne", x, self.const(0, x.dtype))
+        return self._make("convert", (x,), dtype)
+
+    def bits(self, x: Node, dtype: Any) -> Node:
+        """Return the same bits as a number of another type."""
+        if x.dtype == np.dtype(dtype):
+            return x
+        return self.const(x.attr.view(dtype)) if x.op == "const" else self._make("bits", (x,), dtype)
+
+    def table(self, index: Node, column: tuple[Node, ...]) -> Node:
+        """Return the entry of a column, the same for all lanes, at an index within."""
+        return self._make("table", (index, *column), column[0].dtype)
+
+
+def real(dtype: Any) -> bool:
+    """Return whether numbers of this type are real ones."""
+    return np.issubdtype(dtype, np.floating)
+
+
+def _add(graph: Graph, x: Node, y: Node) -> Node | None:
+    return y if x.is_number(0) else x if y.is_number(0) else None
+
+
+def _sub(graph: Graph, x: Node, y: Node) -> Node | None:
+    return x if y.is_number(0) else None
+
+
+def _mul(graph: Graph, x: Node, y: Node) -> Node | None:
+    for a, b in ((x, y), (y, x)):
+        if a.is_number(1):
+            return b
+        if a.is_number(-1):
+            return graph.op("neg", b)
+    return None
+
+
+def _div(graph: Graph, x: Node, y: Node) -> Node | None:
+    """A divisor that does not change in a step is inverted before: one rounding more."""
+    if y.is_number(1):
+        return x
+    if not real(x.dtype) or x.level < Level.STEP or y.level == Level.STEP:
+        return None
+    inverse = graph.op("div", graph.const(1, y.dtype), y)
+    if inverse.op == "const" and not np.finfo(y.dtype).tiny <= abs(inverse.attr) < np.inf:
+        return None
+    return graph.op("mul", x, inverse)
+
+
+def _and(graph: Graph, x: Node, y: Node) -> Node | None:
+    if x is y:
+        return x
+    for a, b in ((x, y), (y, x)):
+        if a.op == "const" and x.dtype == bool:
+            return b if a.attr else a
+        if a.is_number(0):
+            return a
+        if a.op == "not" and a.args[0] is b and x.dtype == bool:
+            return graph.const(False)
+    return None
+
+
+def _or(graph: Graph, x: Node, y: Node) -> Node | None:
+    if x is y:
+        return x
+    for a, b in ((x, y), (y, x)):
+        if a.op == "const" and x.dtype == bool:
+            return a if a.attr else b
+        if a.is_number(0):
+            return b
+        if a.op == "not" and a.args[0] is b and x.dtype == bool:
+            return graph.const(True)
+    return None
+
+
+def _xor(graph: Graph, x: Node, y: Node) -> Node | None:
+    return y if x.is_number(0) else x if y.is_number(0) else None
+
+
+def _not(graph: Graph, x: Node) -> Node | None:
+    if x.op == "not":
+        return x.args[0]
+    return graph.op(CONTRARY[x.op], *x.args) if x.op in CONTRARY else None
+
+
+def _ne(graph: Graph, x: Node, y: Node) -> Node | None:
+    """A truth that was made a number, and is asked."""
+    for a, b in ((x, y), (y, x)):
+        if b.is_number(0) and a.op == "convert" and a.args[0].dtype == bool:
+            return a.args[0]
+        if x.dtype == bool and b.op == "const":
+            return graph.op("not", a) if b.attr else a
+    return None
+
+
+def _eq(graph: Graph, x: Node, y: Node) -> Node | None:
+    found = _ne(graph, x, y)
+    return None if found is None else graph.op("not", found)
+
+
+def _same_shift(graph: Graph, x: Node, y: Node) -> Node | None:
+    return x if y.is_number(0) else None
+
+
+_SIMPLER: dict[str, Callable[..., Node | None]] = {
+    "add": _add,
+    "sub": _sub,
+    "mul": _mul,
+    "div": _div,
+    "and": _and,
+    "or": _or,
+    "xor": _xor,
+    "not": _not,
+    "quotient": lambda graph, x, y: x if y.is_number(1) else None,
+    "neg": lambda graph, x: x.args[0] if x.op == "neg" else None,
+    "ne": _ne,
+    "eq": _eq,
+    "shift_left": _same_shift,
+    "shift_right_logical": _same_shift,
+}

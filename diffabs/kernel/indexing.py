@@ -1,0 +1,117 @@
+"""Rules of entries at places that a lane decides."""
+
+from typing import Any
+
+import numpy as np
+
+from diffabs.kernel.elementwise import extreme
+from diffabs.kernel.graph import Array, Graph, Level, Node
+from diffabs.kernel.primitives import Unsupported, each, entry, rule
+
+LONGEST = 64  # entries of which a lane chooses by comparing, or writes one
+
+
+def _inside(graph: Graph, index: Node, most: int) -> Node:
+    low = extreme(graph, "max", index, graph.const(0, index.dtype))
+    return extreme(graph, "min", low, graph.const(most, index.dtype))
+
+
+@rule("dynamic_slice", "slice_sizes")
+def _dynamic_slice(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    x, places = ins[0], [place.item() for place in ins[1:]]
+    for axis, (size, place) in enumerate(zip(eqn.params["slice_sizes"], places, strict=True)):
+        x = _part(graph, x, axis, place, size)
+    return [x]
+
+
+def _part(graph: Graph, x: Array, axis: int, place: Node, size: int) -> Array:
+    """So many entries along an axis, from a place, which is moved so that they lie within."""
+    most = x.shape[axis] - size
+    if most == 0:
+        return x
+    rows = np.moveaxis(x, axis, 0)
+    if place.op == "const":
+        start = int(np.clip(place.attr, 0, most))
+        return np.moveaxis(rows[start : start + size], 0, axis)
+    place = _inside(graph, place, most)
+    taken: Any = [each(lambda *x: _entry(graph, place, x), *rows[i : i + most + 1]) for i in range(size)]
+    return np.moveaxis(np.stack(taken), 0, axis)
+
+
+def _entry(graph: Graph, index: Node, column: tuple[Node, ...]) -> Node:
+    if len(column) > 2 and all(x.level < Level.LANE for x in column):
+        return graph.table(index, column)
+    if len(column) > LONGEST:
+        raise Unsupported("dynamic_slice", f"of {len(column)} entries that differ between lanes")
+    (_, found), *others = reversed([*enumerate(column)])
+    for i, x in others:
+        found = graph.select(graph.op("eq", index, graph.const(i, index.dtype)), found, x)
+    return found
+
+
+@rule("gather", "dimension_numbers slice_sizes indices_are_sorted unique_indices mode fill_value")
+def _gather(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """x[i] along the first axis, for each of some i."""
+    x, places = ins
+    n, p = eqn.params["dimension_numbers"], eqn.params
+    simple = (
+        n.start_index_map == (0,)
+        and n.collapsed_slice_dims == (0,)
+        and not n.operand_batching_dims
+        and n.offset_dims == tuple(range(places.ndim - 1, places.ndim - 2 + x.ndim))
+        and p["slice_sizes"] == (1, *x.shape[1:])
+    )
+    mode = str(p["mode"]).rsplit(".", 1)[-1]
+    if not simple or mode not in ("PROMISE_IN_BOUNDS", "CLIP"):
+        raise Unsupported("gather", f"with {n}, {mode}")
+    out = np.empty((*places.shape[:-1], *x.shape[1:]), object)
+    for at in np.ndindex(places.shape[:-1]):
+        out[(*at, ...)] = _part(graph, x, 0, places[(*at, 0)], 1)[0]
+    return [out]
+
+
+@rule("dynamic_update_slice")
+def _dynamic_update(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    x, new, places = ins[0], ins[1], [place.item() for place in ins[2:]]
+    for axis, place in enumerate(places):
+        _writable(eqn, x.shape[axis] if new.shape[axis] != x.shape[axis] and place.op != "const" else 0)
+    room = [a - b for a, b in zip(x.shape, new.shape, strict=True)]
+    starts = [_inside(graph, place, most) for place, most in zip(places, room, strict=True)]
+    out = x.copy()
+    for start in np.ndindex(*(most + 1 for most in room)):
+        hits = [graph.op("eq", s, graph.const(o, s.dtype)) for s, o in zip(starts, start, strict=True)]
+        hit, inside = _all(graph, hits), tuple(slice(o, o + size) for o, size in zip(start, new.shape, strict=True))
+        out[inside] = each(lambda a, b, hit=hit: graph.select(hit, a, b), out[inside], new)
+    return [out]
+
+
+@rule("scatter", "dimension_numbers indices_are_sorted mode unique_indices update_consts update_jaxpr")
+def _scatter(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """x.at[i].set(value) of one i along the first axis; nothing where that is outside."""
+    x, places, new = ins
+    n = eqn.params["dimension_numbers"]
+    whole = n.update_window_dims == tuple(range(x.ndim - 1)) and n.inserted_window_dims == (0,)
+    if not whole or n.scatter_dims_to_operand_dims != (0,) or n.operand_batching_dims or places.size != 1:
+        raise Unsupported("scatter", f"with {n}")
+    mode = str(eqn.params["mode"]).rsplit(".", 1)[-1]
+    if mode not in ("FILL_OR_DROP", "PROMISE_IN_BOUNDS", "CLIP"):
+        raise Unsupported("scatter", f"with the mode {mode}")
+    _writable(eqn, len(x))
+    index, out = places.ravel()[0], np.empty(x.shape, object)
+    index = _inside(graph, index, len(x) - 1) if mode == "CLIP" else index
+    for i in range(len(x)):
+        hit = graph.op("eq", index, graph.const(i, index.dtype))
+        out[i, ...] = each(lambda a, b, hit=hit: graph.select(hit, a, b), entry(x[i]), new.reshape(x.shape[1:]))
+    return [out]
+
+
+def _all(graph: Graph, truths: list[Node]) -> Node:
+    found = graph.const(True)
+    for one in truths:
+        found = graph.op("and", found, one)
+    return found
+
+
+def _writable(eqn: Any, count: int) -> None:
+    if count > LONGEST:
+        raise Unsupported(eqn.primitive.name, f"into {count} entries; {LONGEST} are the most")

@@ -1,0 +1,113 @@
+"""Run functions of one lane as native code, for many lanes, each until it is over: a function as any other of JAX."""
+
+import ctypes
+import functools
+import os
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.kernel import compilers, cpp, program
+
+LARGE = 2500  # operations; the blocks of a larger program are of fewer vectors, or compiling takes long
+VECTORS = 4
+_lock = threading.Lock()
+_loaded: dict[str, Any] = {}
+
+
+def run_lanes(
+    renew: Callable[[Any, Any], Any],
+    step: Callable[[Any, Any], Any],
+    running: Callable[[Any, Any], Any],
+    lane: Any,
+    carry: Any,
+    *,
+    steps: int,
+    rounds: int,
+) -> Any:
+    """Return the carry (pytree, n lanes first) of lanes that are all over.
+
+    renew, step: functions of one lane, (lane, carry) -> carry; `renew` is called before every so many `steps`
+    running: (lane, carry) -> whether it goes on; asked after so many `rounds` of these. Until then `step` must do
+        nothing that matters in a lane that is over
+    lane: what is a lane's own, (n, ...) each; what the functions close over is the same for all
+
+    Works under jit and vmap; no derivatives. Raises Unsupported for an operation that has no rule, NoCompiler."""
+    shape = cpp.Shape(VECTORS, steps, rounds)
+    functions = {"renew": renew, "step": step, "running": running}
+    made = compiled(functions, jax.tree.map(_one, lane), jax.tree.map(_one, carry), shape)
+    leaves, tree = jax.tree.flatten(carry)
+    given = [_data(x) for x in (*made.uniform, *jax.tree.leaves(lane), *leaves)]
+    first = len(given) - len(leaves)
+    results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in given[first:]]
+    call = jax.ffi.ffi_call(
+        made.target,
+        results,
+        vmap_method="sequential",
+        input_output_aliases={first + i: i for i in range(len(leaves))},
+    )
+    found = call(*given, threads=np.int64(_threads()))
+    return tree.unflatten([_like(x, leaf) for x, leaf in zip(found, leaves, strict=True)])
+
+
+class Compiled:
+    """A program that XLA can call: its `target`, and the arrays that all lanes share."""
+
+    def __init__(self, target: str, uniform: list[Any], source: str):
+        """Registered already."""
+        self.target, self.uniform, self.source = target, uniform, source
+
+
+def compiled(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any, shape: cpp.Shape) -> Compiled:
+    """Return the functions `renew`, `step` and `running` of one lane as a program that XLA can call; lane and carry of
+    these shapes. Raises Unsupported, NoCompiler."""
+    found = program.build(functions, lane, carry)
+    source = cpp.text(found, shape)
+    count = cpp.operations(source)
+    if count > LARGE and shape.vectors > 1:
+        source = cpp.text(found, shape._replace(vectors=shape.vectors // 2))
+    return Compiled(_registered(source), found.uniform, source)
+
+
+def _registered(source: str) -> str:
+    """The name under which XLA knows the library of a text."""
+    path = compilers.library(source)
+    name = f"diffabs_kernel_{path.stem[:32]}"
+    with _lock:
+        if name not in _loaded:
+            handler = ctypes.CDLL(str(path)).diffabs_kernel
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
+            _loaded[name] = handler
+    return name
+
+
+def _threads() -> int:
+    """Processors that this process may use, shared by the devices, each of which may run lanes at the same time."""
+    return max(1, _processors() // max(1, jax.local_device_count("cpu")))
+
+
+@functools.cache
+def _processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _one(x: Any) -> Any:
+    """A lane of an array."""
+    return jax.ShapeDtypeStruct(jnp.shape(x)[1:], x.dtype)
+
+
+def _data(x: Any) -> Any:
+    """An array, of a key its words."""
+    return jax.random.key_data(x) if _is_key(x) else jnp.asarray(x)
+
+
+def _like(x: Any, leaf: Any) -> Any:
+    return jax.random.wrap_key_data(x) if _is_key(leaf) else x
+
+
+def _is_key(x: Any) -> bool:
+    return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

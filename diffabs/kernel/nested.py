@@ -1,0 +1,73 @@
+"""Rules of programs within a program: calls, conditionals, loops of a known length."""
+
+from typing import Any
+
+import jax
+import jax.extend.core as jex
+import numpy as np
+
+from diffabs.kernel.graph import Array, Graph
+from diffabs.kernel.primitives import Unsupported, called, each, entry, rule, single
+
+LONGEST = 64  # steps of a scan, which is written out
+
+
+@rule(
+    "jit pjit closed_call core_call remat remat2 checkpoint",
+    "jaxpr call_jaxpr name inline in_shardings out_shardings in_layouts out_layouts donated_invars ctx_mesh keep_unused"
+    " compiler_options_kvs prevent_cse differentiated policy",
+)
+@rule("custom_jvp_call", "call_jaxpr jvp_jaxpr_fun num_consts symbolic_zeros")
+@rule("custom_vjp_call", "call_jaxpr fwd_jaxpr_thunk bwd num_consts out_trees symbolic_zeros")
+def _call(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    return called(graph, eqn.params["call_jaxpr" if "call_jaxpr" in eqn.params else "jaxpr"], ins)
+
+
+@rule("custom_vmap_call", "call rule in_tree out_tree")
+def _of_a_batch(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """A rule of its own for batches may be anything; it is known if it says of truths whether any is."""
+    call = eqn.params["call"].jaxpr
+    truth = len(ins) == 1 and eqn.invars[0].aval.dtype == bool and ins[0].ndim == 0
+    if not truth or call.eqns or call.invars != call.outvars or not _says_any(eqn):
+        raise Unsupported("custom_vmap_call", "its rule for batches is not `any`")
+    return [single(graph.any(ins[0].item()))]
+
+
+def _says_any(eqn: Any) -> bool:
+    told = jex.DebugInfo("kernel", "any", None, None)
+    body = jex.Jaxpr((), list(eqn.invars), list(eqn.outvars), [eqn], eqn.effects, told)
+    found = jax.vmap(lambda x: jex.jaxpr_as_fun(jex.ClosedJaxpr(body, ()))(x)[0])
+    with jax.ensure_compile_time_eval():
+        return all(bool(found(np.array(x)).all()) == any(x) for x in ([False, False], [False, True], [True, True]))
+
+
+@rule("cond", "branches")
+def _cond(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    which, rest, branches = ins[0].item(), ins[1:], eqn.params["branches"]
+    if which.op == "const":
+        return called(graph, branches[int(np.clip(which.attr, 0, len(branches) - 1))], rest)
+    taken = called(graph, branches[0], rest)
+    for i, branch in enumerate(branches[1:], 1):
+        asked = graph.convert(which, bool)
+        if len(branches) > 2:
+            asked = graph.op("ge", which, graph.const(i, which.dtype))
+        other = called(graph, branch, rest)
+        flat = [[node for array in arrays for node in array.flat] for arrays in (taken, other)]
+        gated = iter(graph.gate(asked, *flat))
+        taken = [each(lambda _: next(gated), array) for array in taken]  # noqa: B023  used at once
+    return taken
+
+
+@rule("scan", "length reverse jaxpr num_consts num_carry linear unroll _split_transpose")
+def _scan(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    p = eqn.params
+    if p["length"] > LONGEST:
+        raise Unsupported("scan", f"of {p['length']} steps within a step; {LONGEST} are the most")
+    constants, many = p["num_consts"], p["num_carry"]
+    fixed, carry, rows = ins[:constants], ins[constants : constants + many], ins[constants + many :]
+    order = range(p["length"])[:: -1 if p["reverse"] else 1]
+    seen: dict[int, list[Array]] = {}
+    for i in order:
+        outs = called(graph, p["jaxpr"], [*fixed, *carry, *(entry(row[i]) for row in rows)])
+        carry, seen[i] = outs[:many], outs[many:]
+    return [*carry, *(np.stack(column) for column in zip(*(seen[i] for i in sorted(seen)), strict=True))]

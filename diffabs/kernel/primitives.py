@@ -1,0 +1,101 @@
+"""JAX's operations on arrays as operations on single numbers: a rule for each primitive.
+
+An array has a known shape, so it is an array of nodes, and whatever only moves its entries costs nothing. A rule names
+the parameters that it knows. A primitive without a rule, or with another parameter (a later JAX may have one), is an
+objection, never a guess."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax.extend.core as jex
+import numpy as np
+
+from diffabs.kernel.graph import Array, Graph, Node
+
+
+class Unsupported(Exception):
+    """What cannot be translated: the primitive, and why."""
+
+    def __init__(self, primitive: str, reason: str):
+        """`reason` goes on where the primitive's name stands."""
+        super().__init__(f"{primitive}: {reason}")
+        self.primitive, self.reason = primitive, reason
+
+
+class Rule(NamedTuple):
+    """apply(graph, eqn, inputs) -> outputs, and the names of the parameters that it knows."""
+
+    apply: Callable[[Graph, Any, list[Array]], Sequence[Array]]
+    known: frozenset[str]
+
+
+RULES: dict[str, Rule] = {}
+
+
+def rule(names: str, known: str = "") -> Callable[[Any], Any]:
+    """Register a function of (graph, eqn, inputs) for these primitives, with these parameters."""
+
+    def decorate(apply: Any) -> Any:
+        RULES.update({name: Rule(apply, frozenset(known.split())) for name in names.split()})
+        return apply
+
+    return decorate
+
+
+def translate(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Sequence[Array]) -> list[Array]:
+    """Return the outputs of a jaxpr as arrays of nodes. Raises Unsupported."""
+    at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
+
+    def read(atom: Any) -> Array:
+        return known(graph, atom.val, _dtype(atom)) if isinstance(atom, jex.Literal) else at[atom]
+
+    for eqn in jaxpr.eqns:
+        at.update(zip(eqn.outvars, _applied(graph, eqn, [read(atom) for atom in eqn.invars]), strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _dtype(atom: Any) -> Any:
+    return atom.aval.dtype
+
+
+def _applied(graph: Graph, eqn: Any, inputs: list[Array]) -> Sequence[Array]:
+    name = eqn.primitive.name
+    if name not in RULES:
+        raise Unsupported(name, "there is no rule for it")
+    one = RULES[name]
+    if new := sorted(set(eqn.params) - one.known):
+        raise Unsupported(name, f"its parameter {new[0]} is not known")
+    return one.apply(graph, eqn, inputs)
+
+
+def known(graph: Graph, x: Any, dtype: Any = None) -> Array:
+    """Return an array of known numbers."""
+    x = np.asarray(x, dtype)
+    return each(lambda i: graph.const(x.reshape(-1)[i]), np.arange(x.size).reshape(x.shape))
+
+
+def single(node: Node) -> Array:
+    """Return a node as an array of no dimension."""
+    out = np.empty((), object)
+    out[()] = node
+    return out
+
+
+def each(function: Callable[..., Node], *arrays: Any) -> Array:
+    """Return a function of numbers, entry by entry."""
+    arrays = np.broadcast_arrays(*arrays) if len(arrays) > 1 else arrays
+    out = np.empty(arrays[0].shape, object)
+    for i in np.ndindex(out.shape):
+        out[i] = function(*(array[i] for array in arrays))
+    return out
+
+
+def called(graph: Graph, program: Any, inputs: Sequence[Array]) -> list[Array]:
+    """Return the outputs of a program within one."""
+    jaxpr, constants = (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, ())
+    return translate(graph, jaxpr, [known(graph, x) for x in constants], inputs)
+
+
+def entry(x: Any) -> Array:
+    """Return what indexing an array of nodes gives, as an array."""
+    return x if isinstance(x, np.ndarray) else single(x)

@@ -1,0 +1,115 @@
+"""Many runs at once by one program of this machine: a lane stays in the processor's registers from start to stop.
+
+Starts and judgements are XLA's, as for every other run; what lies between, the step of a `FixedStep` or of `Adaptive`
+as it is, with everything in it that the parts have, is translated from its jaxpr (package `kernel`). A lane that has
+ended makes room for the next one, as on the belt of `refill`."""
+
+import functools
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.compiling import traced
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Objective
+from diffabs.core.pytree import strong
+from diffabs.kernel.compilers import NoCompiler
+from diffabs.kernel.launch import run_lanes
+from diffabs.kernel.primitives import Unsupported
+from diffabs.simulate.condition import Condition
+from diffabs.simulate.drivers import BLOCK
+from diffabs.simulate.outcome import judge
+from diffabs.simulate.refill import by_lane
+from diffabs.simulate.run import arguments
+from diffabs.simulate.solution import Run, Solver
+
+ENGINES = ("auto", "xla", "kernel")
+MOST = 1 << 17  # lanes that are started together: the carries of more would fill the memory
+log = logging.getLogger("diffabs")
+
+
+def run_native(
+    loop: Loop, values: Mapping[str, Any], keys: Any, solver: Solver, objectives: Mapping[str, Objective], accepted: Any
+) -> Run:
+    """Return what `refill.run_refilled` returns, to rounding.
+
+    Raises Unsupported for a step that cannot be translated, NoCompiler where there is none, ValueError for what
+    `measure` objects to."""
+    loop, objectives, method = arguments(loop, solver, objectives)
+    values = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
+    lanes, count = (values, keys, accepted), len(accepted)
+
+    def some(start: int) -> Run:
+        mine = jax.tree.map(lambda x: x[start : start + MOST], lanes)
+        return _run(loop, mine[0], dict(objectives), method, *mine[1:])
+
+    runs = [some(start) for start in range(0, count, MOST)]
+    return runs[0] if len(runs) == 1 else jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
+
+
+@jax.jit
+def _run(
+    loop: Loop, values: dict[str, Any], objectives: dict[str, Objective], method: Any, keys: Any, accepted: Any
+) -> Run:
+    leaves, built = by_lane(loop, values, objectives)
+    carry = jax.vmap(lambda mine, key: method.start(*built(mine), key))(leaves, keys)
+    condition = jnp.where(accepted, carry.condition, Condition.DIVERGED).astype(carry.condition.dtype)
+    carry = run_lanes(
+        lambda lane, carry: method.renew(built(lane[0])[0], carry),
+        lambda lane, carry: method.step(*built(lane[0]), lane[1], carry),
+        lambda lane, carry: carry.running,
+        (leaves, keys),
+        carry._replace(condition=condition),
+        steps=BLOCK,
+        rounds=1,
+    )
+    return jax.vmap(lambda mine, carry: judge(*built(mine), carry)[0])(leaves, carry)
+
+
+def by_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Run], why_not: str = "") -> Run:
+    """Return `native()`, or `otherwise()` as the engine says: "kernel" means what it says, "auto" the first if that can
+    be, and tells the log once why it cannot. Raises ValueError for another name, or for what stands against "kernel".
+
+    why_not: what is known already to stand against it"""
+    if engine not in ENGINES:
+        raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(ENGINES)}")
+    if engine == "xla":
+        return otherwise()
+    if not why_not:
+        try:
+            return native()
+        except (Unsupported, NoCompiler) as error:
+            why_not = str(error)
+    if engine == "kernel":
+        raise ValueError(f"engine = 'kernel' is not possible: {why_not}")
+    _tell(why_not)
+    return otherwise()
+
+
+@functools.cache
+def _tell(why_not: str) -> None:
+    """Once."""
+    log.warning("runs are made by XLA, not by a kernel: %s", why_not)
+
+
+def objection(loop: Loop, values: Mapping[str, Any], solver: Solver, objectives: Mapping[str, Objective]) -> str | None:
+    """Return why these runs cannot be made by a kernel, or None: an operation of a part that has no translation, no
+    compiler on this machine, numbers that are not known yet.
+
+    values: by path (lanes, ...); no lane is run, but the kernel is compiled, and kept
+
+    Raises ValueError for what `measure` objects to."""
+    if traced(loop, dict(values), dict(objectives)):
+        return "this is traced; ask with numbers"
+    checked, measured, method = arguments(loop, solver, objectives)
+    columns = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
+    count = len(next(iter(columns.values())))
+    keys = jax.vmap(jax.random.key)(jnp.arange(count))
+    try:
+        _run.lower(checked, columns, dict(measured), method, keys, jnp.ones(count, bool))
+    except (Unsupported, NoCompiler) as error:
+        return str(error)
+    return None

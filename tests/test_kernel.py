@@ -1,0 +1,311 @@
+"""A kernel makes the runs that XLA makes, says why it cannot, and its library is there for several processes."""
+
+import dataclasses
+import json
+import logging
+import os
+import pathlib
+import subprocess
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import run
+from kernels import FOLDER, applied, both, same
+
+import diffabs as d
+from diffabs import controllers, plants, scenario, sensors
+from diffabs.kernel import compilers, launch
+from diffabs.kernel.graph import Graph, Level
+from diffabs.kernel.primitives import Unsupported, known, translate
+from diffabs.objectives import BRAKING
+from diffabs.scenario import section_sweep
+from diffabs.scenario.defaults import braking
+from diffabs.simulate import native
+from diffabs.stops import SpeedReached
+from diffabs.sweep import SweepError, sweep
+
+pytestmark = pytest.mark.xdist_group("kernel")  # one worker compiles what these share
+
+LOOP = braking(
+    plant=plants.MirroredRig(),
+    initial=d.BrakeStart(speed=30 / 3.6),
+    controller=controllers.StateFeedback(gain=np.array([-4000.0, -40.0])),
+    feedforward=controllers.HoldingInput(),
+    stop=SpeedReached(speed=25 / 3.6),
+    sensor=sensors.Noise(slip=0.01, period=4e-3),
+)
+MEASURED = {name: BRAKING[name] for name in ("stop_distance", "settling_time", "iae")}
+SOLVER = d.FixedStep(2e-3, 0.5)
+LANES = 41  # of blocks of 32: some lanes are put in where others have ended
+SPEEDS = np.linspace(26.0, 33.0, LANES) / 3.6
+AT_ONCE, NEVER, DIVERGING = 4, 7, 11
+SPEEDS[AT_ONCE], SPEEDS[NEVER] = 24.0 / 3.6, 90.0 / 3.6
+GAINS = np.where(np.arange(LANES) == DIVERGING, 1e308, -40.0)
+VALUES = {"initial.speed": SPEEDS, "controller.gain.1": GAINS}
+KEYS = np.arange(LANES)
+
+
+OTHER_KEY = jax.random.key(1, impl="rbg")
+
+
+@jax.custom_batching.custom_vmap
+def _every(x):
+    return x
+
+
+@_every.def_vmap
+def _(size, batched, x):
+    return jnp.all(x), False
+
+
+@pytest.fixture(autouse=True)
+def _own_folder(monkeypatch):
+    monkeypatch.setenv(compilers.CACHE, FOLDER)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(compilers.CACHE, FOLDER)
+        return both(LOOP, VALUES, SOLVER, MEASURED, KEYS)
+
+
+class TestRuns:
+    def test_are_those_of_xla(self, runs):
+        """Lanes that begin beyond their stop, diverge and run out of time among them; noise to the last digits."""
+        found, expected = runs
+        assert np.flatnonzero(expected.diverged).tolist() == [AT_ONCE, DIVERGING]
+        assert expected.timed_out[NEVER]
+        assert len(np.unique(expected.metrics["iae"])) == LANES - 1  # NaN once
+        same(found, expected, rtol=1e-13, atol=1e-15)
+
+    def test_do_not_depend_on_their_order_nor_on_threads(self, runs, monkeypatch):
+        monkeypatch.setattr(launch, "_threads", lambda: 3)
+        native._run.clear_cache()
+        order = np.random.default_rng(1).permutation(LANES)
+        values = {path: column[order] for path, column in VALUES.items()}
+        found, _ = (lambda run: (run, None))(self._by_kernel(values, KEYS[order]))
+        for name, value in runs[0].metrics.items():
+            np.testing.assert_array_equal(found.metrics[name], value[order])
+
+    def test_of_new_numbers_are_the_same_program(self, runs, monkeypatch):
+        monkeypatch.setattr(compilers, "library", None)
+        loop = d.replace(LOOP, {"controller.gain.0": -3900.0, "plant.mass": 6.0})
+        found = jax.device_get(self._by_kernel(VALUES, KEYS, loop))
+        assert not np.any(found.metrics["iae"] == runs[0].metrics["iae"])
+
+    def test_under_jit_and_vmap(self, runs):
+        def at(mass):
+            return self._by_kernel(VALUES, KEYS, d.replace(LOOP, {"plant.mass": mass}), live=True).metrics["iae"]
+
+        mass = float(LOOP.plant.mass)
+        found = jax.device_get(jax.jit(jax.vmap(at))(jnp.array([0.97 * mass, mass])))
+        np.testing.assert_allclose(found[1], runs[0].metrics["iae"], rtol=1e-13)
+        assert not np.any(found[0] == found[1])
+
+    def test_of_lanes_in_two_parts(self, runs, monkeypatch):
+        monkeypatch.setattr(native, "MOST", 32)
+        found = jax.device_get(self._by_kernel(VALUES, KEYS))
+        for name, value in runs[0].metrics.items():
+            np.testing.assert_array_equal(found.metrics[name], value)
+
+    @staticmethod
+    def _by_kernel(values, keys, loop=LOOP, live=False):
+        lanes = d.Batch(values, keys)
+        run = d.run_batch(loop, lanes, SOLVER, MEASURED, together=False, accepted=True, engine="kernel")
+        return run if live else jax.device_get(run)
+
+
+@pytest.mark.slow
+def test_adaptive_steps_are_those_of_xla():
+    """Steps end on kinks, which are looked for by what rounding says: the solver's own reproducibility."""
+    loop = d.replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
+    solver = d.Adaptive(rtol=1e-6, duration=0.5, step=2e-3)
+    found, expected = both(loop, VALUES, solver, MEASURED)
+    same(found, expected, rtol=1e-9, atol=1e-12)
+
+
+class TestObjections:
+    """Each is said by `objection`, refused with engine = "kernel", and said once with "auto"."""
+
+    def test_there_is_none(self):
+        assert native.objection(LOOP, VALUES, SOLVER, MEASURED) is None
+
+    def test_without_a_compiler(self, monkeypatch, caplog):
+        monkeypatch.setenv(compilers.COMPILER, "")
+        native._tell.cache_clear()
+        native._run.clear_cache()
+        loop = d.replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
+        line = native.objection(loop, VALUES, SOLVER, {})
+        assert line == f"{compilers.COMPILER} is empty"
+        with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {line}"):
+            d.run_batch(loop, d.Batch(VALUES), SOLVER, {}, accepted=True, engine="kernel")
+        with caplog.at_level(logging.WARNING, "diffabs"):
+            runs = [d.run_batch(loop, d.Batch(VALUES), SOLVER, {}, accepted=True, engine="auto") for _ in range(2)]
+        assert [record.getMessage() for record in caplog.records] == [f"runs are made by XLA, not by a kernel: {line}"]
+        assert runs[0].stopped.tolist() == runs[1].stopped.tolist()
+
+    @pytest.mark.parametrize("command", ["false", "/no/such/compiler"])
+    def test_of_a_compiler_that_does_not_work(self, command, monkeypatch):
+        monkeypatch.setenv(compilers.COMPILER, command)
+        with pytest.raises(compilers.NoCompiler, match=command):
+            compilers.compiler()
+
+    def test_of_another_name(self):
+        with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
+            d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="gpu")
+
+    @pytest.mark.parametrize("more", [{"together": True}, {"trajectories": True}])
+    def test_of_lanes_that_run_together(self, more):
+        with pytest.raises(ValueError, match="together, for trajectories or for derivatives"):
+            d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="kernel", accepted=True, **more)
+
+    def test_of_derivatives(self):
+        def iae(gain):
+            loop = d.replace(LOOP, {"controller.gain.0": gain})
+            run = d.run_batch(loop, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="kernel")
+            return jnp.nanmean(run.metrics["iae"])
+
+        with pytest.raises(ValueError, match="together, for trajectories or for derivatives"):
+            jax.grad(iae)(-4000.0)
+
+    @pytest.mark.parametrize(
+        ("function", "line"),
+        [
+            (lambda x: jax.lax.while_loop(lambda y: y > 1.0, lambda y: 0.5 * y, x), "while: there is no rule for it"),
+            (lambda x: jax.lax.scan(lambda y, _: (0.5 * y, None), x, length=65)[0], "scan: of 65 steps within a step"),
+            (lambda x: jnp.zeros(65).at[x.astype(int)].set(x)[3], "scatter: into 65 entries; 64 are the most"),
+            (lambda x: jnp.linalg.inv(x * jnp.eye(2))[0, 0], "lu: there is no rule for it"),
+            (lambda x: x * jax.random.uniform(OTHER_KEY), "of the generator key<rbg>"),
+            (lambda x: jnp.stack([x * i for i in range(65)])[(x > 1).astype(int)], "of 65 entries that differ"),
+            (lambda x: _every(x > 0), "custom_vmap_call: its rule for batches is not `any`"),
+        ],
+    )
+    def test_of_an_operation(self, function, line):
+        with pytest.raises(Unsupported, match=line.replace("(", r"\(")):
+            applied({"f": function}, np.ones(3))
+
+    def test_of_a_parameter_that_is_not_known(self):
+        """A later JAX may say something with it."""
+        jaxpr = jax.make_jaxpr(lambda x: jnp.exp(x))(1.0).jaxpr
+        eqn = jaxpr.eqns[0]
+        new = jaxpr.replace(eqns=[eqn.replace(params=eqn.params | {"colour": "red"})])
+        with pytest.raises(Unsupported, match="exp: its parameter colour is not known"):
+            translate(Graph(), new, [], [known(Graph(), 1.0)])
+
+
+class TestSweep:
+    SETTINGS = ("sweep.samples=40", "sweep.chunk=16", "solver.step=2e-3", "solver.duration=0.4", "stop.speed_kmh=40.0")
+
+    def test_is_that_of_xla_and_says_what_made_it(self, tmp_path):
+        """Another engine does not go on with it."""
+        study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
+        tables = {}
+        for engine in ("xla", "kernel"):
+            one = dataclasses.replace(study, engine=engine)
+            tables[engine] = sweep(one, tmp_path / engine).table().to_pandas().sort_values("sample")
+        for name in study.objectives:
+            columns = [table[name].to_numpy() for table in tables.values()]
+            np.testing.assert_allclose(*columns, rtol=1e-12, atol=1e-14, err_msg=name)
+        written = json.loads((tmp_path / "kernel" / "manifest.json").read_text())["study"]["engine"]
+        assert written == {"name": "kernel", **compilers.described()}
+        assert "engine" not in json.loads((tmp_path / "xla" / "manifest.json").read_text())["study"]
+        with pytest.raises(SweepError, match="engine"):
+            sweep(study, tmp_path / "kernel", resume=True)
+
+    def test_is_refused_before_anything_is_written(self, tmp_path, monkeypatch):
+        monkeypatch.setenv(compilers.COMPILER, "")
+        native._run.clear_cache()
+        study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
+        with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {compilers.COMPILER} is empty"):
+            sweep(dataclasses.replace(study, engine="kernel"), tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA: "), ("kernel", "")])
+    def test_by_the_command(self, engine, line, tmp_path, monkeypatch):
+        monkeypatch.setenv(compilers.COMPILER, "")
+        changes = [part for setting in self.SETTINGS for part in ("--set", setting)]
+        status = 0 if line else 2
+        done = run("sweep", "slip-lmi", *changes, "--out", tmp_path / "out", "--engine", engine, status=status)
+        assert f"{line}engine = 'kernel' is not possible: {compilers.COMPILER} is empty" in done.stderr
+        assert (tmp_path / "out").exists() == bool(line)
+
+
+class TestGraph:
+    def test_equal_operations_are_one(self):
+        graph = Graph()
+        x, y = (graph.input(float, Level.STEP, i) for i in range(2))
+        assert graph.op("add", x, y) is graph.op("add", y, x)
+        assert graph.op("gt", x, y) is graph.op("lt", y, x)
+        assert graph.op("sub", x, y) is not graph.op("sub", y, x)
+
+    def test_what_is_known_is_worked_out(self):
+        graph = Graph()
+        assert graph.op("add", graph.const(1.0), graph.const(2.0)).attr == 3.0
+        assert graph.op("quotient", graph.const(-7), graph.const(2)).attr == -3
+        x = graph.input(float, Level.STEP, 0)
+        assert graph.op("mul", x, graph.const(1.0)) is x
+        assert graph.op("mul", x, graph.const(0.0)) is not graph.const(0.0)  # x may be infinite
+
+    def test_a_divisor_of_before_the_step_is_inverted_there(self):
+        graph = Graph()
+        x, fixed, tiny = graph.input(float, Level.STEP, 0), graph.input(float, Level.UNIFORM, 1), graph.const(1e-310)
+        product = graph.op("div", x, fixed)
+        assert (product.op, min(arg.level for arg in product.args)) == ("mul", Level.UNIFORM)
+        assert graph.op("div", x, tiny).op == "div"  # its inverse is infinite
+        assert graph.op("div", x, x).op == "div"
+
+
+class TestLibrary:
+    TEXT = "\n".join(  # the least that is one
+        [
+            '#include "functions.h"',
+            'extern "C" double answer(double x) { return k_exp(all(x))[0] + %d; }',
+        ]
+    )
+
+    def test_is_made_once(self, tmp_path, monkeypatch):
+        monkeypatch.setenv(compilers.CACHE, str(tmp_path))
+        path, made = compilers.library(self.TEXT % 1), time.time_ns()
+        monkeypatch.setattr(compilers, "_run", None)
+        assert compilers.library(self.TEXT % 1) == path
+        assert path.stat().st_mtime_ns <= made
+        assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+    @pytest.mark.parametrize("changed", ["FLAGS", "_processor"])
+    def test_is_another_for_other_flags_and_processors(self, changed, tmp_path, monkeypatch):
+        monkeypatch.setenv(compilers.CACHE, str(tmp_path))
+        monkeypatch.setattr(compilers, "_run", lambda command, source, result: result.write_bytes(b""))
+        path, made = compilers.library("one"), compilers.compiler()
+        monkeypatch.setattr(compilers, "compiler", lambda: made)
+        monkeypatch.setattr(compilers, changed, ("-O1",) if changed == "FLAGS" else lambda: "another")
+        assert compilers.library("one") != path
+
+    @pytest.mark.slow
+    def test_of_two_processes_at_once_and_of_one_that_is_killed(self, tmp_path):
+        """Whoever comes first, or is ended in the middle: what has a name is whole."""
+        code = f"import ctypes; from diffabs.kernel import compilers; p = compilers.library({self.TEXT % 2!r})\n"
+        code += (
+            "f = ctypes.CDLL(str(p)).answer; f.restype, f.argtypes = ctypes.c_double, [ctypes.c_double]; print(f(0.0))"
+        )
+        environment = os.environ | {compilers.CACHE: str(tmp_path)}
+        begun = [
+            subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+            for _ in range(3)
+        ]
+        while not any(tmp_path.iterdir()):
+            time.sleep(0.01)
+        begun[0].kill()
+        outputs = [process.communicate()[0] for process in begun]
+        assert outputs[1:] == ["3.0\n", "3.0\n"]
+        whole = [file for file in tmp_path.iterdir() if not file.name.startswith(".")]
+        assert len(whole) == 1
+
+    def test_no_flag_changes_what_is_finite(self):
+        assert not any("fast-math" in flag or "finite" in flag or "unsafe" in flag for flag in compilers.FLAGS)
+        assert pathlib.Path(compilers.NATIVE / "lanes.h").is_file()
