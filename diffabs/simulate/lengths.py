@@ -94,7 +94,8 @@ def longest_stable(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any:
         at = state.with_flow(unflatten(flow))
         return ravel_pytree(loop.flow(t, at, loop.signals(t, at)))[0]
 
-    columns = jax.vmap(lambda one: jax.jvp(rates, (flow,), (one,))[1])(jnp.diag(size)) / size
+    moves = jnp.eye(size.size, dtype=size.dtype) * size
+    columns = jax.vmap(lambda one: jax.jvp(rates, (flow,), (one,))[1])(moves) / size
 
     def multiplied(at: tuple[Any, Any], counts: Any) -> tuple[tuple[Any, Any], None]:
         vector, log = at
