@@ -53,6 +53,7 @@ def test_a_region_is_what_its_runs_do():
     assert not np.array_equal(found.outcomes.recovered[:5], found.outcomes.recovered[:5][::-1])
 
 
+@pytest.mark.slow
 def test_what_is_not_known_in_time_is_undecided_and_nothing_else():
     """The slow LQR after 3 s: neither on the ground nor where it surely returns. In the end 32.8 % return, not 23.0."""
     loop = closed(controller=BalanceFeedback(gain=SLOW))

@@ -178,6 +178,7 @@ def test_the_length_of_a_chunk_changes_rounding_only(study, swept, tmp_path):
         assert np.array_equal(found.column(path), swept.column(path))
 
 
+@pytest.mark.slow
 def test_float32(tmp_path):
     """Against runs in float32: noise is drawn from other bits than in float64."""
     single = dataclasses.replace(described(SINGLE), dtype="float32", samples=70)
