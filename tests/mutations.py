@@ -1102,7 +1102,7 @@ MUTATIONS = [
     ),
     Mutation(
         "command line: unmet limits pass",
-        "cli/tune.py",
+        "cli/tune_document.py",
         '"met": beyond <= 0',
         '"met": True',
         "test_cli_tune.py::test_a_constraint_that_is_not_met_could_not_be_done",
@@ -1151,7 +1151,7 @@ MUTATIONS = [
     ),
     Mutation(
         "command line: limits are met within a tolerance",
-        "cli/tune.py",
+        "cli/tune_document.py",
         '"met": beyond <= 0',
         '"met": beyond <= 1e-3 * abs(bound)',
         "test_cli_tune.py::test_met_is_met_without_a_tolerance",

@@ -92,6 +92,7 @@ def test_a_sweep_is_not_checked_where_that_is_turned_off(file, tmp_path):
     assert json.loads(run("sweep", path, "--out", tmp_path / "out", "--json").stdout)["accuracy"] is None
 
 
+@pytest.mark.slow
 def test_noise_is_the_same_in_a_sweeps_half_steps(tmp_path):
     """Of the noisy sweep of the tests: the half step changes a hundredth of what other noise does."""
     study = section_sweep.study(

@@ -23,8 +23,6 @@ from diffabs.tune import worst_case
 
 LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
 FINE = 4  # times shorter than a scenario's are the fixed steps that are compared with
-QUICK = ("relay, latch, lag",)
-SOME = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in random_loops.STRUCTURES]
 MEASURED = {"iae": IAE(), "max_slip": MaxSlip(), "stop_distance": StopDistance()}
 
 
@@ -71,7 +69,8 @@ def test_a_smaller_error_of_a_step_makes_a_smaller_error_of_the_run():
     assert errors[2] < 2e-7
 
 
-@pytest.mark.parametrize("name", SOME)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", random_loops.STRUCTURES)
 def test_random_loops_of_any_parts_are_right_to_1e_4(name):
     structure, key = random_loops.STRUCTURES[name], jax.random.key(1)
     measured = {n: one for n, one in structure.objectives.items() if n != "torque_rate"}  # a jump counts by the grid

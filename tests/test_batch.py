@@ -182,8 +182,17 @@ def test_trajectories():
         same(jax.tree.map(lambda x: x[i], found), one)  # noqa: B023
 
 
+@pytest.fixture(scope="module")
+def slopes_of_one():
+    def one(gain, speed):
+        loop = replace(QUIET, {"controller.gain.1": gain, "initial.speed": speed})
+        return d.measure(loop, SOLVER, MEASURED).metrics["iae"]
+
+    return jax.jit(jax.grad(one, (0, 1)))
+
+
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
-def test_derivatives_are_those_of_single_runs(mode):
+def test_derivatives_are_those_of_single_runs(mode, slopes_of_one):
     """In the loop, which lanes share, and in their values."""
     speeds = jnp.asarray(SPEEDS[[0, 3]])
 
@@ -191,13 +200,9 @@ def test_derivatives_are_those_of_single_runs(mode):
         loop = replace(QUIET, {"controller.gain.1": gain})
         return d.run_batch(loop, Batch({"initial.speed": speeds}), SOLVER, MEASURED).metrics["iae"]
 
-    def one(gain, speed):
-        loop = replace(QUIET, {"controller.gain.1": gain, "initial.speed": speed})
-        return d.measure(loop, SOLVER, MEASURED).metrics["iae"]
-
-    by_gain, by_speed = mode(many, (0, 1))(-40.0, speeds)
+    by_gain, by_speed = jax.jit(mode(many, (0, 1)))(-40.0, speeds)
     for i, speed in enumerate(speeds):
-        shared, own = jax.grad(one, (0, 1))(-40.0, speed)
+        shared, own = slopes_of_one(-40.0, speed)
         np.testing.assert_allclose(by_gain[i], shared, rtol=1e-9)
         np.testing.assert_allclose(by_speed[i], np.where(np.arange(2) == i, own, 0.0), rtol=1e-9)
 

@@ -9,7 +9,7 @@ import types
 import pytest
 from commands import assert_one_error_line, left_in, run, umask
 
-from diffabs.cli import console, main
+from diffabs.cli import catalogue, console
 from diffabs.papers.digest import Digest
 from diffabs.scenario import registry
 
@@ -18,8 +18,8 @@ from diffabs.scenario import registry
 
 def test_list_knows_every_part():
     document = json.loads(run("list", "--json").stdout)
-    assert set(document) == {*main.PLURALS, "scenarios"}
-    for plural, family in main.PLURALS.items():
+    assert set(document) == {*catalogue.PLURALS, "scenarios"}
+    for plural, family in catalogue.PLURALS.items():
         assert set(document[plural]) == set(registry.types(family))
     mass = document["plants"]["quarter-car"]["parameters"]["mass"]
     assert mass == {"default": 15.0, "unit": "kg", "range": "(0, inf) kg", "low": 0.0, "high": None}
@@ -30,7 +30,7 @@ def test_list_knows_every_part():
     assert document["actuators"]["delay"]["parameters"]["capacity"]["default"] == 1024
     assert document["objectives"]["variation"]["unit"] == "N m"
     assert document["scenarios"]["slip-lmi"]["title"]
-    assert all(member["summary"] for family in main.PLURALS for member in document[family].values())
+    assert all(member["summary"] for family in catalogue.PLURALS for member in document[family].values())
 
 
 def test_list_table_shows_units_and_ranges():

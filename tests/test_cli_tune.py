@@ -15,7 +15,7 @@ import pytest
 from commands import assert_one_error_line, left_in, run, umask
 
 import diffabs.tune as library
-from diffabs.cli import certificates, console
+from diffabs.cli import certificates, console, tune_document
 from diffabs.cli import tune as commands_tune
 from diffabs.core import interrupt
 from diffabs.core.pytree import parameters, replace
@@ -140,7 +140,7 @@ def tuned(tmp_path_factory):
     (folder / "small.toml").write_text(SMALL)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(certificates, "task", lambda chosen: pytest.fail("asked for a proof too early"))
-        patch.setattr(commands_tune, "_proved", lambda after: commands_tune._Proved({"decay_rate": None}, "no proof"))
+        patch.setattr(commands_tune, "_proved", lambda after: commands_tune.Proved({"decay_rate": None}, "no proof"))
         out = ("--out", folder / "out.toml", "--plot", folder / "a.png")
         result = run("tune", folder / "small.toml", "--json", *out)
     return folder, json.loads(result.stdout), result.stderr
@@ -352,9 +352,9 @@ def test_met_is_met_without_a_tolerance(small, invented, bound, met):
 
 
 def test_a_limit_on_what_is_no_number_is_not_met():
-    judged = commands_tune._judged("overshoot", 0.2, 0.3, math.nan, at_most=True)
+    judged = tune_document._judged("overshoot", 0.2, 0.3, math.nan, at_most=True)
     assert (judged["met"], judged["missed"]) == (False, None)
-    judged = commands_tune._judged("certified decay", 5.0, None, None, at_most=False)
+    judged = tune_document._judged("certified decay", 5.0, None, None, at_most=False)
     assert (judged["met"], judged["missed"]) == (False, None)
 
 

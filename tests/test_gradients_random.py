@@ -10,14 +10,14 @@ from parts import inside
 from diffabs import actuators, controllers, plants, references, roads, sensors
 from diffabs.core.pytree import check
 
-QUICK = ("relay, latch, lag",)
-NAMES = [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in random_loops.STRUCTURES]
+COUNTS = dict.fromkeys(random_loops.STRUCTURES, 3) | {"relay, latch, lag": 6}  # loops of a structure
 LEFT_OUT = {"Quantisation", "PeakLiteral"}  # parts whose derivative says nothing of their jumps, as they document
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COUNTS)
 def test_gradients_are_those_of_wide_differences(name):
-    founds = studied(name, range(2 if name in QUICK else 3), seed=1, told=False)
+    founds = studied(name, range(COUNTS[name]), seed=1, told=False)
     assert all(found.ended for found in founds)
     wrong = offenders(founds)
     assert not wrong, "\n".join(line(row) for row in wrong)

@@ -68,7 +68,7 @@ def _fields(loop):
     return {"plant": loop.plant, "initial": loop.initial, "stop": loop.stop}
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", [pytest.param(i, marks=pytest.mark.slow if i > 5 else ()) for i in range(12)])
 def test_random_scenario_agrees_with_scipy(seed):
     loop, torque, rates, memory = _case(seed)
     d.check(loop)

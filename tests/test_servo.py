@@ -309,6 +309,7 @@ def test_certify_and_design_prove_a_gain_over_the_box():
     assert found["guaranteed_cost"] < document["guaranteed_cost"]
 
 
+@pytest.mark.slow
 def test_tune_is_by_gradients_over_inertia_and_load(tmp_path):
     few = ("--set", "tune.iterations=4", "--set", "tune.limits={}", "--set", "tune.decay=0")
     document = json.loads(run("tune", "servo.toml", *PARTS, *FAST, *few, "--out", tmp_path / "t.toml", "--json").stdout)

@@ -109,7 +109,11 @@ def same(found, expected, **tolerance):
 
 def test_each_row_is_its_lane_run_by_itself(with_roads, over_roads):
     assert over_roads.column("sample").tolist() == list(range(150))
-    same(metrics(over_roads), one_by_one(with_roads, range(150)), **TOLERANCE)
+    some = np.arange(0, 150, 4)
+    assert len(set(over_roads.column("plant.road")[some])) == 2
+    assert 0 < over_roads.column("diverged")[some].sum() < len(some)
+    table = {name: column[some] for name, column in metrics(over_roads).items()}
+    same(table, one_by_one(with_roads, some), **TOLERANCE)
 
 
 def test_parameters_are_the_drawn_ones(with_roads, over_roads):
@@ -174,6 +178,7 @@ def test_the_length_of_a_chunk_changes_rounding_only(study, swept, tmp_path):
         assert np.array_equal(found.column(path), swept.column(path))
 
 
+@pytest.mark.slow
 def test_float32(tmp_path):
     """Against runs in float32: noise is drawn from other bits than in float64."""
     single = dataclasses.replace(described(SINGLE), dtype="float32", samples=70)

@@ -316,7 +316,13 @@ def test_a_damaged_chunk_is_found(copy, how):
     assert not path.exists()
 
 
-@pytest.mark.parametrize("how", ["truncated", "a bit in the middle", "a bit of the footer"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        "a bit in the middle",
+        *(pytest.param(how, marks=pytest.mark.slow) for how in ("truncated", "a bit of the footer")),
+    ],
+)
 def test_a_damaged_chunk_is_computed_again(copy, whole, how):
     path = sorted((copy / "chunks").iterdir())[1]
     data = path.read_bytes()

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from diffabs.cli import console, show
+from diffabs.cli import console, show, show_samples
 from diffabs.cli.sweep import warn_of_strays
 from diffabs.core.values import ScenarioError, unknown
 
@@ -29,7 +29,7 @@ def compare(
         a, b = Results(first), Results(second)
         _check_same(a, b)
         result = {"first": str(first), "second": str(second), **_compared(a, b, _metrics(a, b, metric))}
-        show.as_json(result) if as_json else show.compared(result)
+        show.as_json(result) if as_json else show_samples.compared(result)
 
 
 def _check_same(a: "Results", b: "Results") -> None:

@@ -7,26 +7,35 @@ import dataclasses
 import importlib
 import math
 import pathlib
-import time
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import jax
 import numpy as np
 import typer
 
 from diffabs import __version__
-from diffabs.cli import compare, compiled, console, design, identify, rare, show, sweep, tune, usage
+from diffabs.cli import (
+    catalogue,
+    compare,
+    compiled,
+    console,
+    design,
+    identify,
+    rare,
+    reproduce,
+    show,
+    sweep,
+    tune,
+    usage,
+)
 from diffabs.cli.checking import checked, said
-from diffabs.core import interrupt, provenance, values
+from diffabs.core import interrupt, provenance
 from diffabs.core.pytree import parameters
 from diffabs.core.units import units_of
 from diffabs.scenario import registry
-from diffabs.scenario.scenario import Scenario, dump, header, names
+from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.run import measure, rollout
 from diffabs.simulate.solution import Run, described
-
-if TYPE_CHECKING:
-    from diffabs.papers import Reproduction
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -38,9 +47,6 @@ app = typer.Typer(
 )
 
 MOST_ROWS = 20_000  # of a trajectory
-PLURALS = {f"{name}s": name for name in ("plant", "road", "controller", "reference", "actuator", "sensor")}
-PLURALS |= {"feedforward": "feedforward", "antiwindup": "antiwindup", "initial": "initial"}
-PLURALS |= {"stops": "stop", "objectives": "objective"}
 
 
 def main() -> NoReturn:
@@ -196,100 +202,6 @@ def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -
     }
 
 
-def list_parts(
-    family: Annotated[
-        str | None, typer.Argument(metavar="[FAMILY]", help=f"{', '.join(PLURALS)} or scenarios.")
-    ] = None,
-    as_json: console.Json = False,
-) -> None:
-    """Every part with its parameters, defaults, units and ranges; every packaged scenario."""
-    with console.guarded():
-        there = (*PLURALS, "scenarios")
-        if family is not None and family not in there:
-            raise values.unknown(f"there is no family {values.shown(family)}", family, there)
-        result = {name: _listed(name) for name in there if family in (None, name)}
-        if as_json:
-            return show.as_json(result)
-        for name, members in result.items():
-            show.family(name, members)
-    return None
-
-
-def show_scenario(
-    scenario: console.ScenarioName,
-    changes: console.Changes = None,
-    out: Annotated[
-        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write to this file; default: stdout.")
-    ] = None,
-) -> None:
-    """A scenario as TOML with every field, to start one's own from."""
-    with console.guarded():
-        console.check_scenario_file(out)
-        text = dump(console.loaded(scenario, changes, integrated=False))
-        with console.new_file(out, "--out") as file:
-            file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
-
-
-def _listed(plural: str) -> dict[str, Any]:
-    """The members of a family as plain values."""
-    if plural == "scenarios":
-        return {name: header(name) for name in names()}
-    family = PLURALS[plural]
-    return {
-        name: {
-            "summary": registry.summary(part),
-            **({"unit": registry.unit_of(part)} if family == "objective" else {}),
-            "parameters": registry.described(family, part),
-        }
-        for name, part in registry.types(family).items()
-    }
-
-
-def reproduce(
-    name: Annotated[str, typer.Argument(help="slip-lmi, slip-estimator, arm-balance, or all.")] = "all",
-    out: Annotated[pathlib.Path, typer.Option(help="Folder for the results, one folder per paper.")] = pathlib.Path(
-        "out"
-    ),
-    as_json: console.Json = False,
-) -> None:
-    """A paper's whole result: figures, summary.json, and in short what agrees with it and what is refuted."""
-    with console.guarded():
-        console.need_matplotlib()
-        from diffabs.papers import PAPERS, compact
-
-        if name != "all" and name not in PAPERS:
-            raise values.unknown(f"there is no paper {values.shown(name)}", name, (*PAPERS, "all"))
-        results: dict[str, Any] = {}
-        try:
-            for paper in PAPERS if name == "all" else (name,):
-                with console.new_folder(out / paper) as folder:
-                    results[paper] = _reproduced(paper, PAPERS[paper], folder)
-                if not as_json:
-                    show.paper(compact(results[paper]), out / paper)
-        except KeyboardInterrupt:
-            if not results:
-                raise
-            console.say(f"interrupted: whole are {', '.join(str(out / paper) for paper in results)}")
-            raise typer.Exit(console.INTERRUPTED) from None
-        if as_json:
-            show.as_json({"out": str(out), "papers": results, "versions": provenance.versions()})
-
-
-def _reproduced(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> dict[str, Any]:
-    """The summary of a paper. Its steps are told beside the spinner, or in a line each where there is none."""
-    spins, steps, begun = console.animated(), ["starting"], time.monotonic()
-
-    def step(sentence: str) -> None:
-        steps.append(sentence.removeprefix(f"{name}: "))
-        if not spins:
-            console.say(sentence)
-
-    def detail() -> str:
-        return f"{time.monotonic() - begun:.0f} s: {steps[-1]}"
-
-    return console.waited(lambda: reproduction(folder, step), f"reproducing {name}", detail if spins else None)
-
-
 def _parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
     """Every part by its path: its type, and what it has beside parameters."""
     objectives = {f"objective.{name}": one for name, one in chosen.objectives.items()}
@@ -325,6 +237,6 @@ usage.add(app, identify.identify, "identify slip-lmi --data run.csv --free plant
 usage.add(app, sweep.sweep, "sweep slip-lmi --samples 10000 --set solver.step=1e-3 --figures")
 usage.add(app, rare.rare, "rare slip-lmi stop_time=2.2 --set solver.step=1e-3")
 usage.add(app, compare.compare, "compare out/sweep-slip-lmi out/sweep-mine --metric iae")
-usage.add(app, list_parts, "list roads", "list")
-usage.add(app, show_scenario, "show slip-lmi --set plant.mass=6.2 --out mine.toml", "show")
-usage.add(app, reproduce, "reproduce slip-estimator")
+usage.add(app, catalogue.list_parts, "list roads", "list")
+usage.add(app, catalogue.show_scenario, "show slip-lmi --set plant.mass=6.2 --out mine.toml", "show")
+usage.add(app, reproduce.reproduce, "reproduce slip-estimator")

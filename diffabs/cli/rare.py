@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from diffabs.cli import console, show
+from diffabs.cli import console, show, show_samples
 from diffabs.core import provenance
 from diffabs.core.pytree import Spec
 from diffabs.core.values import ScenarioError, number, unknown
@@ -42,7 +42,7 @@ def rare(
         study = section_sweep.study(chosen)
         found = _estimated(study, metric, bound, samples, gradients)
         result = _document(found, study, chosen, metric, bound)
-        show.as_json(result) if as_json else show.rare(result, chosen)
+        show.as_json(result) if as_json else show_samples.rare(result, chosen)
 
 
 def _failure(text: str, chosen: Scenario) -> tuple[str, float]:

@@ -52,7 +52,7 @@ def run(result: dict[str, Any], chosen: Scenario) -> None:
     table = Table("metric", "value", "unit")
     for name, value in result["metrics"].items():
         table.add_row(name, f"{value:.6g}", unit_of(chosen.objectives[name], chosen.loop.plant))
-    _print(chosen.title or chosen.name, table)
+    titled(chosen.title or chosen.name, table)
     for name, path in result["files"].items():
         say(f"{name}: {path}")
 
@@ -65,7 +65,7 @@ def accuracy(found: dict[str, Any]) -> None:
         numbers = (row["difference"], row["relative"], row["error"], row["float32 difference"])
         half, relative, error, single = ("" if x is None or math.isnan(x) else f"{x:.1e}" for x in numbers)
         table.add_row(name, half, relative, order, error, single)
-    _print("what a half step changes, at which order, the error that is left at this step; float32", table)
+    titled("what a half step changes, at which order, the error that is left at this step; float32", table)
 
 
 def family(name: str, members: dict[str, Any]) -> None:
@@ -80,12 +80,10 @@ def family(name: str, members: dict[str, Any]) -> None:
             member = f"{member} [{about['unit']}]" if about.get("unit") else member
             fields = about["parameters"] or {"": {"default": "", "unit": "", "range": ""}}
             for field, row in fields.items():
-                table.add_row(
-                    member, field, _brief(row["default"]), row["unit"], row["range"].removesuffix(row["unit"])
-                )
+                table.add_row(member, field, brief(row["default"]), row["unit"], row["range"].removesuffix(row["unit"]))
                 member = ""
             table.add_section()
-    _print(name, table)
+    titled(name, table)
 
 
 def paper(digest: Digest, folder: pathlib.Path) -> None:
@@ -113,7 +111,7 @@ def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict:
     gains = Table("state", "gain")
     for state, value in zip(result["states"], result["gain"], strict=True):
         gains.add_row(state, f"{value:.8g}")
-    _print(title, gains)
+    titled(title, gains)
     numbers = Table("quantity", "value", "unit")
     numbers.add_row("common Lyapunov matrix" if result["besides"] else "quadratically stable", verdict, "")
     if known := result["besides"]:
@@ -126,7 +124,7 @@ def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict:
     for name, unit in PROOF.items():
         if result[name] is not None:
             numbers.add_row(name.replace("_", " "), f"{result[name]:.8g}", unit)
-    _print("proof", numbers)
+    titled("proof", numbers)
     corners = result["corners"] or [{} for _ in result["poles"]]
     discrete = result["period"] is not None
     names = [f"{name} [{units[name]}]" for name in corners[0]]
@@ -136,7 +134,7 @@ def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict:
     covered = (
         result["coverage"] and f"; their hull covers {result['coverage']['checked']} systems checked within the ranges"
     )
-    _print(f"{result['vertices']} vertices{covered or ', the systems on a grid of the ranges'}", vertices)
+    titled(f"{result['vertices']} vertices{covered or ', the systems on a grid of the ranges'}", vertices)
 
 
 def verified(result: dict[str, Any], json_wanted: bool) -> None:
@@ -154,27 +152,27 @@ def tuned(result: dict[str, Any], chosen: Scenario) -> None:
     """Parameters, metrics and constraints before and after, and how it went."""
     free = Table("parameter", "before", "after", "low", "high", "unit")
     for path, row in result["free"].items():
-        free.add_row(path, *(_brief(row[key]) for key in ("before", "after", "low", "high")), row["unit"])
-    _print(f"{chosen.title or chosen.name}: free parameters", free)
+        free.add_row(path, *(brief(row[key]) for key in ("before", "after", "low", "high")), row["unit"])
+    titled(f"{chosen.title or chosen.name}: free parameters", free)
     metrics = Table("metric", "mean before", "mean after", "worst before", "worst after", "unit")
     for name in result["metrics"]["before"]["mean"]:
         numbers = (result["metrics"][when][of][name] for of in ("mean", "worst") for when in ("before", "after"))
-        metrics.add_row(name, *map(_brief, numbers), unit_of(chosen.objectives[name], chosen.loop.plant))
-    _print(f"over {result['lanes']} lane{'s' if result['lanes'] > 1 else ''}", metrics)
+        metrics.add_row(name, *map(brief, numbers), unit_of(chosen.objectives[name], chosen.loop.plant))
+    titled(f"over {result['lanes']} lane{'s' if result['lanes'] > 1 else ''}", metrics)
     if result["constraints"]:
         limits = Table("constraint", "bound", "before", "after", "met")
         for row in result["constraints"]:
-            numbers = ("" if row[key] is None else _brief(row[key]) for key in ("bound", "before", "after"))
+            numbers = ("" if row[key] is None else brief(row[key]) for key in ("bound", "before", "after"))
             limits.add_row(row["name"], *numbers, "yes" if row["met"] else f"NO, {missed(row)}")
-        _print("constraints, worst lane or vertex", limits)
+        titled("constraints, worst lane or vertex", limits)
     how = Table("tuning", "")
     for name in ("before", "after"):
-        how.add_row(f"objective {name}", _brief(result["objective"][name]))
+        how.add_row(f"objective {name}", brief(result["objective"][name]))
     how.add_row("gradients computed", str(result["evaluations"]))
     how.add_row("gradient mode", result["mode"])
     how.add_row("greatest component of the last gradient", f"{result['gradient_norm']:.2g}")
     how.add_row("it ended because", result["reason"])
-    _print("", how)
+    titled("", how)
     for name, path in result["files"].items():
         say(f"{name}: {path}")
 
@@ -191,12 +189,12 @@ def identified(result: dict[str, Any]) -> None:
     """Values with standard deviations, what hangs together, what the data leave open, and what is left over."""
     values = Table("parameter", "before", "identified", "standard deviation", "unit")
     for name, row in result["values"].items():
-        values.add_row(name, _brief(row["before"]), _brief(row["value"]), f"{row['deviation']:.3g}", row["unit"])
-    _print(f"{result['scenario']}: identified from {result['data']['samples']} instants", values)
+        values.add_row(name, brief(row["before"]), brief(row["value"]), f"{row['deviation']:.3g}", row["unit"])
+    titled(f"{result['scenario']}: identified from {result['data']['samples']} instants", values)
     left = Table("column", "sigma", "rms", "mean", "largest", "unit")
     for name, row in result["residuals"].items():
         left.add_row(name, *(f"{row[key]:.3g}" for key in ("sigma", "rms", "mean", "largest")), row["unit"])
-    _print("simulated minus measured", left)
+    titled("simulated minus measured", left)
     for row in result["correlations"]:
         say(f"note: {row['between'][0]} and {row['between'][1]} are correlated by {row['correlation']:.4f}")
     say(f"it ended because {result['reason']}, after {result['evaluations']} evaluations")
@@ -204,94 +202,15 @@ def identified(result: dict[str, Any]) -> None:
         say(f"{name}: {path}")
 
 
-def swept(result: dict[str, Any], chosen: Scenario) -> None:
-    """Failures, statistics with intervals, what moves what, the worst samples."""
-    failures = Table("failure", "lanes", "probability", "low", "high")
-    for name, row in result["failures"].items():
-        failures.add_row(name, str(row["count"]), *_estimate(row))
-    percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
-    _print(f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", failures)
-    kinds = list(next((row for row in result["metrics"].values() if row), {}))
-    kinds = [kind for kind in kinds if kind not in ("least", "greatest")]
-    metrics = Table("metric", "unit", "", "value", "low", "high")
-    for name, row in result["metrics"].items():
-        for i, kind in enumerate(kinds):
-            first = (name, unit_of(chosen.objectives[name], chosen.loop.plant)) if i == 0 else ("", "")
-            metrics.add_row(*first, kind, *_estimate(row[kind]))
-        metrics.add_section()
-    _print("statistics of the lanes that did not diverge", metrics)
-    paths = list(next(iter(result["sensitivity"].values()), {}))
-    if paths:
-        kind = list(next(iter(result["sensitivity"].values()))[paths[0]])[-1]
-        moves = Table("metric", *paths)
-        for name, row in result["sensitivity"].items():
-            moves.add_row(
-                name, *("" if row[p][kind]["value"] is None else f"{row[p][kind]['value']:.3f}" for p in paths)
-            )
-        _print({"spearman": "rank correlations", "total": "total Sobol' indices"}[kind], moves)
-    if (refused := result["refused"])["count"]:
-        why = "; ".join(f"{reason} ({count})" for reason, count in refused["reasons"].items())
-        say(
-            f"refused: {refused['count']} of {result['samples']} samples were not run and are in no number here, the"
-            f" first sample {refused['samples'][0]}: {why}"
-        )
-    if result["accuracy"] and result["accuracy"]["metrics"]:
-        changes = Table("metric", "median change", "largest", "in sample")
-        for name, row in result["accuracy"]["metrics"].items():
-            changes.add_row(name, f"{row['median']:.1e}", f"{row['largest']:.1e}", str(row["sample"]))
-        count = len(result["accuracy"]["samples"])
-        _print(f"what a half step changes, relative, in {count} lane{'s' if count > 1 else ''} drawn from all", changes)
-    for name, rows in result["worst"].items():
-        if rows:
-            say(f"greatest {name}: {_brief(rows[0]['value'])} in sample {rows[0]['sample']}")
-    say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
-
-
-def rare(result: dict[str, Any], chosen: Scenario) -> None:
-    """A small probability, the levels that led to it, and the likeliest failures."""
-    levels = Table("level", "at least", "share", "coefficient of variation", "accepted", "diverged")
-    for i, row in enumerate(result["levels"], 1):
-        names = ("threshold", "share", "cov", "acceptance")
-        levels.add_row(str(i), *(f"{row[name]:.4g}" for name in names), str(row["diverged"]))
-    _print(f"{chosen.title or chosen.name}: {result['metric']} >= {result['bound']:g} {result['unit']}", levels)
-    estimates = Table("estimate", "probability", "low", "high", "coefficient of variation")
-    for name in ("subset simulation", "importance sampling"):
-        if row := result[name]:
-            estimates.add_row(name, *(f"{x:.4g}" for x in (row["probability"], *row["interval"], row["cov"])))
-    low, high = result["interval"]
-    _print(f"probability {result['probability']:.3g}, 95 % interval {low:.3g} to {high:.3g}", estimates)
-    count = len(next(iter(result["failures"].values()), ()))
-    failures = Table("likeliest failures", *map(str, range(1, count + 1)))
-    for path, column in result["failures"].items():
-        failures.add_row(path, *map(_brief, column))
-    if result["failures"]:
-        _print("", failures)
-    say(f"{result['note']}; {result['reason']}")
-    say(f"{result['runs']} runs and {result['gradients']} gradients; {result['diverged']} diverged")
-
-
-def compared(result: dict[str, Any]) -> None:
-    """Means of two sweeps, and their difference sample by sample."""
-    table = Table("metric", "first", "second", "second - first", "low", "high", "less in", "variance reduction")
-    for name, row in result["metrics"].items():
-        less = f"{100 * row['share in which the second is less']['value']:.1f} %"
-        means = (_brief(row[key]) for key in ("first", "second"))
-        table.add_row(name, *means, *_estimate(row["difference"]), less, _brief(row["variance reduction"]))
-    out = f", {result['left out']} left out that diverged" if result["left out"] else ""
-    _print(f"{result['second']} against {result['first']}: {result['samples']} common samples{out}", table)
-
-
-def _estimate(row: dict[str, Any]) -> list[str]:
-    return ["" if row[key] is None else _brief(row[key]) for key in ("value", "low", "high")]
-
-
-def _brief(value: Any) -> str:
+def brief(value: Any) -> str:
+    """A number to six digits, of a list the first four."""
     if isinstance(value, list):
-        return f"[{', '.join(map(_brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
+        return f"[{', '.join(map(brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _print(title: str, table: Table) -> None:
+def titled(title: str, table: Table) -> None:
+    """A table on stdout, below its title."""
     for column in table.columns:
         column.overflow = "fold"  # a pipe has no width: nothing may be cut off
     console = _console()

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import typer
 
-from diffabs.cli import console, progress, show
+from diffabs.cli import console, progress, show, show_samples
 from diffabs.core import files
 from diffabs.core.pytree import elements
 from diffabs.core.values import ScenarioError, unknown
@@ -76,7 +76,7 @@ def sweep(
                 raise KeyboardInterrupt
             check = chosen.sweep.check
             result = console.waited(lambda: _result(found, study, out, kept, figures, check), "computing statistics")
-        show.as_json(result) if as_json else show.swept(result, chosen)
+        show.as_json(result) if as_json else show_samples.swept(result, chosen)
         _warn(result["accuracy"])
         _check_any(result, chosen)
 

@@ -4,18 +4,16 @@ It needs the extra `diffabs[tune]`, and for a proof `diffabs[design]`; what need
 
 import contextlib
 import dataclasses
-import math
 import pathlib
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import numpy as np
 import typer
 
 from diffabs.cli import certificates, console, show
-from diffabs.core import provenance
-from diffabs.core.pytree import get, parameters
+from diffabs.cli.tune_document import Proved, Work, documented
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.refusals import first_line
@@ -23,28 +21,9 @@ from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Trajectory
 
 if TYPE_CHECKING:
-    from diffabs.tune import Batch, Progress, Tuned
+    from diffabs.tune import Progress, Tuned
 
-WHEN = ("before", "after")
 ROUNDING = 1e-9  # relative: of a decay rate as a factor for one period, with plenty to spare
-
-
-class _Work(NamedTuple):
-    """What is tuned: the scenario, its lanes, its constraints by name, and the linear systems a decay is asked of."""
-
-    chosen: Scenario
-    batch: "Batch"
-    constraints: dict[str, Any]
-    task: certificates.Task | None
-
-
-class _Proved(NamedTuple):
-    """The JSON of a certificate, whose numbers are null where there is none, and why not in a sentence."""
-
-    document: dict[str, Any]
-    sentence: str
-    task: certificates.Task | None = None
-    certified: bool = False
 
 
 def tune(
@@ -104,10 +83,10 @@ def _tuned(chosen: Scenario, out: pathlib.Path | None, picture: pathlib.Path | N
     after = chosen.with_loop(found.loop, "tuned")
     try:
         proved = console.waited(lambda: _proved(after), "certifying the result")
-        result = console.waited(lambda: _result(work, found, proved), "comparing with what there was before")
+        result = console.waited(lambda: documented(work, found, proved), "comparing with what there was before")
     except KeyboardInterrupt:
         interrupted, proved = True, _unproved("interrupted")
-        result = _without_proof(work, _result(work._replace(task=None), found, proved))
+        result = _without_proof(work, documented(work._replace(task=None), found, proved))
     if out and result["met"]:
         out.write_text(dump(after), encoding="utf-8")
     if picture and result["met"]:
@@ -125,7 +104,7 @@ def _finished(draw: Callable[[], None], picture: pathlib.Path) -> bool:
     return True
 
 
-def _without_proof(work: _Work, result: dict[str, Any]) -> dict[str, Any]:
+def _without_proof(work: Work, result: dict[str, Any]) -> dict[str, Any]:
     """With the constraints that nobody has looked at, which are therefore not met."""
     seen = [row["name"] for row in result["constraints"]]
     goal = work.chosen.tune
@@ -138,7 +117,7 @@ def _without_proof(work: _Work, result: dict[str, Any]) -> dict[str, Any]:
     return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
 
 
-def _work(chosen: Scenario) -> _Work:
+def _work(chosen: Scenario) -> Work:
     """Raises ScenarioError for what does not fit together."""
     from diffabs.tune import AtMost, CertifiedDecay, Poles
 
@@ -152,10 +131,10 @@ def _work(chosen: Scenario) -> _Work:
         constraints["certified decay"] = CertifiedDecay(task.polytope, goal.decay)
     if task and goal.damping:
         constraints["damping"] = Poles(task.polytope, damping=goal.damping)
-    return _Work(chosen, batch, constraints, task)
+    return Work(chosen, batch, constraints, task)
 
 
-def _watched(work: _Work) -> tuple["Tuned", bool]:
+def _watched(work: Work) -> tuple["Tuned", bool]:
     """Tune, and say how far it is; whether Ctrl-C ended it. Raises typer.Exit where no start can be used."""
     from diffabs import tune
     from diffabs.tune import Method, StartError, Stopping
@@ -196,7 +175,7 @@ def _said(told: "list[Progress]") -> str:
     )
 
 
-def _proved(after: Scenario) -> _Proved:
+def _proved(after: Scenario) -> Proved:
     """A certificate over the ranges of [design], if there can be one, of the decay that is asked for, if that can be
     proved."""
     decay = after.tune.decay
@@ -217,90 +196,14 @@ def _proved(after: Scenario) -> _Proved:
     rate = document["decay_rate"]
     over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
     said = reason or f"quadratically stable over {over}, decay rate {rate:.4g} 1/s"
-    return _Proved(document, f"certificate: {said}", task, certified=True)
+    return Proved(document, f"certificate: {said}", task, certified=True)
 
 
-def _unproved(why: str) -> _Proved:
-    return _Proved({**dict.fromkeys(certificates.FROM_PROOF), "reason": why}, f"no certificate: {why}")
+def _unproved(why: str) -> Proved:
+    return Proved({**dict.fromkeys(certificates.FROM_PROOF), "reason": why}, f"no certificate: {why}")
 
 
-def _result(work: _Work, found: "Tuned", proved: _Proved) -> dict[str, Any]:
-    """The JSON document."""
-    chosen, goal = work.chosen, work.chosen.tune
-    return {
-        "scenario": chosen.name,
-        "lanes": work.batch.size,
-        "free": {path: _free(chosen, found, path) for path in goal.free},
-        "objective": dict(zip(WHEN, map(float, found.objective), strict=True)),
-        "metrics": {when: _over_lanes(m, chosen) for when, m in zip(WHEN, found.metrics, strict=True)},
-        "constraints": (rows := _constraints(work, found, proved)),
-        "met": all(row["met"] for row in rows),
-        "reason": found.reason.value,
-        "gradient_norm": float(found.gradient),
-        "evaluations": found.evaluations,
-        "mode": found.mode.value,
-        "history": [point._asdict() for point in found.history],
-        "starts": [
-            {"objective": float(s.objective), "violation": float(s.violation), "reason": s.reason.value}
-            for s in found.starts
-        ],
-        "parameters": {path: _plain(value) for path, _, value in parameters(found.loop)},
-        "certificate": proved.document,
-        "versions": provenance.versions("optax", "scipy", *(("cvxpy", "clarabel") if proved.certified else ())),
-        "files": {},
-    }
-
-
-def _free(chosen: Scenario, found: "Tuned", path: str) -> dict[str, Any]:
-    spec = next(spec for name, spec, _ in parameters(chosen.loop) if name == path)
-    low, high = chosen.tune.free[path] or (spec.low, spec.high)
-    before, after = (_plain(get(loop, path)) for loop in (chosen.loop, found.loop))
-    return {"before": before, "after": after, "low": _plain(low), "high": _plain(high), "unit": spec.unit}
-
-
-def _over_lanes(metrics: dict[str, Any], chosen: Scenario) -> dict[str, dict[str, float]]:
-    """NaN where a lane diverged: a mean over the others would hide it."""
-    each = {name: np.asarray(metrics[name], float) for name in chosen.objectives}
-    return {
-        "mean": {name: float(values.mean()) for name, values in each.items()},
-        "worst": {name: float(values.max()) for name, values in each.items()},
-    }
-
-
-def _constraints(work: _Work, found: "Tuned", proved: _Proved) -> list[dict[str, Any]]:
-    """What was asked for, its worst value before and after, and whether it is met."""
-    goal, rows = work.chosen.tune, []
-    for name, bound in goal.limits.items():
-        before, after = (float(np.max(metrics[name])) for metrics in found.metrics)
-        rows.append(_judged(name, bound, before, after, at_most=True))
-    if work.task and goal.decay:
-        before, after = certificates.certified(work.task).decay_rate, proved.document["decay_rate"]
-        rows.append(_judged("certified decay", goal.decay, before, after, at_most=False))
-    if work.task and goal.damping:
-        before = _damping(work.task, work.chosen.loop)
-        after = _damping(proved.task or work.task, found.loop)
-        rows.append(_judged("damping", goal.damping, before, after, at_most=False))
-    return rows
-
-
-def _judged(name: str, bound: float, before: float | None, after: float | None, *, at_most: bool) -> dict[str, Any]:
-    """A line of the constraints. Met is met, without a tolerance; else `missed` is by how much it is not, or null where
-    no number is known."""
-    reached = math.nan if after is None else after
-    beyond = reached - bound if at_most else bound - reached
-    missed = None if math.isnan(beyond) else max(beyond, 0.0)
-    row = {"name": name, "bound": bound, "before": before, "after": after}
-    return {**row, "met": beyond <= 0, "missed": missed}
-
-
-def _damping(task: certificates.Task, loop: Any) -> float:
-    """The least of the poles at the vertices."""
-    from diffabs.tune import Poles
-
-    return float(Poles(task.polytope).least_damping(loop))
-
-
-def _drawn(work: _Work, found: "Tuned", path: pathlib.Path) -> None:
+def _drawn(work: Work, found: "Tuned", path: pathlib.Path) -> None:
     """The history, and the lane that is the worst afterwards, before and after."""
     from diffabs.plot.tuning import tuning
 
@@ -317,7 +220,3 @@ def _drawn(work: _Work, found: "Tuned", path: pathlib.Path) -> None:
     where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
     title = chosen.title or chosen.name
     tuning(found.history, runs, title=title, lane=where, unit=chosen.loop.plant.control_unit).savefig(path)
-
-
-def _plain(value: Any) -> Any:
-    return np.asarray(value, float).tolist()

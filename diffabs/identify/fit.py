@@ -109,15 +109,7 @@ def fit(
     deviations = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, float), (n,))
     estimated = sigma is None or not absolute
     watch = _Watch(progress or (lambda _, __: None), stopping)
-    fits: list[Identified | None] = []
-    for z in points:
-        if not (any(fits) and stopping()):
-            fits.append(_fitted(problem, z, deviations, estimated, tolerances or Tolerances(), watch))
-    done = tuple(one for one in fits if one is not None)
-    if not done:
-        raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
-    diverged = tuple(_values(where, z) for z, one in zip(points, fits, strict=False) if one is None)
-    return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
+    return _best(problem, points, deviations, estimated, tolerances or Tolerances(), watch)
 
 
 class _Stopped(Exception):
@@ -148,6 +140,26 @@ def _check(p: int, n: int, k: int, sigma: Any, norm: float, absolute: bool) -> N
         raise ValueError(f"{n} data do not determine {p} parameters{more}: free fewer, or state a prior")
     if not 2 <= norm < np.inf:
         raise ValueError(f"norm = {norm:g} is outside [2, inf)")
+
+
+def _best(
+    problem: Problem,
+    points: Sequence[np.ndarray],
+    sigma: np.ndarray,
+    estimated: bool,
+    tolerances: Tolerances,
+    watch: _Watch,
+) -> Identified:
+    """The best fit from these points, with all others. Raises ValueError where none can be used."""
+    fits: list[Identified | None] = []
+    for z in points:
+        if not (any(fits) and watch.stopping()):
+            fits.append(_fitted(problem, z, sigma, estimated, tolerances, watch))
+    done = tuple(one for one in fits if one is not None)
+    if not done:
+        raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
+    diverged = tuple(_values(problem.space, z) for z, one in zip(points, fits, strict=False) if one is None)
+    return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
 
 
 def _fitted(

@@ -5,11 +5,12 @@ Units are handed in by the name of a column. Columns are in SI; variables that a
 
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from diffabs.plot.runs import COLOURS, GREY, KMH, Axes, Figure, label, save, sheet
+from diffabs.plot.runs import COLOURS, GREY, Axes, Figure, label, save, sheet
+from diffabs.plot.sweep_view import Variable, View, cells
 from diffabs.sweep.engines import missed, missing
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics.estimates import Count, Tail
@@ -17,10 +18,7 @@ from diffabs.sweep.statistics.estimates import Count, Tail
 FAR = 2.0  # widths between the outer quantiles: what lies further outside would press a histogram together
 LEVELS = 32  # of an exceedance curve along the share, as many along its logarithm, and as many runs one by one
 POINTS = 5000  # of a scatter
-CELLS = (4, 24)  # of a map along one variable, fewest and most; one with fewer different values has a cell for each
-LANES = 10  # of a cell on average, if there are enough
 FEW = 10  # failures, or runs without, that are too few to tell which variables matter
-ROUNDING = 16  # epsilons: metrics are differences of numbers around one
 ROW = 0.055  # of the axes' height, for a line of text beside them
 ABOVE = dict(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False, fontsize=9, handlelength=1.5)
 
@@ -39,7 +37,7 @@ def draw(found: Results, document: Any, folder: pathlib.Path, units: Mapping[str
 
 def distributions(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """A histogram of each metric, with its median and two quantiles. None where no metric varies."""
-    view = _View(found, units)
+    view = View(found, units)
     figure, axes = _panels(view.varying, view.title("distributions of", view.rows))
     for ax, name in zip(axes, view.varying, strict=True):
         values = found.column(name)[view.rows]
@@ -61,7 +59,7 @@ def distributions(found: Results, units: Mapping[str, str] = {}) -> Figure | Non
 def exceedance(found: Results, units: Mapping[str, str] = {}, confidence: float = 0.95) -> Figure | None:
     """The share of runs beyond each value, with pointwise intervals of Clopper and Pearson unless nothing is random.
     None where no metric varies."""
-    view = _View(found, units)
+    view = View(found, units)
     band = f"{100 * confidence:g} % band" + ("" if view.design == "random" else " (as if independent)")
     figure, axes = _panels(view.varying, view.title("how often a value is exceeded in", view.rows))
     for ax, name in zip(axes, view.varying, strict=True):
@@ -85,7 +83,7 @@ def worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -> Fig
     """The runs over the two variables, numbers first, that move a metric most; the worst with their sample numbers. The
     metric is the first that has a bound of failure and varies, or else the first that varies. With one variable, the
     metric over it. None where nothing varies."""
-    view = _View(found, units)
+    view = View(found, units)
     good, metric = view.good, view.leading
     paths = view.influential(good, found.column(metric)[good], numbers_first=True) if metric else []
     if not (ones := [view.variable(path, good) for path in paths]):
@@ -112,7 +110,7 @@ def worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -> Fig
 def sensitivity(found: Results, document: Mapping[str, Any]) -> Figure | None:
     """Bars with intervals for each metric: rank correlations, or Sobol' indices for a Saltelli design. None where the
     document has none."""
-    view = _View(found)
+    view = View(found)
     sobol = view.design == "saltelli"
     kinds, what = (("first", "total"), "Sobol indices") if sobol else (("spearman",), "rank correlations")
     table = {name: rows for name in view.varying if (rows := document["sensitivity"].get(name))}
@@ -136,7 +134,7 @@ def sensitivity(found: Results, document: Mapping[str, Any]) -> Figure | None:
 def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """The share of failed runs in cells of the two variables that move it most, or that move the metric of `worst` most
     if too few failed, or did not; cells without a run are grey. None where no variable varies."""
-    view = _View(found, units)
+    view = View(found, units)
     late = missed(found.column("stopped"), success := found.study["success"])
     rules = [~view.good, late, *(found.column(name) > view.bounds[name] for name in view.bounds)]
     failed = np.any(rules, axis=0)[every := view.accepted]
@@ -145,7 +143,7 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
         rows, result = view.good, found.column(view.leading)[view.good]
     if not (ones := [view.variable(path, every) for path in view.influential(rows, result)]):
         return None
-    places, edges = zip(*(_cells(one, len(ones)) for one in ones), strict=True)
+    places, edges = zip(*(cells(one, len(ones)) for one in ones), strict=True)
     shape = [len(edge) - 1 for edge in edges]
     cell = np.ravel_multi_index(places, shape)
     lanes, bad = (np.bincount(cell, w, np.prod(shape)).reshape(shape[0], -1) for w in (None, failed))
@@ -159,86 +157,6 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     bounds = "".join(f", {name} > {bound:g}" for name, bound in view.bounds.items())
     ax.set_title(f"failed: diverged, {missing(success)}{bounds}", fontsize=9.5)
     return figure
-
-
-class _Variable(NamedTuple):
-    """A column for an axis: numbers, or places in a list of names."""
-
-    label: str
-    values: np.ndarray
-    names: list[str]
-
-
-class _View:
-    """What the figures ask of a sweep."""
-
-    def __init__(self, found: Results, units: Mapping[str, str] = {}):
-        self.found, self.units, self.bounds = found, units, found.study["failures"]
-        self.design, self.good = found.study["space"]["design"]["type"], ~found.column("diverged")
-        self.accepted = found.accepted
-        self.good &= self.accepted
-        period = len(found.study["space"]["variables"]) + 2 if self.design == "saltelli" else 1
-        self.rows = self.good & (found.column("sample") % period == 0)  # those in the statistics: A of (A, B, AB)
-        least = ROUNDING * np.finfo(found.study["dtype"]).eps
-        columns = ((name, found.column(name)[self.rows]) for name in found.metrics if self.rows.any())
-        self.varying = [name for name, x in columns if np.ptp(x) > least * max(1.0, np.abs(x).max())]
-        first = [*found.study["failures"], *self.bounds, *self.varying]
-        self.leading = next((name for name in first if name in self.varying), "")
-
-    def named(self, name: str) -> str:
-        unit = self.units.get(name, "")
-        if ", " in unit:  # of a list, one after the other
-            unit = unit.split(", ")[int(name.rpartition(".")[2])]
-        return f"{name} [{unit}]" if unit else name
-
-    def title(self, what: str, rows: np.ndarray) -> str:
-        """With the scenario's name, if it has one, and how many runs are behind the figure."""
-        name, bad = self.found.manifest.get("source", {}).get("name"), np.sum(self.accepted & ~self.good)
-        refused = np.sum(~self.accepted)
-        runs = f"{np.sum(rows):,} runs" + (f" ({bad:,} diverged)" if bad else "")
-        runs += f" ({refused:,} refused)" if refused else ""
-        return f"{name}: {what} {runs}" if name else f"{what} {runs}"
-
-    def variable(self, path: str, rows: np.ndarray) -> _Variable:
-        values = self.found.column(path)[rows]
-        if not self.found.is_number(path):
-            names, places = np.unique(values.astype(str), return_inverse=True)
-            return _Variable(path, places, names.tolist())
-        fast = self.units.get(path) == "m/s"
-        return _Variable(f"{path} [km/h]" if fast else self.named(path), values * (KMH if fast else 1.0), [])
-
-    def influential(self, rows: np.ndarray, result: np.ndarray, *, numbers_first: bool = False) -> list[str]:
-        """The variable that moves a result most, and the one that moves most of what the first leaves unexplained;
-        names last because the upward axis has room for them."""
-        best: list[str] = []
-        for _ in range(2 if len(result) else 0):
-            rank = {}
-            for path in self.found.variables:
-                one = self.variable(path, rows)
-                if path not in best and np.ptp(one.values) > 0:
-                    rank[path] = (numbers_first and bool(one.names), -np.var(_means(one, result)))
-            if rank:
-                best.append(min(rank, key=rank.__getitem__))
-                result = result - _means(self.variable(best[-1], rows), result)
-        return sorted(best, key=lambda path: not self.found.is_number(path))
-
-
-def _cells(one: _Variable, along: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """The place of each run among cells, and their edges: around each value if there are few, else equally wide."""
-    levels, n = np.unique(one.values), len(one.values)
-    if one.names or len(levels) <= min(CELLS[1], n / 2):
-        middles = (levels[1:] + levels[:-1]) / 2
-        edges = np.array([2 * levels[0] - middles[0], *middles, 2 * levels[-1] - middles[-1]])
-    else:
-        edges = np.linspace(levels[0], levels[-1], int(np.clip((n / LANES) ** (1 / along), *CELLS)) + 1)
-    return np.clip(np.searchsorted(edges, one.values, side="right") - 1, 0, len(edges) - 2), edges
-
-
-def _means(one: _Variable, result: np.ndarray) -> np.ndarray:
-    """For each run the mean of the result over its cell. Unlike a correlation their variance sees a result that is
-    worst in the middle, and what names do."""
-    place = _cells(one)[0]
-    return (np.bincount(place, result) / np.maximum(np.bincount(place), 1))[place]
 
 
 def _exceeding(ordered: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
@@ -297,7 +215,7 @@ def _panels(names: Sequence[str], title: str, size: tuple[float, float] = (5.0, 
     return figure, axes[: len(names)]
 
 
-def _name_axes(ax: Axes, ones: Sequence[_Variable], upward: str = "") -> None:
+def _name_axes(ax: Axes, ones: Sequence[Variable], upward: str = "") -> None:
     label(ax, ones[0].label, ones[1].label if ones[1:] else upward, legend=False)
     for axis, one in zip((ax.xaxis, ax.yaxis), ones, strict=False):
         if one.names:

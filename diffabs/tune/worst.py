@@ -129,22 +129,31 @@ def worst_case(
             cannot be run.
     """
     check(loop)
-    measured = usual(loop.plant) if measured is None else measured
-    if metric not in measured:
-        raise ValueError(f"{metric} is not measured; there is {', '.join(measured)}")
+    measured = _measured(loop, metric, measured)
     middle = replace(loop, {path: 0.5 * (np.asarray(a, float) + np.asarray(b, float)) for path, (a, b) in over.items()})
     free, key = space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
     corners = _corners(np.array(free.ranges))
     points = np.concatenate([corners, _drawn(np.array(free.ranges), screen, seed)])
     lanes = Batch(_at(free, points), None if key is None else np.repeat(key, len(points)))
     screened = _screened(loop, lanes, solver, measured)
-    values = screened.metrics[metric]
-    mode = automatic(free)
-    problem = Problem(middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), mode)
-    lanes = _ascent(problem, points[np.argsort(-np.nan_to_num(values, nan=-np.inf))[:starts]], iterations)
-    each = price or (1 + 1.5 * free.size if mode is Mode.FORWARD else 6.0)
-    gradients = sum(lane.evaluations for lane in lanes)
-    return _found(loop, free, metric, bound, points, len(corners), screened, lanes, len(points) + each * gradients)
+    worst = np.argsort(-np.nan_to_num(screened.metrics[metric], nan=-np.inf))[:starts]
+    problem = Problem(middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), automatic(free))
+    lanes = _ascent(problem, points[worst], iterations)
+    cost = len(points) + (price or _price(free)) * sum(lane.evaluations for lane in lanes)
+    return _found(loop, free, metric, bound, points, len(corners), screened, lanes, cost)
+
+
+def _measured(loop: Any, metric: str, measured: Mapping[str, Objective] | None) -> Mapping[str, Objective]:
+    """The objectives, or the usual ones. Raises ValueError where the metric is none of them."""
+    found = usual(loop.plant) if measured is None else measured
+    if metric not in found:
+        raise ValueError(f"{metric} is not measured; there is {', '.join(found)}")
+    return found
+
+
+def _price(free: Space) -> float:
+    """Rollouts that a gradient costs."""
+    return 1 + 1.5 * free.size if automatic(free) is Mode.FORWARD else 6.0
 
 
 def _screened(loop: Any, lanes: Batch, solver: Solver, measured: Mapping[str, Objective]) -> Run:

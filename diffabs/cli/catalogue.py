@@ -1,0 +1,64 @@
+"""The commands `list` and `show`: every part with its parameters, every packaged scenario, a scenario as TOML."""
+
+import pathlib
+from typing import Annotated, Any
+
+import typer
+
+from diffabs.cli import console, show
+from diffabs.core import values
+from diffabs.scenario import registry
+from diffabs.scenario.scenario import dump, header, names
+
+PLURALS = {f"{name}s": name for name in ("plant", "road", "controller", "reference", "actuator", "sensor")}
+PLURALS |= {"feedforward": "feedforward", "antiwindup": "antiwindup", "initial": "initial"}
+PLURALS |= {"stops": "stop", "objectives": "objective"}
+
+
+def list_parts(
+    family: Annotated[
+        str | None, typer.Argument(metavar="[FAMILY]", help=f"{', '.join(PLURALS)} or scenarios.")
+    ] = None,
+    as_json: console.Json = False,
+) -> None:
+    """Every part with its parameters, defaults, units and ranges; every packaged scenario."""
+    with console.guarded():
+        there = (*PLURALS, "scenarios")
+        if family is not None and family not in there:
+            raise values.unknown(f"there is no family {values.shown(family)}", family, there)
+        result = {name: _listed(name) for name in there if family in (None, name)}
+        if as_json:
+            return show.as_json(result)
+        for name, members in result.items():
+            show.family(name, members)
+    return None
+
+
+def show_scenario(
+    scenario: console.ScenarioName,
+    changes: console.Changes = None,
+    out: Annotated[
+        pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write to this file; default: stdout.")
+    ] = None,
+) -> None:
+    """A scenario as TOML with every field, to start one's own from."""
+    with console.guarded():
+        console.check_scenario_file(out)
+        text = dump(console.loaded(scenario, changes, integrated=False))
+        with console.new_file(out, "--out") as file:
+            file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
+
+
+def _listed(plural: str) -> dict[str, Any]:
+    """The members of a family as plain values."""
+    if plural == "scenarios":
+        return {name: header(name) for name in names()}
+    family = PLURALS[plural]
+    return {
+        name: {
+            "summary": registry.summary(part),
+            **({"unit": registry.unit_of(part)} if family == "objective" else {}),
+            "parameters": registry.described(family, part),
+        }
+        for name, part in registry.types(family).items()
+    }

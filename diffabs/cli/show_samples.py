@@ -1,0 +1,91 @@
+"""What the commands about many samples show: a sweep, a small probability, two sweeps beside each other."""
+
+from typing import Any
+
+from rich.table import Table
+
+from diffabs.cli.console import say
+from diffabs.cli.show import brief, titled
+from diffabs.scenario.registry import unit_of
+from diffabs.scenario.scenario import Scenario
+
+
+def swept(result: dict[str, Any], chosen: Scenario) -> None:
+    """Failures, statistics with intervals, what moves what, the worst samples."""
+    failures = Table("failure", "lanes", "probability", "low", "high")
+    for name, row in result["failures"].items():
+        failures.add_row(name, str(row["count"]), *_estimate(row))
+    percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
+    titled(f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", failures)
+    kinds = list(next((row for row in result["metrics"].values() if row), {}))
+    kinds = [kind for kind in kinds if kind not in ("least", "greatest")]
+    metrics = Table("metric", "unit", "", "value", "low", "high")
+    for name, row in result["metrics"].items():
+        for i, kind in enumerate(kinds):
+            first = (name, unit_of(chosen.objectives[name], chosen.loop.plant)) if i == 0 else ("", "")
+            metrics.add_row(*first, kind, *_estimate(row[kind]))
+        metrics.add_section()
+    titled("statistics of the lanes that did not diverge", metrics)
+    paths = list(next(iter(result["sensitivity"].values()), {}))
+    if paths:
+        kind = list(next(iter(result["sensitivity"].values()))[paths[0]])[-1]
+        moves = Table("metric", *paths)
+        for name, row in result["sensitivity"].items():
+            moves.add_row(
+                name, *("" if row[p][kind]["value"] is None else f"{row[p][kind]['value']:.3f}" for p in paths)
+            )
+        titled({"spearman": "rank correlations", "total": "total Sobol' indices"}[kind], moves)
+    if (refused := result["refused"])["count"]:
+        why = "; ".join(f"{reason} ({count})" for reason, count in refused["reasons"].items())
+        say(
+            f"refused: {refused['count']} of {result['samples']} samples were not run and are in no number here, the"
+            f" first sample {refused['samples'][0]}: {why}"
+        )
+    if result["accuracy"] and result["accuracy"]["metrics"]:
+        changes = Table("metric", "median change", "largest", "in sample")
+        for name, row in result["accuracy"]["metrics"].items():
+            changes.add_row(name, f"{row['median']:.1e}", f"{row['largest']:.1e}", str(row["sample"]))
+        count = len(result["accuracy"]["samples"])
+        titled(f"what a half step changes, relative, in {count} lane{'s' if count > 1 else ''} drawn from all", changes)
+    for name, rows in result["worst"].items():
+        if rows:
+            say(f"greatest {name}: {brief(rows[0]['value'])} in sample {rows[0]['sample']}")
+    say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
+
+
+def rare(result: dict[str, Any], chosen: Scenario) -> None:
+    """A small probability, the levels that led to it, and the likeliest failures."""
+    levels = Table("level", "at least", "share", "coefficient of variation", "accepted", "diverged")
+    for i, row in enumerate(result["levels"], 1):
+        names = ("threshold", "share", "cov", "acceptance")
+        levels.add_row(str(i), *(f"{row[name]:.4g}" for name in names), str(row["diverged"]))
+    titled(f"{chosen.title or chosen.name}: {result['metric']} >= {result['bound']:g} {result['unit']}", levels)
+    estimates = Table("estimate", "probability", "low", "high", "coefficient of variation")
+    for name in ("subset simulation", "importance sampling"):
+        if row := result[name]:
+            estimates.add_row(name, *(f"{x:.4g}" for x in (row["probability"], *row["interval"], row["cov"])))
+    low, high = result["interval"]
+    titled(f"probability {result['probability']:.3g}, 95 % interval {low:.3g} to {high:.3g}", estimates)
+    count = len(next(iter(result["failures"].values()), ()))
+    failures = Table("likeliest failures", *map(str, range(1, count + 1)))
+    for path, column in result["failures"].items():
+        failures.add_row(path, *map(brief, column))
+    if result["failures"]:
+        titled("", failures)
+    say(f"{result['note']}; {result['reason']}")
+    say(f"{result['runs']} runs and {result['gradients']} gradients; {result['diverged']} diverged")
+
+
+def compared(result: dict[str, Any]) -> None:
+    """Means of two sweeps, and their difference sample by sample."""
+    table = Table("metric", "first", "second", "second - first", "low", "high", "less in", "variance reduction")
+    for name, row in result["metrics"].items():
+        less = f"{100 * row['share in which the second is less']['value']:.1f} %"
+        means = (brief(row[key]) for key in ("first", "second"))
+        table.add_row(name, *means, *_estimate(row["difference"]), less, brief(row["variance reduction"]))
+    out = f", {result['left out']} left out that diverged" if result["left out"] else ""
+    titled(f"{result['second']} against {result['first']}: {result['samples']} common samples{out}", table)
+
+
+def _estimate(row: dict[str, Any]) -> list[str]:
+    return ["" if row[key] is None else brief(row[key]) for key in ("value", "low", "high")]
