@@ -53,6 +53,7 @@ WIDTHS = (1e-2, 3e-3, 1e-3)
 CLOSER, FINER = (1e-4, 3e-5, 1e-5), 4  # widths, and steps so many times shorter, for what seems wrong
 AGREE, RIGHT, KNOWN = 1e-3, 2e-3, 1e-2  # of the scale
 SAME, STEP, LESS = 1e-9, 1e-5, 0.6  # of values: rounding; the error of a step; what is left of it at a shorter one
+BY_GRID = ("torque_rate",)  # taken at the steps' ends, as it documents: a kink that is located is one
 KINKED = 1e-2  # by which slopes to the left and to the right differ, of the scale
 PART, LEAST = 1e-3, 1e-6  # the scale's least: of the objective, and absolute
 CLASSES = ("kink", "nearby", "curved", "scatter", "closer", "diverged")
@@ -138,6 +139,7 @@ class Program:
             finer = self.finer.study(found.number, seed, (), slopes=False)
             bound = np.maximum(LESS * off, bound)
             off = np.where(off > STEP * least, np.abs(finer.plain - finer.value), off)
+        off[[name in BY_GRID for name in self.objectives]] = 0.0
         moved = (off > bound) | (np.abs(found.beside - found.value) > SAME * least)
         return found._replace(moved=tuple(np.array(found.objectives)[moved]))
 

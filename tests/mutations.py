@@ -639,6 +639,27 @@ MUTATIONS = [
         "test_blocks.py::test_relay_switches_on_the_far_side_of_its_band",
     ),
     Mutation(
+        "a delay whose derivative in the time is lost where the command is smooth",
+        "actuators/delay.py",
+        "jnp.where(at[0] <= 1.0, moves[0], 0.0)",
+        "0.0 * moves[0]",
+        "test_delay.py::test_derivatives_of_the_method_of_steps[jacfwd-0.0317]",
+    ),
+    Mutation(
+        "a delayed jump whose moment has no derivative",
+        "actuators/delay.py",
+        "_piece(m.window, last + 1).start,",
+        "jax.lax.stop_gradient(_piece(m.window, last + 1).start),",
+        "test_delay.py::test_the_moment_of_a_jump_is_differentiable[0.0073-0.0026-jacfwd]",
+    ),
+    Mutation(
+        "a lent log without the row that was put",
+        "core/log.py",
+        "if self.lent else rows",
+        "if False else rows",
+        "test_delay.py::test_a_ramp_comes_later[1.0]",
+    ),
+    Mutation(
         "a delay that knows no rates",
         "actuators/delay.py",
         "(h * rate for rate in passage.rates)",

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 
 from diffabs.core.blocks import Passage
 from diffabs.core.cubic import Cubic
+from diffabs.core.log import Log
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree, static
 from diffabs.core.rules import Rule, array
@@ -53,10 +54,10 @@ class Piece(NamedTuple):
 class DelayMemory(NamedTuple):
     """A ring of past steps, a row for each `Piece`. The window: rows of the pieces that come out next, how many of them
     there are; between `place` and `last`, those of which the present step may use; and until when [s] it may, less the
-    delay. Where the window begins in the ring, and how many pieces there are from there on. Whole numbers are of the
-    type of the signal."""
+    delay. Where the window begins in the ring, and how many pieces there are from there on; the newest of them. Whole
+    numbers are of the type of the signal."""
 
-    ring: Any
+    ring: Log
     window: Any
     known: Any
     place: Any
@@ -64,6 +65,7 @@ class DelayMemory(NamedTuple):
     until: Any
     first: Any
     count: Any
+    newest: Any
 
 
 @pytree
@@ -81,8 +83,9 @@ class Delay:
         zero = 0.0 * jnp.asarray(signal)
         row = _row(Piece(zero - self.time, zero, Cubic(zero, zero, zero, zero), zero))
         window = jnp.broadcast_to(row, (WINDOW, *row.shape))
-        ring = jnp.zeros((self.capacity + self.capacity // CUTS + SPARE, *row.shape), row.dtype).at[0].set(row)
-        return Memory((), self._aimed(DelayMemory(ring, window, zero + 1, zero, zero, zero, zero, zero + 1)))
+        rows = jnp.zeros((self.capacity + self.capacity // CUTS + SPARE, *row.shape), row.dtype)
+        ring = Log(rows, zero, row).put(zero, row)
+        return Memory((), self._aimed(DelayMemory(ring, window, zero + 1, zero, zero, zero, zero, zero + 1, row)))
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Any:
         """The delayed command; beyond a break that has not come out, straight on."""
@@ -108,26 +111,27 @@ class Delay:
     def record(self, memory: Memory, passage: Passage) -> Memory:
         """Store the step that is over; one without a length is none."""
         m: DelayMemory = memory.held
-        size, h = len(m.ring), passage.end - passage.start
-        newest, free = (_around(m.first + m.count + i, size).astype(int) for i in (-1, 0))
-        before = Piece.of(jax.lax.stop_gradient(m.ring[newest]))
+        h, free = passage.end - passage.start, _around(m.first + m.count, m.ring.size)
+        before = Piece.of(jax.lax.stop_gradient(m.newest))
         cubic = Cubic(*passage.values, *(h * rate for rate in passage.rates))
         after = passage.values[0], self.time * passage.rates[0]
         breaks = jnp.where(_differ((before.command.end, before.rate * self.time), after), 1.0, 0.0).astype(h.dtype)
-        ring = m.ring.at[free].set(_row(Piece(passage.start, passage.end, cubic, breaks)))
-        some = jnp.where(h > _rounding(passage.end), 1.0, 0.0)
-        return memory._replace(held=m._replace(ring=ring, count=m.count + some))
+        row = _row(Piece(passage.start, passage.end, cubic, breaks))
+        some = h > _rounding(passage.end)
+        count = m.count + jnp.where(some, 1.0, 0.0)
+        newest = jnp.where(some, row, m.newest)
+        return memory._replace(held=m._replace(ring=m.ring.put(free, row), newest=newest, count=count))
 
     def tick(self, clock: Clock, memory: Memory, signal: Scalar) -> Memory:
         """The window from here. What breaks at this very instant has come out."""
         del signal
         m: DelayMemory = memory.held
-        size, over = len(m.ring), self._place(clock.t, m)
+        size, over = m.ring.size, self._place(clock.t, m)
         first, count = _around(m.first + over, size), m.count - over
-        rows = m.ring[_around(first.astype(int) + jnp.arange(WINDOW), size)]
+        rows = m.ring.read(_around(first.astype(int) + jnp.arange(WINDOW), size))
         window = jnp.where(count < size, rows, jnp.nan)  # else a piece that is still to come out is overwritten
         known, none = jnp.minimum(count, WINDOW), jnp.zeros_like(count)
-        new = self._aimed(DelayMemory(m.ring, window, known, none, none, none, first, count))
+        new = self._aimed(DelayMemory(m.ring, window, known, none, none, none, first, count, m.newest))
         out = (new.last + 1 < known) & (new.until + self.time <= clock.t)
         return memory._replace(held=self._aimed(new._replace(place=jnp.where(out, new.last + 1, none))))
 

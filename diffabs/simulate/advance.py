@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.blocks import Passage
+from diffabs.core.log import lend
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.protocols import Clock, Memory, Sample, Segment
 from diffabs.core.regime import Regime, Words, crossing, only
@@ -115,12 +116,14 @@ def arrive(system: Dynamics, point: Point, one: Try, active: Any) -> Arrival:
     return Arrival(one.end, rests, tallied, seen.signals, seen[:2], seen.margins, kink, words, passed)
 
 
-def depart(system: Dynamics, clock: Clock, here: Arrival, fired: Margins, one: Try) -> Point:
+def depart(system: Dynamics, clock: Clock, here: Arrival, fired: Margins, one: Try, logs: list[Any]) -> Point:
     """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock. In a
-    loop without ticks, what follows from an event is left to a step that does it `anew`: there are few of them."""
+    loop without ticks, what follows from an event is left to a step that does it `anew`: there are few of them.
+
+    logs: the rows of the blocks' logs, which the state is without (`core.log`)"""
     t, state, tally, signals, rate, margins, _, regime, passed = here
     if system.loop.changes:
-        state = system.loop.change(clock, state, signals, margins, fired, passed)
+        state = lend(system.loop.change(clock, lend(state, logs), signals, margins, fired, passed), None)
     if not system.loop.ticks:
         return Point(t, state, tally, signals.sample, rate, margins, regime)
     kept = (jnp.where(one.lands, bit, jnp.uint32(0)) for bit in only(one.which, system.words))

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.log import lend, settle, tables
 from diffabs.core.loop import Loop, Margins
 from diffabs.core.protocols import Clock
 from diffabs.simulate.advance import Arrival, Point, Try, arrive, begin, depart
@@ -109,6 +110,8 @@ def step(
 
     kinks: whether comparisons are located, as derivatives need it"""
     active = carry.running if until is None else carry.running & (carry.k < until)
+    logs = tables(carry.point.state)
+    carry = carry._replace(point=carry.point._replace(state=lend(carry.point.state, None)))
     to_grid, landing, anew = (
         carry.condition == one for one in (Condition.RUNNING, Condition.LANDING, Condition.REFRESHING)
     )
@@ -119,7 +122,7 @@ def step(
     here = apart(active, lambda: arrive(system, carry.point, one, active))
     verdict = apart(active, lambda: _judge(carry, here, count, active, steps))
     k = carry.k + jnp.where(verdict.on_grid, 1, 0)
-    leave = partial(depart, system, Clock(end, h, k, key, verdict.on_grid), here, verdict.fired, one)
+    leave = partial(depart, system, Clock(end, h, k, key, verdict.on_grid), here, verdict.fired, one, logs)
     point = apart(active, leave) if loop.changes else leave()
     point = select(verdict.over, _last(here, point), point)
 
@@ -131,7 +134,9 @@ def step(
     since = jnp.where(verdict.on_grid, 0, carry.here + extra - carry.extra)
     lost = active & ((~verdict.fine & (carry.blunt if count else True)) | (extra > (EXTRA + KINKS) * steps + SPARE))
     condition = jnp.where(lost, Condition.DIVERGED, condition).astype(carry.condition.dtype)
-    return Carry(select(verdict.taken, point, carry.point), k, length, search, extra, since, blunt, condition)
+    point = select(verdict.taken, point, carry.point)
+    point = point._replace(state=settle(point.state, logs))
+    return Carry(point, k, length, search, extra, since, blunt, condition)
 
 
 def _ahead(loop: Loop, carry: Carry, here: Arrival, verdict: Verdict, h: Any, left: Any) -> tuple[Any, ...]:
