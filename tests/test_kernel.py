@@ -295,7 +295,7 @@ class TestLibrary:
     def test_that_is_none_cannot_be_loaded(self, tmp_path, monkeypatch):
         (tmp_path / "none.so").write_text("nothing")
         monkeypatch.setattr(compilers, "library", lambda text: tmp_path / "none.so")
-        with pytest.raises(compilers.NoCompiler, match="invalid ELF header|file too short|not a mach-o"):
+        with pytest.raises(compilers.NoCompiler, match=r"invalid ELF header|file too short|not a mach-o"):
             launch._registered("")
 
     @pytest.mark.slow
