@@ -201,6 +201,7 @@ class TestObjections:
 class TestSweep:
     SETTINGS = ("sweep.samples=40", "sweep.chunk=16", "solver.step=2e-3", "solver.duration=0.4", "stop.speed_kmh=40.0")
 
+    @pytest.mark.slow
     def test_is_that_of_xla_and_says_what_made_it(self, tmp_path):
         """Another engine does not go on with it."""
         study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
