@@ -10,14 +10,14 @@ demo: $(VENV)/.installed
 	$(BIN)/diffabs reproduce all --out out
 
 test: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow" --durations=25
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" --durations=25
 
 # the share of lines and branches that the fast tests run; the last line is the number
 coverage: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow" --cov=diffabs --cov-branch --cov-report=term:skip-covered
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow" --cov=diffabs --cov-branch --cov-report=term:skip-covered
 
 test-slow: $(VENV)/.test
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m slow
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 lint: $(VENV)/.lint
 	$(BIN)/ruff check .
@@ -29,6 +29,7 @@ bench: $(VENV)/.bench
 	$(BIN)/python benchmarks/bench_peers.py
 	$(BIN)/python benchmarks/bench_work_precision.py
 	$(BIN)/python benchmarks/bench_gradient.py
+	$(BIN)/python benchmarks/bench_gradient.py --rtol 1e-5 --loops lmi est
 	$(BIN)/python benchmarks/bench_riccati.py
 	$(BIN)/python benchmarks/bench_design.py
 	$(BIN)/python benchmarks/bench_sweep.py

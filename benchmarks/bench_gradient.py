@@ -10,7 +10,9 @@ Every time is divided by that of the objective alone, `jit` of the mean of `meas
 are interleaved, ratios and times are medians over them. `--quick` leaves the memory out. Prints tables, writes JSON
 with machine, versions and commit.
 
-    python benchmarks/bench_gradient.py [--lanes 256] [--rounds 9] [--loops lmi est latch] [--quick]
+With `--rtol R` the runs take adaptive steps, the value its own, fewer than the gradient does.
+
+    python benchmarks/bench_gradient.py [--lanes 256] [--rounds 9] [--loops lmi est latch] [--quick] [--rtol 1e-5]
 """
 
 import argparse
@@ -63,10 +65,11 @@ CASES = {
 }
 
 
-def objective(name, lanes, step, duration=None):
+def objective(name, options, duration=None):
     """(logarithmic changes of p <= 8 parameters -> mean objective)."""
     loop, masses, horizon, paths = CASES[name]
-    masses, solver = jnp.linspace(masses[0], masses[1], lanes), d.FixedStep(step, duration or horizon)
+    masses, duration = jnp.linspace(masses[0], masses[1], options.lanes), duration or horizon
+    solver = d.Adaptive(options.rtol, duration) if options.rtol else d.FixedStep(options.step, duration)
 
     def mean(logs):
         factors, values = jnp.concatenate([jnp.exp(logs), jnp.ones(len(paths) + 1 - len(logs))]), {}
@@ -97,7 +100,7 @@ def compiled(function, count):
 
 def timed(name, options):
     """Rows of one loop: {"value", "forward 1", ..., "reverse"} to medians of seconds and of ratios."""
-    mean = objective(name, options.lanes, options.step)
+    mean = objective(name, options)
     programs = {"value": compiled(mean, 8), "reverse": compiled(jax.grad(mean), 8)}
     programs |= {f"forward {p}": compiled(jax.jacfwd(mean), p) for p in COUNTS}
     times = {key: [] for key in programs}
@@ -129,7 +132,7 @@ def memory(name, options):
     """{number of steps: bytes of temporary memory of the reverse gradient}."""
     sizes = {}
     for steps in MEMORY_STEPS:
-        mean = objective(name, options.lanes, options.step, steps * options.step)
+        mean = objective(name, options, steps * options.step)
         sizes[steps] = compiled(jax.grad(mean), 8)[2]
     return sizes
 
@@ -141,6 +144,7 @@ def main():
     parser.add_argument("--step", type=float, default=1e-3, help="of integration [s]")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--loops", nargs="+", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--rtol", type=float, help="of adaptive steps; without it they are fixed")
     parser.add_argument("--quick", action="store_true", help="leave the memory out")
     parser.add_argument("--out", type=pathlib.Path)
     options = parser.parse_args()
@@ -148,7 +152,7 @@ def main():
     found = {}
     for name in options.loops:
         rows = timed(name, options)
-        sizes = {} if options.quick else memory(name, options)
+        sizes = {} if options.quick or options.rtol else memory(name, options)
         found[name] = {"rows": rows, "crossover": crossover(rows), "memory": sizes}
         show(name, found[name], options)
     write(found, options)
@@ -181,8 +185,9 @@ def show(name, found, options):
 
 def write(found, options):
     """JSON with machine, versions and commit."""
-    kept = {"loops": found, "lanes": options.lanes, "step_s": options.step, "rounds": options.rounds}
-    path = record.written("gradient", {**kept, "device": str(jax.devices()[0])}, options.out)
+    kept = {"loops": found, "lanes": options.lanes, "step_s": options.step, "rtol": options.rtol}
+    kept |= {"rounds": options.rounds, "device": str(jax.devices()[0])}
+    path = record.written("gradient-adaptive" if options.rtol else "gradient", kept, options.out)
     Console().print(f"written to {path}")
 
 

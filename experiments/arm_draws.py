@@ -48,7 +48,7 @@ def improved(
         fine = np.cumprod(judge(drawn, multiples), axis=1).sum(axis=1)
         first = int(np.argmax(fine))
         if fine[first] > 1:
-            best, centre = multiples[fine[first] - 1], {name: column[first] for name, column in drawn.items()}
+            best, centre = float(multiples[fine[first] - 1]), {name: column[first] for name, column in drawn.items()}
     return centre, best
 
 

@@ -8,6 +8,7 @@ proved; exits with 0 if all was, 1 if something was not, 2 if the file cannot be
 import json
 import sys
 from fractions import Fraction
+from typing import Any
 
 # a letter for each axis: n states, m inputs, V vertices, N nodes, 2 itself; "?" need not be there
 FIELDS = {"decay": "P:nn rate?: factor?:", "cost": "P:nn Q:nn R:mm x0?:n", "damping": "P:nn cot: zeta:"}
@@ -46,7 +47,7 @@ def dot(x, y):
     return sum(p for p, _ in pairs), sum(e for _, e in pairs)
 
 
-def numbers(value):
+def numbers(value) -> Any:
     """Fractions of the floats in nested lists. Raises ValueError for anything else."""
     if not isinstance(value, (list, float)):
         raise ValueError(f"{value!r} is not a number")

@@ -58,13 +58,15 @@ class Folders:
         changes += [rng.choice(CHANGES)]
         what = "; ".join(f"{change.__name__}: {change(rng, folder, self.room)}" for change in changes)
         self.forged = any(change in FORGED for change in changes)
+        name = "no reader yet"
         try:
             outcomes = []
             for reader in self.readers():
-                outcomes.append((reader.__name__, self._outcome(reader, folder)))
+                name = reader.__name__
+                outcomes.append((name, self._outcome(reader, folder)))
             return what, outcomes
         except Exception as error:
-            error.mutation = f"{what} ({reader.__name__})"
+            error.mutation = f"{what} ({name})"
             raise
 
     def readers(self):

@@ -129,10 +129,24 @@ MUTATIONS = [
     ),
     Mutation(
         "a trajectory shows the end of the step",
-        "simulate/adaptive.py",
-        "    inside = (t < now.t) & (h > 0)",
-        "    inside = (t < now.t) & (h < 0)",
+        "simulate/methods.py",
+        "        inside = (t < now.t) & (carry.past.until > carry.past.t)",
+        "        inside = (t < now.t) & (carry.past.until < carry.past.t)",
         "test_adaptive.py::test_a_trajectory_is_kept_on_the_grid_and_changes_nothing",
+    ),
+    Mutation(
+        "a trajectory takes the rates after a computer's instant for those before",
+        "simulate/adaptive.py",
+        "    return point.t, point.state.flow(), point.rate[0]",
+        "    return point.t, point.state.flow(), jax.tree.map(lambda x: 0.0 * x, point.rate[0])",
+        "test_adaptive.py::test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps",
+    ),
+    Mutation(
+        "a repeated step has the rates of its beginning at its end",
+        "simulate/replay.py",
+        "system.rates(t, z, held, within)[0]) if pace.keeps",
+        "begin.seen.rate) if pace.keeps",
+        "test_adaptive.py::test_the_derivative_of_a_trajectory_is_that_of_fixed_steps[limits]",
     ),
     Mutation(
         "comparisons are seen a step too late",
@@ -151,8 +165,8 @@ MUTATIONS = [
     Mutation(
         "the Jacobian has one column",
         "simulate/lengths.py",
-        "one[i] = one[i].at[k].set(1.0)",
-        "one[0] = one[0].at[0].set(1.0)",
+        "(moves) / size",
+        "(moves * 0.0 + size[0]) / size",
         "test_adaptive.py::test_the_longest_stable_step_is_that_of_the_eigenvalues[arm-hanging]",
     ),
     Mutation(
@@ -621,8 +635,8 @@ MUTATIONS = [
     Mutation(
         "a landing near the zero",
         "simulate/landing.py",
-        "return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf)",
-        "return search.place",
+        "length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)",
+        "length = place",
         "test_blocks.py::test_relay_switches_on_the_far_side_of_its_band",
     ),
     Mutation(
@@ -691,15 +705,36 @@ MUTATIONS = [
     Mutation(
         "a landing without derivative",
         "simulate/landing.py",
-        "return search.place - search.margin / jnp",
-        "return search.place - jax.lax.stop_gradient(search.margin) / jnp",
+        "return -rises / jnp",
+        "return 0.0 * rises / jnp",
         "test_gradients.py::test_gradient_of_every_objective_in_every_parameter[feedback]",
+    ),
+    Mutation(
+        "derivatives of a moment that are those of a while before it",
+        "simulate/landing.py",
+        "share = ratio(zero - search.place, x - search.place)",
+        "share = 0.0 * zero",
+        "test_landing.py::test_derivatives_of_a_moment_are_those_at_the_zero[jacfwd]",
+    ),
+    Mutation(
+        "a landing hundreds of steps away",
+        "simulate/landing.py",
+        "(search.tries < TRIES))\n\n\ndef _moves",
+        "False)\n\n\ndef _moves",
+        "test_landing.py::test_a_margin_that_falls_all_at_once_is_landed_on",
+    ),
+    Mutation(
+        "an event at once whose moment has no derivative",
+        "simulate/landing.py",
+        "smooth & steep, length -",
+        "smooth & steep & False, length -",
+        "test_landing.py::test_the_moment_of_an_event_on_the_grid_is_differentiable[0.002]",
     ),
     Mutation(
         "an event whose moment has no derivative",
         "simulate/landing.py",
-        "margin=jnp.where(near & ~at_once, sought.end, 0.0)",
-        "margin=jnp.where(near & ~at_once, jax.lax.stop_gradient(sought.end), 0.0)",
+        "found = near | at_once",
+        "found = at_once",
         "test_gradients.py::test_gradient_through_the_latch_agrees_with_a_wide_difference[0.0-published0]",
     ),
     Mutation(

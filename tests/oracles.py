@@ -105,7 +105,7 @@ def brake(plant, torque, *, speed, stop, slip=0.0, memory=0, rates=None, duratio
         v, w = max(v, 1e-3), max(w, 0.0)  # a trial step may look past the end
         s = slip_of(v, w)
         dv, dw, dextra = f(v, w, x, extra, torque(t, s, m))
-        return [dv, dw, v, dextra, abs(s - 0.2), *(rates(t, s, m) if memory else ())]
+        return [dv, dw, v, dextra, abs(s - 0.2), *(rates(t, s, m) if memory and rates else ())]
 
     def stopped(t, z):
         return z[0] - stop

@@ -130,5 +130,6 @@ def test_what_is_said():
     line = "a half step changes iae by up to 3 % (sample 7): "
     assert said(loose) == [f"{line}shorten solver.step"]
     assert said({**loose, "solver": {"rtol": 1e-5}}) == [f"{line}lower solver.rtol"]
+    assert said({**loose, "solver": {"rtol": 1e-3}}) == []
     assert "2 of the lanes" in said({**nothing, "ended otherwise": 2})[0]
     assert "accuracy unknown" in said({**nothing, "not comparable": 1})[0]

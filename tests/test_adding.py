@@ -9,8 +9,6 @@ import sys
 
 import pytest
 
-pytestmark = pytest.mark.xdist_group("adding")  # one worker makes what these share
-
 ROOT = pathlib.Path(__file__).parent.parent
 BLOCKS = re.findall(r"```python\n# ([^\n]+)\n(.*?)```", (ROOT / "docs" / "adding.md").read_text(), re.DOTALL)
 

@@ -23,8 +23,6 @@ from diffabs.plants.arm_balance import ArmState
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import FixedStep
 
-pytestmark = pytest.mark.xdist_group("arm-basin")  # one worker compiles what these share
-
 OVER = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "plant.damping": (70.0, 130.0)}
 
 
@@ -78,9 +76,9 @@ COARSE = FixedStep(step=2e-3, duration=60.0)  # far closer to the border than th
 
 @pytest.mark.parametrize("gain", [pytest.param(SLOW, id="slow", marks=pytest.mark.slow), pytest.param(GAIN, id="LQR")])
 def test_starts_beside_the_border_end_as_scipy_says(gain):
-    """Inside and outside, along each of eight rays; SciPy runs until rest or ground."""
+    """Inside and outside, along each of four rays; SciPy runs until rest or ground."""
     loop = closed(controller=BalanceFeedback(gain=gain))
-    angles = np.linspace(0, np.pi, 9)[:-1] + 0.1
+    angles = np.linspace(0, np.pi, 5)[:-1] + 0.1
     rays = [{"initial.theta": float(np.cos(a)), "initial.phi": float(np.sin(a))} for a in angles]
     starts, expected = [], []
     for ray in rays:

@@ -18,8 +18,6 @@ from diffabs.sweep.engines import missed
 from diffabs.tune import worst_case
 from diffabs.tune.tuning import posed
 
-pytestmark = pytest.mark.xdist_group("arm-cli")  # one worker makes what these share
-
 METRICS = {"settling_time", "peak_lean", "peak_arm_angle", "peak_voltage", "peak_torque", "final_norm", "fell"}
 SHORT = ("--set", "solver.duration=0.02")
 

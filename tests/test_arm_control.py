@@ -22,8 +22,6 @@ from diffabs.sensors import AngleSensor
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import FixedStep
 
-pytestmark = pytest.mark.xdist_group("arm-control")  # one worker compiles what these share
-
 SOLVER, MEASURED = FixedStep(step=1e-3, duration=10.0), {"final_norm": FinalNorm()}
 
 # What any control can do
@@ -31,7 +29,7 @@ SOLVER, MEASURED = FixedStep(step=1e-3, duration=10.0), {"final_norm": FinalNorm
 
 def by_eigenvectors(a, b, start, limit):
     """|w'B| U/(s |w'd|) of the one unstable pole."""
-    poles, left = scipy.linalg.eig(a, left=True, right=False)
+    poles, left = scipy.linalg.eig(a, left=True, right=False)  # pyright: ignore[reportAssignmentType]
     (place,) = np.flatnonzero(poles.real > 0)
     w = left[:, place].real
     return abs(w @ b[:, 0]) * limit / (poles[place].real * abs(w @ start))

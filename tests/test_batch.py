@@ -18,8 +18,6 @@ from diffabs.simulate.batch import Batch, by_structure, grid, latin, stacked
 from diffabs.simulate.refill import ROUND
 from diffabs.stops import SpeedReached, Standstill
 
-pytestmark = pytest.mark.xdist_group("batch")  # one worker compiles what these share
-
 LOOP = braking(
     plant=plants.MirroredRig(),
     initial=d.BrakeStart(speed=30 / 3.6),
@@ -34,8 +32,8 @@ SPEEDS = np.array([30.0, 25.1, 90.0, 31.0, 24.0, 28.0, 25.1, 27.0, 33.0, 29.5, 2
 SHORT, NEVER, AT_ONCE, DIVERGING = 1, 2, 4, 7
 GAINS = np.where(np.arange(len(SPEEDS)) == DIVERGING, 1e308, -40.0)
 VALUES = {"initial.speed": SPEEDS, "controller.gain.1": GAINS}
-WIDTHS = [1, 4, len(SPEEDS) + 5]
 SOME = 4  # lanes on the belt where it does not matter how many
+WIDTHS = [1, SOME, pytest.param(len(SPEEDS) + 5, marks=pytest.mark.slow)]
 
 QUIET = replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
 

@@ -24,8 +24,6 @@ from diffabs.objectives import BRAKING
 from diffabs.scenario import registry, scenario
 from diffabs.simulate.stable_step import stable_step
 
-pytestmark = pytest.mark.xdist_group("cli")  # one worker makes what these share
-
 SHORT = ("--set", "solver.duration=0.02", "--set", "solver.step=1e-3", "--set", "solver.every=1")
 
 

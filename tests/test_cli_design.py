@@ -18,8 +18,6 @@ from diffabs.design.frozen import frozen
 from diffabs.design.sdp import solver
 from diffabs.linear.linearization import StateSpace
 
-pytestmark = pytest.mark.xdist_group("cli-design")  # one worker compiles what these share
-
 CHECKER = pathlib.Path(__file__).parent.parent / "experiments" / "check_certificate.py"
 KEYS = [
     *("scenario", "gain", "states", "quadratically_stable", "stable", "verified_exactly", "decay_rate", "damping"),

@@ -20,8 +20,6 @@ from diffabs.simulate import refusals
 from diffabs.simulate.solution import FixedStep
 from diffabs.tune import Reason
 
-pytestmark = pytest.mark.xdist_group("cli-identify")  # one worker compiles what these share
-
 KEYS = [
     *("scenario", "data", "values", "correlations", "undetermined", "residuals", "chi2", "degrees", "scale", "reason"),
     *("evaluations", "parameters", "versions", "files", "interrupted"),

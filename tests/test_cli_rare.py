@@ -16,7 +16,7 @@ from diffabs.reliability.failure import failure_probability
 from diffabs.scenario.scenario import load
 from diffabs.simulate.batch import Batch, run_batch
 
-pytestmark = [pytest.mark.usefixtures("any_step_is_stable", "without_load"), pytest.mark.xdist_group("rare")]
+pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
 RARE = SCENARIO.replace("[28.0, 34.0]", "{ type = 'normal', mean = 30.0, deviation = 1.0, low = 26.0, high = 40.0 }")
 PAGE = (pathlib.Path(__file__).parent.parent / "docs" / "sweeps.md").read_text()

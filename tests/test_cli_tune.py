@@ -26,8 +26,6 @@ from diffabs.simulate.run import measure
 from diffabs.tune import Mode, Point, Reason, StartError, Tuned
 from diffabs.tune.result import Start
 
-pytestmark = pytest.mark.xdist_group("cli-tune")  # one worker compiles what these share
-
 SMALL = """
 title = "small"
 plant = "mirrored-rig"

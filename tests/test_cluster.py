@@ -12,7 +12,7 @@ import threading
 import time
 from types import SimpleNamespace
 
-import dask
+import dask.config
 import jax
 import jax.numpy as jnp
 import psutil
@@ -24,10 +24,7 @@ from sweeping import PATIENCE, SCENARIO, chunks, command, described, environment
 from diffabs.sweep import SweepError, cluster, sweep
 from diffabs.sweep.cluster import Dask
 
-pytestmark = [
-    pytest.mark.xdist_group("cluster"),  # they share two workers
-    pytest.mark.usefixtures("without_load", "any_step_is_stable", "compiled_before"),
-]
+pytestmark = pytest.mark.usefixtures("without_load", "any_step_is_stable", "compiled_before")
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import ScenarioError, dump, load, loads
 from diffabs.sweep import Empirical, Results
 
-pytestmark = [pytest.mark.usefixtures("any_step_is_stable", "without_load"), pytest.mark.xdist_group("columns")]
+pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
 MASSES = [5.4, 5.9, 5.5, 6.1]
 SPEEDS = [28, 31, 33]  # km/h

@@ -1,6 +1,7 @@
 """Pure delay against closed forms: where the command is smooth, where it jumps, at steps of any length, and derivatives
 with respect to everything. Against SciPy: `test_order_of_events.py`; in random loops: `gradients_random.py`."""
 
+import functools
 from collections.abc import Callable
 from math import factorial
 from typing import Any
@@ -98,8 +99,11 @@ class Proportional:
         return -self.k * signal.measured.slip
 
 
-def loop(controller, actuator, plant=None, initial=0.0):
-    plant = plant or Script(read=lambda t: seen(0.1 + 0.0 * t))
+STILL = Script(read=lambda t: seen(0.1 + 0.0 * t))  # one, as what is said below: loops of it are one program
+RAMP = Says(read=lambda t: 3.0 + 1000.0 * t)
+
+
+def loop(controller, actuator, plant=STILL, initial=0.0):
     return d.Loop(
         plant=plant,
         initial=initial,
@@ -123,7 +127,7 @@ def played(controller, actuator, steps, h=H, **solver):
 @pytest.mark.parametrize("back", [1.0, 2.0, 2.7, 5.5])
 def test_a_ramp_comes_later(back):
     """Exact at the instants and in the mean, from the very first moment."""
-    u, mean = played(Says(read=lambda t: 3.0 + 1000.0 * t), Delay(time=back * H, capacity=9), 25)
+    u, mean = played(RAMP, Delay(time=back * H, capacity=9), 25)
     came = H * (np.arange(26) - back)
     close(u, np.where(came > -1e-12, 3.0 + 1000.0 * came, 0.0), rtol=1e-11)
     last = came[-1]
@@ -131,9 +135,12 @@ def test_a_ramp_comes_later(back):
 
 
 def test_a_sine_comes_later_to_fourth_order():
+    w = 200.0
+    says = Says(read=lambda t: jnp.sin(w * t))
+
     def error(n):
-        h, w = 0.05 / n, 200.0
-        u, mean = played(Says(read=lambda t: jnp.sin(w * t)), Delay(time=0.0123, capacity=n + 4), n, h=h)
+        h = 0.05 / n
+        u, mean = played(says, Delay(time=0.0123, capacity=204), n, h=h)
         a = h * np.arange(n + 1) - 0.0123
         whole = (1 - np.cos(w * a[-1])) / w / 0.05
         return np.max(np.abs(u - np.where(a > 0, np.sin(w * a), 0.0))), abs(mean - whole)
@@ -157,7 +164,7 @@ def test_converges_to_the_method_of_steps(kinks):
 
     def error(n):
         solver = d.FixedStep(end / n, end, kinks=kinks)
-        run = d.measure(loop(Proportional(k=k), Delay(time=late, capacity=n), Integrator(), 1.0), solver, {})
+        run = d.measure(loop(Proportional(k=k), Delay(time=late, capacity=400), Integrator(), 1.0), solver, {})
         return abs(float(run.ending.sample.output.slip) - delayed_decay(end, k, late))
 
     errors = [error(n) for n in (50, 100, 200, 400)]
@@ -197,16 +204,21 @@ def test_a_jump_comes_out_at_its_moment(first, late, kinks):
     close(u[clear], np.where(t < late - 1e-9, 0.0, np.where(t < first + late, 2.0, 5.0))[clear], rtol=1e-12)
 
 
+@functools.cache
+def slope_of_jump(derivative):
+    def mean(at):
+        there = loop(Toggles(first=at[0]), Delay(time=at[1], capacity=9))
+        return d.measure(there, d.FixedStep(H, 14 * H), {"mean": Mean()}).metrics["mean"][1]
+
+    return jax.jit(derivative(mean))
+
+
 @pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("first", "late"), [(7.3e-3, 2.6e-3), (7.3e-3, 2.7e-3), (7.25e-3, 0.75e-3 + H)])
 def test_the_moment_of_a_jump_is_differentiable(first, late, derivative):
     """d(mean)/d(first) = -3/duration, d/d(late) = -5/duration; so on the grid, too."""
 
-    def mean(at):
-        there = loop(Toggles(first=at[0]), Delay(time=at[1], capacity=9))
-        return d.measure(there, d.FixedStep(H, 14 * H), {"mean": Mean()}).metrics["mean"][1]
-
-    close(derivative(mean)(np.array([first, late])) * 14 * H, [-3.0, -5.0], rtol=1e-7)
+    close(slope_of_jump(derivative)(np.array([first, late])) * 14 * H, [-3.0, -5.0], rtol=1e-7)
 
 
 @pytest.mark.parametrize("late", [2e-3, pytest.param(2.4e-3, marks=pytest.mark.slow)])
@@ -274,27 +286,30 @@ def test_a_relay_behind_a_delay_has_its_limit_cycle():
 def stepped(delay, command, slope, lengths, jumps=()):
     """Times, delayed commands before and after, and margins, where the steps have these lengths unless the delay cuts
     them: driven by hand, as by a solver that chooses its steps."""
+    margins, output, record = jax.jit(delay.margins), jax.jit(delay.output), jax.jit(delay.record)
+    event = jax.jit(lambda t, memory, cut: delay.event(t, memory, 0.0, (cut,)))
+    tick = jax.jit(lambda t, h, whole, memory: delay.tick(Clock(t, h, 0, None, whole), memory, 0.0))
     memory, t = delay.start(jnp.asarray(0.0)), 0.0
-    memory = delay.tick(Clock(t, 0.0, 0, None), memory, 0.0)
+    memory = tick(t, 0.0, True, memory)
     ends = np.cumsum(lengths)
     found, tries = [], 0
     for end in ends:
         while t < end - 1e-12:
             tries += 1
-            margin = float(delay.margins(t, memory, 0.0, None)[0])
+            margin = float(margins(t, memory, 0.0, None)[0])
             assert margin >= 0
             cut = margin < end - t
             h = min(margin, end - t)
             values = tuple(jnp.asarray(command(at, side)) for at, side in ((t, 1), (t + h, -1)))
             rates = tuple(jnp.asarray(slope(at)) for at in (t, t + h))
-            middle = float(delay.output(t + 0.5 * h, memory, 0.0))
-            before = float(delay.output(t + h, memory, 0.0))
-            memory = delay.event(t + h, memory, 0.0, (jnp.asarray(cut),))
-            memory = delay.record(memory, Passage(jnp.asarray(t), jnp.asarray(t + h), values, rates))
+            middle = float(output(t + 0.5 * h, memory, 0.0))
+            before = float(output(t + h, memory, 0.0))
+            memory = event(t + h, memory, jnp.asarray(cut))
+            memory = record(memory, Passage(jnp.asarray(t), jnp.asarray(t + h), values, rates))
             found.append((t + 0.5 * h, middle, t + h, before))
             t = t + h
-            memory = delay.tick(Clock(t, h, 0, None, not cut), memory, 0.0)
-            found[-1] += (float(delay.output(t, memory, 0.0)),)
+            memory = tick(t, h, not cut, memory)
+            found[-1] += (float(output(t, memory, 0.0)),)
     return np.array(found), tries
 
 

@@ -10,7 +10,7 @@ import pytest
 from diffabs import controllers
 
 STEP = 1e-4
-SLOW = ("robust, PI", "spline, latch, PI")
+SLOW = ("robust, PI", "spline, latch, PI", "spline, latch, P", "fixed slip, P")
 LOOPS = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in event_oracle.LOOPS]
 FLOOR = 0.01  # of what a metric is large: a speed of 0.01 m/s or a slip of 1e-4 matters to nobody
 

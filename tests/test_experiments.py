@@ -13,7 +13,7 @@ from diffabs.core.pytree import replace
 from diffabs.scenario.scenario import load
 
 pytest.importorskip("matplotlib")
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("experiments")]
+pytestmark = pytest.mark.slow
 FOLDER = pathlib.Path(__file__).parent.parent / "experiments"
 
 

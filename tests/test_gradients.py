@@ -1,6 +1,7 @@
 """Every objective differentiated in every parameter of every part: forward, reverse, and against differences."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.flatten_util
@@ -151,12 +152,13 @@ ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {
 }
 
 
-# The largest programs to compile.
-SLOW = ("filtered reference", "arm, observed", "proportional", "computer", "noisy", "relay", "delay")
+# The largest programs to compile, and a wheel that locks, of which test_kinks.py has closed forms.
+SLOW = ("filtered reference", "arm, observed", "proportional", "computer", "noisy", "relay", "delay", "lock")
 
 
+@functools.cache
 def flat(name):
-    """(names, values, objectives as a function of the values) of the tunable parameters of a loop."""
+    """(names, values, objectives as a function of the values, its Jacobian) of the tunable parameters of a loop."""
     loop = strong(LOOPS[name])
     paths = [p for p, spec, v in parameters(loop) if spec.tunable and np.all(np.isfinite(v))]
     measures = OF_BALANCE if name.startswith("arm") else OBJECTIVES
@@ -170,7 +172,7 @@ def flat(name):
         run = d.measure(replace(loop, dict(zip(paths, unravel(x), strict=True))), solver, measures, key=KEY)
         return jnp.stack([run.metrics[one] for one in measures])
 
-    return names, values, measured, list(measures)
+    return names, values, measured, jax.jit(jax.jacfwd(measured)), list(measures)
 
 
 def differences(measured, x, step):
@@ -183,8 +185,8 @@ def differences(measured, x, step):
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in LOOPS])
 def test_gradient_of_every_objective_in_every_parameter(name):
-    names, x, measured, measures = flat(name)
-    jacobian = np.asarray(jax.jit(jax.jacfwd(measured))(x))
+    names, x, measured, jacobian_at, measures = flat(name)
+    jacobian = np.asarray(jacobian_at(x))
     assert np.all(np.isfinite(jacobian)), [names[j] for j in np.argwhere(~np.isfinite(jacobian))[:, 1]]
     step, tolerance = ACCURACY[name]
     expected, scale = differences(measured, x, step)
@@ -197,29 +199,33 @@ def test_gradient_of_every_objective_in_every_parameter(name):
 
 @pytest.mark.parametrize("name", ["feedback", pytest.param("latch", marks=pytest.mark.slow)])
 def test_reverse_mode_equals_forward_mode(name):
-    _, x, measured, _ = flat(name)
+    _, x, measured, jacobian_at, _ = flat(name)
     weights = jnp.array(np.random.default_rng(0).normal(size=len(OBJECTIVES)))
     value, pull = jax.vjp(measured, x)
     reverse = jax.jit(pull)(weights / (1 + jnp.abs(value)))[0]
-    forward = (weights / (1 + jnp.abs(value))) @ jax.jit(jax.jacfwd(measured))(x)
+    forward = (weights / (1 + jnp.abs(value))) @ jacobian_at(x)
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-10 * np.max(np.abs(forward)))
 
 
-def _sensitivity(loop, paths, objective="stop_distance", step=1e-4, difference=None):
-    """d(objective)/d ln(parameter) for each path, by forward mode or a central difference of that relative size."""
-    loop = strong(loop)
-    solver = d.FixedStep(step, 4.0)
+def _distance(logs, loop, paths):
+    """Of a loop whose parameters at these paths are times exp(logs)."""
+    values = {p: get(loop, p) * jnp.exp(v) for p, v in zip(paths, logs, strict=True)}
+    measured = {"stop_distance": objectives.StopDistance()}
+    return d.measure(replace(loop, values), d.FixedStep(1e-4, 4.0), measured).metrics["stop_distance"]
 
-    def distance(logs):
-        values = {p: get(loop, p) * jnp.exp(v) for p, v in zip(paths, logs, strict=True)}
-        return d.measure(replace(loop, values), solver, {objective: OBJECTIVES[objective]}).metrics[objective]
 
-    zero = jnp.zeros(len(paths))
+_slopes = jax.jit(jax.jacfwd(_distance), static_argnums=2)
+_distances = jax.jit(jax.vmap(_distance, (0, None, None)), static_argnums=2)
+
+
+def _sensitivity(loop, paths, difference=None):
+    """d(distance)/d ln(parameter) for each path, by forward mode or a central difference of that relative size."""
+    loop, paths = strong(loop), tuple(paths)
     if difference is None:
-        return np.asarray(jax.jit(jax.jacfwd(distance))(zero))
-    many = jax.jit(jax.vmap(distance))
+        return np.asarray(_slopes(jnp.zeros(len(paths)), loop, paths))
     moves = difference * jnp.eye(len(paths))
-    return np.asarray((many(moves) - many(-moves)) / (2 * difference))
+    lanes = _distances(jnp.concatenate([moves, -moves]), loop, paths)
+    return np.asarray(lanes[: len(paths)] - lanes[len(paths) :]) / (2 * difference)
 
 
 FULL = braking(plant=plants.QuarterCar(road=roads.MagicFormula(), inertia=1.0539))

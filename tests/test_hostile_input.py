@@ -7,7 +7,7 @@ from commands import assert_one_error_line, left_in, run
 
 from diffabs.design.proof.certificate import Certificate
 
-pytestmark = [pytest.mark.xdist_group("hostile"), pytest.mark.usefixtures("any_step_is_stable", "without_load")]
+pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
 HEX = "0x" + "f" * 3600  # 4,335 decimal digits: Python does not write so many
 DEEP = "[" * 5000 + "]" * 5000

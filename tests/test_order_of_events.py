@@ -121,7 +121,7 @@ def rate_limit(loop):
         return wanted(x) + limit
 
     x = np.append(start, 0.0)
-    return _shown(loop, solve_ivp(flow, (0.0, END), x, max_step=2e-5, **TIGHT).y[:-1, -1], lambda x: plant(x))
+    return _shown(loop, solve_ivp(flow, (0.0, END), x, max_step=1e-4, **TIGHT).y[:-1, -1], lambda x: plant(x))
 
 
 STEPS = (1e-3, 5e-4, 2.5e-4)

@@ -20,8 +20,6 @@ from diffabs.papers import PAPERS, arm_balance, compact, lmi_design, record, sli
 from diffabs.references import FixedSlip
 from diffabs.scenario.defaults import braking
 
-pytestmark = pytest.mark.xdist_group("papers")  # one worker makes what these share
-
 SMALLEST_FIGURE = 10_000  # bytes: an empty sheet takes less than 6,000
 
 

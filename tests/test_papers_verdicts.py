@@ -19,8 +19,6 @@ from diffabs.plants import ArmBalance, BrakeStart, MirroredRig
 from diffabs.plants.arm_balance import ArmState
 from diffabs.roads import peak
 
-pytestmark = pytest.mark.xdist_group("papers")  # one worker makes what these share
-
 ROOT = pathlib.Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "papers.md"
 CAR = slip_estimator.CARS["spline B"]

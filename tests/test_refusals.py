@@ -128,16 +128,15 @@ class TestBeforeARun:
     def test_the_step_is_judged_as_by_the_eigenvalues(self):
         """Whatever a lane is decided by: the first bound, the squared one, or its eigenvalues; the last are NumPy's."""
         rng = np.random.default_rng(0)
-        n = 600
+        n = 200
         values = {
             "sensor.time_constant": 10 ** rng.uniform(-4.5, -2, n),
             "plant.mass": rng.uniform(4, 8, n),
             "controller.gain.1": -(10 ** rng.uniform(1, 4, n)),
         }
-        steps = stable_step.stable_steps(
-            jax.vmap(lambda v: replace(strong(RIG), v))({path: jnp.asarray(x) for path, x in values.items()})
-        )
-        for h in (1e-4, 1e-3, float(np.median(steps)), float(steps[7]), float(steps[8]) * (1 + 1e-6)):
+        lanes = jax.vmap(lambda v: replace(strong(RIG), v))({path: jnp.asarray(x) for path, x in values.items()})
+        steps = stable_step.stable_steps(lanes)
+        for h in (1e-4, float(steps[7]), float(steps[8]) * (1 + 1e-6)):
             np.testing.assert_array_equal(stable_step.stable(RIG, values, h), steps >= h)
         quick = 1e-4 * np.asarray(stable_step._bounds(RIG, values, squarings=0)) <= stable_step.WITHIN
         assert np.mean(quick) > 0.7 * np.mean(steps >= 1e-4)  # few are left to the eigenvalues

@@ -40,7 +40,8 @@ def test_scores_are_runs():
         assert value == pytest.approx(float(alone), rel=1e-12)
 
 
-def test_slopes_are_differences_of_runs():
+@pytest.mark.parametrize("metric", ["stop_distance", pytest.param("max_slip", marks=pytest.mark.slow)])
+def test_slopes_are_differences_of_runs(metric):
     """Of a normal variable, a uniform one and a triangular one, two of which depend on each other."""
     space = Space(
         {**SPACE.variables, "controller.gain.0": Triangular(-13e3, -12e3, -11e3)},
@@ -48,14 +49,13 @@ def test_slopes_are_differences_of_runs():
     )
     study = dataclasses.replace(STUDY, space=space, solver=dataclasses.replace(STUDY.solver, kinks=True))
     z = np.array([[0.0, 0.0, 0.3], [-2.0, 1.0, -1.0], [1.0, -1.0, 2.0]])
-    for metric in ("stop_distance", "max_slip"):
-        score, slope = _gradient(study, metric)(z)
-        np.testing.assert_allclose(score, _scores(study, metric, z), rtol=1e-10)
-        for j, offset in enumerate(1e-4 * np.eye(3)):
-            ends = _scores(study, metric, z + offset), _scores(study, metric, z - offset)
-            difference = (ends[0] - ends[1]) / 2e-4
-            # 1e-8 of the curvature, and the rounding of the metric in 1e-4
-            np.testing.assert_allclose(slope[:, j], difference, rtol=1e-5, atol=1e-9, err_msg=f"{metric}, z_{j}")
+    score, slope = _gradient(study, metric)(z)
+    np.testing.assert_allclose(score, _scores(study, metric, z), rtol=1e-10)
+    for j, offset in enumerate(1e-4 * np.eye(3)):
+        ends = _scores(study, metric, z + offset), _scores(study, metric, z - offset)
+        difference = (ends[0] - ends[1]) / 2e-4
+        # 1e-8 of the curvature, and the rounding of the metric in 1e-4
+        np.testing.assert_allclose(slope[:, j], difference, rtol=1e-5, atol=1e-9, err_msg=f"z_{j}")
 
 
 @pytest.mark.slow

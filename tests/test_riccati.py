@@ -5,8 +5,6 @@ import pickle
 import subprocess
 import sys
 
-import contrax
-import control
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +19,7 @@ from diffabs.linear.riccati import care, dare
 ALPHA, BETA, FAST, SLOW = 83.8796606703, 133.472842636189, 140.291806958, 14.0291806958
 CARE, DARE = jax.jit(care), jax.jit(dare)
 OPTIMISED = {"xla_backend_optimization_level": 3}  # as users compile: the hardest cases are a matter of rounding
+HARD_CARE, HARD_DARE = (jax.jit(solve, compiler_options=OPTIMISED) for solve in (care, dare))
 
 
 def rig(speed=FAST):
@@ -95,6 +94,9 @@ def test_published_gain_of_the_arm():
 
 @pytest.mark.slow
 def test_two_control_libraries_agree():
+    import contrax
+    import control
+
     a, b, q, r, _ = random_problem(3, 0)
     found = lqr(a, b, q, r)
     np.testing.assert_allclose(-found.gain, control.lqr(a, b, q, r)[0], rtol=1e-9)
@@ -150,12 +152,12 @@ def rounding(a, b, q, r, p):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("case", numbered(range(20), 3, 4, 5, 14, 15, 16, 17, 18, 19))
+@pytest.mark.parametrize("case", numbered(range(20), 2, 3, 4, 5, 11, 14, 15, 16, 17, 18, 19))
 def test_scipys_cases_in_continuous_time(case):
     """All but two. A fourteenth example of the collection (case 13) has poles 5e-13 left of the imaginary axis; with 80
     digits SciPy's P is wrong by 2e-4. The other, a chain of 21 integrators, is one that SciPy gives up, too."""
     a, b, q, r = scipys_case("TestSolveContinuousAre", case)
-    found = jax.jit(care, compiler_options=OPTIMISED)(a, b, q, r)
+    found = HARD_CARE(a, b, q, r)
     if case in (13, 16):
         assert not found.stabilising
         assert rounding(a, b, q, r, sl.solve_continuous_are(a, b, q, r)) > 1e-7  # the error that is promised
@@ -167,11 +169,11 @@ def test_scipys_cases_in_continuous_time(case):
     assert np.linalg.eigvals(a - b @ np.linalg.solve(r, b.T @ p)).real.max() < 0
 
 
-@pytest.mark.parametrize("case", numbered(range(3, 19), 12, 13, 14, 18))
+@pytest.mark.parametrize("case", numbered(range(3, 19), 9, 10, 11, 12, 13, 14, 16, 17, 18))
 def test_scipys_cases_in_discrete_time(case):
     """All that are real; R is 0 in one and singular in another (6 and 7)."""
     a, b, q, r = scipys_case("TestSolveDiscreteAre", case)
-    found = jax.jit(dare, compiler_options=OPTIMISED)(a, b, q, r)
+    found = HARD_DARE(a, b, q, r)
     assert found.stabilising
     p = np.asarray(found.P)
     gain = np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)

@@ -144,6 +144,17 @@ def test_new_values_do_not_compile_again():
     assert _run._cache_size() == before
 
 
+@jax.jit
+def plainly(loop, objectives, method, tries):
+    loop, audit = prepare(loop)
+    objectives = objectives | audit
+    carry = method.start(loop, objectives, None)
+    over = jax.lax.fori_loop(
+        0, tries, lambda _, carry: method.step(loop, objectives, None, method.renew(loop, carry)), carry
+    )
+    return judge(loop, objectives, over)[0]
+
+
 @pytest.mark.parametrize("like", [d.FixedStep(1e-3), d.Adaptive()], ids=["fixed", "adaptive"])
 @pytest.mark.parametrize("duration", [0.02, 0.3, 3.0])
 def test_another_duration_is_the_same_program_and_the_same_steps(duration, like):
@@ -154,20 +165,9 @@ def test_another_duration_is_the_same_program_and_the_same_steps(duration, like)
     run = d.measure(RIG, solver, BRAKING)
     assert _run._cache_size() == before
     loop, objectives, method = arguments(RIG, solver, BRAKING)
-
-    @jax.jit
-    def plainly(loop, objectives):
-        loop, audit = prepare(loop)
-        objectives = objectives | audit
-        carry = method.start(loop, objectives, None)
-        tries = room(loop, solver.steps)
-        over = jax.lax.fori_loop(
-            0, tries, lambda _, carry: method.step(loop, objectives, None, method.renew(loop, carry)), carry
-        )
-        return judge(loop, objectives, over)[0]
-
+    alone = plainly(loop, objectives, method, room(loop, solver.steps))
     assert bool(run.stopped) == (duration == 3.0)
-    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-13), run, plainly(loop, objectives))
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-13), run, alone)
 
 
 def test_trajectories_of_other_durations_and_strides_are_of_one_program():

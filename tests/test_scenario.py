@@ -13,7 +13,7 @@ from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import dump, load, names
 from diffabs.scenario.section_design import Task
 from diffabs.scenario.section_tune import Goal
-from diffabs.simulate.solution import FixedStep
+from diffabs.simulate.solution import Adaptive, FixedStep
 from diffabs.tune import risk
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")
@@ -117,7 +117,22 @@ def test_everything_nested_survives_dump_and_load(file):
 
 def test_what_is_left_out_has_its_default(file):
     s = load(file(""))
-    assert_same(s, scenario.Scenario(name="mine", loop=braking(), solver=FixedStep()))
+    assert_same(s, scenario.Scenario(name="mine", loop=braking(), solver=Adaptive()))
+
+
+@pytest.mark.parametrize(
+    ("section", "solver"),
+    [
+        ("duration = 3.0", Adaptive(duration=3.0)),
+        ("rtol = 1e-6\nstep = 1e-2", Adaptive(rtol=1e-6, step=1e-2)),
+        ("step = 1e-4", FixedStep(step=1e-4)),
+        ("kinks = true", FixedStep(kinks=True)),
+        ('type = "fixed"', FixedStep()),
+        ('type = "adaptive"\nstep = 1e-2', Adaptive(step=1e-2)),
+    ],
+)
+def test_steps_are_adaptive_unless_their_length_is_given(file, section, solver):
+    assert load(file(f"[solver]\n{section}\n")).solver == solver
 
 
 # The catalogue

@@ -14,7 +14,7 @@ from sweeping import SCENARIO
 
 from diffabs.sweep import Results, SweepError
 
-pytestmark = [pytest.mark.xdist_group("sealed"), pytest.mark.usefixtures("any_step_is_stable", "without_load")]
+pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
 TEXT = SCENARIO.replace("samples = 3200", "samples = 290")  # five chunks, the last one shorter
 

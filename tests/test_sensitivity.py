@@ -74,7 +74,10 @@ def agrees(system, weights, tolerance):
     np.testing.assert_allclose(by_gain / gain[:, None], gains / np.array(gain)[:, None], rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("weights", PUBLISHED.values(), ids=PUBLISHED)
+@pytest.mark.parametrize(
+    "weights",
+    [pytest.param(w, id=name, marks=pytest.mark.slow if name == "ones" else ()) for name, w in PUBLISHED.items()],
+)
 def test_derivatives_of_a_design_are_differences(weights):
     agrees(RIG, weights, 1e-4)
 

@@ -30,8 +30,6 @@ from diffabs.scenario.scenario import ScenarioError, dump, load, loads
 from diffabs.simulate.stable_step import stable_step
 from diffabs.stops import NoStop
 
-pytestmark = pytest.mark.xdist_group("servo")  # one worker compiles what these share
-
 ROOT = pathlib.Path(__file__).parent.parent
 HERE = ROOT / "examples" / "dc-servo"
 PARTS = ("--parts", "dc_servo")

@@ -9,8 +9,6 @@ import pytest
 from commands import left_in
 from sweeping import PATIENCE, SCENARIO, chunks, command, started, until
 
-pytestmark = pytest.mark.xdist_group("sigterm")
-
 LONG = ("--samples", "640000")
 
 

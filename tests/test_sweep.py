@@ -23,7 +23,7 @@ from diffabs.sweep import Categorical, Local, Normal, Results, Space, SweepError
 from diffabs.sweep.seal import contents
 from diffabs.sweep.trajectories import keep
 
-pytestmark = [pytest.mark.xdist_group("sweep"), pytest.mark.usefixtures("any_step_is_stable", "without_load")]
+pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
 SMALL = """
 title = "small"

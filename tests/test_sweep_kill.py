@@ -25,8 +25,6 @@ from diffabs.sweep.manifest import Seals, sealed
 from diffabs.sweep.seal import NAME, encoded
 from diffabs.sweep.store import Store
 
-pytestmark = pytest.mark.xdist_group("sweep-kill")  # what these share takes a whole run
-
 LONG = SCENARIO.replace("step = 1e-3", "step = 5e-4").replace("samples = 3200", "samples = 6400")
 LEFT = {".lock", "manifest.json", "chunks", "summary.json"}
 DAMAGE = {

@@ -12,7 +12,6 @@ from diffabs.sweep import sweep
 
 pytestmark = [
     pytest.mark.slow,  # processes that wait for each other
-    pytest.mark.xdist_group("sweep-processes"),
     pytest.mark.usefixtures("any_step_is_stable"),
 ]
 

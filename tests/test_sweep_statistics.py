@@ -289,6 +289,7 @@ class TestSobol:
             assert one.high - one.low < 0.07
             assert one.samples == 60_000
 
+    @pytest.mark.slow
     @MODELS
     def test_intervals_cover(self, function, truth):
         random, hits = np.random.default_rng(14), np.zeros(len(truth))
@@ -403,7 +404,11 @@ class TestCoverage:
         assert abs(found - exact) < 2
 
     @pytest.mark.parametrize(
-        ("n", "level", "law"), [(1000, 0.95, stats.expon()), (500, 0.9, stats.norm())], ids=["exponential", "normal"]
+        ("n", "level", "law"),
+        [
+            pytest.param(1000, 0.95, stats.expon(), id="exponential"),
+            pytest.param(500, 0.9, stats.norm(), id="normal", marks=pytest.mark.slow),
+        ],
     )
     def test_cvar(self, n, level, law):
         """The truth by quadrature over the upper quantiles."""

@@ -20,8 +20,6 @@ from terminal import COLUMNS, SPINNER, Terminal, assert_fits, assert_orderly, wo
 from diffabs.cli import console, tables
 from diffabs.core import interrupt
 
-pytestmark = pytest.mark.xdist_group("terminal")
-
 TUNED = """
 [tune]
 iterations = 200

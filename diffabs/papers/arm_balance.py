@@ -29,12 +29,11 @@ from diffabs.papers.digest import Digest, Refuted, digest
 from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
 from diffabs.scenario.defaults import balancing
 from diffabs.simulate.run import rollout
-from diffabs.simulate.solution import FixedStep, Run
+from diffabs.simulate.solution import Adaptive, FixedStep, Run, described
 
 TITLE = "Fumita: a two-wheeler balanced by an arm"
 SOLVER = FixedStep(step=1e-3, duration=10.0)
-LONG = FixedStep(step=1e-3, duration=60.0)  # of what is counted: a run ends when it is decided
-LONGEST = FixedStep(step=1e-3, duration=600.0)  # of the rest: a gain that hardly holds a rider is slow
+LONG = Adaptive(rtol=1e-6, duration=600.0)  # of what is counted: a run ends when it is decided
 FINE = FixedStep(step=1e-5, duration=0.1, every=10)  # where 14 kV meet the arm
 START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # of Fig. 3
 HANGING = ArmBalance(arm_length=-0.5)
@@ -123,13 +122,7 @@ def runs() -> dict[str, Run]:
 def multiples(one: Loop, rows: Mapping[str, Any]) -> list[Reach]:
     """Of each of several values of a parameter, (path, values), the largest of MULTIPLES that is recovered."""
     direction = {"initial.theta": START[0], "initial.phi": START[2]}
-    found = largest(one, rows, direction, MULTIPLES, LONG)
-    slow = [i for i, reach in enumerate(found) if reach.undecided]
-    if slow:
-        few = {path: np.asarray(column)[slow] for path, column in rows.items()}
-        for i, reach in zip(slow, largest(one, few, direction, MULTIPLES, LONGEST), strict=True):
-            found[i] = reach
-    return found
+    return largest(one, rows, direction, MULTIPLES, LONG)
 
 
 def bounds(plant: ArmBalance, riders: Any) -> np.ndarray:
@@ -259,7 +252,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
             name: [float(m) for m, reach in zip(RIDERS, reaches, strict=True) if reach.undecided]
             for name, (_, reaches) in over_riders.items()
         },
-        "solver": record.solver(SOLVER),
+        "solver": record.solver(SOLVER, counted=described(LONG)),
         "versions": record.origin(),
     }
     return record.write(folder, summary)

@@ -33,7 +33,7 @@ from diffabs.scenario.compatibility import misfits
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.registry import OTHERS, build, joined, loop_of
 from diffabs.simulate.refusals import together, unstable
-from diffabs.simulate.solution import FixedStep, Solver
+from diffabs.simulate.solution import Adaptive, Solver
 
 LARGEST_FILE = 1_000_000  # bytes
 LONGEST_PATH = 4096  # characters of it in a message
@@ -49,7 +49,7 @@ class Scenario:
     title: str = ""
     description: str = ""
     loop: Loop = dataclasses.field(default_factory=braking)
-    solver: Solver = dataclasses.field(default_factory=FixedStep)
+    solver: Solver = dataclasses.field(default_factory=Adaptive)
     objectives: Mapping[str, Objective] = dataclasses.field(default_factory=lambda: dict(BRAKING))
     seed: int = 0
     design: section_design.Task = dataclasses.field(default_factory=section_design.Task)

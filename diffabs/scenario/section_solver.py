@@ -1,4 +1,6 @@
-"""The section [solver]: how a run is integrated, and the seed of its noise."""
+"""The section [solver]: how a run is integrated, and the seed of its noise.
+
+Where no type is given, a step or `kinks` make it fixed; otherwise, and with an rtol, steps are adaptive."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -41,13 +43,18 @@ SECTIONS = {"fixed": _Fixed, "adaptive": _Adaptive}
 
 
 def read(given: Any) -> tuple[Solver, int]:
-    """Return solver and seed of a section; without a type it is the fixed one. Raises ScenarioError."""
-    table = {"type": "fixed", **given} if isinstance(given, Mapping) else given
+    """Return solver and seed of a section. Raises ScenarioError."""
+    table = {"type": _usual(given), **given} if isinstance(given, Mapping) else given
     found = read_one(SECTIONS, table, "solver")
     said = members(found)
     seed = said.pop("seed")
     kind = next(name for name, section in SECTIONS.items() if type(found) is section)
     return TYPES[kind](**said), seed
+
+
+def _usual(given: Mapping[str, Any]) -> str:
+    """The type that is meant where none is given."""
+    return "fixed" if {"step", "kinks"} & given.keys() and "rtol" not in given else "adaptive"
 
 
 def table(solver: Solver, seed: int) -> dict[str, Any]:

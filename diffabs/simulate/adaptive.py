@@ -17,7 +17,6 @@ import jax.numpy as jnp
 from diffabs.core.blocks import Passage
 from diffabs.core.cubic import Cubic
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
-from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Clock, Memory, Sample, Segment
 from diffabs.core.regime import Words
 from diffabs.simulate.advance import start
@@ -28,6 +27,7 @@ from diffabs.simulate.foresight import kinks
 from diffabs.simulate.landing import Search, earliest, falls_through, init_search, land, seek, select
 from diffabs.simulate.lengths import FIRST, SHRINK, Pace, allowed, error, longest_stable, planned, sizes
 from diffabs.simulate.rk4 import rk4_pair
+from diffabs.simulate.span import Span
 from diffabs.simulate.stepper import MISSED, typed
 
 MOST, EACH = 100_000, 16  # tries of a run, and for each instant of its grid: more of them lead nowhere
@@ -79,7 +79,7 @@ class Carry(NamedTuple):
     search: Search
     tries: Any
     renewed: Any  # how many of these there were when the longest stable step was last looked at
-    past: Any  # the last point but one that the run came to: time, state, rates; () where nobody asks
+    past: Any  # the last step, as a `Span`; () where nobody asks
     note: Any  # of the last try: a bit for each event at its end, and the regime in its middle; () likewise
     condition: Any
 
@@ -117,7 +117,7 @@ def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carr
     left = pace.strike(loop, zero) * pace.h
     length, ends = planned(jnp.minimum(natural, limit), point.ahead, left, pace)
     search = init_search(pace.h)
-    past = (point.t, state, point.rate[0]) if pace.keeps else ()
+    past = Span(point.t, state, point.rate[0], point.t, state.flow(), point.rate[0]) if pace.keeps else ()
     note = (zero, point.words) if pace.notes else ()
     lengths = (natural, length, ends, limit, scale, length)
     return typed(Carry(point, zero, none, *lengths, search, zero, zero, past, note, condition), pace.h.dtype)
@@ -164,7 +164,7 @@ def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict
     found = jax.lax.cond(anyone(looking), lambda: _look(carry, here), lambda: plan)
     search, length, condition = select(looking, found, plan)
     lost = (~verdict.fine & (carry.length <= pace.least)) | (carry.tries > MOST + EACH * pace.steps)
-    last = (carry.point.t, carry.point.state, carry.point.rate[0])
+    last = Span(*(carry.point.t, carry.point.state, carry.point.rate[0]), *_end(here.point))
     return carry._replace(
         point=point,
         natural=natural,
@@ -248,16 +248,9 @@ def before(pace: Pace, carry: Carry, instant: Any) -> Any:
     return carry.running & (carry.point.t < instant * pace.h)
 
 
-def between(carry: Carry, t: Any) -> tuple[Any, LoopState]:
-    """Return this time, or that of the last point where the run has not come to it, and the loop's state there: the
-    cubic through the last two points."""
-    now, (start, state, rate) = carry.point, carry.past
-    h = now.t - start
-    x = clamp((t - start) / jnp.where(h > 0, h, 1.0), 0.0, 1.0)
-    ends = (state.flow(), now.state.flow(), rate, now.rate[0])
-    flow = jax.tree.map(lambda a, b, p, q: Cubic(a, b, h * p, h * q)(x), *ends)
-    inside = (t < now.t) & (h > 0)
-    return jnp.where(inside, t, now.t), select(inside, state.with_flow(flow), now.state)
+def _end(point: Point) -> Any:
+    """Of a span, before what changes there."""
+    return point.t, point.state.flow(), point.rate[0]
 
 
 def _point(system: Dynamics, pace: Pace, t: Any, state: LoopState, tally: Tally, length: Any) -> Point:

@@ -20,12 +20,15 @@ APART = 0.2  # power of the precision: the probe's distance, in steps
 BEYOND = 0.5  # power of the precision: how far behind the zero of a comparison a step ends, in steps
 TRIES = 24  # the most for an event, whose margin may have a corner or jump
 BISECT = 4  # every so many tries halve the bracket
+GRAZES = 1e-2  # of the margin's mean rate in the step: a margin that falls more slowly at the beginning only touches
+SMOOTH = 1e-4  # of the slope: the most by which both ends of a step together know it better; more is a kink between
+PART = 0.5  # of the fall: the most by which it may change where the margin is smooth, or has other signs on either side
 
 
 class Search(NamedTuple):
     """Where an event is looked for: the number of its margin; the length that was tried first [s]; the bracket; the
-    margin at these (infinite where nobody knows it); how many times it was tried. Near the zero: the length, and the
-    margin there."""
+    margin at these (infinite where nobody knows it); how many times it was tried. Near the zero: the length, the
+    margin there, whether there is a zero, and whether that is where the step begins."""
 
     which: Any
     full: Any
@@ -37,6 +40,8 @@ class Search(NamedTuple):
     tries: Any
     place: Any
     margin: Any
+    found: Any
+    at_once: Any
 
 
 class Crossed(NamedTuple):
@@ -60,7 +65,7 @@ class Crossings(NamedTuple):
 def init_search(h: Any) -> Search:
     """Return a search for nothing."""
     none, zero = 0.0 * h, jnp.asarray(0)
-    return Search(zero, h, none, none, none, h, none, zero, h, none)
+    return Search(zero, h, none, none, none, h, none, zero, h, none, *2 * (jnp.asarray(False),))
 
 
 def falls_through(before: list[Any], after: list[Any]) -> list[Any]:
@@ -99,11 +104,13 @@ def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Se
 
     width, newton = search.far - search.near, x - correction
     share = ratio(search.at_near, search.at_near - search.at_far, 0.5)
-    first = jnp.where(jnp.isfinite(search.at_near), search.near + share * width, jnp.minimum(NEAR * h, 0.5 * width))
+    least = jnp.minimum(NEAR * h, 0.5 * width)  # where the margin has begun to fall
+    first = jnp.where(jnp.isfinite(search.at_near), jnp.maximum(search.near + share * width, least), least)
     inside = falls & (newton > search.near) & (newton < search.far) & (search.tries % BISECT != 0)
     guess = jnp.where(inside, newton, jnp.where(fresh, first, search.near + 0.5 * width))
     apart = jnp.where(sought.end < 0, 1.0, -1.0) * h * jnp.finfo(h.dtype).eps ** APART
-    search = search._replace(place=jnp.where(at_once, 0.0, x), margin=jnp.where(near & ~at_once, sought.end, 0.0))
+    found = near | at_once
+    search = search._replace(place=x, margin=jnp.where(found, sought.end, 0.0), found=found, at_once=at_once)
     # Beyond the zero another margin that falls does so before it.
     earlier = enough & ~at_once & tells.another & ~changes & tells.falls & (search.tries < TRIES)
     search = select(earlier, _bracket(search, x, tells.other), search)
@@ -113,18 +120,64 @@ def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Se
 
 def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> Any:
     """Return the length that ends on the zero, or so much `beyond` that its margin has changed its sign for certain,
-    after the probe of length x. The fall is that of the parabola through the place, the probe, and the end of the first
-    try that is on the same side."""
+    after the probe of length x. The fall is that of the parabola through the place, the probe, and an end of the first
+    try: that on the same side, or where that says nothing the other, if the margin is smooth up to there."""
     x = jax.lax.stop_gradient(x)
     g, start = jax.lax.stop_gradient(tells.sought[1:])
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
-    end, at_end = select(margin < 0, (search.full, search.at_full), (0.0 * x, start))
+    ends = (search.full, search.at_full), (0.0 * x, start)
+    side, other = select(margin < 0, ends, ends[::-1])
+    near = _tells(side, place, x)
+    end, at_end = third = select(near, side, other)
     fall = (g - margin) / (x - place)
-    bend = ratio(ratio(at_end - g, end - x) - fall, end - place)
-    far = (jnp.abs(end - place) > 4 * jnp.abs(place - x)) & jnp.isfinite(at_end)
-    fall += jnp.where(far, (place - x) * jnp.where(far, bend, 0.0), 0.0)
-    fall = jax.lax.stop_gradient(fall)
-    return search.place - search.margin / jnp.where(fall < 0, fall, -jnp.inf) + beyond
+    changes = ratio(at_end - g, end - x) - fall
+    far = near | (_tells(third, place, x) & (jnp.abs(changes) <= PART * jnp.abs(fall)))
+    bend = jnp.where(far, ratio(changes, end - place), 0.0)
+    at_place = fall + (place - x) * bend
+    length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)
+    slope = at_place + 2.0 * (length - place) * bend
+    last, at_last = select(near & _tells(other, place, x), other, third)
+    more = ratio(ratio(ratio(at_last - g, last - x) - fall, last - place) - bend, last - end)
+    more *= (length - place) * (length - x) + (length - place + length - x) * (length - end)
+    slope += jnp.where(jnp.abs(more) <= SMOOTH * jnp.abs(slope), more, 0.0)
+    far = jnp.abs(length - place) > jnp.abs(x - place)
+    length = jnp.where(far, jnp.maximum(jnp.minimum(length, search.far), search.near), length)
+    moved = length + jnp.where(far, 0.0, _moves(search, x, tells.sought.end, length, slope))
+    return jnp.where(search.at_once, _at_once(search, at_place, start, moved), moved) + beyond
+
+
+def strays(search: Search, x: Any, length: Any) -> Any:
+    """Return whether a step of this length, after the probe of length x, would end so far from where the zero seemed to
+    be that it is to be looked for again: a margin that hardly falls there, and then all at once."""
+    probe = jnp.abs(x - search.place)
+    missed = (jnp.abs(length - search.place) > probe) & (search.far - search.near > probe)
+    return jax.lax.stop_gradient(missed & ~search.at_once & (search.tries < TRIES))
+
+
+def _moves(search: Search, x: Any, g: Any, zero: Any, fall: Any) -> Any:
+    """0, with the derivatives of the zero. The margin's are those of the place and of the probe x, continued to the
+    zero: they, too, change in the ten-thousandth of a step between."""
+    known = search.found & (fall < 0)
+    share = ratio(zero - search.place, x - search.place)
+    ends = (jnp.where(known, end, 0.0) for end in (search.margin, g))
+    rises = sum(part * (end - jax.lax.stop_gradient(end)) for part, end in zip((1.0 - share, share), ends, strict=True))
+    return -rises / jnp.where(known, fall, -1.0)
+
+
+def _tells(end: tuple[Any, Any], place: Any, probe: Any) -> Any:
+    """Whether the margin at an end of a try says how it bends between the place and the probe."""
+    length, margin = end
+    return (jnp.abs(length - place) > 4 * jnp.abs(place - probe)) & jnp.isfinite(margin)
+
+
+def _at_once(search: Search, fall: Any, start: Any, length: Any) -> Any:
+    """The length of a step at whose beginning the event happens. It has a derivative if the margin falls there as
+    steeply as it does on the whole; not if it jumps, or has its maximum there."""
+    place, margin = jax.lax.stop_gradient((search.place, search.margin))
+    smooth = jnp.where(jnp.isfinite(start), jnp.abs(margin - fall * place - start) <= -PART * fall * place, True)
+    mean = jnp.where(jnp.isfinite(search.at_full), search.at_full / search.full, 0.0)
+    steep = (fall < 0) & (fall <= GRAZES * jax.lax.stop_gradient(mean))
+    return jnp.where(smooth & steep, length - jax.lax.stop_gradient(jnp.minimum(length, 0.0)), 0.0)
 
 
 def _narrowed(old: Search, x: Any, first: Any, sought: Crossed) -> tuple[Search, Any]:

@@ -1,11 +1,12 @@
 """How long an adaptive step may be: by its error, by stability, by the kinks and clocks ahead."""
 
 import dataclasses
-from functools import partial, reduce
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from diffabs.core.loop import Loop, LoopState
 from diffabs.core.numerics import clamp
@@ -85,28 +86,24 @@ def planned(length: Any, ahead: Any, left: Any, pace: Pace) -> tuple[Any, Any]:
 def longest_stable(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any:
     """Return 2.4/rho [s], rho about the spectral radius of the flow's Jacobian: how much longer a vector becomes each
     time that it is multiplied by that, measured in the largest values so far."""
-    flow, tree = jax.tree.flatten(state.flow())
-    leaves = [jnp.ravel(x) for x in flow]
-    sizes = [jnp.where(x > 0, x, 1.0) for leaf in jax.tree.leaves(scale[1]) for x in jnp.ravel(leaf)]
-    places = [(i, k) for i, leaf in enumerate(leaves) for k in range(leaf.size)]
+    flow, unflatten = ravel_pytree(state.flow())
+    size = ravel_pytree(scale[1])[0]
+    size = jnp.where(size > 0, size, 1.0)
 
-    def rates(flow: list[Any]) -> list[Any]:
-        at = state.with_flow(tree.unflatten(flow))
-        found = loop.flow(t, at, loop.signals(t, at))
-        return [x for leaf in jax.tree.leaves(found) for x in jnp.ravel(leaf)]
+    def rates(flow: Any) -> Any:
+        at = state.with_flow(unflatten(flow))
+        return ravel_pytree(loop.flow(t, at, loop.signals(t, at)))[0]
 
-    def column(i: int, k: int) -> list[Any]:
-        one = [jnp.zeros_like(x) for x in leaves]
-        one[i] = one[i].at[k].set(1.0)
-        moves = [jnp.reshape(x, jnp.shape(leaf)) for x, leaf in zip(one, flow, strict=True)]
-        return jax.jvp(rates, (flow,), (moves,))[1]
+    moves = jnp.eye(size.size, dtype=size.dtype) * size
+    columns = jax.vmap(lambda one: jax.jvp(rates, (flow,), (one,))[1])(moves) / size
 
-    matrix = [column(*place) for place in places]
-    vector, log = [jnp.ones_like(x) for x in sizes], 0.0 * t
-    for i in range(MULTIPLIED):
-        terms = [[a * b * x for a, b, x in zip(row, sizes, vector, strict=True)] for row in zip(*matrix, strict=True)]
-        vector = [sum(row) / size for row, size in zip(terms, sizes, strict=True)]
-        norm = reduce(jnp.maximum, map(jnp.abs, vector)) + TINY
-        vector = [x / norm for x in vector]
-        log += jnp.log(norm) if i >= MULTIPLIED // 2 else 0.0
-    return STABLE * jnp.exp(-log / (MULTIPLIED - MULTIPLIED // 2))
+    def multiplied(at: tuple[Any, Any], counts: Any) -> tuple[tuple[Any, Any], None]:
+        vector, log = at
+        vector = jnp.sum(columns * vector[:, None], axis=0)
+        norm = jnp.max(jnp.abs(vector)) + TINY
+        return (vector / norm, log + counts * jnp.log(norm)), None
+
+    # A loop, and not its rounds one by one: XLA would work the matrix out anew in each of them.
+    later = jnp.repeat(jnp.array([0.0, 1.0], t.dtype), MULTIPLIED // 2)
+    log = jax.lax.scan(multiplied, (jnp.ones_like(size), 0.0 * t), later)[0][1]
+    return STABLE * jnp.exp(-log / (MULTIPLIED // 2))

@@ -11,6 +11,7 @@ from diffabs.core.loop import Loop
 from diffabs.simulate import adaptive, stepper
 from diffabs.simulate.checkpoint import anyone
 from diffabs.simulate.dynamics import Objectives
+from diffabs.simulate.landing import select
 from diffabs.simulate.lengths import Pace, longest_stable
 from diffabs.simulate.outcome import observe
 from diffabs.simulate.solution import Adaptive, Solver, Trajectory
@@ -96,12 +97,18 @@ class AtPace(Pace):
 
     def seen(self, loop: Loop, carry: adaptive.Carry, instant: Any) -> Trajectory:
         """Return what is seen at this instant of the grid, which lies within the last step."""
-        t, state = adaptive.between(carry, instant * self.h)
-        return observe(loop, t, state, carry.running | (t < carry.point.t))
+        now, t = carry.point, instant * self.h
+        inside = (t < now.t) & (carry.past.until > carry.past.t)
+        t, state = select(inside, (t, carry.past.at(t)), (now.t, now.state))
+        return observe(loop, t, state, carry.running | inside)
 
     def watched(self) -> "AtPace":
         """Return the method for a run that is seen on its way."""
         return dataclasses.replace(self, keeps=True)
+
+    def unwatched(self) -> "AtPace":
+        """Return the method for a run that is not."""
+        return dataclasses.replace(self, keeps=False)
 
     def noted(self) -> "AtPace":
         """Return the method for a run that is to be repeated. Its derivative changes faster than the run, so the error

@@ -28,8 +28,10 @@ from diffabs.simulate.dynamics import Ahead, Dynamics, Objectives, Tally, dynami
 from diffabs.simulate.foresight import bit
 from diffabs.simulate.landing import select
 from diffabs.simulate.methods import AtPace
+from diffabs.simulate.outcome import observe
 from diffabs.simulate.rk4 import rk4_step_from
-from diffabs.simulate.solution import ORDER, Adaptive
+from diffabs.simulate.solution import ORDER, Adaptive, Trajectory
+from diffabs.simulate.span import Span
 from diffabs.simulate.stepper import typed
 
 MOST, TICKED = 2048, 2  # tries that can be noted at an error of 1e-5, and for each instant of a grid with clocks
@@ -141,22 +143,48 @@ def _skipping(work: Any, on: Any, carry: Any, xs: Any, length: int | None = None
 
 def repeat(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes: Notes, condition: Any) -> Repeated:
     """Return the run of these notes once more, which can be differentiated in every leaf of loop and objectives."""
+    return Repeated(_repeated(loop, objectives, pace, key, notes)[0], condition)
+
+
+def repeat_and_watch(
+    loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes: Notes, condition: Any, instants: Any
+) -> tuple[Repeated, Trajectory, Trajectory]:
+    """Return the same run, what is seen at its beginning, and what at these instants (n,) of the grid: by the cubics of
+    its steps."""
+    last, spans = _repeated(loop, objectives, pace, key, notes)
+    # What was skipped is zero, and comes after the end.
+    starts = jnp.where(jnp.any(notes.moved, axis=1)[:, None], jax.lax.stop_gradient(spans.t), jnp.inf)
+    spans = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), spans)
+
+    def seen(instant: Any) -> Trajectory:
+        t = instant * pace.h
+        place = jnp.searchsorted(starts.ravel(), t, side="right") - 1
+        span = jax.tree.map(lambda x: x[place], spans)
+        return observe(loop, t, span.at(t), t < jax.lax.stop_gradient(last.t))
+
+    first = observe(loop, 0.0 * pace.h, jax.tree.map(lambda x: x[0], spans.state), jnp.asarray(True))
+    return Repeated(last, condition), first, jax.vmap(seen)(instants)
+
+
+def _repeated(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes: Notes) -> tuple[Place, Any]:
+    """The end of the run, and the `Span` of every try, where they are kept."""
     zero = 0.0 * pace.h
     state, tally = start(loop, objectives, Clock(zero, pace.h, 0, key))
     begun = typed(Place(zero, zero, state, tally, jnp.asarray(0)), pace.h.dtype)
 
-    def step(place: Place, one: Notes) -> tuple[Place, None]:
-        return select(one.moved, _step(loop, objectives, pace, key, place, one), place), None
+    def step(place: Place, one: Notes) -> tuple[Place, Any]:
+        new, span = _step(loop, objectives, pace, key, place, one)
+        return select(one.moved, new, place), span
 
     @forgetful
-    def block(place: Place, some: Notes) -> tuple[Place, None]:
+    def block(place: Place, some: Notes) -> tuple[Place, Any]:
         return jax.lax.scan(forgetful(step), place, some)
 
-    return Repeated(_skipping(block, lambda _, some: jnp.any(some.moved), begun, notes)[0], condition)
+    return _skipping(block, lambda _, some: jnp.any(some.moved), begun, notes)
 
 
-def _step(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes) -> Place:
-    """One step within its regime, and what happens at its end."""
+def _step(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes) -> tuple[Place, Any]:
+    """One step within its regime, and what happens at its end; its `Span`, where they are kept."""
     system = dynamics(loop, objectives, place.t, place.state, place.tally, kinks=True)
     within, h = Regime(one.words), one.length - place.late
     begin = system.ahead(place.t, place.state, place.tally, within)
@@ -185,12 +213,14 @@ def _step(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Pla
         lambda: (begin.moving, end.moving),
     )
     tally = {name: Memory(tally[name].flow, o.update(tally[name], segment)) for name, o in objectives.items()}
+    ends = (t, state.flow(), system.rates(t, z, held, within)[0]) if pace.keeps else ()
+    span = Span(place.t, place.state, begin.seen.rate, *ends) if pace.keeps else ()
     if loop.changes:
         late = axpy(shift, end.recorded, end.seen.signals.recorded)
         ends = (begin.seen.signals.recorded, begin.recorded), (late, end.recorded)
         step = passed(*(Recorded(*both) for both in zip((place.t, t), ends, strict=True)))
         state = _changed(system, Clock(t, pace.h, one.k, key, strikes), state, end.seen.margins, one.fired, step)
-    return Place(t, shift, state, tally, one.k)
+    return Place(t, shift, state, tally, one.k), span
 
 
 def _whole(loop: Loop, place: Place, z: Any) -> tuple[LoopState, Tally]:

@@ -20,7 +20,7 @@ from diffabs.core.pytree import arrayed, misshapen, strong
 from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
 from diffabs.simulate.methods import AtPace, method_of
 from diffabs.simulate.outcome import judge, prepare
-from diffabs.simulate.replay import note, repeat, room
+from diffabs.simulate.replay import note, repeat, repeat_and_watch, room
 from diffabs.simulate.solution import Adaptive, Run, Solver, Trajectory
 
 MOST_STEPS = 2**31 - 8  # that a counter in 32 bits holds, landing included
@@ -174,14 +174,14 @@ def _reversible(loop: Loop, objectives: dict[str, Objective], method: Any, key: 
 
 
 def _repeated(loop: Loop, objectives: dict[str, Objective], method: AtPace, key: Any, places: Places) -> Run:
-    """Raises ValueError for a trajectory."""
-    if places.every:
-        raise ValueError("no derivative of a trajectory with Adaptive steps: take FixedStep, or what is measured")
     loop, audit = prepare(loop)
-    objectives = objectives | audit
+    objectives, (tries, instants, every) = objectives | audit, places
     still, measures = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
-    notes, condition = note(still, measures, method, key, places.tries)
-    return judge(loop, objectives, repeat(loop, objectives, method, key, notes, condition))[0]
+    run = (loop, objectives, method, key, *note(still, measures, method.unwatched(), key, tries))
+    if not every:
+        return judge(loop, objectives, repeat(*run))[0]
+    carry, first, seen = repeat_and_watch(*run, jnp.arange(1, instants + 1) * every)
+    return _with_trajectory(judge(loop, objectives, carry), first, seen)
 
 
 def _prepared(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any) -> tuple[Loop, Any, Any]:

@@ -37,6 +37,7 @@ from diffabs.simulate.landing import (
     land,
     seek,
     select,
+    strays,
 )
 
 EXTRA, SPARE = 4, 64  # tries beyond a step of the grid for each of them, about an event; and besides
@@ -175,7 +176,7 @@ def _look(carry: Carry, here: Arrival, fine: Any, kinks: int, h: Any) -> tuple[S
     search, length, enough = seek(carry.search, carry.length, new, tells, h)
     seeking = search, length, jnp.where(enough, Condition.PROBING, Condition.SEEKING)
     beyond = jnp.where(carry.search.which < kinks, h * jnp.finfo(h.dtype).eps ** BEYOND, 0.0)
-    landing = carry.search, land(carry.search, carry.length, tells, beyond), jnp.asarray(Condition.LANDING)
+    landing = _landing(carry, land(carry.search, carry.length, tells, beyond))
     search, length, condition = select(carry.condition == Condition.PROBING, landing, seeking)
     tired = (search.tries >= TRIES) | (carry.here >= MOST) | (carry.extra > KINKS * carry.k + SPARE)
     blunt = carry.blunt | ~fine | (tired & (search.which < kinks))
@@ -183,6 +184,13 @@ def _look(carry: Carry, here: Arrival, fine: Any, kinks: int, h: Any) -> tuple[S
     length = jnp.where(begins, (carry.k + 1) * h - carry.point.t, length)
     condition = jnp.where(begins, Condition.RUNNING, condition)
     return search, length, blunt, condition.astype(carry.condition.dtype)
+
+
+def _landing(carry: Carry, length: Any) -> tuple[Search, Any, Any]:
+    """A step of this length, or a search that goes on in the middle of the bracket: the condition last."""
+    search, again = carry.search, strays(carry.search, carry.length, length)
+    length = jnp.where(again, 0.5 * (search.near + search.far), length)
+    return search, length, jnp.where(again, Condition.SEEKING, Condition.LANDING)
 
 
 def _crossings(carry: Carry, here: Arrival, kinks: int) -> Crossings:

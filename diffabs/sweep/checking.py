@@ -16,7 +16,7 @@ from diffabs.sweep.study import Study, precision
 
 STREAM = 0x0ACC  # of random numbers, beside those of the designs
 EXCLUDED = ("diverged", "refused")  # flags of lanes whose metrics are none
-NOTHING = 1e-9  # in the unit of the metric: a change that is none
+NOTHING = 1e-9  # in the unit of the metric: a change that is none; nor is one of less than solver.rtol
 LOOSE = 0.01  # relative: a metric that a half step changes by more
 
 
@@ -49,7 +49,8 @@ def said(result: dict[str, Any]) -> list[str]:
     """What a reader of the statistics must know, a line each."""
     lines = []
     rows = result["metrics"].items()
-    loose = {name: row for name, row in rows if row["largest"] > LOOSE and row["difference"] > NOTHING}
+    nothing = max(NOTHING, result.get("solver", {}).get("rtol", 0.0))
+    loose = {name: row for name, row in rows if row["largest"] > LOOSE and row["difference"] > nothing}
     if loose:
         each = (f"{name} by up to {100 * row['largest']:.3g} % (sample {row['sample']})" for name, row in loose.items())
         cure = "lower solver.rtol" if "rtol" in result.get("solver", {}) else "shorten solver.step"

@@ -44,7 +44,8 @@ class Search:
         own = problem.space.place(problem.subject)[None]
         drawn = problem.space.spread(jax.random.key(method.seed), method.starts - 1)
         self.starts = np.concatenate([own, drawn])
-        self.before: Seen = jax.device_get(_first(problem.valuer()(jnp.asarray(own))))
+        alike = np.repeat(own, len(self.starts), axis=0)  # one program serves this and the search
+        self.before: Seen = jax.device_get(_first(problem.evaluator(1.0)(alike, self._multipliers()).seen))
         if self.refused:  # its numbers mean nothing
             self.before = jax.tree.map(lambda x: np.full(np.shape(x), np.nan), self.before)._replace(diverged=0)
         size = abs(float(self.before.objective))
@@ -83,10 +84,9 @@ class Search:
         return self._tuned(best, lanes)
 
     def _rounds(self, descent: Descent) -> list[Lane]:
-        k, count = len(self.before.excess), len(self.starts)
-        m = Multipliers(np.zeros((count, k)), np.full(count, PENALTY), np.full(count, self.method.margin))
+        m = self._multipliers()
         lanes = descent.run(self.starts, m)
-        if not k:
+        if not self.problem.excesses:
             return lanes
         worst = _violations(lanes)
         while self.round < self.method.rounds and not all(w <= 0 for w in worst):
@@ -101,6 +101,11 @@ class Search:
                 lane.keep(before.kept)
             m, worst = _harder(m, worst, _violations(lanes)), _violations(lanes)
         return lanes
+
+    def _multipliers(self) -> Multipliers:
+        """At the start."""
+        count, k = len(self.starts), self.problem.excesses
+        return Multipliers(np.zeros((count, k)), np.full(count, PENALTY), np.full(count, self.method.margin))
 
     def _rank(self, point: Point) -> tuple[bool, float]:
         """Those that meet the constraints first."""

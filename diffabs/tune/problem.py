@@ -10,6 +10,7 @@ outside and never quite reach it, so what is aimed at lies a little inside, and 
 
 import dataclasses
 import enum
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.bijectors import Space
+from diffabs.core.compiling import SAME
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
@@ -27,6 +29,7 @@ from diffabs.simulate.solution import Run, Solver
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.risk import Aggregate
 
+FEWEST = 64  # lanes from which on their runs take longer than compiling them
 FEW = 6  # parameters up to which forward mode is the cheaper one (benchmarks/bench_gradient.py)
 
 
@@ -92,11 +95,21 @@ class Problem:
         each = sum(weight * runs.metrics[name] for name, weight in self.weights.items())
         each = each if self.batch.weights is None else each * jnp.asarray(self.batch.weights)
         loop = built(self.space.at(self.subject, z))
-        excess = [jnp.ravel(c.excess(loop, runs.metrics)) for c in self.constraints]
-        excess = jnp.concatenate(excess) if excess else jnp.zeros(0)
+        excess = self._excess(loop, runs.metrics)
         return Seen(self.aggregate(jnp.asarray(each)), excess, jnp.sum(runs.diverged), runs.metrics)
 
-    def loss(self, scale: float) -> Callable[[Any, Multipliers], tuple[Any, tuple[Any, Seen]]]:
+    @functools.cached_property
+    def excesses(self) -> int:
+        """How many excesses there are."""
+        lanes = {name: jax.ShapeDtypeStruct((self.batch.size,), jnp.result_type(float)) for name in self.measured}
+        z = self.space.place(self.subject)
+        return jax.eval_shape(lambda metrics: self._excess(built(self.space.at(self.subject, z)), metrics), lanes).size
+
+    def _excess(self, loop: Loop, metrics: dict[str, Any]) -> Any:
+        excess = [jnp.ravel(c.excess(loop, metrics)) for c in self.constraints]
+        return jnp.concatenate(excess) if excess else jnp.zeros(0)
+
+    def loss(self, scale: Any) -> Callable[[Any, Multipliers], tuple[Any, tuple[Any, Seen]]]:
         """(z, multipliers) -> L, and (L, what was seen)."""
 
         def loss(z: Any, m: Multipliers) -> tuple[Any, tuple[Any, Seen]]:
@@ -107,14 +120,20 @@ class Problem:
         return loss
 
     def evaluator(self, scale: float) -> Callable[[Any, Multipliers], Evaluation]:
-        """(starts, p) and multipliers with a leading axis of starts -> Evaluation; compiled, one call for all."""
+        """(starts, p) and multipliers with a leading axis of starts -> Evaluation; compiled, one call for all, and once
+        for every scale."""
+        return lambda z, m: self._evaluate(z, m, scale)
+
+    @functools.cached_property
+    def _evaluate(self) -> Callable[[Any, Multipliers, Any], Evaluation]:
         derivative = jax.jacfwd if self.mode is Mode.FORWARD else jax.grad
 
-        def evaluate(z: Any, m: Multipliers) -> Evaluation:
+        def evaluate(z: Any, m: Multipliers, scale: Any) -> Evaluation:
             gradient, (value, seen) = derivative(self.loss(scale), has_aux=True)(z, m)
             return Evaluation(value, gradient, seen)
 
-        return jax.jit(jax.vmap(evaluate))
+        options = SAME if self.batch.size <= FEWEST else None
+        return jax.jit(jax.vmap(evaluate, in_axes=(0, 0, None)), compiler_options=options)
 
     def valuer(self) -> Callable[[Any], Seen]:
         """(starts, p) -> Seen: without a gradient."""

@@ -180,7 +180,8 @@ def _ascent(problem: Problem, points: np.ndarray, iterations: int) -> list[Lane]
     low, high = np.array(problem.space.ranges).T
     points = np.clip(points, low + EDGE * (high - low), high - EDGE * (high - low))
     z = np.stack([problem.space.place(replace(problem.subject, _at(problem.space, point))) for point in points])
-    first = jax.device_get(problem.valuer()(jnp.asarray(z[:1])))
+    none = Multipliers(np.zeros((len(z), 0)), np.ones(len(z)))
+    first = jax.device_get(problem.evaluator(1.0)(jnp.asarray(z), none)).seen
     scale = max(abs(float(first.objective[0])), 1e-12)
     loss = problem.loss(scale)
     descent = Descent(
@@ -191,7 +192,7 @@ def _ascent(problem: Problem, points: np.ndarray, iterations: int) -> list[Lane]
         Stopping(iterations=iterations),
         lambda lanes: None,
     )
-    return descent.run(z, Multipliers(np.zeros((len(z), 0)), np.ones(len(z))))
+    return descent.run(z, none)
 
 
 def _found(

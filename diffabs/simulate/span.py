@@ -1,0 +1,30 @@
+"""The run between the two ends of a step: the cubic through the states and the rates there."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from diffabs.core.cubic import Cubic
+from diffabs.core.loop import LoopState
+from diffabs.core.numerics import clamp
+
+
+class Span(NamedTuple):
+    """A step: time [s], state and rates after what changed at its beginning; those of what is integrated before what
+    changes at its end."""
+
+    t: Any
+    state: LoopState
+    rate: Any
+    until: Any
+    flow: Any
+    last_rate: Any
+
+    def at(self, t: Any) -> LoopState:
+        """Return the state at a time within the step."""
+        h = self.until - self.t
+        x = clamp((t - self.t) / jnp.where(h > 0, h, 1.0), 0.0, 1.0)
+        ends = (self.state.flow(), self.flow, self.rate, self.last_rate)
+        flow = jax.tree.map(lambda a, b, p, q: Cubic(a, b, h * p, h * q)(x), *ends)
+        return self.state.with_flow(flow)
