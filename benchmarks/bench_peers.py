@@ -32,8 +32,8 @@ from rich.console import Console
 from rich.table import Table
 
 HERE = pathlib.Path(__file__).parent
-PEERS = ("diffabs_adaptive", "diffabs_fixed", "c_adaptive", "c_fixed", "jax_scan", "numba_adaptive", "diffrax_event")
-PEERS += ("jaxonomy_event", "scipy_loop", "torchdiffeq_event")
+PEERS = ("diffabs_adaptive", "diffabs_fixed", "kernel_adaptive", "kernel_fixed", "c_adaptive", "c_fixed", "jax_scan")
+PEERS += ("numba_adaptive", "diffrax_event", "jaxonomy_event", "scipy_loop", "torchdiffeq_event")
 PATIENCE = 300.0  # seconds for one answer
 FACTOR = 10.0  # a setting so many times finer in error than asked ends the ladder
 

@@ -5,7 +5,7 @@
 A mutation whose test does not end within LIMIT_S is dead too, and it is said. Exit status 1 if a mutation survives, if
 its text is no longer in the file, or if a named test fails without it. Not
 collected by pytest; run it weekly, and when a test is added: add a line to MUTATIONS (of
-sweeps: in mutations_sweep.py).
+sweeps: in mutations_sweep.py, of the kernel: in mutations_kernel.py).
 """
 
 import contextlib
@@ -18,6 +18,7 @@ import sys
 import tempfile
 from typing import NamedTuple
 
+from mutations_kernel import KERNEL
 from mutations_sweep import SWEEP
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
@@ -1542,6 +1543,7 @@ MUTATIONS = [
         "test_batch.py::test_a_lane_of_which_enough_is_seen_is_taken_off",
     ),
     *(Mutation(*each) for each in SWEEP),
+    *(Mutation(*each) for each in KERNEL),
     Mutation(
         "lanes that one run would refuse are run",
         "simulate/refill.py",

@@ -201,6 +201,7 @@ class TestObjections:
 class TestSweep:
     SETTINGS = ("sweep.samples=40", "sweep.chunk=16", "solver.step=2e-3", "solver.duration=0.4", "stop.speed_kmh=40.0")
 
+    @pytest.mark.slow
     def test_is_that_of_xla_and_says_what_made_it(self, tmp_path):
         """Another engine does not go on with it."""
         study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
@@ -285,6 +286,18 @@ class TestLibrary:
         monkeypatch.setattr(compilers, "compiler", lambda: made)
         monkeypatch.setattr(compilers, changed, ("-O1",) if changed == "FLAGS" else lambda: "another")
         assert compilers.library("one") != path
+
+    def test_in_a_folder_that_cannot_be_made(self, tmp_path, monkeypatch):
+        (tmp_path / "file").write_text("")
+        monkeypatch.setenv(compilers.CACHE, str(tmp_path / "file" / "kernel"))
+        with pytest.raises(compilers.NoCompiler, match=r"no kernel in .*file.kernel: Not a directory"):
+            compilers.library(self.TEXT % 3)
+
+    def test_that_is_none_cannot_be_loaded(self, tmp_path, monkeypatch):
+        (tmp_path / "none.so").write_text("nothing")
+        monkeypatch.setattr(compilers, "library", lambda text: tmp_path / "none.so")
+        with pytest.raises(compilers.NoCompiler, match=r"invalid ELF header|file too short|not a mach-o"):
+            launch._registered("")
 
     @pytest.mark.slow
     def test_of_two_processes_at_once_and_of_one_that_is_killed(self, tmp_path):

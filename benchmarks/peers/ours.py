@@ -26,13 +26,13 @@ def solver(kind, setting, duration):
     return diffabs.FixedStep(setting, duration)
 
 
-def prepared_with(kind, masses, speeds, setting, dtype):
-    """What `prepared` of a peer returns, for a solver of diffabs."""
+def prepared_with(kind, masses, speeds, setting, dtype, engine="xla"):
+    """What `prepared` of a peer returns, for a solver and an engine of diffabs."""
     chosen = solver(kind, setting, problem.DURATION)
 
     def solve(m, v):
         batch = diffabs.Batch({"plant.mass": m, "initial.speed": v})
-        metrics = diffabs.run_batch(LOOP, batch, chosen, MEASURED).metrics
+        metrics = diffabs.run_batch(LOOP, batch, chosen, MEASURED, engine=engine).metrics
         return tuple(jnp.asarray(metrics[name]) for name in problem.METRICS)
 
     return on_devices.spread(solve, masses, speeds, dtype, compiled=False)

@@ -72,19 +72,23 @@ def compiler() -> Compiler:
 
 
 def library(text: str) -> pathlib.Path:
-    """Return the file of the library of a text, which is compiled if it is not there yet. Raises NoCompiler."""
+    """Return the file of the library of a text, which is compiled if it is not there yet. Raises NoCompiler, also for a
+    folder that cannot be written."""
     made = compiler()
     digest = _digest(text, made)
     folder = cache_folder()
     path = folder / f"{digest}.so"
     if path.is_file():
         return path
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{digest[:16]}-", dir=folder) as own:
-        source, result = pathlib.Path(own) / "kernel.cpp", pathlib.Path(own) / "kernel.so"
-        source.write_text(text)
-        _run(made.command, source, result)
-        os.replace(result, path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{digest[:16]}-", dir=folder) as own:
+            source, result = pathlib.Path(own) / "kernel.cpp", pathlib.Path(own) / "kernel.so"
+            source.write_text(text)
+            _run(made.command, source, result)
+            os.replace(result, path)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise NoCompiler(f"no kernel in {folder}: {getattr(error, 'strerror', None) or error}") from None
     return path
 
 

@@ -22,7 +22,8 @@ INFIX = {
 }  # fmt: skip
 PREFIX = {"neg": "-", "not": "~"}
 NAMED = {
-    "lt": "lt", "le": "le", "eq": "eq", "ne": "ne", "max": "most", "min": "least", "lower": "lower", "higher": "higher", "abs": "size", "sqrt": "root",
+    "lt": "lt", "le": "le", "eq": "eq", "ne": "ne", "max": "most", "min": "least", "lower": "lower",
+    "higher": "higher", "abs": "size", "sqrt": "root",
     "rint": "whole", "floor": "down", "ceil": "up", "rem": "rest", "is_finite": "finite",
     **{name: f"k_{name}" for name in (
         "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan", "asin", "acos", "sinh", "cosh", "atan2",

@@ -3,6 +3,7 @@
 import ctypes
 import functools
 import os
+import pathlib
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -79,10 +80,18 @@ def _registered(source: str) -> str:
     name = f"diffabs_kernel_{path.stem[:32]}"
     with _lock:
         if name not in _loaded:
-            handler = ctypes.CDLL(str(path)).diffabs_kernel
+            handler = _handler(path)
             jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
             _loaded[name] = handler
     return name
+
+
+def _handler(path: pathlib.Path) -> Any:
+    """Raises NoCompiler for a library that this process cannot load: a folder from which nothing may be run."""
+    try:
+        return ctypes.CDLL(str(path)).diffabs_kernel
+    except (OSError, AttributeError) as error:
+        raise compilers.NoCompiler(f"{path.parent}: {error}") from None
 
 
 def _threads() -> int:
