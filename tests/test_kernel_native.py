@@ -111,6 +111,8 @@ RULES = {
     "summed up": lambda x, y, k: jnp.cumsum(x * jnp.arange(4.0)),
     "products": lambda x, y, k: (x * jnp.arange(6.0).reshape(2, 3)) @ jnp.arange(3.0) + jnp.ones(2) @ jnp.ones((2, 2)),
     "moved": lambda x, y, k: jnp.concatenate([jnp.flip(x * jnp.arange(3.0)), jnp.stack([y])])[1:4:2],
+    "padded": lambda x, y, k: jax.lax.pad(x * jnp.arange(1.0, 7.0).reshape(2, 3), y, [(1, 0, 2), (-1, 2, 0)]),
+    "diagonal": lambda x, y, k: jnp.diag(jnp.stack([x, y])),
     "turned": lambda x, y, k: (x * jnp.arange(6.0).reshape(2, 3)).T.reshape(2, 3),
     "table": lambda x, y, k: _table(x),
     "own table": lambda x, y, k: jnp.stack([x, y, x + y])[jnp.clip(k, 0, 2)],

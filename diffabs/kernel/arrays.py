@@ -40,6 +40,20 @@ def _concatenate(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [np.concatenate(ins, eqn.params["dimension"])]
 
 
+@rule("pad", "padding_config")
+def _pad(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """Before, after and between the entries of each axis; less than none cuts off."""
+    x, value = ins[0], ins[1].item()
+    for axis, (low, high, between) in enumerate(eqn.params["padding_config"]):
+        rows = np.moveaxis(x, axis, 0)
+        wide = np.full((max(0, len(rows) + between * (len(rows) - 1)), *rows.shape[1:]), value, object)
+        wide[:: between + 1] = rows
+        ends = [np.full((max(0, n), *rows.shape[1:]), value, object) for n in (low, high)]
+        wide = wide[max(0, -low) : len(wide) - max(0, -high)]
+        x = np.moveaxis(np.concatenate([ends[0], wide, ends[1]]), 0, axis)
+    return [x]
+
+
 @rule("transpose", "permutation")
 def _transpose(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [ins[0].transpose(eqn.params["permutation"])]
