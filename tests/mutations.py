@@ -740,8 +740,8 @@ MUTATIONS = [
     Mutation(
         "a landing hundreds of steps away",
         "simulate/landing.py",
-        "(search.tries < TRIES))\n\n\ndef _moves",
-        "False)\n\n\ndef _moves",
+        "missed & ~search.at_once & (search.tries < TRIES)",
+        "missed & False",
         "test_landing.py::test_a_margin_that_falls_all_at_once_is_landed_on",
     ),
     Mutation(

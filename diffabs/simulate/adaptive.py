@@ -24,7 +24,7 @@ from diffabs.simulate.checkpoint import anyone, apart
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.dynamics import FREE, Dynamics, Objectives, Tally, dynamics, parted
 from diffabs.simulate.foresight import kinks
-from diffabs.simulate.landing import Search, earliest, falls_through, init_search, land, seek, select
+from diffabs.simulate.landing import Search, aimed, earliest, falls_through, init_search, land, seek, select
 from diffabs.simulate.lengths import FIRST, SHRINK, Pace, allowed, error, longest_stable, planned, sizes
 from diffabs.simulate.rk4 import rk4_pair
 from diffabs.simulate.span import Span
@@ -298,7 +298,8 @@ def _look(carry: Carry, here: Arrival) -> tuple[Search, Any, Any]:
     tells = earliest(carry.search.which, 0, *_margins(carry, here))
     search, length, enough = seek(carry.search, carry.length, new, tells, base)
     seeking = search, length, jnp.where(enough, Condition.PROBING, Condition.SEEKING)
-    landing = carry.search, land(carry.search, carry.length, tells, 0.0 * base), jnp.asarray(Condition.LANDING)
+    end, again = aimed(carry.search, carry.length, land(carry.search, carry.length, tells, 0.0 * base))
+    landing = carry.search, end, jnp.where(again, Condition.SEEKING, Condition.LANDING)
     search, length, condition = select(carry.condition == Condition.PROBING, landing, seeking)
     return search, length, condition.astype(carry.condition.dtype)
 

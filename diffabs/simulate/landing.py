@@ -146,12 +146,14 @@ def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> Any:
     return jnp.where(search.at_once, _at_once(search, at_place, start, moved), moved) + beyond
 
 
-def strays(search: Search, x: Any, length: Any) -> Any:
-    """Return whether a step of this length, after the probe of length x, would end so far from where the zero seemed to
-    be that it is to be looked for again: a margin that hardly falls there, and then all at once."""
+def aimed(search: Search, x: Any, length: Any) -> tuple[Any, Any]:
+    """Return the length of a step that is to land, after the probe of length x, and whether it is none: where it would
+    end so far from where the zero seemed to be that it is to be looked for again, in the middle of the bracket. So it
+    is with a margin that hardly falls there, and then all at once."""
     probe = jnp.abs(x - search.place)
     missed = (jnp.abs(length - search.place) > probe) & (search.far - search.near > probe)
-    return jax.lax.stop_gradient(missed & ~search.at_once & (search.tries < TRIES))
+    again = jax.lax.stop_gradient(missed & ~search.at_once & (search.tries < TRIES))
+    return jnp.where(again, 0.5 * (search.near + search.far), length), again
 
 
 def _moves(search: Search, x: Any, g: Any, zero: Any, fall: Any) -> Any:

@@ -32,13 +32,13 @@ from diffabs.simulate.landing import (
     Crossed,
     Crossings,
     Search,
+    aimed,
     earliest,
     falls_through,
     init_search,
     land,
     seek,
     select,
-    strays,
 )
 
 EXTRA, SPARE = 4, 64  # tries beyond a step of the grid for each of them, about an event; and besides
@@ -192,10 +192,9 @@ def _look(carry: Carry, here: Arrival, fine: Any, kinks: int, h: Any) -> tuple[S
 
 
 def _landing(carry: Carry, length: Any) -> tuple[Search, Any, Any]:
-    """A step of this length, or a search that goes on in the middle of the bracket: the condition last."""
-    search, again = carry.search, strays(carry.search, carry.length, length)
-    length = jnp.where(again, 0.5 * (search.near + search.far), length)
-    return search, length, jnp.where(again, Condition.SEEKING, Condition.LANDING)
+    """A step of this length, or a search that goes on: the condition last."""
+    length, again = aimed(carry.search, carry.length, length)
+    return carry.search, length, jnp.where(again, Condition.SEEKING, Condition.LANDING)
 
 
 def _crossings(carry: Carry, here: Arrival, kinks: int) -> Crossings:
