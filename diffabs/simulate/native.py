@@ -16,12 +16,15 @@ from diffabs.core.compiling import traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
+from diffabs.core.tracing import pushed
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.drivers import BLOCK
+from diffabs.simulate.methods import AtPace
 from diffabs.simulate.outcome import judge
+from diffabs.simulate.pursuit import Pursuing, Pursuit
 from diffabs.simulate.refill import by_lane
 from diffabs.simulate.run import arguments
 from diffabs.simulate.solution import Run, Solver
@@ -44,10 +47,30 @@ def run_native(
 
     def some(start: int) -> Run:
         mine = jax.tree.map(lambda x: x[start : start + MOST], lanes)
-        return _run(loop, mine[0], dict(objectives), method, *mine[1:])
+        return _made((loop, mine[0], dict(objectives), method, *mine[1:]))
 
     runs = [some(start) for start in range(0, count, MOST)]
     return runs[0] if len(runs) == 1 else jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
+
+
+@jax.custom_jvp
+def _made(given: Any) -> Run:
+    """The runs of (loop, values, objectives, method, keys, accepted)."""
+    return _run(*given)
+
+
+def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
+    """By steps that end on kinks, as derivatives have them elsewhere (`run`)."""
+
+    def run(given: Any) -> Run:
+        loop, values, objectives, method, keys, accepted = given
+        method = Pursuing(method.noted()) if isinstance(method, AtPace) else method.located()
+        return _run(loop, values, objectives, method, keys, accepted)
+
+    return pushed(run, primals, tangents)
+
+
+_made.defjvp(_rule, symbolic_zeros=True)
 
 
 @jax.jit
@@ -55,18 +78,28 @@ def _run(
     loop: Loop, values: dict[str, Any], objectives: dict[str, Objective], method: Any, keys: Any, accepted: Any
 ) -> Run:
     leaves, built = by_lane(loop, values, objectives)
-    carry = jax.vmap(lambda mine, key: method.start(*built(mine), key))(leaves, keys)
-    condition = jnp.where(accepted, carry.condition, Condition.DIVERGED).astype(carry.condition.dtype)
+
+    def start(mine: Any, key: Any, accepted: Any) -> Any:
+        return _only(accepted, method.start(*built(mine), key))
+
     carry = run_lanes(
         lambda lane, carry: method.renew(built(lane[0])[0], carry),
         lambda lane, carry: method.step(*built(lane[0]), lane[1], carry),
         lambda lane, carry: carry.running,
         (leaves, keys),
-        carry._replace(condition=condition),
+        jax.vmap(start)(leaves, keys, accepted),
         steps=BLOCK,
         rounds=1,
     )
     return jax.vmap(lambda mine, carry: judge(*built(mine), carry)[0])(leaves, carry)
+
+
+def _only(accepted: Any, carry: Any) -> Any:
+    """A carry that does not run if it is not accepted."""
+    if isinstance(carry, Pursuit):
+        return carry._replace(ahead=_only(accepted, carry.ahead))
+    condition = jnp.where(accepted, carry.condition, Condition.DIVERGED)
+    return carry._replace(condition=condition.astype(carry.condition.dtype))
 
 
 def by_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Run], why_not: str = "") -> Run:
