@@ -39,6 +39,7 @@ def _sum_of_tangents(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @rule("stop_gradient copy copy_p optimization_barrier pvary")
+@rule("reshard", "dst_sharding concrete_mesh")
 def _unchanged(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return ins
 

@@ -121,7 +121,9 @@ def _real_type(inputs: dict[Place, Node]) -> np.dtype:
 
 
 def _type(x: Any) -> Any:
-    return x if isinstance(x, jax.ShapeDtypeStruct) else jax.typeof(x)
+    """Of one lane's program, so not on which devices it lies."""
+    aval = x if isinstance(x, jax.ShapeDtypeStruct) else jax.typeof(x)
+    return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=getattr(aval, "weak_type", False))
 
 
 def live(roots: Sequence[Node]) -> list[Node]:

@@ -158,9 +158,7 @@ def _reached(program: Program, functions: Functions, could: Moving, begins: Movi
 
 def _pushed(functions: Functions, could: Moving) -> Functions:
     """The functions of values and tangents: of each level its arrays, then tangents of those that could have one."""
-    types = {
-        level: [_alike(x) for x in (*all, *(all[i] for i in could[level]))] for level, all in functions.types.items()
-    }
+    types = {level: [*all, *(all[i] for i in could[level])] for level, all in functions.types.items()}
     uniform = len(types[Level.UNIFORM])
     each: dict[str, Function] = {}
     for name, function in functions.each.items():
@@ -198,7 +196,3 @@ def _push(functions: Functions, function: Function, could: Moving, moves: bool) 
         return [*values, *(tangents[i] for i in could[Level.STEP])]
 
     return push
-
-
-def _alike(x: Any) -> Any:
-    return jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=getattr(x, "weak_type", False))

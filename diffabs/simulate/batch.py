@@ -156,19 +156,18 @@ def run_batch(
         objectives,
         jnp.broadcast_to(jnp.asarray(accepted, bool), count),
     )
-    if engine == "kernel" and not (trajectories or together or enough):
-        return by_engine(engine, lambda: run_native(*given), lambda: run_refilled(*given))
-    if trajectories or (live if together is None else together) or (not batch.values and batch.keys is None):
-        if enough is not None:
-            raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
+    as_one = trajectories or (live if together is None else together) or (not batch.values and batch.keys is None)
+    if as_one and enough is not None:
+        raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
 
-        def together_() -> Run:
-            run = rollout if trajectories else measure
-            return _flagged(_together(loop, batch, solver, objectives, run), accepted)
+    def by_xla() -> Run:
+        if not as_one:
+            return run_refilled(*given, enough)
+        run = rollout if trajectories else measure
+        return _flagged(_together(loop, batch, solver, objectives, run), accepted)
 
-        return by_engine(engine, together_, together_, TOGETHER)
-    why_not = "" if enough is None else "runs are to end early, when enough is seen"
-    return by_engine(engine, lambda: run_native(*given), lambda: run_refilled(*given, enough), why_not)
+    why_not = TOGETHER if trajectories or together or (as_one and engine == "auto") else ""
+    return by_engine(engine, lambda: run_native(*given, enough), by_xla, why_not)
 
 
 def _together(loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], run: Any) -> Run:
