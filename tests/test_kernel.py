@@ -137,7 +137,7 @@ class TestObjections:
 
     def test_without_a_compiler(self, monkeypatch, caplog):
         monkeypatch.setenv(compilers.COMPILER, "")
-        native._tell.cache_clear()
+        native.tell.cache_clear()
         native._run.clear_cache()
         loop = d.replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
         line = native.objection(loop, VALUES, SOLVER, {})

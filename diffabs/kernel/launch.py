@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.kernel import compilers, cpp, program
+from diffabs.kernel import binding, compilers, cpp, program
 
-LARGE = 2500  # operations; the blocks of a larger program are of fewer vectors, or compiling takes long
+LINES = 10_000  # of a step; the blocks of a larger program are of fewer vectors, or compiling takes long
 VECTORS = 4
 _lock = threading.Lock()
 _loaded: dict[str, Any] = {}
@@ -37,41 +37,38 @@ def run_lanes(
         nothing that matters in a lane that is over
     lane: what is a lane's own, (n, ...) each; what the functions close over is the same for all
 
-    Works under jit and vmap; no derivatives. Raises Unsupported for an operation that has no rule, NoCompiler."""
-    shape = cpp.Shape(VECTORS, steps, rounds)
-    functions = {"renew": renew, "step": step, "running": running}
-    made = compiled(functions, jax.tree.map(_one, lane), jax.tree.map(_one, carry), shape)
-    leaves, tree = jax.tree.flatten(carry)
-    given = [_data(x) for x in (*made.uniform, *jax.tree.leaves(lane), *leaves)]
-    first = len(given) - len(leaves)
-    results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in given[first:]]
-    call = jax.ffi.ffi_call(
-        made.target,
-        results,
-        vmap_method="sequential",
-        input_output_aliases={first + i: i for i in range(len(leaves))},
+    Works under jit and vmap, with derivatives forward. Raises Unsupported for an operation that has no rule, NoCompiler
+    where there is none, ValueError for reverse mode."""
+    compilers.compiler()
+    functions = program.traced(
+        {"renew": renew, "step": step, "running": running}, jax.tree.map(_one, lane), jax.tree.map(_one, carry)
     )
-    found = call(*given, threads=np.int64(_threads()))
+    leaves, tree = jax.tree.flatten(carry)
+    given = [_data(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
+    launch = functools.partial(_launched, shape=cpp.Shape(VECTORS, steps, rounds))
+    lanes = binding.Lanes(functions._replace(uniform=[]), launch)
+    found = binding.bound(lanes, given)
     return tree.unflatten([_like(x, leaf) for x, leaf in zip(found, leaves, strict=True)])
 
 
-class Compiled:
-    """A program that XLA can call: its `target`, and the arrays that all lanes share."""
+def _launched(made: program.Program, before: list[Any], carry: list[Any], shape: cpp.Shape) -> list[Any]:
+    """The carry of lanes that are all over; `before`: what is the same for all lanes, and what is a lane's own."""
+    first = len(before)
+    call = jax.ffi.ffi_call(
+        target(made, shape),
+        [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry],
+        input_output_aliases={first + i: i for i in range(len(carry))},
+    )
+    return list(call(*before, *carry, threads=np.int64(_threads())))
 
-    def __init__(self, target: str, uniform: list[Any], source: str):
-        """Registered already."""
-        self.target, self.uniform, self.source = target, uniform, source
 
-
-def compiled(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any, shape: cpp.Shape) -> Compiled:
-    """Return the functions `renew`, `step` and `running` of one lane as a program that XLA can call; lane and carry of
-    these shapes. Raises Unsupported, NoCompiler."""
-    found = program.build(functions, lane, carry)
-    source = cpp.text(found, shape)
-    count = cpp.operations(source)
-    if count > LARGE and shape.vectors > 1:
-        source = cpp.text(found, shape._replace(vectors=shape.vectors // 2))
-    return Compiled(_registered(source), found.uniform, source)
+def target(made: program.Program, shape: cpp.Shape) -> str:
+    """Return the name under which XLA knows a program; compiled, if it was not before. Raises NoCompiler."""
+    source = cpp.text(made, shape)
+    while cpp.operations(source) * shape.vectors > LINES and shape.vectors > 1:
+        shape = shape._replace(vectors=shape.vectors // 2)
+        source = cpp.text(made, shape)
+    return _registered(source)
 
 
 def _registered(source: str) -> str:
