@@ -16,6 +16,7 @@ from diffabs.kernel import compilers, cpp, program
 
 LARGE = 2500  # operations; the blocks of a larger program are of fewer vectors, or compiling takes long
 VECTORS = 4
+NAME = "diffabs_kernel_"  # begins the names of libraries
 _lock = threading.Lock()
 _loaded: dict[str, Any] = {}
 
@@ -42,7 +43,7 @@ def run_lanes(
     functions = {"renew": renew, "step": step, "running": running}
     made = compiled(functions, jax.tree.map(_one, lane), jax.tree.map(_one, carry), shape)
     leaves, tree = jax.tree.flatten(carry)
-    given = [_data(x) for x in (*made.uniform, *jax.tree.leaves(lane), *leaves)]
+    given = [data(x) for x in (*made.uniform, *jax.tree.leaves(lane), *leaves)]
     first = len(given) - len(leaves)
     results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in given[first:]]
     call = jax.ffi.ffi_call(
@@ -51,7 +52,7 @@ def run_lanes(
         vmap_method="sequential",
         input_output_aliases={first + i: i for i in range(len(leaves))},
     )
-    found = call(*given, threads=np.int64(_threads()))
+    found = call(*given, threads=np.int64(threads()))
     return tree.unflatten([_like(x, leaf) for x, leaf in zip(found, leaves, strict=True)])
 
 
@@ -71,19 +72,28 @@ def compiled(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: 
     count = cpp.operations(source)
     if count > LARGE and shape.vectors > 1:
         source = cpp.text(found, shape._replace(vectors=shape.vectors // 2))
-    return Compiled(_registered(source), found.uniform, source)
+    return Compiled(register(compilers.library(source)), found.uniform, source)
 
 
-def _registered(source: str) -> str:
-    """The name under which XLA knows the library of a text."""
-    path = compilers.library(source)
-    name = f"diffabs_kernel_{path.stem[:32]}"
+def register(path: pathlib.Path) -> str:
+    """Return the name under which XLA knows a library from now on. Raises NoCompiler for one that is not there."""
+    name = f"{NAME}{path.stem[:32]}"
     with _lock:
         if name not in _loaded:
             handler = _handler(path)
             jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
-            _loaded[name] = handler
+            _loaded[name] = handler, path
     return name
+
+
+def names() -> list[str]:
+    """Return the names under which XLA knows libraries."""
+    return list(_loaded)
+
+
+def path(name: str) -> pathlib.Path:
+    """Return the library of a name."""
+    return _loaded[name][1]
 
 
 def _handler(path: pathlib.Path) -> Any:
@@ -94,8 +104,8 @@ def _handler(path: pathlib.Path) -> Any:
         raise compilers.NoCompiler(f"{path.parent}: {error}") from None
 
 
-def _threads() -> int:
-    """Processors that this process may use, shared by the devices, each of which may run lanes at the same time."""
+def threads() -> int:
+    """Return how many processors a device may use: those of this process, shared by all that run at the same time."""
     return max(1, _processors() // max(1, jax.local_device_count("cpu")))
 
 
@@ -109,14 +119,15 @@ def _one(x: Any) -> Any:
     return jax.ShapeDtypeStruct(jnp.shape(x)[1:], x.dtype)
 
 
-def _data(x: Any) -> Any:
-    """An array, of a key its words."""
-    return jax.random.key_data(x) if _is_key(x) else jnp.asarray(x)
+def data(x: Any) -> Any:
+    """Return an array, of a key its words."""
+    return jax.random.key_data(x) if is_key(x) else jnp.asarray(x)
 
 
 def _like(x: Any, leaf: Any) -> Any:
-    return jax.random.wrap_key_data(x) if _is_key(leaf) else x
+    return jax.random.wrap_key_data(x) if is_key(leaf) else x
 
 
-def _is_key(x: Any) -> bool:
+def is_key(x: Any) -> bool:
+    """Return whether these are keys."""
     return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

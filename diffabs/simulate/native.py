@@ -17,6 +17,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
 from diffabs.kernel.compilers import NoCompiler
+from diffabs.kernel.kept import Kept
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
 from diffabs.simulate.condition import Condition
@@ -44,7 +45,7 @@ def run_native(
 
     def some(start: int) -> Run:
         mine = jax.tree.map(lambda x: x[start : start + MOST], lanes)
-        return _run(loop, mine[0], dict(objectives), method, *mine[1:])
+        return _made(loop, mine[0], dict(objectives), method, *mine[1:])
 
     runs = [some(start) for start in range(0, count, MOST)]
     return runs[0] if len(runs) == 1 else jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
@@ -67,6 +68,9 @@ def _run(
         rounds=1,
     )
     return jax.vmap(lambda mine, carry: judge(*built(mine), carry)[0])(leaves, carry)
+
+
+_made = Kept(_run, _run)
 
 
 def by_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Run], why_not: str = "") -> Run:
@@ -109,7 +113,7 @@ def objection(loop: Loop, values: Mapping[str, Any], solver: Solver, objectives:
     count = len(next(iter(columns.values())))
     keys = jax.vmap(jax.random.key)(jnp.arange(count))
     try:
-        _run.lower(checked, columns, dict(measured), method, keys, jnp.ones(count, bool))
+        _made.ready(checked, columns, dict(measured), method, keys, jnp.ones(count, bool))
     except (Unsupported, NoCompiler) as error:
         return str(error)
     return None
