@@ -18,7 +18,7 @@ from kernels import FOLDER, applied, both, same
 
 import diffabs as d
 from diffabs import controllers, plants, scenario, sensors
-from diffabs.kernel import compilers, launch
+from diffabs.kernel import compilers, kept, launch
 from diffabs.kernel.graph import Graph, Level
 from diffabs.kernel.primitives import Unsupported, known, translate
 from diffabs.objectives import BRAKING
@@ -65,12 +65,14 @@ def _(size, batched, x):
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
     monkeypatch.setenv(compilers.CACHE, FOLDER)
+    monkeypatch.setenv(kept.OFF, "1")  # what is kept between processes has a file of its own
 
 
 @pytest.fixture(scope="module")
 def runs():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(compilers.CACHE, FOLDER)
+        patch.setenv(kept.OFF, "1")
         return both(LOOP, VALUES, SOLVER, MEASURED, KEYS)
 
 
@@ -84,8 +86,8 @@ class TestRuns:
         same(found, expected, rtol=1e-13, atol=1e-15)
 
     def test_do_not_depend_on_their_order_nor_on_threads(self, runs, monkeypatch):
-        monkeypatch.setattr(launch, "_threads", lambda: 3)
-        native._run.clear_cache()
+        monkeypatch.setattr(launch, "threads", lambda: 3)
+        native._kept.forget()
         order = np.random.default_rng(1).permutation(LANES)
         values = {path: column[order] for path, column in VALUES.items()}
         found, _ = (lambda run: (run, None))(self._by_kernel(values, KEYS[order]))
@@ -138,7 +140,7 @@ class TestObjections:
     def test_without_a_compiler(self, monkeypatch, caplog):
         monkeypatch.setenv(compilers.COMPILER, "")
         native.tell.cache_clear()
-        native._run.clear_cache()
+        native._kept.forget()
         loop = d.replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
         line = native.objection(loop, VALUES, SOLVER, {})
         assert line == f"{compilers.COMPILER} is empty"
@@ -220,7 +222,7 @@ class TestSweep:
 
     def test_is_refused_before_anything_is_written(self, tmp_path, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, "")
-        native._run.clear_cache()
+        native._kept.forget()
         study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
         with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {compilers.COMPILER} is empty"):
             sweep(dataclasses.replace(study, engine="kernel"), tmp_path / "out")
@@ -271,6 +273,7 @@ class TestLibrary:
     )
 
     def test_is_made_once(self, tmp_path, monkeypatch):
+        compilers.compiler()  # has been tried, which is noted
         monkeypatch.setenv(compilers.CACHE, str(tmp_path))
         path, made = compilers.library(self.TEXT % 1), time.time_ns()
         monkeypatch.setattr(compilers, "_run", None)
@@ -295,9 +298,8 @@ class TestLibrary:
 
     def test_that_is_none_cannot_be_loaded(self, tmp_path, monkeypatch):
         (tmp_path / "none.so").write_text("nothing")
-        monkeypatch.setattr(compilers, "library", lambda text: tmp_path / "none.so")
         with pytest.raises(compilers.NoCompiler, match=r"invalid ELF header|file too short|not a mach-o"):
-            launch._registered("")
+            launch.register(tmp_path / "none.so")
 
     @pytest.mark.slow
     def test_of_two_processes_at_once_and_of_one_that_is_killed(self, tmp_path):

@@ -11,7 +11,7 @@ from kernels import FOLDER, both, same
 import diffabs as d
 from diffabs import scenario
 from diffabs.core.pytree import get
-from diffabs.kernel import compilers, launch
+from diffabs.kernel import compilers, kept, launch
 from diffabs.objectives import usual
 from diffabs.scenario.defaults import balancing, braking
 
@@ -31,6 +31,7 @@ CLOSE = {"fixed": {"rtol": 1e-13, "atol": 1e-14}, "adaptive": {"rtol": 1e-7, "at
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
     monkeypatch.setenv(compilers.CACHE, FOLDER)
+    monkeypatch.setenv(kept.OFF, "1")
     monkeypatch.setattr(launch, "VECTORS", 2)
 
 

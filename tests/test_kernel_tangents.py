@@ -143,7 +143,7 @@ print("on two devices")
 
 
 def moved(loop, solver, objectives, path, engine):
-    """Values and derivatives of all metrics along two changes of everything in a loop, and of what its lanes begin with."""
+    """Values and derivatives of all metrics along two changes of all in a loop, and of what its lanes begin with."""
     leaves, tree = jax.tree.flatten(arrayed(loop))
     ways = [np.random.default_rng(i).uniform(0.5, 1.0, np.shape(x)) for i, x in enumerate(leaves)]
     spread = float(get(loop, path)) * np.linspace(0.96, 1.04, 12) + 1e-3

@@ -3,6 +3,8 @@
 A library's name is the digest of everything that it is made of: text, headers, compiler, flags, processor. It is
 written whole and then named, so that two processes, or one that was killed, leave nothing that is half a library."""
 
+import contextlib
+import ctypes
 import functools
 import hashlib
 import importlib.util
@@ -44,16 +46,28 @@ class Compiler(NamedTuple):
 
 @functools.cache
 def _tried(command: tuple[str, ...]) -> Compiler | str:
-    """The compiler of a command, or why it is none: it has to make a library that this process can load."""
+    """The compiler of a command, or why it is none: it has to make a library that this process can load. That it did so
+    once is noted beside the libraries."""
+    try:
+        version = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=LONGEST)
+        made = Compiler(command, version.stdout.partition("\n")[0].strip())
+        note = cache_folder() / f".{_digest('works', made)[:32]}"
+        if not note.is_file():
+            _try(command)
+            with contextlib.suppress(OSError):
+                note.parent.mkdir(parents=True, exist_ok=True)
+                note.touch()
+    except (OSError, subprocess.TimeoutExpired, NoCompiler) as error:
+        return f"{' '.join(command)}: {error}"
+    return made
+
+
+def _try(command: tuple[str, ...]) -> None:
     with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
         source, library = pathlib.Path(folder) / "one.cpp", pathlib.Path(folder) / "one.so"
         source.write_text('#include "functions.h"\nextern "C" double one(double x) { return k_exp(all(x))[0]; }\n')
-        try:
-            version = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=LONGEST)
-            _run(command, source, library)
-        except (OSError, subprocess.TimeoutExpired, NoCompiler) as error:
-            return f"{' '.join(command)}: {error}"
-        return Compiler(command, version.stdout.partition("\n")[0].strip())
+        _run(command, source, library)
+        ctypes.CDLL(str(library))
 
 
 def compiler() -> Compiler:

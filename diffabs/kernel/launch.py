@@ -16,6 +16,7 @@ from diffabs.kernel import binding, compilers, cpp, program
 
 LINES = 10_000  # of a step; the blocks of a larger program are of fewer vectors, or compiling takes long
 VECTORS = 4
+NAME = "diffabs_kernel_"  # begins the names of libraries
 _lock = threading.Lock()
 _loaded: dict[str, Any] = {}
 
@@ -44,7 +45,7 @@ def run_lanes(
         {"renew": renew, "step": step, "running": running}, jax.tree.map(_one, lane), jax.tree.map(_one, carry)
     )
     leaves, tree = jax.tree.flatten(carry)
-    given = [_data(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
+    given = [data(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
     launch = functools.partial(_launched, shape=cpp.Shape(VECTORS, steps, rounds))
     lanes = binding.Lanes(functions._replace(uniform=[]), launch)
     found = binding.bound(lanes, given)
@@ -59,7 +60,7 @@ def _launched(made: program.Program, before: list[Any], carry: list[Any], shape:
         [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry],
         input_output_aliases={first + i: i for i in range(len(carry))},
     )
-    return list(call(*before, *carry, threads=np.int64(_threads())))
+    return list(call(*before, *carry, threads=np.int64(threads())))
 
 
 def target(made: program.Program, shape: cpp.Shape) -> str:
@@ -68,19 +69,28 @@ def target(made: program.Program, shape: cpp.Shape) -> str:
     while cpp.operations(source) * shape.vectors > LINES and shape.vectors > 1:
         shape = shape._replace(vectors=shape.vectors // 2)
         source = cpp.text(made, shape)
-    return _registered(source)
+    return register(compilers.library(source))
 
 
-def _registered(source: str) -> str:
-    """The name under which XLA knows the library of a text."""
-    path = compilers.library(source)
-    name = f"diffabs_kernel_{path.stem[:32]}"
+def register(path: pathlib.Path) -> str:
+    """Return the name under which XLA knows a library from now on. Raises NoCompiler for one that is not there."""
+    name = f"{NAME}{path.stem[:32]}"
     with _lock:
         if name not in _loaded:
             handler = _handler(path)
             jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
-            _loaded[name] = handler
+            _loaded[name] = handler, path
     return name
+
+
+def names() -> list[str]:
+    """Return the names under which XLA knows libraries."""
+    return list(_loaded)
+
+
+def path(name: str) -> pathlib.Path:
+    """Return the library of a name."""
+    return _loaded[name][1]
 
 
 def _handler(path: pathlib.Path) -> Any:
@@ -91,8 +101,8 @@ def _handler(path: pathlib.Path) -> Any:
         raise compilers.NoCompiler(f"{path.parent}: {error}") from None
 
 
-def _threads() -> int:
-    """Processors that this process may use, shared by the devices, each of which may run lanes at the same time."""
+def threads() -> int:
+    """Return how many processors a device may use: those of this process, shared by all that run at the same time."""
     return max(1, _processors() // max(1, jax.local_device_count("cpu")))
 
 
@@ -106,14 +116,15 @@ def _one(x: Any) -> Any:
     return jax.ShapeDtypeStruct(jnp.shape(x)[1:], x.dtype)
 
 
-def _data(x: Any) -> Any:
-    """An array, of a key its words."""
-    return jax.random.key_data(x) if _is_key(x) else jnp.asarray(x)
+def data(x: Any) -> Any:
+    """Return an array, of a key its words."""
+    return jax.random.key_data(x) if is_key(x) else jnp.asarray(x)
 
 
 def _like(x: Any, leaf: Any) -> Any:
-    return jax.random.wrap_key_data(x) if _is_key(leaf) else x
+    return jax.random.wrap_key_data(x) if is_key(leaf) else x
 
 
-def _is_key(x: Any) -> bool:
+def is_key(x: Any) -> bool:
+    """Return whether these are keys."""
     return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

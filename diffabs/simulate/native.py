@@ -19,6 +19,7 @@ from diffabs.core.pytree import strong
 from diffabs.core.tracing import pushed
 from diffabs.kernel import compilers
 from diffabs.kernel.compilers import NoCompiler
+from diffabs.kernel.kept import Kept
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
 from diffabs.simulate.condition import Condition
@@ -70,7 +71,7 @@ def run_native(
 @jax.custom_jvp
 def _made(given: Any) -> Run:
     """The runs of (loop, values, objectives, method, keys, accepted), and what is enough of each, and when."""
-    return _run(*given)
+    return _kept(*given)
 
 
 def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
@@ -129,6 +130,9 @@ def _only(accepted: Any, carry: Any) -> Any:
     return carry._replace(condition=condition.astype(carry.condition.dtype))
 
 
+_kept = Kept(_run, _run)
+
+
 def by_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Run], why_not: str = "") -> Run:
     """Return `native()`, or `otherwise()` as the engine says: "kernel" means what it says, "auto" the first if that can
     be, and tells the log once why it cannot. Raises ValueError for another name, or for what stands against "kernel".
@@ -174,7 +178,7 @@ def objection(loop: Loop, values: Mapping[str, Any], solver: Solver, objectives:
     count = len(next(iter(columns.values())))
     keys = jax.vmap(jax.random.key)(jnp.arange(count))
     try:
-        _run.lower(checked, columns, dict(measured), method, keys, jnp.ones(count, bool), None, None)
+        _kept.ready(checked, columns, dict(measured), method, keys, jnp.ones(count, bool), None, None)
     except (Unsupported, NoCompiler) as error:
         return str(error)
     return None
