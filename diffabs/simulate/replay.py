@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.blocks import Passage
+from diffabs.core.log import lend, tables, written
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment
@@ -170,11 +171,13 @@ def _repeated(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes:
     """The end of the run, and the `Span` of every try, where they are kept."""
     zero = 0.0 * pace.h
     state, tally = start(loop, objectives, Clock(zero, pace.h, 0, key))
-    begun = typed(Place(zero, zero, state, tally, jnp.asarray(0)), pace.h.dtype)
+    begun = typed(Place(zero, zero, lend(state, tables(state)), tally, jnp.asarray(0)), pace.h.dtype)
 
     def step(place: Place, one: Notes) -> tuple[Place, Any]:
-        new, span = _step(loop, objectives, pace, key, place, one)
-        return select(one.moved, new, place), span
+        logs, place = written(place.state), place._replace(state=lend(place.state, None))
+        new, span = _step(loop, objectives, pace, key, place, one, logs)
+        place = select(one.moved, new, place)
+        return place._replace(state=lend(place.state, logs)), span
 
     @forgetful
     def block(place: Place, some: Notes) -> tuple[Place, Any]:
@@ -183,8 +186,11 @@ def _repeated(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes:
     return _skipping(block, lambda _, some: jnp.any(some.moved), begun, notes)
 
 
-def _step(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes) -> tuple[Place, Any]:
-    """One step within its regime, and what happens at its end; its `Span`, where they are kept."""
+def _step(
+    loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes, logs: list[Any]
+) -> tuple[Place, Any]:
+    """One step within its regime, and what happens at its end; its `Span`, where they are kept. The rows of the logs,
+    which the state is without."""
     system = dynamics(loop, objectives, place.t, place.state, place.tally, kinks=True)
     within, h = Regime(one.words), one.length - place.late
     begin = system.ahead(place.t, place.state, place.tally, within)
@@ -219,7 +225,8 @@ def _step(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Pla
         late = axpy(shift, end.recorded, end.seen.signals.recorded)
         ends = (begin.seen.signals.recorded, begin.recorded), (late, end.recorded)
         step = passed(*(Recorded(*both) for both in zip((place.t, t), ends, strict=True)))
-        state = _changed(system, Clock(t, pace.h, one.k, key, strikes), state, end.seen.margins, one.fired, step)
+        clock, state = Clock(t, pace.h, one.k, key, strikes), lend(state, logs)
+        state = lend(_changed(system, clock, state, end.seen.margins, one.fired, step), None)
     return Place(t, shift, state, tally, one.k), span
 
 
