@@ -18,7 +18,7 @@ from diffabs.simulate.condition import Condition
 from diffabs.simulate.dynamics import Objectives
 from diffabs.simulate.landing import select
 from diffabs.simulate.methods import AtPace
-from diffabs.simulate.replay import Notes, Place, noted, place_at_start, repeat_step
+from diffabs.simulate.replay import Notes, Place, noted, place_at_start, repeat_try
 
 
 class Pursuit(NamedTuple):
@@ -69,7 +69,7 @@ class Pursuing:
         one = before._replace(next=select(last.moved, last.words, new.point.words))
 
         def repeated() -> Place:
-            return repeat_step(loop, objectives, self.pace, key, carry.point, one)[0]
+            return repeat_try(loop, objectives, self.pace, key, carry.point, one)[0]
 
         point = select(due, jax.lax.cond(anyone(due), repeated, lambda: carry.point), carry.point)
         return Pursuit(new, select(last.moved, last, before), last.moved | (carry.waits & ~due), point)

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.blocks import Passage
+from diffabs.core.log import lend, tables, written
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment
@@ -173,8 +174,7 @@ def _repeated(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes:
     begun = place_at_start(loop, objectives, pace, key)
 
     def step(place: Place, one: Notes) -> tuple[Place, Any]:
-        new, span = repeat_step(loop, objectives, pace, key, place, one)
-        return select(one.moved, new, place), span
+        return repeat_try(loop, objectives, pace, key, place, one)
 
     @forgetful
     def block(place: Place, some: Notes) -> tuple[Place, Any]:
@@ -187,13 +187,24 @@ def place_at_start(loop: Loop, objectives: Objectives, pace: AtPace, key: Any) -
     """Return where a run begins."""
     zero = 0.0 * pace.h
     state, tally = start(loop, objectives, Clock(zero, pace.h, 0, key))
-    return typed(Place(zero, zero, state, tally, jnp.asarray(0)), pace.h.dtype)
+    return typed(Place(zero, zero, lend(state, tables(state)), tally, jnp.asarray(0)), pace.h.dtype)
 
 
-def repeat_step(
+def repeat_try(
     loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes
 ) -> tuple[Place, Any]:
-    """Return where a step leads, within its regime, and what happens at its end; its `Span`, where they are kept."""
+    """Return where a try leads, if it led on; its `Span`, where they are kept."""
+    logs, place = written(place.state), place._replace(state=lend(place.state, None))
+    new, span = _step(loop, objectives, pace, key, place, one, logs)
+    place = select(one.moved, new, place)
+    return place._replace(state=lend(place.state, logs)), span
+
+
+def _step(
+    loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes, logs: list[Any]
+) -> tuple[Place, Any]:
+    """One step within its regime, and what happens at its end; its `Span`, where they are kept. The rows of the logs,
+    which the state is without."""
     system = dynamics(loop, objectives, place.t, place.state, place.tally, kinks=True)
     within, h = Regime(one.words), one.length - place.late
     begin = system.ahead(place.t, place.state, place.tally, within)
@@ -228,7 +239,8 @@ def repeat_step(
         late = axpy(shift, end.recorded, end.seen.signals.recorded)
         ends = (begin.seen.signals.recorded, begin.recorded), (late, end.recorded)
         step = passed(*(Recorded(*both) for both in zip((place.t, t), ends, strict=True)))
-        state = _changed(system, Clock(t, pace.h, one.k, key, strikes), state, end.seen.margins, one.fired, step)
+        clock, state = Clock(t, pace.h, one.k, key, strikes), lend(state, logs)
+        state = lend(_changed(system, clock, state, end.seen.margins, one.fired, step), None)
     return Place(t, shift, state, tally, one.k), span
 
 
