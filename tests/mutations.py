@@ -18,6 +18,7 @@ import sys
 import tempfile
 from typing import NamedTuple
 
+from mutations_face import FACE
 from mutations_kernel import KERNEL
 from mutations_sweep import SWEEP
 
@@ -1558,6 +1559,7 @@ MUTATIONS = [
     ),
     *(Mutation(*each) for each in SWEEP),
     *(Mutation(*each) for each in KERNEL),
+    *(Mutation(*each) for each in FACE),
     Mutation(
         "lanes that one run would refuse are run",
         "simulate/refill.py",
