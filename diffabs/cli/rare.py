@@ -2,12 +2,14 @@
 
 It needs the extra `diffabs[sweep]`, which is imported when it runs."""
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from diffabs.cli import console, show, show_samples
+from diffabs.cli import engine as engines
 from diffabs.core import provenance
 from diffabs.core.pytree import Spec
 from diffabs.core.values import ScenarioError, number, unknown
@@ -15,6 +17,7 @@ from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.toml import value
+from diffabs.simulate.native import described
 
 if TYPE_CHECKING:
     from diffabs.reliability.subset_simulation import Progress, RareEvent
@@ -30,19 +33,31 @@ def rare(
     samples: Annotated[int, typer.Option(help="Runs of each level.")] = 2800,
     seed: Annotated[int | None, typer.Option(help="The same as --set sweep.seed=N.")] = None,
     gradients: Annotated[bool, typer.Option("--gradients", help="Also draw around points found by gradients.")] = False,
+    engine: engines.Engine = "xla",
     as_json: console.Json = False,
 ) -> None:
     """The probability that a metric reaches a bound while [sweep.over] varies, down to 1e-7 and less."""
     with console.guarded():
         console.need_extra("sweep")
+        engines.check(engine)
         chosen = console.loaded(scenario, console.changed(changes, "sweep", seed=seed))
         metric, bound = _failure(failure, chosen)
         if samples < 20 or samples % 10:
             console.fail(f"--samples {samples} is no multiple of 10 from 20 on")
-        study = section_sweep.study(chosen)
+        study = _by_engine(section_sweep.study(chosen), metric, engine)
         found = _estimated(study, metric, bound, samples, gradients)
         result = _document(found, study, chosen, metric, bound)
         show.as_json(result) if as_json else show_samples.rare(result, chosen)
+
+
+def _by_engine(study: "Study", metric: str, engine: str) -> "Study":
+    """Raises ScenarioError for a study that cannot be run."""
+    from diffabs.reliability.failure import objection
+
+    try:
+        return dataclasses.replace(study, engine=engines.decided(engine, lambda: objection(study, metric)))
+    except ValueError as error:
+        raise ScenarioError(str(error)) from None
 
 
 def _failure(text: str, chosen: Scenario) -> tuple[str, float]:
@@ -115,5 +130,6 @@ def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str,
         "gradients": found.gradients,
         "diverged": found.diverged,
         "seed": study.seed,
+        "engine": described(study.engine),
         "versions": provenance.versions("numpy", "scipy"),
     }

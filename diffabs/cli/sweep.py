@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import typer
 
 from diffabs.cli import console, progress, show, show_samples
+from diffabs.cli import engine as engines
 from diffabs.core import files
 from diffabs.core.pytree import elements
 from diffabs.core.values import ScenarioError, unknown
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads
-from diffabs.simulate.native import ENGINES
 from diffabs.simulate.refusals import first_line
 
 if TYPE_CHECKING:
@@ -42,9 +42,7 @@ def sweep(
     samples: Annotated[int | None, typer.Option(help="The same as --set sweep.samples=N.")] = None,
     seed: Annotated[int | None, typer.Option(help="The same as --set sweep.seed=N.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep that is in the folder.")] = False,
-    engine: Annotated[
-        str, typer.Option(help="xla, kernel (a program of this machine, by its C++ compiler), or auto.")
-    ] = "xla",
+    engine: engines.Engine = "xla",
     on: Annotated[str, typer.Option(help="local or dask.")] = "local",
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Of a Dask scheduler, tcp://host:port.")
@@ -144,9 +142,9 @@ def _check_options(
     engine: str, on: str, scheduler: str | None, workers: int | None, devices: int | None, figures: bool
 ) -> None:
     console.need_extra("sweep")
-    for option, value, possible in (("--engine", engine, ENGINES), ("--on", on, PLACES)):
-        if value not in possible:
-            raise unknown(f"{option} {value} is unknown", value, possible)
+    engines.check(engine)
+    if on not in PLACES:
+        raise unknown(f"--on {on} is unknown", on, PLACES)
     if on == "dask":
         console.need_extra("cluster")
     for option, value, needed in (

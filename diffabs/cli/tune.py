@@ -13,9 +13,11 @@ import numpy as np
 import typer
 
 from diffabs.cli import certificates, console, show
+from diffabs.cli import engine as engines
 from diffabs.cli.tune_document import Proved, Work, documented
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, dump
+from diffabs.simulate.native import EngineError
 from diffabs.simulate.refusals import first_line
 from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Trajectory
@@ -30,6 +32,7 @@ def tune(
     scenario: console.ScenarioName,
     changes: console.Changes = None,
     starts: Annotated[int | None, typer.Option(help="Descents; the same as --set tune.starts=N.")] = None,
+    engine: engines.Engine = "xla",
     as_json: console.Json = False,
     out: Annotated[
         pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write the tuned scenario to this file.")
@@ -41,13 +44,14 @@ def tune(
     """Tune the free parameters of [tune] by gradients, over all its runs at once."""
     with console.guarded(), certificates.reported():
         console.need_extra("tune")
+        engines.check(engine)
         console.check_picture(plot)
         console.check_scenario_file(out)
         with contextlib.ExitStack() as files:
             out_file = files.enter_context(console.new_file(out, "--out"))
             picture = files.enter_context(console.new_file(plot, "--plot"))
             chosen = console.loaded(scenario, console.changed(changes, "tune", starts=starts))
-            result, told = _tuned(chosen, out_file, picture)
+            result, told = _tuned(chosen, engine, out_file, picture)
             if not result["met"]:  # inside, so that no file is written
                 _show(result, told, chosen, as_json)
                 _leave_if_interrupted(result)
@@ -75,11 +79,13 @@ def _show(result: dict[str, Any], told: str, chosen: Scenario, as_json: bool) ->
     console.say(told)
 
 
-def _tuned(chosen: Scenario, out: pathlib.Path | None, picture: pathlib.Path | None) -> tuple[dict[str, Any], str]:
+def _tuned(
+    chosen: Scenario, engine: str, out: pathlib.Path | None, picture: pathlib.Path | None
+) -> tuple[dict[str, Any], str]:
     """The JSON document and a sentence about the certificate. The files are written if all constraints are met. Ctrl-C
     leaves out what is not there yet, once there is something to show."""
     work = console.waited(lambda: _work(chosen), "computing the lanes")
-    found, interrupted = _watched(work)
+    found, interrupted = _watched(work, engine)
     after = chosen.with_loop(found.loop, "tuned")
     try:
         proved = console.waited(lambda: _proved(after), "certifying the result")
@@ -134,7 +140,7 @@ def _work(chosen: Scenario) -> Work:
     return Work(chosen, batch, constraints, task)
 
 
-def _watched(work: Work) -> tuple["Tuned", bool]:
+def _watched(work: Work, engine: str) -> tuple["Tuned", bool]:
     """Tune, and say how far it is; whether Ctrl-C ended it. Raises typer.Exit where no start can be used."""
     from diffabs import tune
     from diffabs.tune import Method, StartError, Stopping
@@ -142,26 +148,28 @@ def _watched(work: Work) -> tuple["Tuned", bool]:
     goal, told = work.chosen.tune, list["Progress"]()
     ending = console.Ending("the evaluation in hand", nothing=lambda: not told)
     method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
+    posed: dict[str, Any] = {
+        "free": goal.free,
+        "objective": goal.objective,
+        "over": work.batch,
+        "solver": work.chosen.solver,
+        "measured": work.chosen.objectives,
+        "aggregate": goal.aggregated(),
+        "constraints": list(work.constraints.values()),
+    }
+    loop = work.chosen.loop
+    engine = engines.decided(engine, lambda: tune.posed(loop, **posed, engine="kernel").objection())
 
     def tuned() -> "Tuned":
-        return tune.tune(
-            work.chosen.loop,
-            free=goal.free,
-            objective=goal.objective,
-            over=work.batch,
-            solver=work.chosen.solver,
-            measured=work.chosen.objectives,
-            aggregate=goal.aggregated(),
-            constraints=list(work.constraints.values()),
-            method=method,
-            progress=told.append,
-            stopping=ending,
-        )
+        told_to = {"method": method, "progress": told.append, "stopping": ending}
+        return tune.tune(loop, **posed, **told_to, engine=engine)
 
     try:
         return console.waited(tuned, f"tuning {work.chosen.name}", lambda: _said(told), ending), ending.asked
     except StartError as error:
         console.fail(f"{work.chosen.name}: no start can be used: {error}", console.FAILED)
+    except EngineError as error:
+        console.fail(str(error))
 
 
 def _said(told: "list[Progress]") -> str:

@@ -49,6 +49,7 @@ def documented(work: Work, found: "Tuned", proved: Proved) -> dict[str, Any]:
         "gradient_norm": float(found.gradient),
         "evaluations": found.evaluations,
         "mode": found.mode.value,
+        "engine": found.engine,
         "history": [point._asdict() for point in found.history],
         "starts": [
             {"objective": float(s.objective), "violation": float(s.violation), "reason": s.reason.value}

@@ -19,6 +19,7 @@ import numpy as np
 
 from diffabs.reliability.importance_sampling import STARTS, Gradient
 from diffabs.reliability.subset_simulation import RareEvent, subset_simulation
+from diffabs.simulate import native
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.refusals import refusals
 from diffabs.sweep.study import Study, noise_key, precision
@@ -62,6 +63,22 @@ def failure_probability(
     return subset_simulation(score, study.space.dimension, bound, gradient=gradient, **options)
 
 
+def objection(study: Study, metric: str) -> str | None:
+    """Return why a kernel cannot make these runs, or None. None is made, but what makes them is compiled.
+
+    Raises ValueError for what cannot be run at all."""
+    values = study.space.normal(np.zeros((1, study.space.dimension)))
+    with precision(study.dtype):
+        return native.objection(*_posed(study, metric, values))
+
+
+def _posed(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
+    """Loop, values, solver and objectives, of the study's type."""
+    given = study.loop, {metric: study.objectives[metric]}
+    loop, objective = jax.tree.map(lambda x: np.asarray(x, study.dtype), given)
+    return loop, values, study.solver, objective
+
+
 def _scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
     """The metric at z (n, dimension), NaN where the run diverges. n is filled up to a power of two: few programs."""
     values = study.space.normal(_filled(z, 1 << (len(z) - 1).bit_length()))
@@ -72,11 +89,10 @@ def _scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
 
 def _measured(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
     """The metric of lanes (n,) that share one sequence of noise."""
-    given = study.loop, {metric: study.objectives[metric]}
-    loop, objective = jax.tree.map(lambda x: np.asarray(x, study.dtype), given)
+    loop, _, solver, objective = _posed(study, metric, values)
     keys = jax.vmap(lambda _: noise_key(study.seed, 0))(np.arange(Batch(values).size))
     lanes = Batch(values, keys)
-    return run_batch(loop, lanes, study.solver, objective, accepted=True, engine=study.engine).metrics[metric]
+    return run_batch(loop, lanes, solver, objective, accepted=True, engine=study.engine).metrics[metric]
 
 
 def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) -> None:
