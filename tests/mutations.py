@@ -66,6 +66,27 @@ MUTATIONS = [
         "test_kinks.py::test_a_wheel_that_locks_does_so_at_its_moment",
     ),
     Mutation(
+        "an adaptive landing that strays is a landing",
+        "simulate/adaptive.py",
+        "jnp.where(again, Condition.SEEKING, Condition.LANDING)",
+        "jnp.asarray(Condition.LANDING)",
+        "test_landing.py::test_a_margin_that_falls_all_at_once_is_landed_on",
+    ),
+    Mutation(
+        "a landing where the margin does not seem to fall",
+        "simulate/landing.py",
+        "((off > probe) | ((off == 0) & (search.margin != 0)))",
+        "(off > probe)",
+        "test_landing.py::test_a_margin_that_falls_all_at_once_is_landed_on",
+    ),
+    Mutation(
+        "a delay of a whole period without a moment",
+        "controllers/sampled.py",
+        "until = self._until(clock.t)",
+        "until = clock.t + self.delay",
+        "test_landing.py::test_the_moment_of_an_event_on_the_grid_is_differentiable",
+    ),
+    Mutation(
         "a search that nobody looks at",
         "core/regime.py",
         "next = below + jnp.where(high < -_rounding(x), 1, 0) - jnp.where(low < -_rounding(x), 1, 0)",
@@ -446,8 +467,8 @@ MUTATIONS = [
     Mutation(
         "a computer without delay",
         "controllers/sampled.py",
-        "clock.t + self.delay",
-        "clock.t",
+        "t + self.delay - jax",
+        "t - jax",
         "test_blocks.py::test_sampled_is_a_zero_order_hold",
     ),
     Mutation(

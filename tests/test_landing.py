@@ -48,28 +48,31 @@ class Slips:
         return Memory(held=jnp.where(fired[0], 5.0, memory.held))
 
 
-def test_a_margin_that_falls_all_at_once_is_landed_on():
+@pytest.mark.parametrize("solver", [d.FixedStep(H, 0.01, kinks=False), d.Adaptive(1e-5, 0.01, H)])
+def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
     """Where it is still flat, a parabola through three tries may take it for near its zero, and its fall there leads
     hundreds of steps away."""
 
     @jax.jit
     def mean(level):
         there = loop(Slips(level=level), Direct())
-        return d.measure(there, d.FixedStep(H, 0.01, kinks=False), {"mean": Mean()}).metrics["mean"][1]
+        return d.measure(there, solver, {"mean": Mean()}).metrics["mean"][1]
 
     for level in np.geomspace(1e-7, 1e-5, 9):
         moment = 8e-3 + 6e-5 * np.log(level)
         close(mean(level) * 0.01, 2.0 * moment + 5.0 * (0.01 - moment), rtol=2e-5)
 
 
-@pytest.mark.parametrize("late", [2e-3, pytest.param(4e-3, marks=pytest.mark.slow), 2.3e-3])
-def test_the_moment_of_an_event_on_the_grid_is_differentiable(late):
+@pytest.mark.parametrize("late", [2e-3, pytest.param(4e-3, marks=pytest.mark.slow), 2.3e-3, 5e-3])
+@pytest.mark.parametrize("solver", [d.FixedStep(H, 0.03), pytest.param(d.Adaptive(1e-5, 0.03, H), id="adaptive")])
+def test_the_moment_of_an_event_on_the_grid_is_differentiable(late, solver):
     """A computer says the time, each 5 ms, and takes a while for it. Some of these moments are a rounding after the
-    beginning of a step: an event at once has its derivatives as any other."""
+    beginning of a step: an event at once has its derivatives as any other. Where it takes all the time that it may, a
+    derivative is that of taking less."""
 
     def mean(late):
         sampled = Sampled(controller=Says(read=lambda t: 1.0 + 100.0 * t), period=5e-3, delay=late)
-        return d.measure(loop(sampled, Direct()), d.FixedStep(H, 0.03), {"mean": Mean()}).metrics["mean"][1]
+        return d.measure(loop(sampled, Direct()), solver, {"mean": Mean()}).metrics["mean"][1]
 
     levels = 1.0 + 100.0 * 5e-3 * np.arange(6)
     lengths = np.append(np.full(5, 5e-3), 5e-3 - late)

@@ -19,6 +19,8 @@ from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.core.rules import Rule, array
 from diffabs.core.timing import whole_steps
 
+CLOSE = 16.0  # precisions of the time: instants that are one
+
 
 class SampledMemory(NamedTuple):
     """Inner memory; output that is applied; output that waits, until when [s], and 1 while it does."""
@@ -51,13 +53,13 @@ class Sampled:
         return memory.held.applied
 
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """At a sampling instant: compute. What still waits, since the delay is a whole period, is applied."""
+        """At a sampling instant: compute. What still waits is applied."""
         m: SampledMemory = memory.held
         now, number = clock.ticks(self.period)
         inner, output = self.computed(clock._replace(h=self.period, k=number), m.inner, signal)
         waits = jnp.greater(self.delay, 0)
         applied = jnp.where(waits, jnp.where(m.waits > 0.5, m.next, m.applied), output)
-        new = SampledMemory(inner, applied, output, clock.t + self.delay, jnp.where(waits, 1.0, 0.0))
+        new = SampledMemory(inner, applied, output, self._until(clock.t), jnp.where(waits, 1.0, 0.0))
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m))
 
     def computed(self, clock: Clock, memory: Memory, signal: Tracking) -> tuple[Memory, Scalar]:
@@ -67,6 +69,13 @@ class Sampled:
         output = self.controller.output(clock.t, inner, signal)
         flow = axpy(self.period, self.controller.flow(clock.t, inner, signal), inner.flow)
         return Memory(flow, inner.held), output
+
+    def _until(self, t: Scalar) -> Any:
+        """When what is sampled now is applied: a rounding before the next sample at the latest, or the moment of a
+        whole period would have no derivative."""
+        rounding = CLOSE * jnp.finfo(jnp.result_type(t, self.period)).eps * (t + self.period)
+        over = jnp.maximum(self.delay - (self.period - rounding), 0.0)
+        return t + self.delay - jax.lax.stop_gradient(over)
 
     def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: Any) -> tuple[Any]:
         """The time until the output changes."""

@@ -148,10 +148,10 @@ def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> Any:
 
 def aimed(search: Search, x: Any, length: Any) -> tuple[Any, Any]:
     """Return the length of a step that is to land, after the probe of length x, and whether it is none: where it would
-    end so far from where the zero seemed to be that it is to be looked for again, in the middle of the bracket. So it
-    is with a margin that hardly falls there, and then all at once."""
-    probe = jnp.abs(x - search.place)
-    missed = (jnp.abs(length - search.place) > probe) & (search.far - search.near > probe)
+    end so far from where the zero seemed to be, or the margin so little seems to fall there, that it is to be looked
+    for again, in the middle of the bracket. So it is with a margin that hardly falls, and then all at once."""
+    probe, off = jnp.abs(x - search.place), jnp.abs(length - search.place)
+    missed = ((off > probe) | ((off == 0) & (search.margin != 0))) & (search.far - search.near > probe)
     again = jax.lax.stop_gradient(missed & ~search.at_once & (search.tries < TRIES))
     return jnp.where(again, 0.5 * (search.near + search.far), length), again
 
