@@ -12,8 +12,8 @@ ROUNDING = 1e-12  # relative to the greatest coefficient of a matrix: less is no
 
 
 def equations(loop: Loop, target: Any = None) -> dict[str, Any]:
-    """Return the linear controller at rest on the setpoint: x(k+1) = F x(k) + G y(k), u(k) = H x(k) + J y(k), all differences
-    from rest; by name F (n, n), G (n, m), H (n,), J (m,), the names of y, and the period [s].
+    """Return the linear controller at rest on the setpoint: x(k+1) = F x(k) + G y(k), u(k) = H x(k) + J y(k), all
+    of them differences from rest; by name F (n, n), G (n, m), H (n,), J (m,), the names of y, and the period [s].
 
     Raises:
         NotExported: a controller in continuous time, or a loop without a linear model.
