@@ -225,6 +225,7 @@ def test_the_command_writes_a_file_that_compiles(tmp_path):
     )
     result = json.loads(command("export", "slip-cured", "--to", "table", "--json").stdout)
     assert result["H"] == [pytest.approx(-17300.0)]
+    assert result["inputs"] == ["target", "slip", "feedforward"]  # the speed has a coefficient of 7e-18
     command("export", "slip-cured", "--to", "table", "-o", tmp_path / "t.csv")
     rows = [line.split(",") for line in (tmp_path / "t.csv").read_text().splitlines()]
     assert rows[0] == ["", "x1", "d target", "d slip", "d feedforward"]
@@ -273,3 +274,25 @@ def test_a_target_that_moves_is_returned_as_it_was(tmp_path):
     program = compiled(c_source(device(loop), "unit"), "unit", tmp_path)
     said = subprocess.run([program], input="0.1\n0.1\n0.1\n", capture_output=True, text=True, check=True).stdout
     np.testing.assert_allclose([*map(float, said.split())], 0.2 - 0.1 * np.exp(-np.arange(3) / 10), rtol=1e-6)
+
+
+@needs_cc
+def test_memory_behind_memory_is_kept(tmp_path):
+    """The command is the double integral of the error: it needs the first integral only a sample later."""
+
+    @d.core.pytree.pytree
+    class Twice:
+        def start(self, signal):
+            return d.core.protocols.Memory(flow=(0.0 * signal.target, 0.0 * signal.target))
+
+        def flow(self, t, memory, signal):
+            return memory.flow[1], signal.target - signal.measured.slip
+
+        def output(self, t, memory, signal):
+            return memory.flow[0]
+
+    text = c_source(device(rig(Twice())), "unit")
+    said = subprocess.run(
+        [compiled(text, "unit", tmp_path)], input="0.1\n" * 4, capture_output=True, text=True, check=True
+    ).stdout
+    np.testing.assert_allclose([*map(float, said.split())], np.array([0.0, 0.0, 1.0, 3.0]) * 1e-6 * 0.1, rtol=1e-12)
