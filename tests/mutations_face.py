@@ -29,7 +29,7 @@ FACE = [
      f"{TEST}::test_a_sampled_loop_behind_a_delay_is_that_of_a_step_response"),
     ("margins: a command at its limit stays there", OPENED, "OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)",
      "OFFSETS = (0.0,)", f"{TEST}::test_noise_is_a_disturbance_and_limits_do_not_act"),
-    ("margins: noise acts at instants", OPENED, "and not _nothing(equation)", "",
+    ("margins: noise acts at instants", "core/tracing.py", "not _zero(step) and any(", "any(",
      f"{TEST}::test_noise_is_a_disturbance_and_limits_do_not_act"),
     ("margins: the search for rest begins where the run does", OPENED,
      "there.at[0].set(around.setpoint) if around.frozen else there", "there",
@@ -38,4 +38,29 @@ FACE = [
      f"{TEST}::test_python_control_there_and_back"),
     ("margins: the worst is the best", "linear/robustness.py", "return {name: max(self.systems",
      "return {name: min(self.systems", f"{TEST}::test_a_band_is_of_the_corners_and_of_samples_between"),
+]  # fmt: skip
+
+EXPORT, DEVICE, TESTS = "export/c99.py", "export/device.py", "test_export.py"
+PARTS = f"{TESTS}::test_what_is_exported_commands_what_the_parts_do"
+FACE += [
+    ("export: a comparison the other way round", EXPORT, 'CHOSEN = {"lower": "<", "higher": ">"}',
+     'CHOSEN = {"lower": ">", "higher": "<"}', f"{PARTS}[PID, filtered derivative-float64]"),
+    ("export: a selection the other way round", EXPORT, 'return f"{which} ? {yes} : {no}"',
+     'return f"{which} ? {no} : {yes}"', f"{PARTS}[conditional integration-float64]"),
+    ("export: the target moves once a period", EXPORT, "i < {self.device.moves}", "i < 1",
+     f"{PARTS}[filtered target-float64]"),
+    ("export: what is returned is read too late", EXPORT, "late = {node.id: node for node in [*stored.values(), *more]",
+     "late = {node.id: node for node in [*stored.values()]",
+     f"{TESTS}::test_a_target_that_moves_is_returned_as_it_was"),
+    ("export: samples are not counted", DEVICE, "return inner, state.samples + 1, command",
+     "return inner, state.samples, command", f"{PARTS}[observer-float64]"),
+    ("export: memory that the command does not need at once", EXPORT, "if not more:\n                break",
+     "if kept:\n                break", f"{TESTS}::test_memory_behind_memory_is_kept"),
+    ("export: numbers of seven digits", EXPORT, 'np.format_float_positional(x, trim="0")',
+     'np.format_float_positional(x, precision=7, trim="0")',
+     f"{TESTS}::test_a_whole_run_is_what_the_exported_controller_does"),
+    ("export: an estimator is exported as it starts", DEVICE, "if offers(reference) or moves:", "if False:",
+     f"{TESTS}::test_the_target_can_come_from_outside"),
+    ("export: the coefficients of rounding", "export/difference_equations.py", "ROUNDING = 1e-12", "ROUNDING = 0.0",
+     f"{TESTS}::test_the_command_writes_a_file_that_compiles"),
 ]  # fmt: skip

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 
@@ -43,3 +44,19 @@ def separated(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[An
         return tree.unflatten([next(rest) if on else x for x, on in zip(fixed, moves, strict=True)])
 
     return jax.vmap(moving)(batch) if any(moves) else [], whole
+
+
+def follows(function: Callable[[Any], Any], signal: Any) -> bool:
+    """Return whether what a function of a signal returns depends on it, as its program has it; a product with a zero
+    that stands there does not."""
+    program = jax.make_jaxpr(function)(signal).jaxpr
+    reached = set(program.invars)
+    for step in program.eqns:
+        if not _zero(step) and any(not hasattr(v, "val") and v in reached for v in step.invars):
+            reached.update(step.outvars)
+    return any(not hasattr(v, "val") and v in reached for v in program.outvars)
+
+
+def _zero(step: Any) -> bool:
+    """Whether a step of a program multiplies by zero."""
+    return step.primitive.name == "mul" and any(np.all(v.val == 0) for v in step.invars if hasattr(v, "val"))

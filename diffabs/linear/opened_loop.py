@@ -23,6 +23,7 @@ from diffabs.core.blocks import Direct, Series, offers
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import strong
+from diffabs.core.tracing import follows
 from diffabs.linear.linearization import StateSpace, _kept
 from diffabs.linear.operating_point import RESIDUE, _root
 from diffabs.linear.transfer import WHOLE, Transfer
@@ -102,25 +103,9 @@ def _check_continuous(loop: Loop) -> None:
 
 
 def _follows(block: Any, signal: Any) -> bool:
-    """Whether a block's ticks look at its signal; noise does not. Read from the traced program."""
-    memory, (leaves, tree) = block.start(signal), jax.tree.flatten(signal)
-    clock = Clock(0.0, 1e-3, 1, jax.random.key(0))
-
-    def held(*leaves: Any) -> Any:
-        return block.tick(clock, memory, jax.tree.unflatten(tree, leaves)).held
-
-    program = jax.make_jaxpr(held)(*map(jnp.asarray, leaves)).jaxpr
-    reached = {id(v) for v in program.invars}
-    for equation in program.eqns:
-        if reached & {id(v) for v in equation.invars} and not _nothing(equation):
-            reached |= {id(v) for v in equation.outvars}
-    return any(id(v) in reached for v in program.outvars)
-
-
-def _nothing(equation: Any) -> bool:
-    """Whether an equation multiplies by zero."""
-    known = [v.val for v in equation.invars if hasattr(v, "val")]
-    return equation.primitive.name == "mul" and any(np.all(value == 0) for value in known)
+    """Whether a block's ticks look at its signal; noise does not."""
+    memory, clock = block.start(signal), Clock(0.0, 1e-3, 1, jax.random.key(0))
+    return follows(lambda signal: block.tick(clock, memory, signal).held, signal)
 
 
 class _Around(NamedTuple):

@@ -1,0 +1,163 @@
+"""The computer's part of a loop: what it does once a period, from what is measured to the command.
+
+    memory, measured --> target, feed-forward, controller --> memory, command
+
+It is the loop's own code, traced: reference, feed-forward and the controller within `Sampled` (`Sampled.computed`),
+with the numbers of its parameters. A target that moves by itself, such as a filtered one, is advanced by the
+Runge-Kutta steps that the simulation takes. Sensors and actuators are the machine's, not the computer's."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.controllers import Sampled
+from diffabs.core.blocks import offers
+from diffabs.core.loop import Loop
+from diffabs.core.protocols import Clock, Memory, Tracking
+from diffabs.core.pytree import prepared, strong
+from diffabs.core.tracing import follows
+from diffabs.simulate.rk4 import rk4_step
+
+MOST_STEPS = 64  # of the simulation in a period, for a target that moves by itself
+
+
+class NotExported(ValueError):
+    """What of a loop cannot be exported, and why, in one line."""
+
+
+class Input(NamedTuple):
+    """What the computer is given in each period: what is measured, and the target if somebody else says it."""
+
+    measured: Any
+    target: Any = ()
+
+
+class State(NamedTuple):
+    """What it remembers: of the controller, how many samples there were, and of the reference."""
+
+    controller: Memory
+    samples: Any
+    reference: Memory
+
+
+@dataclasses.dataclass(frozen=True)
+class Device:
+    """start(input) -> state, before the first sample. At each sample step(state, input) -> (controller's memory,
+    samples, command), and then `moves` times move(state, i) -> reference's memory, i = 0, 1, ...; units of the inputs,
+    by name; shapes of input and state, of numbers of `dtype`; period and computing delay [s]."""
+
+    start: Callable[[Input], State]
+    step: Callable[[State, Input], tuple[Memory, Any, Any]]
+    move: Callable[[State, Any], Memory]
+    moves: int
+    units: dict[str, str]
+    input: Input
+    state: State
+    dtype: np.dtype
+    period: float
+    delay: float
+    control_unit: str
+
+
+def device(loop: Loop, *, step: float | None = None, dtype: Any = np.float64, given_target: bool = False) -> Device:
+    """Return the computer's part of a loop whose controller is `Sampled`.
+
+    step: of the simulation [s], which a target that moves by itself is advanced by; by default the period
+    given_target: the target is an input
+    Raises:
+        NotExported: a controller in continuous time; a reference that follows what is measured, unless the target is
+            given.
+    """
+    controller = loop.controller
+    if not isinstance(controller, Sampled):
+        name = type(controller).__name__
+        raise NotExported(f"controller {name} runs in continuous time: a computer needs it within a sampled controller")
+    with jax.enable_x64(True):
+        typed: Loop = prepared(jax.tree.map(lambda x: jnp.asarray(x, dtype), strong(loop)))
+        shapes = jax.eval_shape(lambda: _given(typed, given_target))
+        if not given_target:
+            _check_reference(typed, _given(typed, False).measured)
+        count = _steps(float(controller.period), step)
+        work = _Work(typed, count, given_target, shapes)
+        state = jax.eval_shape(work.start, shapes)
+    units = dict(loop.plant.shows.units)
+    if given_target:
+        units["target"] = units[loop.plant.shows._fields[0]]
+    moves = count if jax.tree.leaves(state.reference.flow) else 0
+    return Device(
+        work.start, work.step, work.move, moves, units, shapes, state, np.dtype(dtype), float(controller.period),
+        float(controller.delay), loop.plant.control_unit,
+    )  # fmt: skip
+
+
+def _given(loop: Loop, target: bool) -> Input:
+    """The input at the loop's start."""
+    state = loop.start()
+    measured = loop.sensor.output(0.0, state.sensor, loop.plant.output(state.plant))
+    return Input(measured, measured[0] if target else ())
+
+
+def _steps(period: float, step: float | None) -> int:
+    count = round(period / step) if step else 1
+    if count > MOST_STEPS:
+        raise NotExported(f"the period of {period:g} s is {count} steps of the solver; {MOST_STEPS} are the most")
+    return max(count, 1)
+
+
+def _check_reference(loop: Loop, measured: Any) -> None:
+    """Raises NotExported for a target that depends on what is measured, or changes at instants."""
+    reference, name = loop.reference, type(loop.reference).__name__
+    memory = reference.start(measured)
+    moves = follows(lambda y: (reference.flow(0.0, memory, y), reference.output(0.0, memory, y)), measured)
+    if offers(reference) or moves:
+        raise NotExported(f"reference {name} follows what is measured between samples: give the target from outside")
+
+
+class _Work:
+    """What the computer does, of a loop whose numbers are of one type."""
+
+    def __init__(self, loop: Loop, count: int, given_target: bool, given: Input):
+        self.loop, self.count, self.given_target, self.given = loop, count, given_target, given
+        assert isinstance(loop.controller, Sampled)
+        self.controller: Sampled = loop.controller
+
+    def start(self, given: Input) -> State:
+        """The memories at the first sample."""
+        reference = Memory() if self.given_target else self.loop.reference.start(given.measured)
+        tracking = self._tracking(reference, given, 0.0)
+        return State(self.controller.controller.start(tracking), jnp.zeros((), jnp.int64), reference)
+
+    def step(self, state: State, given: Input) -> tuple[Memory, Any, Any]:
+        """The controller's memory after a sample, how many samples there were, and the command."""
+        period, t = self.controller.period, self._time(state)
+        tracking = self._tracking(state.reference, given, t)
+        clock = Clock(t, period, state.samples, None, before=tracking)
+        inner, command = self.controller.computed(clock, state.controller, tracking)
+        return inner, state.samples + 1, command
+
+    def move(self, state: State, i: Any) -> Memory:
+        """The reference's memory after the i-th step of the simulation in a period."""
+        h, memory = self.controller.period / self.count, state.reference
+        zero = jax.tree.map(jnp.zeros_like, self.given.measured)
+
+        def rate(t: Any, x: Any) -> Any:
+            return self.loop.reference.flow(t, memory._replace(flow=x), zero)
+
+        return memory._replace(flow=rk4_step(rate, self._time(state) + i * h, memory.flow, h))
+
+    def _time(self, state: State) -> Any:
+        """Of the sample [s]."""
+        period = self.controller.period
+        return state.samples.astype(jnp.result_type(period)) * period
+
+    def _tracking(self, reference: Memory, given: Input, t: Any) -> Tracking:
+        if self.given_target:
+            target = setpoint = given.target
+        else:
+            target = self.loop.reference.output(t, reference, given.measured)
+            setpoint = self.loop.reference.setpoint(reference)
+        return Tracking(target, given.measured, self.loop.feedforward.input(self.loop.plant, given.measured, setpoint))

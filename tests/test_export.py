@@ -1,0 +1,298 @@
+"""Exported controllers: compiled, and against the parts themselves and against whole runs."""
+
+import json
+import math
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import assert_one_error_line
+from commands import run as command
+
+import diffabs as d
+from diffabs.controllers import (
+    PID,
+    BackCalculation,
+    Clamping,
+    ConstantInput,
+    HoldingInput,
+    ObserverFeedback,
+    ProportionalFeedback,
+    Sampled,
+    ScheduledFeedback,
+    SlidingMode,
+    StateFeedback,
+)
+from diffabs.core.protocols import BalanceOutput, BrakeOutput
+from diffabs.export import NotExported, c_source, device, equations
+from diffabs.export.device import Input
+from diffabs.plants import ArmBalance, LabRig, MirroredRig
+from diffabs.references import FilteredSlip, FixedSlip, PeakLatch
+from diffabs.roads import Tabulated
+from diffabs.scenario.defaults import balancing, braking
+from diffabs.scenario.scenario import load
+
+needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+SAMPLES = 10_000
+FLAGS = ("-std=c99", "-O2", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wconversion")
+
+
+def rig(controller, **parts):
+    usual = {"plant": MirroredRig(), "reference": FixedSlip(slip=0.2), "feedforward": ConstantInput(value=2.7)}
+    return braking(**{**usual, "controller": Sampled(controller=controller, period=1e-3), **parts})
+
+
+def observer():
+    draw = np.random.default_rng(5)
+    transition = np.eye(6) * 0.8 + 0.02 * draw.normal(size=(6, 6))
+    matrices = {"transition": transition, "entry": draw.normal(size=6), "correction": draw.normal(size=(6, 2)) * 0.05}
+    return ObserverFeedback(gain=draw.normal(size=6), voltage_max=3.0, **matrices)
+
+
+LOOPS = {
+    "state feedback": rig(StateFeedback(gain=(-300.0, -48.0))),
+    "PID, filtered derivative": rig(PID(kp=60.0, ki=400.0, kd=0.3, torque_max=9.03)),
+    "conditional integration": rig(PID(kp=30.0, ki=900.0, torque_max=9.03, antiwindup=Clamping())),
+    "back-calculation": rig(PID(kp=30.0, ki=900.0, torque_max=9.03, antiwindup=BackCalculation())),
+    "schedule": rig(ScheduledFeedback(speeds=(2.0, 6.0, 14.0), integral_gains=(-90.0, -200.0, -300.0),
+                                      gains=(-9.0, -40.0, -58.0), torque_min=0.0, torque_max=9.03)),
+    "proportional to the speed": rig(ProportionalFeedback(gain=(-300.0, -48.0), torque_min=0.0, torque_max=9.03)),
+    "filtered target": rig(StateFeedback(gain=(-300.0, -48.0)), reference=FilteredSlip()),
+    "holding torque": rig(StateFeedback(gain=(-300.0, -48.0)), feedforward=HoldingInput()),
+    "holding command, table of friction": rig(SlidingMode(gain=0.2), feedforward=HoldingInput(),
+        plant=LabRig(road=Tabulated())),
+    "observer": balancing(controller=Sampled(controller=observer(), period=0.01)),
+}  # fmt: skip
+
+
+def measured(loop, seed):
+    """Random signals (SAMPLES,) of whatever the plant shows: of a brake within what it can show."""
+    draw = np.random.default_rng(seed)
+    if loop.plant.shows is BalanceOutput:
+        return BalanceOutput(*(0.3 * draw.normal(size=SAMPLES) for _ in BalanceOutput._fields))
+    speed = draw.uniform(0.5, 20.0, SAMPLES)
+    slip = np.clip(0.2 + 0.15 * draw.normal(size=SAMPLES), 0.0, 1.0)
+    return BrakeOutput(slip, speed, speed * (1 - slip), 6 * draw.uniform(size=SAMPLES), 0 * slip)
+
+
+def commands_of_parts(loop, seen, dtype, step=None):
+    """What the parts themselves command, sample by sample: reference, feed-forward, `Sampled`'s own tick."""
+    with jax.enable_x64(dtype == np.float64):
+        loop, seen = jax.tree.map(lambda x: jnp.asarray(x, dtype), (d.core.pytree.strong(loop), seen))
+        h = loop.controller.period / (step or 1)
+
+        def tracking(reference, y):
+            target, setpoint = loop.reference.output(0.0, reference, y), loop.reference.setpoint(reference)
+            return d.core.protocols.Tracking(target, y, loop.feedforward.input(loop.plant, y, setpoint))
+
+        def moved(reference, y):
+            return d.simulate.rk4.rk4_step(
+                lambda t, x: loop.reference.flow(t, reference._replace(flow=x), y), 0.0, reference.flow, h
+            )
+
+        first = jax.tree.map(lambda x: x[0], seen)
+        reference = loop.reference.start(first)
+        memory = loop.controller.start(tracking(reference, first))
+
+        def sample(carry, row):
+            (reference, memory), (k, y) = carry, row
+            signal = tracking(reference, y)
+            clock = d.core.protocols.Clock(k * loop.controller.period, loop.controller.period, k, None, before=signal)
+            memory = loop.controller.tick(clock, memory, signal)
+            command = loop.controller.output(0.0, memory, signal)
+            for _ in range(step or 1):
+                if jax.tree.leaves(reference.flow):
+                    reference = reference._replace(flow=moved(reference, y))
+            return (reference, memory), command
+
+        rows = (jnp.arange(SAMPLES), seen)
+        return np.asarray(jax.jit(lambda: jax.lax.scan(sample, (reference, memory), rows)[1])())
+
+
+def compiled(text, name, folder):
+    """The program of an exported text."""
+    source, program = folder / f"{name}.c", folder / name
+    source.write_text(text)
+    subprocess.run(["cc", *FLAGS, f"-D{name.upper()}_MAIN", source, "-o", program, "-lm"], check=True)
+    return program
+
+
+def commands_of_c(found, text, name, seen, folder):
+    """What the compiled text commands; its inputs are found by the names in its struct."""
+    struct = text.partition("typedef struct {")[2].partition("}")[0]
+    names = [line.split()[1].rstrip(";") for line in struct.splitlines() if f"{name}_real" in line]
+    columns = [np.asarray(getattr(seen, name), found.dtype) for name in names]
+    lines = "\n".join(" ".join(f"{value:.17g}" for value in row) for row in zip(*columns, strict=True))
+    program = compiled(text, name, folder)
+    said = subprocess.run([program], input=lines + "\n", capture_output=True, text=True, check=True).stdout
+    return np.array(said.split(), float)
+
+
+@needs_cc
+@pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("name", LOOPS)
+def test_what_is_exported_commands_what_the_parts_do(name, dtype, tmp_path):
+    loop, seen = LOOPS[name], measured(LOOPS[name], seed=11)
+    step = 4 if name == "filtered target" else None
+    found = device(loop, step=1e-3 / 4 if step else None, dtype=dtype)
+    text = c_source(found, "unit")
+    wanted = commands_of_parts(loop, seen, dtype, step)
+    result = commands_of_c(found, text, "unit", seen, tmp_path)
+    assert len(result) == SAMPLES
+    assert np.ptp(wanted) > 0
+    tolerance = 1e-11 if dtype == np.float64 else 3e-3  # an integral over 10,000 samples gathers roundings
+    np.testing.assert_allclose(result, wanted, rtol=tolerance, atol=tolerance * np.max(np.abs(wanted)))
+    early = slice(0, 50)
+    tight = 1e-13 if dtype == np.float64 else 2e-5
+    np.testing.assert_allclose(result[early], wanted[early], rtol=tight, atol=tight * np.max(np.abs(wanted)))
+
+
+@needs_cc
+def test_a_whole_run_is_what_the_exported_controller_does(tmp_path):
+    """slip-cured, sample by sample: what it measured goes in, what it commanded comes out."""
+    chosen = load("slip-cured", ["initial.speed_kmh=40"])
+    period = float(chosen.loop.controller.period)
+    every = round(period / chosen.solver.step)
+    run = d.rollout(chosen.loop, d.FixedStep(chosen.solver.step, 0.4, every=every), chosen.objectives)
+    count = int(run.trajectory.running.sum())
+    seen = jax.tree.map(lambda x: np.asarray(x)[:count], run.trajectory.sample.output)
+    found = device(chosen.loop, step=chosen.solver.step)
+    result = commands_of_c(found, c_source(found, "cured"), "cured", seen, tmp_path)
+    assert count > 300
+    np.testing.assert_allclose(result, np.asarray(run.trajectory.sample.command)[:count], rtol=1e-12, atol=1e-12)
+
+
+@needs_cc
+def test_the_target_can_come_from_outside(tmp_path):
+    loop = rig(PID(kp=60.0, ki=400.0), reference=PeakLatch())
+    with pytest.raises(NotExported, match="PeakLatch follows what is measured"):
+        device(loop)
+    found = device(loop, given_target=True)
+    text = c_source(found, "given")
+    program = compiled(text, "given", tmp_path)
+    said = subprocess.run([program], input="0.1 0.2\n0.1 0.3\n", capture_output=True, text=True, check=True).stdout
+    first, second = map(float, said.split())
+    assert first == pytest.approx(2.7 + 60.0 * 0.1)
+    assert second == pytest.approx(2.7 + 60.0 * 0.2 + 400.0 * 1e-3 * 0.1)
+    assert "target; /* [1] */" in text
+
+
+def test_difference_equations_are_the_controllers():
+    found = equations(rig(PID(kp=60.0, ki=400.0, kd=0.3, cutoff=55.0, torque_max=np.inf), feedforward=HoldingInput()))
+    assert found["inputs"] == ["target", "slip", "feedforward"]
+    T, wc, kd = 1e-3, 55.0, 0.3
+    np.testing.assert_allclose(found["F"], [[1.0, 0.0], [0.0, 1 - T * wc]], rtol=1e-12)
+    np.testing.assert_allclose(found["G"], [[T, -T, 0.0], [T * wc, -T * wc, 0.0]], rtol=1e-12)
+    np.testing.assert_allclose(found["H"], [400.0, -kd * wc], rtol=1e-12)
+    np.testing.assert_allclose(found["J"], [60 + kd * wc, -60 - kd * wc, 1.0], rtol=1e-12)
+    with pytest.raises(NotExported, match="continuous time"):
+        equations(braking(plant=MirroredRig(), controller=StateFeedback(), feedforward=HoldingInput()))
+
+
+@pytest.mark.parametrize("name", ["2fast", "a b", "float", "while"])
+def test_a_name_that_c_does_not_have_is_refused(name):
+    with pytest.raises(NotExported, match="no name that C has"):
+        c_source(device(LOOPS["state feedback"]), name)
+
+
+def test_an_operation_without_translation_is_named():
+    @d.core.pytree.pytree
+    class Sorted:
+        start, flow = d.core.protocols.no_memory, d.core.protocols.no_flow
+
+        def output(self, t, memory, signal):
+            return jax.lax.lgamma(signal.measured.slip)
+
+    with pytest.raises(NotExported, match="lgamma has no translation to C"):
+        c_source(device(rig(Sorted())), "unit")
+
+
+@needs_cc
+def test_the_command_writes_a_file_that_compiles(tmp_path):
+    path = tmp_path / "controller.c"
+    command("export", "slip-cured", "--float32", "-o", path)
+    text = path.read_text()
+    assert "typedef float controller_real;" in text
+    assert str(tmp_path) not in text
+    program = compiled(text, "controller", tmp_path)
+    said = subprocess.run([program], input="0.0 13.9\n", capture_output=True, text=True, check=True).stdout
+    assert float(said) == pytest.approx(2.6912710579228354, rel=1e-6)
+    assert command("export", "slip-cured").stdout.startswith(
+        "/* slip_cured: the controller, to be called every 0.001 s"
+    )
+    result = json.loads(command("export", "slip-cured", "--to", "table", "--json").stdout)
+    assert result["H"] == [pytest.approx(-17300.0)]
+    assert result["inputs"] == ["target", "slip", "feedforward"]  # the speed has a coefficient of 7e-18
+    command("export", "slip-cured", "--to", "table", "-o", tmp_path / "t.csv")
+    rows = [line.split(",") for line in (tmp_path / "t.csv").read_text().splitlines()]
+    assert rows[0] == ["", "x1", "d target", "d slip", "d feedforward"]
+    assert float(rows[2][1]) == pytest.approx(-17300.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["slip-lmi"], "controller StateFeedback runs in continuous time"),
+        (["slip-estimator", "--set", 'controller={type="sampled"}'], "say --given target"),
+        (["slip-cured", "--json"], "--json is for --to table"),
+        (["slip-cured", "--to", "table", "--float32"], "are for --to c"),
+        (["slip-cured", "--to", "fortran"], "fortran"),
+    ],
+)
+def test_the_command_refuses_in_one_line(arguments, words, tmp_path):
+    path = tmp_path / "x.c"
+    result = command("export", *arguments, "-o", path, status=2)
+    assert words in result.stderr
+    assert_one_error_line(result)
+    assert not list(tmp_path.iterdir())
+
+
+def test_inputs_are_what_the_plant_shows():
+    found = device(LOOPS["observer"])
+    assert isinstance(found.input, Input)
+    assert found.units["theta"] == "rad"
+    assert found.period == pytest.approx(0.01)
+    assert math.isclose(found.delay, 0.0)
+    assert isinstance(LOOPS["observer"].plant, ArmBalance)
+
+
+@needs_cc
+def test_a_target_that_moves_is_returned_as_it_was(tmp_path):
+    """A controller that commands the target itself: what is returned is memory that moves in the same call."""
+
+    @d.core.pytree.pytree
+    class Follow:
+        start, flow = d.core.protocols.no_memory, d.core.protocols.no_flow
+
+        def output(self, t, memory, signal):
+            return signal.target
+
+    loop = rig(Follow(), reference=FilteredSlip(slip=0.2, time_constant=0.01))
+    program = compiled(c_source(device(loop), "unit"), "unit", tmp_path)
+    said = subprocess.run([program], input="0.1\n0.1\n0.1\n", capture_output=True, text=True, check=True).stdout
+    np.testing.assert_allclose([*map(float, said.split())], 0.2 - 0.1 * np.exp(-np.arange(3) / 10), rtol=1e-6)
+
+
+@needs_cc
+def test_memory_behind_memory_is_kept(tmp_path):
+    """The command is the double integral of the error: it needs the first integral only a sample later."""
+
+    @d.core.pytree.pytree
+    class Twice:
+        def start(self, signal):
+            return d.core.protocols.Memory(flow=(0.0 * signal.target, 0.0 * signal.target))
+
+        def flow(self, t, memory, signal):
+            return memory.flow[1], signal.target - signal.measured.slip
+
+        def output(self, t, memory, signal):
+            return memory.flow[0]
+
+    text = c_source(device(rig(Twice())), "unit")
+    said = subprocess.run(
+        [compiled(text, "unit", tmp_path)], input="0.1\n" * 4, capture_output=True, text=True, check=True
+    ).stdout
+    np.testing.assert_allclose([*map(float, said.split())], np.array([0.0, 0.0, 1.0, 3.0]) * 1e-6 * 0.1, rtol=1e-12)
