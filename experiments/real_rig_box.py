@@ -58,7 +58,7 @@ class Box:
 
 INERTIA = 7.53e-3  # kg m^2
 NOMINAL = {"mass": 5.75, "speed": 50.0, "height": 1.0, "place": 1.0, "inertia": 1.0, "lag": 1e-3, "delay": 0.0}
-NOMINAL |= {"first": 0.0, "last": 0.0, "bias": 0.0}
+SENSOR = {"first": "sensor.blocks.2.first", "last": "sensor.blocks.2.last", "bias": "sensor.blocks.3.deceleration"}
 
 
 def drawn(box: Box, speed: str, count: int, seed: int) -> dict[str, np.ndarray]:
@@ -83,12 +83,13 @@ def corners(box: Box, speed: str, seeds: int = 1) -> dict[str, np.ndarray]:
 
 
 def columns(points: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Parameters of the loop by path, for points by name; `first`, `last` and `bias` are the sensor's."""
+    """Parameters of the loop by path, for points by name; what is not named is nominal."""
     at = {**{name: np.full(1, value) for name, value in NOMINAL.items()}, **points}
     h, c = at["height"], at["place"]
     road = {"w1": RIG.w1 * h / c, "w2": RIG.w2 * h / c**2, "w3": RIG.w3 * h / c**3, "w4": RIG.w4 * h}
     road["a"] = RIG.a * c**RIG.q
     found = {
+        **{path: at[name] for name, path in SENSOR.items() if name in points},
         "plant.mass": at["mass"],
         "plant.wheel_inertia": INERTIA * at["inertia"],
         "initial.speed": at["speed"] / KMH,

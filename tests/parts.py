@@ -95,6 +95,7 @@ CONTROLLERS: dict[str, Any] = {
         voltage_max=60.0,
     ),
     "sampled relay": controllers.Sampled(controller=controllers.Relay(), delay=3e-4),
+    "sampled on the grid": controllers.SampledOnGrid(controller=_PID, sampling_period=2e-3, delay=1.3e-3),
 }
 
 REFERENCES: dict[str, Any] = {
@@ -105,6 +106,7 @@ REFERENCES: dict[str, Any] = {
     "upright": references.Upright(),
     "setpoint": references.Setpoint(value=0.3),
     "robust": references.PeakRobust(time_constant=0.002, threshold=0.01),
+    "limited": references.LimitedSlip(rate=15.0, time_constant=0.003, period=2e-3),
 }
 
 ACTUATORS: dict[str, Any] = {
@@ -128,6 +130,9 @@ SENSORS: dict[str, Any] = {
     "angles": sensors.AngleSensor(theta=0.01, psi=0.02, period=2e-3),
     "speed scale": sensors.SpeedScale(factor=0.95),
     "accelerometer": sensors.IntegratedAccelerometer(bias=0.05),
+    "wheel noise": sensors.WheelNoise(slip=0.01, period=2e-3),
+    "drifting speed": sensors.DriftingSpeed(first=0.03, last=-0.05, time_constant=0.01),
+    "estimated speed": sensors.SpeedEstimator(gate=0.2, growth=0.3, period=2e-3),
     "series": blocks.Series(blocks=(sensors.Noise(deceleration=0.05), sensors.WheelSpeed())),
 }
 

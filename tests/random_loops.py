@@ -214,6 +214,36 @@ def rig_proportional(r: Draw) -> d.Loop:
     )
 
 
+def rig_on_grid(r: Draw, speed: Any) -> d.Loop:
+    return braking(
+        **r.rig(),
+        sensor=Series(blocks=(sensors.WheelNoise(slip=1e-3, period=2e-3), *speed)),
+        controller=controllers.SampledOnGrid(
+            controller=controllers.ProportionalFeedback(
+                gain=np.array([-r.near(2000.0), -r.near(100.0)]),
+                torque_min=r.within(0.1, 0.4),
+                torque_max=r.near(4.0),
+                antiwindup=controllers.BackCalculation(tracking_time=r.near(0.05)),
+            ),
+            sampling_period=2e-3,
+            delay=r.within(1e-4, 1.9e-3),
+        ),
+        feedforward=controllers.ConstantInput(value=r.near(1.5)),
+        reference=references.LimitedSlip(slip=r.near(0.15), rate=r.near(3.0), time_constant=r.near(0.02), period=2e-3),
+        actuator=actuators.Lag(time_constant=r.near(0.002)),
+    )
+
+
+def rig_drifting(r: Draw) -> d.Loop:
+    first, last = r.within(-0.03, 0.03), r.within(-0.03, 0.03)
+    return rig_on_grid(r, (sensors.DriftingSpeed(first=first, last=last, time_constant=r.near(0.3)),))
+
+
+def rig_estimated(r: Draw) -> d.Loop:
+    noise = sensors.Noise(deceleration=r.near(0.1), period=2e-3)
+    return rig_on_grid(r, (noise, sensors.SpeedEstimator(gate=r.near(0.2), growth=r.near(0.3), period=2e-3)))
+
+
 def lab_rig(r: Draw) -> d.Loop:
     return braking(
         plant=plants.LabRig(),
@@ -385,6 +415,8 @@ STRUCTURES = {
     "rig, filtered": Structure(rig),
     "rig, scheduled, delay": Structure(rig_scheduled),
     "rig, proportional, rate limit": Structure(rig_proportional),
+    "rig, speed that drifts": Structure(rig_drifting),
+    "rig, estimated speed": Structure(rig_estimated),
     "lab rig, relay": Structure(lab_rig),
     "lab rig, lock": Structure(lock),
     "lock and free": Structure(lock_and_free),

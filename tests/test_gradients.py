@@ -103,6 +103,34 @@ LOOPS = {
             )
         ),
     ),
+    "speed that drifts": braking(
+        **RIG,
+        controller=controllers.SampledOnGrid(
+            controller=controllers.ProportionalFeedback(gain=np.array([-2000.0, -120.0])), delay=4e-4
+        ),
+        feedforward=controllers.ConstantInput(value=2.7),
+        reference=references.LimitedSlip(rate=3.0, time_constant=0.02),
+        sensor=blocks.Series(
+            blocks=(sensors.WheelNoise(slip=1e-3), sensors.DriftingSpeed(first=0.01, last=-0.02, time_constant=0.1))
+        ),
+        actuator=actuators.Lag(time_constant=0.002),
+    ),
+    "estimated speed": braking(
+        **RIG,
+        controller=controllers.SampledOnGrid(
+            controller=controllers.ProportionalFeedback(gain=np.array([-2000.0, -120.0])), delay=4e-4
+        ),
+        feedforward=controllers.ConstantInput(value=2.7),
+        reference=references.LimitedSlip(rate=3.0, time_constant=0.02),
+        sensor=blocks.Series(
+            blocks=(
+                sensors.WheelNoise(slip=1e-3),
+                sensors.Noise(deceleration=0.1),
+                sensors.SpeedEstimator(gate=0.15, growth=0.3),
+            )
+        ),
+        actuator=actuators.Lag(time_constant=0.002),
+    ),
     "arm": braking(
         plant=plants.ArmBalance(arm_length=-0.5, gear=1.1, rotor_inertia=0.3),
         initial=plants.BalanceStart(theta=0.004, psi=0.01, phi=0.001, theta_rate=-0.001, psi_rate=0.02, phi_rate=0.002),

@@ -12,6 +12,7 @@ from diffabs.controllers.gain_schedule import ProportionalFeedback as Proportion
 from diffabs.controllers.gain_schedule import ScheduledFeedback as ScheduledFeedback
 from diffabs.controllers.pid import PID as PID
 from diffabs.controllers.sampled import Sampled as Sampled
+from diffabs.controllers.sampled_on_grid import SampledOnGrid as SampledOnGrid
 from diffabs.controllers.switching import ConstantTorque as ConstantTorque
 from diffabs.controllers.switching import Relay as Relay
 from diffabs.controllers.switching import SlidingMode as SlidingMode

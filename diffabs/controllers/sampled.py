@@ -99,12 +99,17 @@ class Sampled:
 
     def rules(self) -> Iterator[Rule]:
         """A computation takes no longer than the period."""
-        yield Rule(
-            array(self.delay) <= array(self.period),
-            "delay exceeds the period",
-            lambda: f"delay = {self.delay:g} s exceeds the period of {self.period:g} s",
-        )
+        yield delay_within(self.delay, self.period)
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """The period is on the integration grid."""
         yield whole_steps("period", self.period, step)
+
+
+def delay_within(delay: Scalar, period: Scalar) -> Rule:
+    """Return the rule that a delay [s] does not exceed the period [s]."""
+    return Rule(
+        array(delay) <= array(period),
+        "delay exceeds the period",
+        lambda: f"delay = {delay:g} s exceeds the period of {period:g} s",
+    )

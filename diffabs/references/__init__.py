@@ -1,5 +1,6 @@
 """Slip references: measured output -> target slip."""
 
+from diffabs.references.limited import LimitedSlip as LimitedSlip
 from diffabs.references.peak_slip import PeakLatch as PeakLatch
 from diffabs.references.peak_slip import PeakLiteral as PeakLiteral
 from diffabs.references.peak_slip import PeakRobust as PeakRobust

@@ -54,6 +54,38 @@ class Noise:
         yield whole_steps("period", self.period, step)
 
 
+@pytree
+class WheelNoise:
+    """Gaussian noise of the wheel's speed in proportion to the vehicle's, w_seen = w - v n, drawn every `period` and
+    held, so that the measured slip has the noise n of this standard deviation at any speed. Needs a key.
+
+    That is what teeth of unequal width do; whoever estimates the vehicle's speed from the wheel's sees it, too."""
+
+    slip: Scalar = param(default=0.0, unit="1", low=0.0)
+    period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+
+    flow = no_flow
+    grid_rules = Noise.grid_rules
+
+    def start(self, signal: BrakeOutput) -> Memory:
+        """No noise before the first draw."""
+        return Memory(held=0.0 * signal.slip)
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
+        """Wheel speed and slip with noise."""
+        del t
+        noise = memory.held
+        return signal._replace(slip=signal.slip + noise, wheel_speed=signal.wheel_speed - signal.speed * noise)
+
+    def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
+        """Draw at the instants of the period. Raises ValueError without a key."""
+        del signal
+        if clock.key is None:
+            raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
+        now, draw = clock.ticks(self.period)
+        return Memory(held=jnp.where(now, drawn(jnp.asarray(self.slip), clock.key, draw), memory.held))
+
+
 @jax.custom_jvp
 def drawn(deviation: Any, key: Any, number: Any) -> Any:
     """deviation z: z is drawn only where it counts, or where it is the derivative."""

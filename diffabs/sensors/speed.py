@@ -75,3 +75,27 @@ class SpeedScale:
         del t, memory
         v = self.factor * signal.speed
         return signal._replace(slip=(v - signal.wheel_speed) / jnp.maximum(v, self.floor), speed=v)
+
+
+@pytree
+class DriftingSpeed:
+    """A vehicle speed whose relative error drifts, and the slip computed with it and the wheel's speed as it is seen.
+
+        v_seen = (1 + e) v,   e = last + (first - last) exp(-t/T),   slip = (v_seen - w)/v_seen
+
+    Held at the slip s as measured, the wheel slips by s - e (1 - s): a speed that is seen low (e < 0) hides slip."""
+
+    first: Scalar = param(default=0.0, unit="1", above=-1.0)
+    last: Scalar = param(default=0.0, unit="1", above=-1.0)
+    time_constant: Scalar = param(default=0.5, unit="s", above=0.0)
+    floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
+
+    start = no_memory
+    flow = no_flow
+
+    def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
+        """The speed that is off, and the slip computed with it."""
+        del memory
+        error = self.last + (self.first - self.last) * jnp.exp(-t / self.time_constant)
+        v = (1 + error) * signal.speed
+        return signal._replace(slip=(v - signal.wheel_speed) / jnp.maximum(v, self.floor), speed=v)

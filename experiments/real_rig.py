@@ -1,0 +1,169 @@
+"""Is the overshoot cured on the rig as it really is, everything wrong at once?
+
+The box of what a controller does not know was fixed beforehand (`real_rig_box.py`, docs/real-rig.md). Estimator of the
+speed, reference and controller are tuned together, by gradients over thousands of lanes (`real_rig_tune.py`), beside
+what others find (`real_rig_others.py`), what no gain can do (`real_rig_floor.py`) and what can be proved
+(`real_rig_proof.py`), and judged at weak spots, in all corners and on 100,000 points (`real_rig_judge.py`).
+
+    python experiments/real_rig.py
+"""
+
+import dataclasses
+import pathlib
+import time
+from typing import Any
+
+import jax
+import numpy as np
+from real_rig_box import ESTIMATED, KNOWN, Box, Fixed
+from real_rig_document import document
+from real_rig_figures import degradation, descents, distributions, map_figure, traces
+from real_rig_judge import Judging, in_corners, on_samples, weak_spots
+from real_rig_loops import quantised
+from real_rig_others import Others, Score, contenders
+from real_rig_proof import Proving, proofs
+from real_rig_tune import Tuning, start, tuned
+
+from diffabs import Loop
+from diffabs.papers import record
+from diffabs.tune import Tuned
+
+TUNED, WORST, BEFORE = "tuned, CVaR", "tuned, smooth worst", "before tuning"
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Every number of the experiment."""
+
+    fixed: Fixed = dataclasses.field(default_factory=Fixed)
+    box: Box = dataclasses.field(default_factory=Box)
+    tuning: Tuning = dataclasses.field(default_factory=Tuning)
+    judging: Judging = dataclasses.field(default_factory=Judging)
+    others: Others = dataclasses.field(default_factory=Others)
+    proving: Proving = dataclasses.field(default_factory=Proving)
+    price: float = 4.0  # runs that a gradient counts as, measured
+    map_points: int = 25  # along each side of a map
+    drawn: int = 20_000  # points of the figure of distributions
+    out: str = "out/experiments/real_rig"
+
+
+def cost(config: Config, stages: dict[str, Tuned], last: str) -> int:
+    """Runs that a tuning took until the end of a stage."""
+    t, total = config.tuning, 0
+    for name, found in stages.items():
+        lanes = t.few if name == "starts" else t.lanes
+        total += int(config.price * lanes * sum(one.history[-1].evaluations for one in found.starts))
+        if name == last:
+            return total
+    return total
+
+
+def compared(config: Config, speed: str, stages: dict[str, Tuned], told: Any) -> dict[str, tuple[Loop, int]]:
+    """All loops of one kind of speed by name, with what it cost to find each; others see the same estimated speed."""
+    best: Any = stages["CVaR"].loop
+    score = Score(config.others, config.box, config.fixed, speed, config.tuning.weights, config.judging)
+    estimator = None if speed == KNOWN else best.sensor.blocks[-1]
+    found = contenders(config.others, config.box, config.fixed, speed, estimator, score, told)
+    own = {
+        BEFORE: (start(config.tuning, config.fixed, speed), 0),
+        TUNED: (best, cost(config, stages, "CVaR")),
+        WORST: (stages["smooth worst"].loop, cost(config, stages, "smooth worst")),
+    }
+    return found | {name: (quantised(one, config.fixed), runs) for name, (one, runs) in own.items()}
+
+
+def judged(config: Config, speed: str, one: Loop) -> dict[str, Any]:
+    """Weak spots, corners, points of the box."""
+    return {
+        "weak spots: overshoot [%]": weak_spots(one, speed, config.judging),
+        "corners": in_corners(one, config.box, config.fixed, speed, config.judging),
+        "box": on_samples(one, config.box, config.fixed, speed, config.judging),
+    }
+
+
+def printed(speed: str, results: dict[str, dict[str, Any]]) -> None:
+    """The table, in two: weak spots, and the rest."""
+    record.show(
+        f"Speed {speed}: worst overshoot [%] where one thing is wrong",
+        [{"controller": name, **one["weak spots: overshoot [%]"]} for name, one in results.items()],
+    )
+    record.show(f"Speed {speed}: the box", [{"controller": name, **row(one)} for name, one in results.items()])
+
+
+def row(one: dict[str, Any]) -> dict[str, Any]:
+    """What a line of the table says."""
+
+    def interval(name: str) -> str:
+        p = one["box"][name]
+        return f"{p['percent']:.4g} ({p['low']:.3g}-{p['high']:.3g})"
+
+    box, proof = one["box"], one["proof"]
+    rate = proof.get("decay [1/s]")
+    return {
+        "worst corner [%]": f"{one['corners']['overshoot [%]']:.1f}",
+        "P(> 1 %) [%]": interval("overshoot > 1 %"),
+        "P(> 5 %) [%]": interval("overshoot > 5 %"),
+        "P(locks) [%]": interval("locks"),
+        "within 1.5 floors [%]": f"{box['within 1.5 floors of the box']['percent']:.2f}",
+        "overshoot median, 95 %": f"{box['overshoot [%]']['median']:.1f}, {box['overshoot [%]']['95 %']:.1f}",
+        "above floor 95 %": f"{box['above the floor [%]']['95 %']:.1f}",
+        "settled median, 95 % [s]": f"{box['settling [s]']['median']:.3f}, {box['settling [s]']['95 %']:.3f}",
+        "lost median [%]": f"{box['distance lost [%]']['median']:.2f}",
+        "certificate": proof["said"] + ("" if rate is None else f", {rate:.2g} /s"),
+        "runs to find": one["runs to find"],
+    }
+
+
+def of_speed(config: Config, speed: str, told: Any) -> tuple[dict[str, Tuned], dict[str, Loop], dict[str, Any]]:
+    """Tune, compare, judge, prove: stages of the tuning, loops, and what is said of each."""
+    stages = tuned(config.tuning, config.box, config.fixed, speed, told)
+    those = compared(config, speed, stages, lambda name: told(f"{speed}, found: {name}"))
+    loops = {name: one for name, (one, _) in those.items()}
+    proved = proofs(config.proving, config.box, config.fixed, loops)
+    results = {}
+    for name, (one, runs) in those.items():
+        results[name] = {**judged(config, speed, one), "proof": proved[name], "runs to find": runs}
+        told(f"{speed}, judged: {name}")
+    return stages, loops, results
+
+
+def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
+    """Run, print, save; returns the results."""
+    config, begun = config or Config(), time.perf_counter()
+    told = progress or (lambda line: None)
+    folder, figures, results, stages = pathlib.Path(config.out), {}, {}, {}
+    for speed in (KNOWN, ESTIMATED):
+        stages[speed], loops, rows = of_speed(config, speed, told)
+        printed(speed, rows)
+        maps = degradation(loops[TUNED], speed, config.judging, config.map_points)
+        shown = {name: one for name, one in loops.items() if name != WORST and "best of" not in name}
+        figures[f"maps-{speed}"] = map_figure(maps, speed, config.box)
+        figures[f"overshoot-{speed}"] = distributions(
+            shown, speed, config.box, config.fixed, config.judging, config.drawn
+        )
+        figures[f"traces-{speed}"] = traces(shown, speed, config.fixed)
+        results[speed] = {"controllers": rows, "beyond the box": maps, "tuning": described(stages[speed])}
+        for name, one in loops.items():
+            record.write(folder / "controllers", document(one), f"{speed}, {name}.json".replace("/", " "))
+    figures["tuning"] = descents(stages)
+    told(f"{time.perf_counter() - begun:.0f} s")
+    return record.experiment(config, results | {"seconds": time.perf_counter() - begun}, figures)
+
+
+def described(stages: dict[str, Tuned]) -> dict[str, Any]:
+    """What the descents found, and how."""
+    return {
+        name: {
+            "objective": list(found.objective),
+            "values": {path: np.asarray(value).tolist() for path, value in found.values.items()},
+            "starts": [{"objective": one.objective, "reason": one.reason.value} for one in found.starts],
+            "gradients": sum(one.history[-1].evaluations for one in found.starts),
+        }
+        for name, found in stages.items()
+    }
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    clock = time.perf_counter()
+    main(progress=lambda line: print(f"{time.perf_counter() - clock:5.0f} s  {line}", flush=True))

@@ -1,0 +1,168 @@
+"""What `real_rig.py` compares with: the published gain, robust designs, the first cure, sliding mode, and the PI that
+searches without gradients find."""
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import cma
+import numpy as np
+from real_rig_box import INERTIA, KMH, Box, Fixed, spread
+from real_rig_floor import floor
+from real_rig_judge import Judging, runs
+from real_rig_loops import loop
+from scipy.optimize import minimize
+
+from diffabs import Loop, replace
+from diffabs.controllers import PID, BackCalculation, ProportionalFeedback, SlidingMode, StateFeedback
+from diffabs.core.bijectors import space
+from diffabs.design import Spec, design
+from diffabs.design.parameter_box import polytope
+from diffabs.design.spec import L2Gain
+from diffabs.design.synthesis import DesignError
+from diffabs.linear.slip_model import SlipModel
+from diffabs.papers import lmi_design
+from diffabs.references import FilteredSlip
+from diffabs.roads import RIG
+from diffabs.scenario.scenario import load
+
+
+@dataclasses.dataclass(frozen=True)
+class Others:
+    """Every number of the comparison."""
+
+    lanes: int = 1024  # of a search without gradients, and of the choice among designs
+    evaluations: int = 240  # of a search: as many runs as the gradients took
+    weights: tuple[tuple[float, ...], tuple[float, ...]] = ((1e2, 1e4, 1e6, 1e8), (1.0, 1e2, 1e4))  # of the LMI
+    decays: tuple[float, ...] = (5.0, 10.0, 20.0, 40.0)  # 1/s
+    efforts: tuple[float, ...] = (1e-3, 1e-2, 3e-2, 0.1)  # weight of the torque, H-infinity
+    pi: tuple[float, float] = (100.0, 500.0)  # kp, ki, start
+    pi_ranges: tuple[tuple[float, float], tuple[float, float]] = ((5.0, 500.0), (1.0, 2e4))
+    sliding: tuple[float, float] = (5.0, 0.1)  # gain, boundary, start
+    sliding_ranges: tuple[tuple[float, float], tuple[float, float]] = ((0.5, 20.0), (0.01, 0.5))
+    tracking_time: float = 0.05  # s
+    level: float = 0.95
+    seed: int = 19
+
+
+class Score:
+    """The objective of the tuning of a loop, on the rig with its quantisation: CVaR over the box of overshoot above its
+    floor and IAE. It counts the runs."""
+
+    def __init__(self, config: Others, box: Box, fixed: Fixed, speed: str, weights: Any, judging: Judging):
+        """On so many points, spread evenly."""
+        self.points = spread(box, speed, config.lanes, config.seed)
+        self.floors = floor(self.points, speed, fixed)
+        self.config, self.weights, self.judging, self.rollouts = config, weights, judging, 0
+
+    def __call__(self, one: Loop) -> float:
+        """Of a loop; a great number where a run diverges."""
+        found = runs(one, self.points, self.judging, self.config.seed)
+        self.rollouts += self.config.lanes
+        each = self.weights["overshoot"] * (found["overshoot"] - self.floors) + self.weights["iae"] * found["iae"]
+        each = np.sort(np.nan_to_num(each, nan=1e3, posinf=1e3))
+        return float(each[-int(np.ceil(len(each) * (1 - self.config.level))) :].mean())
+
+
+Free = dict[str, Any]
+
+
+def nelder_mead(score: Score, one: Loop, free: Free, config: Others) -> Loop:
+    """Nelder and Mead's search in the coordinates of `tune`."""
+    coordinates = space(one, free)
+    options = {"maxfev": config.evaluations, "xatol": 1e-4, "fatol": 1e-6}
+    found = minimize(
+        lambda z: score(_at(one, coordinates, z)), coordinates.place(one), method="Nelder-Mead", options=options
+    )
+    return _at(one, coordinates, found.x)
+
+
+def cma_es(score: Score, one: Loop, free: Free, config: Others) -> Loop:
+    """CMA-ES in the coordinates of `tune`."""
+    coordinates = space(one, free)
+    options = {"maxfevals": config.evaluations, "verbose": -9, "seed": config.seed, "verb_log": 0}
+    search = cma.CMAEvolutionStrategy(coordinates.place(one), 0.5, options)
+    while not search.stop():
+        asked = search.ask()
+        search.tell(asked, [score(_at(one, coordinates, z)) for z in asked])
+    return _at(one, coordinates, search.result.xbest)
+
+
+def _at(one: Loop, coordinates: Any, z: Any) -> Loop:
+    return replace(one, {path: np.asarray(value) for path, value in coordinates.values(z).items()})
+
+
+def designs(config: Others, box: Box, fixed: Fixed) -> dict[str, list[np.ndarray]]:
+    """Gains by the robust designs of the package, for a grid of what they leave open. `wide` also has friction (height
+    and place), inertia, and the speed's error, which is one of the input's gain, as ranges."""
+    speeds = (fixed.end / KMH, box.speed[1] / KMH)
+    narrow = {"plant.mass": box.mass, "speed": speeds}
+    seen = 1 + box.first[1]
+    wide = narrow | {
+        "plant.wheel_inertia": (INERTIA * box.inertia[0] / seen, INERTIA * box.inertia[1] * seen),
+        "plant.road.w4": tuple(RIG.w4 * x for x in box.height),
+        "plant.road.a": tuple(RIG.a * x**RIG.q for x in box.place),
+    }
+    model = SlipModel(slip=fixed.slip)
+    plain, ranged = polytope(model, narrow), polytope(model, wide)
+    lq = [Spec(Q=q, R=1.0) for q in itertools.product(*config.weights)]
+    fast = [Spec(Q=(1e4, 1e2), R=1.0, decay=rate) for rate in config.decays]
+    kept = [Spec(l2=_disturbance(effort)) for effort in config.efforts]
+    return {
+        "LMI": list(_gains(plain, lq)),
+        "LMI, wide": list(_gains(ranged, lq)),
+        "decay, wide": list(_gains(ranged, fast)),
+        "H-infinity, wide": list(_gains(ranged, kept)),
+    }
+
+
+def _disturbance(effort: float) -> L2Gain:
+    """From a torque that disturbs to (integral of the slip error, slip error, effort times torque)."""
+    return L2Gain(output=[[10.0, 0.0], [0.0, 1.0], [0.0, 0.0]], feedthrough=[[0.0], [0.0], [effort]])
+
+
+def _gains(system: Any, specs: list[Spec]) -> Iterator[np.ndarray]:
+    for spec in specs:
+        try:
+            yield np.asarray(design(system, spec).gain[0])
+        except DesignError:
+            continue
+
+
+def contenders(
+    config: Others, box: Box, fixed: Fixed, speed: str, estimator: Any, score: Score, told: Callable[[str], None]
+) -> dict[str, tuple[Loop, int]]:
+    """Loops by name, and the runs that it took to find each."""
+
+    def feedback(gain: Any) -> Loop:
+        return loop(fixed, StateFeedback(gain=np.asarray(gain, float)), speed, estimator=estimator)
+
+    found: dict[str, tuple[Loop, int]] = {"published gain": (feedback(lmi_design.PUBLISHED), 0)}
+    for name, gains in designs(config, box, fixed).items():
+        score.rollouts = 0
+        those = [feedback(gain) for gain in gains]
+        if those:
+            found[f"{name}, best of {len(those)}"] = (
+                those[int(np.argmin([score(one) for one in those]))],
+                score.rollouts,
+            )
+        told(name)
+    cured: Any = load("slip-cured", integrated=False).loop
+    target = FilteredSlip(slip=fixed.slip, time_constant=cured.reference.time_constant)
+    first = ProportionalFeedback(gain=np.asarray(cured.controller.controller.gain, float))
+    found["first cure"] = (loop(fixed, first, speed, target, estimator), 0)
+    pi = PID(kp=config.pi[0], ki=config.pi[1], antiwindup=BackCalculation(tracking_time=config.tracking_time))
+    mode = SlidingMode(gain=config.sliding[0], boundary=config.sliding[1])
+    searches = {
+        "PI, Nelder-Mead": (nelder_mead, pi, ("kp", "ki"), config.pi_ranges),
+        "PI, CMA-ES": (cma_es, pi, ("kp", "ki"), config.pi_ranges),
+        "sliding mode, CMA-ES": (cma_es, mode, ("gain", "boundary"), config.sliding_ranges),
+    }
+    for name, (search, controller, paths, ranges) in searches.items():
+        score.rollouts = 0
+        one = loop(fixed, controller, speed, estimator=estimator)
+        free = {f"controller.controller.{path}": ends for path, ends in zip(paths, ranges, strict=True)}
+        found[name] = (search(score, one, free, config), score.rollouts)
+        told(name)
+    return found

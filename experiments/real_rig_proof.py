@@ -1,0 +1,114 @@
+"""What can be proved of the controllers of `real_rig.py`: the sampled loop with lag and computing delay, over the box.
+
+States: integral of the slip error, slip error, torque of the brake, torque of the last sample. In a run only the speed
+varies (and how fast it falls, and where on the friction curve the error of the speed puts the wheel); mass, inertia,
+friction, lag and delay are constant. So the box is cut into cells of lag and delay, and a Lyapunov matrix for each cell
+proves the whole; within a cell everything may vary at will.
+
+A controller in proportion to the speed as it is seen cancels the error of that speed: the slip as it is seen moves by
+v/v_seen of the true one, and the gain is v_seen/v of what it should be. A fixed gain is off by that error, which is a
+range of the inertia."""
+
+import dataclasses
+import itertools
+from typing import Any
+
+import numpy as np
+from real_rig_box import INERTIA, KMH, Box, Fixed
+
+from diffabs import Loop
+from diffabs.actuators import Lag
+from diffabs.controllers import PID, ProportionalFeedback, StateFeedback
+from diffabs.design import certify
+from diffabs.design.parameter_box import polytope
+from diffabs.design.speed_scaled import SpeedScaled, fall
+from diffabs.linear.slip_model import Sampling, SlipModel
+from diffabs.roads import RIG
+
+
+@dataclasses.dataclass(frozen=True)
+class Proving:
+    """Every number of the proofs."""
+
+    cuts: int = 2  # of lag, and of delay
+    fastest: float = 8.8  # m/s^2, more than the friction of the box gives
+    slips: tuple[float, float] = (0.2, 0.2)  # where the wheel may be
+    grid: int = 5
+
+
+def gain(one: Loop) -> tuple[np.ndarray, str] | None:
+    """K of a linear controller, and whether it is fixed or proportional to the speed; None for another."""
+    inner: Any = one.controller.controller  # pyright: ignore[reportAttributeAccessIssue]
+    if isinstance(inner, PID):
+        return np.array([-float(inner.ki), -float(inner.kp)]), "fixed"
+    if isinstance(inner, StateFeedback):
+        return np.asarray(inner.gain, float), "fixed"
+    if isinstance(inner, ProportionalFeedback):
+        return np.asarray(inner.gain, float), "proportional"
+    return None
+
+
+def cells(config: Proving, box: Box) -> list[dict[str, tuple[float, float]]]:
+    """Ranges of lag and delay."""
+    lags = np.geomspace(*box.lag, config.cuts + 1)
+    delays = np.linspace(*box.delay, config.cuts + 1)
+    pairs = itertools.product(itertools.pairwise(lags.tolist()), itertools.pairwise(delays.tolist()))
+    return [{"actuator.time_constant": lag, "sampling.delay": delay} for lag, delay in pairs]
+
+
+def system(config: Proving, box: Box, fixed: Fixed, kind: str, cell: dict[str, tuple[float, float]]) -> Any:
+    """The polytope of a cell."""
+    model = SlipModel(
+        slip=fixed.slip, actuator=Lag(time_constant=box.lag[0]), sampling=Sampling(period=fixed.period, delay=0.0)
+    )
+    low, high = fixed.end / KMH, box.speed[1] / KMH
+    seen = 1 + box.first[1] if kind == "fixed" else 1.0
+    over = {
+        "plant.mass": box.mass,
+        "plant.wheel_inertia": (INERTIA * box.inertia[0] / seen, INERTIA * box.inertia[1] * seen),
+        "plant.road.w4": tuple(RIG.w4 * x for x in box.height),
+        "speed": (low, high),
+        **({"slip": config.slips} if config.slips[0] < config.slips[1] else {}),
+        **cell,
+    }
+    if kind == "fixed":
+        return polytope(model, over, grid=config.grid)
+    scaled = SpeedScaled(model=model, reference_speed=50 / KMH)
+    falls = {"fall": (0.0, fall(config.fastest, low, fixed.period))}
+    return polytope(scaled, {f"model.{path}": ends for path, ends in over.items()} | falls, grid=config.grid)
+
+
+def proofs(config: Proving, box: Box, fixed: Fixed, ones: dict[str, Loop]) -> dict[str, dict[str, Any]]:
+    """What is proved of each: in how many cells there is a common P, and the slowest decay that it proves."""
+    kinds = {name: found for name, one in ones.items() if (found := gain(one)) is not None}
+    said: dict[str, dict[str, Any]] = {
+        name: {"said": "not linear", "cells": 0, "of": 0} for name in ones if name not in kinds
+    }
+    systems = {
+        kind: [system(config, box, fixed, kind, cell) for cell in cells(config, box)]
+        for kind in {kind for _, kind in kinds.values()}
+    }
+    for name, (k, kind) in kinds.items():
+        said[name] = _one(k, systems[kind])
+    return said
+
+
+def _one(k: np.ndarray, those: list[Any]) -> dict[str, Any]:
+    found = [certify(np.concatenate([k, np.zeros(those[0].order - len(k))]), one, fastest=True) for one in those]
+    stable = [proof.quadratically_stable for proof in found]
+    rates = [proof.decay_rate for proof in found if proof.quadratically_stable]
+    worst = max(float(np.max(proof.frozen)) for proof in found)
+    word = "proved" if all(stable) else "refuted" if False in stable else "undecided"
+    if worst >= 1:
+        word = "unstable"
+    return {
+        "said": word,
+        "cells": sum(s is True for s in stable),
+        "of": len(found),
+        "decay [1/s]": min(rates) if len(rates) == len(found) else None,
+        "largest frozen |pole|": worst,
+        "vertices": [one.vertices for one in those],
+        "verified exactly": all(
+            proof.verified_exactly for proof, s in zip(found, stable, strict=True) if s is not None
+        ),
+    }

@@ -1,0 +1,116 @@
+"""Estimator, reference and controller of `real_rig.py` tuned together by gradients, over thousands of lanes."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from real_rig_box import KNOWN, Box, Fixed, batch, columns, spread
+from real_rig_floor import floor, stopping_time
+from real_rig_loops import loop
+
+from diffabs import Batch, FixedStep, Loop
+from diffabs.controllers import BackCalculation, ProportionalFeedback
+from diffabs.objectives import IAE, Overshoot
+from diffabs.references import LimitedSlip
+from diffabs.sensors import SpeedEstimator
+from diffabs.tune import CVaR, Method, Mode, SmoothWorst, Stopping, Tuned, tune
+
+MEASURED = {"overshoot": Overshoot(), "iae": IAE()}
+
+
+@dataclasses.dataclass(frozen=True)
+class Tuning:
+    """Every number of the tuning. Paths of the sensor are those of the loop whose speed is estimated."""
+
+    weights: Mapping[str, float] = dataclasses.field(default_factory=lambda: {"overshoot": 1.0, "iae": 1.0})  # 1, 1/s
+    step: float = 1e-3  # s
+    few: int = 512  # lanes on which all starts are tried
+    lanes: int = 4096  # lanes on which the best of them is tuned
+    starts: int = 4
+    tried: int = 12  # steps of each start
+    iterations: int = 8  # steps of the best
+    level: float = 0.95  # of CVaR
+    softness: float = 0.3  # of the smooth worst case, in units of the mean
+    seed: int = 19
+    gain: tuple[float, float] = (-2000.0, -120.0)  # starts, at 50 km/h
+    rate: float = 4.0  # 1/s
+    time_constant: float = 0.02  # s
+    tracking_time: float = 0.05  # s
+    free: Mapping[str, Any] = dataclasses.field(
+        default_factory=lambda: {
+            "controller.controller.gain": ((-2e4, -400.0), (-10.0, -10.0)),
+            "controller.controller.antiwindup.tracking_time": (0.002, 1.0),
+            "reference.rate": (0.5, 20.0),
+            "reference.time_constant": (0.002, 0.1),
+        }
+    )
+    of_estimator: Mapping[str, Any] = dataclasses.field(
+        default_factory=lambda: {"sensor.blocks.4.gate": (0.003, 0.3), "sensor.blocks.4.growth": (1e-3, 3.0)}
+    )
+
+
+class Above:
+    """An aggregate of what the lanes' numbers exceed their floors by: what a controller can do something about."""
+
+    def __init__(self, inner: Any, floors: np.ndarray):
+        """`floors`: of the weighted sum of the metrics (lanes,)."""
+        self.inner, self.floors = inner, floors
+
+    def __call__(self, values: Any) -> Any:
+        """values (n,) -> scalar."""
+        return self.inner(values - self.floors)
+
+
+def start(config: Tuning, fixed: Fixed, speed: str) -> Loop:
+    """What is tuned, before: with noise in place of the quantisation."""
+    windup = BackCalculation(tracking_time=config.tracking_time)
+    controller = ProportionalFeedback(gain=np.array(config.gain), antiwindup=windup)
+    target = LimitedSlip(slip=fixed.slip, rate=config.rate, time_constant=config.time_constant)
+    return loop(fixed, controller, speed, target, SpeedEstimator(period=fixed.period), smooth=True)
+
+
+def longest(points: dict[str, np.ndarray], fixed: Fixed) -> np.ndarray:
+    """In which every lane is sure to end [s]."""
+    return 0.3 + 1.2 * stopping_time(points, fixed)
+
+
+def lanes(config: Tuning, box: Box, fixed: Fixed, speed: str, count: int) -> tuple[Batch, np.ndarray]:
+    """Points of the box, spread evenly, with their noise; and the floor of the objective of each."""
+    points = spread(box, speed, count, config.seed)
+    found = dataclasses.replace(batch(columns(points), config.seed), durations=longest(points, fixed))
+    return found, config.weights["overshoot"] * floor(points, speed, fixed)
+
+
+def tuned(
+    config: Tuning, box: Box, fixed: Fixed, speed: str, progress: Callable[[str], None] = lambda line: None
+) -> dict[str, Tuned]:
+    """The best of several starts on few lanes, under CVaR; and from there on many, under CVaR and the smooth worst."""
+    subject = start(config, fixed, speed)
+    free = {**config.free, **({} if speed == KNOWN else config.of_estimator)}
+
+    def search(name: str, subject: Loop, aggregate: Any, count: int, starts: int, iterations: int) -> Tuned:
+        over, floors = lanes(config, box, fixed, speed, count)
+        method = Method(
+            starts=starts, seed=config.seed, mode=Mode.FORWARD, stopping=Stopping(change=1e-4, iterations=iterations)
+        )
+        return tune(
+            subject,
+            free=free,
+            objective=config.weights,
+            over=over,
+            solver=FixedStep(step=config.step, duration=float(np.max(over.durations)), kinks=False),
+            measured=MEASURED,
+            aggregate=Above(aggregate, floors),
+            method=method,
+            progress=lambda p: progress(f"{speed}, {name}: {p.point.evaluations} gradients, {p.point.objective:.5g}"),
+        )
+
+    risk, worst = CVaR(level=config.level), SmoothWorst(softness=config.softness)
+    first = search("starts", subject, risk, config.few, config.starts, config.tried)
+    cvar = search("CVaR", first.part, risk, config.lanes, 1, config.iterations)
+    return {
+        "starts": first,
+        "CVaR": cvar,
+        "smooth worst": search("smooth worst", cvar.part, worst, config.lanes, 1, config.iterations),
+    }
