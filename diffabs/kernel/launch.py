@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.kernel import compilers, cpp, program
+from diffabs.kernel import compilers, cpp, gpu, program
 
 LARGE = 2500  # operations; the blocks of a larger program are of fewer vectors, or compiling takes long
 VECTORS = 4
@@ -41,38 +41,36 @@ def run_lanes(
     Works under jit and vmap; no derivatives. Raises Unsupported for an operation that has no rule, NoCompiler."""
     shape = cpp.Shape(VECTORS, steps, rounds)
     functions = {"renew": renew, "step": step, "running": running}
-    made = compiled(functions, jax.tree.map(_one, lane), jax.tree.map(_one, carry), shape)
+    found = program.build(functions, jax.tree.map(_one, lane), jax.tree.map(_one, carry))
     leaves, tree = jax.tree.flatten(carry)
-    given = [data(x) for x in (*made.uniform, *jax.tree.leaves(lane), *leaves)]
-    first = len(given) - len(leaves)
-    results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in given[first:]]
+    given = [data(x) for x in (*found.uniform, *jax.tree.leaves(lane), *leaves)]
+    results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in given[len(given) - len(leaves) :]]
+    ended = (gpu.call if gpu.device() else _call)(found, shape, given, results)
+    return tree.unflatten([_like(x, leaf) for x, leaf in zip(ended, leaves, strict=True)])
+
+
+def _call(found: program.Program, shape: cpp.Shape, given: list[Any], results: list[Any]) -> list[Any]:
+    """What `gpu.call` returns, by the processor."""
+    first = len(given) - len(results)
     call = jax.ffi.ffi_call(
-        made.target,
+        register(compilers.library(_source(found, shape))),
         results,
         vmap_method="sequential",
-        input_output_aliases={first + i: i for i in range(len(leaves))},
+        input_output_aliases={first + i: i for i in range(len(results))},
     )
-    found = call(*given, threads=np.int64(threads()))
-    return tree.unflatten([_like(x, leaf) for x, leaf in zip(found, leaves, strict=True)])
+    return call(*given, threads=np.int64(threads()))
 
 
-class Compiled:
-    """A program that XLA can call: its `target`, and the arrays that all lanes share."""
-
-    def __init__(self, target: str, uniform: list[Any], source: str):
-        """Registered already."""
-        self.target, self.uniform, self.source = target, uniform, source
-
-
-def compiled(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any, shape: cpp.Shape) -> Compiled:
-    """Return the functions `renew`, `step` and `running` of one lane as a program that XLA can call; lane and carry of
-    these shapes. Raises Unsupported, NoCompiler."""
-    found = program.build(functions, lane, carry)
+def _source(found: program.Program, shape: cpp.Shape) -> str:
     source = cpp.text(found, shape)
-    count = cpp.operations(source)
-    if count > LARGE and shape.vectors > 1:
-        source = cpp.text(found, shape._replace(vectors=shape.vectors // 2))
-    return Compiled(register(compilers.library(source)), found.uniform, source)
+    if cpp.operations(source) > LARGE and shape.vectors > 1:
+        return cpp.text(found, shape._replace(vectors=shape.vectors // 2))
+    return source
+
+
+def described() -> dict[str, str]:
+    """Return what decides the bits of a kernel besides its text: compiler, flags, processor. Raises NoCompiler."""
+    return gpu.described() if gpu.device() else compilers.described()
 
 
 def register(path: pathlib.Path) -> str:
