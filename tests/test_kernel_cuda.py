@@ -1,5 +1,5 @@
-"""The kernels of a GPU: their text run thread by thread on the processor, their machine code where NVRTC's wheel is, and
-on a GPU where there is one (marker gpu)."""
+"""The kernels of a GPU: text run thread by thread on the processor, machine code where NVRTC is found, and on a GPU
+where there is one (marker gpu)."""
 
 import ctypes
 import dataclasses
