@@ -5,16 +5,20 @@ The rate is measured first, by a kernel that only multiplies and adds. The share
 multiplications and divisions of a step as the program has them, one each, times the steps of the runs; selections,
 comparisons, elementary functions and whole numbers count nothing. Times are taken in turn, medians of `--rounds`.
 
-Never run yet where this was written: no machine there has a GPU.
+Never run yet where this was written: no machine there has a GPU. With --machine-code no GPU is asked for: registers and
+spills of the packaged scenarios for sm_80 and sm_90, as NVRTC's assembler tells them.
 
     python benchmarks/bench_gpu.py [--lanes 131072 1048576] [--dtypes float32 float64] [--rounds 5]
+    python benchmarks/bench_gpu.py --machine-code
 """
 
 import argparse
 import ctypes
 import functools
+import os
 import pathlib
 import statistics
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -25,9 +29,13 @@ from peers import on_devices, problem, reference
 from rich.console import Console
 from rich.table import Table
 
-from diffabs.kernel import cuda, gpu
+import diffabs
+from diffabs import scenario
+from diffabs.core.pytree import get
+from diffabs.kernel import cuda, gpu, kept, launch, nvrtc
 from diffabs.kernel.graph import Level, real
 from diffabs.kernel.program import Program, live
+from diffabs.simulate import native
 
 ACCURACY = 1e-4
 STEPS, TOLERANCES = (1e-3, 5e-4, 2e-4, 1e-4), (1e-5, 5e-6, 1e-6)
@@ -88,14 +96,14 @@ def solvers(masses, speeds, dtype):
     """Return, by name, the settings of each contender, and what makes its program for one."""
     from peers import ours
 
-    def diffabs(kind, engine):
+    def of(kind, engine):
         return lambda setting: ours.prepared_with(kind, masses, speeds, setting, dtype, engine)
 
     found = {
-        "kernel, FixedStep": (STEPS, diffabs("fixed", "kernel")),
-        "kernel, Adaptive": (TOLERANCES, diffabs("adaptive", "kernel")),
-        "XLA, FixedStep": (STEPS, diffabs("fixed", "xla")),
-        "XLA, Adaptive": (TOLERANCES, diffabs("adaptive", "xla")),
+        "kernel, FixedStep": (STEPS, of("fixed", "kernel")),
+        "kernel, Adaptive": (TOLERANCES, of("adaptive", "kernel")),
+        "XLA, FixedStep": (STEPS, of("fixed", "xla")),
+        "XLA, Adaptive": (TOLERANCES, of("adaptive", "xla")),
     }
     try:
         from peers import diffrax_event
@@ -142,32 +150,74 @@ def measured(lanes, dtype, rounds, peak):
     return rows
 
 
-def main():
+class Translated(Exception):
+    """A program, and how it is to be run."""
+
+
+def translated(name, dtype):
+    """Return program and shape of a packaged scenario."""
+
+    def call(found, shape, given, results):
+        raise Translated(found, shape)
+
+    one, path = scenario.load(name), "initial.theta" if name.startswith("arm") else "initial.speed"
+    lanes = diffabs.Batch({path: np.full(2, float(get(one.loop, path)))}, np.arange(2))
+    given = (one.loop, lanes, one.solver, one.objectives)
+    off = mock.patch.dict(os.environ, {kept.OFF: "1"})
+    with jax.enable_x64(dtype == "float64"), mock.patch.object(launch, "_call", call), off:
+        native._made.forget()
+        try:
+            diffabs.run_batch(*given, together=False, accepted=True, engine="kernel")
+        except Translated as done:
+            return done.args
+    raise AssertionError("no kernel was asked for")
+
+
+def in_registers(dtypes):
+    """Print what a thread of each packaged scenario needs."""
+    table = Table("", "numbers", "", "operations", "real ones", "registers", "bytes spilled")
+    for name in scenario.names():
+        for dtype in dtypes:
+            program, shape = translated(name, dtype)
+            source = cuda.source(program, shape)
+            operations = (len(live(program.results["step"])), arithmetic(program))
+            for architecture in ("sm_80", "sm_90"):
+                log = nvrtc.machine_code(source.text, architecture).with_suffix(".log").read_text()
+                used = nvrtc.registers(log)["run_all"]
+                numbers = map(str, (*operations, used["registers"], used["spilled"]))
+                table.add_row(name, dtype, architecture, *numbers)
+    Console().print(table)
+
+
+def on_a_gpu(options):
     """Measure, print, write. Exits where JAX runs on no GPU."""
+    on = gpu.device()
+    if on is None:
+        raise SystemExit("JAX runs on no GPU here: pip install jax[cuda13] on a machine with one")
+    peak, rounds = rate(on, options.rounds), options.rounds
+    rows = [row for n in options.lanes for dtype in options.dtypes for row in measured(n, dtype, rounds, peak)]
+    table = Table("", "lanes", "numbers", "setting", "worst error", "runs/s", "of FP32 peak")
+    for row in rows:
+        share = f"{row['share']:.1%}" if "share" in row else ""
+        shown = (f"{row['lanes']:,}", row["dtype"], f"{row['setting']:g}", f"{row['error']:.1e}", f"{row['runs']:,.0f}")
+        table.add_row(row["name"], *shown, share)
+    Console().print(table, f"FP32, measured: {peak / 1e12:.1f} Tflop/s")
+    print(record.written("gpu", {"rows": rows, "fp32_flops": peak, "accuracy": ACCURACY}, options.out))
+
+
+def main():
+    """Do what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lanes", type=int, nargs="+", default=[1 << 17, 1 << 20])
     parser.add_argument("--dtypes", nargs="+", default=["float32", "float64"], choices=("float32", "float64"))
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--out", type=pathlib.Path)
+    parser.add_argument("--machine-code", action="store_true")
     options = parser.parse_args()
-    on = gpu.device()
-    if on is None:
-        raise SystemExit("JAX runs on no GPU here: pip install jax[cuda13] on a machine with one")
-    peak = rate(on, options.rounds)
-    rows = [row for n in options.lanes for dtype in options.dtypes for row in measured(n, dtype, options.rounds, peak)]
-    table = Table("", "lanes", "numbers", "setting", "worst error", "runs/s", "of FP32 peak")
-    for row in rows:
-        share = f"{row['share']:.1%}" if "share" in row else ""
-        numbers = (
-            f"{row['lanes']:,}",
-            row["dtype"],
-            f"{row['setting']:g}",
-            f"{row['error']:.1e}",
-            f"{row['runs']:,.0f}",
-        )
-        table.add_row(row["name"], *numbers, share)
-    Console().print(table, f"FP32, measured: {peak / 1e12:.1f} Tflop/s")
-    print(record.written("gpu", {"rows": rows, "fp32_flops": peak, "accuracy": ACCURACY}, options.out))
+    if options.machine_code:
+        in_registers(options.dtypes)
+    else:
+        on_a_gpu(options)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@ where there is one (marker gpu)."""
 
 import ctypes
 import dataclasses
+import importlib
+import pathlib
 from typing import NamedTuple
 
 import jax
@@ -17,8 +19,7 @@ from test_kernel import AT_ONCE, DIVERGING, KEYS, LOOP, MEASURED, NEVER, SOLVER,
 
 import diffabs as d
 from diffabs import scenario
-from diffabs.core.pytree import get
-from diffabs.kernel import compilers, cuda, gpu, kept, launch, nvrtc
+from diffabs.kernel import compilers, cuda, gpu, kept, nvrtc
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import native
@@ -114,28 +115,6 @@ BOUNDS = {
 }
 
 
-def translated(name, monkeypatch):
-    """Program and shape of a packaged scenario."""
-    taken = {}
-
-    class Enough(Exception):
-        pass
-
-    def call(found, shape, given, results):
-        taken.update(found=found, shape=shape)
-        raise Enough
-
-    one = scenario.load(name)
-    path = cases.VARIED.get(name, "initial.speed")
-    values = {path: float(get(one.loop, path)) * np.linspace(0.98, 1.0, 4)}
-    with monkeypatch.context() as patch:
-        patch.setattr(launch, "_call", call)
-        lanes = d.Batch(values, np.arange(4))
-        with pytest.raises(Enough):
-            d.run_batch(one.loop, lanes, one.solver, one.objectives, together=False, accepted=True, engine="kernel")
-    return taken["found"], taken["shape"]
-
-
 class TestMachineCode:
     @pytest.fixture(autouse=True)
     def _compiler(self):
@@ -147,8 +126,8 @@ class TestMachineCode:
     @pytest.mark.parametrize("architecture", ["sm_80", "sm_90"])
     @pytest.mark.parametrize(("name", "dtype"), BOUNDS, ids=map("-".join, BOUNDS))
     def test_of_a_scenario_stays_in_registers(self, name, dtype, architecture, monkeypatch):
-        with jax.enable_x64(dtype == "float64"):
-            source = cuda.source(*translated(name, monkeypatch))
+        monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parent.parent / "benchmarks"))
+        source = cuda.source(*importlib.import_module("bench_gpu").translated(name, dtype))
         code = nvrtc.machine_code(source.text, architecture)
         assert code.read_bytes()[:4] == b"\x7fELF"
         used = nvrtc.registers(code.with_suffix(".log").read_text())["run_all"]

@@ -58,7 +58,7 @@ def _call(found: program.Program, shape: cpp.Shape, given: list[Any], results: l
         vmap_method="sequential",
         input_output_aliases={first + i: i for i in range(len(results))},
     )
-    return call(*given, threads=np.int64(threads()))
+    return [*call(*given, threads=np.int64(threads()))]
 
 
 def _source(found: program.Program, shape: cpp.Shape) -> str:
