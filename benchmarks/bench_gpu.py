@@ -157,15 +157,15 @@ class Translated(Exception):
 def translated(name, dtype):
     """Return program and shape of a packaged scenario."""
 
-    def call(found, shape, given, results):
-        raise Translated(found, shape)
+    def launched(made, before, carry, shape):
+        raise Translated(made, shape)
 
     one, path = scenario.load(name), "initial.theta" if name.startswith("arm") else "initial.speed"
     lanes = diffabs.Batch({path: np.full(2, float(get(one.loop, path)))}, np.arange(2))
     given = (one.loop, lanes, one.solver, one.objectives)
     off = mock.patch.dict(os.environ, {kept.OFF: "1"})
-    with jax.enable_x64(dtype == "float64"), mock.patch.object(launch, "_call", call), off:
-        native._made.forget()
+    with jax.enable_x64(dtype == "float64"), mock.patch.object(launch, "_launched", launched), off:
+        native._kept.forget()
         try:
             diffabs.run_batch(*given, together=False, accepted=True, engine="kernel")
         except Translated as done:

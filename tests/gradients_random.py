@@ -24,9 +24,9 @@ doing: at a quarter of the step all widths say the same.
 Of `nearby` and `curved` the derivative is known all the same, from the narrow two or by extrapolation; how many
 gradients agree with that to 1e-2 is said, and does not count.
 
-A derivative must not change the value: that beside the gradient is the value (1e-9), and that of a run which locates no
-kinks (1e-5) but for the step's error, which is of first order where a rate jumps (conditional integration): at a
-quarter of the step it must be nearer. Else the value has `moved`, and counts as a wrong entry. Not collected by pytest;
+A derivative must not change the value: that beside the gradient is the value (1e-9), and that of a run as it is without
+a derivative, whose kinks are not located unless a rate jumps there (1e-5), but for the step's error: at a quarter of
+the step it must be nearer. Else the value has `moved`, and counts as a wrong entry. Not collected by pytest;
 `test_gradients_random.py` runs some."""
 
 import argparse
@@ -73,7 +73,7 @@ class Found(NamedTuple):
     sides: np.ndarray  # (widths, 2, m, n), objectives at +width and -width
     ended: bool  # the run itself reached its stop, or the end of its time if it has none
     beside: np.ndarray  # (m,), values that come with the gradient
-    plain: np.ndarray  # (m,), values of a run that locates no kinks
+    plain: np.ndarray  # (m,), values without a derivative
     closer: Any = False  # (m, n), entries whose differences are not to be believed
     moved: tuple[str, ...] = ()  # objectives whose value is another one beside a gradient
 
@@ -102,7 +102,7 @@ class Program:
             return jax.jacfwd(twice, argnums=2, has_aux=True)(*args)
 
         self.values = jax.jit(jax.vmap(partial(one, slow), (None, None, 0)))
-        self.plain = jax.jit(partial(one, FixedStep(step, duration, kinks=False)))
+        self.plain = jax.jit(partial(one, FixedStep(step, duration)))
         self.slopes = jax.jit(with_slopes)
 
     @cached_property
@@ -340,7 +340,7 @@ def line(row: dict[str, Any]) -> str:
     """A wrong entry in a line."""
     differences = ", ".join(f"{x:.6g}" for x in row["differences"])
     if row["parameter"] == "value":
-        found = f"{row['value']:.9g}; beside a gradient {row['gradient']:.9g}, without kinks {differences}"
+        found = f"{row['value']:.9g}; beside a gradient {row['gradient']:.9g}, without {differences}"
         return f"loop {row['loop']:>3} ({row['structure']}): {row['objective']} = {found}"
     of = f"d {row['objective']} / d {row['parameter']}"
     return f"loop {row['loop']:>3} ({row['structure']}): {of} = {row['gradient']:.6g}; differences {differences}"

@@ -18,6 +18,7 @@ import sys
 import tempfile
 from typing import NamedTuple
 
+from mutations_face import FACE
 from mutations_kernel import KERNEL
 from mutations_sweep import SWEEP
 
@@ -44,11 +45,25 @@ MUTATIONS = [
         "test_kinks.py::test_who_looks_sees_what_is_contradicted_and_by_how_much[gt]",
     ),
     Mutation(
-        "an integral that stays clamped where comparisons are held",
+        "an equality that nobody holds, in the rate of an integral that waits",
         "controllers/antiwindup.py",
-        "jnp.not_equal(raw, limited) & ",
-        "",
-        "test_kinks.py::test_an_integral_that_was_clamped_goes_on",
+        "(raw - limited) * gain * error > 0",
+        "jnp.not_equal(raw, limited) & ((raw - limited) * gain * error > 0)",
+        "test_kinks.py::test_where_a_rate_jumps_a_value_is_right_too",
+    ),
+    Mutation(
+        "values that step over a rate's jump",
+        "simulate/methods.py",
+        "loop.jumps if self.kinks is None",
+        "False if self.kinks is None",
+        "test_kinks.py::test_where_a_rate_jumps_a_value_is_right_too",
+    ),
+    Mutation(
+        "a lab rig that says nothing of its locking",
+        "plants/lab_rig.py",
+        "jumps = True",
+        "jumps = False",
+        "test_kinks.py::test_a_wheel_that_locks_does_so_at_its_moment",
     ),
     Mutation(
         "a search that nobody looks at",
@@ -277,8 +292,8 @@ MUTATIONS = [
     Mutation(
         "a step without the derivative in its parameters",
         "simulate/rk4.py",
-        "return jax.jvp(step, (moving,), (rates,))",
-        "return jax.jvp(step, (moving,), ([*rates[:2], *(0.0 * r for r in rates[2:])],))",
+        "pushed(lambda *step: _scan(f, *step), primals",
+        "pushed(lambda *step: _scan(f, *step[:4], jax.lax.stop_gradient(step[4])), primals",
         "test_checkpoints.py::test_reverse_forward_and_differences_agree_in_nested_scans",
     ),
     Mutation(
@@ -1544,6 +1559,7 @@ MUTATIONS = [
     ),
     *(Mutation(*each) for each in SWEEP),
     *(Mutation(*each) for each in KERNEL),
+    *(Mutation(*each) for each in FACE),
     Mutation(
         "lanes that one run would refuse are run",
         "simulate/refill.py",

@@ -62,6 +62,9 @@ class Slow(NamedTuple):
 
     speeds: Any
 
+    def own(self, number):
+        return number
+
     def reached(self, number, output):
         return output.speed < self.speeds[jnp.minimum(number, len(self.speeds) - 1)]
 

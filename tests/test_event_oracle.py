@@ -7,7 +7,8 @@ import numpy as np
 import oracles
 import pytest
 
-from diffabs import controllers
+import diffabs as d
+from diffabs import controllers, objectives
 
 STEP = 1e-4
 SLOW = ("robust, PI", "spline, latch, PI", "spline, latch, P", "fixed slip, P")
@@ -46,6 +47,13 @@ def test_derivative_through_events(name, ours):
 @pytest.mark.parametrize("name", LOOPS)
 def test_value_across_events(name, ours):
     assert misses(ours(name)[0], event_oracle.values(name), 1e-8, FLOOR) == []
+
+
+def test_values_are_as_right_where_a_rate_jumps():
+    """Without being asked: conditional integration begins and ends within a step."""
+    name = "fixed slip, PI, clamping"
+    metrics = d.measure(event_oracle.LOOPS[name], d.FixedStep(STEP, 4.0), objectives.BRAKING).metrics
+    assert misses([metrics[one] for one in event_oracle.METRICS], event_oracle.values(name), 1e-8, FLOOR) == []
 
 
 @pytest.mark.slow

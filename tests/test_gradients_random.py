@@ -14,13 +14,8 @@ COUNTS = dict.fromkeys(random_loops.STRUCTURES, 3) | {"relay, latch, lag": 6}  #
 LEFT_OUT = {"Quantisation", "PeakLiteral"}  # parts whose derivative says nothing of their jumps, as they document
 
 
-# Without kinks a value is of first order where a command bends that comes out of a delay: 5e-5 of IAE here, and the
-# quarter of a step has not brought it nearer. The gradients of this structure are right.
-BENT = pytest.param("rig, scheduled, delay", marks=pytest.mark.xfail(strict=True, reason="values without kinks"))
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*(name for name in COUNTS if name != BENT.values[0]), BENT])
+@pytest.mark.parametrize("name", COUNTS)
 def test_gradients_are_those_of_wide_differences(name):
     founds = studied(name, range(COUNTS[name]), seed=1, told=False)
     assert all(found.ended for found in founds)

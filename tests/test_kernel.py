@@ -87,7 +87,7 @@ class TestRuns:
 
     def test_do_not_depend_on_their_order_nor_on_threads(self, runs, monkeypatch):
         monkeypatch.setattr(launch, "threads", lambda: 3)
-        native._made.forget()
+        native._kept.forget()
         order = np.random.default_rng(1).permutation(LANES)
         values = {path: column[order] for path, column in VALUES.items()}
         found, _ = (lambda run: (run, None))(self._by_kernel(values, KEYS[order]))
@@ -139,8 +139,8 @@ class TestObjections:
 
     def test_without_a_compiler(self, monkeypatch, caplog):
         monkeypatch.setenv(compilers.COMPILER, "")
-        native._tell.cache_clear()
-        native._made.forget()
+        native.tell.cache_clear()
+        native._kept.forget()
         loop = d.replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
         line = native.objection(loop, VALUES, SOLVER, {})
         assert line == f"{compilers.COMPILER} is empty"
@@ -232,7 +232,7 @@ class TestSweep:
 
     def test_is_refused_before_anything_is_written(self, tmp_path, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, "")
-        native._made.forget()
+        native._kept.forget()
         study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
         with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {compilers.COMPILER} is empty"):
             sweep(dataclasses.replace(study, engine="kernel"), tmp_path / "out")

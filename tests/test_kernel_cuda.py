@@ -32,9 +32,9 @@ ON_GPU = jax.default_backend() == "gpu"
 def _own_folder(monkeypatch):
     monkeypatch.setenv(compilers.CACHE, FOLDER)
     monkeypatch.setenv(kept.OFF, "1")
-    native._made.forget()
+    native._kept.forget()
     yield
-    native._made.forget()
+    native._kept.forget()
 
 
 @pytest.fixture

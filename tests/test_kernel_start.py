@@ -37,11 +37,11 @@ def folder(monkeypatch):
     monkeypatch.setattr(kept, "FOLDER", f"programs-{secrets.token_hex(4)}")
     monkeypatch.setattr(launch, "VECTORS", 1)
     monkeypatch.delenv(kept.OFF, raising=False)
-    native._made.forget()
+    native._kept.forget()
     place = compilers.cache_folder() / kept.FOLDER
     yield place
     shutil.rmtree(place, ignore_errors=True)
-    native._made.forget()
+    native._kept.forget()
 
 
 def run(loop=LOOP, solver=SOLVER, measured=MEASURED, values=SPEEDS):
@@ -51,7 +51,7 @@ def run(loop=LOOP, solver=SOLVER, measured=MEASURED, values=SPEEDS):
 
 def again(**changed):
     """In what a new process has: nothing but files."""
-    native._made.forget()
+    native._kept.forget()
     return run(**changed)
 
 
@@ -65,8 +65,8 @@ def same_bits(a, b):
 def traced(monkeypatch):
     """How often a loop was translated."""
     count = []
-    build = program.build
-    monkeypatch.setattr(program, "build", lambda *args: (count.append(1), build(*args))[1])
+    trace = program.traced
+    monkeypatch.setattr(program, "traced", lambda *args: (count.append(1), trace(*args))[1])
     return count
 
 
@@ -218,9 +218,9 @@ class TestSurroundings:
     def test_differ_for_what_was_put_into_a_module(self, monkeypatch):
         """A constant, a function, a method of a class."""
         found = [fingerprint.surroundings()]
-        for owner, name in ((launch, "LARGE"), (landing, "seek"), (controllers.PID, "flow")):
+        for owner, name in ((launch, "LINES"), (landing, "seek"), (controllers.PID, "flow")):
             with monkeypatch.context() as patch:
-                patch.setattr(owner, name, 7 if name == "LARGE" else lambda *args: None)
+                patch.setattr(owner, name, 7 if name == "LINES" else lambda *args: None)
                 found.append(fingerprint.surroundings())
         assert len(set(found)) == 4
 

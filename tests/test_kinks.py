@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 import diffabs as d
-from diffabs.controllers import Clamping, ConstantTorque, StateFeedback
+from diffabs.actuators import Delay
+from diffabs.controllers import PID, Clamping, ConstantTorque, Sampled, StateFeedback
 from diffabs.core.kinks import Program
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import quotient, searchsorted
 from diffabs.core.pytree import param, pytree, static
 from diffabs.core.regime import Regime, crossing
-from diffabs.objectives import IAE, FinalError
+from diffabs.objectives import IAE, Effort, FinalError, LockedTime, StopDistance
 from diffabs.plants import LabRig, MirroredRig
 from diffabs.references import FixedSlip, Setpoint
 from diffabs.roads import DRY_ASPHALT
@@ -282,3 +283,43 @@ def test_an_integral_that_was_clamped_goes_on():
         d.measure(loop, d.FixedStep(1e-4, 1.0, kinks=kinks), {"iae": IAE()}).metrics["iae"] for kinks in (False, True)
     )
     np.testing.assert_allclose(located, plain, rtol=1e-3)
+
+
+def integrating(late: float) -> tuple[Loop, float]:
+    """The error falls in proportion to the time, and the torque with it, from its limit inwards: from that moment on
+    the integral grows. The command comes out `late`. The integral of its square, too."""
+    setpoint, kp, ki, most = 1.7337, 2.0, 1.0, 2.0
+    error, leaves = np.poly1d([-1.0, setpoint]), setpoint - most / kp
+    integral = error.integ() - error.integ()(leaves)
+    square = ((kp * error + ki * integral) ** 2).integ()
+    loop = clockwork(lambda x, a: 1.0 + 0.0 * x, jnp.asarray(0.0))
+    pid = PID(kp=kp, ki=ki, torque_max=most, antiwindup=Clamping())
+    parts = {"controller": pid, "reference": Setpoint(value=setpoint)}
+    parts |= {"actuator": Delay(time=late, capacity=128)} if late else {}
+    return Loop(**{**vars(loop), **parts}), most**2 * leaves + square(END - late) - square(leaves)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.0337])
+def test_where_a_rate_jumps_a_value_is_right_too(late):
+    """An integral that waits for a limit starts at once when the limit is left: in the middle of a step of 10 ms, which
+    is off by as much as it is long unless it ends there."""
+    loop, expected = integrating(late)
+    found = d.measure(loop, d.FixedStep(0.01, END), {"effort": Effort()}).metrics["effort"]
+    np.testing.assert_allclose(found, expected, rtol=1e-8)
+    held = Loop(**{**vars(loop), "controller": Sampled(controller=loop.controller, period=0.02)})
+    assert loop.jumps
+    assert not held.jumps  # nothing in it is integrated
+
+
+def test_a_wheel_that_locks_does_so_at_its_moment():
+    """Then the force of the lab rig's lever jumps: a value would depend on where in a step that is, to first order, and
+    by 3e-5 of the time here."""
+    loop = braking(
+        plant=LabRig(),
+        initial=d.BrakeStart(speed=8.0, slip=0.08),
+        controller=ConstantTorque(torque=0.9),
+        stop=SpeedReached(speed=4.5),
+    )
+    found = [d.measure(loop, d.FixedStep(h, 2.0), {"s": StopDistance(), "t": LockedTime()}) for h in (4e-4, 1e-4)]
+    for name in ("s", "t"):
+        np.testing.assert_allclose(found[0].metrics[name], found[1].metrics[name], rtol=1e-8)

@@ -21,6 +21,7 @@ from diffabs.cli import (
     console,
     design,
     identify,
+    margins,
     rare,
     reproduce,
     show,
@@ -232,6 +233,7 @@ usage.add(app, simulate, "simulate slip-lmi --set plant.mass=6.2 --plot run.png"
 usage.add(app, design.design, "design slip-lmi --set design.decay=80 --out gain.json")
 usage.add(app, design.certify, "certify slip-lmi --gain=-11753,-76.7")
 usage.add(app, design.verify, "verify gain.json")
+usage.add(app, margins.margins, "margins slip-cured --at speed=5 --plot loop.png")
 usage.add(app, tune.tune, "tune slip-cured --set reference.time_constant=0.03 --out tuned.toml")
 usage.add(app, identify.identify, "identify slip-lmi --data run.csv --free plant.mass=4:8")
 usage.add(app, sweep.sweep, "sweep slip-lmi --samples 10000 --set solver.step=1e-3 --figures")

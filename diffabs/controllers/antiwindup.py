@@ -23,11 +23,11 @@ class NoAntiWindup:
 class Clamping:
     """I' = e, but 0 while the output is at a limit and gain * e would push it further out (conditional integration)."""
 
+    jumps = True
+
     def rate(self, error: Scalar, gain: Scalar, raw: Scalar, limited: Scalar) -> Scalar:
         """I'."""
-        # Within the limits the product is 0 whatever the sign was, so who holds comparisons (`core.kinks`) would hold
-        # this one for ever; an equality is never held.
-        outward = jnp.not_equal(raw, limited) & ((raw - limited) * gain * error > 0)
+        outward = (raw - limited) * gain * error > 0
         return jnp.where(outward, 0.0, error)
 
 

@@ -54,13 +54,19 @@ class Sampled:
         """At a sampling instant: compute. What still waits, since the delay is a whole period, is applied."""
         m: SampledMemory = memory.held
         now, number = clock.ticks(self.period)
-        inner = self._sampled(clock._replace(h=self.period, k=number), m.inner, signal)
-        output = self.controller.output(clock.t, inner, signal)
-        flow = axpy(self.period, self.controller.flow(clock.t, inner, signal), inner.flow)
+        inner, output = self.computed(clock._replace(h=self.period, k=number), m.inner, signal)
         waits = jnp.greater(self.delay, 0)
         applied = jnp.where(waits, jnp.where(m.waits > 0.5, m.next, m.applied), output)
-        new = SampledMemory(Memory(flow, inner.held), applied, output, clock.t + self.delay, jnp.where(waits, 1.0, 0.0))
+        new = SampledMemory(inner, applied, output, clock.t + self.delay, jnp.where(waits, 1.0, 0.0))
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m))
+
+    def computed(self, clock: Clock, memory: Memory, signal: Tracking) -> tuple[Memory, Scalar]:
+        """What the computer does with one sample: the inner controller's memory after it, and the output. `clock` is
+        that of the period."""
+        inner = self._sampled(clock, memory, signal)
+        output = self.controller.output(clock.t, inner, signal)
+        flow = axpy(self.period, self.controller.flow(clock.t, inner, signal), inner.flow)
+        return Memory(flow, inner.held), output
 
     def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: Any) -> tuple[Any]:
         """The time until the output changes."""

@@ -2,7 +2,7 @@
 
 A step of a run chooses, of everything, between what was and what is to be. Of a table of a thousand rows that costs a
 copy of it each time, though one row is new. So a solver may lend the tables to the blocks, who then only say which row
-is to be written, and write these itself: at the end of a step, in place."""
+is to be written, and write these itself: at the end of a step, or before the next one reads, in place."""
 
 import dataclasses
 from functools import partial
@@ -54,6 +54,12 @@ def settle(tree: Any, rows: list[Any]) -> Any:
     """Return a tree whose logs have these rows, and the row that was put while they were lent."""
     each = iter(rows)
     return _mapped(lambda log: Log(next(each), log.place, log.row).put(log.place, log.row), tree)
+
+
+def written(tree: Any) -> list[Any]:
+    """Return the rows of all logs with the row that was put last. Who writes what the step before has put, and then
+    reads, does so in place; who reads first needs a copy, unless the row depends on what was read."""
+    return tables(settle(tree, tables(tree)))
 
 
 def _is_log(x: Any) -> bool:

@@ -16,8 +16,19 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.blocks import Direct, NoFeedforward, Passage, next_tick, offers, recorded
-from diffabs.core.protocols import Block, Clock, Feedforward, Memory, Plant, Reference, Sample, Stop, Tracking
-from diffabs.core.pytree import Scalar, part, pytree
+from diffabs.core.protocols import (
+    Block,
+    Clock,
+    Feedforward,
+    Memory,
+    Plant,
+    Reference,
+    Sample,
+    Stop,
+    Tracking,
+    no_flow,
+)
+from diffabs.core.pytree import Scalar, part, parts, pytree
 
 
 class LoopState(NamedTuple):
@@ -121,6 +132,11 @@ class Loop:
         return any(offers(getattr(self, name), "margins") for name in BLOCKS)
 
     @property
+    def jumps(self) -> bool:
+        """Whether a rate in the flow jumps where a comparison changes, as a part of the loop says."""
+        return any(_jumps(getattr(self, name)) for name in ("plant", *BLOCKS))
+
+    @property
     def recorders(self) -> tuple[str, ...]:
         """The blocks that record their signal, by name."""
         return tuple(name for name in BLOCKS if offers(getattr(self, name), "record"))
@@ -190,6 +206,13 @@ class Loop:
         target = self.reference.output(t, reference, measured)
         setpoint = self.reference.setpoint(reference)
         return Tracking(target, measured, self.feedforward.input(self.plant, measured, setpoint))
+
+
+def _jumps(one: Any) -> bool:
+    """Whether a part says so, or one in it; of a block without a flow nothing is integrated."""
+    if getattr(type(one), "flow", None) is no_flow:
+        return False
+    return getattr(one, "jumps", False) or any(map(_jumps, parts(one)))
 
 
 def _seen(signals: Signals) -> dict[str, Any]:

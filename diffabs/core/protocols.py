@@ -28,6 +28,7 @@ What a part may offer beyond its contract, as a method or an attribute of its cl
                    cautions()                           what is allowed but hardly meant
                    prepared(), refined(times)           the part for a run; for a step that is so many times shorter
                    family = "sensor"                    which blocks from outside it is among
+                   jumps = True                         its rates jump where a comparison changes: a step ends there
     block          tick()                               what a clock changes: see Ticking
                    margins(), event()                   what changes where a margin falls through zero: see Switching
                    period                               of its clock [s]; without it, it ticks on the whole grid

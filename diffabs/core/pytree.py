@@ -173,6 +173,15 @@ def _children(part: Any, prefix: str) -> Iterator[tuple[str, dataclasses.Field[A
                 yield prefix + field.name, field, getattr(part, field.name)
 
 
+def parts(part: Any) -> Iterator[Any]:
+    """The parts of which a part is made."""
+    for _, field, value in _children(part, ""):
+        if field is None:
+            yield value
+        elif "part" in field.metadata:
+            yield from value if isinstance(value, tuple) else (value,)
+
+
 def problems(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[str]:
     """One line for each field that is out of range, then what the parts themselves object to: the shapes of their
     fields (a method `problems`), and if these are right, the rules between their numbers (`rules`)."""

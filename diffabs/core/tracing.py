@@ -4,6 +4,22 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+from jax.custom_derivatives import SymbolicZero
+
+
+def pushed(function: Callable[..., Any], primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """Return function(*primals) and its derivative along tangents, of a rule with `symbolic_zeros`. Only what has a
+    tangent is differentiated: zeros worked out would cost as much as any other."""
+    values, tree = jax.tree.flatten(primals)
+    moves = tree.flatten_up_to(tangents)
+    live = [type(move) is not SymbolicZero for move in moves]
+
+    def run(moving: list[Any]) -> Any:
+        left = iter(moving)
+        return function(*tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)]))
+
+    moving, rates = ([x for x, on in zip(xs, live, strict=True) if on] for xs in (values, moves))
+    return jax.jvp(run, (moving,), (rates,))
 
 
 def separated(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[Any], Any]]:

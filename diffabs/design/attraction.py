@@ -94,10 +94,15 @@ class _Ellipsoids(NamedTuple):
     hopeless: Any
     system: Any
 
-    def reached(self, number: Any, output: Any) -> Any:
-        """Whether lane `number` is inside, with something to spare, or hopeless."""
+    def own(self, number: Any) -> Any:
+        """Root and hopelessness of lane `number`."""
         mine = self.system[jnp.minimum(number, len(self.system) - 1)]
-        return (jnp.sum((self.roots[mine] @ state_of(output)) ** 2) <= INSIDE) | self.hopeless[mine]
+        return self.roots[mine], self.hopeless[mine]
+
+    def reached(self, own: Any, output: Any) -> Any:
+        """Whether a lane is inside, with something to spare, or hopeless."""
+        root, hopeless = own
+        return (jnp.sum((root @ state_of(output)) ** 2) <= INSIDE) | hopeless
 
     def of(self, lanes: slice) -> "_Ellipsoids":
         """For some lanes only."""
@@ -109,36 +114,49 @@ class _Ellipsoids(NamedTuple):
 
 
 def outcomes(
-    loop: Loop, starts: Mapping[str, Any], solver: Solver, *, band: float | None = None, key: Any = None
+    loop: Loop,
+    starts: Mapping[str, Any],
+    solver: Solver,
+    *,
+    band: float | None = None,
+    key: Any = None,
+    engine: str = "xla",
 ) -> Outcomes:
     """Of lanes that differ in the values (lanes,) at these paths: what becomes of each within the solver's duration.
 
     band: |x| at the end of the run below which it counts as recovered, for loops of which no ellipsoid is known (noise,
         observers, samples), where nothing is proved of what comes after
     key: lanes of a noisy loop draw from fold_in(key, lane)
+    engine: what makes the runs, as in `run_batch`
 
     Raises ValueError for a loop of which no ellipsoid is known, without a band.
     """
     starts = {path: np.asarray(column) for path, column in starts.items()}
     count = len(next(iter(starts.values())))
     inside = _ellipsoids(loop, starts, count) if band is None else _ball(band, count)
-    return _outcomes(loop, starts, solver, inside, band is None, key)
+    return _outcomes(loop, starts, solver, inside, band is None, key, engine)
 
 
 def _outcomes(
-    loop: Loop, starts: dict[str, np.ndarray], solver: Solver, inside: "_Ellipsoids", early: bool, key: Any
+    loop: Loop,
+    starts: dict[str, np.ndarray],
+    solver: Solver,
+    inside: "_Ellipsoids",
+    early: bool,
+    key: Any,
+    engine: str,
 ) -> Outcomes:
     """early: a run that comes inside ends there."""
     count = len(inside.system)
     keys = None if key is None else jax.vmap(lambda i: jax.random.fold_in(key, i))(np.arange(count))
-    parts = max(1, min(os.cpu_count() or 1, count // FEWEST))
+    parts = max(1, min(os.cpu_count() or 1, count // FEWEST)) if engine == "xla" else 1  # a kernel has its threads
 
     def part(lanes: slice) -> Any:
         """Every so many lanes: neighbours take equally long."""
         mine = {path: column[lanes] for path, column in starts.items()}
         own = None if keys is None else keys[lanes]
         enough = inside.of(lanes) if early else None
-        return jax.device_get(run_batch(loop, Batch(mine, own), solver, enough=enough))
+        return jax.device_get(run_batch(loop, Batch(mine, own), solver, enough=enough, engine=engine))
 
     found = Outcomes(*np.zeros((4, count), bool), time=np.zeros(count))
     slices = [slice(i, None, parts) for i in range(parts)]
@@ -161,11 +179,13 @@ def attraction(
     paths: tuple[str, str] = ("initial.theta", "initial.phi"),
     band: float | None = None,
     key: Any = None,
+    engine: str = "xla",
 ) -> Basin:
-    """The region of attraction over the cells of two axes, the first rows; `band` and `key` as for `outcomes`."""
+    """The region of attraction over the cells of two axes, the first rows; `band`, `key` and `engine` as for
+    `outcomes`."""
     grid = np.meshgrid(first.centres, second.centres, indexing="ij")
     starts = {path: axis.ravel() for path, axis in zip(paths, grid, strict=True)}
-    found = outcomes(loop, starts, solver, band=band, key=key)
+    found = outcomes(loop, starts, solver, band=band, key=key, engine=engine)
     return Basin(first, second, Outcomes(*(column.reshape(grid[0].shape) for column in found)))
 
 
@@ -175,13 +195,15 @@ def largest(
     direction: Mapping[str, float],
     multiples: np.ndarray,
     solver: Solver,
+    *,
+    engine: str = "xla",
 ) -> list[Reach]:
     """For each of the values (rows,) at these paths the greatest of the rising `multiples` of `direction` (values by
     path of the initial state) up to which all are recovered, 0 if none is. One batch."""
     count = len(next(iter(rows.values())))
     lanes = {path: np.repeat(np.asarray(column), len(multiples), axis=0) for path, column in rows.items()}
     lanes |= {path: np.tile(value * np.asarray(multiples), count) for path, value in direction.items()}
-    found = outcomes(loop, lanes, solver)
+    found = outcomes(loop, lanes, solver, engine=engine)
     fine, open_ = (x.reshape(count, -1) for x in (found.recovered, found.undecided))
     good = np.where(fine.all(axis=1), len(multiples), np.argmin(fine, axis=1))
     known = np.concatenate([[0.0], multiples])
@@ -196,6 +218,7 @@ def recoverable(
     most: float = 1.0,
     band: float | None = None,
     key: Any = None,
+    engine: str = "xla",
 ) -> Reach:
     """The greatest c in [0, most] such that the loop recovers from c' times `direction` (values by path of the initial
     state) for every c' up to c that is tried; to a relative width of 1e-4. Every refinement is one batch.
@@ -209,7 +232,7 @@ def recoverable(
     while high - low > FINEST * high:
         tried = np.linspace(low, high, POINTS + 1)[1:]
         starts = {path: value * tried for path, value in direction.items()}
-        found = _outcomes(loop, starts, solver, inside, band is None, key)
+        found = _outcomes(loop, starts, solver, inside, band is None, key, engine)
         good = POINTS if found.recovered.all() else int(np.argmin(found.recovered))
         if good == POINTS:
             return Reach(high, undecided)

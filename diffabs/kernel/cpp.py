@@ -12,6 +12,7 @@ import numpy as np
 from diffabs.kernel.graph import Level, Node, real
 from diffabs.kernel.program import Block, Branch, Place, Program, live, ordered
 
+ONE = range(1)
 SHORT = 24  # operations in a branch: fewer are worked out anyway
 TYPES = {
     "float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "uint32": "u32", "uint64": "u64",
@@ -157,7 +158,7 @@ class Text:
             yield "  " + _spread(node, value)
         columns = [x for _, node in self.columns.values() for x in node.args[1:]]
         wanted = [node for node in [*self.shared, *columns] if node.level == Level.UNIFORM]
-        yield from self._lines(ordered(wanted, Level.UNIFORM), 0, "  ")
+        yield from self._lines(ordered(wanted, Level.UNIFORM), ONE, "  ")
         for node in self.shared:
             yield f"  s.v{node.id} = first(v{node.id});"
         for name, node in self.columns.values():
@@ -171,7 +172,7 @@ class Text:
         yield from self._uniform([node for node in live(self.lanes) if node.level == Level.LANE])
         for _, node in self._given(Level.LANE):
             yield f"  const {vector(node.dtype)} v{node.id}_0 = b.l{node.id}[q];"
-        yield from self._lines(ordered(self.lanes, Level.LANE), 0, "  ")
+        yield from self._lines(ordered(self.lanes, Level.LANE), ONE, "  ")
         for node in self.lanes:
             if node.op not in ("input", "const"):
                 yield f"  b.l{node.id}[q] = v{node.id}_0;"
@@ -210,7 +211,7 @@ class Text:
                     yield f"  const {vector(node.dtype)} v{node.id}_{q} = b.c{node.id}[{q}];"
             for node in lanes.values():
                 yield f"  const {vector(node.dtype)} v{node.id}_{q} = b.l{node.id}[{q}];"
-        yield from self._lines(ordered(roots, Level.STEP), self.shape.vectors, "  ")
+        yield from self._lines(ordered(roots, Level.STEP), range(self.shape.vectors), "  ")
 
     def _uniform(self, readers: list[Node]) -> Iterator[str]:
         """What all lanes share of what these read."""
@@ -239,41 +240,38 @@ class Text:
 
     # operations -------------------------------------------------------------------------------------------------------
 
-    def _lines(self, block: Block, vectors: int, indent: str) -> Iterator[str]:
-        """The lines of a block, for so many vectors; 0 where there is one."""
+    def _lines(self, block: Block, vectors: range, indent: str) -> Iterator[str]:
+        """The lines of a block, for these vectors."""
         for item in block:
             if isinstance(item, Branch):
                 yield from self._branch(item, vectors, indent)
             else:
-                for q in range(max(vectors, 1)):
+                for q in vectors:
                     yield f"{indent}const {vector(item.dtype)} {self._name(item, q)} = {self._expression(item, q)};"
 
-    def _branch(self, branch: Branch, vectors: int, indent: str) -> Iterator[str]:
-        """A branch that is worth a jump, if any lane goes there; in the lanes that do not, its results do not count."""
-        count = max(vectors, 1)
+    def _branch(self, branch: Branch, vectors: range, indent: str) -> Iterator[str]:
+        """A branch that is worth a jump, for each vector in which any lane goes there; in the lanes that do not, its
+        results do not count."""
+        yield from self._lines(branch.no, vectors, indent)
         if branch.size < SHORT + len(branch.gates):
-            yield from self._lines(branch.no, vectors, indent)
             yield from self._lines(branch.yes, vectors, indent)
-            for gate in branch.gates:
-                for q in range(count):
-                    which, no, yes = (self._name(x, q) for x in gate.args)
-                    yield f"{indent}const {vector(gate.dtype)} {self._name(gate, q)} = sel({which}, {yes}, {no});"
+            yield from self._gates(branch, vectors, indent + "const ")
             return
         for gate in branch.gates:
-            yield indent + f"{vector(gate.dtype)} " + ", ".join(self._name(gate, q) for q in range(count)) + ";"
-        which = [self._name(branch.which, q) for q in range(count)]
-        yield from self._lines(branch.no, vectors, indent)
-        yield f"{indent}if (any({' | '.join(which)})) {{"
-        yield from self._lines(branch.yes, vectors, indent + "  ")
+            names = ", ".join(f"{self._name(gate, q)} = {self._name(gate.args[1], q)}" for q in vectors)
+            yield f"{indent}{vector(gate.dtype)} {names};"
+        for q in vectors:
+            yield f"{indent}if (any({self._name(branch.which, q)})) {{"
+            yield from self._lines(branch.yes, range(q, q + 1), indent + "  ")
+            yield from self._gates(branch, range(q, q + 1), indent + "  ", declared=True)
+            yield indent + "}"
+
+    def _gates(self, branch: Branch, vectors: range, indent: str, declared: bool = False) -> Iterator[str]:
         for gate in branch.gates:
-            for q in range(count):
-                one, no, yes = (self._name(x, q) for x in gate.args)
-                yield f"{indent}  {self._name(gate, q)} = sel({one}, {yes}, {no});"
-        yield indent + "} else {"
-        for gate in branch.gates:
-            for q in range(count):
-                yield f"{indent}  {self._name(gate, q)} = {self._name(gate.args[1], q)};"
-        yield indent + "}"
+            for q in vectors:
+                which, no, yes = (self._name(x, q) for x in gate.args)
+                left = self._name(gate, q) if declared else f"{vector(gate.dtype)} {self._name(gate, q)}"
+                yield f"{indent}{left} = sel({which}, {yes}, {no});"
 
     def _name(self, node: Node, q: int) -> str:
         if node.op == "const":

@@ -65,7 +65,7 @@ def call(program: Program, shape: Shape, given: list[Any], results: list[Any]) -
             on.start(code, _arrays([*map(on.address, ins), *found], [*sizes, sizes[-1]]), room, count, context)
 
     whole = [*results, jax.ShapeDtypeStruct((source.room,), np.uint8)]
-    return buffer_callback(start, whole, vmap_method="sequential")(*given)[:-1]
+    return buffer_callback(start, whole)(*given)[:-1]
 
 
 def described() -> dict[str, str]:

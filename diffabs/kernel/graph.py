@@ -188,6 +188,21 @@ class Graph:
         """Return the entry of a column, the same for all lanes, at an index within."""
         return self._make("table", (index, *column), column[0].dtype)
 
+    def again(self, node: Node, args: list[Node]) -> Node:
+        """Return the operation of a node, of another graph, on these numbers."""
+        match node.op:
+            case "const":
+                return self.const(node.attr)
+            case "convert" | "bits":
+                return (self.convert if node.op == "convert" else self.bits)(args[0], node.dtype)
+            case "table":
+                return self.table(args[0], tuple(args[1:]))
+            case "select" | "any":
+                return self.select(*args) if node.op == "select" else self.any(args[0])
+            case "gate":
+                return self._gated(node.attr, *args) if args[0].op != "const" and args[1] is not args[2] else args[2]
+        return self.op(node.op, *args)
+
 
 def real(dtype: Any) -> bool:
     """Return whether numbers of this type are real ones."""

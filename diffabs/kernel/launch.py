@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.kernel import compilers, cpp, gpu, program
+from diffabs.kernel import binding, compilers, cpp, gpu, program
 
-LARGE = 2500  # operations; the blocks of a larger program are of fewer vectors, or compiling takes long
+LINES = 10_000  # of a step; the blocks of a larger program are of fewer vectors, or compiling takes long
 VECTORS = 4
 NAME = "diffabs_kernel_"  # begins the names of libraries
 _lock = threading.Lock()
@@ -38,34 +38,41 @@ def run_lanes(
         nothing that matters in a lane that is over
     lane: what is a lane's own, (n, ...) each; what the functions close over is the same for all
 
-    Works under jit and vmap; no derivatives. Raises Unsupported for an operation that has no rule, NoCompiler."""
-    shape = cpp.Shape(VECTORS, steps, rounds)
-    functions = {"renew": renew, "step": step, "running": running}
-    found = program.build(functions, jax.tree.map(_one, lane), jax.tree.map(_one, carry))
-    leaves, tree = jax.tree.flatten(carry)
-    given = [data(x) for x in (*found.uniform, *jax.tree.leaves(lane), *leaves)]
-    results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in given[len(given) - len(leaves) :]]
-    ended = (gpu.call if gpu.device() else _call)(found, shape, given, results)
-    return tree.unflatten([_like(x, leaf) for x, leaf in zip(ended, leaves, strict=True)])
-
-
-def _call(found: program.Program, shape: cpp.Shape, given: list[Any], results: list[Any]) -> list[Any]:
-    """What `gpu.call` returns, by the processor."""
-    first = len(given) - len(results)
-    call = jax.ffi.ffi_call(
-        register(compilers.library(_source(found, shape))),
-        results,
-        vmap_method="sequential",
-        input_output_aliases={first + i: i for i in range(len(results))},
+    Works under jit and vmap, with derivatives forward. Raises Unsupported for an operation that has no rule, NoCompiler
+    where there is none, ValueError for reverse mode."""
+    if not gpu.device():
+        compilers.compiler()
+    functions = program.traced(
+        {"renew": renew, "step": step, "running": running}, jax.tree.map(_one, lane), jax.tree.map(_one, carry)
     )
-    return [*call(*given, threads=np.int64(threads()))]
+    leaves, tree = jax.tree.flatten(carry)
+    given = [data(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
+    launch = functools.partial(_launched, shape=cpp.Shape(VECTORS, steps, rounds))
+    lanes = binding.Lanes(functions._replace(uniform=[]), launch)
+    found = binding.bound(lanes, given)
+    return tree.unflatten([_like(x, leaf) for x, leaf in zip(found, leaves, strict=True)])
 
 
-def _source(found: program.Program, shape: cpp.Shape) -> str:
-    source = cpp.text(found, shape)
-    if cpp.operations(source) > LARGE and shape.vectors > 1:
-        return cpp.text(found, shape._replace(vectors=shape.vectors // 2))
-    return source
+def _launched(made: program.Program, before: list[Any], carry: list[Any], shape: cpp.Shape) -> list[Any]:
+    """The carry of lanes that are all over; `before`: what is the same for all lanes, and what is a lane's own."""
+    first, results = len(before), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
+    if gpu.device():
+        return gpu.call(made, shape, [*before, *carry], results)
+    call = jax.ffi.ffi_call(
+        target(made, shape),
+        results,
+        input_output_aliases={first + i: i for i in range(len(carry))},
+    )
+    return list(call(*before, *carry, threads=np.int64(threads())))
+
+
+def target(made: program.Program, shape: cpp.Shape) -> str:
+    """Return the name under which XLA knows a program; compiled, if it was not before. Raises NoCompiler."""
+    source = cpp.text(made, shape)
+    while cpp.operations(source) * shape.vectors > LINES and shape.vectors > 1:
+        shape = shape._replace(vectors=shape.vectors // 2)
+        source = cpp.text(made, shape)
+    return register(compilers.library(source))
 
 
 def described() -> dict[str, str]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from diffabs.kernel import arrays, draws, elementwise, indexing, nested
 from diffabs.kernel.graph import Array, Graph, Level, Node, real
-from diffabs.kernel.primitives import Unsupported, translate
+from diffabs.kernel.primitives import Unsupported, known, translate
 
 RULES = (arrays, draws, elementwise, indexing, nested)  # which they register
 LARGEST = 60_000  # operations of a step; a compiler would take minutes
@@ -42,14 +42,52 @@ class Program:
         return [node for place, node in self.inputs.items() if place.level == Level.STEP]
 
 
+class Function(NamedTuple):
+    """A function of one lane as a jaxpr of lane and carry, which closes over arrays of `Functions.uniform`, by their
+    numbers, and then over known constants."""
+
+    jaxpr: Any
+    closed: tuple[int, ...]
+    constants: tuple[Any, ...] = ()
+
+
+class Functions(NamedTuple):
+    """Functions by name; the types of what they are of, array by array: what is the same for all lanes, lane, carry;
+    and the arrays of the first, which may be traced."""
+
+    each: dict[str, Function]
+    types: dict[Level, list[Any]]
+    uniform: list[Any]
+
+
+def traced(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any) -> Functions:
+    """Return functions of (lane, carry), of pytrees of these shapes, as jaxprs."""
+    uniform: list[Any] = []
+    numbers: dict[int, int] = {}
+    each: dict[str, Function] = {}
+    for name, function in functions.items():
+        closed = jax.make_jaxpr(function)(lane, carry)
+        for x in closed.consts:
+            if id(x) not in numbers:
+                numbers[id(x)] = len(uniform)
+                uniform.append(x)
+        each[name] = Function(closed.jaxpr, tuple(numbers[id(x)] for x in closed.consts))
+    types = {Level.UNIFORM: uniform, Level.LANE: jax.tree.leaves(lane), Level.STEP: jax.tree.leaves(carry)}
+    return Functions(each, {level: [_type(x) for x in xs] for level, xs in types.items()}, uniform)
+
+
 def build(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any) -> Program:
     """Return the program of functions of (lane, carry), of pytrees of these shapes. Raises Unsupported."""
-    graph, uniform = Graph(), []
-    inputs: dict[Place, Node] = {}
-    sizes: dict[Level, list[int]] = {Level.UNIFORM: [], Level.LANE: [], Level.STEP: []}
+    return translated(traced(functions, lane, carry))
 
-    def taken(leaf: Any, level: Level) -> Array:
-        shape, dtype = draws.key_shape(leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf))
+
+def translated(functions: Functions) -> Program:
+    """Return the program of functions. Raises Unsupported."""
+    graph, inputs = Graph(), {}
+    sizes: dict[Level, list[int]] = {level: [] for level in functions.types}
+
+    def taken(aval: Any, level: Level) -> Array:
+        shape, dtype = draws.key_shape(aval)
         array, out = len(sizes[level]), np.empty(shape, object)
         for entry, at in enumerate(np.ndindex(shape)):
             place = Place(level, array, entry)
@@ -57,23 +95,35 @@ def build(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any
         sizes[level].append(out.size)
         return out
 
-    args = [taken(x, level) for tree, level in ((lane, Level.LANE), (carry, Level.STEP)) for x in jax.tree.leaves(tree)]
+    given = {level: [taken(aval, level) for aval in avals] for level, avals in functions.types.items()}
     results: dict[str, list[Node]] = {}
-    given: dict[int, Array] = {}
-    for name, function in functions.items():
-        closed = jax.make_jaxpr(function)(lane, carry)
-        for x in closed.consts:
-            if id(x) not in given:
-                given[id(x)] = taken(x, Level.UNIFORM)
-                uniform.append(x)
-        outs = translate(graph, closed.jaxpr, [given[id(x)] for x in closed.consts], args)
+    for name, (jaxpr, closed, constants) in functions.each.items():
+        shared = [given[Level.UNIFORM][i] for i in closed] + [known(graph, x) for x in constants]
+        outs = translate(graph, jaxpr, shared, [*given[Level.LANE], *given[Level.STEP]])
         results[name] = [node for array in outs for node in array.flat]
-    if len(graph.nodes) > LARGEST:
-        raise Unsupported("step", f"of {len(graph.nodes)} operations; {LARGEST} are the most")
+    found = Program(inputs, results, functions.uniform, sizes, _real_type(inputs))
+    return checked(found, len(graph.nodes))
+
+
+def checked(program: Program, operations: int) -> Program:
+    """Return the program. Raises Unsupported for one of too many operations."""
+    if operations > LARGEST:
+        raise Unsupported("step", f"of {operations} operations; {LARGEST} are the most")
+    return program
+
+
+def _real_type(inputs: dict[Place, Node]) -> np.dtype:
+    """The type of the real numbers of the carry. Raises Unsupported for several."""
     kinds = {np.dtype(node.dtype) for place, node in inputs.items() if place.level == Level.STEP and real(node.dtype)}
     if len(kinds) != 1 or not kinds <= {np.dtype(np.float32), np.dtype(np.float64)}:
         raise Unsupported("carry", f"of the types {', '.join(sorted(map(str, kinds))) or 'without a real number'}")
-    return Program(inputs, results, uniform, sizes, kinds.pop())
+    return kinds.pop()
+
+
+def _type(x: Any) -> Any:
+    """Of one lane's program, so not on which devices it lies."""
+    aval = x if isinstance(x, jax.ShapeDtypeStruct) else jax.typeof(x)
+    return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=getattr(aval, "weak_type", False))
 
 
 def live(roots: Sequence[Node]) -> list[Node]:

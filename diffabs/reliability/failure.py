@@ -7,7 +7,8 @@ on which side of the bound it lies. If asked for, design points are found by
 
     dm/dz_j = sum_i dm/dv_i dv_i/dz_j
 
-with dm/dv through the run in reverse mode, and dv/dz, which costs no run, by central differences."""
+with dm/dv through the run in reverse mode, or forward by a kernel, and dv/dz, which costs no run, by central
+differences."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -28,7 +29,8 @@ STEP = 1e-4  # of the differences in z: errors of 1e-9 and 1e-12 of the values
 def failure_probability(
     study: Study, metric: str, bound: float, *, gradients: bool = False, **options: Any
 ) -> RareEvent:
-    """Return an estimate of P[metric >= bound] over the space of a study, whose design and samples do not matter.
+    """Return an estimate of P[metric >= bound] over the space of a study, whose design and samples do not matter. Runs
+    are made by the study's engine.
 
     metric: a name of what the study measures
     gradients: also draw around design points, found by gradients through the run
@@ -73,7 +75,8 @@ def _measured(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
     given = study.loop, {metric: study.objectives[metric]}
     loop, objective = jax.tree.map(lambda x: np.asarray(x, study.dtype), given)
     keys = jax.vmap(lambda _: noise_key(study.seed, 0))(np.arange(Batch(values).size))
-    return run_batch(loop, Batch(values, keys), study.solver, objective, accepted=True).metrics[metric]
+    lanes = Batch(values, keys)
+    return run_batch(loop, lanes, study.solver, objective, accepted=True, engine=study.engine).metrics[metric]
 
 
 def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) -> None:
@@ -103,13 +106,22 @@ def _gradient(study: Study, metric: str) -> Gradient:
 
 
 def _slopes(study: Study, metric: str) -> Callable[[Mapping[str, Any]], Any]:
-    """The metric of a batch of values, and its derivative in each. Compiled once."""
+    """The metric of a batch of values, and its derivative in each: in reverse, by a kernel forward. Compiled once."""
+
+    def forward(values: Mapping[str, Any]) -> Any:
+        def along(way: Mapping[str, Any]) -> Any:
+            return jax.jvp(lambda values: _measured(study, metric, values), (values,), (way,))
+
+        rows = dict(zip(values, np.eye(len(values)), strict=True))
+        ways = {path: jnp.outer(rows[path], jnp.ones_like(column)) for path, column in values.items()}
+        scores, rates = jax.vmap(along, out_axes=(None, 0))(ways)
+        return scores, dict(zip(values, rates, strict=True))
 
     def slopes(values: Mapping[str, Any]) -> Any:
         scores, pull = jax.vjp(lambda values: _measured(study, metric, values), values)
         return scores, *pull(jnp.ones_like(scores))
 
-    return jax.jit(slopes)
+    return jax.jit(forward if study.engine == "kernel" else slopes)
 
 
 def _steepness(study: Study, z: np.ndarray) -> dict[str, np.ndarray]:

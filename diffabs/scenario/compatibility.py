@@ -8,7 +8,7 @@ from typing import Any
 import jax
 
 from diffabs.core.loop import Loop
-from diffabs.core.protocols import Clock, Memory, Objective, still
+from diffabs.core.protocols import Clock, Memory, Objective, Sample, still
 from diffabs.core.pytree import strong
 from diffabs.core.values import kebab
 from diffabs.scenario.registry import joined
@@ -32,7 +32,8 @@ def misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
 
 
 def _everything(loop: Loop, objectives: Mapping[str, Objective]) -> Any:
-    return _once(loop), [_measured(loop, objective) for objective in objectives.values()]
+    sample = _sample(loop)  # once: following the signal around the loop is most of the time
+    return _once(loop), [_read(objective, sample) for objective in objectives.values()]
 
 
 def _once(loop: Loop) -> Any:
@@ -41,7 +42,14 @@ def _once(loop: Loop) -> Any:
 
 
 def _measured(loop: Loop, objective: Objective) -> Any:
-    sample = loop.signals(0.0, loop.start()).sample
+    return _read(objective, _sample(loop))
+
+
+def _sample(loop: Loop) -> Sample:
+    return loop.signals(0.0, loop.start()).sample
+
+
+def _read(objective: Objective, sample: Sample) -> Any:
     memory: Memory = objective.start(sample)
     return objective.flow(memory, sample), objective.update(memory, still(sample, 1e-3))
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 
 from diffabs.core.blocks import Passage
 from diffabs.core.cubic import Cubic
+from diffabs.core.log import lend, tables, written
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.protocols import Clock, Memory, Sample, Segment
 from diffabs.core.regime import Words
@@ -109,6 +110,7 @@ def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carr
     """Return the carry at t = 0."""
     zero, none = jnp.asarray(0), 0.0 * pace.h
     state, tally = start(loop, objectives, Clock(none, pace.h, zero, key))
+    state, logs = lend(state, None), tables(state)
     natural = jnp.minimum(FIRST, pace.h * pace.steps) + none
     point = _point(dynamics(loop, objectives, none, state, tally, kinks=True), pace, none, state, tally, natural)
     scale = sizes(state, point.sample)
@@ -120,12 +122,15 @@ def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carr
     past = Span(point.t, state, point.rate[0], point.t, state.flow(), point.rate[0]) if pace.keeps else ()
     note = (zero, point.words) if pace.notes else ()
     lengths = (natural, length, ends, limit, scale, length)
+    point = point._replace(state=lend(state, logs))
     return typed(Carry(point, zero, none, *lengths, search, zero, zero, past, note, condition), pace.h.dtype)
 
 
 def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry, until: Any = None) -> Carry:
     """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
     active = carry.running if until is None else before(pace, carry, until)
+    logs = written(carry.point.state)
+    carry = carry._replace(point=carry.point._replace(state=lend(carry.point.state, None)))
     system = dynamics(loop, objectives, carry.point.t, carry.point.state, carry.point.tally, kinks=True)
     strike = pace.strike(loop, carry.k)
     end = jnp.where(carry.ends, strike * pace.h, carry.point.t + carry.length)
@@ -135,17 +140,18 @@ def step(loop: Loop, objectives: Objectives, pace: Pace, key: Any, carry: Carry,
     strikes = verdict.taken & carry.ends
     k = jnp.where(strikes, strike, carry.k)
     clock = Clock(end, pace.h, k, key, strikes)
-    point = depart(system, pace, clock, carry.point, here, verdict.fired, carry.natural)
+    point = depart(system, pace, clock, carry.point, here, verdict.fired, carry.natural, logs)
     point = select(verdict.over, here.point, point)
 
     since = jnp.where(strikes, 0.0, jnp.where(verdict.taken, carry.since + carry.length, carry.since))
     carry = carry._replace(k=k, since=since)
     after = _after(loop, pace, carry, here, verdict, select(verdict.taken, point, carry.point))
     if until is None:  # of a run that is over, the rest does not matter
-        return after._replace(
-            **{name: jnp.where(active, getattr(after, name), getattr(carry, name)) for name in COUNTED}
-        )
-    return select(active, after, carry)
+        kept = {name: jnp.where(active, getattr(after, name), getattr(carry, name)) for name in COUNTED}
+        after = after._replace(**kept)
+    else:
+        after = select(active, after, carry)
+    return after._replace(point=after.point._replace(state=lend(after.point.state, logs)))
 
 
 def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict, point: Point) -> Carry:
@@ -224,14 +230,24 @@ def _middle(system: Dynamics, start: Point, end: Point, h: Any) -> Words:
 
 
 def depart(
-    system: Dynamics, pace: Pace, clock: Clock, begun: Point, here: Arrival, fired: Margins, natural: Any
+    system: Dynamics,
+    pace: Pace,
+    clock: Clock,
+    begun: Point,
+    here: Arrival,
+    fired: Margins,
+    natural: Any,
+    logs: list[Any],
 ) -> Point:
     """Return the point from which a run goes on, after the events that have `fired` and the ticks of the clock. In a
-    loop without ticks, what follows from an event is left to a step of no length: there are few of them."""
+    loop without ticks, what follows from an event is left to a step of no length: there are few of them.
+
+    logs: the rows of the blocks' logs, which the state is without (`core.log`)"""
     loop, point = system.loop, here.point
     if not loop.changes:
         return point
-    state = loop.change(clock, point.state, here.signals, point.margins, fired, passed(begun, point))
+    lent, step = lend(point.state, logs), passed(begun, point)
+    state = lend(loop.change(clock, lent, here.signals, point.margins, fired, step), None)
     if not loop.ticks:
         return point._replace(state=state)
     return _point(system, pace, point.t, state, point.tally, natural)

@@ -18,6 +18,7 @@ from diffabs.simulate.refusals import first_line, refusals
 from diffabs.simulate.run import arguments, measure, rollout
 from diffabs.simulate.solution import Run, Solver
 
+TOGETHER = "lanes run together, for trajectories or for derivatives in either mode"
 LONGER = 2.0  # lanes that run together differ by less than this factor in length
 
 
@@ -121,8 +122,9 @@ def run_batch(
     accepted: which lanes are run (lanes,), or True for all; the others have `diverged`, and their metrics are NaN.
         None is those that `refusals` accepts, or all if the call is traced
     enough: ends runs early, which then have neither stopped, timed out nor diverged; not together
-    engine: "kernel" makes of the loop's step a program of this machine (a C++ compiler is needed): no derivatives, no
-        trajectories, the same numbers to rounding. "auto" does so where it can, and otherwise what "xla" does
+    engine: "kernel" makes of the loop's step a program of this machine (a C++ compiler is needed): the same numbers to
+        rounding, and derivatives, forward (`jax.jvp`, `jax.jacfwd`) and not in reverse; no trajectories. "auto" does so
+        for values where it can, and otherwise what "xla" does
 
     Compiled once for a structure and a number of lanes, not for new values, keys or durations.
 
@@ -146,19 +148,26 @@ def run_batch(
     if accepted is None:
         asked = bool(batch.values) and not live
         accepted = refusals(loop, batch.values, solver).accepted if asked else live or not first_line(loop, {}, solver)
-    if trajectories or (live if together is None else together) or (not batch.values and batch.keys is None):
-        if enough is not None:
-            raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
+    given = (
+        loop,
+        batch.values,
+        batch._keys(),
+        solver,
+        objectives,
+        jnp.broadcast_to(jnp.asarray(accepted, bool), count),
+    )
+    as_one = trajectories or (live if together is None else together) or (not batch.values and batch.keys is None)
+    if as_one and enough is not None:
+        raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
 
-        def together_() -> Run:
-            run = rollout if trajectories else measure
-            return _flagged(_together(loop, batch, solver, objectives, run), accepted)
+    def by_xla() -> Run:
+        if not as_one:
+            return run_refilled(*given, enough)
+        run = rollout if trajectories else measure
+        return _flagged(_together(loop, batch, solver, objectives, run), accepted)
 
-        return by_engine(engine, together_, together_, "lanes run together, for trajectories or for derivatives")
-    accepted = jnp.broadcast_to(jnp.asarray(accepted, bool), count)
-    given = (loop, batch.values, batch._keys(), solver, objectives, accepted)
-    why_not = "" if enough is None else "runs are to end early, when enough is seen"
-    return by_engine(engine, lambda: run_native(*given), lambda: run_refilled(*given, enough), why_not)
+    why_not = TOGETHER if trajectories or together or (as_one and engine == "auto") else ""
+    return by_engine(engine, lambda: run_native(*given, enough), by_xla, why_not)
 
 
 def _together(loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], run: Any) -> Run:

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from diffabs.core.log import lend
 from diffabs.core.loop import Loop
 from diffabs.simulate import adaptive, stepper
 from diffabs.simulate.checkpoint import anyone
@@ -25,7 +26,7 @@ ROUND = 16  # tries between two looks at what is stable
 @dataclasses.dataclass(frozen=True)
 class OnGrid:
     """The steps of a `FixedStep`: their length [s], how many there are, and whether comparisons are located; None for
-    derivatives only."""
+    derivatives, and where a rate jumps."""
 
     h: Any
     steps: Any
@@ -33,13 +34,13 @@ class OnGrid:
 
     def start(self, loop: Loop, objectives: Objectives, key: Any) -> stepper.Carry:
         """Return the carry at t = 0."""
-        return stepper.init_carry(loop, objectives, self.h, key, kinks=bool(self.kinks))
+        return stepper.init_carry(loop, objectives, self.h, key, kinks=self._locates(loop))
 
     def step(
         self, loop: Loop, objectives: Objectives, key: Any, carry: stepper.Carry, until: Any = None
     ) -> stepper.Carry:
         """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
-        return stepper.step(loop, objectives, self.h, key, self.steps, carry, until, kinks=bool(self.kinks))
+        return stepper.step(loop, objectives, self.h, key, self.steps, carry, until, kinks=self._locates(loop))
 
     def renew(self, loop: Loop, carry: stepper.Carry) -> stepper.Carry:
         """Return the carry: nothing has to be looked at but in the steps."""
@@ -66,6 +67,9 @@ class OnGrid:
     def room(self, loop: Loop, steps: int) -> int:
         """Return how many tries so many steps may take."""
         return stepper.room(loop, steps, kinks=self.kinks is not False)
+
+    def _locates(self, loop: Loop) -> bool:
+        return loop.jumps if self.kinks is None else self.kinks
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["h", "steps", "rtol"], meta_fields=["keeps", "notes"])
@@ -99,7 +103,7 @@ class AtPace(Pace):
         """Return what is seen at this instant of the grid, which lies within the last step."""
         now, t = carry.point, instant * self.h
         inside = (t < now.t) & (carry.past.until > carry.past.t)
-        t, state = select(inside, (t, carry.past.at(t)), (now.t, now.state))
+        t, state = select(inside, (t, carry.past.at(t)), (now.t, lend(now.state, None)))
         return observe(loop, t, state, carry.running | inside)
 
     def watched(self) -> "AtPace":

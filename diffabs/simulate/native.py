@@ -16,14 +16,18 @@ from diffabs.core.compiling import traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
+from diffabs.core.tracing import pushed
+from diffabs.kernel import launch
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.kept import Kept
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.drivers import BLOCK
+from diffabs.simulate.methods import AtPace
 from diffabs.simulate.outcome import judge
-from diffabs.simulate.refill import by_lane
+from diffabs.simulate.pursuit import Pursuing, Pursuit
+from diffabs.simulate.refill import ROUND, Enough, by_lane
 from diffabs.simulate.run import arguments
 from diffabs.simulate.solution import Run, Solver
 
@@ -32,45 +36,101 @@ MOST = 1 << 17  # lanes that are started together: the carries of more would fil
 log = logging.getLogger("diffabs")
 
 
+class EngineError(ValueError):
+    """What stands against the engine that is asked for."""
+
+
 def run_native(
-    loop: Loop, values: Mapping[str, Any], keys: Any, solver: Solver, objectives: Mapping[str, Objective], accepted: Any
+    loop: Loop,
+    values: Mapping[str, Any],
+    keys: Any,
+    solver: Solver,
+    objectives: Mapping[str, Objective],
+    accepted: Any,
+    enough: Enough | None = None,
 ) -> Run:
-    """Return what `refill.run_refilled` returns, to rounding.
+    """Return what `refill.run_refilled` returns, to rounding; with derivatives, forward.
 
     Raises Unsupported for a step that cannot be translated, NoCompiler where there is none, ValueError for what
     `measure` objects to."""
     loop, objectives, method = arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
-    lanes, count = (values, keys, accepted), len(accepted)
+    count = len(accepted)
+    enough = jax.tree.map(jnp.asarray, enough)
+    own = None if enough is None else jax.vmap(enough.own)(jnp.arange(count))
+    lanes = values, keys, accepted, own
 
     def some(start: int) -> Run:
         mine = jax.tree.map(lambda x: x[start : start + MOST], lanes)
-        return _made(loop, mine[0], dict(objectives), method, *mine[1:])
+        return _made((loop, mine[0], dict(objectives), method, *mine[1:], enough))
 
     runs = [some(start) for start in range(0, count, MOST)]
     return runs[0] if len(runs) == 1 else jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
 
 
+@jax.custom_jvp
+def _made(given: Any) -> Run:
+    """The runs of (loop, values, objectives, method, keys, accepted), and what is enough of each, and when."""
+    return _kept(*given)
+
+
+def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
+    """By steps that end on kinks, as derivatives have them elsewhere (`run`)."""
+
+    def run(given: Any) -> Run:
+        loop, values, objectives, method, *rest = given
+        method = Pursuing(method.noted()) if isinstance(method, AtPace) else method.located()
+        return _run(loop, values, objectives, method, *rest)
+
+    return pushed(run, primals, tangents)
+
+
+_made.defjvp(_rule, symbolic_zeros=True)
+
+
 @jax.jit
 def _run(
-    loop: Loop, values: dict[str, Any], objectives: dict[str, Objective], method: Any, keys: Any, accepted: Any
+    loop: Loop,
+    values: dict[str, Any],
+    objectives: dict[str, Objective],
+    method: Any,
+    keys: Any,
+    accepted: Any,
+    own: Any,
+    enough: Enough | None,
 ) -> Run:
     leaves, built = by_lane(loop, values, objectives)
-    carry = jax.vmap(lambda mine, key: method.start(*built(mine), key))(leaves, keys)
-    condition = jnp.where(accepted, carry.condition, Condition.DIVERGED).astype(carry.condition.dtype)
+
+    def start(mine: Any, key: Any, accepted: Any) -> Any:
+        return _only(accepted, method.start(*built(mine), key))
+
+    def running(lane: Any, carry: Any) -> Any:
+        if enough is None:
+            return carry.running
+        output = built(lane[0])[0].plant.output(carry.point.state.plant)
+        return carry.running & ~enough.reached(lane[2], output)
+
     carry = run_lanes(
         lambda lane, carry: method.renew(built(lane[0])[0], carry),
         lambda lane, carry: method.step(*built(lane[0]), lane[1], carry),
-        lambda lane, carry: carry.running,
-        (leaves, keys),
-        carry._replace(condition=condition),
+        running,
+        (leaves, keys, own),
+        jax.vmap(start)(leaves, keys, accepted),
         steps=BLOCK,
-        rounds=1,
+        rounds=1 if enough is None else ROUND // BLOCK,
     )
     return jax.vmap(lambda mine, carry: judge(*built(mine), carry)[0])(leaves, carry)
 
 
-_made = Kept(_run, _run)
+def _only(accepted: Any, carry: Any) -> Any:
+    """A carry that does not run if it is not accepted."""
+    if isinstance(carry, Pursuit):
+        return carry._replace(ahead=_only(accepted, carry.ahead))
+    condition = jnp.where(accepted, carry.condition, Condition.DIVERGED)
+    return carry._replace(condition=condition.astype(carry.condition.dtype))
+
+
+_kept = Kept(_run, _run)
 
 
 def by_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Run], why_not: str = "") -> Run:
@@ -88,14 +148,19 @@ def by_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Ru
         except (Unsupported, NoCompiler) as error:
             why_not = str(error)
     if engine == "kernel":
-        raise ValueError(f"engine = 'kernel' is not possible: {why_not}")
-    _tell(why_not)
+        raise EngineError(f"engine = 'kernel' is not possible: {why_not}")
+    tell(why_not)
     return otherwise()
 
 
+def described(engine: str) -> dict[str, str]:
+    """Return what a result says of the engine that made it: its name, and what decides the bits of a kernel."""
+    return {"name": engine} | (launch.described() if engine == "kernel" else {})
+
+
 @functools.cache
-def _tell(why_not: str) -> None:
-    """Once."""
+def tell(why_not: str) -> None:
+    """Say in the log why XLA does what was left to be decided, once."""
     log.warning("runs are made by XLA, not by a kernel: %s", why_not)
 
 
@@ -113,7 +178,7 @@ def objection(loop: Loop, values: Mapping[str, Any], solver: Solver, objectives:
     count = len(next(iter(columns.values())))
     keys = jax.vmap(jax.random.key)(jnp.arange(count))
     try:
-        _made.ready(checked, columns, dict(measured), method, keys, jnp.ones(count, bool))
+        _kept.ready(checked, columns, dict(measured), method, keys, jnp.ones(count, bool), None, None)
     except (Unsupported, NoCompiler) as error:
         return str(error)
     return None

@@ -27,8 +27,12 @@ ROUND = 64  # steps
 class Enough(Protocol):
     """When a run may end before its stop and its time, because how it goes on is known; a pytree."""
 
-    def reached(self, number: Any, output: Any) -> Any:
-        """Whether lane `number`, of which this is seen now, is taken off the belt."""
+    def own(self, number: Any) -> Any:
+        """Return what it takes to say so of lane `number`, a pytree."""
+        ...
+
+    def reached(self, own: Any, output: Any) -> Any:
+        """Whether a lane, of which this is its own and seen now, is taken off the belt."""
         ...
 
 
@@ -126,7 +130,7 @@ def _seen_enough(enough: Enough | None, built: Callable[[Any], Any], belt: _Belt
     if enough is None:
         return jnp.zeros_like(belt.carry.running)
     output = jax.vmap(lambda mine, at: built(mine)[0].plant.output(at.point.state.plant))(belt.leaves, belt.carry)
-    return jax.vmap(enough.reached)(belt.number, output)
+    return jax.vmap(lambda number, output: enough.reached(enough.own(number), output))(belt.number, output)
 
 
 def _exchanged(

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.blocks import Passage
+from diffabs.core.log import lend, tables, written
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment
@@ -94,17 +95,19 @@ def room(loop: Loop, solver: Adaptive) -> int:
     return math.ceil(MOST * max(1.0, 1e-5 / solver.rtol) ** (1 / ORDER)) + (TICKED * solver.steps if loop.ticks else 0)
 
 
+def noted(old: Carry, new: Carry) -> Notes:
+    """Return the notes of one try, between these carries; the regime of the next is not known yet."""
+    fired, words = new.note
+    moved = (new.point.t > old.point.t) | (fired != 0)
+    return Notes(moved, new.point.t, old.length, old.natural, new.k, fired, words, words)
+
+
 def note(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, tries: int) -> tuple[Notes, Any]:
     """Return the notes of a run, with room for so many tries, and how it ended: it has diverged if it took more."""
 
-    def entry(old: Carry, new: Carry) -> Notes:
-        fired, words = new.note
-        moved = (new.point.t > old.point.t) | (fired != 0)
-        return Notes(moved, new.point.t, old.length, old.natural, new.k, fired, words, words)
-
     def one(carry: Carry, _: Any) -> tuple[Carry, Notes]:
         new = pace.step(loop, objectives, key, carry)
-        return new, entry(carry, new)
+        return new, noted(carry, new)
 
     def some(carry: Carry) -> tuple[Carry, Notes]:
         return jax.lax.scan(one, pace.renew(loop, carry), length=BLOCK)
@@ -168,13 +171,10 @@ def repeat_and_watch(
 
 def _repeated(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes: Notes) -> tuple[Place, Any]:
     """The end of the run, and the `Span` of every try, where they are kept."""
-    zero = 0.0 * pace.h
-    state, tally = start(loop, objectives, Clock(zero, pace.h, 0, key))
-    begun = typed(Place(zero, zero, state, tally, jnp.asarray(0)), pace.h.dtype)
+    begun = place_at_start(loop, objectives, pace, key)
 
     def step(place: Place, one: Notes) -> tuple[Place, Any]:
-        new, span = _step(loop, objectives, pace, key, place, one)
-        return select(one.moved, new, place), span
+        return repeat_try(loop, objectives, pace, key, place, one)
 
     @forgetful
     def block(place: Place, some: Notes) -> tuple[Place, Any]:
@@ -183,8 +183,28 @@ def _repeated(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes:
     return _skipping(block, lambda _, some: jnp.any(some.moved), begun, notes)
 
 
-def _step(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes) -> tuple[Place, Any]:
-    """One step within its regime, and what happens at its end; its `Span`, where they are kept."""
+def place_at_start(loop: Loop, objectives: Objectives, pace: AtPace, key: Any) -> Place:
+    """Return where a run begins."""
+    zero = 0.0 * pace.h
+    state, tally = start(loop, objectives, Clock(zero, pace.h, 0, key))
+    return typed(Place(zero, zero, lend(state, tables(state)), tally, jnp.asarray(0)), pace.h.dtype)
+
+
+def repeat_try(
+    loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes
+) -> tuple[Place, Any]:
+    """Return where a try leads, if it led on; its `Span`, where they are kept."""
+    logs, place = written(place.state), place._replace(state=lend(place.state, None))
+    new, span = _step(loop, objectives, pace, key, place, one, logs)
+    place = select(one.moved, new, place)
+    return place._replace(state=lend(place.state, logs)), span
+
+
+def _step(
+    loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes, logs: list[Any]
+) -> tuple[Place, Any]:
+    """One step within its regime, and what happens at its end; its `Span`, where they are kept. The rows of the logs,
+    which the state is without."""
     system = dynamics(loop, objectives, place.t, place.state, place.tally, kinks=True)
     within, h = Regime(one.words), one.length - place.late
     begin = system.ahead(place.t, place.state, place.tally, within)
@@ -219,7 +239,8 @@ def _step(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Pla
         late = axpy(shift, end.recorded, end.seen.signals.recorded)
         ends = (begin.seen.signals.recorded, begin.recorded), (late, end.recorded)
         step = passed(*(Recorded(*both) for both in zip((place.t, t), ends, strict=True)))
-        state = _changed(system, Clock(t, pace.h, one.k, key, strikes), state, end.seen.margins, one.fired, step)
+        clock, state = Clock(t, pace.h, one.k, key, strikes), lend(state, logs)
+        state = lend(_changed(system, clock, state, end.seen.margins, one.fired, step), None)
     return Place(t, shift, state, tally, one.k), span
 
 
@@ -243,7 +264,7 @@ def _shift(end: Ahead, changed: Words, one: Notes, h: Any, strikes: Any) -> Any:
     shift = jnp.where(strikes & ~happens, 0.0, shift)
     events = zip(jax.tree.leaves(end.seen.margins), jax.tree.leaves(end.falls), strict=True)
     for i, (margin, fall) in reversed(list(enumerate(events))):
-        close, later = _until((one.fired >> i) & 1 != 0, margin, fall, NEAR * one.natural)
+        close, later = _until(one.fired & (1 << i) != 0, margin, fall, NEAR * one.natural)
         shift = jnp.where(close, later, shift)
     return shift
 
@@ -260,5 +281,5 @@ def _changed(
     """The state after the events and the ticks at the end of a step."""
     signals = system.loop.signals(clock.t, state)
     leaves, tree = jax.tree.flatten(margins)
-    happens = tree.unflatten([(fired >> i) & 1 != 0 for i in range(len(leaves))])
+    happens = tree.unflatten([fired & (1 << i) != 0 for i in range(len(leaves))])
     return system.loop.change(clock, state, signals, margins, happens, step)

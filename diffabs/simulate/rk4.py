@@ -6,10 +6,10 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core.numerics import axpy
 from diffabs.core.pytree import Scalar
+from diffabs.core.tracing import pushed
 from diffabs.simulate.checkpoint import forgetful
 
 X = TypeVar("X")
@@ -73,17 +73,7 @@ def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
 
 
 def _rule(f: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
-    """Only what has a tangent is differentiated: zeros worked out would cost as much as any other."""
-    values, tree = jax.tree.flatten(primals)
-    moves = tree.flatten_up_to(tangents)
-    live = [type(move) is not SymbolicZero for move in moves]
-
-    def step(moving: list[Any]) -> Any:
-        left = iter(moving)
-        return _scan(f, *tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)]))
-
-    moving, rates = ([x for x, on in zip(xs, live, strict=True) if on] for xs in (values, moves))
-    return jax.jvp(step, (moving,), (rates,))
+    return pushed(lambda *step: _scan(f, *step), primals, tangents)
 
 
 _step.defjvp(_rule, symbolic_zeros=True)

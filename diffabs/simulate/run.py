@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core import kinds
 from diffabs.core.compiling import SAME, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, misshapen, strong
+from diffabs.core.tracing import pushed
 from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
 from diffabs.simulate.methods import AtPace, method_of
 from diffabs.simulate.outcome import judge, prepare
@@ -126,18 +126,7 @@ def _simulated(places: Places, run: Any) -> Run:
 
 
 def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
-    """Only what has a tangent is differentiated: zeros worked out would cost as much as any other."""
-    values, tree = jax.tree.flatten(primals)
-    moves = tree.flatten_up_to(tangents)
-    live = [type(move) is not SymbolicZero for move in moves]
-
-    def run(moving: list[Any]) -> Run:
-        left = iter(moving)
-        (run,) = tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)])
-        return _reversible(*run, places=places)
-
-    moving, rates = ([x for x, on in zip(xs, live, strict=True) if on] for xs in (values, moves))
-    return jax.jvp(run, (moving,), (rates,))
+    return pushed(lambda run: _reversible(*run, places=places), primals, tangents)
 
 
 _simulated.defjvp(_rule, symbolic_zeros=True)

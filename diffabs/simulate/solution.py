@@ -15,8 +15,9 @@ class FixedStep:
     """Steps of equal length [s], up to `duration` [s]; a trajectory keeps every `every`-th instant.
 
     kinks: whether a step ends where a comparison in the flow changes (a limit, the knot of a measured road, a wheel
-    that locks) as it does on events. None: where a derivative is asked for. A value is exact to h^2 in such a step
-    without, a derivative only to h; it costs up to twice as much."""
+    that locks) as it does on events. None: where a derivative is asked for, and where the rates of a part jump there
+    (conditional integration). Without, a value is exact to h^2 in such a step, where a rate jumps only to h, and a
+    derivative to one order less; it costs up to twice as much."""
 
     step: float = 1e-3
     duration: float = 10.0

@@ -15,6 +15,7 @@ import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
+from diffabs.simulate.native import described
 from diffabs.tune.descent import Descent, Lane, Optimiser, Point, lbfgs
 from diffabs.tune.problem import Multipliers, Problem, Seen
 from diffabs.tune.result import Method, Progress, Start, StartError, Tuned
@@ -152,6 +153,7 @@ class Search:
             starts=[start(lane) for lane in lanes],
             mode=self.problem.mode,
             diverged=(int(self.before.diverged), int(best.seen.diverged)),
+            engine=described(self.problem.engine),
         )
 
     def _values(self, z: np.ndarray) -> dict[str, Any]:

@@ -24,12 +24,14 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
 from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.native import ENGINES, EngineError, tell
 from diffabs.simulate.refusals import first_line, refusals
 from diffabs.simulate.solution import Run, Solver
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.risk import Aggregate
 
 FEWEST = 64  # lanes from which on their runs take longer than compiling them
+REVERSE = "a kernel has no reverse mode; forward mode, or engine = 'xla'"
 FEW = 6  # parameters up to which forward mode is the cheaper one (benchmarks/bench_gradient.py)
 
 
@@ -84,10 +86,41 @@ class Problem:
     aggregate: Aggregate
     constraints: Sequence[Constraint]
     mode: Mode
+    engine: str = "xla"
 
     def runs(self, z: Any) -> Run:
         """All lanes at z, without trajectories."""
-        return run_batch(built(self.space.at(self.subject, z)), self.batch, self.solver, self.measured, together=True)
+        together = True if self.engine == "xla" else None
+        loop = built(self.space.at(self.subject, z))
+        return run_batch(loop, self.batch, self.solver, self.measured, together=together, engine=self.engine)
+
+    def by(self, engine: str, mode: Mode | None = None) -> "Problem":
+        """Return the problem whose runs are made by this engine; "auto" is a kernel if it can be one, and tells the log
+        once why it is not. Of a kernel the mode is forward, if none is asked for.
+
+        Raises EngineError for a kernel in reverse mode."""
+        if engine not in ENGINES:
+            raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(ENGINES)}")
+        if engine == "xla":
+            return self
+        line = REVERSE if mode is Mode.REVERSE else None
+        found = dataclasses.replace(self, engine="kernel", mode=Mode.FORWARD)
+        if engine == "kernel" and line:
+            raise EngineError(f"engine = 'kernel' is not possible: {line}")
+        if engine == "auto" and (line := line or found.objection()):
+            tell(line)
+            return self
+        return found
+
+    def objection(self) -> str | None:
+        """Return why its engine cannot make the runs and their derivatives, or None. Nothing is compiled."""
+        z = jax.ShapeDtypeStruct((1, self.space.size), jnp.result_type(float))
+        none = Multipliers(np.zeros((1, self.excesses)), np.ones(1), None)
+        try:
+            jax.eval_shape(self._evaluate, z, none, 1.0)
+        except EngineError as error:
+            return str(error)
+        return None
 
     def seen(self, z: Any) -> Seen:
         """Objective and excesses at z."""

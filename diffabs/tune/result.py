@@ -66,6 +66,7 @@ class Tuned:
     met: whether every constraint holds, without a tolerance
     reason: why the descent of the best start ended, in its last round
     history: of the best start; `starts` has all of them
+    engine: what made the runs, with compiler and flags of a kernel
     evaluations: gradients that were computed for the best start, rejected trials included
     """
 
@@ -80,6 +81,7 @@ class Tuned:
     starts: list[Start]
     mode: Mode
     diverged: tuple[int, int]
+    engine: dict[str, str]
 
     @property
     def loop(self) -> Any:

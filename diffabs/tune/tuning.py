@@ -31,6 +31,7 @@ def tune(
     method: Method | None = None,
     progress: Callable[[Progress], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
+    engine: str = "xla",
 ) -> Tuned:
     """Minimise an aggregate, over a batch of runs, of a weighted sum of metrics, and return what was found.
 
@@ -45,6 +46,8 @@ def tune(
     method: optimiser, starts, iterations; None is L-BFGS from the subject's own values
     progress: told the best so far after every iteration
     stopping: asked after every evaluation; True ends the search with the best that it has met so far
+    engine: what makes the runs and their derivatives, as in `run_batch`; a kernel's are forward, of however many
+        parameters
 
     >>> import diffabs as d
     >>> from diffabs import controllers, objectives, plants, roads, stops, tune
@@ -58,6 +61,7 @@ def tune(
 
     Raises:
         ValueError: a path, range, metric or batch that does not fit; a lane that must not be run whatever is tuned.
+        EngineError: what stands against the engine "kernel".
         StartError: a start that diverges, or at which the integration step is not stable, if there is no other.
     """
     method = method or Method()
@@ -71,6 +75,7 @@ def tune(
         aggregate=aggregate,
         constraints=constraints,
         mode=method.mode,
+        engine=engine,
     )
     return Search(problem, method, progress, stopping).result()
 
@@ -86,10 +91,11 @@ def posed(
     aggregate: Aggregate | None = None,
     constraints: Sequence[Constraint] = (),
     mode: Mode | None = None,
+    engine: str = "xla",
 ) -> Problem:
     """Return the problem that `tune` solves, for those who bring their own search.
 
-    subject, free, objective, over, solver, measured, aggregate, constraints: as in `tune`
+    subject, free, objective, over, solver, measured, aggregate, constraints, engine: as in `tune`
     mode: of differentiation, forward or reverse; None is the cheaper one
 
     Raises ValueError as `tune` does."""
@@ -99,7 +105,7 @@ def posed(
     batch = (over or Batch()).check(loop)
     _check_metrics(objective, measured, constraints)
     free_space = space(subject, free)
-    return Problem(
+    problem = Problem(
         subject=subject,
         space=free_space,
         solver=solver,
@@ -110,6 +116,7 @@ def posed(
         constraints=constraints,
         mode=mode or automatic(free_space),
     )
+    return problem.by(engine, mode)
 
 
 def _check_metrics(objective: Mapping[str, float], measured: Mapping[str, Objective], constraints: Any) -> None:

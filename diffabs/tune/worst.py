@@ -110,6 +110,7 @@ def worst_case(
     seed: int = 0,
     seed_of_noise: int | None = None,
     price: float | None = None,
+    engine: str = "xla",
 ) -> WorstCase:
     """Return the greatest value of a metric found over a box: Sobol points and corners, then ascent by gradients.
 
@@ -123,6 +124,7 @@ def worst_case(
     starts: how many of the worst of them are ascended from, together, for so many `iterations`
     seed, seed_of_noise: of the sequence, and of noisy sensors
     price: rollouts that a gradient counts as; None is 1 + 1.5 p in forward mode and 6 in reverse
+    engine: what makes the runs and their derivatives, as in `run_batch`
 
     Raises:
         ValueError: a path or range that does not fit, an unknown metric, a corner or another point of the box that
@@ -135,11 +137,12 @@ def worst_case(
     corners = _corners(np.array(free.ranges))
     points = np.concatenate([corners, _drawn(np.array(free.ranges), screen, seed)])
     lanes = Batch(_at(free, points), None if key is None else np.repeat(key, len(points)))
-    screened = _screened(loop, lanes, solver, measured)
+    screened = _screened(loop, lanes, solver, measured, engine)
     worst = np.argsort(-np.nan_to_num(screened.metrics[metric], nan=-np.inf))[:starts]
     problem = Problem(middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), automatic(free))
+    problem = problem.by(engine)
     lanes = _ascent(problem, points[worst], iterations)
-    cost = len(points) + (price or _price(free)) * sum(lane.evaluations for lane in lanes)
+    cost = len(points) + (price or _price(problem)) * sum(lane.evaluations for lane in lanes)
     return _found(loop, free, metric, bound, points, len(corners), screened, lanes, cost)
 
 
@@ -151,16 +154,16 @@ def _measured(loop: Any, metric: str, measured: Mapping[str, Objective] | None) 
     return found
 
 
-def _price(free: Space) -> float:
+def _price(problem: Problem) -> float:
     """Rollouts that a gradient costs."""
-    return 1 + 1.5 * free.size if automatic(free) is Mode.FORWARD else 6.0
+    return 1 + 1.5 * problem.space.size if problem.mode is Mode.FORWARD else 6.0
 
 
-def _screened(loop: Any, lanes: Batch, solver: Solver, measured: Mapping[str, Objective]) -> Run:
+def _screened(loop: Any, lanes: Batch, solver: Solver, measured: Mapping[str, Objective], engine: str) -> Run:
     """Run every point. Raises ValueError for one that cannot be run."""
     if line := first_line(loop, lanes.values, solver):
         raise ValueError(f"the box has points that cannot be run; {line}")
-    return jax.device_get(run_batch(loop, lanes, solver, measured, accepted=True))
+    return jax.device_get(run_batch(loop, lanes, solver, measured, accepted=True, engine=engine))
 
 
 def _corners(ranges: np.ndarray) -> np.ndarray:

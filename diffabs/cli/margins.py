@@ -1,0 +1,201 @@
+"""The command `margins`: how far the linearised loop is from instability."""
+
+import importlib
+import math
+import pathlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from diffabs.cli import console, show
+from diffabs.core import provenance
+from diffabs.core.pytree import Spec, replace
+from diffabs.core.values import ScenarioError, inside, shown
+from diffabs.scenario.parameter_paths import entries, parameters_of
+from diffabs.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from diffabs.linear.robustness import Band, System
+    from diffabs.linear.stability_margins import Margins
+
+UNITS = {
+    **{"gain_up": "1", "gain_down": "1", "phase": "rad", "delay": "s", "modulus": "1", "sensitivity": "1"},
+    **{"complementary": "1", "crossover": "rad/s"},
+}
+NAMES = {
+    **{"gain_up": "gain may rise to, times", "gain_down": "gain may fall to, times", "phase": "phase margin [deg]"},
+    **{"delay": "delay margin [ms]", "modulus": "modulus margin, 1/Ms", "sensitivity": "greatest |S|, Ms"},
+    **{"complementary": "greatest |T|, Mt", "crossover": "crossover [rad/s]"},
+}
+SHOWN_IN = {"phase": math.degrees(1), "delay": 1e3}
+MOST_SAMPLES = 10_000
+SHORT = {"speed": "initial.speed", "speed_kmh": "initial.speed_kmh"}
+
+
+def margins(
+    scenario: console.ScenarioName,
+    at: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--at", metavar="PATH=VALUE", help="Only here: speed=10, plant.mass=6, target=0.15; may be repeated."
+        ),
+    ] = None,
+    samples: Annotated[
+        int,
+        typer.Option(min=0, max=MOST_SAMPLES, help="Systems inside the ranges of [design.over], beside the corners."),
+    ] = 32,
+    changes: console.Changes = None,
+    plot: Annotated[
+        pathlib.Path | None, typer.Option(help="Draw Bode, Nyquist and sensitivities to this file (.png, .pdf, .svg).")
+    ] = None,
+    as_json: console.Json = False,
+) -> None:
+    """Gain, phase, delay and modulus margin of the linearised loop, and their worst over [design.over]."""
+    with console.guarded():
+        console.check_picture(plot)
+        with console.new_file(plot, "--plot") as picture:
+            chosen = console.loaded(scenario, changes, integrated=False)
+            values, target = _places(chosen, at or ())
+            nominal, found = _found(chosen, values, target, samples)
+            if picture:
+                console.waited(lambda: _draw(chosen, nominal, found, picture), "drawing")
+        result = _document(chosen, nominal, found, values, target, plot)
+        show.as_json(result) if as_json else _show(result, chosen, nominal, found)
+        _judge(chosen, nominal, found)
+
+
+def _places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, float], float | None]:
+    """The values by path of the loop, in SI, and the target. Raises ScenarioError."""
+    table: dict[str, Any] = {}
+    for item in given:
+        path, _, text = item.partition("=")
+        try:
+            value = float(text)
+        except ValueError:
+            raise ScenarioError(f"--at {shown(item)}: a number is needed, as in --at speed=10") from None
+        path = SHORT.get(path.strip(), path.strip())
+        if path in table:
+            raise ScenarioError(f"--at {path} is given twice")
+        table[path] = value
+    there = {**parameters_of(chosen.loop), "target": (Spec("1"), ())}
+    found = [one.single("have a place") for one in entries(table, "--at", there, "no parameter of this loop")]
+    values = {one.path: inside(one.given, one.spec, one.where) / one.scale for one in found}
+    return values, values.pop("target", None)
+
+
+def _found(
+    chosen: Scenario, values: dict[str, float], target: float | None, samples: int
+) -> tuple["System", "Band | None"]:
+    """The loop at these values, and over the ranges that are left. Raises typer.Exit where it is not linear."""
+    from diffabs.linear.robustness import band
+
+    loop = replace(chosen.loop, values)
+    over = {path: ends for path, ends in _ranges(chosen).items() if path not in values}
+    try:
+        one = console.waited(lambda: band(loop, {}, 0, target).systems[0], f"linearising {chosen.name}")
+        return one, console.waited(lambda: band(loop, over, samples, target), "over the ranges") if over else None
+    except ValueError as error:
+        console.fail(f"{chosen.name}: {error}", console.FAILED)
+
+
+def _ranges(chosen: Scenario) -> dict[str, tuple[float, float]]:
+    """Those of [design.over], by path of the loop; that of the speed between start and stop if none is given there."""
+    over, loop = dict(chosen.design.over), chosen.loop
+    start, end = getattr(loop.initial, "speed", None), getattr(loop.stop, "speed", None)
+    if over and hasattr(loop.plant, "frozen") and start is not None and end is not None:
+        over.setdefault("initial.speed", (float(end), float(start)))
+    return {path: ends for path, ends in over.items() if ends[0] < ends[1]}
+
+
+def _draw(chosen: Scenario, nominal: "System", found: "Band | None", picture: pathlib.Path) -> None:
+    frequency: Any = importlib.import_module("diffabs.plot.frequency")
+    others = [one.loop for one in found.systems] if found else []
+    title = f"{chosen.title or chosen.name}: the open loop"
+    frequency.loop_shape(nominal.loop, nominal.margins, others, title=title).savefig(picture)
+
+
+def numbers(found: "Margins") -> dict[str, float]:
+    """The margins by their names in the JSON document."""
+    low, high = found.gain
+    return {
+        **{"gain_up": high, "gain_down": low, "phase": found.phase, "delay": found.delay},
+        **{"modulus": found.modulus, "sensitivity": found.sensitivity, "complementary": found.complementary},
+        "crossover": found.crossover,
+    }
+
+
+def _document(
+    chosen: Scenario,
+    nominal: "System",
+    found: "Band | None",
+    values: dict[str, float],
+    target: float | None,
+    plot: pathlib.Path | None,
+) -> dict[str, Any]:
+    """For JSON, in SI. Infinity (no limit) is a text, as in an override."""
+
+    def plain(one: "System") -> dict[str, Any]:
+        rows = numbers(one.margins).items()
+        return {"stable": one.margins.stable, **{k: "inf" if v == math.inf else float(v) for k, v in rows}}
+
+    worst = found.worst() if found else {}
+    return {
+        "scenario": chosen.name,
+        "at": values | ({} if target is None else {"target": target}),
+        "period": nominal.loop.period,
+        "delay_in_the_loop": nominal.loop.delay,
+        "order": len(nominal.loop.transfer().A),
+        "margins": plain(nominal),
+        "units": UNITS,
+        "over": {path: list(ends) for path, ends in _ranges(chosen).items() if path not in values} if found else {},
+        "systems": [{"values": one.values, **plain(one)} for one in found.systems] if found else [],
+        "corners": found.corners if found else 0,
+        "unstable": len(found.unstable) if found else 0,
+        "worst": {name: {"value": plain(one)[name], "values": one.values} for name, one in worst.items()},
+        "versions": provenance.versions(),
+        "files": {"plot": str(plot)} if plot else {},
+    }
+
+
+def _show(result: dict[str, Any], chosen: Scenario, nominal: "System", found: "Band | None") -> None:
+    """A table of the margins, and where each is worst."""
+    here = numbers(nominal.margins)
+    worst = found.worst() if found else {}
+    columns = [f"worst of {len(found.systems)}", "where"] if worst and found else []
+    table = Table("margin", "here", *columns)
+    for name, words in NAMES.items():
+        row = [_said(name, here[name])]
+        if columns:
+            one = worst.get(name)
+            row += [_said(name, numbers(one.margins)[name]), _where(one.values, chosen)] if one else ["", ""]
+        table.add_row(words, *row)
+    when = f"sampled every {1e3 * result['period']:g} ms" if result["period"] else "in continuous time"
+    delay = f", {1e3 * result['delay_in_the_loop']:g} ms of delay" if result["delay_in_the_loop"] else ""
+    show.titled(f"{chosen.title or chosen.name}: the linearised loop, {when}{delay}", table)
+    if frozen := getattr(chosen.loop.plant, "frozen", ()):
+        console.say(f"note: {' and '.join(frozen)} are held where they are; limits do not act")
+    for name, path in result["files"].items():
+        console.say(f"{name}: {path}")
+
+
+def _said(name: str, value: float) -> str:
+    if math.isnan(value):
+        return "none"
+    return "no limit" if value == math.inf else f"{value * SHOWN_IN.get(name, 1.0):.4g}"
+
+
+def _where(values: dict[str, float], chosen: Scenario) -> str:
+    units = {path: spec.unit for path, (spec, _) in parameters_of(chosen.loop).items()}
+    return ", ".join(f"{path.rpartition('.')[2]} {value:.4g} {units[path]}".strip() for path, value in values.items())
+
+
+def _judge(chosen: Scenario, nominal: "System", found: "Band | None") -> None:
+    """Raises typer.Exit for a loop that is not stable, here or within the ranges."""
+    if not nominal.margins.stable:
+        console.fail(f"{chosen.name}: the closed loop is not stable: no margins", console.FAILED)
+    if found and found.unstable:
+        first = _where(found.unstable[0].values, chosen)
+        count = f"{len(found.unstable)} of {len(found.systems)} systems"
+        console.fail(f"{chosen.name}: not stable in {count} of the ranges, as at {first}", console.FAILED)

@@ -1,0 +1,99 @@
+"""Margins of a loop over a box of parameters: its corners, and samples inside."""
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import replace
+from diffabs.linear.opened_loop import OpenLoop, open_loop
+from diffabs.linear.stability_margins import Margins, margins
+
+MOST_CORNERS = 2**10
+
+# How bad a margin is: the greatest is the worst.
+BADNESS: Mapping[str, Callable[[Margins], float]] = {
+    "gain_up": lambda m: -m.gain[1],
+    "gain_down": lambda m: m.gain[0],
+    "phase": lambda m: -m.phase,
+    "delay": lambda m: -m.delay,
+    "modulus": lambda m: m.sensitivity,
+    "sensitivity": lambda m: m.sensitivity,
+    "complementary": lambda m: m.complementary,
+}
+
+
+class System(NamedTuple):
+    """A loop at some values of its parameters, by path: opened, and its margins."""
+
+    values: dict[str, float]
+    loop: OpenLoop
+    margins: Margins
+
+
+class Band(NamedTuple):
+    """The systems of a box: its `corners` first, then samples inside."""
+
+    systems: tuple[System, ...]
+    corners: int
+
+    @property
+    def unstable(self) -> tuple[System, ...]:
+        """Those whose closed loop is not stable."""
+        return tuple(one for one in self.systems if not one.margins.stable)
+
+    def worst(self) -> dict[str, System]:
+        """The system that each margin is worst of, by the names in `BADNESS`; empty unless all are stable."""
+        if self.unstable:
+            return {}
+        return {name: max(self.systems, key=lambda one, bad=bad: bad(one.margins)) for name, bad in BADNESS.items()}
+
+
+def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, target: Any = None) -> Band:
+    """Return the margins of a loop over a box {path: (low, high)}: at its corners, and at samples that fill it evenly.
+
+    target: as for `open_loop`
+    Raises:
+        ValueError: an inverted range, too many corners, a loop without a linear model.
+        KeyError: a path that is none.
+    """
+    free = {path: (float(low), float(high)) for path, (low, high) in over.items()}
+    for path, (low, high) in free.items():
+        if not low <= high:
+            raise ValueError(f"{path}: the range ({low:g}, {high:g}) is inverted")
+    if 2 ** len(free) > MOST_CORNERS:
+        raise ValueError(f"{len(free)} ranges have {2 ** len(free)} corners; at most {MOST_CORNERS} are looked at")
+    corners = list(dict.fromkeys(itertools.product(*free.values())))
+    inside = even(samples if any(low < high for low, high in free.values()) else 0, len(free))
+    low, high = np.array(list(free.values())).reshape(-1, 2).T
+    points = [*corners, *(low + (high - low) * inside).tolist()]
+    return Band(
+        tuple(_system(loop, dict(zip(free, map(float, at), strict=True)), target) for at in points), len(corners)
+    )
+
+
+def _system(loop: Loop, values: dict[str, float], target: Any) -> System:
+    opened = open_loop(replace(loop, values), target)
+    return System(values, opened, margins(opened))
+
+
+def even(count: int, dimensions: int) -> np.ndarray:
+    """Return points (count, dimensions) that fill the unit cube evenly, always the same: multiples of powers of the
+    root of x^(d+1) = x + 1 (Roberts, 2018), the golden ratio in one dimension."""
+    root = 2.0
+    for _ in range(64):
+        root = (1 + root) ** (1 / (dimensions + 1))
+    steps = root ** -np.arange(1, dimensions + 1)
+    return (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
+
+
+def frequencies(systems: Sequence[OpenLoop], decades: float = 1.5, count: int = 400) -> np.ndarray:
+    """Return frequencies (count,) [rad/s] for a figure of these loops: so many decades around their crossovers, not
+    beyond half the sampling rate."""
+    found = [m.crossover for m in map(margins, systems) if math.isfinite(m.crossover)] or [1.0]
+    low, high = min(found) * 10**-decades, max(found) * 10**decades
+    half = [math.pi / loop.period for loop in systems if loop.period]
+    return np.geomspace(low, min([high, *half]), count)

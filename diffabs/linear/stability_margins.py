@@ -1,0 +1,279 @@
+"""How far a loop is from instability: gain, phase and delay margins, modulus margin, peaks of the sensitivities.
+
+    L  the open loop, of one input and one output, with feedback u = -L v;   S = 1/(1 + L),   T = L/(1 + L)
+
+Whether the closed loop is stable is decided by its poles; with a pure delay in continuous time by counting the poles
+that cross the imaginary axis while the delay grows from zero, which they do where |L| = 1 and nowhere else (Cooke and
+van den Driessche, On zeroes of some transcendental equations, 1986). Crossings are bracketed on a grid that is refined
+until neighbours lie close, and bisected to rounding."""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from diffabs.linear.opened_loop import OpenLoop
+from diffabs.linear.transfer import Transfer
+
+DECADES, PER_DECADE = 4, 60  # beyond the slowest and the fastest pole; points of the grid before it is refined
+CLOSE, PASSES = 0.05, 14  # relative distance of neighbours; how often the grid is refined
+SMALL, TURN = 1e-3, 0.2  # |L| from which on a delay's turns are not resolved; angle of a delay between points [rad]
+MOST = 200_000  # points of a grid
+BISECTIONS, GOLDEN = 70, (math.sqrt(5) - 1) / 2
+EDGE = 1e-9  # relative: |L(0)| and L at half the sampling rate are real but for rounding
+STEPS, FURTHEST = 40, 4.0  # of a search for the delay margin of a sampled loop: steps, multiples of the first guess
+
+
+class Margins(NamedTuple):
+    """Margins of a loop; numbers of an unstable one are NaN.
+
+    stable: whether the closed loop is
+    gain: by which factors the loop's gain can be multiplied, (low, high): 0 and infinity where nothing happens
+    gain_at: where [rad/s], NaN for those
+    phase: what phase can be lost [rad], infinity without a crossover; phase_at [rad/s]
+    delay: what delay can be added [s]
+    sensitivity, sensitivity_at: Ms, the greatest |S|, and where [rad/s]; 1/Ms is the modulus margin
+    complementary, complementary_at: Mt, the greatest |T|
+    crossover: the greatest frequency at which |L| = 1 [rad/s], NaN where there is none
+    """
+
+    stable: bool
+    gain: tuple[float, float]
+    gain_at: tuple[float, float]
+    phase: float
+    phase_at: float
+    delay: float
+    sensitivity: float
+    sensitivity_at: float
+    complementary: float
+    complementary_at: float
+    crossover: float
+
+    @property
+    def modulus(self) -> float:
+        """The least distance of L from -1: 1/Ms."""
+        return 1 / self.sensitivity
+
+
+class Crossings(NamedTuple):
+    """Where |L| = 1: frequencies [rad/s] and the phase above -pi there, in (-pi, pi]. Where L is real and negative:
+    frequencies and the factors 1/|L|."""
+
+    gain_at: np.ndarray
+    phases: np.ndarray
+    phase_at: np.ndarray
+    factors: np.ndarray
+
+
+def margins(loop: OpenLoop | Transfer) -> Margins:
+    """Return the margins of an open loop.
+
+    Of an `OpenLoop` whose controller is sampled, the delay margin is that of the loop with the delay in it, sampled
+    anew; of a sampled `Transfer` it is the phase margin's, at the crossover where it is least.
+    Raises:
+        ValueError: several inputs or outputs.
+    """
+    system = loop.transfer() if isinstance(loop, OpenLoop) else loop
+    if np.shape(system.D) != (1, 1):
+        raise ValueError(f"margins are of one input and one output; the system has {np.shape(system.D)[::-1]}")
+    w = grid(system)
+    found = crossings(system, w)
+    crossover = float(found.gain_at.max()) if len(found.gain_at) else math.nan
+    if not stable(system):
+        none = (math.nan, math.nan)
+        return Margins(False, none, none, *none, math.nan, *none, *none, crossover)
+    i = int(np.argmin(np.abs(found.phases))) if len(found.phases) else None
+    phase, phase_at = (math.inf, math.nan) if i is None else (abs(found.phases[i]), found.gain_at[i])
+    gain, gain_at = _gain_margins(found)
+    ms, mt = _sensitivities(system, w)
+    angle = (float(phase), float(phase_at))
+    return Margins(True, gain, gain_at, *angle, _delay_margin(loop, found), *ms, *mt, crossover)
+
+
+def crossings(system: Transfer, w: np.ndarray | None = None) -> Crossings:
+    """Return where |L| = 1, and where L is real and negative; w is a grid, by default `grid(system)`."""
+    w = grid(system) if w is None else w
+    gain_at = _roots(lambda w: np.log(np.abs(_response(system, w))), w)
+    phases = np.angle(-_response(system, gain_at))
+    phase_at = _roots(lambda w: _response(system, w).imag, w)
+    ends = [0.0, *([math.pi / system.period] if system.period else [])]
+    phase_at = np.union1d(phase_at, [end for end in ends if _real(system, end)])
+    values = _response(system, phase_at).real
+    real = (values < 0) & np.isfinite(values)
+    real &= np.abs(_response(system, phase_at).imag) <= 1e-6 * np.abs(values)  # not where a pole turns the sign
+    return Crossings(gain_at, phases, phase_at[real], -1 / values[real])
+
+
+def stable(system: Transfer) -> bool:
+    """Return whether the closed loop is stable, all its poles inside."""
+    if system.period is not None or not system.delay:
+        return unstable_poles(system.without_delay()) == 0
+    count = unstable_poles(system._replace(delay=0.0))
+    for w, phase in zip(*_turning(system), strict=True):
+        first = (phase % (2 * math.pi)) / w  # the delay at which a pair of poles is at +-jw
+        if system.delay > first:
+            times = 1 + math.floor((system.delay - first) * w / (2 * math.pi))
+            falling = abs(_rational(system, w * 1.0001)) < abs(_rational(system, w * 0.9999))
+            count += 2 * times if falling else -2 * times
+    return count == 0
+
+
+def unstable_poles(system: Transfer) -> int:
+    """Return how many poles of the closed loop are not inside; of a system without delay."""
+    gain = 1 + system.D[0, 0]
+    if not gain:
+        return len(system.A) + 1
+    poles = np.linalg.eigvals(system.A - system.B @ system.C / gain)
+    return int(np.sum(poles.real >= 0 if system.period is None else np.abs(poles) >= 1))
+
+
+def grid(system: Transfer) -> np.ndarray:
+    """Return frequencies (k,) [rad/s] between which L hardly changes, from well below its slowest pole to well above
+    its fastest, or to half the sampling rate."""
+    poles = system.poles
+    if system.period is not None:
+        with np.errstate(divide="ignore"):
+            poles = np.log(poles[np.abs(poles) > 1e-12].astype(complex)) / system.period
+    sizes = np.abs(poles)[np.abs(poles) > 1e-9]
+    half = math.pi / system.period if system.period else math.inf
+    closed = np.abs(_closed_poles(system))
+    sizes = np.concatenate([sizes, closed[closed > 1e-9]]) if len(closed) else sizes
+    low, high = (sizes.min(), sizes.max()) if len(sizes) else (1.0, 1.0)
+    low, high = min(low, half) * 10.0**-DECADES, min(high * 10.0**DECADES, half)
+    w = np.geomspace(low, high, int(PER_DECADE * math.log10(high / low)) + 2)
+    around = [abs(p.imag) + abs(p.real) * np.linspace(-5, 5, 41) for p in poles if p.imag > 0]
+    w = np.unique(np.concatenate([w, *around]))
+    w = _with_turns(system, w[(w >= low) & (w <= high)])
+    return _refined(system, w)
+
+
+def _closed_poles(system: Transfer) -> np.ndarray:
+    """Of the loop without its delay, in s."""
+    poles = np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0)).astype(complex)
+    if system.period is None:
+        return poles
+    return np.log(poles[np.abs(poles) > 1e-12]) / system.period
+
+
+def _with_turns(system: Transfer, w: np.ndarray) -> np.ndarray:
+    """The grid with points at which a delay turns L by little, up to where L has become small."""
+    if not system.delay:
+        return w
+    large = w[np.abs(_response(system, w)) > SMALL]
+    if not len(large):
+        return w
+    count = min(MOST, int(large[-1] * system.delay / TURN) + 2)
+    return np.union1d(w, np.linspace(w[0], large[-1], count))
+
+
+def _refined(system: Transfer, w: np.ndarray) -> np.ndarray:
+    """The grid with points between neighbours at which L differs, as seen from 0 and from -1."""
+    values = _response(system, w)
+    for _ in range(PASSES):
+        change = np.abs(np.diff(values))
+        near = np.minimum(np.abs(values), np.abs(1 + values))
+        wide = change > CLOSE * np.maximum(np.minimum(near[1:], near[:-1]), 1e-6)
+        wide &= np.maximum(np.abs(values[1:]), np.abs(values[:-1])) > SMALL
+        wide &= np.diff(w) > 1e-9 * w[1:]
+        if not wide.any() or len(w) > MOST:
+            break
+        middle = np.sqrt(w[:-1][wide] * w[1:][wide])
+        places = np.flatnonzero(wide) + 1
+        w, values = np.insert(w, places, middle), np.insert(values, places, _response(system, middle))
+    return w
+
+
+def _response(system: Transfer, w: Any) -> Any:
+    return system.response(w)[:, 0, 0]
+
+
+def _rational(system: Transfer, w: float) -> complex:
+    return complex(system.rational(w)[0, 0, 0])
+
+
+def _closed(values: np.ndarray) -> np.ndarray:
+    """T, 1 where L is infinite."""
+    with np.errstate(all="ignore"):
+        return np.where(np.isfinite(values), values / (1 + values), 1.0)
+
+
+def _turning(system: Transfer) -> tuple[np.ndarray, np.ndarray]:
+    """Where |L| = 1, and the phase above -pi of L without its delay."""
+    found = crossings(system._replace(delay=0.0))
+    return found.gain_at, found.phases
+
+
+def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> np.ndarray:
+    """Where a function changes its sign between neighbours of a grid, bisected to rounding."""
+    with np.errstate(all="ignore"):
+        sign = np.sign(function(w))
+        here = np.flatnonzero((sign[1:] * sign[:-1] < 0) | (sign[1:] == 0))
+        low, high, before = w[here], w[here + 1], sign[here]
+        for _ in range(BISECTIONS if len(here) else 0):
+            middle = 0.5 * (low + high)
+            left = np.sign(function(middle)) == before
+            low, high = np.where(left, middle, low), np.where(left, high, middle)
+    return 0.5 * (low + high)
+
+
+def _peak(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[float, float]:
+    """The greatest value of a function and its place, by golden sections around the greatest of a grid."""
+    with np.errstate(all="ignore"):
+        i = int(np.nanargmax(function(w)))
+        low, high = w[max(i - 1, 0)], w[min(i + 1, len(w) - 1)]
+        while high - low > 1e-9 * high:
+            a, b = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+            values = function(np.array([a, b]))
+            low, high = (low, b) if values[0] > values[1] else (a, high)
+        places = np.array([w[i], 0.5 * (low + high)])
+        values = function(places)
+    best = int(np.nanargmax(values))
+    return float(values[best]), float(places[best])
+
+
+def _sensitivities(system: Transfer, w: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The peaks of |S| and |T|, and where; the ends of the axis count too."""
+    w = np.concatenate([[0.0], w])
+    peaks = [_peak(function, w) for function in (
+        lambda w: 1 / np.abs(1 + _response(system, w)), lambda w: np.abs(_closed(_response(system, w))),
+    )]  # fmt: skip
+    if system.period is None:
+        far = system.D[0, 0]
+        peaks = [max(peak, (end, math.inf)) for peak, end in zip(peaks, (1 / abs(1 + far), abs(far)), strict=True)]
+    return peaks[0], peaks[1]
+
+
+def _real(system: Transfer, w: float) -> bool:
+    """Whether L is finite and real at an end of the axis."""
+    value = _response(system, w)[0]
+    return bool(np.isfinite(value)) and abs(value.imag) <= EDGE * abs(value) and abs(value) < 1 / EDGE
+
+
+def _gain_margins(found: Crossings) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The factors next to 1, below and above, and where."""
+    low, high, low_at, high_at = 0.0, math.inf, math.nan, math.nan
+    for factor, w in zip(found.factors.tolist(), found.phase_at.tolist(), strict=True):
+        if low < factor < 1:
+            low, low_at = factor, w
+        if 1 < factor < high:
+            high, high_at = factor, w
+    return (low, high), (low_at, high_at)
+
+
+def _delay_margin(loop: OpenLoop | Transfer, found: Crossings) -> float:
+    """The delay that a stable loop bears [s]."""
+    delays = (found.phases % (2 * math.pi)) / found.gain_at
+    guess = float(delays.min()) if len(delays) else math.inf
+    if not isinstance(loop, OpenLoop) or loop.period is None or not math.isfinite(guess):
+        return guess
+    step, low = max(guess, loop.period) / STEPS, 0.0
+    while stable(loop.transfer(low + step)):
+        low += step
+        if low > FURTHEST * max(guess, loop.period):
+            return math.inf
+    high = low + step
+    while high - low > 1e-12 * high:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(loop.transfer(middle)) else (low, middle)
+    return 0.5 * (low + high)

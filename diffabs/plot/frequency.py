@@ -1,0 +1,86 @@
+"""A loop in the frequency domain: Bode, Nyquist, sensitivities, with the band of its box behind."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from diffabs.linear.opened_loop import OpenLoop
+from diffabs.linear.robustness import frequencies
+from diffabs.linear.stability_margins import Margins
+from diffabs.plot.runs import COLOURS, GREY, label, sheet
+
+FAR = 3.0  # how far from 0 the Nyquist plot looks
+LIGHT = 0.25
+LEAST_DB = -80.0
+
+
+def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *, title: str = "") -> Any:
+    """Return a figure: magnitude and phase of the open loop, its Nyquist plot with the circle of its sensitivity, and
+    the sensitivities |S| and |T|.
+
+    band: loops whose curves lie behind, from the least to the greatest at each frequency
+    """
+    w = frequencies([loop, *band])
+    figure, (magnitude, nyquist, phase, closed) = sheet(2, 2, title=title, size=(5.6, 3.4))
+    main, around = _response(loop, w), np.array([_response(one, w) for one in band])
+    for ax in (magnitude, phase, closed):
+        ax.set_xscale("log")
+        ax.set_xlim(w[0], w[-1])
+    _banded(magnitude, w, _db(main), _db(around), COLOURS[0], "L")
+    magnitude.axhline(0, color=GREY, linewidth=0.8)
+    magnitude.set_ylim(max(magnitude.get_ylim()[0], LEAST_DB), None)
+    label(magnitude, "", "|L| [dB]", legend=False)
+    _banded(phase, w, _degrees(main), np.array([_degrees(one) for one in around]), COLOURS[0], "L")
+    phase.axhline(-180, color=GREY, linewidth=0.8)
+    label(phase, "frequency [rad/s]", "phase of L [degrees]", legend=False)
+    _nyquist(nyquist, main, around, found)
+    for values, colour, name in ((1 / (1 + main), COLOURS[1], "S"), (main / (1 + main), COLOURS[2], "T")):
+        others = 1 / (1 + around) if name == "S" else around / (1 + around)
+        _banded(closed, w, _db(values), _db(others), colour, name)
+    closed.axhline(0, color=GREY, linewidth=0.8)
+    closed.set_ylim(max(closed.get_ylim()[0], LEAST_DB / 2), None)
+    label(closed, "frequency [rad/s]", "sensitivities [dB]")
+    if np.isfinite(found.crossover):
+        for ax in (magnitude, phase):
+            ax.axvline(found.crossover, color=GREY, linewidth=0.8, linestyle=":")
+    return figure
+
+
+def _response(loop: OpenLoop, w: np.ndarray) -> Any:
+    return loop.transfer().response(w)[:, 0, 0]
+
+
+def _db(values: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return 20 * np.log10(np.abs(values))
+
+
+def _degrees(values: np.ndarray) -> np.ndarray:
+    """Continuous, and between -360 and 0 where |L| is closest to 1."""
+    angles = np.unwrap(np.angle(values))
+    near = angles[np.argmin(np.abs(np.log(np.abs(values))))]
+    return np.degrees(angles - 2 * np.pi * np.ceil(near / (2 * np.pi)))
+
+
+def _banded(ax: Any, w: np.ndarray, main: np.ndarray, around: np.ndarray, colour: str, name: str) -> None:
+    """A curve, and what lies between the least and the greatest of others."""
+    if len(around):
+        ax.fill_between(w, around.min(axis=0), around.max(axis=0), color=colour, alpha=LIGHT, linewidth=0)
+    ax.plot(w, main, color=colour, label=name)
+
+
+def _nyquist(ax: Any, main: Any, around: Any, found: Margins) -> None:
+    """L in the complex plane, with the point -1 and the circle that L does not enter."""
+    for values in around:
+        ax.plot(values.real, values.imag, color=COLOURS[0], alpha=LIGHT, linewidth=0.7)
+    ax.plot(main.real, main.imag, color=COLOURS[0], label="L")
+    ax.plot([-1], [0], "+", color=COLOURS[1], markersize=10)
+    if found.stable:
+        turn = np.linspace(0, 2 * np.pi, 181)
+        circle = -1 + found.modulus * np.exp(1j * turn)
+        ax.plot(circle.real, circle.imag, "--", color=COLOURS[1], linewidth=1, label=f"1/Ms = {found.modulus:.3g}")
+    ax.set_xlim(-FAR, FAR - 1)
+    ax.set_ylim(-FAR + 0.5, FAR - 0.5)
+    ax.set_aspect("equal", adjustable="box")
+    label(ax, "Re L", "Im L")

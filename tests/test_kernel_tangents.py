@@ -1,0 +1,193 @@
+"""Derivatives of a kernel's runs, forward: those of XLA, in one launch, and an objection in reverse.
+
+To rounding where steps are those of the grid. Where a step ends on an event or a kink, the derivative of its moment is
+divided by how the margin falls there, which is a difference over a thousandth of a step: XLA's own digits end there."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from kernels import FOLDER
+from test_kernel_parts import CASES, VARIED, with_part
+
+import diffabs as d
+from diffabs import scenario
+from diffabs.core.pytree import arrayed, get
+from diffabs.kernel import compilers, launch, tangents
+from diffabs.kernel.graph import Level
+from diffabs.kernel.launch import run_lanes
+from diffabs.objectives import usual
+
+pytestmark = pytest.mark.xdist_group("kernel tangents")
+
+LANES, STEPS = 37, 5
+EXACT, LANDED = {"rtol": 1e-12}, {"rtol": 1e-7}  # of the largest derivative among the lanes
+PARTS_HERE = [case for case in CASES if case[0] != "stop"]
+
+
+@pytest.fixture(autouse=True)
+def _own_folder(monkeypatch):
+    monkeypatch.setenv(compilers.CACHE, FOLDER)
+    monkeypatch.setattr(launch, "VECTORS", 2)
+
+
+def chain(gain, rates, engine="kernel"):
+    """What follows from what, step by step: y from the gain, z from y, w from z; and what moves with nothing."""
+
+    def step(rate, carry):
+        i, y, z, w, still = carry
+        new = (y + 0.1 * gain * jnp.sin(rate * y), z + y / (1 + z * z), w + jnp.where(z > 1.5, z * w, w), still + 1.0)
+        return (i + (i < STEPS), *(jnp.where(i < STEPS, a, b) for a, b in zip(new, carry[1:], strict=True)))
+
+    ones = jnp.ones(len(rates))
+    carry = (jnp.zeros(len(rates), int), ones, ones, ones, ones)
+    if engine == "kernel":
+        carry = run_lanes(lambda _, c: c, step, lambda _, c: c[0] < STEPS, rates, carry, steps=2, rounds=1)
+    else:
+        for _ in range(STEPS):
+            carry = jax.vmap(step)(rates, carry)
+    return jnp.stack(carry[1:])
+
+
+RATES = jnp.linspace(0.5, 2.0, LANES)
+WAYS = {
+    "of what is the same for all": lambda f: jax.jvp(lambda g: f(g, RATES), (2.0,), (1.0,))[1],
+    "of the lanes": lambda f: jax.jvp(lambda r: f(2.0, r), (RATES,), (RATES**2,))[1],
+    "of both": lambda f: jax.jvp(f, (2.0, RATES), (1.0, RATES))[1],
+    "three tangents": lambda f: jax.jacfwd(lambda x: f(x[0] * x[1], x[2] * RATES))(jnp.array([2.0, 1.0, 1.0])),
+    "eleven tangents": lambda f: jax.jacfwd(lambda x: f(jnp.sum(jnp.sin(x)), x[3] * RATES))(jnp.arange(1.0, 12.0) / 9),
+    "under jit": lambda f: jax.jit(jax.jacfwd(lambda x: f(x[0], x[1] * RATES)))(jnp.array([2.0, 1.0])),
+    "for several gains": lambda f: jax.vmap(lambda g: f(g, RATES))(jnp.array([1.0, 2.0, 3.0])),
+    "several tangents for several gains": lambda f: jax.vmap(jax.jacfwd(lambda x: f(x[0], x[1] * RATES)))(
+        jnp.array([[2.0, 1.0], [1.0, 1.5], [0.5, 1.0]])
+    ),
+    "along a batch": lambda f: jax.jacfwd(jax.vmap(lambda x: f(x, RATES[:3])))(jnp.array([1.0, 2.0])),
+    "of lanes in a batch": lambda f: jax.vmap(lambda r, s: jax.jvp(lambda r: f(2.0, r), (r,), (s,))[1], (1, None), 2)(
+        jnp.stack([RATES, 2 * RATES], 1), RATES
+    ),
+}
+
+
+class TestLaunch:
+    @pytest.mark.parametrize("way", WAYS)
+    def test_derivatives_are_those_of_xla(self, way):
+        found, expected = (jax.device_get(WAYS[way](lambda g, r, e=e: chain(g, r, e))) for e in ("kernel", "xla"))
+        assert np.abs(expected[..., :3]).max() > 0
+        np.testing.assert_allclose(found, expected, rtol=2e-13, atol=1e-13)
+
+    def test_only_what_moves_is_carried(self, monkeypatch):
+        """The fourth number moves with nothing, and what comes from no tangent is no operation."""
+        seen = []
+        spread = tangents.spread
+        monkeypatch.setattr(tangents, "spread", lambda f, one, *more: seen.append(one.do) or spread(f, one, *more))
+        jax.jvp(lambda g: chain(g, RATES), (2.0,), (1.0,))
+        assert seen[-1][Level.STEP] == (1, 2, 3)
+        assert seen[-1][Level.LANE] == ()
+
+    @pytest.mark.parametrize(("many", "launches"), [(8, 1), (9, 2)])
+    def test_tangents_are_one_launch(self, many, launches, monkeypatch):
+        made = []
+        launched = launch._launched
+        monkeypatch.setattr(launch, "_launched", lambda *args, **how: made.append(1) or launched(*args, **how))
+        jax.jacfwd(lambda x: chain(jnp.sum(x), RATES))(jnp.ones(many))
+        assert len(made) == launches
+
+    @pytest.mark.parametrize(
+        "reverse",
+        [
+            lambda f: jax.grad(f)(2.0),
+            lambda f: jax.jit(jax.grad(f))(2.0),
+            lambda f: jax.grad(jax.jit(f))(2.0),
+            lambda f: jax.vmap(jax.grad(f))(jnp.ones(2)),
+        ],
+    )
+    def test_reverse_mode_is_refused(self, reverse):
+        with pytest.raises(ValueError, match="a kernel has no reverse mode: forward mode"):
+            reverse(lambda g: jnp.sum(chain(g, RATES)))
+
+    def test_second_derivatives_are_refused(self):
+        with pytest.raises(ValueError, match="a kernel has no second derivatives"):
+            jax.jacfwd(jax.jacfwd(lambda g: chain(g, RATES)))(2.0)
+
+    def test_on_two_devices(self):
+        """Lanes that lie on two devices, each of which runs its own; and their derivatives."""
+        environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", compilers.CACHE: FOLDER}
+        environment["PYTHONPATH"] = os.pathsep.join([os.path.dirname(__file__), *sys.path])
+        done = subprocess.run([sys.executable, "-c", ON_TWO], env=environment, capture_output=True, text=True)
+        assert done.stdout == "on two devices\n", done.stderr[-2000:]
+
+
+ON_TWO = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+from test_kernel_tangents import chain
+
+jax.config.update("jax_enable_x64", True)
+mesh, lanes = jax.make_mesh((2,), ("lanes",)), PartitionSpec("lanes")
+rates = jnp.linspace(0.5, 2.0, 38)
+apart = jax.device_put(rates, NamedSharding(mesh, lanes))
+specs = {"in_specs": (PartitionSpec(), lanes), "out_specs": PartitionSpec(None, "lanes")}
+own = jax.jit(jax.shard_map(chain, mesh=mesh, **specs))
+known = chain(2.0, rates, "xla"), jax.jacfwd(lambda g: chain(g, rates, "xla"))(2.0)
+for f in (own, jax.jit(chain)):
+    found = f(2.0, apart), jax.jacfwd(lambda g: f(g, apart))(2.0)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-13, atol=1e-13), found, known)
+assert len(own(2.0, apart).sharding.device_set) == 2
+print("on two devices")
+"""
+
+
+def moved(loop, solver, objectives, path, engine):
+    """Values and derivatives of all metrics along two changes of all in a loop, and of what its lanes begin with."""
+    leaves, tree = jax.tree.flatten(arrayed(loop))
+    ways = [np.random.default_rng(i).uniform(0.5, 1.0, np.shape(x)) for i, x in enumerate(leaves)]
+    spread = float(get(loop, path)) * np.linspace(0.96, 1.04, 12) + 1e-3
+
+    def metrics(z):
+        one = tree.unflatten([jnp.asarray(x, float) * (1 + w * z[0]) for x, w in zip(leaves, ways, strict=True)])
+        lanes = d.Batch({path: spread * (1 + z[1])}, np.arange(12))
+        run = d.run_batch(one, lanes, solver, objectives, accepted=True, engine=engine)
+        return run.metrics, (run.metrics, run.diverged)
+
+    return jax.device_get(jax.jit(jax.jacfwd(metrics, has_aux=True))(jnp.zeros(2)))
+
+
+def compare(given, close, values=1e-13):
+    """By a kernel and by XLA."""
+    (found, (metrics, diverged)), (expected, (known, lost)) = (moved(*given, engine) for engine in ("kernel", "xla"))
+    np.testing.assert_array_equal(diverged, lost)
+    assert any(np.nanmax(np.abs(slope)) > 0 for slope in expected.values())
+    for name, slope in expected.items():
+        np.testing.assert_allclose(metrics[name], known[name], rtol=values, atol=1e-12, err_msg=name)
+        largest = np.nanmax(np.abs(slope), axis=0, initial=0.0) if np.isfinite(slope).any() else np.zeros(2)
+        off = np.abs(found[name] - slope)
+        np.testing.assert_array_equal(np.isnan(found[name]), np.isnan(slope), err_msg=name)
+        assert not (off > close["rtol"] * largest + 1e-12).any(), (name, off.max(axis=0), largest)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("family", "name"), PARTS_HERE, ids=map("-".join, PARTS_HERE))
+def test_a_part(family, name):
+    """With steps of the grid alone."""
+    loop, path = with_part(family, name)
+    compare((loop, d.FixedStep(1e-3, 0.06, kinks=False), usual(loop.plant), path), EXACT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["grid", "kinks", "adaptive"])
+@pytest.mark.parametrize("name", scenario.names())
+def test_a_scenario(name, kind):
+    """To its end where steps end on what happens."""
+    one = scenario.load(name)
+    solver = dataclasses.replace(one.solver, kinks=False, duration=200 * one.solver.step)
+    if kind == "kinks":
+        solver = one.solver
+    if kind == "adaptive":
+        solver = d.Adaptive(rtol=1e-6, duration=one.solver.duration, step=one.solver.step)
+    given = (one.loop, solver, dict(one.objectives), VARIED.get(name, "initial.speed"))
+    compare(given, EXACT if kind == "grid" else LANDED, 1e-7 if kind == "adaptive" else 1e-12)
