@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import test_kernel_native
 import test_kernel_parts as cases
+import test_kernel_tangents
 from cuda_on_processor import Processor
 from kernels import FOLDER, applied, both, same
 from test_kernel import AT_ONCE, DIVERGING, KEYS, LOOP, MEASURED, NEVER, SOLVER, VALUES
@@ -88,6 +89,10 @@ class TestText:
         two = jax.device_get(jax.vmap(at)(jnp.array([0.97 * mass, mass])))["iae"]
         np.testing.assert_array_equal(two[1], at(mass)["iae"])
         assert not np.any(two[0] == two[1])
+
+    @pytest.mark.parametrize("way", ["of both", "eleven tangents", "several tangents for several gains"])
+    def test_derivatives_are_those_of_xla(self, way, processor):
+        test_kernel_tangents.TestLaunch().test_derivatives_are_those_of_xla(way)
 
     @pytest.mark.slow
     @pytest.mark.parametrize("kind", cases.SOLVERS)
@@ -254,6 +259,10 @@ class TestGPU:
 
     def test_rules_are_those_of_jax(self):
         test_kernel_native.test_rules_are_those_of_jax()
+
+    @pytest.mark.parametrize("way", test_kernel_tangents.WAYS)
+    def test_derivatives_are_those_of_xla(self, way):
+        test_kernel_tangents.TestLaunch().test_derivatives_are_those_of_xla(way)
 
     @pytest.mark.parametrize("kind", cases.SOLVERS)
     @pytest.mark.parametrize("name", scenario.names())
