@@ -27,7 +27,7 @@ import record
 from jax.experimental.buffer_callback import buffer_callback
 from peers import on_devices, problem, reference
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 import diffabs
 from diffabs import scenario
@@ -175,7 +175,7 @@ def translated(name, dtype):
 
 def in_registers(dtypes):
     """Print what a thread of each packaged scenario needs."""
-    table = Table("", "numbers", "", "operations", "real ones", "registers", "bytes spilled")
+    table = Table(Column(no_wrap=True), "numbers", "", "operations", "real ones", "registers", "bytes spilled")
     for name in scenario.names():
         for dtype in dtypes:
             program, shape = translated(name, dtype)

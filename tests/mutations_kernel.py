@@ -79,7 +79,7 @@ KERNEL = [
      "    except ZeroDivisionError:\n        _do(\"cuCtxPop",
      f"{CUDA}::TestDriver::test_objects"),
     ("cuda: flags do not name machine code", "kernel/nvrtc.py", "repr((FLAGS, version(), architecture))",
-     "repr((version(), architecture))", f"{CUDA}::TestMachineCode::test_is_made_once"),
+     "repr((version(), architecture))", f"{CUDA}::test_machine_code_is_made_once"),
     ("cuda: every GPU is NVIDIA's", GPU, 'if not capability.replace(".", "").isdigit():', "if False:",
      f"{CUDA}::TestObjections::test_of_a_gpu_of_another_make"),
     ("kernel: a scan's inputs are told otherwise", NESTED, "if len(groups) != 3 or", "if False and",
