@@ -9,7 +9,11 @@ RULES = f"{FUNCTIONS}::test_rules_are_those_of_jax"
 ULPS = f"{FUNCTIONS}::test_elementary_functions_are_right_to_a_unit_in_the_last_place[float64-]"
 OBJECTION = "test_kernel.py::TestObjections"
 
-START = "test_kernel_start.py"
+START, CUDA = "test_kernel_start.py", "test_kernel_cuda.py"
+LANE, THREADS, GPU = "kernel/native/lane.h", "kernel/native/threads.h", "kernel/gpu.py"
+CUDA_RUNS = f"{CUDA}::TestText::test_runs_are_those_of_xla"
+CUDA_RULES = f"{CUDA}::TestText::test_rules_are_those_of_jax"
+TOLD = f"{CUDA}::TestDriver::test_is_told_of_arrays_threads_and_lanes"
 KEPT, FINGERPRINT = "kernel/kept.py", "core/fingerprint.py"
 
 KERNEL = [
@@ -58,4 +62,59 @@ KERNEL = [
      f"{START}::TestSurroundings::test_differ_for_settings"),
     ("start: the types of what is given are not seen", FINGERPRINT, 'f"array {x.dtype} {x.shape}', 'f"array {x.shape}',
      f"{START}::TestDigest::test_of_what_is_given_is_that_of_types_and_shapes"),
+    ("cuda: NaN is no extreme", LANE, "T most(T a, T b) { return a == a ? higher(a, b) : a; }",
+     "T most(T a, T b) { return higher(a, b); }", CUDA_RULES),
+    ("cuda: too large a number is cut off", LANE, "x < high ? (V)x : greatest", "true ? (V)x : greatest", CUDA_RULES),
+    ("cuda: bits are a value", LANE, "both.from = x;", "both.to = (V)x;", CUDA_RULES),
+    ("cuda: a thread keeps its lane", THREADS, "j = (i64)atomicAdd((u64*)next, (u64)1);", "j = count;", CUDA_RUNS),
+    ("cuda: what belongs to a lane is not worked out anew", THREADS,
+     "arrays.carry);\n    begin(b, s, 0);\n  }", "arrays.carry);\n  }", CUDA_RUNS),
+    ("cuda: a lane is left out", THREADS, "*next = threads;", "*next = threads + 1;", CUDA_RUNS),
+    ("cuda: more threads than the counter knows of", GPU, "ctypes.c_int64(blocks * cuda.THREADS)",
+     "ctypes.c_int64(blocks)", TOLD),
+    ("cuda: another stream", GPU, "cuda.THREADS, context.stream, arrays", "cuda.THREADS, 0, arrays", TOLD),
+    ("cuda: blocks that the device does not hold", GPU, "min(one.blocks, -(-count // cuda.THREADS))",
+     "-(-count // cuda.THREADS)", TOLD),
+    ("cuda: a context is left behind", GPU, "    finally:\n        _do(\"cuCtxPop",
+     "    except ZeroDivisionError:\n        _do(\"cuCtxPop",
+     f"{CUDA}::TestDriver::test_objects"),
+    ("cuda: flags do not name machine code", "kernel/nvrtc.py", "repr((FLAGS, version(), architecture))",
+     "repr((version(), architecture))", f"{CUDA}::test_machine_code_is_made_once"),
+    ("cuda: every GPU is NVIDIA's", GPU, 'if not capability.replace(".", "").isdigit():', "if False:",
+     f"{CUDA}::TestObjections::test_of_a_gpu_of_another_make"),
+    ("kernel: a scan's inputs are told otherwise", NESTED, "if len(groups) != 3 or", "if False and",
+     f"{OBJECTION}::test_of_a_scan_whose_inputs_are_told_otherwise"),
+    ("kernel: an empty compiler is the first one", "kernel/compilers.py", "if said is not None and not said.strip():",
+     "if False:", f"{OBJECTION}::test_without_a_compiler"),
+    ("kernel: a compiler is not tried", "kernel/compilers.py", "            _try(command)\n", "",
+     f"{OBJECTION}::test_of_a_compiler_that_does_not_work[false]"),
+    ("kernel: any name of an engine", "simulate/native.py", "if engine not in ENGINES:", "if False:",
+     f"{OBJECTION}::test_of_another_name"),
+    ("kernel: lanes that run together by a kernel", "simulate/batch.py",
+     'return by_engine(engine, together_, together_, "lanes', 'return by_engine("xla", together_, together_, "lanes',
+     f"{OBJECTION}::test_of_lanes_that_run_together"),
+    ("kernel: a primitive without a rule is nothing", "kernel/primitives.py", "if name not in RULES:",
+     'if name not in RULES and name != "while":', f"{OBJECTION}::test_of_an_operation"),
+    ("kernel: scans of any length", NESTED, 'if p["length"] > LONGEST:', "if False:",
+     f"{OBJECTION}::test_of_an_operation"),
+    ("kernel: arrays of any length are written", "kernel/indexing.py", "if count > LONGEST:", "if False:",
+     f"{OBJECTION}::test_of_an_operation"),
+    ("kernel: columns of any length", "kernel/indexing.py", "if len(column) > LONGEST:", "if False:",
+     f"{OBJECTION}::test_of_an_operation"),
+    ("kernel: keys of any generator", DRAWS, 'if str(aval.dtype) != "key<fry>":', "if False:",
+     f"{OBJECTION}::test_of_an_operation"),
+    ("kernel: auto does not say why", "simulate/native.py", "    _tell(why_not)\n", "",
+     f"{OBJECTION}::test_without_a_compiler"),
+    ("kernel: a library that cannot be loaded", "kernel/launch.py", "except (OSError, AttributeError) as error:",
+     "except AttributeError as error:", "test_kernel.py::TestLibrary::test_that_is_none_cannot_be_loaded"),
+    ("kernel: a folder that cannot be made", "kernel/compilers.py",
+     "    except (OSError, subprocess.TimeoutExpired) as error:\n        raise NoCompiler(f\"no kernel",
+     "    except subprocess.TimeoutExpired as error:\n        raise NoCompiler(f\"no kernel",
+     "test_kernel.py::TestLibrary::test_in_a_folder_that_cannot_be_made"),
+    ("kernel: the command says auto and means XLA", "cli/sweep.py", 'if engine == "xla":', "if True:",
+     "test_kernel.py::TestSweep::test_by_the_command[kernel-]"),
+    ("kernel: the command does not fall back", "cli/sweep.py", 'if line and engine == "kernel":', "if line:",
+     "test_kernel.py::TestSweep::test_by_the_command[auto-note: runs are made by XLA: ]"),
+    ("kernel: a sweep writes before it is refused", "sweep/run.py", 'if study.engine != "xla" and', "if False and",
+     "test_kernel.py::TestSweep::test_is_refused_before_anything_is_written"),
 ]  # fmt: skip

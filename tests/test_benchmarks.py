@@ -5,6 +5,7 @@ import json
 import pathlib
 import sys
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -181,3 +182,21 @@ def test_the_figure_has_a_panel_for_each_problem(tmp_path):
     with pytest.raises(ValueError, match="3 lanes were not run"):
         draw.panels(whole, None, 3, "float64")
     matplotlib.pyplot.close(figure)
+
+
+def test_useful_operations_are_those_of_real_numbers_in_a_step():
+    """Not what is worked out before it, nor whole numbers, nor what only chooses."""
+    from diffabs.kernel import program
+
+    def step(lane, carry):
+        x, k = carry
+        return jnp.where(x > 1.0, (x * lane + 2.0 * lane) / x - 1.0, x), k + 1
+
+    found = program.build({"step": step}, 1.0, (1.0, 1))
+    assert module("bench_gpu").arithmetic(found) == 4
+
+
+def test_the_gpu_is_asked_for_first(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["bench_gpu.py"])
+    with pytest.raises(SystemExit, match="JAX runs on no GPU here"):
+        module("bench_gpu").main()

@@ -191,6 +191,16 @@ class TestObjections:
         with pytest.raises(Unsupported, match=line.replace("(", r"\(")):
             applied({"f": function}, np.ones(3))
 
+    @pytest.mark.parametrize("structure", [None, (1, 1, 1), {}])
+    def test_of_a_scan_whose_inputs_are_told_otherwise(self, structure):
+        """As JAX 0.11 began to do: a still later one may do so again."""
+        jaxpr = jax.make_jaxpr(lambda x: jax.lax.fori_loop(0, 3, lambda i, y: x * y, x))(1.0).jaxpr
+        (eqn,) = (eqn for eqn in jaxpr.eqns if eqn.primitive.name == "scan")
+        params = {name: x for name, x in eqn.params.items() if name not in ("num_consts", "num_carry")}
+        new = jaxpr.replace(eqns=[eqn.replace(params=params | {"ft_in": structure})])
+        with pytest.raises(Unsupported, match="scan: its parameter ft_in is not known"):
+            translate(Graph(), new, [], [known(Graph(), 1.0)])
+
     def test_of_a_parameter_that_is_not_known(self):
         """A later JAX may say something with it."""
         jaxpr = jax.make_jaxpr(lambda x: jnp.exp(x))(1.0).jaxpr

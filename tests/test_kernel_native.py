@@ -122,16 +122,13 @@ RULES = {
     "part written": lambda x, y, k: jax.lax.dynamic_update_slice(jnp.zeros(5), jnp.stack([x, y]), (k,)),
     "either way": lambda x, y, k: jax.lax.cond(x > y, lambda: jnp.sin(x) + y, lambda: x * y),
     "one of three": lambda x, y, k: jax.lax.switch(k, [lambda: x, lambda: y, lambda: x * y]),
+    "scanned twice": lambda x, y, k: jax.lax.fori_loop(0, 3, lambda i, a: (a[0] * y + i, a[1] + a[0]), (x, y))[1],
     "scanned": lambda x, y, k: jax.lax.scan(lambda a, b: (a * y + b, a), x, jnp.arange(3.0), reverse=True)[1],
     "draws": lambda x, y, k: jax.random.normal(jax.random.fold_in(KEY, k), (3,)),
     "draws, 32 bits": lambda x, y, k: jax.random.bits(jax.random.fold_in(KEY, k), (), np.uint32),
     "arc": lambda x, y, k: jnp.stack([jnp.arctan2(x, y), jnp.tan(x), jnp.sinh(x / 40), jnp.cosh(y / 40)]),
     "logistic": lambda x, y, k: jnp.stack([jax.nn.sigmoid(x), jax.lax.rsqrt(jnp.abs(y))]),
 }
-
-
-if jax.__version_info__ >= (0, 12):  # its `scan` says otherwise what is carried: an objection
-    del RULES["scanned"]
 
 
 def test_rules_are_those_of_jax():

@@ -43,7 +43,7 @@ class Shape(NamedTuple):
 
 def text(program: Program, shape: Shape) -> str:
     """Return the C++ of a program with the functions `renew`, `step` (carry to carry) and `running` (to one truth)."""
-    return "\n".join(_Text(program, shape).parts()) + "\n"
+    return "\n".join(Text(program, shape).parts()) + "\n"
 
 
 def truth(dtype: np.dtype) -> bool:
@@ -85,8 +85,13 @@ def literal(node: Node) -> str:
     return f"all(({name}){float(x).hex()})"
 
 
-class _Text:
+class Text:
+    """The parts of a text, of which another back end has another first and last one, over the same names."""
+
+    HEAD, DRIVER = '#include "functions.h"', '#include "drive.h"'
+
     def __init__(self, program: Program, shape: Shape):
+        """What of a program is worked out where."""
         self.program, self.shape = program, shape
         self.roots = [node for nodes in program.results.values() for node in nodes]
         nodes = live(self.roots)
@@ -111,7 +116,7 @@ class _Text:
     def parts(self) -> Iterator[str]:
         """The parts of the text, in their order."""
         single = "#define SINGLE\n" if self.program.dtype == np.float32 else ""
-        yield f'{single}#include "functions.h"\nenum {{ VECTORS = {self.shape.vectors}, SLOTS = VECTORS*LANES }};'
+        yield f"{single}{self.HEAD}\nenum {{ VECTORS = {self.shape.vectors}, SLOTS = VECTORS*LANES }};"
         sizes = self.program.sizes
         counts = zip(("UNIFORM", "OF_LANES", "CARRIED"), (len(sizes[level]) for level in sizes), strict=True)
         yield "enum { " + ", ".join(f"{name} = {count}" for name, count in counts) + " };"
@@ -126,7 +131,7 @@ class _Text:
         yield from self._running()
         yield from self._moves()
         yield f"enum {{ STEPS = {self.shape.steps}, ROUNDS = {self.shape.rounds} }};"
-        yield '#include "drive.h"'
+        yield self.DRIVER
 
     def _given(self, level: Level) -> list[tuple[Place, Node]]:
         return [
@@ -147,7 +152,7 @@ class _Text:
 
     def _prepare(self) -> Iterator[str]:
         """static void prepare(Shared&, arrays): what is the same for all lanes."""
-        yield "static void prepare(Shared& s, const Array* uniform) { (void)s; (void)uniform;"
+        yield "PART void prepare(Shared& s, const Array* uniform) { (void)s; (void)uniform;"
         for place, node in self._given(Level.UNIFORM):
             value = f"((const {kind(node.dtype)}*)uniform[{place.array}].data)[{place.entry}]"
             yield "  " + _spread(node, value)
@@ -163,7 +168,7 @@ class _Text:
 
     def _begin(self) -> Iterator[str]:
         """static void begin(Block&, const Shared&, int q): what follows from the inputs of the lanes of vector q."""
-        yield "static void begin(Block& b, const Shared& s, int q) { (void)b; (void)s; (void)q;"
+        yield "PART void begin(Block& b, const Shared& s, int q) { (void)b; (void)s; (void)q;"
         yield from self._uniform([node for node in live(self.lanes) if node.level == Level.LANE])
         for _, node in self._given(Level.LANE):
             yield f"  const {vector(node.dtype)} v{node.id}_0 = b.l{node.id}[q];"
@@ -177,7 +182,7 @@ class _Text:
         """static void NAME(Block&, const Shared&): a function of the carry, of all vectors."""
         carried, results = self.program.carried(), self.program.results[name]
         changed = [(c, r) for c, r in zip(carried, results, strict=True) if c is not r]
-        yield f"static __attribute__((noinline)) void {name}(Block& b, const Shared& s) {{ (void)b; (void)s;"
+        yield f"BODY void {name}(Block& b, const Shared& s) {{ (void)b; (void)s;"
         yield from self._body([r for _, r in changed])
         for q in range(self.shape.vectors):
             for c, r in changed:
@@ -187,7 +192,7 @@ class _Text:
     def _running(self) -> Iterator[str]:
         """static void running(const Block&, const Shared&, mask*): whether each lane goes on."""
         (root,) = self.program.results["running"]
-        yield "static void running(const Block& b, const Shared& s, mask* on) { (void)b; (void)s;"
+        yield "PART void running(const Block& b, const Shared& s, mask* on) { (void)b; (void)s;"
         yield from self._body([root])
         for q in range(self.shape.vectors):
             yield f"  on[{q}] = {self._name(root, q)};"
@@ -217,19 +222,19 @@ class _Text:
 
     def _moves(self) -> Iterator[str]:
         """Functions that put a lane into a place of the block, and take its carry out."""
-        yield "static void put(Block& b, int p, i64 j, const Array* lanes, const Array* carry) {"
+        yield "PART void put(Block& b, int p, i64 j, const Array* lanes, const Array* carry) {"
         yield "  const int i = p/LANES, q = p%LANES; (void)lanes;"
         for places, name, array in ((Level.LANE, "l", "lanes"), (Level.STEP, "c", "carry")):
             for place, node in self._given(places):
                 size = self.program.sizes[places][place.array]
                 value = f"((const {kind(node.dtype)}*){array}[{place.array}].data)[j*{size} + {place.entry}]"
                 target = f"b.{name}{node.id}[i]"
-                yield f"  set({target}, q, {value});" if truth(node.dtype) else f"  {target}[q] = {value};"
-        yield "}\nstatic void take(const Block& b, int p, i64 j, const Array* carry) {"
+                yield f"  set({target}, q, {value});" if truth(node.dtype) else f"  place({target}, q, {value});"
+        yield "}\nPART void take(const Block& b, int p, i64 j, const Array* carry) {"
         yield "  const int i = p/LANES, q = p%LANES;"
         for place, node in self._given(Level.STEP):
             size, value = self.program.sizes[Level.STEP][place.array], f"b.c{node.id}[i]"
-            value = f"get({value}, q)" if truth(node.dtype) else f"{value}[q]"
+            value = f"get({value}, q)" if truth(node.dtype) else f"at({value}, q)"
             yield f"  (({kind(node.dtype)}*)carry[{place.array}].data)[j*{size} + {place.entry}] = {value};"
         yield "}"
 
@@ -286,7 +291,7 @@ class _Text:
         if node.op == "convert":
             return f"to({args[0]}, {vector(node.dtype)}{{}})"
         if node.op == "bits":
-            return f"({vector(node.dtype)}){args[0]}"
+            return f"bits_as({args[0]}, {vector(node.dtype)}{{}})"
         if node.op == "any":
             return args[0]
         assert node.op == "table", node.op

@@ -82,7 +82,7 @@ class Kept:
             return self._known[place]
 
     def _found(self, args: Any, device: Any) -> Callable[..., Any] | None:
-        around = (fingerprint.surroundings(), compilers.described(), launch.threads(), str(device))
+        around = (fingerprint.surroundings(), launch.described(), launch.threads(), str(device))
         path = compilers.cache_folder() / FOLDER / f"{fingerprint.digest(args, (self.told, *around))}.program"
         program = _read(path, len(jax.tree.leaves(args)), device)
         if program is None:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.kernel import binding, compilers, cpp, program
+from diffabs.kernel import binding, compilers, cpp, gpu, program
 
 LINES = 10_000  # of a step; the blocks of a larger program are of fewer vectors, or compiling takes long
 VECTORS = 4
@@ -40,7 +40,8 @@ def run_lanes(
 
     Works under jit and vmap, with derivatives forward. Raises Unsupported for an operation that has no rule, NoCompiler
     where there is none, ValueError for reverse mode."""
-    compilers.compiler()
+    if not gpu.device():
+        compilers.compiler()
     functions = program.traced(
         {"renew": renew, "step": step, "running": running}, jax.tree.map(_one, lane), jax.tree.map(_one, carry)
     )
@@ -54,10 +55,12 @@ def run_lanes(
 
 def _launched(made: program.Program, before: list[Any], carry: list[Any], shape: cpp.Shape) -> list[Any]:
     """The carry of lanes that are all over; `before`: what is the same for all lanes, and what is a lane's own."""
-    first = len(before)
+    first, results = len(before), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
+    if gpu.device():
+        return gpu.call(made, shape, [*before, *carry], results)
     call = jax.ffi.ffi_call(
         target(made, shape),
-        [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry],
+        results,
         input_output_aliases={first + i: i for i in range(len(carry))},
     )
     return list(call(*before, *carry, threads=np.int64(threads())))
@@ -70,6 +73,11 @@ def target(made: program.Program, shape: cpp.Shape) -> str:
         shape = shape._replace(vectors=shape.vectors // 2)
         source = cpp.text(made, shape)
     return register(compilers.library(source))
+
+
+def described() -> dict[str, str]:
+    """Return what decides the bits of a kernel besides its text: compiler, flags, processor. Raises NoCompiler."""
+    return gpu.described() if gpu.device() else compilers.described()
 
 
 def register(path: pathlib.Path) -> str:

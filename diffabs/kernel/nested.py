@@ -58,12 +58,12 @@ def _cond(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return taken
 
 
-@rule("scan", "length reverse jaxpr num_consts num_carry linear unroll _split_transpose")
+@rule("scan", "length reverse jaxpr num_consts num_carry linear unroll _split_transpose ft_in ft_out")
 def _scan(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     p = eqn.params
     if p["length"] > LONGEST:
         raise Unsupported("scan", f"of {p['length']} steps within a step; {LONGEST} are the most")
-    constants, many = p["num_consts"], p["num_carry"]
+    constants, many = _counts(p, len(ins))
     fixed, carry, rows = ins[:constants], ins[constants : constants + many], ins[constants + many :]
     order = range(p["length"])[:: -1 if p["reverse"] else 1]
     seen: dict[int, list[Array]] = {}
@@ -71,3 +71,17 @@ def _scan(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         outs = called(graph, p["jaxpr"], [*fixed, *carry, *(entry(row[i]) for row in rows)])
         carry, seen[i] = outs[:many], outs[many:]
     return [*carry, *(np.stack(column) for column in zip(*(seen[i] for i in sorted(seen)), strict=True))]
+
+
+def _counts(params: Any, inputs: int) -> tuple[int, int]:
+    """How many inputs of a scan are constants, and how many are carried: numbers until JAX 0.10, then a structure of
+    three groups of inputs, in their order."""
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    try:
+        groups = [list(group) for group in params["ft_in"].update(range(inputs)).unpack()]
+    except (AssertionError, AttributeError, TypeError, ValueError):
+        groups = []
+    if len(groups) != 3 or [i for group in groups for i in group] != [*range(inputs)]:
+        raise Unsupported("scan", "its parameter ft_in is not known")
+    return len(groups[0]), len(groups[1])

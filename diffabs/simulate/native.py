@@ -17,7 +17,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
 from diffabs.core.tracing import pushed
-from diffabs.kernel import compilers
+from diffabs.kernel import launch
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.kept import Kept
 from diffabs.kernel.launch import run_lanes
@@ -155,7 +155,7 @@ def by_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Ru
 
 def described(engine: str) -> dict[str, str]:
     """Return what a result says of the engine that made it: its name, and what decides the bits of a kernel."""
-    return {"name": engine} | (compilers.described() if engine == "kernel" else {})
+    return {"name": engine} | (launch.described() if engine == "kernel" else {})
 
 
 @functools.cache

@@ -26,7 +26,7 @@ from distributed import Client, KilledWorker, LocalCluster, Security, as_complet
 from distributed.comm.core import connect
 
 from diffabs.core import files, provenance
-from diffabs.kernel import compilers
+from diffabs.kernel import launch
 from diffabs.sweep.engines import DECISIVE, Done, done
 from diffabs.sweep.manifest import Seals, described
 from diffabs.sweep.runner import Runner
@@ -147,7 +147,7 @@ def _check(client: Client, engine: str) -> None:
 
 def _origin(engine: str) -> dict[str, str]:
     """What can change a bit of the results, here: versions; of a kernel, the compiler and the processor."""
-    return provenance.origin(*DECISIVE) | (compilers.described() if engine == "kernel" else {})
+    return provenance.origin(*DECISIVE) | (launch.described() if engine == "kernel" else {})
 
 
 def _completed(client: Client, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Iterator[Done]:

@@ -16,7 +16,7 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, problems, replace
 from diffabs.core.values import plain, unknown
-from diffabs.kernel import compilers
+from diffabs.kernel import launch
 from diffabs.objectives import usual
 from diffabs.simulate.refusals import ill
 from diffabs.simulate.solution import Solver, described
@@ -110,7 +110,7 @@ class Study:
         own: dict[str, Any] = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
         own |= {"failures": self.bounded, "success": self.success}
         if self.engine != "xla":
-            own |= {"engine": {"name": self.engine, **compilers.described()}}
+            own |= {"engine": {"name": self.engine, **launch.described()}}
         return json.loads(
             json.dumps(
                 {

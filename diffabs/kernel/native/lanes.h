@@ -24,6 +24,8 @@
 #endif
 #define LANES (BYTES/sizeof(REAL))
 #define FN static inline __attribute__((always_inline, unused))
+#define PART static
+#define BODY static __attribute__((noinline))
 
 typedef float f32;
 typedef double f64;
@@ -172,6 +174,10 @@ FN vu32 size(vu32 x) { return x; }
 FN vu64 size(vu64 x) { return x; }
 FN mask finite(vf32 x) { return le(size(x), all(3.40282346638528859812e38f)); }
 FN mask finite(vf64 x) { return le(size(x), all(1.79769313486231570815e308)); }
+
+template<class V> FN auto at(V x, int q) -> decltype(x[0] + 0*x[0]) { return x[q]; }
+template<class V, class T> FN void place(V& x, int q, T value) { x[q] = value; }
+template<class V, class T> FN V bits_as(T x, V) { return (V)x; }
 
 /* Types. A real number beyond what a whole one can be becomes the nearest of these, NaN becomes 0, as in XLA. */
 template<class V, class T> FN V to(T x, V) { return CAST(V, x); }

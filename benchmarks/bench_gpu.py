@@ -1,0 +1,224 @@
+"""Closed loops per second on an NVIDIA GPU: a kernel of diffabs, its XLA path, and diffrax, on the problem of the peers
+(peers/problem.py), at equal accuracy; and what share of the card's FP32 rate the kernel's own arithmetic is.
+
+The rate is measured first, by a kernel that only multiplies and adds. The share counts the real additions,
+multiplications and divisions of a step as the program has them, one each, times the steps of the runs; selections,
+comparisons, elementary functions and whole numbers count nothing. Times are taken in turn, medians of `--rounds`.
+
+Never run yet where this was written: no machine there has a GPU. With --machine-code no GPU is asked for: registers and
+spills of the packaged scenarios for sm_80 and sm_90, as NVRTC's assembler tells them.
+
+    python benchmarks/bench_gpu.py [--lanes 131072 1048576] [--dtypes float32 float64] [--rounds 5]
+    python benchmarks/bench_gpu.py --machine-code
+"""
+
+import argparse
+import ctypes
+import functools
+import os
+import pathlib
+import statistics
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import record
+from jax.experimental.buffer_callback import buffer_callback
+from peers import on_devices, problem, reference
+from rich.console import Console
+from rich.table import Column, Table
+
+import diffabs
+from diffabs import scenario
+from diffabs.core.pytree import get
+from diffabs.kernel import cuda, gpu, kept, launch, nvrtc
+from diffabs.kernel.graph import Level, real
+from diffabs.kernel.program import Program, live
+from diffabs.simulate import native
+
+ACCURACY = 1e-4
+STEPS, TOLERANCES = (1e-3, 5e-4, 2e-4, 1e-4), (1e-5, 5e-6, 1e-6)
+COUNTED = {"add": 1, "sub": 1, "mul": 1, "div": 1}
+TURNS, CHAINS, THREADS = 1 << 15, 8, 1 << 20  # of the kernel that measures the card
+RATE = f"""
+struct Arrays {{ void* data[3]; }};
+extern "C" __global__ void begin_all(const Arrays arrays, void* shared, long long* next, long long threads) {{}}
+extern "C" __global__ void run_all(const Arrays arrays, const void* shared, long long* next, long long count) {{
+  float x[{CHAINS}];
+  const float a = 0.999f, b = threadIdx.x*1e-3f;
+  for (int k = 0; k < {CHAINS}; k++) x[k] = b + k;
+  for (int i = 0; i < {TURNS}; i++)
+    for (int k = 0; k < {CHAINS}; k++) x[k] = a*x[k] + b;
+  float sum = 0;
+  for (int k = 0; k < {CHAINS}; k++) sum += x[k];
+  if (sum == 12345.f) ((float*)arrays.data[1])[0] = sum;
+}}
+"""
+
+
+def rate(on: gpu.Device, rounds: int) -> float:
+    """Return the card's single-precision operations per second, an addition and a multiplication each one."""
+    code = on.compiled(RATE)
+    blocks = -(-THREADS // cuda.THREADS) * cuda.THREADS
+
+    def start(context, outs, ins):
+        addresses = (ctypes.c_void_p * 3)(on.address(ins), on.address(outs[0]), 0)
+        on.start(code, addresses, on.address(outs[1]), blocks, context)
+
+    shapes = [jax.ShapeDtypeStruct((1,), np.float32), jax.ShapeDtypeStruct((256,), np.uint8)]
+    call = jax.jit(lambda x: buffer_callback(start, shapes)(x))
+    jax.block_until_ready(call(jnp.zeros(1)))
+    seconds = statistics.median(record.timed(lambda: jax.block_until_ready(call(jnp.zeros(1)))) for _ in range(rounds))
+    return 2.0 * TURNS * CHAINS * held(on, code) / seconds
+
+
+def held(on: gpu.Device, code: pathlib.Path) -> int:
+    """Return how many threads a launch has: no more than the card holds at once."""
+    blocks = next(one.blocks for (path, _), one in on._loaded.items() if path == code)
+    return min(blocks, -(-THREADS // cuda.THREADS)) * cuda.THREADS
+
+
+def arithmetic(program: Program) -> int:
+    """Return how many real operations a step has."""
+    nodes = live(program.results["step"])
+    return sum(COUNTED.get(node.op, 0) for node in nodes if node.level == Level.STEP and real(node.dtype))
+
+
+def programs() -> list[Program]:
+    """Return a list to which every program that is translated from now on is added."""
+    found, source = [], cuda.source
+    cuda.source = lambda program, shape: (found.append(program), source(program, shape))[1]
+    return found
+
+
+def solvers(masses, speeds, dtype):
+    """Return, by name, the settings of each contender, and what makes its program for one."""
+    from peers import ours
+
+    def of(kind, engine):
+        return lambda setting: ours.prepared_with(kind, masses, speeds, setting, dtype, engine)
+
+    found = {
+        "kernel, FixedStep": (STEPS, of("fixed", "kernel")),
+        "kernel, Adaptive": (TOLERANCES, of("adaptive", "kernel")),
+        "XLA, FixedStep": (STEPS, of("fixed", "xla")),
+        "XLA, Adaptive": (TOLERANCES, of("adaptive", "xla")),
+    }
+    try:
+        from peers import diffrax_event
+    except ImportError:
+        return found
+    solve = lambda setting: jax.vmap(functools.partial(diffrax_event.one, tolerance=setting))  # noqa: E731
+    found["diffrax, Tsit5"] = (
+        diffrax_event.LADDER,
+        lambda setting: on_devices.spread(solve(setting), masses, speeds, dtype),
+    )
+    return found
+
+
+def measured(lanes, dtype, rounds, peak):
+    """Return a row for each contender: its setting, error, runs per second, and share of the card's rate."""
+    jax.config.update("jax_enable_x64", dtype == "float64")
+    masses, speeds = problem.lanes(lanes)
+    (right, _), seen, chosen = reference.answers(masses, speeds), programs(), {}
+    for name, (settings, prepared) in solvers(masses, speeds, dtype).items():
+        points = []
+        for setting in settings:
+            run = prepared(setting)
+            found = run()
+            error = float(problem.errors(found, right).max())
+            points.append({"setting": setting, "error": error, "run": run, "time": float(np.mean(found[0]))})
+            if error <= ACCURACY:
+                break
+        chosen[name] = record.best(points, ACCURACY) | {"operations": arithmetic(seen[-1]) if seen else 0}
+    taken = record.in_turn({name: functools.partial(record.timed, one["run"]) for name, one in chosen.items()}, rounds)
+    rows = []
+    for name, one in chosen.items():
+        runs = lanes / statistics.median(taken[name])
+        row = {
+            "name": name,
+            "lanes": lanes,
+            "dtype": dtype,
+            "setting": one["setting"],
+            "error": one["error"],
+            "runs": runs,
+        }
+        if name == "kernel, FixedStep" and dtype == "float32":
+            row["share"] = runs * one["time"] / one["setting"] * one["operations"] / peak
+        rows.append(row)
+    return rows
+
+
+class Translated(Exception):
+    """A program, and how it is to be run."""
+
+
+def translated(name, dtype):
+    """Return program and shape of a packaged scenario."""
+
+    def launched(made, before, carry, shape):
+        raise Translated(made, shape)
+
+    one, path = scenario.load(name), "initial.theta" if name.startswith("arm") else "initial.speed"
+    lanes = diffabs.Batch({path: np.full(2, float(get(one.loop, path)))}, np.arange(2))
+    given = (one.loop, lanes, one.solver, one.objectives)
+    off = mock.patch.dict(os.environ, {kept.OFF: "1"})
+    with jax.enable_x64(dtype == "float64"), mock.patch.object(launch, "_launched", launched), off:
+        native._kept.forget()
+        try:
+            diffabs.run_batch(*given, together=False, accepted=True, engine="kernel")
+        except Translated as done:
+            return done.args
+    raise AssertionError("no kernel was asked for")
+
+
+def in_registers(dtypes):
+    """Print what a thread of each packaged scenario needs."""
+    table = Table(Column(no_wrap=True), "numbers", "", "operations", "real ones", "registers", "bytes spilled")
+    for name in scenario.names():
+        for dtype in dtypes:
+            program, shape = translated(name, dtype)
+            source = cuda.source(program, shape)
+            operations = (len(live(program.results["step"])), arithmetic(program))
+            for architecture in ("sm_80", "sm_90"):
+                log = nvrtc.machine_code(source.text, architecture).with_suffix(".log").read_text()
+                used = nvrtc.registers(log)["run_all"]
+                numbers = map(str, (*operations, used["registers"], used["spilled"]))
+                table.add_row(name, dtype, architecture, *numbers)
+    Console().print(table)
+
+
+def on_a_gpu(options):
+    """Measure, print, write. Exits where JAX runs on no GPU."""
+    on = gpu.device()
+    if on is None:
+        raise SystemExit("JAX runs on no GPU here: pip install jax[cuda13] on a machine with one")
+    peak, rounds = rate(on, options.rounds), options.rounds
+    rows = [row for n in options.lanes for dtype in options.dtypes for row in measured(n, dtype, rounds, peak)]
+    table = Table("", "lanes", "numbers", "setting", "worst error", "runs/s", "of FP32 peak")
+    for row in rows:
+        share = f"{row['share']:.1%}" if "share" in row else ""
+        shown = (f"{row['lanes']:,}", row["dtype"], f"{row['setting']:g}", f"{row['error']:.1e}", f"{row['runs']:,.0f}")
+        table.add_row(row["name"], *shown, share)
+    Console().print(table, f"FP32, measured: {peak / 1e12:.1f} Tflop/s")
+    print(record.written("gpu", {"rows": rows, "fp32_flops": peak, "accuracy": ACCURACY}, options.out))
+
+
+def main():
+    """Do what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--lanes", type=int, nargs="+", default=[1 << 17, 1 << 20])
+    parser.add_argument("--dtypes", nargs="+", default=["float32", "float64"], choices=("float32", "float64"))
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--out", type=pathlib.Path)
+    parser.add_argument("--machine-code", action="store_true")
+    options = parser.parse_args()
+    if options.machine_code:
+        in_registers(options.dtypes)
+    else:
+        on_a_gpu(options)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""CUDA C++ to machine code of a named architecture, by NVIDIA's runtime compiler, which comes with JAX for GPUs.
+
+It needs neither a GPU nor a driver. Kept in the user's cache folder as libraries of the processor are (`compilers`)."""
+
+import ctypes
+import functools
+import hashlib
+import importlib.util
+import pathlib
+import re
+from typing import Any
+
+from diffabs.core import files
+from diffabs.kernel.compilers import NATIVE, NoCompiler, cache_folder
+
+HEADERS = ("lane.h", "threads.h")
+# Nothing that changes what is finite: the smallest numbers stay, division and roots are IEEE's. The last two only tell.
+FLAGS = (
+    *("-std=c++17", "-default-device", "-fmad=true", "-ftz=false", "-prec-div=true", "-prec-sqrt=true"),
+    *("-Xptxas=-v", "-diag-suppress=177"),
+)
+
+
+def machine_code(text: str, architecture: str) -> pathlib.Path:
+    """Return the file of the machine code of a text, compiled if it is not there yet; beside it (`.log`) what the
+    assembler said of registers. Raises NoCompiler.
+
+    architecture: as in sm_90"""
+    headers = [(NATIVE / name).read_bytes() for name in HEADERS]
+    said = [text.encode(), *headers, repr((FLAGS, version(), architecture)).encode()]
+    digest = hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in said)).hexdigest()
+    path = cache_folder() / f"{digest}.cubin"
+    if not path.is_file():
+        code, log = _compiled(text, architecture, headers)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            files.write(path.with_suffix(".log"), log.encode())
+            files.write(path, code)
+        except OSError as error:
+            raise NoCompiler(f"no kernel in {path.parent}: {error.strerror or error}") from None
+    return path
+
+
+def registers(log: str) -> dict[str, dict[str, int]]:
+    """Return, of each kernel that the assembler tells of, how many registers a thread has, and bytes that it spills."""
+    found = {}
+    for part in re.split(r"Compiling entry function", log)[1:]:
+        name = re.search(r"'(\w+)'", part)
+        used, spilled = re.search(r"Used (\d+) registers", part), re.findall(r"(\d+) bytes spill", part)
+        if name and used:
+            found[name[1]] = {"registers": int(used[1]), "spilled": sum(map(int, spilled))}
+    return found
+
+
+@functools.cache
+def version() -> tuple[int, int]:
+    """Return the compiler's version. Raises NoCompiler."""
+    major, minor = ctypes.c_int(), ctypes.c_int()
+    _library().nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
+    return major.value, minor.value
+
+
+@functools.cache
+def _library() -> Any:
+    """Of the packages nvidia-cuda-nvrtc (CUDA 13) and nvidia-cuda-nvrtc-cu12, or of the system."""
+    found = importlib.util.find_spec("nvidia")
+    folders = [*(found.submodule_search_locations or ())] if found else []
+    paths = [
+        str(p) for folder in folders for p in sorted(pathlib.Path(folder).glob("*/lib/libnvrtc.so.*"), reverse=True)
+    ]
+    for path in (*paths, "libnvrtc.so.13", "libnvrtc.so.12"):
+        try:
+            return ctypes.CDLL(path)
+        except OSError:
+            continue
+    raise NoCompiler("no CUDA compiler; the package nvidia-cuda-nvrtc, which jax[cuda13] brings, has one")
+
+
+def _compiled(text: str, architecture: str, headers: list[bytes]) -> tuple[bytes, str]:
+    nvrtc, program = _library(), ctypes.c_void_p()
+    names = (ctypes.c_char_p * len(HEADERS))(*(name.encode() for name in HEADERS))
+    contents = (ctypes.c_char_p * len(headers))(*headers)
+    nvrtc.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"kernel.cu", len(HEADERS), contents, names)
+    try:
+        options = [option.encode() for option in (f"-arch={architecture}", *FLAGS)]
+        failed = nvrtc.nvrtcCompileProgram(program, len(options), (ctypes.c_char_p * len(options))(*options))
+        log = _part(nvrtc, "ProgramLog", program).rstrip(b"\0").decode(errors="replace")
+        if failed:
+            lines = [line for line in log.splitlines() if "error" in line] or [f"NVRTC says {failed}"]
+            raise NoCompiler(f"NVRTC, {architecture}: {lines[0][:300]}")
+        return _part(nvrtc, "CUBIN", program), log
+    finally:
+        nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
+
+
+def _part(nvrtc: Any, name: str, program: ctypes.c_void_p) -> bytes:
+    size = ctypes.c_size_t()
+    getattr(nvrtc, f"nvrtcGet{name}Size")(program, ctypes.byref(size))
+    out = ctypes.create_string_buffer(size.value)
+    getattr(nvrtc, f"nvrtcGet{name}")(program, out)
+    return out.raw
