@@ -54,7 +54,18 @@ overshoot = 0.5
 """
 KEYS = [
     *("scenario", "lanes", "free", "objective", "metrics", "constraints", "met", "reason", "gradient_norm"),
-    *("evaluations", "mode", "engine", "history", "starts", "parameters", "certificate", "versions", "files", "interrupted"),
+    *(
+        "evaluations",
+        "mode",
+        "engine",
+        "history",
+        "starts",
+        "parameters",
+        "certificate",
+        "versions",
+        "files",
+        "interrupted",
+    ),
 ]
 HISTORY = [Point(0, 2.0, 1.0, 0.5, 0.1, 1), Point(1, 1.5, 0.75, 0.01, 0.0, 3)]
 
