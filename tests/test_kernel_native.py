@@ -98,6 +98,7 @@ RULES = {
     "rests": lambda x, y, k: jnp.stack([jnp.fmod(x, 0.7), jnp.remainder(y, 0.7)]),
     "whole rests": lambda x, y, k: jnp.stack([k % 5, -k % 7, k // 3, -k // 4, k // (k - 3), k % (k - 3)]),
     "rounded": lambda x, y, k: jnp.stack([jax.lax.round(x), jnp.round(x), jnp.trunc(y)]),
+    "bits that are set": lambda x, y, k: jax.lax.population_count(jnp.uint32(k) * jnp.uint32(2654435761)),
     "converted": lambda x, y, k: jnp.stack([(100 * x).astype(int), k + (x > y), x.astype(bool) + k]),
     "single": lambda x, y, k: (x.astype(np.float32) * np.float32(1.7)).astype(float),
     "bits": lambda x, y, k: jax.lax.bitcast_convert_type(x, jnp.uint64) >> jnp.uint64(3),

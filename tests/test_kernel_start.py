@@ -193,7 +193,11 @@ class TestWhatNobodyCanTell:
         assert len(traced) == 2
         assert not [*folder.glob("*.program")]
 
-    @pytest.mark.parametrize("thing", [object(), lambda x: x, np.array([None]), jnp.sin], ids=str)
+    @pytest.mark.parametrize(
+        "thing",
+        [object(), lambda x: x, np.array([None]), jnp.sin],
+        ids=["an object", "a function", "an array of objects", "a compiled function"],
+    )
     def test_other_things(self, thing):
         with pytest.raises(Unknown):
             fingerprint.digest(thing, None)

@@ -4,22 +4,31 @@ An array has a known shape, so it is an array of nodes, and whatever only moves 
 the parameters that it knows. A primitive without a rule, or with another parameter (a later JAX may have one), is an
 objection, never a guess."""
 
+import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.extend.core as jex
 import numpy as np
 
 from diffabs.kernel.graph import Array, Graph, Node
 
+JAX = pathlib.Path(jax.__file__).parent
+CARRIERS = [pathlib.Path(__file__).parents[1] / name for name in ("core", "kernel", "simulate")]
+
 
 class Unsupported(Exception):
-    """What cannot be translated: the primitive, and why."""
+    """What cannot be translated: the primitive, why, and, where it can be told, the method of the part that asks."""
 
     def __init__(self, primitive: str, reason: str):
         """`reason` goes on where the primitive's name stands."""
-        super().__init__(f"{primitive}: {reason}")
-        self.primitive, self.reason = primitive, reason
+        super().__init__(primitive, reason)
+        self.primitive, self.reason, self.method = primitive, reason, ""
+
+    def __str__(self) -> str:
+        """One line."""
+        return f"{self.primitive}: {self.reason}" + (f" (in {self.method})" if self.method else "")
 
 
 class Rule(NamedTuple):
@@ -60,12 +69,26 @@ def _dtype(atom: Any) -> Any:
 
 def _applied(graph: Graph, eqn: Any, inputs: list[Array]) -> Sequence[Array]:
     name = eqn.primitive.name
-    if name not in RULES:
-        raise Unsupported(name, "there is no rule for it")
-    one = RULES[name]
-    if new := sorted(set(eqn.params) - one.known):
-        raise Unsupported(name, f"its parameter {new[0]} is not known")
-    return one.apply(graph, eqn, inputs)
+    try:
+        if name not in RULES:
+            raise Unsupported(name, "there is no rule for it")
+        if new := sorted(set(eqn.params) - RULES[name].known):
+            raise Unsupported(name, f"its parameter {new[0]} is not known")
+        return RULES[name].apply(graph, eqn, inputs)
+    except Unsupported as error:
+        error.method = error.method or _asked_by(eqn)
+        raise
+
+
+def _asked_by(eqn: Any) -> str:
+    """The innermost method from which this comes, of a class that is not JAX's nor of what carries parts; or none."""
+    traceback = getattr(getattr(eqn, "source_info", None), "traceback", None)
+    for frame in getattr(traceback, "frames", ()):
+        place = pathlib.Path(frame.file_name)
+        method = frame.function_name.partition(".<locals>")[0]
+        if "." in method and not (JAX in place.parents or any(folder in place.parents for folder in CARRIERS)):
+            return method
+    return ""
 
 
 def known(graph: Graph, x: Any, dtype: Any = None) -> Array:

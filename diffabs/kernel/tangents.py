@@ -84,7 +84,8 @@ def spread(functions: Functions, one: Derivative, many: int, as_lanes: frozenset
         values = [new[node.id][0] for nodes in arrays[: len(functions.types[Level.STEP])] for node in nodes]
         slopes = [arrays[_number(functions, one, Key(Level.STEP, i, True))] for i in one.do[Level.STEP]]
         results[name] = values + [_copy(new[x.id], k) for nodes in slopes for k in range(many) for x in nodes]
-    return checked(Program(inputs, results, functions.uniform, sizes, old.dtype), len(graph.nodes))
+    copies = {node.id: k for nodes in new.values() if len(nodes) > 1 for k, node in enumerate(nodes)}
+    return checked(Program(inputs, results, functions.uniform, sizes, old.dtype, copies), len(graph.nodes))
 
 
 def _number(functions: Functions, one: Derivative, key: Key) -> int:

@@ -39,6 +39,11 @@ log = logging.getLogger("diffabs")
 class EngineError(ValueError):
     """What stands against the engine that is asked for."""
 
+    @classmethod
+    def of(cls, line: Any) -> "EngineError":
+        """Return the error that says so of a kernel."""
+        return cls(f"engine = 'kernel' is not possible: {line}")
+
 
 def run_native(
     loop: Loop,
@@ -148,7 +153,7 @@ def by_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Ru
         except (Unsupported, NoCompiler) as error:
             why_not = str(error)
     if engine == "kernel":
-        raise EngineError(f"engine = 'kernel' is not possible: {why_not}")
+        raise EngineError.of(why_not)
     tell(why_not)
     return otherwise()
 

@@ -23,6 +23,7 @@ from diffabs.core.compiling import SAME
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
+from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.native import ENGINES, EngineError, tell
 from diffabs.simulate.refusals import first_line, refusals
@@ -106,20 +107,23 @@ class Problem:
         line = REVERSE if mode is Mode.REVERSE else None
         found = dataclasses.replace(self, engine="kernel", mode=Mode.FORWARD)
         if engine == "kernel" and line:
-            raise EngineError(f"engine = 'kernel' is not possible: {line}")
+            raise EngineError.of(line)
         if engine == "auto" and (line := line or found.objection()):
             tell(line)
             return self
         return found
 
     def objection(self) -> str | None:
-        """Return why its engine cannot make the runs and their derivatives, or None. Nothing is compiled."""
+        """Return why its engine cannot make the runs and their derivatives, or None. None is made, but what makes them
+        is compiled, and kept."""
         z = jax.ShapeDtypeStruct((1, self.space.size), jnp.result_type(float))
         none = Multipliers(np.zeros((1, self.excesses)), np.ones(1), None)
         try:
-            jax.eval_shape(self._evaluate, z, none, 1.0)
+            self._evaluate.lower(z, none, 1.0)
         except EngineError as error:
             return str(error)
+        except NoCompiler as error:  # where that is already known to be no objection, and is one now
+            return str(EngineError.of(error))
         return None
 
     def seen(self, z: Any) -> Seen:
@@ -158,7 +162,7 @@ class Problem:
         return lambda z, m: self._evaluate(z, m, scale)
 
     @functools.cached_property
-    def _evaluate(self) -> Callable[[Any, Multipliers, Any], Evaluation]:
+    def _evaluate(self) -> Any:
         derivative = jax.jacfwd if self.mode is Mode.FORWARD else jax.grad
 
         def evaluate(z: Any, m: Multipliers, scale: Any) -> Evaluation:

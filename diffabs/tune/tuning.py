@@ -8,8 +8,10 @@ import numpy as np
 from diffabs.core.bijectors import Range, space
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import check
+from diffabs.kernel.compilers import NoCompiler
 from diffabs.objectives import usual
 from diffabs.simulate.batch import Batch
+from diffabs.simulate.native import EngineError
 from diffabs.simulate.solution import Solver
 from diffabs.tune.augmented_lagrangian import Search
 from diffabs.tune.constraints import Constraint
@@ -77,7 +79,10 @@ def tune(
         mode=method.mode,
         engine=engine,
     )
-    return Search(problem, method, progress, stopping).result()
+    try:
+        return Search(problem, method, progress, stopping).result()
+    except NoCompiler as error:
+        raise EngineError.of(error) from None
 
 
 def posed(

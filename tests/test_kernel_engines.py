@@ -1,0 +1,169 @@
+"""Wherever batches run, a kernel makes the runs that XLA makes, and says what stands against it."""
+
+import dataclasses
+import json
+import logging
+
+import jax
+import numpy as np
+import pytest
+from commands import run
+from kernels import FOLDER
+
+import diffabs as d
+from diffabs import actuators, controllers, plants, reliability, roads, scenario, stops, sweep, tune
+from diffabs.core.pytree import get
+from diffabs.design.attraction import Cells, attraction
+from diffabs.kernel import compilers
+from diffabs.objectives import IAE, StopTime
+from diffabs.scenario.defaults import braking
+from diffabs.simulate import native
+from diffabs.tune.problem import Mode
+
+pytestmark = pytest.mark.xdist_group("kernel engines")
+
+LOOP = braking(
+    plant=plants.QuarterCar(road=roads.DRY_ASPHALT),
+    stop=stops.SpeedReached(speed=15.0),
+    controller=controllers.ConstantTorque(torque=20.0),
+)
+TUNED = {
+    "free": {"controller.torque": (10.0, 100.0)},
+    "objective": {"iae": 1.0},
+    "measured": {"iae": IAE()},
+    "over": d.Batch({"plant.mass": [14.0, 15.0, 16.0]}),
+    "solver": d.FixedStep(2e-3, 3.0),
+}
+LOCKED = braking(
+    initial=d.BrakeStart(speed=10.0, slip=1.0),
+    controller=controllers.ConstantTorque(torque=500.0),
+    stop=stops.SpeedReached(speed=5.0),
+)
+SPACE = {"initial.speed": sweep.Normal(10.0, 0.5, low=6.0, high=14.0)}
+STUDY = sweep.Study(
+    LOCKED, sweep.Space(SPACE), samples=1, solver=d.FixedStep(5e-3, 3.0), objectives={"stop_time": StopTime()}
+)
+DELAYED = d.replace(LOOP, {"actuator": actuators.Delay(capacity=1024)})
+NONE = f"{compilers.COMPILER} is empty"
+
+
+@pytest.fixture(autouse=True)
+def _own_folder(monkeypatch):
+    monkeypatch.setenv(compilers.CACHE, FOLDER)
+
+
+@pytest.fixture
+def no_compiler(monkeypatch):
+    monkeypatch.setenv(compilers.COMPILER, "")
+    native.tell.cache_clear()
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+class TestTune:
+    def test_is_that_of_xla(self):
+        """Two starts, each with its lanes, in one launch; the values of what is tuned to the last digits."""
+        method = tune.Method(starts=2)
+        found, expected = (tune.tune(LOOP, **TUNED, method=method, engine=e) for e in ("kernel", "xla"))
+        assert found.engine == {"name": "kernel", **compilers.described()}
+        assert expected.engine == {"name": "xla"}
+        np.testing.assert_allclose(found.objective, expected.objective, rtol=1e-9)
+        np.testing.assert_allclose(found.values["controller.torque"], expected.values["controller.torque"], rtol=1e-6)
+        assert found.mode is Mode.FORWARD
+
+    def test_without_lanes_of_its_own_and_of_many_parameters(self):
+        """One lane; and forward mode where XLA would have taken reverse mode."""
+        given = {**TUNED, "over": None}
+        paths = ["controller.torque", "plant.mass", "plant.inertia", "initial.speed", "plant.road.c1", "plant.radius"]
+        paths += ["plant.road.c2", "plant.road.c3", "stop.speed"]
+        ranges = {path: (0.9 * float(get(LOOP, path)), 1.1 * float(get(LOOP, path))) for path in paths}
+        problems = [
+            tune.posed(LOOP, **{**given, "free": ranges}, engine=e, mode=m)
+            for e, m in (("kernel", None), ("xla", Mode.REVERSE))
+        ]
+        z = problems[0].space.place(LOOP)[None]
+        none = tune.problem.Multipliers(np.zeros((1, 0)), np.ones(1))
+        found, expected = (jax.device_get(problem.evaluator(1.0)(z, none)) for problem in problems)
+        np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-7, atol=1e-12)
+
+    def test_in_reverse_mode_is_refused(self):
+        method = tune.Method(mode=Mode.REVERSE)
+        with pytest.raises(native.EngineError, match="engine = 'kernel' is not possible: a kernel has no reverse mode"):
+            tune.tune(LOOP, **TUNED, method=method, engine="kernel")
+
+    def test_of_another_name(self):
+        with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
+            tune.tune(LOOP, **TUNED, engine="gpu")
+
+    def test_without_a_compiler(self, no_compiler, caplog):
+        with pytest.raises(native.EngineError, match=NONE):
+            tune.tune(LOOP, **TUNED, engine="kernel")
+        with caplog.at_level(logging.WARNING, "diffabs"):
+            found = [tune.posed(LOOP, **TUNED, engine="auto") for _ in range(2)]
+        assert [problem.engine for problem in found] == ["xla", "xla"]
+        assert len(caplog.records) == 1
+        assert NONE in caplog.records[0].getMessage()
+
+    def test_of_what_has_no_rule_names_the_part(self):
+        line = tune.posed(DELAYED, **TUNED, engine="kernel").objection()
+        why = "dynamic_slice: of 1296 entries that differ between lanes (in Delay.tick)"
+        assert line == f"engine = 'kernel' is not possible: {why}"
+
+    @pytest.mark.slow
+    def test_by_the_command(self, tmp_path, monkeypatch):
+        """It writes what made it; without a compiler it is an objection, or XLA, and says so."""
+        few = ("--set", "tune.iterations=1", "--json")
+        document = json.loads(run("tune", "slip-lmi", *few, "--engine", "kernel").stdout)
+        assert document["engine"] == {"name": "kernel", **compilers.described()}
+        monkeypatch.setenv(compilers.COMPILER, "")
+        assert NONE in run("tune", "slip-lmi", *few, "--engine", "kernel", status=2).stderr
+        done = run("tune", "slip-lmi", *few, "--engine", "auto")
+        assert f"note: runs are made by XLA: engine = 'kernel' is not possible: {NONE}" in done.stderr
+        assert json.loads(done.stdout)["engine"] == {"name": "xla"}
+
+    @pytest.mark.parametrize("command", [("tune", "slip-lmi"), ("rare", "slip-lmi", "overshoot")])
+    def test_another_engine_is_refused_by_the_command(self, command):
+        assert "--engine gpu is unknown" in run(*command, "--engine", "gpu", status=2).stderr
+
+
+@pytest.mark.slow
+def test_the_worst_case_is_that_of_xla():
+    over = {"plant.mass": (14.0, 16.0), "initial.speed": (25.0, 28.0)}
+    given = {"over": over, "metric": "iae", "solver": TUNED["solver"], "measured": TUNED["measured"]}
+    found, expected = (
+        tune.worst_case(LOOP, **given, screen=16, starts=3, iterations=3, engine=e) for e in ("kernel", "xla")
+    )
+    assert found.value == pytest.approx(expected.value, rel=1e-9)
+    assert found.values.keys() == expected.values.keys()
+
+
+@pytest.mark.slow
+def test_a_map_of_starts_is_that_of_xla():
+    """Runs that end inside of an ellipsoid, that fall, and that do neither; known at the same instant."""
+    loop = scenario.load("arm-hanging").loop
+    cells = Cells(-1.5, 1.5, 9)
+    maps = [attraction(loop, cells, cells, d.FixedStep(2e-3, 1.0), engine=e).outcomes for e in ("kernel", "xla")]
+    for name in ("recovered", "fell", "unstable", "diverged"):
+        np.testing.assert_array_equal(getattr(maps[0], name), getattr(maps[1], name), err_msg=name)
+    assert maps[1].recovered.any()
+    assert not maps[1].recovered.all()
+    np.testing.assert_allclose(maps[0].time, maps[1].time, rtol=1e-12)
+
+
+class TestRare:
+    @pytest.mark.parametrize("gradients", [False, True])
+    def test_is_that_of_xla(self, gradients):
+        """P[stop_time >= 0.878] = 1.1e-3 in closed form."""
+        study = dataclasses.replace(STUDY, engine="kernel")
+        given = {"gradients": gradients, "samples": 200}
+        found, expected = (reliability.failure_probability(s, "stop_time", 0.878, **given) for s in (study, STUDY))
+        assert found.probability == pytest.approx(expected.probability, rel=1e-6)
+        assert found.evaluations == expected.evaluations
+        assert found.gradients == expected.gradients
+
+    def test_objection(self, no_compiler):
+        assert reliability.failure.objection(STUDY, "stop_time") == NONE
+        study = dataclasses.replace(STUDY, engine="kernel")
+        with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {NONE}"):
+            reliability.failure_probability(study, "stop_time", 0.878)
