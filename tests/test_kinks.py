@@ -323,3 +323,30 @@ def test_a_wheel_that_locks_does_so_at_its_moment():
     found = [d.measure(loop, d.FixedStep(h, 2.0), {"s": StopDistance(), "t": LockedTime()}) for h in (4e-4, 1e-4)]
     for name in ("s", "t"):
         np.testing.assert_allclose(found[0].metrics[name], found[1].metrics[name], rtol=1e-8)
+
+
+@pytree
+class Pulsed(Clockwork):
+    """y' = 1, and 3 from an instant to another one, both known in advance."""
+
+    jumps = True
+
+    def derivative(self, t: Any, state: Shown, control: Any) -> Shown:
+        on = (t > self.place) & (t < self.place + 0.2)
+        return Shown(jnp.where(on, 3.0, 1.0) + 0.0 * control, 1.0 + 0.0 * control)
+
+
+@pytest.mark.parametrize(("solver", "off"), [(d.FixedStep(0.01, END), 1e-7), (d.Adaptive(1e-5, END, 0.01), 3e-5)])
+def test_a_pulse_begins_and_ends_at_its_instants(solver, off):
+    """Also where the end of the run cuts it off; on the grid and off it. Adaptive values see the jump as an error."""
+
+    def final(place: Any) -> Any:
+        loop = clockwork(jnp.maximum, place)
+        loop = Loop(**{**vars(loop), "plant": Pulsed(place=place)})
+        return d.measure(loop, solver, {"y": FinalError()}).metrics["y"]
+
+    for place, slope in ((0.3337, 0.0), (0.3, 0.0), (0.9, -2.0), (0.87654321, -2.0)):
+        exact = END + 2.0 * min(0.2, END - place)
+        np.testing.assert_allclose(jax.jit(final)(place), exact, rtol=off)
+        found = jax.jvp(jax.jit(final), (place,), (1.0,))
+        np.testing.assert_allclose(found, [exact, slope], rtol=off, atol=off)

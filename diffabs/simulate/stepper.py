@@ -127,9 +127,14 @@ def step(
     point = select(verdict.over, _last(here, point), point)
 
     trying, plan = active & ~verdict.taken, (carry.search, carry.length, carry.blunt, carry.condition)
-    found = jax.lax.cond(anyone(trying), lambda: _look(carry, here, verdict.fine, count, h), lambda: plan)
-    ahead = _ahead(loop, carry, here, verdict, h, (k + 1) * h - end)
-    search, length, blunt, condition = select(active, select(trying, found, ahead), plan)
+
+    def looked() -> Any:
+        return select(trying, _look(carry, here, verdict.fine, count, h), plan)
+
+    search, *tried = jax.lax.cond(anyone(trying), looked, lambda: plan)
+    length, blunt, condition = select(
+        verdict.taken, _ahead(loop, carry, here, verdict, h, (k + 1) * h - end), tuple(tried)
+    )
     extra = carry.extra + jnp.where(active & ~verdict.on_grid, 1, 0)
     since = jnp.where(verdict.on_grid, 0, carry.here + extra - carry.extra)
     lost = active & ((~verdict.fine & (carry.blunt if count else True)) | (extra > (EXTRA + KINKS) * steps + SPARE))
@@ -140,13 +145,12 @@ def step(
 
 
 def _ahead(loop: Loop, carry: Carry, here: Arrival, verdict: Verdict, h: Any, left: Any) -> tuple[Any, ...]:
-    """What a try that is taken leaves: search, next length, whether steps are blunt, and the condition; `left` to the
-    grid."""
+    """What a try that is taken leaves: next length, whether steps are blunt, and the condition; `left` to the grid."""
     ended = _ended(loop, carry, here, verdict)
     left = jnp.where(ended == Condition.REFRESHING, 0.0, jnp.where(verdict.on_grid, h, left))
     same = [a == b for a, b in zip(here.regime, carry.point.regime, strict=True)]
     calm = verdict.on_grid & jnp.all(jnp.array(same))
-    return carry.search, left, carry.blunt & ~calm, ended
+    return left, carry.blunt & ~calm, ended
 
 
 def _judge(carry: Carry, here: Arrival, kinks: int, active: Any, steps: Any) -> Verdict:
