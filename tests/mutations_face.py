@@ -86,3 +86,15 @@ FACE += [
     ("frames: deviations of nobody", "identify/fit.py", "deviations.get(name))", "0.0)",
      f"{FRAMES}::test_an_identification_has_a_table"),
 ]  # fmt: skip
+
+FIGURES = "test_figures.py"
+FACE += [
+    ("figures: labels at every mark", "plot/runs.py", "one.set_minor_formatter(NullFormatter())", "pass",
+     f"{FIGURES}::test_labels_of_a_logarithmic_axis_do_not_touch[(0.2, 0.9)]"),
+    ("figures: a long axis has numbers", "plot/runs.py", "few = low > 0 and", "few = low > 0 or",
+     f"{FIGURES}::test_a_long_axis_has_powers_and_a_short_one_numbers"),
+    ("figures: T where S is", "plot/frequency.py", "(1 / (1 + main), COLOURS[1]", "(main / (1 + main), COLOURS[1]",
+     f"{FIGURES}::test_the_curves_of_a_loop_are_its_response"),
+    ("figures: a map of one colour", "plot/sweeps.py", "np.maximum.at(table, cell, values)", "table[:] = values.max()",
+     "test_plot_sweep.py::test_a_map_where_nothing_failed_is_over_what_moves_the_metric"),
+]  # fmt: skip
