@@ -231,8 +231,13 @@ def seen(config: Config, one: Loop, mass: float, speed: float) -> Run:
 
 def figures(config: Config, found: Tuned, those: dict[str, tuple[Loop, str]]) -> dict[str, Any]:
     """Before and after, the torque, and how the tuning went."""
-    columns = len(config.drawn)
-    figure, axes = plot.sheet(2, columns, title="The overshoot, cured, and where not", size=(5.2, 3.1))
+    return {"cure": before_and_after(config, those), "tuning": tuning_figure(found)}
+
+
+def before_and_after(config: Config, those: dict[str, tuple[Loop, str]]) -> Any:
+    """Slip and torque of four controllers: in the box, at its worst corner, and outside."""
+    columns, title = len(config.drawn), "Slip of the rig before and after: the overshoot, cured, and where not"
+    figure, axes = plot.sheet(2, columns, title=title, size=(5.2, 3.1), sharex=True, sharey="row")
     shown = ("published gain", "LMI, weights of least overshoot", "published gain, filter 35 ms", "the cure")
     for column, (mass, speed) in enumerate(config.drawn):
         for i, name in enumerate(shown):
@@ -247,12 +252,15 @@ def figures(config: Config, found: Tuned, those: dict[str, tuple[Loop, str]]) ->
             axes[columns + column].plot(t, sample.control, **style)
         axes[column].axhline(config.slip, color="black", linewidth=0.8, linestyle=":")
         where = f"{mass:g} kg from {speed:g} km/h" + (" (outside the box)" if speed > config.box.speeds[-1] else "")
-        plot.label(axes[column], "", "slip [1]" if column == 0 else "", where, legend=column == 0)
+        plot.label(axes[column], "", "slip [1]" if column == 0 else "", where, legend=False)
         plot.label(axes[columns + column], "time [s]", "brake torque [N m]" if column == 0 else "", legend=False)
         for ax in (axes[column], axes[columns + column]):
             ax.set_xlim(0, 0.35)
+            ax.locator_params(axis="x", nbins=4)
         axes[column].set_ylim(0, 0.45)
-    return {"cure": figure, "tuning": tuning_figure(found)}
+    words = dict(loc="outside lower center", ncols=len(shown), frameon=False, fontsize=11)
+    figure.legend(*axes[0].get_legend_handles_labels(), **words)
+    return figure
 
 
 def tuning_figure(found: Tuned) -> Any:
@@ -261,7 +269,8 @@ def tuning_figure(found: Tuned) -> Any:
     n = [p.evaluations for p in found.history]
     for ax, (name, unit) in zip(axes, {"objective": "IAE [s]", "gradient": "", "violation": ""}.items(), strict=True):
         ax.plot(n, [getattr(p, name) for p in found.history], "o-", markersize=3, color=plot.COLOURS[0])
-        ax.set_yscale("log" if name == "gradient" else "linear")
+        if name == "gradient":
+            plot.logarithmic(ax, "y")
         plot.label(ax, "gradients computed", f"{name} {unit}")
     return figure
 

@@ -64,3 +64,37 @@ FACE += [
     ("export: the coefficients of rounding", "export/difference_equations.py", "ROUNDING = 1e-12", "ROUNDING = 0.0",
      f"{TESTS}::test_the_command_writes_a_file_that_compiles"),
 ]  # fmt: skip
+
+FRAMES = "test_frames.py"
+FACE += [
+    ("frames: rounding is a number", "core/summary.py", "NOTHING = 1e-14", "NOTHING = 0.0",
+     f"{FRAMES}::test_rounding_is_no_number"),
+    ("frames: a run goes on after its end", "simulate/frames.py", "[:count]) for name, (unit, values)",
+     ") for name, (unit, values)", f"{FRAMES}::test_frames_have_units_and_end_where_the_run_does"),
+    ("frames: the control has no plant", "simulate/frames.py", "plant.control_unit if plant is not None else RELATIVE",
+     "RELATIVE", f"{FRAMES}::test_frames_have_units_and_end_where_the_run_does"),
+    ("frames: what diverged counts", "simulate/frames.py", '"reached its stop {end}" if run.stopped',
+     '"reached its stop {end}" if True', f"{FRAMES}::test_a_run_says_what_it_is"),
+    ("frames: HTML as it comes", "core/summary.py", "<strong>{html.escape(self.title)}</strong>",
+     "<strong>{self.title}</strong>", f"{FRAMES}::test_a_summary_is_text_and_html"),
+    ("frames: who was refused has failed", "sweep/results.py", "{name: failed & run for", "{name: failed for",
+     f"{FRAMES}::test_what_was_missed_or_refused_is_told_apart"),
+    ("frames: a sweep without units", "sweep/study.py", "if path in declared}", "if False}",
+     f"{FRAMES}::test_the_frame_of_a_sweep_has_units_and_says_what_failed"),
+    ("frames: before is after", "tune/result.py", '("objective", *self.objective)',
+     '("objective", *self.objective[::-1])', f"{FRAMES}::test_a_tuning_has_a_table"),
+    ("frames: deviations of nobody", "identify/fit.py", "deviations.get(name))", "0.0)",
+     f"{FRAMES}::test_an_identification_has_a_table"),
+]  # fmt: skip
+
+FIGURES = "test_figures.py"
+FACE += [
+    ("figures: labels at every mark", "plot/runs.py", "one.set_minor_formatter(NullFormatter())", "pass",
+     f"{FIGURES}::test_labels_of_a_logarithmic_axis_do_not_touch[(0.2, 0.9)]"),
+    ("figures: a long axis has numbers", "plot/runs.py", "few = low > 0 and", "few = low > 0 or",
+     f"{FIGURES}::test_a_long_axis_has_powers_and_a_short_one_numbers"),
+    ("figures: T where S is", "plot/frequency.py", "(1 / (1 + main), COLOURS[1]", "(main / (1 + main), COLOURS[1]",
+     f"{FIGURES}::test_the_curves_of_a_loop_are_its_response"),
+    ("figures: a map of one colour", "plot/sweeps.py", "np.maximum.at(table, cell, values)", "table[:] = values.max()",
+     "test_plot_sweep.py::test_a_map_where_nothing_failed_is_over_what_moves_the_metric"),
+]  # fmt: skip

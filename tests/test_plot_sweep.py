@@ -295,8 +295,12 @@ def test_a_map_where_nothing_failed_is_over_what_moves_the_metric(found, made):
     sweep = made({"a": A, "b": B, "c": C}, metrics, failures={"overshoot": 9.0})
     ax = plots.failure_map(sweep).axes[0]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("b", "c")
-    assert (mesh(ax)[1] == 0).all()
-    assert ax.collections[0].get_clim() == (0, 1)
+    edges, table = mesh(ax)
+    across, upward = (np.clip(np.digitize(x, edge) - 1, 0, 9) for x, edge in zip((B, C), edges, strict=True))
+    for i, j in [(0, 0), (3, 7), (9, 2)]:
+        np.testing.assert_array_equal(table[i, j], OVERSHOOT[(across == i) & (upward == j)].max())
+    assert ax.figure.axes[1].get_ylabel() == "greatest overshoot, fails beyond 9"
+    assert np.ptp(table) > 0  # a map of one colour says nothing
 
 
 def test_names_are_cells_upward(made):
@@ -343,7 +347,7 @@ ODD = {
     "all diverged": ({"a": A}, {"effort": A}, {"diverged": True}, ["failure_map"]),
     "none stopped": ({"a": A, "b": B}, {"effort": 0 * A}, {"stopped": False}, ["failure_map"]),
     "nothing varies": ({"a": 0 * A}, {"effort": 0 * A}, {}, []),
-    "rounding": ({"a": A}, {"effort": 1 + 4e-16 * (A > 0.5)}, {}, ["failure_map"]),
+    "rounding": ({"a": A}, {"effort": 1 + 4e-16 * (A > 0.5)}, {}, []),
     "names": (
         {"road": np.array(["x", "y"])[(A > 0.5) * 1], "tyre": np.array(["u", "v"])[(B > 0.5) * 1]},
         {"effort": (A > 0.5) + C},

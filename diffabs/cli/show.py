@@ -14,6 +14,7 @@ from rich.table import Table
 from diffabs.cli.console import say
 from diffabs.cli.tables import fitted
 from diffabs.core.loop import signals
+from diffabs.core.summary import number
 from diffabs.papers.digest import Digest
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
@@ -51,7 +52,7 @@ def run(result: dict[str, Any], chosen: Scenario) -> None:
     """Metrics with their units, and what was written."""
     table = Table("metric", "value", "unit")
     for name, value in result["metrics"].items():
-        table.add_row(name, f"{value:.6g}", unit_of(chosen.objectives[name], chosen.loop.plant))
+        table.add_row(name, number(value), unit_of(chosen.objectives[name], chosen.loop.plant))
     titled(chosen.title or chosen.name, table)
     for name, path in result["files"].items():
         say(f"{name}: {path}")
@@ -206,7 +207,7 @@ def brief(value: Any) -> str:
     """A number to six digits, of a list the first four."""
     if isinstance(value, list):
         return f"[{', '.join(map(brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return number(value) if isinstance(value, float) else str(value)
 
 
 def titled(title: str, table: Table) -> None:

@@ -85,6 +85,7 @@ def compared(result: dict[str, Any]) -> None:
         table.add_row(name, *means, *_estimate(row["difference"]), less, brief(row["variance reduction"]))
     out = f", {result['left out']} left out that diverged" if result["left out"] else ""
     titled(f"{result['second']} against {result['first']}: {result['samples']} common samples{out}", table)
+    say("variance reduction: as many times more samples would be needed if the two sweeps did not share them")
 
 
 def _estimate(row: dict[str, Any]) -> list[str]:

@@ -19,6 +19,7 @@ from scipy.optimize import least_squares
 from diffabs.core.bijectors import Range, Space, space
 from diffabs.core.pytree import check, replace, strong
 from diffabs.core.reason import Reason
+from diffabs.core.summary import Summary, number
 from diffabs.identify.residuals import Prior, Problem, Residuals, Seen, traced
 from diffabs.identify.uncertainty import Uncertainty, uncertainty
 
@@ -63,6 +64,21 @@ class Identified:
     start: dict[str, Any]
     starts: tuple["Identified", ...] = ()
     diverged: tuple[dict[str, Any], ...] = ()
+
+    def table(self) -> Summary:
+        """What was found: parameters before and after, with their standard deviations."""
+        deviations = self.uncertainty.deviations
+        rows = tuple((name, self.start.get(name), value, deviations.get(name)) for name, value in self.values.items())
+        title = f"Identified from {len(self.residuals)} residuals, chi2 = {number(self.chi2)}: {self.reason.value}"
+        return Summary(title, ("parameter", "before", "identified", "standard deviation"), rows)
+
+    def __repr__(self) -> str:
+        """The table."""
+        return str(self.table())
+
+    def _repr_html_(self) -> str:
+        """The table for a notebook."""
+        return self.table()._repr_html_()
 
 
 def fit(

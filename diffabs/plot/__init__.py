@@ -13,6 +13,7 @@ from diffabs.plot.runs import controlled as controlled
 from diffabs.plot.runs import convergence as convergence
 from diffabs.plot.runs import friction as friction
 from diffabs.plot.runs import label as label
+from diffabs.plot.runs import logarithmic as logarithmic
 from diffabs.plot.runs import named as named
 from diffabs.plot.runs import of as of
 from diffabs.plot.runs import positions as positions

@@ -8,7 +8,7 @@ import numpy as np
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.robustness import frequencies
 from diffabs.linear.stability_margins import Margins
-from diffabs.plot.runs import COLOURS, GREY, label, sheet
+from diffabs.plot.runs import COLOURS, GREY, label, logarithmic, sheet
 
 FAR = 3.0  # how far from 0 the Nyquist plot looks
 LIGHT = 0.25
@@ -25,7 +25,7 @@ def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *,
     figure, (magnitude, nyquist, phase, closed) = sheet(2, 2, title=title, size=(5.6, 3.4))
     main, around = _response(loop, w), np.array([_response(one, w) for one in band])
     for ax in (magnitude, phase, closed):
-        ax.set_xscale("log")
+        logarithmic(ax, "x")
         ax.set_xlim(w[0], w[-1])
     _banded(magnitude, w, _db(main), _db(around), COLOURS[0], "L")
     magnitude.axhline(0, color=GREY, linewidth=0.8)

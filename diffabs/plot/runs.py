@@ -23,6 +23,7 @@ try:
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
+    from matplotlib.ticker import Formatter, LogLocator, NullFormatter
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError('figures need matplotlib: pip install "diffabs[plot]"', name=error.name) from error
 
@@ -31,6 +32,7 @@ DASHES = ("-", "--", "-.", ":", "-", "--", "-.")
 GREY = "#767676"
 KMH = 3.6  # km/h per m/s
 DPI = 150
+FEW_DECADES, PLAIN = 2.0, 4  # fewer have labels between them; powers of ten that are written out
 TITLE = 9  # characters per inch, with room to spare
 
 
@@ -59,6 +61,43 @@ def label(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> 
         ax.set_title(title, fontsize=11)
     if legend and ax.get_legend_handles_labels()[1]:
         ax.legend(fontsize=9.5, framealpha=0.9, edgecolor="none")
+
+
+def logarithmic(ax: Axes, axis: str) -> None:
+    """Make an axis, "x" or "y", logarithmic, with as many labels as have room: over less than two decades 1, 2 and 5
+    of each, as plain numbers, over more the decades."""
+    (ax.set_xscale if axis == "x" else ax.set_yscale)("log")
+    one = ax.xaxis if axis == "x" else ax.yaxis
+    one.set_major_locator(_Decades())
+    one.set_major_formatter(_Powers())
+    one.set_minor_formatter(NullFormatter())
+
+
+class _Decades(LogLocator):
+    """Decades, and 2 and 5 of each where there are few."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        """Where labels are."""
+        decades = np.log10(vmax / vmin) if vmin > 0 else np.inf
+        self.set_params(subs=(1.0, 2.0, 5.0) if decades < FEW_DECADES else (1.0,))
+        found = np.asarray(super().tick_values(vmin, vmax))
+        return found if decades >= FEW_DECADES else found[(found >= vmin) & (found <= vmax)]
+
+
+class _Powers(Formatter):
+    """Powers of ten over many decades, plain numbers over few, unless they are long."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """The label of a place."""
+        del pos
+        low, high = np.sort(self.axis.get_view_interval())  # pyright: ignore[reportOptionalMemberAccess]
+        few = low > 0 and np.log10(high / low) < FEW_DECADES
+        if few and 10.0**-PLAIN <= x < 10.0 ** (PLAIN + 1):
+            return f"{x:g}"
+        power = int(np.floor(np.log10(x) + 1e-9)) if x > 0 else 0
+        mantissa = x / 10.0**power
+        head = "" if abs(mantissa - 1) < 1e-9 else rf"{mantissa:.0f}\times"
+        return rf"${head}10^{{{power}}}$"
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
@@ -201,7 +240,8 @@ def speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
     figure, axes = sheet(1, len(runs), title=title, size=(5.2 if len(runs) > 1 else 6.4, 3.6), sharex=True, sharey=True)
     for i, (ax, (name, seen)) in enumerate(zip(axes, runs.items(), strict=True)):
         _speeds(ax, seen)
-        label(ax, "time [s]", "" if i else "speed [km/h]", name)
+        words = f"{name}: {float(seen.sample.t[-1]):.2f} s" if name else ""
+        label(ax, "time [s]", "" if i else "speed [km/h]", words)
         ax.set_xlim(0, None)
     axes[0].set_ylim(min(axes[0].get_ylim()[0], 0.0), None)  # below 0 where a locked wheel's line would hide the axis
     return figure
@@ -274,6 +314,8 @@ def convergence(
             ax.loglog(h, errors, "o" + DASHES[j], color=COLOURS[j], markersize=4.5, label=words)
         top = 3.0 * np.max([np.max(e) for e in curves.values()])
         ax.loglog(h, top * (h / h.max()) ** order, color=GREY, linewidth=0.9, label=f"slope {order}")
+        logarithmic(ax, "x")
+        logarithmic(ax, "y")
         label(ax, "step [s]", "" if i else "relative error [1]", name, legend=False)
         ax.legend(fontsize=9, loc="lower right", framealpha=0.9, edgecolor="none")
     return figure

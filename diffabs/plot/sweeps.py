@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.plot.runs import COLOURS, GREY, Axes, Figure, label, save, sheet
+from diffabs.plot.runs import COLOURS, GREY, Axes, Figure, label, logarithmic, save, sheet
 from diffabs.plot.sweep_view import Variable, View, cells
 from diffabs.sweep.engines import missed, missing
 from diffabs.sweep.results import Results
@@ -71,7 +71,7 @@ def exceedance(found: Results, units: Mapping[str, str] = {}, confidence: float 
             known = [Count(int(k), n).probability(confidence=confidence) for k in counts]
             ends = [one.low for one in known], [one.high for one in known]
             ax.fill_between(x, *ends, color=COLOURS[0], alpha=0.25, linewidth=0, label=band)
-        ax.set_yscale("log")
+        logarithmic(ax, "y")
         ax.set_xlim(limits)
         ax.set_ylim(0.3 / n, 1.5)
         label(ax, view.named(name), "share beyond [1]", legend=False)
@@ -133,11 +133,14 @@ def sensitivity(found: Results, document: Mapping[str, Any]) -> Figure | None:
 
 def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """The share of failed runs in cells of the two variables that move it most, or that move the metric of `worst` most
-    if too few failed, or did not; cells without a run are grey. None where no variable varies."""
+    if too few failed, or did not; cells without a run are grey. Where none failed the colour is the greatest value of
+    that metric in a cell. None where no variable varies, or nothing failed and no metric varies."""
     view = View(found, units)
     late = missed(found.column("stopped"), success := found.study["success"])
     rules = [~view.good, late, *(found.column(name) > view.bounds[name] for name in view.bounds)]
     failed = np.any(rules, axis=0)[every := view.accepted]
+    if not (failed.any() or view.leading):
+        return None
     rows, result = every, failed
     if view.leading and min(np.sum(failed), np.sum(~failed)) < FEW:
         rows, result = view.good, found.column(view.leading)[view.good]
@@ -147,16 +150,34 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     shape = [len(edge) - 1 for edge in edges]
     cell = np.ravel_multi_index(places, shape)
     lanes, bad = (np.bincount(cell, w, np.prod(shape)).reshape(shape[0], -1) for w in (None, failed))
-    share = np.ma.masked_where(lanes == 0, bad / np.maximum(lanes, 1))
     figure, (ax,) = sheet(title=view.title(f"{np.sum(failed):,} failed of", every), size=(7.4, 5.0))
-    mesh = ax.pcolormesh(*[*edges, [0, 1]][:2], share.T, cmap="Oranges", vmin=0, vmax=share.max() or 1)
-    figure.colorbar(mesh, ax=ax, label="share of failed runs [1]")
+    if failed.any():
+        table, words = bad / np.maximum(lanes, 1), "share of failed runs [1]"
+        colours = {"cmap": "Oranges", "vmin": 0, "vmax": np.max(table)}
+    else:
+        table, words = _greatest(cell, found.column(view.leading)[every], lanes), _bounded(view)
+        colours = {"cmap": "viridis"}
+    mesh = ax.pcolormesh(*[*edges, [0, 1]][:2], np.ma.masked_where(lanes == 0, table).T, **colours)
+    figure.colorbar(mesh, ax=ax, label=words)
     ax.set_facecolor("#BBBBBB")
     ax.yaxis.set_visible(len(ones) > 1)
     _name_axes(ax, ones)
     bounds = "".join(f", {name} > {bound:g}" for name, bound in view.bounds.items())
     ax.set_title(f"failed: diverged, {missing(success)}{bounds}", fontsize=9.5)
     return figure
+
+
+def _greatest(cell: Any, values: np.ndarray, lanes: np.ndarray) -> np.ndarray:
+    """The greatest value in each cell."""
+    table = np.full(lanes.size, -np.inf)
+    np.maximum.at(table, cell, values)
+    return table.reshape(lanes.shape)
+
+
+def _bounded(view: View) -> str:
+    """What the colour is where nothing failed."""
+    bound = view.bounds.get(view.leading)
+    return f"greatest {view.named(view.leading)}" + ("" if bound is None else f", fails beyond {bound:g}")
 
 
 def _exceeding(ordered: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.plot.runs import COLOURS, DASHES, GREY, Axes, Figure, controlled, label, named, sheet
+from diffabs.plot.runs import COLOURS, DASHES, GREY, Axes, Figure, controlled, label, logarithmic, named, sheet
 from diffabs.simulate.solution import Trajectory
 
 MARKS = "osD^v"
@@ -98,7 +98,7 @@ def _objective(ax: Axes, points: Sequence[Any]) -> None:
     ax.plot(n, values, "o-", markersize=3.5, color=COLOURS[0], label="objective")
     known = values[np.isfinite(values)]
     if len(known) and known.min() > 0 and known.max() > DECADES * known.min():
-        ax.set_yscale("log")
+        logarithmic(ax, "y")
     violation = np.array([p.violation for p in points])
     if np.any(violation > 0):
         other = ax.twinx()
@@ -111,7 +111,7 @@ def _objective(ax: Axes, points: Sequence[Any]) -> None:
 
 def _gradient(ax: Axes, points: Sequence[Any]) -> None:
     ax.plot([p.evaluations for p in points], [p.gradient for p in points], "o-", markersize=3.5, color=COLOURS[2])
-    ax.set_yscale("log")
+    logarithmic(ax, "y")
     label(ax, "gradients computed", "gradient, greatest component")
 
 

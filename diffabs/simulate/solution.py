@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.protocols import Ending, Sample
+from diffabs.simulate import frames
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,3 +95,26 @@ class Run(NamedTuple):
     timed_out: Any  # bool: the duration was over before the stop; a run is one of the three, or was ended from outside
     ending: Ending
     trajectory: Trajectory | None
+
+    def __repr__(self) -> str:
+        """How it ended, and what was measured."""
+        return str(frames.summary(self))
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        return frames.summary(self)._repr_html_()
+
+    def pandas(self, plant: Any = None) -> Any:
+        """The trajectory as a pandas.DataFrame indexed by time, with `attrs["units"]`; of a run without one its
+        metrics, a row for each lane. `plant` says the unit of the control. Raises ValueError for many trajectories."""
+        return frames.to_pandas(self, plant)
+
+    def xarray(self, plant: Any = None) -> Any:
+        """The trajectory as an xarray.Dataset over the time, each variable with `units`. Raises ValueError for a run
+        without one, or for many."""
+        return frames.to_xarray(self, plant)
+
+    def plot(self, plant: Any = None, *, title: str = "") -> Any:
+        """The run as a figure of matplotlib (extra `diffabs[plot]`); `plant` says the unit of the control. Raises
+        ValueError for a run without a trajectory."""
+        return frames.to_figure(self, plant, title)

@@ -5,6 +5,7 @@
     versions    of the packages that can change a bit of them
     commit      of diffabs, where it is known
     source      name and text of the scenario
+    units       of what varies and what is measured, where they are known
     digest      SHA-256 of the rest: a file that was changed afterwards is not read
 
 Format, study and versions own the chunks: their digest is in each (`seal`)."""
@@ -167,3 +168,4 @@ class _Manifest:
     versions: Mapping[str, str] = entry(table_of(text))
     source: Mapping[str, str] = entry(table_of(_utf8))
     commit: str = entry(text, "")
+    units: Mapping[str, str] = entry(table_of(text), dict)

@@ -11,8 +11,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from diffabs.core import files
+from diffabs.core.summary import Summary
 from diffabs.sweep import seal
-from diffabs.sweep.engines import accepted
+from diffabs.sweep.engines import accepted, missed, missing
 from diffabs.sweep.manifest import Seals, read_manifest
 from diffabs.sweep.seal import SweepError
 from diffabs.sweep.store import listing, read_chunk
@@ -58,6 +59,31 @@ class Results:
         return list(self.study["objectives"])
 
     @property
+    def units(self) -> dict[str, str]:
+        """Of the columns, by name, where they are known."""
+        return dict(self.manifest.get("units", {}))
+
+    def __repr__(self) -> str:
+        """What was swept, and how much of it is there."""
+        return str(self._summary())
+
+    def _repr_html_(self) -> str:
+        """The same for a notebook."""
+        return self._summary()._repr_html_()
+
+    def _summary(self) -> Summary:
+        run, lost, failed = self.accepted, self.column("diverged"), int(self.failed().sum())
+        rows = []
+        for name in self.metrics:
+            good = self.column(name)[run & ~lost]
+            spread = (good.mean(), good.min(), good.max()) if len(good) else ("", "", "")
+            rows.append((name, *spread, self.units.get(name, "")))
+        whole = "" if self.complete else f" of {self.study['samples']}, not complete"
+        title = f"Sweep of {len(run)} samples{whole}: {failed} failed, {int((lost & run).sum())} diverged"
+        note = f"over {', '.join(self.variables)}; in {self.folder}"
+        return Summary(title, ("metric", "mean", "least", "greatest", "unit"), tuple(rows), note)
+
+    @property
     def variables(self) -> list[str]:
         """Paths of what varies."""
         known = {"sample", *FLAGS, *self.metrics}
@@ -98,6 +124,21 @@ class Results:
         """SHA-256 over the contents of all chunks in order: equal for equal tables in chunks of one size."""
         return seal.contents(self._read(chunk, None) for chunk in sorted(self.files))
 
+    def failures(self) -> dict[str, np.ndarray]:
+        """Which samples (n,) failed, by how: diverged, an end that the stop does not call a success, a metric beyond
+        its bound. One that was refused did not."""
+        study, run = self.study, self.accepted
+        kinds = {
+            "diverged": self.column("diverged"),
+            missing(study["success"]): missed(self.column("stopped"), study["success"]),
+        }
+        kinds |= {f"{name} > {bound:g}": self.column(name) > bound for name, bound in study["failures"].items()}
+        return {name: failed & run for name, failed in kinds.items()}
+
+    def failed(self) -> np.ndarray:
+        """Which samples (n,) failed, in any way."""
+        return np.any(list(self.failures().values()), axis=0)
+
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows in the order of the samples; some columns, or all."""
         names = list(columns) if columns is not None else None
@@ -108,18 +149,25 @@ class Results:
         return self.table([name]).column(name).to_numpy()
 
     def pandas(self) -> Any:
-        """A pandas.DataFrame, indexed by sample."""
-        return self.table().to_pandas().set_index("sample")
+        """A pandas.DataFrame indexed by sample, with a column `failed`, and units in `attrs["units"]`."""
+        frame = self.table().to_pandas().set_index("sample").assign(failed=self.failed())
+        frame.attrs["units"] = self.units
+        return frame
 
     def polars(self) -> Any:
-        """A polars.DataFrame."""
+        """A polars.DataFrame, with a column `failed`."""
         import polars  # pyright: ignore[reportMissingImports]  # the user has it, or not
 
-        return polars.from_arrow(self.table())
+        frame: Any = polars.from_arrow(self.table())
+        return frame.with_columns(polars.Series("failed", self.failed()))
 
     def xarray(self) -> Any:
-        """An xarray.Dataset over the dimension `sample`."""
-        return self.pandas().to_xarray()
+        """An xarray.Dataset over the dimension `sample`, its variables with `units`."""
+        data = self.pandas().to_xarray()
+        for name, unit in self.units.items():
+            if name in data:
+                data[name].attrs["units"] = unit
+        return data
 
     @property
     def accepted(self) -> np.ndarray:

@@ -93,7 +93,8 @@ def _begun(
         try:
             if jax.process_index() == 0:
                 held.enter_context(store.locked())
-                manifest = {**described(study), **provenance.commit(), "source": dict(source)}
+                notes = {**provenance.commit(), "source": dict(source), "units": study.units()}
+                manifest = {**described(study), **notes}
                 store.begin(manifest, resume=resume)
                 whole, damaged = store.scan(Seals(manifest))
                 found[:] = np.where(np.isin(np.arange(study.chunks), list(whole)), HERE, MISSING)

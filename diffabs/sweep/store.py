@@ -147,7 +147,7 @@ def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
 
 def _decisive(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """What results depend on: everything but the commit, which is a note."""
-    return {key: value for key, value in manifest.items() if key not in ("commit", "source")}
+    return {key: value for key, value in manifest.items() if key not in ("commit", "source", "units")}
 
 
 def _short(value: Any) -> str:

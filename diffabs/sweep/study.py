@@ -14,7 +14,8 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import elements, get, problems, replace
+from diffabs.core.pytree import elements, get, parameters, problems, replace
+from diffabs.core.units import in_loop, units_of
 from diffabs.core.values import plain, unknown
 from diffabs.kernel import launch
 from diffabs.objectives import usual
@@ -65,6 +66,14 @@ class Study:
     def success(self) -> bool:
         """Whether reaching the stop is what a run shall do."""
         return bool(self.loop.stop.success)
+
+    def units(self) -> dict[str, str]:
+        """Of the parameters that vary and of the metrics, by name, where they are known."""
+        loop = units_of(self.loop.plant)
+        declared = {path: spec.unit for path, spec, _ in parameters(self.loop, units=loop)}
+        varied = {path: declared[path] for path in self.space.paths if path in declared}
+        measured = {name: in_loop(getattr(one, "unit", ""), loop) for name, one in self.objectives.items()}
+        return {**varied, **{name: unit for name, unit in measured.items() if unit}}
 
     @property
     def bounded(self) -> dict[str, float]:

@@ -3,9 +3,11 @@
 import dataclasses
 from typing import Any, NamedTuple
 
+import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
+from diffabs.core.summary import Summary
 from diffabs.tune.descent import Point, Stopping
 from diffabs.tune.problem import Mode, built
 
@@ -83,6 +85,24 @@ class Tuned:
     diverged: tuple[int, int]
     engine: dict[str, str]
 
+    def table(self) -> Summary:
+        """What was found: the free parameters; means of the metrics and the objective, before and after."""
+        rows: list[tuple[Any, ...]] = [(name, "", value) for name, value in self.values.items()]
+        rows += [(f"mean {name}", *(_mean(one[name]) for one in self.metrics)) for name in self.metrics[0]]
+        rows.append(("objective", *self.objective))
+        lanes = np.size(next(iter(self.metrics[0].values()), ()))
+        title = f"Tuned over {lanes} lane{'' if lanes == 1 else 's'}: {self.reason.value}"
+        met = "" if self.met else "NOT every constraint is met"
+        return Summary(title, ("", "before", "after"), tuple(rows), met)
+
+    def __repr__(self) -> str:
+        """The table."""
+        return str(self.table())
+
+    def _repr_html_(self) -> str:
+        """The table for a notebook."""
+        return self.table()._repr_html_()
+
     @property
     def loop(self) -> Any:
         """The tuned loop."""
@@ -97,3 +117,9 @@ class Tuned:
     def evaluations(self) -> int:
         """Gradients computed for the best start."""
         return self.history[-1].evaluations
+
+
+def _mean(values: Any) -> float:
+    """Of the lanes that did not diverge; NaN where all did."""
+    good = np.asarray(values)[np.isfinite(values)]
+    return float(good.mean()) if good.size else float("nan")

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.sweep.engines import missed, missing
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics.estimates import Count, Tail, cvar, quantile, replicated
 from diffabs.sweep.statistics.estimates import summary as summarised
@@ -90,13 +89,7 @@ class _View:
 
 
 def _failures(found: Results, view: _View, confidence: float) -> Iterator[tuple[str, Any]]:
-    success = found.study["success"]
-    columns = {name: found.column(name) for name in found.study["failures"] | {"stopped": 0, "diverged": 0}}
-    kinds = {
-        "diverged": columns["diverged"] & view.accepted,
-        missing(success): missed(columns["stopped"], success),
-    }
-    kinds |= {f"{name} > {bound:g}": columns[name] > bound for name, bound in found.study["failures"].items()}
+    kinds = found.failures()
     kinds["any"] = np.any(list(kinds.values()), axis=0)
     asked = view.rows & view.accepted
     if not asked.any():

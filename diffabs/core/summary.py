@@ -1,0 +1,61 @@
+"""A result in a few lines, for whoever looks at it: text for a terminal, HTML for a notebook."""
+
+import dataclasses
+import html
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+NOTHING = 1e-14  # less than this is rounding, of numbers in SI
+
+
+def number(value: Any, digits: int = 6) -> str:
+    """Return a number for a table, to so many digits: what is rounding alone is 0."""
+    value = float(value)
+    return "0" if abs(value) < NOTHING else f"{value:.{digits}g}"
+
+
+def cell(value: Any) -> str:
+    """Return what a table shows of a value: of a list the first four entries."""
+    if isinstance(value, str | bool | np.bool_) or value is None:
+        return "" if value is None else str(value)
+    if np.ndim(value):
+        rows = np.asarray(value).reshape(-1)
+        return f"[{', '.join(map(number, rows[:4]))}{', ...' if len(rows) > 4 else ''}]"
+    return str(value) if isinstance(value, int) else number(value)
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """A title, a table (columns, and rows of values), and a line below it. As text it fits most terminals."""
+
+    title: str
+    columns: tuple[str, ...] = ()
+    rows: tuple[tuple[Any, ...], ...] = ()
+    note: str = ""
+
+    def __str__(self) -> str:
+        """As text."""
+        lines = [list(self.columns), *([cell(value) for value in row] for row in self.rows)] if self.rows else []
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        table = [
+            "  ".join(word.ljust(width) for word, width in zip(line, widths, strict=True)).rstrip() for line in lines
+        ]
+        if table:
+            table.insert(1, "-" * (sum(widths) + 2 * (len(widths) - 1)))
+        return "\n".join([self.title, *table, *([self.note] if self.note else [])])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        """For a notebook."""
+        head = "".join(f"<th>{html.escape(name)}</th>" for name in self.columns)
+        body = "".join(_row(row) for row in self.rows)
+        note = f"<p>{html.escape(self.note)}</p>" if self.note else ""
+        table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>" if self.rows else ""
+        return f"<p><strong>{html.escape(self.title)}</strong></p>{table}{note}"
+
+
+def _row(values: Sequence[Any]) -> str:
+    return f"<tr>{''.join(f'<td>{html.escape(cell(value))}</td>' for value in values)}</tr>"

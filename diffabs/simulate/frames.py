@@ -1,0 +1,107 @@
+"""A run for a person and for other tools: a summary, a pandas.DataFrame, an xarray.Dataset, a figure."""
+
+import importlib
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from diffabs.core.summary import Summary, number
+
+NUMBERS = (jax.Array, np.ndarray, np.generic, float, int, bool)
+RELATIVE = "control"  # the unit of the control where no plant says it
+
+
+def known(run: Any) -> bool:
+    """Return whether a run has numbers: not within a function that JAX traces."""
+    leaves = jax.tree.leaves(run)
+    return all(isinstance(x, NUMBERS) and not isinstance(x, Tracer) for x in leaves)
+
+
+def summary(run: Any) -> Summary:
+    """Return what a run is: how it ended, and what was measured."""
+    shape, kept = np.shape(run.stopped), run.trajectory is not None
+    if not known(run):
+        return Summary(f"Run being traced, of {len(run.metrics)} metrics")
+    if shape:
+        return _of_many(run, int(np.prod(shape)))
+    seen = f"; a trajectory of {len(run.trajectory.running)} instants" if kept else ""
+    end = f"at t = {number(run.ending.sample.t)} s"
+    how = "diverged" if run.diverged else f"reached its stop {end}" if run.stopped else f"ended {end}"
+    rows = tuple((name, value) for name, value in run.metrics.items())
+    return Summary(f"Run that {how}{seen}", ("metric", "value"), rows)
+
+
+def _of_many(run: Any, count: int) -> Summary:
+    lost, stopped = np.asarray(run.diverged).reshape(-1), int(np.sum(run.stopped))
+    rows = []
+    for name, values in run.metrics.items():
+        good = np.asarray(values).reshape(-1)[~lost]
+        rows.append((name, *((good.mean(), good.min(), good.max()) if len(good) else ("", "", ""))))
+    title = f"{count} runs: {stopped} reached their stop, {int(lost.sum())} diverged"
+    return Summary(title, ("metric", "mean", "least", "greatest"), tuple(rows), "of those that did not diverge")
+
+
+def columns(run: Any, plant: Any = None) -> dict[str, tuple[str, np.ndarray]]:
+    """Return unit and values (instants,) of what was seen in a run up to its end, by name; the time is `t`.
+
+    plant: whose unit the control has; without one that is said as "control"
+    Raises:
+        ValueError: a run without a trajectory, or many runs.
+    """
+    if run.trajectory is None:
+        raise ValueError("the run has no trajectory: make it with rollout")
+    if np.shape(run.stopped):
+        raise ValueError("these are many runs: take one, jax.tree.map(lambda x: x[0], run)")
+    seen = run.trajectory
+    count = int(np.sum(seen.running)) + 1  # after the end the last sample is repeated
+    sample, units = seen.sample, type(seen.sample.output).units
+    shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}
+    control = plant.control_unit if plant is not None else RELATIVE
+    target = units[sample.output._fields[0]]
+    rest = {"target": (target, sample.target), "setpoint": (target, sample.setpoint)}
+    given = {name: (control, getattr(sample, name)) for name in ("feedforward", "command", "control")}
+    every = {"t": ("s", sample.t), **shown, **rest, **given}
+    return {name: (unit, np.asarray(values)[:count]) for name, (unit, values) in every.items()}
+
+
+def to_pandas(run: Any, plant: Any = None) -> Any:
+    """Return the trajectory as a frame indexed by time; or, of a run without one, its metrics, a row for each lane."""
+    import pandas  # pyright: ignore[reportMissingImports]  # the user has it, or not
+
+    if run.trajectory is None:
+        flags = {name: getattr(run, name) for name in ("stopped", "diverged", "timed_out")}
+        rows = {
+            name: np.atleast_1d(np.asarray(values)).reshape(-1) for name, values in {**run.metrics, **flags}.items()
+        }
+        return pandas.DataFrame(rows)
+    found = columns(run, plant)
+    frame = pandas.DataFrame({name: values for name, (_, values) in found.items()}).set_index("t")
+    frame.attrs |= {"units": {name: unit for name, (unit, _) in found.items()}, **_attributes(run)}
+    return frame
+
+
+def to_xarray(run: Any, plant: Any = None) -> Any:
+    """Return the trajectory as a data set over the time, each variable with its `units`."""
+    import xarray  # pyright: ignore[reportMissingImports]  # the user has it, or not
+
+    found = columns(run, plant)
+    each = {name: ("t", values, {"units": unit}) for name, (unit, values) in found.items()}
+    return xarray.Dataset(each, coords={"t": each.pop("t")}, attrs=_attributes(run))
+
+
+def to_figure(run: Any, plant: Any = None, title: str = "") -> Any:
+    """Return the run as a figure: that of its kind of plant, told by what it shows."""
+    plot: Any = importlib.import_module("diffabs.plot")
+    shown = SimpleNamespace(shows=type(run.ending.sample.output))
+    unit = plant.control_unit if plant is not None else None
+    return plot.of(shown)(run, title=title, **({"unit": unit} if unit else {}))
+
+
+def _attributes(run: Any) -> Mapping[str, Any]:
+    """Metrics and how it ended, as plain numbers."""
+    flags = {name: int(getattr(run, name)) for name in ("stopped", "diverged", "timed_out")}
+    return {**{name: float(value) for name, value in run.metrics.items()}, **flags}

@@ -1,0 +1,218 @@
+"""Results as objects: what a run, a tuning, an identification and a sweep say of themselves, and as frames."""
+
+import dataclasses
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import run as command
+
+import diffabs as d
+from diffabs import objectives
+from diffabs.controllers import HoldingInput, StateFeedback
+from diffabs.core.summary import Summary, cell, number
+from diffabs.identify import Traces, identify
+from diffabs.plants import BrakeStart, MirroredRig
+from diffabs.references import FixedSlip
+from diffabs.scenario.defaults import braking
+from diffabs.stops import SpeedReached
+from diffabs.sweep import Results, Space, Study, Uniform, sweep
+from diffabs.tune import grid, tune
+
+SOLVER = d.FixedStep(2e-3, 2.0)
+
+
+def rig():
+    return braking(
+        plant=MirroredRig(),
+        initial=BrakeStart(speed=6.0),
+        reference=FixedSlip(slip=0.2),
+        controller=StateFeedback(gain=(-3000.0, -48.0)),
+        feedforward=HoldingInput(),
+        stop=SpeedReached(speed=2.0),
+    )
+
+
+@pytest.fixture(scope="module")
+def run():
+    return d.rollout(rig(), SOLVER, objectives.BRAKING)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (8e-17, "0"),
+        (-8e-17, "0"),
+        (1.25e-9, "1.25e-09"),
+        (math.nan, "nan"),
+        (math.inf, "inf"),
+        (-3.14159265, "-3.14159"),
+    ],
+)
+def test_rounding_is_no_number(value, text):
+    assert number(value) == text
+
+
+def test_a_cell_of_a_list_is_its_beginning():
+    assert cell(np.arange(6.0)) == "[0, 1, 2, 3, ...]"
+    assert cell(np.array([1.5, -1e-17])) == "[1.5, 0]"
+    assert cell(None) == ""
+    assert cell(True) == "True"
+
+
+def test_a_summary_is_text_and_html():
+    found = Summary("a <title>", ("name", "value"), (("x", 1 / 3), ("longer", 8e-17)), "note")
+    assert str(found).splitlines() == [
+        "a <title>", "name    value", "----------------", "x       0.333333", "longer  0", "note",
+    ]  # fmt: skip
+    html = found._repr_html_()
+    assert "a &lt;title&gt;" in html
+    assert html.count("<tr>") == 3
+    assert "<td>0</td>" in html
+
+
+def test_a_run_says_what_it_is(run):
+    lines = repr(run).splitlines()
+    end = float(run.ending.sample.t)
+    assert lines[0].startswith(f"Run that reached its stop at t = {end:.6g} s; a trajectory of")
+    assert any(line.split() == ["iae", f"{float(run.metrics['iae']):.6g}"] for line in lines)
+    assert len(repr(run)) < 1000
+    assert "<table>" in run._repr_html_()
+    late = d.measure(rig(), dataclasses.replace(SOLVER, duration=0.1), objectives.BRAKING)
+    assert repr(late).startswith("Run that ended at t = 0.1 s")
+    wild = dataclasses.replace(rig(), controller=StateFeedback(gain=(-3e9, 48e5)))
+    lost = d.measure(wild, SOLVER, objectives.BRAKING)
+    assert repr(lost).startswith("Run that diverged")
+
+
+def test_many_runs_are_counted_and_a_traced_one_can_be_shown():
+    said = []
+
+    def one(mass):
+        found = d.measure(d.replace(rig(), {"plant.mass": mass}), SOLVER, {"iae": objectives.BRAKING["iae"]})
+        said.append(repr(found))
+        return found
+
+    many = jax.vmap(one)(jnp.linspace(5.0, 6.0, 3))
+    assert said[0] == "Run being traced, of 1 metrics"
+    lines = repr(many).splitlines()
+    assert lines[0] == "3 runs: 3 reached their stop, 0 diverged"
+    row = next(line.split() for line in lines if line.startswith("iae"))
+    values = np.asarray(many.metrics["iae"])
+    assert [*map(float, row[1:])] == pytest.approx([values.mean(), values.min(), values.max()], rel=1e-5)
+    frame = many.pandas()
+    np.testing.assert_array_equal(frame["iae"], values)
+    assert frame["stopped"].tolist() == [True] * 3
+
+
+def test_frames_have_units_and_end_where_the_run_does(run):
+    count = int(np.sum(run.trajectory.running)) + 1
+    frame, plant = run.pandas(rig().plant), rig().plant
+    assert frame.index.name == "t"
+    assert len(frame) == count < len(run.trajectory.running)
+    assert frame.index[-1] == pytest.approx(float(run.ending.sample.t))
+    np.testing.assert_array_equal(frame["slip"], np.asarray(run.trajectory.sample.output.slip)[:count])
+    np.testing.assert_array_equal(frame["command"], np.asarray(run.trajectory.sample.command)[:count])
+    assert frame.attrs["units"] | {} == {
+        **plant.shows.units, "t": "s", "target": "1", "setpoint": "1", "feedforward": "N m", "command": "N m",
+        "control": "N m",
+    }  # fmt: skip
+    assert frame.attrs["iae"] == float(run.metrics["iae"])
+    data = run.xarray(plant)
+    assert data["speed"].attrs["units"] == "m/s"
+    assert data["t"].attrs["units"] == "s"
+    assert run.xarray()["control"].attrs["units"] == "control"
+    np.testing.assert_array_equal(data["speed"], frame["speed"])
+    assert float(data["slip"].sel(t=0.0)) == frame["slip"].iloc[0]
+    with pytest.raises(ValueError, match="no trajectory"):
+        run._replace(trajectory=None).xarray()
+    with pytest.raises(ValueError, match="many runs"):
+        jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), run).pandas()
+
+
+def test_a_run_draws_the_figure_of_its_plant(run, tmp_path):
+    figure = run.plot(rig().plant, title="a rig")
+    assert figure.get_axes()[0].get_ylabel() == "slip [1]"
+    assert figure.get_suptitle() == "a rig"
+    balance = d.rollout(d.balancing(), d.FixedStep(1e-2, 0.1), {})
+    assert balance.plot().get_axes()[0].get_ylabel() == "angle [rad]"
+    figure.savefig(tmp_path / "run.png")
+
+
+def test_a_tuning_has_a_table():
+    free, over = {"controller.gain": ((-1e4, -300.0), (-200.0, -10.0))}, grid({"plant.mass": [5.3, 6.2]})
+    found = tune(rig(), free=free, objective={"iae": 1.0}, over=over, solver=SOLVER)
+    table = found.table()
+    rows = {row[0]: row[1:] for row in table.rows}
+    np.testing.assert_array_equal(rows["controller.gain"][1], found.values["controller.gain"])
+    assert rows["mean iae"] == (np.mean(found.metrics[0]["iae"]), np.mean(found.metrics[1]["iae"]))
+    assert rows["objective"] == found.objective
+    assert repr(found) == str(table)
+    assert repr(found).startswith("Tuned over 2 lanes: ")
+    assert "<table>" in found._repr_html_()
+
+
+def test_an_identification_has_a_table(run):
+    frame = run.pandas()
+    data = Traces(t=frame.index.to_numpy(), columns={"speed": frame["speed"].to_numpy()}, sigma={"speed": 0.01})
+    found = identify(d.replace(rig(), {"plant.mass": 5.0}), data, {"plant.mass": (4.0, 8.0)}, solver=SOLVER)
+    (row,) = found.table().rows
+    assert row == ("plant.mass", 5.0, found.values["plant.mass"], found.uncertainty.deviations["plant.mass"])
+    assert repr(found) == str(found.table())
+    assert f"Identified from {len(frame)} residuals" in repr(found)
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    space = Space({"plant.mass": Uniform(low=5.0, high=6.5)})
+    study = Study(
+        loop=rig(), solver=SOLVER, objectives=objectives.BRAKING, space=space,
+        samples=20, failures={"iae": 0.02},
+    )  # fmt: skip
+    return sweep(study, tmp_path_factory.mktemp("sweeps") / "study")
+
+
+def test_the_frame_of_a_sweep_has_units_and_says_what_failed(swept):
+    bound = float(np.median(swept.column("iae")))
+    swept.manifest["study"]["failures"] = {"iae": bound}  # of those of the study none fails, or all do
+    frame = swept.pandas()
+    np.testing.assert_array_equal(frame["failed"], swept.column("iae") > bound)
+    assert 0 < frame["failed"].sum() < 20
+    assert frame.attrs["units"]["plant.mass"] == "kg"
+    assert frame.attrs["units"]["stop_time"] == "s"
+    assert swept.polars()["failed"].to_list() == frame["failed"].tolist()
+    data = swept.xarray()
+    assert data["plant.mass"].attrs["units"] == "kg"
+    lines = repr(swept).splitlines()
+    assert lines[0] == f"Sweep of 20 samples: {int(frame['failed'].sum())} failed, 0 diverged"
+    assert any(line.split()[0] == "stop_time" and line.split()[-1] == "s" for line in lines)
+    assert "over plant.mass" in lines[-1]
+    assert "<table>" in swept._repr_html_()
+
+
+def test_what_was_missed_or_refused_is_told_apart(swept, monkeypatch):
+    stopped, refused = np.ones(20, bool), np.full(20, "")
+    stopped[3], refused[5] = False, "a step that is too long"
+    columns = {"stopped": stopped, "refused": refused, "diverged": refused != "", "iae": np.zeros(20)}
+    monkeypatch.setattr(swept, "column", columns.__getitem__)
+    assert np.flatnonzero(swept.failed()).tolist() == [3]
+    assert np.flatnonzero(swept.failures()["not stopped"]).tolist() == [3]
+
+
+def test_a_sweep_of_before_has_no_units(swept):
+    older = Results(swept.folder)
+    older.manifest.pop("units")
+    assert older.units == {}
+    assert older.pandas().attrs["units"] == {}
+
+
+def test_no_table_of_the_command_line_has_rounding_for_a_number(monkeypatch):
+    from diffabs.cli import show
+
+    assert show.brief(8e-17) == "0"
+    assert show.brief([1.0, 8e-17]) == "[1, 0]"
+    result = json.loads(command("simulate", "slip-lmi", "--set", "solver.step=1e-3", "--json").stdout)
+    assert set(result["metrics"]) >= {"iae"}
