@@ -58,10 +58,16 @@ def cost(config: Config, stages: dict[str, Tuned], last: str) -> int:
     return total
 
 
+def scored(config: Config, speed: str) -> Score:
+    """The objective of the tuning, as others search it."""
+    tuning = config.tuning
+    return Score(config.others, config.box, config.fixed, speed, tuning.weights, config.judging)
+
+
 def compared(config: Config, speed: str, stages: dict[str, Tuned], told: Any) -> dict[str, tuple[Loop, int]]:
     """All loops of one kind of speed by name, with what it cost to find each; others see the same estimated speed."""
     best: Any = stages["CVaR"].loop
-    score = Score(config.others, config.box, config.fixed, speed, config.tuning.weights, config.judging)
+    score = scored(config, speed)
     estimator = None if speed == KNOWN else best.sensor.blocks[-1]
     found = contenders(config.others, config.box, config.fixed, speed, estimator, score, told)
     own = {
@@ -100,6 +106,7 @@ def row(one: dict[str, Any]) -> dict[str, Any]:
     box, proof = one["box"], one["proof"]
     rate = proof.get("decay [1/s]")
     return {
+        "objective": f"{one['objective']:.4f}",
         "worst corner [%]": f"{one['corners']['overshoot [%]']:.1f}",
         "P(> 1 %) [%]": interval("overshoot > 1 %"),
         "P(> 5 %) [%]": interval("overshoot > 5 %"),
@@ -120,9 +127,10 @@ def of_speed(config: Config, speed: str, told: Any) -> tuple[dict[str, Tuned], d
     those = compared(config, speed, stages, lambda name: told(f"{speed}, found: {name}"))
     loops = {name: one for name, (one, _) in those.items()}
     proved = proofs(config.proving, config.box, config.fixed, loops)
-    results = {}
+    results, score = {}, scored(config, speed)
     for name, (one, runs) in those.items():
-        results[name] = {**judged(config, speed, one), "proof": proved[name], "runs to find": runs}
+        found = {"objective": score(one), "proof": proved[name], "runs to find": runs}
+        results[name] = {**judged(config, speed, one), **found}
         told(f"{speed}, judged: {name}")
     return stages, loops, results
 
@@ -143,6 +151,7 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
         )
         figures[f"traces-{speed}"] = traces(shown, speed, config.fixed)
         results[speed] = {"controllers": rows, "beyond the box": maps, "tuning": described(stages[speed])}
+        (folder / "controllers").mkdir(parents=True, exist_ok=True)
         for name, one in loops.items():
             record.write(folder / "controllers", document(one), f"{speed}, {name}.json".replace("/", " "))
     figures["tuning"] = descents(stages)

@@ -58,6 +58,7 @@ class Box:
 
 INERTIA = 7.53e-3  # kg m^2
 NOMINAL = {"mass": 5.75, "speed": 50.0, "height": 1.0, "place": 1.0, "inertia": 1.0, "lag": 1e-3, "delay": 0.0}
+NOMINAL |= {"first": 0.0, "last": 0.0, "bias": 0.0}
 SENSOR = {"first": "sensor.blocks.2.first", "last": "sensor.blocks.2.last", "bias": "sensor.blocks.3.deceleration"}
 
 

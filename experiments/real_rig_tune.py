@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from real_rig_box import KNOWN, Box, Fixed, batch, columns, spread
+from real_rig_box import ESTIMATED, KNOWN, Box, Fixed, batch, columns, spread
 from real_rig_floor import floor, stopping_time
 from real_rig_loops import loop
 
@@ -27,7 +27,7 @@ class Tuning:
     step: float = 1e-3  # s
     few: int = 512  # lanes on which all starts are tried
     lanes: int = 4096  # lanes on which the best of them is tuned
-    starts: int = 4
+    starts: Mapping[str, int] = dataclasses.field(default_factory=lambda: {KNOWN: 4, ESTIMATED: 3})
     tried: int = 12  # steps of each start
     iterations: int = 8  # steps of the best
     level: float = 0.95  # of CVaR
@@ -37,6 +37,8 @@ class Tuning:
     rate: float = 4.0  # 1/s
     time_constant: float = 0.02  # s
     tracking_time: float = 0.05  # s
+    gate: float = 0.01
+    growth: float = 1.0  # m/s/s^0.5
     free: Mapping[str, Any] = dataclasses.field(
         default_factory=lambda: {
             "controller.controller.gain": ((-2e4, -400.0), (-10.0, -10.0)),
@@ -46,7 +48,7 @@ class Tuning:
         }
     )
     of_estimator: Mapping[str, Any] = dataclasses.field(
-        default_factory=lambda: {"sensor.blocks.4.gate": (0.003, 0.3), "sensor.blocks.4.growth": (1e-3, 3.0)}
+        default_factory=lambda: {"sensor.blocks.4.gate": (0.001, 0.3), "sensor.blocks.4.growth": (1e-3, 30.0)}
     )
 
 
@@ -67,7 +69,8 @@ def start(config: Tuning, fixed: Fixed, speed: str) -> Loop:
     windup = BackCalculation(tracking_time=config.tracking_time)
     controller = ProportionalFeedback(gain=np.array(config.gain), antiwindup=windup)
     target = LimitedSlip(slip=fixed.slip, rate=config.rate, time_constant=config.time_constant)
-    return loop(fixed, controller, speed, target, SpeedEstimator(period=fixed.period), smooth=True)
+    estimator = SpeedEstimator(gate=config.gate, growth=config.growth, period=fixed.period)
+    return loop(fixed, controller, speed, target, estimator, smooth=True)
 
 
 def longest(points: dict[str, np.ndarray], fixed: Fixed) -> np.ndarray:
@@ -107,7 +110,7 @@ def tuned(
         )
 
     risk, worst = CVaR(level=config.level), SmoothWorst(softness=config.softness)
-    first = search("starts", subject, risk, config.few, config.starts, config.tried)
+    first = search("starts", subject, risk, config.few, config.starts[speed], config.tried)
     cvar = search("CVaR", first.part, risk, config.lanes, 1, config.iterations)
     return {
         "starts": first,

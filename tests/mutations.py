@@ -38,6 +38,55 @@ class Mutation(NamedTuple):
 
 MUTATIONS = [
     Mutation(
+        "a sampled controller on the grid whose delay does nothing",
+        "controllers/sampled_on_grid.py",
+        "waits * m.last + (1 - waits) * m.next",
+        "m.next",
+        "test_real_rig.py::test_a_document_runs_elsewhere[all wrong-known]",
+    ),
+    Mutation(
+        "a delay on the grid that begins half a step late",
+        "controllers/sampled_on_grid.py",
+        "(m.until - clock.t) / clock.h, 0.0",
+        "(m.until - clock.t) / clock.h + 0.5, 0.0",
+        "test_real_rig.py::test_the_grid_agrees_with_located_events",
+    ),
+    Mutation(
+        "a limited target that does not mind the speed",
+        "references/limited.py",
+        "h = self.period * self.reference_speed / jnp.maximum(signal.speed, self.floor)",
+        "h = self.period",
+        "test_real_rig.py::test_a_limited_target_asks_for_the_same_torque_at_every_speed",
+    ),
+    Mutation(
+        "a wheel's noise that is not in its speed",
+        "sensors/noise.py",
+        "wheel_speed=signal.wheel_speed - signal.speed * noise",
+        "wheel_speed=signal.wheel_speed",
+        "test_real_rig.py::test_noise_of_the_wheel_is_the_slip_s_at_any_speed",
+    ),
+    Mutation(
+        "a speed that does not drift",
+        "sensors/speed.py",
+        "error = self.last + (self.first - self.last) * jnp.exp(-t / self.time_constant)",
+        "error = self.last + 0.0 * t",
+        "test_real_rig.py::test_a_document_runs_elsewhere[all wrong-known]",
+    ),
+    Mutation(
+        "an estimator that believes a locked wheel",
+        "sensors/speed_estimator.py",
+        "clamp(1 - slip / self.gate, 0.0, 1.0)",
+        "1.0 + 0.0 * slip",
+        "test_real_rig.py::test_an_estimator_is_not_led_astray_by_a_wheel_that_locks",
+    ),
+    Mutation(
+        "an estimator that does not learn how much it knows",
+        "sensors/speed_estimator.py",
+        "(1 - gain) * variance",
+        "variance",
+        "test_real_rig.py::test_the_estimator_averages_the_first_samples",
+    ),
+    Mutation(
         "a comparison that nobody looks at",
         "core/regime.py",
         "against = margin < -_rounding(x)",

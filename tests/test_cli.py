@@ -384,7 +384,7 @@ def test_completion_offers_commands_and_scenarios():
         return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False).stdout
 
     assert offered("diffabs id").split() == ["identify"]
-    assert set(offered("diffabs simulate slip-").split()) == {"slip-cured", "slip-estimator", "slip-lmi"}
+    assert set(offered("diffabs simulate slip-").split()) == {"slip-cured", "slip-estimator", "slip-lmi", "slip-real"}
 
 
 def test_the_extra_all_is_all_of_them():

@@ -6,6 +6,7 @@ import pathlib
 import sys
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import real_rig_oracle as oracle
@@ -13,6 +14,7 @@ import real_rig_oracle as oracle
 import diffabs as d
 from diffabs import controllers, references, sensors
 from diffabs.core.blocks import Series
+from diffabs.core.protocols import BrakeOutput, Clock
 
 ROOT = pathlib.Path(__file__).parent.parent
 
@@ -98,3 +100,71 @@ def test_a_speed_seen_low_biases_the_slip_whatever_the_gain(rig):
     points = {name: np.full(1, value) for name, value in rig["box"].NOMINAL.items()}
     points |= {"first": np.full(1, -0.03), "last": np.full(1, -0.03)}
     np.testing.assert_allclose(rig["floor"].floor(points, "known", rig["box"].Fixed()), 0.12, rtol=1e-12)
+
+
+def fed(block, outputs, key=None):
+    """What a sampled sensor puts out at 1 kHz for these outputs of a plant, (n,) each."""
+
+    def step(memory, at):
+        k, signal = at
+        memory = block.tick(Clock(1e-3 * k, 1e-3, k, key), memory, signal)
+        return memory, block.output(1e-3 * k, memory, signal)
+
+    first = jax.tree.map(lambda x: x[0], outputs)
+    return jax.lax.scan(step, block.start(first), (jnp.arange(len(outputs[0])), outputs))[1]
+
+
+def test_noise_of_the_wheel_is_the_slip_s_at_any_speed():
+    n = 4000
+    v = jnp.linspace(20.0, 2.0, n)
+    true = BrakeOutput(0.2 + 0.0 * v, v, 0.8 * v, 8.0 + 0.0 * v, 0.0 * v)
+    seen = fed(sensors.WheelNoise(slip=0.01), true, jax.random.key(5))
+    noise = np.asarray(seen.slip) - 0.2
+    np.testing.assert_allclose((v - seen.wheel_speed) / v, seen.slip, rtol=1e-12)
+    np.testing.assert_allclose(seen.speed, v, rtol=0)
+    for part in (noise[: n // 2], noise[n // 2 :]):
+        assert abs(part.std() / 0.01 - 1) < 4 / np.sqrt(2 * n / 2)
+    assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 4 / np.sqrt(n)
+    assert float(sensors.WheelNoise(slip=0.01).start(true).held[0]) == 0  # before the first instant
+
+
+def test_an_estimator_is_not_led_astray_by_a_wheel_that_locks():
+    """It rolls for 20 ms, locks for 0.3 s, and rolls again, at 8 m/s^2; the accelerometer is off by 0.1 m/s^2."""
+    t = 1e-3 * jnp.arange(500)
+    v = 15.0 - 8.0 * t
+    w = v * jnp.clip(jnp.where(t < 0.2, 1 - (t - 0.02) / 0.01, (t - 0.33) / 0.01), 0.0, 1.0)
+    true = BrakeOutput(1 - w / v, v, w, 8.1 + 0.0 * v, 0.0 * v)
+    gated, open_ = (fed(sensors.SpeedEstimator(gate=gate, growth=0.05), true) for gate in (0.03, 0.99))
+    error = np.asarray(gated.speed - v)
+    assert np.abs(error).max() < 0.07
+    assert np.abs(np.asarray(open_.speed - v)).max() > 1.0
+    locked = slice(40, 320)  # the accelerometer alone: its bias, integrated
+    np.testing.assert_allclose(np.diff(error[locked]), -1e-4, rtol=1e-6)
+    assert abs(error[-1]) < 0.2 * abs(error[320])  # what it had lost is found again on the wheel that rolls
+    np.testing.assert_allclose(gated.slip, 1 - w / gated.speed, rtol=0, atol=1e-12)
+
+
+def test_the_estimator_averages_the_first_samples():
+    """P starts at R, so without growth the gains are 1/2, 1/3, ...: of a wheel that rolls, and is never slower than the
+    estimate, the estimate is the mean so far."""
+    w = 10.0 + 1e-3 * jnp.arange(40.0)
+    still = BrakeOutput(0 * w, w, w, 0 * w, 0 * w)
+    seen = fed(sensors.SpeedEstimator(growth=1e-9, noise=0.005), still)
+    mean = np.cumsum(w) / np.arange(1, 41)
+    np.testing.assert_allclose(seen.speed, mean, rtol=1e-5)  # R goes with the estimate
+
+
+def test_a_limited_target_asks_for_the_same_torque_at_every_speed():
+    """Its rise, times the speed, is at most rate v0; and then it settles with T v/v0."""
+    target = references.LimitedSlip(rate=3.0, time_constant=0.02, reference_speed=10.0)
+    for v in (5.0, 20.0):
+        n = 600
+        speed = jnp.full(n, v)
+        still = BrakeOutput(0 * speed, speed, speed, 0 * speed, 0 * speed)
+        rise = np.asarray(fed(target, still))
+        steps = np.diff(np.concatenate([[0.0], rise]))
+        assert steps.max() * v / 10.0 / 1e-3 <= 3.0 * (1 + 1e-9)
+        first = (0.2 - 3.0 * 0.02) / 3.0 * v / 10.0  # s, as long as it rises at its limit
+        np.testing.assert_allclose(rise[int(0.5 * first / 1e-3)], 3.0 * 10 / v * 1e-3 * (int(0.5 * first / 1e-3) + 1))
+        left = 0.2 - rise[int(first / 1e-3) + 20 : int(first / 1e-3) + 80]
+        np.testing.assert_allclose(left[1:] / left[:-1], np.exp(-1e-3 * 10.0 / (0.02 * v)), rtol=1e-6)
