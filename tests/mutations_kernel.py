@@ -94,7 +94,7 @@ KERNEL = [
     ("kernel: any name of an engine", "simulate/native.py", "if engine not in ENGINES:", "if False:",
      f"{OBJECTION}::test_of_another_name"),
     ("kernel: lanes that run together by a kernel", "simulate/batch.py",
-     "return by_engine(engine, lambda: run_native", 'return by_engine("xla", lambda: run_native',
+     "why_not = TOGETHER if trajectories or together or", "why_not = TOGETHER if False and",
      f"{OBJECTION}::test_of_lanes_that_run_together"),
     ("kernel: a primitive without a rule is nothing", "kernel/primitives.py", "if name not in RULES:",
      'if name not in RULES and name != "while":', f"{OBJECTION}::test_of_an_operation"),

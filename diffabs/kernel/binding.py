@@ -145,6 +145,8 @@ def _push(arrays: Sequence[Any], slopes: Sequence[Any], *, lanes: Lanes, begins:
         found = operation.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=as_lanes)
         return found, [_none(x) for x in found]
 
+    lanes.derivative(begins)  # now: where JAX 0.12 asks for shapes nothing can be traced
+
     def alone(key: Key, x: Any) -> Any:
         return jnp.expand_dims(x, 0 if key.level == Level.UNIFORM and key.number not in as_lanes else 1)
 
