@@ -311,6 +311,7 @@ def test_the_command_says_margins_and_where_they_are_worst(tmp_path):
     here = open_loop(load("slip-cured").loop)
     assert result["margins"]["phase"] == pytest.approx(margins(here).phase, rel=1e-12)
     assert (tmp_path / "loop.png").stat().st_size > 10_000
+    assert "mass 6.2 kg, speed 5 km/h" in command("margins", "slip-cured", "--samples", "0").stdout
     done = command("margins", "slip-cured", "--at", "speed_kmh=6", "--at", "plant.mass=6.2", "--json")
     result = json.loads(done.stdout)
     assert result["systems"] == []

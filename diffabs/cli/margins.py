@@ -14,6 +14,7 @@ from diffabs.core import provenance
 from diffabs.core.pytree import Spec, replace
 from diffabs.core.values import ScenarioError, inside, shown
 from diffabs.scenario.parameter_paths import entries, parameters_of
+from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -188,7 +189,11 @@ def _said(name: str, value: float) -> str:
 
 def _where(values: dict[str, float], chosen: Scenario) -> str:
     units = {path: spec.unit for path, (spec, _) in parameters_of(chosen.loop).items()}
-    return ", ".join(f"{path.rpartition('.')[2]} {value:.4g} {units[path]}".strip() for path, value in values.items())
+    words = []
+    for path, value in values.items():
+        scale, unit = (KMH, "km/h") if units[path] == "m/s" else (1.0, units[path])
+        words.append(f"{path.rpartition('.')[2]} {scale * value:.4g} {unit}".strip())
+    return ", ".join(words)
 
 
 def _judge(chosen: Scenario, nominal: "System", found: "Band | None") -> None:
