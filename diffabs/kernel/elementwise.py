@@ -39,6 +39,7 @@ def _sum_of_tangents(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 @rule("stop_gradient copy copy_p optimization_barrier pvary")
+@rule("reshard", "dst_sharding concrete_mesh")
 def _unchanged(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return ins
 
@@ -181,3 +182,24 @@ def _shift(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         return graph.select(inside, zero, graph.op(name, x, graph.select(inside, graph.const(0, by.dtype), by)))
 
     return [each(shift, *ins)]
+
+
+@rule("population_count")
+def _population(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    """The bits that are set: sums of neighbours, of pairs, of fours, and by a product of bytes."""
+
+    def count(x: Node) -> Node:
+        if x.dtype != np.uint32:
+            raise Unsupported("population_count", f"of {x.dtype}")
+
+        def part(y: Node, places: int, mask: int) -> Node:
+            moved = graph.op("shift_right_logical", y, graph.const(places, y.dtype))
+            return graph.op("and", moved if places else y, graph.const(mask, y.dtype))
+
+        x = graph.op("sub", x, part(x, 1, 0x55555555))
+        x = graph.op("add", part(x, 0, 0x33333333), part(x, 2, 0x33333333))
+        fours = graph.op("add", x, graph.op("shift_right_logical", x, graph.const(4, x.dtype)))
+        bytes_ = graph.op("mul", part(fours, 0, 0x0F0F0F0F), graph.const(0x01010101, x.dtype))
+        return graph.op("shift_right_logical", bytes_, graph.const(24, x.dtype))
+
+    return [each(count, *ins)]
