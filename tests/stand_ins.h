@@ -1,7 +1,7 @@
 /* What a kernel of CUDA asks of its GPU, on a processor: one thread after the other. */
 #define __global__
 #define __grid_constant__
-#define __launch_bounds__(threads)
+#define __launch_bounds__(threads, blocks)
 #define __device__
 struct Index { int x; };
 static Index blockIdx, blockDim, threadIdx;

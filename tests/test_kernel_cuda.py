@@ -111,7 +111,8 @@ class TestText:
         cases.test_objectives()
 
 
-MOST = {"float32": (168, 64), "float64": (255, 64)}  # registers of a thread (255 is all it can have), bytes spilled
+MOST = {"float32": (168, 16), "float64": (255, 16)}  # registers of a thread (255 is all it can have), bytes spilled
+LARGE = {"slip-real": {"float32": 160, "float64": 1500}}  # bytes spilled by a program of two to three times the size
 FAST = ("slip-lmi", "arm-balance")
 
 
@@ -136,7 +137,7 @@ class TestMachineCode:
         used = nvrtc.registers(code.with_suffix(".log").read_text())["run_all"]
         most, spilled = MOST[dtype]
         assert used["registers"] <= most
-        assert used["spilled"] <= spilled
+        assert used["spilled"] <= LARGE.get(name, {}).get(dtype, spilled)
 
     def test_of_a_wrong_text_is_an_objection(self, tmp_path, monkeypatch):
         monkeypatch.setenv(compilers.CACHE, str(tmp_path))

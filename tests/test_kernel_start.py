@@ -44,8 +44,8 @@ def folder(monkeypatch):
     native._kept.forget()
 
 
-def run(loop=LOOP, solver=SOLVER, measured=MEASURED, values=SPEEDS):
-    lanes = d.Batch(values)
+def run(loop=LOOP, solver=SOLVER, measured=MEASURED, values=SPEEDS, keys=None):
+    lanes = d.Batch(values, keys)
     return jax.device_get(d.run_batch(loop, lanes, solver, measured, accepted=True, together=False, engine="kernel"))
 
 
@@ -176,7 +176,8 @@ def test_of_a_scenario(name, traced):
     one = scenario.load(name)
     path = {"arm-balance": "initial.theta", "arm-hanging": "initial.theta"}.get(name, "initial.speed")
     values = {path: np.linspace(0.98, 1.0, 4) * float(get(one.loop, path))}
-    whole = {"loop": one.loop, "solver": one.solver, "measured": dict(one.objectives), "values": values}
+    whole = {"loop": one.loop, "solver": one.solver, "measured": dict(one.objectives)}
+    whole |= {"values": values, "keys": np.arange(4)}
     same_bits(run(**whole), again(**whole))
     assert len(traced) == 1
 

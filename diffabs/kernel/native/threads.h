@@ -2,6 +2,12 @@
    its warp go on. Two launches: what all lanes share is worked out by one thread first. */
 #pragma once
 
+#ifdef SINGLE
+enum { BLOCKS = 3 };   /* that a multiprocessor holds at least, so that a thread has 168 registers, or 255 */
+#else
+enum { BLOCKS = 2 };
+#endif
+
 struct Arrays {
   Array uniform[UNIFORM + 1], lanes[OF_LANES + 1], carry[CARRIED + 1], results[CARRIED + 1];
 };
@@ -11,7 +17,7 @@ extern "C" __global__ void begin_all(const __grid_constant__ Arrays arrays, Shar
   prepare(*shared, arrays.uniform);
 }
 
-extern "C" __global__ void __launch_bounds__(THREADS)
+extern "C" __global__ void __launch_bounds__(THREADS, BLOCKS)
 run_all(const __grid_constant__ Arrays arrays, const Shared* __restrict__ shared, i64* next, i64 count) {
   const Shared& s = *shared;
   i64 j = (i64)blockIdx.x*blockDim.x + threadIdx.x;
