@@ -10,9 +10,11 @@ Every time is divided by that of the objective alone, `jit` of the mean of `meas
 are interleaved, ratios and times are medians over them. `--quick` leaves the memory out. Prints tables, writes JSON
 with machine, versions and commit.
 
-With `--rtol R` the runs take adaptive steps, the value its own, fewer than the gradient does.
+With `--rtol R` the runs take adaptive steps, the value its own, fewer than the gradient does. With `--engine kernel`
+values and forward derivatives are a kernel's, and XLA's stand beside them, alternately; there is no reverse mode.
 
     python benchmarks/bench_gradient.py [--lanes 256] [--rounds 9] [--loops lmi est latch] [--quick] [--rtol 1e-5]
+                                        [--engine kernel] [--kinks no]
 """
 
 import argparse
@@ -65,11 +67,12 @@ CASES = {
 }
 
 
-def objective(name, options, duration=None):
+def objective(name, options, duration=None, engine="xla"):
     """(logarithmic changes of p <= 8 parameters -> mean objective)."""
     loop, masses, horizon, paths = CASES[name]
     masses, duration = jnp.linspace(masses[0], masses[1], options.lanes), duration or horizon
-    solver = d.Adaptive(options.rtol, duration) if options.rtol else d.FixedStep(options.step, duration)
+    kinks = {"located": None, "no": False}[options.kinks]
+    solver = d.Adaptive(options.rtol, duration) if options.rtol else d.FixedStep(options.step, duration, kinks=kinks)
 
     def mean(logs):
         factors, values = jnp.concatenate([jnp.exp(logs), jnp.ones(len(paths) + 1 - len(logs))]), {}
@@ -78,6 +81,10 @@ def objective(name, options, duration=None):
             values[path] = value * (factors[: value.size] if value.ndim else factors[0])
             factors = factors[value.size :]
         changed = d.replace(loop, values)
+        if engine == "kernel":
+            lanes = d.Batch({"plant.mass": masses})
+            metrics = d.run_batch(changed, lanes, solver, MEASURED, accepted=True, engine=engine).metrics
+            return jnp.mean(metrics["stop_distance"] + metrics["iae"])
 
         def one(mass):
             metrics = d.measure(d.replace(changed, {"plant.mass": mass}), solver, MEASURED).metrics
@@ -100,9 +107,13 @@ def compiled(function, count):
 
 def timed(name, options):
     """Rows of one loop: {"value", "forward 1", ..., "reverse"} to medians of seconds and of ratios."""
-    mean = objective(name, options)
-    programs = {"value": compiled(mean, 8), "reverse": compiled(jax.grad(mean), 8)}
+    mean = objective(name, options, engine=options.engine)
+    programs = {"value": compiled(mean, 8)}
+    programs |= {"reverse": compiled(jax.grad(mean), 8)} if options.engine == "xla" else {}
     programs |= {f"forward {p}": compiled(jax.jacfwd(mean), p) for p in COUNTS}
+    if options.engine == "kernel":
+        known = objective(name, options)
+        programs |= {"value by XLA": compiled(known, 8), "forward 2 by XLA": compiled(jax.jacfwd(known), 2)}
     times = {key: [] for key in programs}
     for r in range(options.rounds + 1):  # the first warms up
         for key, (call, _, _) in programs.items():
@@ -145,6 +156,8 @@ def main():
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--loops", nargs="+", choices=list(CASES), default=list(CASES))
     parser.add_argument("--rtol", type=float, help="of adaptive steps; without it they are fixed")
+    parser.add_argument("--engine", choices=("xla", "kernel"), default="xla")
+    parser.add_argument("--kinks", choices=("located", "no"), default="located", help="of fixed steps, in derivatives")
     parser.add_argument("--quick", action="store_true", help="leave the memory out")
     parser.add_argument("--out", type=pathlib.Path)
     options = parser.parse_args()
@@ -152,8 +165,8 @@ def main():
     found = {}
     for name in options.loops:
         rows = timed(name, options)
-        sizes = {} if options.quick or options.rtol else memory(name, options)
-        found[name] = {"rows": rows, "crossover": crossover(rows), "memory": sizes}
+        sizes = {} if options.quick or options.rtol or options.engine == "kernel" else memory(name, options)
+        found[name] = {"rows": rows, "crossover": crossover(rows) if "reverse" in rows else None, "memory": sizes}
         show(name, found[name], options)
     write(found, options)
 
@@ -164,7 +177,7 @@ def show(name, found, options):
     for heading in ("", "run [ms]", "ratio", "bound", "compile [s]", "temporary [MB]"):
         table.add_column(heading)
     for key, row in found["rows"].items():
-        kind, _, count = key.partition(" ")
+        kind, _, count = key.removesuffix(" by XLA").partition(" ")
         bound = {"value": 1.0, "reverse": REVERSE_BOUND}.get(kind, 1 + FORWARD_BOUND * int(count or 0))
         table.add_row(
             key,
@@ -176,7 +189,8 @@ def show(name, found, options):
         )
     console = Console()
     console.print(table)
-    console.print(f"reverse mode is the cheaper from p = {found['crossover']:.1f}")
+    if found["crossover"] is not None:
+        console.print(f"reverse mode is the cheaper from p = {found['crossover']:.1f}")
     if found["memory"]:
         sizes = ", ".join(f"{steps}: {size / 1e6:.2f} MB" for steps, size in found["memory"].items())
         spread = max(found["memory"].values()) / min(found["memory"].values())
@@ -187,7 +201,9 @@ def write(found, options):
     """JSON with machine, versions and commit."""
     kept = {"loops": found, "lanes": options.lanes, "step_s": options.step, "rtol": options.rtol}
     kept |= {"rounds": options.rounds, "device": str(jax.devices()[0])}
-    path = record.written("gradient-adaptive" if options.rtol else "gradient", kept, options.out)
+    kept |= {"engine": options.engine, "kinks": options.kinks}
+    name = "gradient" + ("-adaptive" if options.rtol else "") + ("-kernel" if options.engine == "kernel" else "")
+    path = record.written(name, kept, options.out)
     Console().print(f"written to {path}")
 
 

@@ -147,7 +147,7 @@ KERNEL = [
     ("tangents: the last step is not repeated", "simulate/pursuit.py", "return self.ahead.running | self.waits",
      "return self.ahead.running", f"{SCENARIO}-adaptive]"),
     ("tangents: by steps that end on no kink", "simulate/native.py", "else method.located()", "else method",
-     f"{SCENARIO}-kinks]"),
+     "test_kernel_tangents.py::test_steps_end_on_kinks_where_those_of_xla_do"),
     ("kernel: it looks for enough at other instants", "simulate/native.py", "ROUND // BLOCK", "1",
      f"{ENGINES}::test_a_map_of_starts_is_that_of_xla"),
     ("kernel: reverse mode of a tuning is forward mode", "tune/problem.py", "REVERSE if mode is Mode.REVERSE else None",

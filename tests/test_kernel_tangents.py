@@ -18,12 +18,13 @@ from kernels import FOLDER
 from test_kernel_parts import CASES, VARIED, with_part
 
 import diffabs as d
-from diffabs import scenario
+from diffabs import controllers, plants, scenario
 from diffabs.core.pytree import arrayed, get
 from diffabs.kernel import compilers, launch, tangents
 from diffabs.kernel.graph import Level
 from diffabs.kernel.launch import run_lanes
-from diffabs.objectives import usual
+from diffabs.objectives import IAE, usual
+from diffabs.scenario.defaults import braking
 
 pytestmark = pytest.mark.xdist_group("kernel tangents")
 
@@ -177,6 +178,23 @@ def test_a_part(family, name):
     """With steps of the grid alone."""
     loop, path = with_part(family, name)
     compare((loop, d.FixedStep(1e-3, 0.06, kinks=False), usual(loop.plant), path), EXACT)
+
+
+@pytest.mark.slow
+def test_steps_end_on_kinks_where_those_of_xla_do():
+    """Of a torque that comes to its limits: without, the derivatives would be others."""
+    loop = braking(
+        plant=plants.MirroredRig(),
+        initial=d.BrakeStart(speed=50 / 3.6),
+        controller=controllers.StateFeedback(torque_min=0.0, torque_max=9.03),
+        feedforward=controllers.HoldingInput(),
+    )
+    given = {
+        kinks: (loop, d.FixedStep(2e-3, 0.2, kinks=kinks), {"iae": IAE()}, "plant.mass") for kinks in (None, False)
+    }
+    found, known, blunt = (moved(*given[k], e)[0]["iae"] for k, e in ((None, "kernel"), (None, "xla"), (False, "xla")))
+    np.testing.assert_allclose(found, known, rtol=0, atol=1e-7 * np.abs(known).max())
+    assert np.abs(blunt - known).max() > 1e-5 * np.abs(known).max()
 
 
 @pytest.mark.slow

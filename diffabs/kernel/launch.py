@@ -68,6 +68,8 @@ def _launched(made: program.Program, before: list[Any], carry: list[Any], shape:
 
 def target(made: program.Program, shape: cpp.Shape) -> str:
     """Return the name under which XLA knows a program; compiled, if it was not before. Raises NoCompiler."""
+    many = 1 + max(made.tangents.values(), default=0)
+    shape = shape._replace(vectors=max(1, shape.vectors // many))  # tangents, too, do not wait for each other
     source = cpp.text(made, shape)
     while cpp.operations(source) * shape.vectors > LINES and shape.vectors > 1:
         shape = shape._replace(vectors=shape.vectors // 2)
