@@ -108,13 +108,6 @@ MUTATIONS = [
         "test_kinks.py::test_where_a_rate_jumps_a_value_is_right_too",
     ),
     Mutation(
-        "a lab rig that says nothing of its locking",
-        "plants/lab_rig.py",
-        "jumps = True",
-        "jumps = False",
-        "test_kinks.py::test_a_wheel_that_locks_does_so_at_its_moment",
-    ),
-    Mutation(
         "an adaptive landing that strays is a landing",
         "simulate/adaptive.py",
         "jnp.where(again, Condition.SEEKING, Condition.LANDING)",

@@ -68,7 +68,6 @@ class LabRig:
     road: Road = part(default=RIG)
 
     shows = BrakeOutput
-    jumps = True  # where the wheel locks, the normal force does
     control_unit = "1"  # a command, where other plants take a torque in N m
     frozen = FROZEN
 
