@@ -26,12 +26,12 @@ class Pair:
 
 PAIRS = {
     KNOWN: (
-        Pair("inertia", "lag", (0.6, 1.6), (0.2e-3, 6e-3)),
+        Pair("inertia", "lag", (0.6, 1.6), (0.5e-3, 8e-3)),
         Pair("height", "place", (0.5, 1.4), (0.5, 2.0)),
         Pair("last", "speed", (-0.08, 0.08), (10.0, 120.0)),
     ),
     ESTIMATED: (
-        Pair("inertia", "lag", (0.6, 1.6), (0.2e-3, 6e-3)),
+        Pair("inertia", "lag", (0.6, 1.6), (0.5e-3, 8e-3)),
         Pair("height", "place", (0.5, 1.4), (0.5, 2.0)),
         Pair("bias", "speed", (-0.3, 0.3), (10.0, 120.0)),
     ),

@@ -22,6 +22,7 @@ MEASURED = {
     "iae": IAE(),
 }
 LONGEST = 5.0  # s, of a run
+LOST = 100.0  # overshoot of a run that diverged
 ENOUGH = 1.5  # times the floor is what was asked for
 PEAK = float(np.max(np.asarray(RIG.friction(np.linspace(0.1, 0.3, 2001)))))  # before the rise towards a locked wheel
 
@@ -59,7 +60,7 @@ def runs(one: Loop, points: dict[str, np.ndarray], config: Judging, seed: int) -
     lanes = batch(columns(points), seed)
     solver = FixedStep(step=config.step, duration=LONGEST, kinks=False)
     found = jax.device_get(run_batch(one, lanes, solver, MEASURED, engine=config.engine))
-    worst = {"overshoot": np.inf, "locked": np.inf, "settling": LONGEST, "distance": np.nan, "iae": np.nan}
+    worst = {"overshoot": LOST, "locked": LONGEST, "settling": LONGEST, "distance": np.nan, "iae": np.nan}
     return {name: np.where(found.diverged, worst[name], found.metrics[name]) for name in MEASURED}
 
 

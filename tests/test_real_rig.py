@@ -12,7 +12,7 @@ import pytest
 import real_rig_oracle as oracle
 
 import diffabs as d
-from diffabs import controllers, references, sensors
+from diffabs import controllers, objectives, references, scenario, sensors
 from diffabs.core.blocks import Series
 from diffabs.core.protocols import BrakeOutput, Clock
 
@@ -168,3 +168,16 @@ def test_a_limited_target_asks_for_the_same_torque_at_every_speed():
         np.testing.assert_allclose(rise[int(0.5 * first / 1e-3)], 3.0 * 10 / v * 1e-3 * (int(0.5 * first / 1e-3) + 1))
         left = 0.2 - rise[int(first / 1e-3) + 20 : int(first / 1e-3) + 80]
         np.testing.assert_allclose(left[1:] / left[:-1], np.exp(-1e-3 * 10.0 / (0.02 * v)), rtol=1e-6)
+
+
+def test_the_packaged_scenario_neither_locks_nor_goes_far_astray(rig):
+    """slip-real, with sixteen noises, beside the same loop that sees the true speed."""
+    found = scenario.load("slip-real", integrated=False)
+    lanes = d.Batch({"sensor.blocks.3.deceleration": np.linspace(-0.1, 0.1, 16)}, np.arange(16))
+    measured = {"locked": objectives.LockedTime(), "distance": objectives.StopDistance()}
+    run = d.run_batch(found.loop, lanes, found.solver, measured)
+    assert not np.any(run.diverged)
+    assert np.all(run.metrics["locked"] == 0)
+    truth = rig["loops"].with_truth(found.loop)
+    known = d.run_batch(truth, d.Batch({}, np.arange(16)), found.solver, measured)
+    np.testing.assert_allclose(run.metrics["distance"], known.metrics["distance"], rtol=0.02)
