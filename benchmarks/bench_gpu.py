@@ -18,6 +18,7 @@ import functools
 import os
 import pathlib
 import statistics
+from typing import Any
 from unittest import mock
 
 import jax
@@ -57,7 +58,7 @@ extern "C" __global__ void run_all(const Arrays arrays, const void* shared, long
 """
 
 
-def rate(on: gpu.Device, rounds: int) -> float:
+def rate(on: Any, rounds: int) -> float:
     """Return the card's single-precision operations per second, an addition and a multiplication each one."""
     code = on.compiled(RATE)
     blocks = -(-THREADS // cuda.THREADS) * cuda.THREADS
@@ -73,7 +74,7 @@ def rate(on: gpu.Device, rounds: int) -> float:
     return 2.0 * TURNS * CHAINS * held(on, code) / seconds
 
 
-def held(on: gpu.Device, code: pathlib.Path) -> int:
+def held(on: Any, code: pathlib.Path) -> int:
     """Return how many threads a launch has: no more than the card holds at once."""
     blocks = next(one.blocks for (path, _), one in on._loaded.items() if path == code)
     return min(blocks, -(-THREADS // cuda.THREADS)) * cuda.THREADS
@@ -131,7 +132,7 @@ def measured(lanes, dtype, rounds, peak):
             points.append({"setting": setting, "error": error, "run": run, "time": float(np.mean(found[0]))})
             if error <= ACCURACY:
                 break
-        chosen[name] = record.best(points, ACCURACY) | {"operations": arithmetic(seen[-1]) if seen else 0}
+        chosen[name] = (record.best(points, ACCURACY) or {}) | {"operations": arithmetic(seen[-1]) if seen else 0}
     taken = record.in_turn({name: functools.partial(record.timed, one["run"]) for name, one in chosen.items()}, rounds)
     rows = []
     for name, one in chosen.items():
