@@ -124,8 +124,8 @@ MUTATIONS = [
     Mutation(
         "a delay of a whole period without a moment",
         "controllers/sampled.py",
-        "until = self._until(clock.t)",
-        "until = clock.t + self.delay",
+        "output, self._until(clock.t), jnp",
+        "output, clock.t + self.delay, jnp",
         "test_landing.py::test_the_moment_of_an_event_on_the_grid_is_differentiable",
     ),
     Mutation(

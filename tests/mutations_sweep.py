@@ -226,8 +226,8 @@ SWEEP = [
     (
         "sweep: the map of failures transposed",
         FIGURES,
-        "share.T, cmap",
-        "share, cmap",
+        "lanes == 0, table).T, **colours",
+        "lanes == 0, table), **colours",
         "test_plot_sweep.py::test_the_map_has_the_share_of_failed_runs",
     ),
     (

@@ -117,6 +117,7 @@ def invented(monkeypatch, unproved):
             [start],
             Mode.FORWARD,
             (0, 0),
+            {"name": "xla"},
         )
 
     monkeypatch.setattr(library, "tune", tune)
@@ -282,7 +283,8 @@ def test_without_the_design_extra_there_is_no_certificate(small, invented, monke
 def fake(loop, what):
     metrics = {name: np.zeros(what["over"].size) for name in what["measured"]}
     return Tuned(
-        loop, {}, (1.0, 1.0), (0.0, 0.0), (metrics, metrics), True, Reason.GRADIENT, HISTORY, [], Mode.FORWARD, (0, 0)
+        *(loop, {}, (1.0, 1.0), (0.0, 0.0), (metrics, metrics), True, Reason.GRADIENT, HISTORY, [], Mode.FORWARD),
+        *((0, 0), {"name": "xla"}),
     )
 
 

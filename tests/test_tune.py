@@ -235,6 +235,7 @@ class Constrained:
     """A problem without rollouts: minimise x^2 + 2 y^2 with 1 - x - y <= 0; the minimum is at (2/3, 1/3)."""
 
     mode = Mode.REVERSE
+    engine = "xla"
     subject = None
 
     def __init__(self, start, excess):

@@ -231,16 +231,18 @@ def _value(given: Any, field: dataclasses.Field[Any], default: Any, place: tuple
 
 
 def _parts(family: str, given: Any, default: tuple[Any, ...], path: str, units: Units | None) -> tuple[Any, ...]:
-    """A list of parts; or a table by number, which changes some of the default ones."""
+    """A list of parts; or a table by number, which changes some of the default ones, or adds the next."""
     if isinstance(given, list) and given:
         return tuple(build(family, item, None, f"{path}.{i}", units) for i, item in enumerate(given))
     if not isinstance(given, dict):
         raise wrong(path, given, "a list of parts")
     parts = list(default)
     for key, item in given.items():
-        if key not in map(str, range(len(parts))):
+        if key not in map(str, range(len(parts) + 1)):
             raise unknown(f"{joined(path, key)} is not there", key, map(str, range(len(parts))))
-        parts[int(key)] = build(family, item, parts[int(key)], f"{path}.{key}", units)
+        place = int(key)
+        old = parts[place] if place < len(parts) else None
+        parts[place : place + 1] = [build(family, item, old, f"{path}.{key}", units)]
     return tuple(parts)
 
 
