@@ -142,6 +142,7 @@ def test_a_run_draws_the_figure_of_its_plant(run, tmp_path):
     figure.savefig(tmp_path / "run.png")
 
 
+@pytest.mark.slow
 def test_a_tuning_has_a_table():
     free, over = {"controller.gain": ((-1e4, -300.0), (-200.0, -10.0))}, grid({"plant.mass": [5.3, 6.2]})
     found = tune(rig(), free=free, objective={"iae": 1.0}, over=over, solver=SOLVER)

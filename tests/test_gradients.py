@@ -183,7 +183,10 @@ ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {
 
 
 # The largest programs to compile, and a wheel that locks, of which test_kinks.py has closed forms.
-SLOW = ("filtered reference", "arm, observed", "proportional", "computer", "noisy", "relay", "delay", "lock", "arm")
+SLOW = (
+    *("estimated speed", "filtered reference", "arm, observed", "proportional", "computer", "noisy", "relay", "delay"),
+    *("lock", "arm"),
+)
 
 
 @functools.cache

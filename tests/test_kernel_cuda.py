@@ -56,6 +56,7 @@ class TestText:
         assert processor.rooms
         same(found, expected, rtol=1e-13, atol=1e-15)
 
+    @pytest.mark.slow
     def test_runs_in_single_precision(self, processor):
         with jax.enable_x64(False):
             values = {"initial.speed": np.linspace(27.0, 33.0, 12) / 3.6}

@@ -72,6 +72,7 @@ class TestTune:
         np.testing.assert_allclose(found.values["controller.torque"], expected.values["controller.torque"], rtol=1e-6)
         assert found.mode is Mode.FORWARD
 
+    @pytest.mark.slow
     def test_without_lanes_of_its_own_and_of_many_parameters(self):
         """One lane; and forward mode where XLA would have taken reverse mode."""
         given = {**TUNED, "over": None}
@@ -152,7 +153,7 @@ def test_a_map_of_starts_is_that_of_xla():
 
 
 class TestRare:
-    @pytest.mark.parametrize("gradients", [False, True])
+    @pytest.mark.parametrize("gradients", [pytest.param(False, marks=pytest.mark.slow), True])
     def test_is_that_of_xla(self, gradients):
         """P[stop_time >= 0.878] = 1.1e-3 in closed form."""
         study = dataclasses.replace(STUDY, engine="kernel")
