@@ -38,6 +38,19 @@ def content(path: str | os.PathLike[str], most: int = sys.maxsize) -> bytes:
         return file.read(-1 if most == sys.maxsize else most)
 
 
+def make_room(folder: pathlib.Path, pattern: str, room: int) -> None:
+    """Remove the older half of those files of a folder that match, where they have more than `room` bytes. Raises
+    OSError for a folder that cannot be read."""
+    found = []
+    for path in folder.glob(pattern):
+        with contextlib.suppress(FileNotFoundError):  # another process was quicker
+            found.append((path.stat().st_mtime, path.stat().st_size, path))
+    if sum(size for _, size, _ in found) > room:
+        for _, _, path in sorted(found)[: (len(found) + 1) // 2]:
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
 @contextlib.contextmanager
 def unfinished(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """A file or folder that is gone afterwards, unless it was renamed to its place; also where `clear` has to end what

@@ -77,6 +77,18 @@ def odd(curve: Callable[[Any], Any], x: Scalar) -> Any:
     return s * curve(s * x)
 
 
+def risen(x: Scalar, nodes: Any) -> Any:
+    """How much of each interval between nodes (n,), which increase, lies below x, from 0 to 1 (n-1,). A `table` is a
+    sum over it: no index to look up, which derivatives would have to scatter to."""
+    inside = (x - nodes[:-1]) / jnp.diff(nodes)
+    return jnp.where(x >= nodes[1:], 1.0, jnp.where(x < nodes[:-1], 0.0, inside))
+
+
+def table(risen: Any, values: Any) -> Any:
+    """The values (n,) at the nodes: linear between them, constant beyond."""
+    return values[0] + jnp.sum(risen * jnp.diff(values))
+
+
 def axpy(a: Scalar, x: Any, y: Any) -> Any:
     """a x + y on pytrees."""
     return jax.tree.map(lambda x, y: a * x + y, x, y)

@@ -1,9 +1,13 @@
 """Where a number comes from: versions of what computed it, and the commit."""
 
+import datetime
 import importlib.metadata
+import os
 import pathlib
 import platform
+import shlex
 import subprocess
+from collections.abc import Sequence
 
 import jax
 
@@ -17,6 +21,15 @@ def versions(*packages: str) -> dict[str, str]:
 def origin(*packages: str) -> dict[str, str]:
     """Return what can change a bit of a result: `versions`, JAX's backend, and the processor."""
     return versions(*packages) | {"backend": jax.default_backend(), "machine": platform.machine()}
+
+
+def made(words: Sequence[str]) -> dict[str, str | int]:
+    """Return when (UTC) and on which kind of machine something is computed, the commit where there is one, and the
+    command, of the words after `diffabs`, that computes it again."""
+    now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
+    machine = {"machine": platform.machine(), "system": platform.system(), "processors": os.cpu_count() or 1}
+    command = shlex.join(["diffabs", *map(str, words)])
+    return {"command": command, "date": now.isoformat(), **machine, "backend": jax.default_backend(), **commit()}
 
 
 def commit() -> dict[str, str]:

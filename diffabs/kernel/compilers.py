@@ -19,6 +19,8 @@ from typing import NamedTuple
 
 import jax.ffi
 
+from diffabs.core import files, stopwatch
+
 NATIVE = pathlib.Path(__file__).parent / "native"
 CACHE = "DIFFABS_KERNEL_CACHE"  # the folder of the libraries, if set
 COMPILER = "DIFFABS_KERNEL_COMPILER"  # the command, if set; an empty one is none
@@ -31,6 +33,7 @@ FLAGS = (
     *("-fno-exceptions", "-fno-rtti", "-fPIC", "-shared", "-pthread", "-w"),
 )
 LONGEST = 600  # s
+ROOM = 1 << 28  # bytes of libraries, some 800; beyond, the half that was not used for longest goes
 
 
 class NoCompiler(Exception):
@@ -93,13 +96,17 @@ def library(text: str) -> pathlib.Path:
     folder = cache_folder()
     path = folder / f"{digest}.so"
     if path.is_file():
+        with contextlib.suppress(OSError):  # of somebody else
+            os.utime(path)
         return path
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        files.make_room(folder, "*.so", ROOM)
         with tempfile.TemporaryDirectory(prefix=f".{digest[:16]}-", dir=folder) as own:
             source, result = pathlib.Path(own) / "kernel.cpp", pathlib.Path(own) / "kernel.so"
             source.write_text(text)
-            _run(made.command, source, result)
+            with stopwatch.compiling():
+                _run(made.command, source, result)
             os.replace(result, path)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise NoCompiler(f"no kernel in {folder}: {getattr(error, 'strerror', None) or error}") from None

@@ -30,7 +30,7 @@ from diffabs.core.fingerprint import Unknown
 from diffabs.kernel import compilers, launch
 
 OFF = "DIFFABS_NO_CACHE"  # if set, nothing is kept
-MOST = 400  # programs in the folder; beyond, the older half goes
+ROOM = 1 << 27  # bytes of programs, some 600; beyond, the older half goes
 FOLDER = "programs"  # in that of the libraries
 
 
@@ -163,17 +163,10 @@ def _write(path: pathlib.Path, program: Program) -> None:
         head = {"digest": hashlib.sha256(body).hexdigest(), "count": found.num_leaves}
         head |= {"results": program.results, "libraries": program.libraries}
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        _make_room(path.parent)
+        files.make_room(path.parent, "*.program", ROOM)
         files.write(path, json.dumps(head).encode() + b"\n" + body)
     except (OSError, ValueError, NotImplementedError, JaxRuntimeError):
         return
-
-
-def _make_room(folder: pathlib.Path) -> None:
-    found = sorted(folder.glob("*.program"), key=lambda path: path.stat().st_mtime)
-    if len(found) > MOST:
-        for path in found[: len(found) // 2]:
-            path.unlink(missing_ok=True)
 
 
 # structures -----------------------------------------------------------------------------------------------------------

@@ -19,7 +19,6 @@ import numpy as np
 
 from diffabs.reliability.importance_sampling import STARTS, Gradient
 from diffabs.reliability.subset_simulation import RareEvent, subset_simulation
-from diffabs.simulate import native
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.refusals import refusals
 from diffabs.sweep.study import Study, noise_key, precision
@@ -67,6 +66,8 @@ def objection(study: Study, metric: str) -> str | None:
     """Return why a kernel cannot make these runs, or None. None is made, but what makes them is compiled.
 
     Raises ValueError for what cannot be run at all."""
+    from diffabs.simulate import native
+
     values = study.space.normal(np.zeros((1, study.space.dimension)))
     with precision(study.dtype):
         return native.objection(*_posed(study, metric, values))

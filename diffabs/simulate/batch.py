@@ -12,7 +12,7 @@ from diffabs.core.compiling import traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, get, parameters, replace
-from diffabs.simulate.native import by_engine, run_native
+from diffabs.simulate.engine import by_engine
 from diffabs.simulate.refill import Enough, run_refilled
 from diffabs.simulate.refusals import first_line, refusals
 from diffabs.simulate.run import arguments, measure, rollout
@@ -160,6 +160,11 @@ def run_batch(
     if as_one and enough is not None:
         raise ValueError("enough: lanes that run together, or have trajectories, all run to their ends")
 
+    def by_kernel() -> Run:
+        from diffabs.simulate.native import run_native
+
+        return run_native(*given, enough)
+
     def by_xla() -> Run:
         if not as_one:
             return run_refilled(*given, enough)
@@ -167,7 +172,7 @@ def run_batch(
         return _flagged(_together(loop, batch, solver, objectives, run), accepted)
 
     why_not = TOGETHER if trajectories or together or (as_one and engine == "auto") else ""
-    return by_engine(engine, lambda: run_native(*given, enough), by_xla, why_not)
+    return by_engine(engine, by_kernel, by_xla, why_not)
 
 
 def _together(loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], run: Any) -> Run:

@@ -4,9 +4,7 @@ Starts and judgements are XLA's, as for every other run; what lies between, the 
 as it is, with everything in it that the parts have, is translated from its jaxpr (package `kernel`). A lane that has
 ended makes room for the next one, as on the belt of `refill`."""
 
-import functools
-import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -17,7 +15,6 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
 from diffabs.core.tracing import pushed
-from diffabs.kernel import launch
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.kept import Kept
 from diffabs.kernel.launch import run_lanes
@@ -31,18 +28,7 @@ from diffabs.simulate.refill import ROUND, Enough, by_lane
 from diffabs.simulate.run import arguments
 from diffabs.simulate.solution import Run, Solver
 
-ENGINES = ("auto", "xla", "kernel")
 MOST = 1 << 17  # lanes that are started together: the carries of more would fill the memory
-log = logging.getLogger("diffabs")
-
-
-class EngineError(ValueError):
-    """What stands against the engine that is asked for."""
-
-    @classmethod
-    def of(cls, line: Any) -> "EngineError":
-        """Return the error that says so of a kernel."""
-        return cls(f"engine = 'kernel' is not possible: {line}")
 
 
 def run_native(
@@ -136,37 +122,6 @@ def _only(accepted: Any, carry: Any) -> Any:
 
 
 _kept = Kept(_run, _run)
-
-
-def by_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Run], why_not: str = "") -> Run:
-    """Return `native()`, or `otherwise()` as the engine says: "kernel" means what it says, "auto" the first if that can
-    be, and tells the log once why it cannot. Raises ValueError for another name, or for what stands against "kernel".
-
-    why_not: what is known already to stand against it"""
-    if engine not in ENGINES:
-        raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(ENGINES)}")
-    if engine == "xla":
-        return otherwise()
-    if not why_not:
-        try:
-            return native()
-        except (Unsupported, NoCompiler) as error:
-            why_not = str(error)
-    if engine == "kernel":
-        raise EngineError.of(why_not)
-    tell(why_not)
-    return otherwise()
-
-
-def described(engine: str) -> dict[str, str]:
-    """Return what a result says of the engine that made it: its name, and what decides the bits of a kernel."""
-    return {"name": engine} | (launch.described() if engine == "kernel" else {})
-
-
-@functools.cache
-def tell(why_not: str) -> None:
-    """Say in the log why XLA does what was left to be decided, once."""
-    log.warning("runs are made by XLA, not by a kernel: %s", why_not)
 
 
 def objection(loop: Loop, values: Mapping[str, Any], solver: Solver, objectives: Mapping[str, Objective]) -> str | None:

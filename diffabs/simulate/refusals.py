@@ -17,9 +17,10 @@ import numpy as np
 
 from diffabs.core.compiling import QUICK, compile_once, traced
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import broken, grid_rules, replace, rules, strong
-from diffabs.core.pytree import check as check_parts
+from diffabs.core.pytree import replace, strong
 from diffabs.core.rules import Rule
+from diffabs.core.validity import broken, grid_rules, rules
+from diffabs.core.validity import check as check_parts
 from diffabs.simulate.solution import Adaptive, Solver
 from diffabs.simulate.stable_step import stable, stable_step
 

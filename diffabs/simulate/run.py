@@ -15,8 +15,9 @@ from diffabs.core import kinds
 from diffabs.core.compiling import SAME, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import arrayed, misshapen, strong
+from diffabs.core.pytree import arrayed, strong
 from diffabs.core.tracing import pushed
+from diffabs.core.validity import misshapen
 from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
 from diffabs.simulate.methods import AtPace, method_of
 from diffabs.simulate.outcome import judge, prepare

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
-from diffabs.core import provenance
+from diffabs.core import provenance, stopwatch
 from diffabs.sweep.engines import Engine, Local
 from diffabs.sweep.manifest import Seals, described
 from diffabs.sweep.results import Results
@@ -22,8 +22,9 @@ HERE, MISSING, UNKNOWN = 0, 1, 2  # a chunk
 
 
 class Progress(NamedTuple):
-    """How far a sweep is: samples that are done, of how many, those that this run has done in how many seconds, and
-    how many of these failed, diverged and were refused; `damaged`: chunks found damaged that are computed again."""
+    """How far a sweep is: samples that are done, of how many, those that this run has done in how many seconds
+    (compiling left out, where `stopwatch.listen` counts it), and how many of these failed, diverged and were refused;
+    `damaged`: chunks found damaged that are computed again."""
 
     samples: int
     total: int
@@ -139,6 +140,6 @@ class _Tally:
 
     def tell(self) -> None:
         if self.told:
-            seconds = time.monotonic() - self.begun
+            seconds = time.monotonic() - self.begun - stopwatch.compiled(self.begun)
             counts = (self.before + self.here, self.total, self.here, seconds, self.failed, self.diverged)
             self.told(Progress(*counts, self.damaged, self.refused))

@@ -14,8 +14,9 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import elements, get, parameters, problems, replace
+from diffabs.core.pytree import elements, get, parameters, replace
 from diffabs.core.units import in_loop, units_of
+from diffabs.core.validity import problems
 from diffabs.core.values import plain, unknown
 from diffabs.kernel import launch
 from diffabs.objectives import usual

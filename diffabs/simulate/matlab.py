@@ -1,0 +1,29 @@
+"""A run as a MAT file, which MATLAB and Octave load. SciPy writes it, and is imported where that is asked for."""
+
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+from diffabs.core.loop import signals
+from diffabs.core.protocols import Plant
+from diffabs.simulate.solution import Run
+
+
+def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
+    """Write the instants up to the end of a run that has a trajectory: a column vector for each signal, their `units`
+    and the run's `metrics` as structs, and `more`, whose mappings are structs with underscores for dots."""
+    from scipy.io import savemat
+
+    assert run.trajectory is not None
+    kept = signals(run.trajectory.sample, plant)
+    rows = int(run.trajectory.running.sum()) + 1  # after the end the last sample is repeated
+    content: dict[str, Any] = {name: values[:rows] for name, (_, values) in kept.items()}
+    content["units"] = {name: unit for name, (unit, _) in kept.items()}
+    content["metrics"] = {name: float(value) for name, value in run.metrics.items()}
+    content |= {name: _struct(value) if isinstance(value, Mapping) else value for name, value in more.items()}
+    with path.open("wb") as file:
+        savemat(file, content, do_compression=True, long_field_names=True, oned_as="column")
+
+
+def _struct(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name.replace(".", "_"): value for name, value in values.items()}
