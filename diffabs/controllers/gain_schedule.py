@@ -14,6 +14,7 @@ import numpy as np
 
 from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.controllers.feedback import StateFeedback
+from diffabs.core.numerics import risen, table
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree
 from diffabs.core.rules import Rule, increasing
@@ -45,8 +46,8 @@ class ScheduledFeedback:
         shapes = [np.shape(x) for x in (self.speeds, self.integral_gains, self.gains)]
         if len(set(shapes)) != 1:
             raise ValueError(f"speeds, integral_gains and gains have shapes {', '.join(map(str, shapes))}")
-        rise = _rise(signal.measured.speed, jnp.asarray(self.speeds))
-        rows = (_table(rise, jnp.asarray(gains)) for gains in (self.integral_gains, self.gains))
+        rise = risen(signal.measured.speed, jnp.asarray(self.speeds))
+        rows = (table(rise, jnp.asarray(gains)) for gains in (self.integral_gains, self.gains))
         limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
         return StateFeedback(gain=jnp.stack(list(rows)), **limits, antiwindup=self.antiwindup)
 
@@ -60,18 +61,6 @@ class ScheduledFeedback:
         """Speeds that increase, limits that do not exclude each other."""
         yield increasing("speeds", self.speeds, "do not increase", "m/s")
         yield from StateFeedback.rules(self)  # pyright: ignore[reportArgumentType]  # has the same limits
-
-
-def _rise(v: Any, nodes: Any) -> Any:
-    """How much of each interval between nodes lies below v, from 0 to 1. A table is a sum over it: no index to look up,
-    which derivatives would have to scatter to."""
-    inside = (v - nodes[:-1]) / jnp.diff(nodes)
-    return jnp.where(v >= nodes[1:], 1.0, jnp.where(v < nodes[:-1], 0.0, inside))
-
-
-def _table(rise: Any, values: Any) -> Any:
-    """Linear between nodes, constant beyond."""
-    return values[0] + jnp.sum(rise * jnp.diff(values))
 
 
 @pytree

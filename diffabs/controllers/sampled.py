@@ -67,7 +67,7 @@ class Sampled:
         that of the period."""
         inner = self._sampled(clock, memory, signal)
         output = self.controller.output(clock.t, inner, signal)
-        flow = axpy(self.period, self.controller.flow(clock.t, inner, signal), inner.flow)
+        flow = axpy(clock.h, self.controller.flow(clock.t, inner, signal), inner.flow)
         return Memory(flow, inner.held), output
 
     def _until(self, t: Scalar) -> Any:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from diffabs.controllers.pid import PID
 from diffabs.controllers.sampled import Sampled, delay_within
-from diffabs.core.numerics import axpy, clamp
+from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.core.rules import Rule
@@ -42,7 +42,7 @@ class SampledOnGrid:
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
 
     flow = no_flow
-    _sampled = Sampled._sampled
+    computed, _sampled = Sampled.computed, Sampled._sampled
 
     def start(self, signal: Tracking) -> Memory:
         """Output zero until the first sample has been computed."""
@@ -58,10 +58,8 @@ class SampledOnGrid:
         """At a sampling instant: compute. At every instant of the grid: what is applied until the next."""
         m: GridMemory = memory.held
         now, number = clock.ticks(self.sampling_period)
-        inner = self._sampled(clock._replace(h=self.sampling_period, k=number), m.inner, signal)
-        flow = axpy(self.sampling_period, self.controller.flow(clock.t, inner, signal), inner.flow)
-        output = self.controller.output(clock.t, inner, signal)
-        new = GridMemory(Memory(flow, inner.held), output, m.next, clock.t + self.delay, m.applied)
+        inner, output = self.computed(clock._replace(h=self.sampling_period, k=number), m.inner, signal)
+        new = GridMemory(inner, output, m.next, clock.t + self.delay, m.applied)
         m = jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m)
         waits = clamp((m.until - clock.t) / clock.h, 0.0, 1.0)
         applied = waits * m.last + (1 - waits) * m.next

@@ -1,5 +1,7 @@
 """Slip references: measured output -> target slip."""
 
+from diffabs.references.by_deceleration import SlipByDeceleration as SlipByDeceleration
+from diffabs.references.extremum_seeking import ExtremumSeeking as ExtremumSeeking
 from diffabs.references.limited import LimitedSlip as LimitedSlip
 from diffabs.references.peak_slip import PeakLatch as PeakLatch
 from diffabs.references.peak_slip import PeakLiteral as PeakLiteral

@@ -1,5 +1,6 @@
 """Friction curves: `friction(slip, speed, distance) -> mu`."""
 
+from diffabs.roads.along import ScaledAlong as ScaledAlong
 from diffabs.roads.burckhardt import DRY_ASPHALT as DRY_ASPHALT
 from diffabs.roads.burckhardt import DRY_COBBLESTONE as DRY_COBBLESTONE
 from diffabs.roads.burckhardt import DRY_CONCRETE as DRY_CONCRETE

@@ -23,8 +23,8 @@ import jax
 from diffabs.core import files
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import cautions, problems
 from diffabs.core.units import units_of
+from diffabs.core.validity import cautions, problems
 from diffabs.core.values import ScenarioError as ScenarioError
 from diffabs.core.values import plain, shown, text, unknown, wrong
 from diffabs.objectives import BRAKING, usual

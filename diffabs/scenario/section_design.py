@@ -75,6 +75,15 @@ class Task:
             over.setdefault("initial.speed", (float(end), float(start)))
         return {known[path].model: ends for path, ends in over.items()}
 
+    def ranges(self, loop: Loop) -> dict[str, Range]:
+        """The ranges by path of the loop, without those of a single value; that of the speed between the loop's start
+        and its stop if others are given and none of it."""
+        over = dict(self.over)
+        start, end = getattr(loop.initial, "speed", None), getattr(loop.stop, "speed", None)
+        if over and hasattr(loop.plant, "frozen") and start is not None and end is not None:
+            over.setdefault("initial.speed", (float(end), float(start)))
+        return {path: ends for path, ends in over.items() if ends[0] < ends[1]}
+
     def table(self) -> dict[str, Any]:
         """As values of TOML."""
         return {name: value for name, value in members(self).items() if value is not None}

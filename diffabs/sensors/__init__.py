@@ -3,6 +3,7 @@
 from diffabs.sensors.angles import AngleSensor as AngleSensor
 from diffabs.sensors.noise import Bias as Bias
 from diffabs.sensors.noise import Noise as Noise
+from diffabs.sensors.noise import PlayedWheelNoise as PlayedWheelNoise
 from diffabs.sensors.noise import Quantisation as Quantisation
 from diffabs.sensors.noise import WheelNoise as WheelNoise
 from diffabs.sensors.speed import DriftingSpeed as DriftingSpeed

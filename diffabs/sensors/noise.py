@@ -5,11 +5,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow, no_memory
-from diffabs.core.pytree import Scalar, param, pytree
+from diffabs.core.pytree import Scalar, Vector, param, pytree
 from diffabs.core.rules import Rule
 from diffabs.core.timing import whole_steps
 
@@ -84,6 +85,34 @@ class WheelNoise:
             raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
         now, draw = clock.ticks(self.period)
         return Memory(held=jnp.where(now, drawn(jnp.asarray(self.slip), clock.key, draw), memory.held))
+
+
+@pytree
+class PlayedWheelNoise:
+    """A given error of the wheel's speed in proportion to the vehicle's, w_seen = w - v n: an entry of `noise` (n,) for
+    each period, held, and again from the first after the last.
+
+    What `WheelNoise` draws, as parameters: a recorded sequence, or one that is looked for. One that repeats is what
+    the teeth of a wheel do."""
+
+    noise: Vector = param(default=(0.0,), unit="1", free=True)
+    period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
+
+    flow = no_flow
+    grid_rules, start, output = Noise.grid_rules, WheelNoise.start, WheelNoise.output
+
+    def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
+        """The next entry at the instants of the period."""
+        del signal
+        now, played = clock.ticks(self.period)
+        noise = jnp.asarray(self.noise)
+        entry = jax.lax.dynamic_index_in_dim(noise, played % noise.size, keepdims=False)
+        return Memory(held=jnp.where(now, entry, memory.held))
+
+    def problems(self) -> Iterator[str]:
+        """No noise."""
+        if np.ndim(self.noise) != 1 or np.size(self.noise) < 1:
+            yield f"noise has shape {np.shape(self.noise)}; it needs (n,), n at least 1"
 
 
 @jax.custom_jvp

@@ -1,0 +1,59 @@
+"""A road whose friction changes along the way: another road times a cubic spline of the distance.
+
+    mu(s, v, x) = f(x) mu_0(s, v, x),   f(x) = sum_i c_i B(x/d - i),   i = 0 ... n - 1
+
+B is the cubic B-spline on the knots -2 ... 2, positive with sum 1, so that f lies between its least and its greatest
+factor c and is smooth to its second derivative. |f'| is at most the greatest |c_(i+1) - c_i|/d. Before 0 and beyond
+(n - 1) d the factors go on as the first and the last. C. de Boor, A Practical Guide to Splines, ch. IX, XI.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.numerics import clamp
+from diffabs.core.protocols import Road
+from diffabs.core.pytree import Scalar, Vector, param, part, pytree
+from diffabs.roads.burckhardt import DRY_ASPHALT
+
+FIRST, LAST = 2, 1  # intervals before 0 and beyond the last factor, from where on the spline is constant
+
+
+@pytree
+class ScaledAlong:
+    """f(x) mu of another road; `factors` (n,) of f, one every `spacing`.
+
+    >>> from diffabs.roads import RIG, ScaledAlong
+    >>> road = ScaledAlong(road=RIG, factors=(1.0, 1.0, 1.0, 0.5, 0.5, 0.5), spacing=2.0)
+    >>> print(*(f"{road.friction(0.2, 10.0, at) / RIG.friction(0.2):.3f}" for at in (0.0, 5.0, 100.0)))
+    1.000 0.750 0.500
+    """
+
+    road: Road = part(default=DRY_ASPHALT)
+    factors: Vector = param(default=(1.0, 0.9, 1.1, 1.0), unit="1", above=0.0, high=10.0, free=True)
+    spacing: Scalar = param(default=1.0, unit="m", above=0.0)
+
+    def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
+        """mu [1] at this distance [m]."""
+        return self.factor(distance) * self.road.friction(slip, speed, distance)
+
+    def factor(self, distance: Scalar) -> Any:
+        """f [1] at a distance [m]."""
+        c = jnp.asarray(self.factors)
+        ends = jnp.ones(FIRST + LAST)
+        padded = jnp.concatenate([c[0] * ends, c, c[-1] * ends])
+        place = clamp(distance / self.spacing, -1.0 * FIRST, 1.0 * (c.size - 1 + FIRST))
+        whole = jax.lax.stop_gradient(jnp.floor(place))
+        t = place - whole
+        near = jax.lax.dynamic_slice_in_dim(padded, whole.astype(int) + FIRST, 4)
+        a, b = 1 - t, t * t * t
+        weights = (a * a * a, 4 + 3 * t * t * (t - 2), 4 + 3 * a * a * (a - 2), b)
+        return sum(w * near[i] for i, w in enumerate(weights)) / 6
+
+    def problems(self) -> Iterator[str]:
+        """No factors."""
+        if np.ndim(self.factors) != 1 or np.size(self.factors) < 1:
+            yield f"factors has shape {np.shape(self.factors)}; it needs (n,), n at least 1"

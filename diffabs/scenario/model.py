@@ -1,0 +1,51 @@
+"""What a scenario is made of, as values of JSON: for the documents that commands write, and their readers."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from diffabs.core.pytree import parameters
+from diffabs.core.units import units_of
+from diffabs.scenario import registry
+from diffabs.scenario.scenario import Scenario
+from diffabs.simulate.solution import described
+
+
+def model(chosen: Scenario) -> dict[str, Any]:
+    """Return title and description, the parts by path, every parameter with its unit, how it is integrated, and the
+    units of the metrics by name."""
+    return {
+        "title": chosen.title,
+        "description": chosen.description,
+        "parts": parts(chosen),
+        "parameters": numbers(chosen),
+        "solver": {**described(chosen.solver), "seed": chosen.seed},
+        "metrics": {name: registry.unit_of(one, chosen.loop.plant) for name, one in chosen.objectives.items()},
+    }
+
+
+def parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
+    """Return every part by its path: its type, and what it has beside parameters."""
+    found = dict(registry.choices(chosen.loop))
+    for name, one in chosen.objectives.items():
+        found |= registry.choices(one, f"objective.{name}")
+    return found
+
+
+def numbers(chosen: Scenario) -> dict[str, dict[str, Any]]:
+    """Return value and unit of every number by its path, in SI; what JSON has no number for is a text that an override
+    understands."""
+
+    def plain(value: Any) -> Any:
+        return value if math.isfinite(value) else str(value)
+
+    objectives = (
+        (f"objective.{name}.{path}", spec, value)
+        for name, one in chosen.objectives.items()
+        for path, spec, value in parameters(one, units=units_of(chosen.loop.plant))
+    )
+    return {
+        path: {"value": np.vectorize(plain, otypes=[object])(np.asarray(value, float)).tolist(), "unit": spec.unit}
+        for path, spec, value in (*parameters(chosen.loop), *objectives)
+    }
