@@ -20,9 +20,10 @@ from typing import Any
 
 import jax
 import numpy as np
+from cure_figures import figures
 from weak_spots import Box, torques, weak_spots
 
-from diffabs import Batch, BrakeStart, FixedStep, Loop, Run, plot, replace, rollout, run_batch
+from diffabs import Batch, BrakeStart, FixedStep, Loop, Run, replace, run_batch
 from diffabs.actuators import Lag
 from diffabs.controllers import ConstantInput, HoldingInput, ProportionalFeedback, Sampled, StateFeedback
 from diffabs.core.pytree import parameters
@@ -221,58 +222,6 @@ def asked(config: Config, one: Loop) -> dict[str, tuple[float, float]]:
     solver = FixedStep(step=config.step, duration=config.longer)
     outside = dataclasses.replace(config.box, speeds=(config.drawn[-1][1],))
     return {"in the box": torques(one, config.box, solver), "from 70 km/h": torques(one, outside, solver)}
-
-
-def seen(config: Config, one: Loop, mass: float, speed: float) -> Run:
-    """One run with its trajectory."""
-    solver = FixedStep(step=config.step, duration=config.longer, every=4)
-    return rollout(replace(one, {"plant.mass": mass, "initial.speed": speed / KMH}), solver, BRAKING)
-
-
-def figures(config: Config, found: Tuned, those: dict[str, tuple[Loop, str]]) -> dict[str, Any]:
-    """Before and after, the torque, and how the tuning went."""
-    return {"cure": before_and_after(config, those), "tuning": tuning_figure(found)}
-
-
-def before_and_after(config: Config, those: dict[str, tuple[Loop, str]]) -> Any:
-    """Slip and torque of four controllers: in the box, at its worst corner, and outside."""
-    columns, title = len(config.drawn), "Slip of the rig before and after: the overshoot, cured, and where not"
-    figure, axes = plot.sheet(2, columns, title=title, size=(5.2, 3.1), sharex=True, sharey="row")
-    shown = ("published gain", "LMI, weights of least overshoot", "published gain, filter 35 ms", "the cure")
-    for column, (mass, speed) in enumerate(config.drawn):
-        for i, name in enumerate(shown):
-            sample = seen(config, those[name][0], mass, speed).trajectory.sample
-            t = np.asarray(sample.t)
-            style = {
-                "color": plot.COLOURS[i],
-                "linestyle": plot.DASHES[i],
-                "linewidth": 2.0 if name == "the cure" else 1.1,
-            }
-            axes[column].plot(t, sample.output.slip, label=name, **style)
-            axes[columns + column].plot(t, sample.control, **style)
-        axes[column].axhline(config.slip, color="black", linewidth=0.8, linestyle=":")
-        where = f"{mass:g} kg from {speed:g} km/h" + (" (outside the box)" if speed > config.box.speeds[-1] else "")
-        plot.label(axes[column], "", "slip [1]" if column == 0 else "", where, legend=False)
-        plot.label(axes[columns + column], "time [s]", "brake torque [N m]" if column == 0 else "", legend=False)
-        for ax in (axes[column], axes[columns + column]):
-            ax.set_xlim(0, 0.35)
-            ax.locator_params(axis="x", nbins=4)
-        axes[column].set_ylim(0, 0.45)
-    words = dict(loc="outside lower center", ncols=len(shown), frameon=False, fontsize=11)
-    figure.legend(*axes[0].get_legend_handles_labels(), **words)
-    return figure
-
-
-def tuning_figure(found: Tuned) -> Any:
-    """Objective, gradient and violation over the gradients that were computed."""
-    figure, axes = plot.sheet(1, 3, title="How the tuning went", size=(4.4, 3.2))
-    n = [p.evaluations for p in found.history]
-    for ax, (name, unit) in zip(axes, {"objective": "IAE [s]", "gradient": "", "violation": ""}.items(), strict=True):
-        ax.plot(n, [getattr(p, name) for p in found.history], "o-", markersize=3, color=plot.COLOURS[0])
-        if name == "gradient":
-            plot.logarithmic(ax, "y")
-        plot.label(ax, "gradients computed", f"{name} {unit}")
-    return figure
 
 
 def summary(config: Config, found: Tuned, proof: Certificate) -> dict[str, Any]:

@@ -29,8 +29,9 @@ SEEN = {
     ],
     "SpeedEstimator": [
         "a_k = deceleration + normal of the accelerometer's deviation + bias",
-        "k = 0: v_0 = max(w_0, floor), P = (noise v_0)^2; then",
-        "p = max(v_(k-1) - h a_k, floor), P = P + h growth^2, s = (p - w_k)/p",
+        "k = 0: v_0 = max(w_0, floor), P = (noise v_0)^2, f = 9.81 m/s^2; then",
+        "p = max(v_(k-1) - h a_k, floor), P = P + h growth^2, s = (p - w_k)/p, f = max(a_k, f exp(-h/hold))",
+        "where s >= gate and f < rest: as for k = 0; else",
         "open = min(max(1 - s/gate, 0), 1), L = open P/(P + (noise p)^2)",
         "v_k = max(p + L (w_k - p), floor), P = (1 - L) P, slip_k = (v_k - w_k)/v_k",
     ],

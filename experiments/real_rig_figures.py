@@ -36,8 +36,16 @@ PAIRS = {
         Pair("bias", "speed", (-0.3, 0.3), (10.0, 120.0)),
     ),
 }
-UNITS = {"inertia": "of nominal", "lag": "s", "height": "of nominal", "place": "of nominal", "last": "1"}
-UNITS |= {"bias": "m/s^2", "speed": "km/h"}
+AXES = {  # label, and what a number is multiplied by
+    "inertia": ("inertia of the wheel [of nominal]", 1.0),
+    "lag": ("lag of the brake [ms]", 1e3),
+    "height": ("height of the friction [of nominal]", 1.0),
+    "place": ("slip of its peak [of nominal]", 1.0),
+    "last": ("relative error of the seen speed [%]", 100.0),
+    "bias": ("bias of the accelerometer [m/s^2]", 1.0),
+    "speed": ("speed of the start [km/h]", 1.0),
+}
+LEVELS = (0, 2, 5, 10, 20, 40, 60, 100)  # %
 SEEDS = 2
 
 
@@ -69,19 +77,22 @@ def _mine(name: str, speed: str) -> bool:
 
 def map_figure(maps: Maps, speed: str, box: Box) -> Any:
     """How it degrades outside of the box, which is drawn."""
+    from matplotlib.colors import BoundaryNorm
     from matplotlib.patches import Rectangle
 
     figure, axes = plot.sheet(1, len(maps), title=f"Overshoot [%] beyond the box, speed {speed}", size=(4.8, 3.8))
     for ax, pair in zip(axes, PAIRS[speed], strict=True):
         one = maps[f"{pair.x}, {pair.y}"]
         values = np.clip(np.array(one["overshoot [%]"]), 0.0, 100.0)
-        drawn_ = ax.contourf(one["x"], one["y"], values.T, levels=[0, 2, 5, 10, 20, 40, 60, 100], cmap="viridis")
-        figure.colorbar(drawn_, ax=ax)
+        (x_label, x_scale), (y_label, y_scale) = AXES[pair.x], AXES[pair.y]
+        x, y = x_scale * np.array(one["x"]), y_scale * np.array(one["y"])
+        filled = ax.contourf(x, y, values.T, levels=LEVELS, cmap="viridis", norm=BoundaryNorm(LEVELS, 256))
+        figure.colorbar(filled, ax=ax)
         if np.any(one["locks"]):
-            ax.contour(one["x"], one["y"], np.array(one["locks"], float).T, levels=[0.5], colors="red")
-        (x0, x1), (y0, y1) = (getattr(box, name) for name in (pair.x, pair.y))
+            ax.contour(x, y, np.array(one["locks"], float).T, levels=[0.5], colors="red")
+        (x0, x1), (y0, y1) = x_scale * np.array(getattr(box, pair.x)), y_scale * np.array(getattr(box, pair.y))
         ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor="white", linewidth=1.5))
-        plot.label(ax, f"{pair.x} [{UNITS[pair.x]}]", f"{pair.y} [{UNITS[pair.y]}]", legend=False)
+        plot.label(ax, x_label, y_label, legend=False)
     return figure
 
 
@@ -103,26 +114,26 @@ def distributions(ones: dict[str, Loop], speed: str, box: Box, fixed: Fixed, con
     return figure
 
 
-def traces(ones: dict[str, Loop], speed: str, fixed: Fixed) -> Any:
+def traces(ones: dict[str, Loop], speed: str) -> Any:
     """Slip and torque at the nominal point and where much is wrong."""
-    del fixed
     wrong = {"mass": 6.2, "speed": 70.0, "height": 1.1, "inertia": 1.1, "lag": 2e-3, "delay": 1e-3}
     wrong |= {"first": -0.03, "last": -0.03} if speed == KNOWN else {"bias": 0.1}
-    cases = {"nominal, 50 km/h": {}, "70 km/h and much wrong": wrong}
-    figure, axes = plot.sheet(2, len(cases), title=f"Slip and torque, speed {speed}", size=(6.0, 3.2))
-    for column, (title, case) in enumerate(cases.items()):
-        values = columns({name: np.full(1, x) for name, x in case.items()} or {"mass": np.full(1, NOMINAL["mass"])})
-        for i, (name, one) in enumerate(ones.items()):
-            solver = FixedStep(step=1e-3, duration=2.6, kinks=False)
-            run = run_batch(one, batch(values, 7), solver, trajectories=True)
-            sample = jax.tree.map(lambda x: np.asarray(x[0]), run.trajectory.sample)
-            style = {"color": plot.COLOURS[i % len(plot.COLOURS)], "linestyle": plot.DASHES[i % len(plot.DASHES)]}
-            axes[column].plot(sample.t, sample.output.slip, label=name, linewidth=1.1, **style)
-            axes[len(cases) + column].plot(sample.t, sample.control, linewidth=0.9, **style)
+    titles = ("nominal, 50 km/h", "70 km/h and much wrong")
+    lanes = batch(columns({name: np.array([NOMINAL[name], x]) for name, x in wrong.items()}), 7)
+    figure, axes = plot.sheet(2, len(titles), title=f"Slip and torque, speed {speed}", size=(6.0, 3.2))
+    for i, (name, one) in enumerate(ones.items()):
+        run = run_batch(one, lanes, FixedStep(step=1e-3, duration=2.6, kinks=False), trajectories=True)
+        seen = jax.device_get(run.trajectory)
+        style = {"color": plot.COLOURS[i % len(plot.COLOURS)], "linestyle": plot.DASHES[i % len(plot.DASHES)]}
+        for column in range(len(titles)):
+            sample, on = jax.tree.map(lambda x, at=column: x[at], (seen.sample, seen.running))
+            axes[column].plot(sample.t[on], sample.output.slip[on], label=name, linewidth=1.1, **style)
+            axes[len(titles) + column].plot(sample.t[on], sample.control[on], linewidth=0.9, **style)
+    for column, title in enumerate(titles):
         axes[column].axhline(0.2, color="black", linewidth=0.8, linestyle=":")
         axes[column].set_ylim(0, 0.6)
         plot.label(axes[column], "", "slip [1]" if column == 0 else "", title, legend=column == 0)
-        plot.label(axes[len(cases) + column], "time [s]", "torque [N m]" if column == 0 else "", legend=False)
+        plot.label(axes[len(titles) + column], "time [s]", "torque [N m]" if column == 0 else "", legend=False)
     return figure
 
 

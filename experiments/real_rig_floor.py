@@ -7,11 +7,22 @@ The speed is seen as (1 + e) v. Who holds the slip that he sees at s* has w = (1
 3 % seen low is 12 % of overshoot, whatever the gain. An estimate that integrates an accelerometer with a bias b, seen
 decelerations being too high by b, has e = -b t/v, which is worst at the end. Noise, quantisation and the first
 approach come on top; they are what a controller can do something about.
+
+Who settles below his target is left of that floor and holds nothing. `Deviation` counts what is below as well, once
+there was time to get there; its floor is that of |e|.
 """
 
+import math
+from typing import Any
+
+import jax.numpy as jnp
 import numpy as np
 from real_rig_box import KMH, KNOWN, Fixed
 
+from diffabs.core.numerics import larger
+from diffabs.core.protocols import Memory, Sample, Segment
+from diffabs.core.pytree import pytree
+from diffabs.objectives.tracking import held, nothing
 from diffabs.roads import RIG
 
 HELD = 0.25  # s, from which on every controller worth the name holds its target
@@ -33,8 +44,30 @@ def error(points: dict[str, np.ndarray], speed: str, fixed: Fixed, t: np.ndarray
     return -points["bias"] * t / left
 
 
-def floor(points: dict[str, np.ndarray], speed: str, fixed: Fixed) -> np.ndarray:
-    """Overshoot that the error of the speed alone makes, while the target is held (n,)."""
+def floor(points: dict[str, np.ndarray], speed: str, fixed: Fixed, *, two_sided: bool = False) -> np.ndarray:
+    """Overshoot that the error of the speed alone makes, while the target is held (n,); with `two_sided` the deviation
+    either way."""
     t = np.linspace(HELD, stopping_time(points, fixed), INSTANTS)
-    lowest = error(points, speed, fixed, t).min(axis=0)
-    return np.maximum(0.0, -lowest) * (1 - fixed.slip) / fixed.slip
+    errors = error(points, speed, fixed, t)
+    worst = np.abs(errors) if two_sided else np.maximum(0.0, -errors)
+    return worst.max(axis=0) * (1 - fixed.slip) / fixed.slip
+
+
+@pytree
+class Deviation:
+    """Greatest deviation from the setpoint, as a fraction of it: above it at any time, below it from HELD on."""
+
+    unit = "1"
+    physical = (0.0, math.inf)
+
+    flow, value = nothing, held
+
+    def start(self, sample: Sample) -> Memory:
+        """None yet."""
+        return Memory(held=0.0 * sample.t)
+
+    def update(self, memory: Memory, segment: Segment) -> Any:
+        """The greater of that so far and that at the end of the step."""
+        off = segment.end.output.slip / segment.end.setpoint - 1
+        counts = jnp.where(segment.end.t >= HELD, larger(off, -off), off)
+        return larger(memory.held, counts)

@@ -6,9 +6,9 @@ from typing import Any
 import jax
 import numpy as np
 from real_rig_box import ESTIMATED, KMH, KNOWN, NOMINAL, Box, Fixed, batch, columns, corners, drawn
-from real_rig_floor import GRAVITY, MIRRORED, floor
+from real_rig_floor import GRAVITY, MIRRORED, Deviation, floor
 
-from diffabs import FixedStep, Loop, run_batch
+from diffabs import Batch, FixedStep, Loop, run_batch
 from diffabs.objectives import IAE, LockedTime, Overshoot, SettlingTime, StopDistance
 from diffabs.roads import RIG
 from diffabs.sweep.statistics.estimates import Count
@@ -20,6 +20,7 @@ MEASURED = {
     "locked": LockedTime(),
     "distance": StopDistance(),
     "iae": IAE(),
+    "deviation": Deviation(),
 }
 LONGEST = 5.0  # s, of a run
 LOST = 100.0  # overshoot of a run that diverged
@@ -47,7 +48,9 @@ MASSES, SPEEDS, SEEDS = (5.3, 5.75, 6.2), (20.0, 35.0, 50.0), 4  # on which a we
 class Judging:
     """Every number of the judging."""
 
-    samples: int = 100_000
+    samples: int = 100_000  # of the tuned ones
+    fewer: int = 20_000  # of the others
+    block: int = 1024  # lanes of a call: one program for any number of points
     corner_seeds: int = 4
     seed: int = 2026  # of the points and their noise: not those that were tuned on
     step: float = 1e-3  # s
@@ -56,12 +59,21 @@ class Judging:
 
 
 def runs(one: Loop, points: dict[str, np.ndarray], config: Judging, seed: int) -> dict[str, np.ndarray]:
-    """Metrics at points of a box, each with a noise of its own; a run that diverges counts as locked."""
+    """Metrics at points of a box, each with a noise of its own, and whether the run stopped. One that diverges counts
+    as locked."""
     lanes = batch(columns(points), seed)
+    places = np.arange(config.block * -(-lanes.size // config.block)).clip(max=lanes.size - 1)
+    blocks = [_block(one, lanes, at, config) for at in places.reshape(-1, config.block)]
+    found: Any = jax.tree.map(lambda *parts: np.concatenate(parts)[: lanes.size], *blocks)
+    worst = {"overshoot": LOST, "deviation": LOST, "locked": LONGEST, "settling": LONGEST}
+    metrics = {name: np.where(found.diverged, worst.get(name, np.nan), found.metrics[name]) for name in MEASURED}
+    return metrics | {"stopped": found.stopped & ~found.diverged}
+
+
+def _block(one: Loop, lanes: Batch, at: np.ndarray, config: Judging) -> Any:
+    some = Batch({path: column[at] for path, column in lanes.values.items()}, lanes.keys[at])
     solver = FixedStep(step=config.step, duration=LONGEST, kinks=False)
-    found = jax.device_get(run_batch(one, lanes, solver, MEASURED, engine=config.engine))
-    worst = {"overshoot": LOST, "locked": LONGEST, "settling": LONGEST, "distance": np.nan, "iae": np.nan}
-    return {name: np.where(found.diverged, worst[name], found.metrics[name]) for name in MEASURED}
+    return jax.device_get(run_batch(one, some, solver, MEASURED, engine=config.engine))
 
 
 def spots(speed: str) -> dict[str, dict[str, np.ndarray]]:
@@ -99,9 +111,9 @@ def chance(happens: np.ndarray, confidence: float) -> dict[str, Any]:
     return {"percent": 100 * found.value, "low": 100 * found.low, "high": 100 * found.high, "count": int(happens.sum())}
 
 
-def on_samples(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging) -> dict[str, Any]:
-    """Probabilities and quantiles on points of the box."""
-    points = drawn(box, speed, config.samples, config.seed)
+def on_samples(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, samples: int) -> dict[str, Any]:
+    """Probabilities and quantiles on so many points of the box."""
+    points = drawn(box, speed, samples, config.seed)
     found, least = runs(one, points, config, config.seed), floor(points, speed, fixed)
     widest = 4 * max(map(abs, (*box.first, *box.last)))  # the floor of the box, of a known speed
     overshoot, lost = found["overshoot"], found["distance"] / shortest(points, fixed) - 1
@@ -110,6 +122,7 @@ def on_samples(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging) -
         "overshoot > 1 %": chance(overshoot > 0.01, config.confidence),
         "overshoot > 5 %": chance(overshoot > 0.05, config.confidence),
         "locks": chance(found["locked"] > 0, config.confidence),
+        "does not stop": chance(~found["stopped"], config.confidence),
         "within 1.5 floors of the box": chance(overshoot <= ENOUGH * widest, config.confidence),
         "within 1.5 floors of its own, where that exceeds 1 %": chance(
             overshoot[low] <= ENOUGH * least[low], config.confidence
@@ -118,7 +131,7 @@ def on_samples(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging) -
         "above the floor [%]": quantiles(100 * (overshoot - least)),
         "settling [s]": quantiles(found["settling"]),
         "distance lost [%]": quantiles(100 * lost),
-        "samples": config.samples,
+        "samples": samples,
     }
     return said | ({"against the true speed": against_truth(one, points, found, config)} if speed == ESTIMATED else {})
 
@@ -151,5 +164,6 @@ def in_corners(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging) -
         "above the floor, most [%]": float(100 * np.max(found["overshoot"] - least)),
         "at": {name: float(value[worst]) for name, value in points.items()},
         "locks": int((found["locked"] > 0).sum()),
+        "do not stop": int((~found["stopped"]).sum()),
         "corners": len(points["mass"]) // config.corner_seeds,
     }

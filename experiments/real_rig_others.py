@@ -47,20 +47,23 @@ class Others:
 
 
 class Score:
-    """The objective of the tuning of a loop, on the rig with its quantisation: CVaR over the box of overshoot above its
-    floor and IAE. It counts the runs."""
+    """The objective of the tuning of a loop, on the rig with its quantisation: CVaR over the box of IAE plus overshoot,
+    or the deviation to both sides, above its floor. It counts the runs."""
 
     def __init__(self, config: Others, box: Box, fixed: Fixed, speed: str, weights: Any, judging: Judging):
-        """On so many points, spread evenly."""
+        """On so many points, spread evenly. `weights`: of IAE, and of "overshoot" or "deviation"."""
         self.points = spread(box, speed, config.lanes, config.seed)
-        self.floors = floor(self.points, speed, fixed)
-        self.config, self.weights, self.judging, self.rollouts = config, weights, judging, 0
+        self.weights, self.judging, self.config, self.rollouts = weights, judging, config, 0
+        two_sided = "deviation" in weights
+        self.floors = weights["deviation" if two_sided else "overshoot"] * floor(
+            self.points, speed, fixed, two_sided=two_sided
+        )
 
     def __call__(self, one: Loop) -> float:
         """Of a loop; a great number where a run diverges."""
         found = runs(one, self.points, self.judging, self.config.seed)
         self.rollouts += self.config.lanes
-        each = self.weights["overshoot"] * (found["overshoot"] - self.floors) + self.weights["iae"] * found["iae"]
+        each = sum(weight * found[name] for name, weight in self.weights.items()) - self.floors
         each = np.sort(np.nan_to_num(each, nan=1e3, posinf=1e3))
         tail = each[-int(np.ceil(len(each) * (1 - self.config.level))) :]
         return float(tail.mean())
@@ -127,15 +130,21 @@ def _gains(system: Any, specs: list[Spec]) -> Iterator[np.ndarray]:
 
 
 def contenders(
-    config: Others, box: Box, fixed: Fixed, speed: str, estimator: Any, score: Score, told: Callable[[str], None]
+    config: Others,
+    fixed: Fixed,
+    speed: str,
+    robust: dict[str, list[np.ndarray]],
+    estimator: Any,
+    score: Score,
+    told: Callable[[str], None],
 ) -> dict[str, tuple[Loop, int]]:
-    """Loops by name, and the runs that it took to find each."""
+    """Loops by name, and the runs that it took to find each. `robust`: what `designs` found."""
 
     def feedback(gain: Any) -> Loop:
         return loop(fixed, StateFeedback(gain=np.asarray(gain, float)), speed, estimator=estimator)
 
     found: dict[str, tuple[Loop, int]] = {"published gain": (feedback(lmi_design.PUBLISHED), 0)}
-    for name, gains in designs(config, box, fixed).items():
+    for name, gains in robust.items():
         score.rollouts = 0
         those = [feedback(gain) for gain in gains]
         if those:
@@ -148,17 +157,29 @@ def contenders(
     target = FilteredSlip(slip=fixed.slip, time_constant=cured.reference.time_constant)
     first = ProportionalFeedback(gain=np.asarray(cured.controller.controller.gain, float))
     found["first cure"] = (loop(fixed, first, speed, target, estimator), 0)
-    pi = PID(kp=config.pi[0], ki=config.pi[1], antiwindup=BackCalculation(tracking_time=config.tracking_time))
-    mode = SlidingMode(gain=config.sliding[0], boundary=config.sliding[1])
     searches = {
-        "PI, Nelder-Mead": (nelder_mead, pi, ("kp", "ki"), config.pi_ranges),
-        "PI, CMA-ES": (cma_es, pi, ("kp", "ki"), config.pi_ranges),
-        "sliding mode, CMA-ES": (cma_es, mode, ("gain", "boundary"), config.sliding_ranges),
+        "PI, Nelder-Mead": (nelder_mead, *proportional_integral(config)),
+        "PI, CMA-ES": (cma_es, *proportional_integral(config)),
+        "sliding mode, CMA-ES": (cma_es, *sliding(config)),
     }
-    for name, (search, controller, paths, ranges) in searches.items():
+    for name, (search, controller, free) in searches.items():
         score.rollouts = 0
         one = loop(fixed, controller, speed, estimator=estimator)
-        free = {f"controller.controller.{path}": ends for path, ends in zip(paths, ranges, strict=True)}
         found[name] = (search(score, one, free, config), score.rollouts)
         told(name)
     return found
+
+
+def proportional_integral(config: Others) -> tuple[PID, Free]:
+    """The PI that is searched for: where it starts, and what is free."""
+    pi = PID(kp=config.pi[0], ki=config.pi[1], antiwindup=BackCalculation(tracking_time=config.tracking_time))
+    return pi, {
+        f"controller.controller.{name}": ends for name, ends in zip(("kp", "ki"), config.pi_ranges, strict=True)
+    }
+
+
+def sliding(config: Others) -> tuple[SlidingMode, Free]:
+    """The sliding mode that is searched for."""
+    mode = SlidingMode(gain=config.sliding[0], boundary=config.sliding[1])
+    names = zip(("gain", "boundary"), config.sliding_ranges, strict=True)
+    return mode, {f"controller.controller.{name}": ends for name, ends in names}

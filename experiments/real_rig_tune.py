@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from real_rig_box import ESTIMATED, KNOWN, Box, Fixed, batch, columns, spread
-from real_rig_floor import floor, stopping_time
+from real_rig_floor import Deviation, floor, stopping_time
 from real_rig_loops import loop
 
 from diffabs import Batch, FixedStep, Loop
@@ -16,14 +16,15 @@ from diffabs.references import LimitedSlip
 from diffabs.sensors import SpeedEstimator
 from diffabs.tune import CVaR, Method, Mode, SmoothWorst, Stopping, Tuned, tune
 
-MEASURED = {"overshoot": Overshoot(), "iae": IAE()}
+MEASURED = {"overshoot": Overshoot(), "iae": IAE(), "deviation": Deviation()}
+ONE_SIDED: Mapping[str, float] = {"overshoot": 1.0, "iae": 1.0}  # 1, 1/s
+TWO_SIDED: Mapping[str, float] = {"deviation": 1.0, "iae": 1.0}
 
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
     """Every number of the tuning. Paths of the sensor are those of the loop whose speed is estimated."""
 
-    weights: Mapping[str, float] = dataclasses.field(default_factory=lambda: {"overshoot": 1.0, "iae": 1.0})  # 1, 1/s
     step: float = 1e-3  # s
     few: int = 512  # lanes on which all starts are tried
     lanes: int = 4096  # lanes on which the best of them is tuned
@@ -33,6 +34,7 @@ class Tuning:
     level: float = 0.95  # of CVaR
     softness: float = 0.3  # of the smooth worst case, in units of the mean
     seed: int = 19
+    engine: str = "auto"
     gain: tuple[float, float] = (-2000.0, -120.0)  # starts, at 50 km/h
     rate: float = 4.0  # 1/s
     time_constant: float = 0.02  # s
@@ -78,42 +80,62 @@ def longest(points: dict[str, np.ndarray], fixed: Fixed) -> np.ndarray:
     return 0.3 + 1.2 * stopping_time(points, fixed)
 
 
-def lanes(config: Tuning, box: Box, fixed: Fixed, speed: str, count: int) -> tuple[Batch, np.ndarray]:
+def lanes(
+    config: Tuning, box: Box, fixed: Fixed, speed: str, count: int, weights: Mapping[str, float]
+) -> tuple[Batch, np.ndarray]:
     """Points of the box, spread evenly, with their noise; and the floor of the objective of each."""
     points = spread(box, speed, count, config.seed)
     found = dataclasses.replace(batch(columns(points), config.seed), durations=longest(points, fixed))
-    return found, config.weights["overshoot"] * floor(points, speed, fixed)
+    two_sided = "deviation" in weights
+    weight = weights["deviation" if two_sided else "overshoot"]
+    return found, weight * floor(points, speed, fixed, two_sided=two_sided)
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """A search: what of the lanes' numbers is minimised, on how many of them, from how many starts, for how long."""
+
+    name: str
+    aggregate: Any
+    lanes: int
+    starts: int
+    iterations: int
+    weights: Mapping[str, float] = dataclasses.field(default_factory=lambda: ONE_SIDED)
+
+
+def searched(
+    stage: Stage, subject: Loop, config: Tuning, box: Box, fixed: Fixed, speed: str, progress: Callable[[str], None]
+) -> Tuned:
+    """What a search finds from a loop on."""
+    over, floors = lanes(config, box, fixed, speed, stage.lanes, stage.weights)
+    stopping = Stopping(change=1e-4, iterations=stage.iterations)
+    return tune(
+        subject,
+        free={**config.free, **({} if speed == KNOWN else config.of_estimator)},
+        objective=stage.weights,
+        over=over,
+        solver=FixedStep(step=config.step, duration=float(np.max(over.durations)), kinks=False),
+        measured={name: MEASURED[name] for name in stage.weights},
+        aggregate=Above(stage.aggregate, floors),
+        method=Method(starts=stage.starts, seed=config.seed, mode=Mode.FORWARD, stopping=stopping),
+        engine=config.engine,
+        progress=lambda p: progress(f"{speed}, {stage.name}: {p.point.evaluations} gradients, {p.point.objective:.5g}"),
+    )
 
 
 def tuned(
     config: Tuning, box: Box, fixed: Fixed, speed: str, progress: Callable[[str], None] = lambda line: None
 ) -> dict[str, Tuned]:
-    """The best of several starts on few lanes, under CVaR; and from there on many, under CVaR and the smooth worst."""
-    subject = start(config, fixed, speed)
-    free = {**config.free, **({} if speed == KNOWN else config.of_estimator)}
-
-    def search(name: str, subject: Loop, aggregate: Any, count: int, starts: int, iterations: int) -> Tuned:
-        over, floors = lanes(config, box, fixed, speed, count)
-        method = Method(
-            starts=starts, seed=config.seed, mode=Mode.FORWARD, stopping=Stopping(change=1e-4, iterations=iterations)
-        )
-        return tune(
-            subject,
-            free=free,
-            objective=config.weights,
-            over=over,
-            solver=FixedStep(step=config.step, duration=float(np.max(over.durations)), kinks=False),
-            measured=MEASURED,
-            aggregate=Above(aggregate, floors),
-            method=method,
-            progress=lambda p: progress(f"{speed}, {name}: {p.point.evaluations} gradients, {p.point.objective:.5g}"),
-        )
-
+    """The best of several starts on few lanes, under CVaR; from there on many under CVaR; from there under the smooth
+    worst and, where the speed is known, CVaR of the deviation to both sides."""
     risk, worst = CVaR(level=config.level), SmoothWorst(softness=config.softness)
-    first = search("starts", subject, risk, config.few, config.starts[speed], config.tried)
-    cvar = search("CVaR", first.part, risk, config.lanes, 1, config.iterations)
-    return {
-        "starts": first,
-        "CVaR": cvar,
-        "smooth worst": search("smooth worst", cvar.part, worst, config.lanes, 1, config.iterations),
-    }
+    lanes, steps = config.lanes, config.iterations
+    given = (config, box, fixed, speed, progress)
+    first = searched(
+        Stage("starts", risk, config.few, config.starts[speed], config.tried), start(config, fixed, speed), *given
+    )
+    cvar = searched(Stage("CVaR", risk, lanes, 1, steps), first.part, *given)
+    later = [Stage("smooth worst", worst, lanes, 1, steps)]
+    if speed == KNOWN:
+        later.append(Stage("both sides", risk, lanes, 1, steps, TWO_SIDED))
+    return {"starts": first, "CVaR": cvar} | {stage.name: searched(stage, cvar.part, *given) for stage in later}
