@@ -1,4 +1,5 @@
-"""The command `export`: the computer's part of a scenario as C, or as difference equations."""
+"""The command `export`: the computer's part of a scenario as C, Structured Text or difference equations; the plant as
+an FMU."""
 
 import enum
 import pathlib
@@ -12,14 +13,18 @@ from rich.table import Table
 from diffabs import __version__
 from diffabs.cli import console, show
 from diffabs.core.provenance import versions
+from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
+from diffabs.simulate.solution import FixedStep
 
 
 class Form(enum.StrEnum):
     """What can be written."""
 
     C = "c"
+    ST = "st"
     TABLE = "table"
+    FMU = "fmu"
 
 
 class Given(enum.StrEnum):
@@ -30,34 +35,49 @@ class Given(enum.StrEnum):
 
 def export(
     scenario: console.ScenarioName,
-    to: Annotated[Form, typer.Option(help="One file of C99, or a table of difference equations.")] = Form.C,
+    to: Annotated[
+        Form,
+        typer.Option(
+            help="C99, Structured Text (IEC 61131-3), a table of difference equations; or the plant as an FMU."
+        ),
+    ] = Form.C,
     changes: console.Changes = None,
     out: Annotated[
         pathlib.Path | None, typer.Option("--out", "-o", metavar="FILE", help="Write to this file; default: stdout.")
     ] = None,
-    single: Annotated[bool, typer.Option("--float32", help="Numbers of C in single precision.")] = False,
-    given: Annotated[Given | None, typer.Option(help="What the C is given from outside, beside measurements.")] = None,
+    single: Annotated[bool, typer.Option("--float32", help="Numbers in single precision.")] = False,
+    given: Annotated[
+        Given | None, typer.Option(help="What the code is given from outside, beside measurements.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="With --to table: one JSON document on stdout.")] = False,
 ) -> None:
-    """The sampled controller, with filter, limits, anti-windup, schedule and target, as code for a computer."""
+    """The sampled controller, with filter, limits, anti-windup, schedule and target, as code for a computer; or the
+    plant for other simulators."""
     with console.guarded():
         from diffabs.export import NotExported
 
-        if to is Form.C and as_json:
-            console.fail("--json is for --to table; C is text")
-        if to is Form.TABLE and (single or given):
-            console.fail("--float32 and --given are for --to c")
+        if to is not Form.TABLE and as_json:
+            console.fail("--json is for --to table; code is text")
+        if to is Form.FMU and out is None:
+            console.fail("--to fmu needs a file: -o plant.fmu")
+        if to in (Form.TABLE, Form.FMU) and (single or given):
+            console.fail("--float32 and --given are for --to c and --to st")
         with console.new_file(out, "--out") as file:
-            chosen = console.loaded(scenario, changes, integrated=False)
+            chosen = console.loaded(scenario, changes, integrated=to is Form.FMU)
             try:
+                if to is Form.FMU and file and out:
+                    _fmu(chosen, file, out)
+                    return
                 if to is Form.TABLE:
                     _table(chosen, file, as_json)
                     return
-                text = console.waited(lambda: _source(chosen, out, single, given), f"tracing {chosen.name}")
+                text = console.waited(lambda: _source(chosen, out, to, single, given), f"tracing {chosen.name}")
             except NotExported as error:
                 console.fail(f"{chosen.name}: {_hinted(str(error))}")
             file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
-        if out:
+        if out and to is Form.ST:
+            console.say(f"st: {out}; FUNCTION_BLOCK {_name(chosen, out)}, to be called once a period")
+        elif out:
             console.say(f"c: {out}; try it with: cc -std=c99 -D{_name(chosen, out).upper()}_MAIN {out} -lm")
 
 
@@ -68,18 +88,33 @@ def _hinted(line: str) -> str:
 
 def _name(chosen: Scenario, out: pathlib.Path | None) -> str:
     """What functions begin with: the file's name, or the scenario's."""
-    name = re.sub(r"\W", "_", out.stem if out else chosen.name)
+    name = re.sub(r"[\W_]+", "_", out.stem if out else chosen.name).strip("_")
     return name if name[:1].isalpha() else f"controller_{name}"
 
 
-def _source(chosen: Scenario, out: pathlib.Path | None, single: bool, given: Any) -> str:
-    from diffabs.export import c_source, device
+def _source(chosen: Scenario, out: pathlib.Path | None, to: Form, single: bool, given: Any) -> str:
+    from diffabs.export import c_source, device, structured_text
 
     step = getattr(chosen.solver, "step", None)
     dtype = np.float32 if single else np.float64
     found = device(chosen.loop, step=step, dtype=dtype, given_target=given is Given.TARGET)
     title = f"Scenario {chosen.name}{f': {chosen.title}' if chosen.title else ''}."
-    return c_source(found, _name(chosen, out), [title, f"Written by diffabs {__version__}."])
+    written = structured_text if to is Form.ST else c_source
+    return written(found, _name(chosen, out), [title, f"Written by diffabs {__version__}."])
+
+
+def _fmu(chosen: Scenario, file: pathlib.Path, out: pathlib.Path) -> None:
+    """The plant, as the scenario integrates it. Raises ScenarioError, NotExported."""
+    from diffabs.export import fmu
+
+    solver = chosen.solver
+    if not isinstance(solver, FixedStep):
+        raise ScenarioError("solver.type = adaptive: an FMU takes fixed steps, as in --set solver.type=fixed")
+    name, about = _name(chosen, out), chosen.title or chosen.name
+    times = {"step": float(solver.step), "duration": float(solver.duration)}
+    data = console.waited(lambda: fmu(chosen.loop, name, **times, about=about), f"compiling the plant of {chosen.name}")
+    file.write_bytes(data)
+    console.say(f"fmu: {out}; FMI 2.0 for co-simulation, input control [{chosen.loop.plant.control_unit}]")
 
 
 def _table(chosen: Scenario, file: pathlib.Path | None, as_json: bool) -> None:

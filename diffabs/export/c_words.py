@@ -1,0 +1,113 @@
+"""Operations on single numbers as C99: what a controller and a plant have in common.
+
+An operation that C has no word for is an objection that names it."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from diffabs.kernel.graph import Node, real
+from diffabs.kernel.primitives import Unsupported
+
+TYPES = {"int64": "int64_t", "uint64": "uint64_t", "int32": "int32_t", "uint32": "uint32_t", "bool": "bool"}
+INFIX = {
+    **{"add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/", "and": "&", "or": "|", "xor": "^"},
+    **{"lt": "<", "le": "<=", "eq": "==", "ne": "!=", "shift_left": "<<", "shift_right_logical": ">>"},
+}
+CHOSEN = {"lower": "<", "higher": ">"}
+EXTREMES = {"min": "<", "max": ">"}
+FUNCTIONS = {
+    **{name: name for name in ("exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan", "asin", "acos")},
+    **{name: name for name in ("sinh", "cosh", "atan2", "pow", "sqrt", "rint", "floor", "ceil")},
+    **{"abs": "fabs", "rem": "fmod"},
+}
+WORDS = (
+    "auto break case char const continue default do double else enum extern float for goto if inline int long "
+    "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
+    "bool true false"
+)
+RESERVED = set(WORDS.split())
+
+
+class Words:
+    """C for numbers of a type, `real` (`single`: in single precision), where `place(where, path)` says where an input
+    of the graph stands."""
+
+    def __init__(self, real: str, place: Callable[[str, str], str], single: bool = False):
+        """Nothing is written yet."""
+        self.real, self.place, self.single = real, place, single
+
+    def operations(self, nodes: Sequence[Node], indent: str) -> Iterator[str]:
+        """The lines that work these out, arguments first."""
+        for node in nodes:
+            if node.op in ("const", "input"):
+                continue
+            if node.op == "table":
+                rows = ", ".join(self.name(x) for x in node.args[1:])
+                yield f"{indent}const {self.type(node)} t{node.id}[] = {{{rows}}};"
+            yield f"{indent}const {self.type(node)} v{node.id} = {self._expression(node)};"
+
+    def type(self, node: Node) -> str:
+        """Of a number."""
+        return self.real if real(node.dtype) else TYPES[node.dtype.name]
+
+    def name(self, node: Node) -> str:
+        """What stands for a number: a literal, a variable, a place."""
+        if node.op == "const":
+            return self._literal(node)
+        if node.op != "input":
+            return f"v{node.id}"
+        return self.place(*node.attr)
+
+    def _literal(self, node: Node) -> str:
+        x = node.attr
+        if node.dtype.kind == "b":
+            return "true" if x else "false"
+        if not real(node.dtype):
+            return f"(({TYPES[node.dtype.name]}){int(x)})"
+        if np.isnan(x):
+            return "NAN"
+        if np.isinf(x):
+            return "(-INFINITY)" if x < 0 else "INFINITY"
+        short = 1e-4 <= abs(x) < 1e7 or x == 0
+        text = np.format_float_positional(x, trim="0") if short else np.format_float_scientific(x, trim="0")
+        text += "f" if self.single else ""
+        return f"({text})" if np.signbit(x) else text
+
+    def _expression(self, node: Node) -> str:
+        args = [self.name(x) for x in node.args]
+        suffix = "f" if self.single else ""
+        if node.op in INFIX:
+            return f"{args[0]} {INFIX[node.op]} {args[1]}"
+        if node.op in CHOSEN:
+            return f"{args[0]} {CHOSEN[node.op]} {args[1]} ? {args[0]} : {args[1]}"
+        if node.op in EXTREMES:  # NaN where either is
+            a, b = args
+            return f"{a} != {a} || {a} {EXTREMES[node.op]} {b} ? {a} : {b}"
+        if node.op in FUNCTIONS and real(node.dtype):
+            return f"{FUNCTIONS[node.op]}{suffix}({', '.join(args)})"
+        if node.op == "is_finite":
+            return f"isfinite({args[0]}) != 0"
+        if node.op == "neg":
+            return f"-{args[0]}"
+        if node.op == "not":
+            return f"!{args[0]}" if node.dtype.kind == "b" else f"~{args[0]}"
+        if node.op == "rem":
+            return f"{args[0]} % {args[1]}"
+        if node.op in ("select", "gate"):
+            which, no, yes = args
+            return f"{which} ? {yes} : {no}"
+        if node.op == "any":
+            return args[0]
+        if node.op == "convert":
+            return f"({self.type(node)}){args[0]}"
+        if node.op == "table":
+            return f"t{node.id}[{args[0]}]"
+        raise Unsupported(node.op, "there is none")
+
+
+def identifier(path: str) -> str:
+    """Return a path as a name of C."""
+    name = re.sub(r"\W", "_", path)
+    return f"{name}_" if name in RESERVED else name

@@ -1,0 +1,136 @@
+"""A plant as an FMU: FMI 2.0 for co-simulation, compiled C that needs neither Python nor this package where it runs.
+
+Libraries that make FMUs of Python code put Python, and here JAX, behind every step of the importing tool. The plant is
+C already (`plant_c`), so an FMU is its library, its source and a description."""
+
+import hashlib
+import importlib.resources
+import io
+import pathlib
+import platform
+import subprocess
+import sys
+import tempfile
+import uuid
+import zipfile
+from collections.abc import Sequence
+from typing import Any
+from xml.etree import ElementTree as xml
+
+from diffabs.core.loop import Loop
+from diffabs.export.device import NotExported
+from diffabs.export.plant_c import Plant, Variable, plant_source
+from diffabs.kernel.compilers import NoCompiler, compiler
+
+FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-fPIC")
+LONGEST = 600  # s
+LONG_AGO = (1980, 1, 1, 0, 0, 0)  # of every file in the archive: the same plant is the same bytes
+SYSTEMS = {"linux": ("linux", "so"), "darwin": ("darwin", "dylib"), "win32": ("win", "dll")}
+CAUSES = {
+    "output": {"causality": "output", "variability": "continuous", "initial": "calculated"},
+    "input": {"causality": "input", "variability": "continuous"},
+    "parameter": {"causality": "parameter", "variability": "fixed", "initial": "exact"},
+}
+
+
+def fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str = "") -> bytes:
+    """Return the plant of a loop as the bytes of an FMU: its control is the input, what it shows are the outputs, and
+    every number of plant and start is a parameter that the importing tool may set.
+
+    name: an identifier of C; step: of its Runge-Kutta method, at most [s]; duration: of an experiment by default [s];
+    about: a line of description
+    Raises:
+        NotExported: an operation that has no translation, or no C compiler that works.
+    """
+    plant = plant_source(loop)
+    guid = str(uuid.UUID(hashlib.sha256(f"{plant} {name} {step} {about}".encode()).hexdigest()[:32]))
+    source = _source(plant, guid, step)
+    system, ending = SYSTEMS.get(sys.platform, SYSTEMS["linux"])
+    folder = f"{system}{'64' if platform.architecture()[0] == '64bit' else '32'}"
+    content = {
+        "modelDescription.xml": _description(plant, name, guid, step, duration, about),
+        f"sources/{name}.c": source.encode(),
+        f"binaries/{folder}/{name}.{ending}": _compiled(source),
+    }
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+        for path, data in content.items():
+            file.writestr(zipfile.ZipInfo(path, LONG_AGO), data, zipfile.ZIP_DEFLATED)
+    return archive.getvalue()
+
+
+def _source(plant: Plant, guid: str, step: float) -> str:
+    """All of its C in one file."""
+    outputs = sum(one.role == "output" for one in plant.variables)
+    begun = ", ".join(_number(one.value) for one in plant.variables)
+    struct = "double v[VARIABLES];\n  double x[STATES];\n  double time;\n  bool running;"
+    head = (
+        "#include <math.h>\n#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>\n\n"
+        f'#define GUID "{guid}"\n#define VARIABLES {len(plant.variables)}\n#define OUTPUTS {outputs}\n'
+        f"#define STATES {plant.states}\n#define STEP {step!r}\n\ntypedef struct {{\n  {struct}\n}} model;\n\n"
+        f"static const double begun[VARIABLES] = {{{begun}}};\n"
+    )
+    glue = (importlib.resources.files("diffabs.export") / "fmi2.c").read_text(encoding="utf-8")
+    return f"{head}\n{plant.text}\n{glue}"
+
+
+def _number(value: float) -> str:
+    return {"inf": "INFINITY", "-inf": "-INFINITY", "nan": "NAN"}.get(str(value), repr(value))
+
+
+def _compiled(source: str) -> bytes:
+    """A library of this machine. Raises NotExported."""
+    with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
+        text, result = pathlib.Path(folder) / "fmu.c", pathlib.Path(folder) / "fmu.lib"
+        text.write_text(source, encoding="utf-8")
+        try:
+            command = [*compiler().command, *FLAGS, str(text), "-o", str(result), "-lm"]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST)
+        except (NoCompiler, OSError, subprocess.TimeoutExpired) as error:
+            raise NotExported(f"an FMU needs a C compiler: {' '.join(str(error).split())}") from None
+        if done.returncode or not result.is_file():
+            raise NotExported(f"{command[0]} does not compile it: {' '.join(done.stderr.split())[:300]}")
+        return result.read_bytes()
+
+
+def _description(plant: Plant, name: str, guid: str, step: float, duration: float, about: str) -> bytes:
+    """modelDescription.xml."""
+    root = xml.Element("fmiModelDescription", {
+        **{"fmiVersion": "2.0", "modelName": name, "guid": guid, "generationTool": "diffabs", "description": about},
+        "variableNamingConvention": "structured",
+    })  # fmt: skip
+    simulation = xml.SubElement(root, "CoSimulation", {
+        **{"modelIdentifier": name, "canHandleVariableCommunicationStepSize": "true"},
+        **{"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"},
+    })  # fmt: skip
+    xml.SubElement(xml.SubElement(simulation, "SourceFiles"), "File", {"name": f"{name}.c"})
+    units = dict.fromkeys(one.unit for one in plant.variables if one.unit not in ("", "1"))
+    if units:
+        definitions = xml.SubElement(root, "UnitDefinitions")
+        for unit in units:
+            xml.SubElement(definitions, "Unit", {"name": unit})
+    xml.SubElement(root, "DefaultExperiment", {"startTime": "0.0", "stopTime": repr(duration), "stepSize": repr(step)})
+    variables = xml.SubElement(root, "ModelVariables")
+    for reference, one in enumerate(plant.variables):
+        _variable(variables, one, reference)
+    structure = xml.SubElement(root, "ModelStructure")
+    _unknowns(structure, plant.variables)
+    xml.indent(root)
+    return xml.tostring(root, encoding="UTF-8", xml_declaration=True)
+
+
+def _variable(parent: Any, one: Variable, reference: int) -> None:
+    scalar = xml.SubElement(parent, "ScalarVariable", {
+        "name": one.name, "valueReference": str(reference), **CAUSES[one.role],
+    })  # fmt: skip
+    start = {} if one.role == "output" else {"start": repr(one.value).replace("inf", "INF")}
+    xml.SubElement(scalar, "Real", {**start, **({} if one.unit in ("", "1") else {"unit": one.unit})})
+
+
+def _unknowns(structure: Any, variables: Sequence[Variable]) -> None:
+    """The outputs, which are of the state alone; before the start, of the parameters."""
+    outputs = [k for k, one in enumerate(variables, 1) if one.role == "output"]
+    for tag in ("Outputs", "InitialUnknowns"):
+        parent = xml.SubElement(structure, tag)
+        for index in outputs:
+            xml.SubElement(parent, "Unknown", {"index": str(index)})

@@ -1,0 +1,127 @@
+"""A plant as C99: its start, a Runge-Kutta step, and what it shows, with every parameter as a variable.
+
+The text is that of the functions which the simulation calls, traced, as for a controller (`lowered`)."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from diffabs.core.loop import Loop
+from diffabs.core.pytree import parameters, prepared, strong
+from diffabs.export.c_words import Words
+from diffabs.export.device import NotExported
+from diffabs.export.lowered import filled, named, outputs
+from diffabs.kernel.graph import Graph, Level, Node, real
+from diffabs.kernel.primitives import Unsupported
+from diffabs.kernel.program import live
+from diffabs.simulate.rk4 import rk4_step
+
+CONTROL = "control"
+
+
+class Variable(NamedTuple):
+    """A number that is seen from outside: what is shown ("output"), the control ("input"), or a parameter, with its
+    value before anything is set; a unit."""
+
+    name: str
+    role: str
+    value: float
+    unit: str
+
+
+class Plant(NamedTuple):
+    """C functions `plant_start(m)`, `plant_step(m, t, h)` and `plant_show(m)`, of a struct `m` of arrays `v` of the
+    variables, in their order, and `x` of so many states; the text lacks the struct."""
+
+    text: str
+    variables: tuple[Variable, ...]
+    states: int
+
+
+def plant_source(loop: Loop) -> Plant:
+    """Return the plant of a loop, at the loop's start, as C.
+
+    Raises:
+        NotExported: an operation that has no translation, or a state that is no real number.
+    """
+    with jax.enable_x64(True):
+        typed = jax.tree.map(lambda x: jnp.asarray(x, float), strong((loop.plant, loop.initial)))
+        variables = _variables(loop)
+        try:
+            written = _Written(typed, variables)
+            text = "\n".join(written.parts())
+        except Unsupported as error:
+            raise NotExported(f"{error.primitive} has no translation to C: {error.reason}") from None
+    return Plant(f"{text}\n", variables, written.states)
+
+
+def _variables(loop: Loop) -> tuple[Variable, ...]:
+    """Outputs, the control, the parameters of plant and start, number by number."""
+    plant = loop.plant
+    found = [Variable(name, "output", 0.0, plant.shows.units[name]) for name in plant.shows._fields]
+    found.append(Variable(CONTROL, "input", 0.0, plant.control_unit))
+    for where, part in (("plant", plant), ("initial", loop.initial)):
+        for path, spec, value in parameters(part):
+            numbers = np.asarray(value, float)
+            units = [unit.strip() for unit in spec.unit.split(",")]
+            for k, at in enumerate(np.ndindex(numbers.shape)):
+                unit = units[min(k, len(units) - 1)]
+                found.append(Variable(".".join([where, path, *map(str, at)]), "parameter", float(numbers[at]), unit))
+    return tuple(found)
+
+
+class _Written:
+    def __init__(self, typed: tuple[Any, Any], variables: Sequence[Variable]):
+        self.places = {one.name: k for k, one in enumerate(variables)}
+        self.words = Words("double", self._place)
+        graph = Graph()
+        plant, initial = typed
+        given = [
+            number
+            for where, part in (("plant", plant), ("initial", initial))
+            for number in filled(part, named(part, graph, "v", lambda path, where=where: f"{where}.{path}"))
+        ]
+        own = given[: len(jax.tree.leaves(plant))]
+        state = jax.eval_shape(lambda both: prepared(both[0]).start(both[1]), typed)
+        held = filled(state, named(state, graph, "x", str))
+        if any(not real(leaf.dtype) for leaf in jax.tree.leaves(state)):
+            raise NotExported(f"plant {type(plant).__name__} has a state that is no real number")
+        self.order = {node.attr[1]: k for k, node in enumerate(node for array in held for node in array.flat)}
+        self.states = len(self.order)
+        one = jax.ShapeDtypeStruct((), np.float64)
+        control, time, length = (
+            np.full((), graph.input(np.float64, Level.UNIFORM, place), object)
+            for place in (("v", CONTROL), ("", "t"), ("", "h"))
+        )
+        self.begun = outputs(graph, lambda both: prepared(both[0]).start(both[1]), typed, given)
+        moving, shown = (plant, state, one, one, one), (plant, state)
+        self.moved = outputs(graph, lambda all: _moved(*all), moving, [*own, *held, control, time, length])
+        self.shown = outputs(graph, lambda both: prepared(both[0]).output(both[1]), shown, [*own, *held])
+
+    def _place(self, where: str, path: str) -> str:
+        return f"m->v[{self.places[path]}]" if where == "v" else f"m->x[{self.order[path]}]" if where == "x" else path
+
+    def parts(self) -> Iterator[str]:
+        """The lines of the text."""
+        yield from self._function("plant_start(model *m)", "x", dict(enumerate(self.begun)))
+        yield from self._function("plant_step(model *m, double t, double h)", "x", dict(enumerate(self.moved)), "th")
+        yield from self._function("plant_show(model *m)", "v", dict(enumerate(self.shown)))
+
+    def _function(self, head: str, array: str, results: Mapping[int, Node], unused: str = "") -> Iterator[str]:
+        """Results are stored when all are known: one may be what another is made of."""
+        yield f"static void {head}\n{{"
+        yield from (f"  (void){name};" for name in unused)
+        yield from self.words.operations(live(list(results.values())), "  ")
+        for k, node in results.items():
+            yield f"  const double n{k} = {self.words.name(node)};"
+        yield from (f"  m->{array}[{k}] = n{k};" for k in results)
+        yield "}\n"
+
+
+def _moved(plant: Any, state: Any, control: Any, t: Any, h: Any) -> Any:
+    """The state after a step in which the control is held, as `FixedStep` makes it."""
+    plant = prepared(plant)
+    return plant.project(rk4_step(lambda t, x: plant.derivative(t, x, control), t, state, h))

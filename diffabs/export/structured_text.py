@@ -1,0 +1,273 @@
+"""A device as a function block in Structured Text (IEC 61131-3), for a PLC: the same operations as in C.
+
+Every operation is an assignment to a variable with a type, so no order of evaluation and no mixing of types is left to
+a compiler. What is not finite has no literal in this language: infinite limits become the largest finite number, and a
+NaN is an objection. Comparisons with a NaN are false, as in C, if the machine follows IEEE 754.
+"""
+
+import re
+from collections.abc import Iterator, Sequence
+
+import jax
+import numpy as np
+
+from diffabs.export.device import Device, NotExported
+from diffabs.export.lowered import INPUTS, MEMORY, Lowered
+from diffabs.kernel.graph import Node, real
+from diffabs.kernel.primitives import Unsupported
+from diffabs.kernel.program import live
+
+INTEGERS = {"int64": "LINT", "uint64": "ULINT", "int32": "DINT", "uint32": "UDINT"}
+INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/"}
+COMPARED = {"lt": "<", "le": "<=", "eq": "=", "ne": "<>"}
+LOGICAL = {"and": "AND", "or": "OR", "xor": "XOR"}
+FUNCTIONS = {
+    **{"exp": "EXP", "log": "LN", "sin": "SIN", "cos": "COS", "tan": "TAN", "atan": "ATAN", "asin": "ASIN"},
+    **{"acos": "ACOS", "sqrt": "SQRT", "abs": "ABS", "pow": "EXPT", "atan2": "ATAN2"},
+}
+HYPERBOLIC = {
+    "sinh": "(EXP({0}) - EXP(-{0})) / {2}",
+    "cosh": "(EXP({0}) + EXP(-{0})) / {2}",
+    "tanh": "{1} - {2} / (EXP({2} * {0}) + {1})",
+}
+LINE = 110  # columns of a list of variables
+WORDS = (
+    "abs acos action and any array asin at atan atan2 begin bool by byte case configuration constant cos date "
+    "dint do dt dword else elsif end exit exp expt extends false final for from function function_block global if "
+    "in int interface interval jmp ld len limit lint ln log lreal lt ltime lword max method min mod move mux "
+    "namespace not of on or out overlap override pointer priority private program protected public read read_only "
+    "read_write real ref ref_to repeat reset resource retain return rol ror shl shr sel sin single sint sqrt st "
+    "step string struct super tan task then this time to transition true trunc type udint uint ulint until using "
+    "usint var while with word wstring write xor le ge gt eq ne add sub mul div r s n p l d sd ds sl"
+)
+RESERVED = set(WORDS.split())
+OWN = {"command", "reset", "started", "i"}  # names of the block itself
+
+
+def structured_text(found: Device, name: str, notes: Sequence[str] = ()) -> str:
+    """Return a device as a FUNCTION_BLOCK with an input for each measurement and `reset`, and the output `command`; it
+    is to be called once a period, and begins with its first call or where `reset` is true.
+
+    name: an identifier; notes: lines of the comment at its head
+    Raises:
+        NotExported: an operation that has no translation.
+    """
+    if not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in RESERVED:
+        raise NotExported(f"{name!r} is no name that Structured Text has for a block: letters, digits and single _")
+    with jax.enable_x64(True):
+        try:
+            return "\n".join(_Block(found, name, notes).parts()) + "\n"
+        except Unsupported as error:
+            why = f"{error.primitive} has no translation to Structured Text: {error.reason}"
+            raise NotExported(why) from None
+
+
+class _Block:
+    def __init__(self, found: Device, name: str, notes: Sequence[str]):
+        self.device, self.name, self.notes = found, name, notes
+        self.program = program = Lowered(found)
+        self.real = "REAL" if found.dtype == np.float32 else "LREAL"
+        taken = set(OWN)
+        self.names = {(INPUTS, path): _fresh(path, taken) for path in program.read}
+        self.names |= {(MEMORY, path): _fresh(f"m_{path}", taken) for path in program.kept}
+        self.temporary: dict[str, str] = {}  # its type, by name
+        self.letter = "v"
+
+    def parts(self) -> Iterator[str]:
+        """The lines of the text."""
+        program = self.program
+        body = list(self._body())  # makes the temporaries
+        yield from self._head()
+        yield f"FUNCTION_BLOCK {self.name}"
+        yield "VAR_INPUT"
+        for path in program.read:
+            yield f"  {self.names[INPUTS, path]} : {self.real}; (* [{self.device.units.get(path, '1')}] *)"
+        yield "  reset : BOOL; (* begin anew, with what is measured now *)\nEND_VAR"
+        yield f"VAR_OUTPUT\n  command : {self.real}; (* [{self.device.control_unit}] *)\nEND_VAR"
+        yield "VAR"
+        for path in program.kept:
+            yield f"  {self.names[MEMORY, path]} : {self._type(program.state[path])};"
+        yield "  started : BOOL := FALSE;\nEND_VAR"
+        if self.temporary:
+            yield from ["VAR_TEMP", *self._declared(), "END_VAR"]
+        yield ""
+        yield from body
+        yield "END_FUNCTION_BLOCK"
+
+    def _head(self) -> Iterator[str]:
+        delay = f", its command to be output {self.device.delay:g} s after that" if self.device.delay else ""
+        lines = [
+            f"{self.name}: the controller, to be called every {self.device.period:g} s{delay}.",
+            *self.notes,
+            "Nothing is global: two instances are two controllers.",
+        ]
+        text = "\n   ".join(line.replace("*)", "* )").replace("(*", "( *") for line in lines)
+        yield f"(* {text} *)"
+
+    def _declared(self) -> Iterator[str]:
+        """The temporaries, many of a type in a line."""
+        for kind in dict.fromkeys(self.temporary.values()):
+            line = ""
+            for name in (name for name, of in self.temporary.items() if of == kind):
+                if len(line) + len(name) > LINE:
+                    yield f"  {line} : {kind};"
+                    line = ""
+                line += f"{', ' if line else ''}{name}"
+            yield f"  {line} : {kind};"
+
+    def _body(self) -> Iterator[str]:
+        program = self.program
+        yield "IF reset OR NOT started THEN"
+        self.letter = "b"
+        yield from self._assigned(program.begun, (), "  ")
+        yield "  started := TRUE;\nEND_IF;"
+        self.letter = "v"
+        yield from self._assigned(program.stored, [program.command], "")
+
+    def _assigned(self, stored: dict[str, Node], more: Sequence[Node], indent: str) -> Iterator[str]:
+        """The operations that these need, the command, and the memory's new values."""
+        yield from self._operations(live([*stored.values(), *more]), indent)
+        for node in more:
+            yield f"{indent}command := {self._value(node)};"
+        changed = {name: node for name, node in stored.items() if node is not self.program.state[name]}
+        values = {}
+        for name, node in changed.items():  # what is stored may be what was read before
+            values[name] = self._value(node)
+            if node.op == "input":
+                values[name] = self._new(node, f"o{node.id}")
+                yield f"{indent}{values[name]} := {self._value(node)};"
+        if more and self.program.moving:
+            yield from self._moves(indent)
+        for name, value in values.items():
+            yield f"{indent}{self.names[MEMORY, name]} := {value};"
+
+    def _moves(self, indent: str) -> Iterator[str]:
+        """What moves by itself until the next sample, by as many steps as the simulation takes."""
+        moving = self.program.moving
+        self.temporary["i"] = "LINT"
+        yield f"{indent}FOR i := 0 TO {self.device.moves - 1} DO"
+        self.letter = "w"
+        yield from self._operations(live(list(moving.values())), indent + "  ")
+        for name, node in moving.items():
+            if node is not self.program.state[name]:
+                yield f"{indent}  {self.names[MEMORY, name]} := {self._value(node)};"
+        self.letter = "v"
+        yield f"{indent}END_FOR;"
+
+    def _operations(self, nodes: Sequence[Node], indent: str) -> Iterator[str]:
+        for node in nodes:
+            if node.op in ("const", "input"):
+                continue
+            if node.op == "table":
+                table = f"t{self.letter}{node.id}"
+                self.temporary[table] = f"ARRAY[0..{len(node.args) - 2}] OF {self._type(node)}"
+                for k, entry in enumerate(node.args[1:]):
+                    yield f"{indent}{table}[{k}] := {self._value(entry)};"
+            expression = self._expression(node)
+            yield f"{indent}{self._new(node)} := {expression};"
+
+    def _new(self, node: Node, name: str = "") -> str:
+        """A variable for a number, declared."""
+        name = name or f"{self.letter}{node.id}"
+        self.temporary[name] = self._type(node)
+        return name
+
+    def _type(self, node: Node) -> str:
+        if real(node.dtype):
+            return self.real
+        return "BOOL" if node.dtype.kind == "b" else INTEGERS[node.dtype.name]
+
+    def _value(self, node: Node) -> str:
+        if node.op == "const":
+            return self._literal(node.attr, node)
+        if node.op != "input":
+            return f"{self.letter}{node.id}"
+        where, path = node.attr
+        return self.names[where, path] if where else path
+
+    def _literal(self, x: float, node: Node) -> str:
+        if node.dtype.kind == "b":
+            return "TRUE" if x else "FALSE"
+        if not real(node.dtype):
+            return f"{self._type(node)}#{int(x)}"
+        if np.isnan(x):
+            raise Unsupported("nan", "there is no such number in it")
+        limit = np.finfo(self.device.dtype).max
+        x = self.device.dtype.type(min(max(x, -limit), limit))
+        short = 1e-4 <= abs(x) < 1e7 or x == 0
+        text = np.format_float_positional(x, trim="0") if short else _scientific(x)
+        return f"({text})" if np.signbit(x) else text
+
+    def _expression(self, node: Node) -> str:
+        args, op = [self._value(x) for x in node.args], node.op
+        boolean = node.args[0].dtype.kind == "b"
+        if op in INFIX or (op in COMPARED and not (boolean and op in ("lt", "le"))):
+            return f"{args[0]} {(INFIX | COMPARED)[op]} {args[1]}"
+        if op in LOGICAL and boolean:
+            return f"{args[0]} {LOGICAL[op]} {args[1]}"
+        if op == "not" and boolean:
+            return f"NOT {args[0]}"
+        if op in ("lower", "higher"):
+            return f"SEL({args[0]} {'<' if op == 'lower' else '>'} {args[1]}, {args[1]}, {args[0]})"
+        if op in ("min", "max"):  # NaN where either is
+            a, b = args
+            return f"SEL(({a} <> {a}) OR ({a} {'<' if op == 'min' else '>'} {b}), {b}, {a})"
+        if op in ("select", "gate"):
+            return f"SEL({', '.join(args)})"
+        if op == "neg":
+            return f"-{args[0]}"
+        if op == "any":
+            return args[0]
+        if op == "rem" and not real(node.dtype):
+            return f"{args[0]} MOD {args[1]}"
+        if op == "table":
+            return f"t{self.letter}{node.id}[{args[0]}]"
+        if op == "is_finite":
+            return f"ABS({args[0]}) <= {_scientific(np.finfo(self.device.dtype).max)}"
+        if op == "convert":
+            return self._converted(node, args[0])
+        return self._function(node, args)
+
+    def _function(self, node: Node, args: list[str]) -> str:
+        """Of the standard's functions, and what is made of them."""
+        op = node.op
+        if op == "abs" or (op in FUNCTIONS and real(node.dtype)):
+            return f"{FUNCTIONS[op]}({', '.join(args)})"
+        if op in HYPERBOLIC:
+            return HYPERBOLIC[op].format(args[0], "1.0", "2.0")
+        whole = f"LINT_TO_{self.real}({self.real}_TO_LINT({args[0]}))"  # the nearest, and of two the even one
+        if op == "rint":
+            return whole
+        if op in ("floor", "ceil"):
+            beyond, sign = (">", "-") if op == "floor" else ("<", "+")
+            return f"SEL({whole} {beyond} {args[0]}, {whole}, {whole} {sign} 1.0)"
+        raise Unsupported(op, "there is none")
+
+    def _converted(self, node: Node, arg: str) -> str:
+        """A number as one of another type; to a whole one, cut off as C does."""
+        before, after = self._type(node.args[0]), self._type(node)
+        if before == after:
+            return arg
+        if after == "BOOL":
+            return f"{arg} <> {'0.0' if before == self.real else f'{before}#0'}"
+        if before == "BOOL":
+            zero, one = ("0.0", "1.0") if after == self.real else (f"{after}#0", f"{after}#1")
+            return f"SEL({arg}, {zero}, {one})"
+        if before == self.real:
+            return f"{before}_TRUNC_{after}({arg})"
+        return f"{before}_TO_{after}({arg})"
+
+
+def _scientific(x: float) -> str:
+    return np.format_float_scientific(x, trim="0", exp_digits=1).replace("e", "E")
+
+
+def _fresh(path: str, taken: set[str]) -> str:
+    """A name that the language has, that no other is, whatever the case; which is then taken."""
+    name = re.sub(r"[\W_]+", "_", path).strip("_")
+    name = f"in_{name}" if name.lower() in RESERVED or not name[:1].isalpha() else name
+    number, fresh = 2, name
+    while fresh.lower() in taken or re.fullmatch(r"[bvwo]\d+|t[bvw]\d+", fresh.lower()):
+        number, fresh = number + 1, f"{name}_{number}"
+    taken.add(fresh.lower())
+    return fresh
