@@ -1,0 +1,59 @@
+"""The command `report`: results as one HTML file. It needs the extra `diffabs[report]`."""
+
+import pathlib
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from diffabs.cli import console
+from diffabs.core import files
+from diffabs.core.values import ScenarioError
+
+NAME = "report.html"
+ENDINGS = (".html", ".htm")
+
+
+def report(
+    source: Annotated[
+        pathlib.Path,
+        typer.Argument(metavar="DIR|FILE.json", help="What reproduce, sweep, tune, identify, design or rare wrote."),
+    ],
+    out: Annotated[
+        pathlib.Path | None,
+        typer.Option("--out", "-o", metavar="FILE.html", help="Default: report.html in the folder."),
+    ] = None,
+) -> None:
+    """Make one HTML file of a result: question, answer, figures, tables, certificate, model, provenance."""
+    with console.guarded():
+        console.need_extra("report")
+        target = out or (source / NAME if source.is_dir() else source.with_suffix(".html"))
+        if target.suffix.lower() not in ENDINGS:
+            console.fail(f"--out {target}: the name must end in {' or '.join(ENDINGS)}")
+        if not source.exists():
+            console.fail(f"{source}: there is no such folder or file")
+        check(target)
+        console.waited(lambda: write([source], target), "writing the report")
+        console.say(f"report: {target}")
+
+
+def write(sources: Sequence[pathlib.Path], target: pathlib.Path, title: str = "") -> None:
+    """Write the report of what folders or files hold, whole or not at all. Raises ScenarioError for one that holds
+    nothing of ours, OSError."""
+    from diffabs.report import ReportError, documents
+    from diffabs.report import report as made
+
+    try:
+        text = made([one for source in sources for one in documents(source)], title)
+    except ReportError as error:
+        raise ScenarioError(str(error)) from None
+    files.write(target, text.encode())
+
+
+def check(target: pathlib.Path) -> None:
+    """Raises typer.Exit where a file of somebody else's has the name."""
+    from diffabs.report import ours
+
+    target = console.resolved(target, "--out")
+    if target.exists() and not (target.is_file() and ours(target)):
+        console.fail(f"--out {target}: exists and is no earlier report; move it away")

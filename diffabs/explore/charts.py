@@ -1,0 +1,241 @@
+"""Curves, fan and poles as options of Apache ECharts, which the page draws with. Numbers go in columns, once each."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from diffabs.explore.curves import Curves, Fan, Panel
+from diffabs.explore.stability import Stability
+
+BLUE, RED, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#767676", "#1F2933"
+COLOURS = (BLUE, RED, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
+DIGITS = 5
+QUANTITIES = {"rad": "angle", "rad/s": "rate", "km/h": "speed", "N m": "torque", "V": "voltage"}
+AIMS = {"target": "dashed", "setpoint": "dotted", "command": "dashed"}
+OUTER, INNER = "5 to 95 % of the fan", "25 to 75 %"
+BEFORE = "before"
+FONT = "'Inter', 'Roboto', system-ui, sans-serif"
+ROOM = 1.5  # of the control's range, in which its command is shown
+TOP, BOTTOM, BETWEEN = 6.0, 7.5, 6.5  # per cent of the height
+
+
+def frame(found: Curves) -> dict[str, Any]:
+    """Return the chart of a run: axes, legends and lines, also those of what is not there yet."""
+    shown, given = found.panels, curves(found)
+    count = len(shown)
+    height = (100 - TOP - BOTTOM - BETWEEN * (count - 1)) / count
+    tops = [TOP + i * (height + BETWEEN) for i in range(count)]
+    return {
+        "animation": False,
+        "textStyle": {"fontFamily": FONT, "color": INK},
+        "grid": [{"left": 68, "right": 18, "top": f"{top:.2f}%", "height": f"{height:.2f}%"} for top in tops],
+        "legend": [_legend(panel, i, top) for i, (panel, top) in enumerate(zip(shown, tops, strict=True))],
+        "tooltip": {
+            "trigger": "axis",
+            "confine": True,
+            "textStyle": {"fontSize": 12},
+            ":valueFormatter": "v => v == null || isNaN(v) ? '-' : (+v).toPrecision(4)",
+        },
+        "dataZoom": [{"type": "inside", "xAxisIndex": list(range(count)), "filterMode": "none"}],
+        "axisPointer": {"link": [{"xAxisIndex": "all"}], "label": {"precision": 3}},
+        "xAxis": [_x(i, last=i == count - 1) for i in range(count)],
+        "yAxis": [_y(panel, i) | given["yAxis"][i] for i, panel in enumerate(shown)],
+        "dataset": [*given["dataset"], *({"id": name, "source": {"t": []}} for name in ("before", "fan"))],
+        "series": [line for i, panel in enumerate(shown) for line in _series(panel, i)],
+    }
+
+
+def curves(found: Curves, which: str = "now") -> dict[str, Any]:
+    """Return the change of the chart that shows a run; `which` is "now" or "before"."""
+    source = {"t": rounded(found.t)}
+    for i, panel in enumerate(found.panels):
+        lines = panel.lines if which == "now" else panel.lines[:1]
+        source |= {f"{i}.{j}": rounded(line.values) for j, line in enumerate(lines)}
+    change: dict[str, Any] = {"dataset": [{"id": which, "source": source}]}
+    if which == "now":
+        change["yAxis"] = [_limits(panel) for panel in found.panels]
+    return change
+
+
+def fan(found: Fan | None) -> dict[str, Any]:
+    """Return the change of the chart that shows a fan, or none."""
+    if found is None:
+        return nothing("fan")
+    source = {"t": rounded(found.t)}
+    for i, band in enumerate(found.bands):
+        low, quarter, _, third, high = band
+        steps = (low, quarter - low, third - quarter, high - third)
+        source |= {f"{i}.{j}": rounded(values) for j, values in enumerate(steps)}
+    return {"dataset": [{"id": "fan", "source": source}]}
+
+
+def nothing(which: str) -> dict[str, Any]:
+    """Return the change of the chart that takes curves away."""
+    return {"dataset": [{"id": which, "source": {"t": []}}]}
+
+
+def pole_frame() -> dict[str, Any]:
+    """Return the empty map of poles, in s: the left half plane is where they decay."""
+    axis = {
+        "type": "value",
+        "nameLocation": "middle",
+        "nameTextStyle": {"fontSize": 11},
+        "axisLabel": {"fontSize": 10, "showMaxLabel": True},
+    }
+    axis |= {"splitLine": {"lineStyle": {"color": "#E4E7EB"}}, "axisLine": {"onZero": False}}
+    unstable = {"silent": True, "itemStyle": {"color": "rgba(213,94,0,0.10)"}, "data": []}
+    crosses = {"type": "scatter", "symbol": CROSS, "encode": {"x": 0, "y": 1}}
+    return {
+        "animation": False,
+        "textStyle": {"fontFamily": FONT, "color": INK},
+        "grid": {"left": 58, "right": 14, "top": 12, "bottom": 40},
+        "tooltip": {"confine": True, ":formatter": POLE},
+        "xAxis": {
+            **axis,
+            "axisLabel": {"fontSize": 10, "showMaxLabel": False},
+            "name": "real part [1/s]",
+            "nameGap": 24,
+        },
+        "yAxis": {**axis, "name": "imaginary part [rad/s]", "nameGap": 42},
+        "series": [
+            {"id": "corners", **crosses, "symbolSize": 6, "itemStyle": {"color": "#9AA5B1"}, "data": []},
+            {"id": "poles", **crosses, "symbolSize": 11, "itemStyle": {"color": BLUE}, "data": []}
+            | {"markArea": unstable},
+        ],
+    }
+
+
+DASH = "path://M0,6 h18 v3 h-18 Z M0,0 h18 v0.01 h-18 Z M0,15 h18 v0.01 h-18 Z"  # a line in the middle of its place
+CROSS = "path://M0,12 L12,0 L14,2 L2,14 Z M0,2 L2,0 L14,12 L12,14 Z"
+POLE = (
+    "p => { const [x, y] = p.data, w = Math.hypot(x, y);"
+    " return `${x.toPrecision(4)} ${y < 0 ? '-' : '+'} ${Math.abs(y).toPrecision(4)} j 1/s<br>`"
+    " + `damping ${(-x / w).toPrecision(3)}, ${w.toPrecision(4)} rad/s`; }"
+)
+
+
+def poles(found: Stability | None) -> dict[str, Any]:
+    """Return the change of the map that shows the poles of a loop; those of a sampled one as ln(z)/T."""
+    here = _points(found.poles, found.period) if found else []
+    around = _points(found.corners, found.period) if found else []
+    x, y = (np.array([point[i] for point in here + around] or [-1.0]) for i in (0, 1))
+    far = _nice(1.05 * max(float(np.max(np.abs(x))), 1e-3))
+    right = max(0.1 * far, _nice(1.05 * float(x.max())) if x.max() > 0 else 0.0)
+    high = _nice(1.1 * max(float(np.max(np.abs(y))), 0.1 * far))
+    area = {"data": [[{"xAxis": 0}, {"xAxis": right}]]}
+    return {
+        "xAxis": [{"min": -far, "max": right, "interval": _interval(far)}],
+        "yAxis": [{"min": -high, "max": high, "interval": high / 2}],
+        "series": [{"id": "corners", "data": around}, {"id": "poles", "data": here, "markArea": area}],
+    }
+
+
+def _points(values: np.ndarray, period: float | None) -> list[list[float]]:
+    poles = np.asarray(values, complex)
+    if period is not None:
+        poles = np.log(poles[np.abs(poles) > 1e-9]) / period  # those at z = 0 are delays
+    return [[float(f"{p.real:.5g}"), float(f"{p.imag:.5g}")] for p in poles]
+
+
+def rounded(values: np.ndarray) -> list[float | None]:
+    """Return numbers with as many digits as a screen can show; None where there is none."""
+    values = np.asarray(values, float)
+    finite = np.isfinite(values)
+    safe = np.where(finite & (values != 0), values, 1.0)
+    unit = 10.0 ** (np.floor(np.log10(np.abs(safe))) - DIGITS + 1)
+    near = np.where(finite, np.round(np.where(finite, values, 0.0) / unit) * unit, np.nan)
+    return [None if math.isnan(x) else float(f"{x:.{DIGITS}g}") for x in near.tolist()]
+
+
+def _legend(panel: Panel, i: int, top: float) -> dict[str, Any]:
+    names = [line.name for line in panel.lines] + ([BEFORE, OUTER, INNER] if i == 0 else [])
+    style = {"fontSize": 11, "color": INK}
+    place = {"right": 18, "top": f"{top - 5.2:.2f}%", "itemWidth": 18, "itemHeight": 8, "itemGap": 12, "icon": DASH}
+    return {"data": names, "textStyle": style, **place}
+
+
+def _x(i: int, *, last: bool) -> dict[str, Any]:
+    name = {"name": "time [s]", "nameLocation": "middle", "nameGap": 26} if last else {}
+    return {
+        "type": "value",
+        "gridIndex": i,
+        "min": 0,
+        "axisLabel": {"show": last, "fontSize": 11, "hideOverlap": True, ":formatter": "v => +v.toPrecision(3)"},
+        "axisTick": {"show": last},
+        "splitLine": {"lineStyle": {"color": "#EDF0F2"}},
+        "axisLine": {"onZero": False, "lineStyle": {"color": "#9AA5B1"}},
+        "nameTextStyle": {"fontSize": 12, "color": INK},
+        **name,
+    }
+
+
+def _y(panel: Panel, i: int) -> dict[str, Any]:
+    return {
+        "type": "value",
+        "gridIndex": i,
+        "name": label(panel),
+        "nameLocation": "middle",
+        "nameGap": 48,
+        "nameTextStyle": {"fontSize": 12, "color": INK},
+        "splitNumber": 4,
+        "axisLabel": {"fontSize": 11},
+        "splitLine": {"lineStyle": {"color": "#EDF0F2"}},
+        "axisLine": {"show": True, "onZero": False, "lineStyle": {"color": "#9AA5B1"}},
+    }
+
+
+def label(panel: Panel) -> str:
+    """Return what an axis says of a panel: the quantity and its unit."""
+    signals = [line.name for line in panel.lines if line.name not in AIMS]
+    words = signals[0] if len(signals) == 1 and signals[0] != "control" else QUANTITIES.get(panel.unit, signals[0])
+    return f"{words} [{panel.unit}]"
+
+
+def _series(panel: Panel, i: int) -> list[dict[str, Any]]:
+    place = {"type": "line", "xAxisIndex": i, "yAxisIndex": i, "showSymbol": False, "symbol": "none"}
+    hidden = {**place, "datasetId": "fan", "stack": f"fan {i}", "stackStrategy": "all", "silent": True}
+    hidden |= {"lineStyle": {"width": 0}, "tooltip": {"show": False}, "z": 1}
+    names = ("", OUTER, INNER, OUTER)
+    shades = (0.0, 0.13, 0.26, 0.13)
+    found = [
+        {**hidden, "name": name or f"fan {i}", "encode": {"x": "t", "y": f"{i}.{j}"}}
+        | {"areaStyle": {"color": BLUE, "opacity": shade}, "itemStyle": {"color": "#8FBFDC" if j != 2 else "#5FA3CC"}}
+        for j, (name, shade) in enumerate(zip(names, shades, strict=True))
+    ]
+    before = {"lineStyle": {"color": GREY, "width": 1.5, "type": [6, 3]}, "itemStyle": {"color": GREY}, "z": 2}
+    found.append({**place, "name": BEFORE, "datasetId": "before", "encode": {"x": "t", "y": f"{i}.0"}, **before})
+    signals = 0
+    for j, line in enumerate(panel.lines):
+        dashes = AIMS.get(line.name, "solid")
+        colour = INK if line.name == "setpoint" else RED if line.name in AIMS else COLOURS[signals % len(COLOURS)]
+        signals += line.name not in AIMS
+        style = {"color": colour, "width": 2 if j == 0 else 1.4, "type": dashes}
+        look = {"lineStyle": style, "itemStyle": {"color": colour}, "z": 4 if j == 0 else 3}
+        found.append({**place, "name": line.name, "datasetId": "now", "encode": {"x": "t", "y": f"{i}.{j}"}, **look})
+    return found
+
+
+def _limits(panel: Panel) -> dict[str, Any]:
+    """Ends of an axis: free, but those of a control, whose command may lie far beyond what can be given."""
+    if panel.lines[-1].name != "command":
+        return {}
+    values = panel.lines[0].values[np.isfinite(panel.lines[0].values)]
+    most = float(np.max(np.abs(values))) if values.size else 0.0
+    if not most:
+        return {"min": -1, "max": 1}
+    nice = _nice(ROOM * most)
+    low, high = -nice if values.min() < 0 else 0, nice if values.max() > 0 else 0
+    return {"min": low, "max": high, "interval": nice / 2 if low and high else _interval(nice)}
+
+
+def _interval(end: float) -> float:
+    """How far ticks are apart on an axis from 0 to one of the numbers of `_nice`: three to five of them."""
+    mantissa = float(f"{end:.1e}".partition("e")[0])
+    return end / {1.0: 4, 1.5: 3, 2.0: 4, 3.0: 3, 4.0: 4, 5.0: 5, 6.0: 3, 8.0: 4}[mantissa]
+
+
+def _nice(value: float) -> float:
+    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten."""
+    unit = 10.0 ** math.floor(math.log10(value))
+    return next(float(f"{n * unit:.12g}") for n in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if n * unit >= value * (1 - 1e-9))

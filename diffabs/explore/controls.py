@@ -1,0 +1,162 @@
+"""The left column: which scenario, road and controller, and a slider and a field for each number."""
+
+import html
+import pathlib
+from collections.abc import Awaitable, Callable, Iterable
+from functools import partial
+from typing import Any
+
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+
+from diffabs.explore.curves import Fan
+from diffabs.explore.knobs import STEPS, Knob, unit_words
+from diffabs.explore.session import AS_GIVEN, FAMILIES, Session
+from diffabs.scenario.scenario import names
+
+EVERY = 0.016  # s between events of a slider, a frame of the screen
+MASS, ROAD = "mass", "road"
+
+Turned = Callable[[str, Any, int], None]
+Replaced = Callable[[Callable[[], None]], Awaitable[None]]
+
+
+class Controls:
+    """Sliders and fields of a session's numbers. `turned` hears of each change, `replaced` of what needs all anew."""
+
+    def __init__(self, session: Session, turned: Turned, replaced: Replaced):
+        """Nothing is on the page yet."""
+        self.session, self._turned, self._replaced = session, turned, replaced
+        self.fields: dict[str, Any] = {}
+        self.sliders: dict[str, Any] = {}
+        self.sources = list(dict.fromkeys([session.source, *names()]))
+
+    def build(self) -> None:
+        """Put it into the column that is open."""
+        self.message = ui.label().classes("refused").props("data-id=refused")
+        self.message.set_visibility(False)
+        self.inside = ui.element("div").classes("rows")
+        self._fill()
+
+    def rebuild(self) -> None:
+        """Show other numbers, or a choice that was refused as it was before."""
+        self.inside.clear()
+        self._fill()
+
+    def show(self, key: str) -> None:
+        """Show a number as it is now."""
+        knob, value = self.session.knobs[key], self.session.value(key)
+        if key in self.fields:
+            self.fields[key].props(remove="error")
+            self.fields[key].set_value(knob.text(value))
+        if key in self.sliders and abs(self.sliders[key].value - knob.place_of(value)) > 1e-6:
+            self.sliders[key].set_value(knob.place_of(value))
+
+    def show_all(self) -> None:
+        """Show every number as it is now."""
+        for key in self.fields:
+            self.show(key)
+
+    def refused(self, line: str) -> None:
+        """Say what cannot be; nothing for an empty line."""
+        self.message.set_text(line)
+        self.message.set_visibility(bool(line))
+
+    def wrong(self, key: str) -> None:
+        """Mark the field of a number that was refused."""
+        if key in self.fields:
+            self.fields[key].props("error")
+
+    def fan(self, found: Fan | None) -> None:
+        """Say what the fan is made of."""
+        if found is None:
+            self.made.set_text("no fan: nothing differs between its runs")
+            return
+        lost = f"; {found.diverged} diverged" if found.diverged else ""
+        self.made.set_text(f"{found.members} runs, {found.words}{lost}")
+
+    def _fill(self) -> None:
+        self.fields, self.sliders = {}, {}
+        with self.inside:
+            self._choosers()
+            self._spread()
+            self._rows(self.session.first)
+            rest = [key for key in self.session.knobs if key not in self.session.first]
+            with (
+                ui.expansion(f"all other numbers ({len(rest)})").classes("w-full").props("dense data-id=others") as more
+            ):
+                pass
+            more.on_value_change(lambda event: self._more(more, rest) if event.value else None)
+
+    def _more(self, place: Any, keys: list[str]) -> None:
+        """The other numbers, when somebody looks for them the first time."""
+        if not any(key in self.fields for key in keys):
+            with place:
+                self._rows(keys)
+
+    def _choosers(self) -> None:
+        labels = {source: pathlib.Path(source).name for source in self.sources}
+        look = "dense outlined options-dense"
+        source = ui.select(labels, value=self.session.source, label="scenario").classes("w-full chooser")
+        source.props(f"{look} data-id=scenario").on_value_change(
+            lambda event: self._replaced(partial(self.session.open, event.value))
+        )
+        for family in FAMILIES:
+            if there := self.session.choices(family):
+                part = ui.select(there, value=self.session.parts[family], label=family).classes("w-full chooser")
+                part.props(f"{look} data-id={family}").on_value_change(
+                    lambda event, family=family: self._replaced(partial(self.session.choose, family, event.value))
+                )
+
+    def _spread(self) -> None:
+        ui.label("fan of 200 runs").classes("group")
+        words = {MASS: "masses differ by ±", ROAD: "friction differs by ±"}
+        wanted = [MASS, ROAD] if AS_GIVEN in self.session.choices("road") else [MASS]
+        for name in wanted:
+            with ui.element("div").classes("spread"):
+                ui.label(words[name])
+                field = ui.input(value=f"{100 * getattr(self.session.spread, name):g}").props("dense outlined")
+                field.props(f"data-id=fan-{name}")
+                field.on("change", lambda _, name=name, field=field: self._widened(name, field.value))
+                ui.label("%").classes("unit")
+        self.made = ui.label().classes("note").props("data-id=fan")
+
+    async def _widened(self, name: str, given: Any) -> None:
+        await self._replaced(partial(self.session.widen, name, given))
+
+    def _rows(self, keys: Iterable[str]) -> None:
+        group = ""
+        for key in keys:
+            knob = self.session.knobs[key]
+            if knob.group != group:
+                group = knob.group
+                ui.label(group).classes("group")
+            self._row(key, knob)
+
+    def _row(self, key: str, knob: Knob) -> None:
+        value = self.session.value(key)
+        with ui.element("div").classes("knob"):
+            ui.label(knob.label).classes("name").tooltip(f"{knob.name} in {knob.spec.interval()}")
+            field = ui.input(value=knob.text(value)).props("dense outlined hide-bottom-space")
+            field.props(f'data-field="{html.escape(key)}" aria-label="{html.escape(knob.name)}"')
+            field.on("change", lambda _: self._typed(key, field.value))
+            self.fields[key] = field
+            ui.label(unit_words(knob.spec.unit)).classes("unit")
+            if knob.low is not None:
+                slider = ui.slider(min=0, max=STEPS, step=1, value=knob.place_of(value)).props("dense")
+                slider.props(f'data-slider="{html.escape(key)}" aria-label="{html.escape(knob.name)}"')
+                slider.on(
+                    "update:model-value",
+                    lambda event: self._dragged(key, *event.args),
+                    throttle=EVERY,
+                    js_handler="(place) => emit(place, explorer.edited())",
+                )
+                self.sliders[key] = slider
+
+    def _typed(self, key: str, text: Any) -> None:
+        self._turned(key, str(text), 0)
+
+    def _dragged(self, key: str, place: Any, edit: Any) -> None:
+        knob = self.session.knobs.get(key)
+        if knob is None or knob.low is None or not isinstance(place, int | float) or not 0 <= place <= STEPS:
+            return
+        self._turned(key, knob.text(knob.value_at(place)), edit if isinstance(edit, int) else 0)

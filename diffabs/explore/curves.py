@@ -1,0 +1,185 @@
+"""What is drawn: the signals of a run, panel by panel, and a fan of many runs around them."""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from diffabs.core.pytree import get, parameters
+from diffabs.explore.friction import FACTOR
+from diffabs.explore.knobs import mass
+from diffabs.linear.robustness import even
+from diffabs.scenario.registry import KMH
+from diffabs.scenario.scenario import Scenario
+from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.frames import columns
+from diffabs.simulate.run import rollout
+from diffabs.simulate.solution import Adaptive, FixedStep, Run, Solver
+
+INSTANTS = 400  # of a curve
+LONG = 4 * INSTANTS  # steps, from which a draft is quicker
+DRAFT = 1e-3  # relative error of a draft's step
+MEMBERS = 200  # of a fan
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+FEWEST = 0.1  # of the members must still run where a fan is drawn
+
+
+class Line(NamedTuple):
+    """A curve: its name, and its values as they are shown, NaN where there is none."""
+
+    name: str
+    values: np.ndarray
+
+
+class Panel(NamedTuple):
+    """Curves of one unit, the first of which has the fan."""
+
+    unit: str
+    lines: tuple[Line, ...]
+
+
+class Curves(NamedTuple):
+    """A run: the instants [s], its panels, its metrics by name, how it ended; a `draft` is made by long steps."""
+
+    t: np.ndarray
+    panels: tuple[Panel, ...]
+    metrics: dict[str, float]
+    end: str
+    draft: bool
+
+
+class Fan(NamedTuple):
+    """Quantiles, (QUANTILES, instants), of the first curve of each panel; how many runs, how many of them diverged, and
+    what differs between them in words."""
+
+    t: np.ndarray
+    bands: tuple[np.ndarray, ...]
+    members: int
+    diverged: int
+    words: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """How far the members of a fan differ from the values shown, as a fraction: even between less and more."""
+
+    mass: float = 0.1
+    road: float = 0.2
+
+
+def solver(chosen: Scenario) -> Solver:
+    """Return the scenario's solver, keeping as many instants as are drawn."""
+    return dataclasses.replace(chosen.solver, every=max(1, math.ceil(chosen.solver.steps / INSTANTS)))
+
+
+def draft_solver(chosen: Scenario) -> Solver | None:
+    """Return a solver that is quicker, to draw by while a value is dragged; None where the scenario's own is quick, or
+    a clock in the loop needs its grid."""
+    own = chosen.solver
+    if chosen.loop.ticks or not isinstance(own, FixedStep) or own.steps <= LONG:
+        return None
+    return Adaptive(rtol=DRAFT, duration=own.duration, step=own.duration / INSTANTS)
+
+
+def curves(chosen: Scenario, by: Solver | None = None) -> Curves:
+    """Return the run of a scenario, by its own solver or another."""
+    run: Run = jax.device_get(rollout(chosen.loop, by or solver(chosen), chosen.objectives, key=chosen.key()))
+    t, panels = _panels(run, chosen.loop.plant)
+    metrics = {name: float(run.metrics[name]) for name in chosen.objectives}
+    return Curves(t, panels, metrics, _ended(chosen, run, t), by is not None)
+
+
+def fan(chosen: Scenario, spread: Spread) -> Fan | None:
+    """Return the fan of many runs whose masses and roads differ, all at once; None where neither is there."""
+    values, words = members(chosen, spread)
+    if not values:
+        return None
+    by = draft_solver(chosen) or solver(chosen)
+    batch = Batch(values, keys=np.arange(MEMBERS) + chosen.seed)
+    run: Run = jax.device_get(run_batch(chosen.loop, batch, by, {}, trajectories=True))
+    lost = np.asarray(run.diverged)
+    assert run.trajectory is not None
+    going = np.asarray(run.trajectory.running) & ~lost[:, None]
+    t = np.asarray(run.trajectory.sample.t)
+    longest = int(np.argmax(going.sum(axis=1)))
+    count = int(np.sum(going.mean(axis=0) >= FEWEST * max(1e-9, going[:, 0].mean())))
+    shown = [_first(panel) for panel in _layout(run, chosen.loop.plant)]
+    bands = tuple(_quantiles(np.where(going, values, np.nan)[:, :count]) for values in shown)
+    return Fan(t[longest, :count], bands, MEMBERS, int(lost.sum()), words)
+
+
+def members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], str]:
+    """Return the values of a fan's members by path, always the same parts of the spread, and what they are in words."""
+    there = {path: spec for path, spec, _ in parameters(chosen.loop)}
+    wanted = {mass(chosen): spread.mass, FACTOR: spread.road}
+    wanted = {path: part for path, part in wanted.items() if path in there and part > 0}
+    unit = 2 * even(MEMBERS, len(wanted)) - 1
+    values, words = {}, []
+    for i, (path, part) in enumerate(wanted.items()):
+        spec, here = there[path], float(get(chosen.loop, path))
+        low, high = (here * (1 + sign * part) for sign in (-1, 1))
+        middle, half = (low + min(high, spec.high)) / 2, (min(high, spec.high) - low) / 2
+        values[path] = middle + half * unit[:, i]
+        name = "friction" if path == FACTOR else path.rpartition(".")[2].replace("_", " ")
+        words.append(f"{name} ± {100 * part:g} %")
+    return values, ", ".join(words)
+
+
+def _quantiles(values: np.ndarray) -> np.ndarray:
+    if not values.size:
+        return np.zeros((len(QUANTILES), 0))
+    return np.nanquantile(values, QUANTILES, axis=0)
+
+
+def _panels(run: Run, plant: Any) -> tuple[np.ndarray, tuple[Panel, ...]]:
+    """The instants of one run, and what is drawn of them."""
+    count = len(columns(run, plant)["t"][1])
+    assert run.trajectory is not None
+    cut = tuple(
+        Panel(panel.unit, tuple(Line(line.name, _finite(line.values[:count])) for line in panel.lines))
+        for panel in _layout(run, plant)
+    )
+    return np.asarray(run.trajectory.sample.t)[:count], cut
+
+
+def _layout(run: Run, plant: Any) -> list[Panel]:
+    """The first signal with target and setpoint, the next ones of one unit, the control with its command; in full
+    length, of one run or many."""
+    assert run.trajectory is not None
+    sample = run.trajectory.sample
+    groups: dict[str, list[Line]] = {}
+    for name, unit in type(sample.output).units.items():
+        words = name.replace("_", " ")
+        groups.setdefault(unit, []).append(Line(words, np.asarray(getattr(sample.output, name), float)))
+    units = list(groups)
+    aims = [Line("target", np.asarray(sample.target, float)), Line("setpoint", np.asarray(sample.setpoint, float))]
+    shown = [Panel(units[0], (*groups[units[0]], *aims))]
+    shown += [_in_kmh(Panel(unit, tuple(groups[unit]))) for unit in units[1:2]]
+    control = [Line(name, np.asarray(getattr(sample, name), float)) for name in ("control", "command")]
+    return [*shown, Panel(plant.control_unit, tuple(control))]
+
+
+def _in_kmh(panel: Panel) -> Panel:
+    if panel.unit != "m/s":
+        return panel
+    return Panel("km/h", tuple(Line(line.name, KMH * line.values) for line in panel.lines))
+
+
+def _first(panel: Panel) -> np.ndarray:
+    return panel.lines[0].values
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _ended(chosen: Scenario, run: Run, t: np.ndarray) -> str:
+    if run.diverged:
+        return "diverged: a number became infinite or impossible, or something switched in every step"
+    stop, end = chosen.loop.stop, f"after {float(t[-1]):.4g} s"
+    if bool(run.stopped) == stop.success:
+        return f"ends {end}"
+    otherwise = getattr(stop, "otherwise", "")
+    return f"{'stops early' if run.stopped else 'has not stopped'} {end}{otherwise and f': {otherwise}'}"

@@ -1,0 +1,53 @@
+"""A factor on a road's friction as a parameter of its own: roads of every kind get slippery by the same slider.
+
+The road is put into `Scaled` with the factor 1, which changes no bit of a run; what the scenario says of the road's
+parameters then has paths that are one part deeper. A factor that was left at 1 is taken out again."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from diffabs.roads import Scaled
+from diffabs.scenario.scenario import Scenario
+
+ROAD, INNER = "plant.road.", "plant.road.road."
+FACTOR = "plant.road.scale"
+
+
+def with_factor(chosen: Scenario) -> Scenario:
+    """Return the scenario with a friction factor as `plant.road.scale`; the same where there is no road, or one that
+    has a factor."""
+    road = getattr(chosen.loop.plant, "road", None)
+    if road is None or isinstance(road, Scaled):
+        return chosen
+    plant: Any = chosen.loop.plant
+    plant = dataclasses.replace(plant, road=Scaled(road=road))
+    return _renamed(chosen, plant, lambda path: INNER + path[len(ROAD) :] if path.startswith(ROAD) else path)
+
+
+def without_factor(chosen: Scenario, given: Scenario) -> Scenario:
+    """Return the scenario without the factor that `with_factor` has put into `given`, if it still is 1."""
+    road = getattr(chosen.loop.plant, "road", None)
+    had = isinstance(getattr(given.loop.plant, "road", None), Scaled)
+    if not isinstance(road, Scaled) or had or float(road.scale) != 1.0:
+        return chosen
+    plant: Any = chosen.loop.plant
+    plant = dataclasses.replace(plant, road=road.road)
+    return _renamed(chosen, plant, lambda path: ROAD + path[len(INNER) :] if path.startswith(INNER) else path)
+
+
+def _renamed(chosen: Scenario, plant: Any, name: Callable[[str], str]) -> Scenario:
+    def keys(table: Mapping[str, Any]) -> dict[str, Any]:
+        return {name(path): value for path, value in table.items()}
+
+    tune, sweep = chosen.tune, chosen.sweep
+    correlation = sweep.correlation
+    if correlation is not None:
+        correlation = dataclasses.replace(correlation, paths=tuple(map(name, correlation.paths)))
+    return dataclasses.replace(
+        chosen,
+        loop=dataclasses.replace(chosen.loop, plant=plant),
+        design=dataclasses.replace(chosen.design, over=keys(chosen.design.over)),
+        tune=dataclasses.replace(tune, free=keys(tune.free), over=keys(tune.over)),
+        sweep=dataclasses.replace(sweep, over=keys(sweep.over), correlation=correlation),
+    )

@@ -1,0 +1,69 @@
+"""Who may speak to the explorer: the pages that it has served itself, on this machine.
+
+A server on loopback is reached by every page that the browser has open, and by a name that somebody lets point to
+127.0.0.1. So a request must come from this machine, name the explorer as its host, and if it says which page sent it
+(`Origin`, as every WebSocket of a browser does), that must be the explorer's."""
+
+import ipaddress
+from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from typing import Any
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Any]]
+Send = Callable[[Any], Awaitable[None]]
+
+LOOPBACK = "127.0.0.1"
+NAMES = (LOOPBACK, "localhost")
+# Nothing from elsewhere is loaded, whatever a page asks for; scripts in the page are those of the framework.
+POLICY = (
+    "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' ws://127.0.0.1:* ws://localhost:*; "
+    "frame-ancestors 'none'; base-uri 'self'; form-action 'self'"
+)
+
+
+class Guard:
+    """An ASGI application that lets through to another what is allowed, and answers 403 to the rest."""
+
+    def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], port: int):
+        """`port` is that of the explorer."""
+        self.app, self.hosts = app, {f"{name}:{port}" for name in NAMES}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        if scope["type"] == "lifespan" or self.allowed(scope):
+            await self.app(scope, receive, _with_policy(send) if scope["type"] == "http" else send)
+        elif scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            kind = [(b"content-type", b"text/plain; charset=utf-8")]
+            await send({"type": "http.response.start", "status": 403, "headers": kind})
+            await send({"type": "http.response.body", "body": b"diffabs explore answers only its own page\n"})
+
+    def allowed(self, scope: Mapping[str, Any]) -> bool:
+        """Whether a request comes from this machine and from a page of the explorer."""
+        given: dict[bytes, list[str]] = {}
+        for name, value in scope["headers"]:
+            given.setdefault(name.lower(), []).append(value.decode("latin-1"))
+        host, origin = given.get(b"host", []), given.get(b"origin", [])
+        here = len(host) == 1 and host[0] in self.hosts
+        own = origin in ([], [f"http://{host[0]}"]) if here else False
+        return here and own and _loopback(scope.get("client"))
+
+
+def _loopback(client: Any) -> bool:
+    try:
+        return ipaddress.ip_address(client[0]).is_loopback
+    except (TypeError, IndexError, ValueError):
+        return False
+
+
+def _with_policy(send: Send) -> Send:
+    async def sent(message: Any) -> None:
+        if message["type"] == "http.response.start":
+            more = [(b"content-security-policy", POLICY.encode()), (b"x-content-type-options", b"nosniff")]
+            message = {**message, "headers": [*message.get("headers", []), *more]}
+        await send(message)
+
+    return sent

@@ -1,0 +1,183 @@
+"""What can be turned: every number of a loop, with a name, a unit, its range, and the ends of its slider."""
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from diffabs.core.pytree import Spec, parameters
+from diffabs.core.values import inside, wrong
+from diffabs.explore.friction import FACTOR
+from diffabs.scenario.parameter_paths import canonical
+from diffabs.scenario.registry import KMH
+from diffabs.scenario.scenario import Scenario
+
+STEPS = 1000  # of a slider, end to end
+DECADE = 10.0  # a slider over so many times its lower end is logarithmic
+WIDTH = 2.0  # how many times more, and less, than its value a number without a range can be dragged to
+NEARBY = 1.25  # beyond the range of a scenario a slider goes on to so many times its value
+SPEEDS = ("speed", "reference_speed")  # in km/h, as everywhere where a person reads
+FILTERS = ("time_constant", "cutoff")
+LIMITS = ("torque_min", "torque_max", "reference_speed", "period")  # of a controller, hardly dragged
+MOST_FIRST = 14
+
+
+@dataclasses.dataclass(frozen=True)
+class Knob:
+    """A single number of the loop.
+
+    path: of the parameter in the loop; place: in it, if that is a list
+    name: as scenarios and messages have it; group, label: as the page has it
+    spec: unit and range as shown, `scale` times SI
+    low, high: ends of the slider, as shown; None where the number has no sensible ones
+    """
+
+    path: str
+    place: int | None
+    name: str
+    group: str
+    label: str
+    spec: Spec
+    scale: float
+    low: float | None
+    high: float | None
+
+    @property
+    def key(self) -> str:
+        """Its own path."""
+        return self.path if self.place is None else f"{self.path}.{self.place}"
+
+    def read(self, given: Any) -> float:
+        """Return what was typed or dragged, in SI. Raises ScenarioError that names the field, value, range and unit."""
+        if isinstance(given, str):
+            try:
+                given = float(given.strip())
+            except ValueError:
+                raise wrong(self.name, given.strip(), f"a number in {self.spec.interval()}") from None
+        return inside(given, self.spec, self.name) / self.scale
+
+    def text(self, value: float) -> str:
+        """Return a value [SI] as it is shown."""
+        return f"{value * self.scale:.6g}"
+
+    def place_of(self, value: float) -> float:
+        """Return where on the slider, of `STEPS`, a value [SI] is, at an end for what is beyond."""
+        if self.low is None or self.high is None or not math.isfinite(value):
+            return 0.0
+        low, high, at = self._line(self.low), self._line(self.high), value * self.scale
+        if self._logarithmic and at * self.low <= 0:
+            return 0.0 if self.low > 0 else float(STEPS)
+        return float(np.clip(STEPS * (self._line(at) - low) / (high - low), 0, STEPS))
+
+    def value_at(self, place: float) -> float:
+        """Return the value [SI] at a place of the slider."""
+        assert self.low is not None
+        assert self.high is not None
+        part = place / STEPS
+        if part in (0.0, 1.0):
+            return (self.high if part else self.low) / self.scale
+        on = self._line(self.low) * (1 - part) + self._line(self.high) * part
+        shown = math.copysign(math.exp(abs(on) if self.low > 0 else -on), self.low) if self._logarithmic else on
+        return float(f"{shown:.5g}") / self.scale  # what is shown is what is run
+
+    @property
+    def _logarithmic(self) -> bool:
+        low, high = self.low, self.high
+        if low is None or high is None or low * high <= 0:
+            return False
+        return max(abs(low), abs(high)) >= DECADE * min(abs(low), abs(high))
+
+    def _line(self, shown: float) -> float:
+        """Where a number lies on the line on which the slider is even."""
+        return math.copysign(math.log(abs(shown)), shown) if self._logarithmic else shown
+
+
+def knobs(chosen: Scenario) -> dict[str, Knob]:
+    """Return every number of a scenario's loop by its path."""
+    found = (knob for path, spec, value in parameters(chosen.loop) for knob in _of(chosen, path, spec, value))
+    return {knob.key: knob for knob in found}
+
+
+def unit_words(unit: str) -> str:
+    """Return a unit as the page shows it; nothing for plain numbers."""
+    return "" if unit == "1" else unit.replace("^2", "²")
+
+
+def first(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
+    """Return the numbers that are shown at once: mass, speed, friction, what the scenario tunes, filters, gains; then
+    what it varies."""
+    tune, over = chosen.tune, [*chosen.design.over, *chosen.tune.over, *chosen.sweep.over]
+    paths = [*filter(None, (mass(chosen),)), "initial.speed", FACTOR, *tune.free]
+    paths += [knob.path for knob in known.values() if knob.path.rpartition(".")[2] in FILTERS]
+    if not any(path.startswith("controller.") for path in tune.free):
+        tails = {knob.path: knob.path.rpartition(".")[2] for knob in known.values()}
+        paths += [path for path, tail in tails.items() if path.startswith("controller.") and tail not in LIMITS]
+    paths += [*over, *(knob.path for knob in known.values() if knob.group == "initial")]
+    keys = [knob.key for path in dict.fromkeys(paths) for knob in known.values() if knob.path == path]
+    usable = [key for key in keys if known[key].low is not None]
+    groups = list(dict.fromkeys(known[key].group for key in usable))
+    return sorted(usable[:MOST_FIRST], key=lambda key: groups.index(known[key].group))
+
+
+def mass(chosen: Scenario) -> str | None:
+    """Return the path of the mass that differs from one vehicle or rider to the next: one that the scenario varies,
+    else the plant's first, else its first moment of inertia; None where there is neither."""
+    over = {*chosen.design.over, *chosen.tune.over, *chosen.sweep.over}
+    for unit in ("kg", "kg m^2"):
+        there = [path for path, spec, value in parameters(chosen.loop) if spec.unit == unit and not np.ndim(value)]
+        if there:
+            return next((path for path in there if path in over), there[0])
+    return None
+
+
+def _of(chosen: Scenario, path: str, spec: Spec, value: Any) -> Iterator[Knob]:
+    tail = path.rpartition(".")[2]
+    scale = KMH if spec.unit == "m/s" and tail in SPEEDS else 1.0
+    name = canonical(path) + ("_kmh" if scale != 1.0 else "")
+    group, _, label = canonical(path).partition(".")
+    label = label.removeprefix(f"{group}.").replace("_", " ")
+    label = "friction factor" if path == FACTOR else label
+    values = np.asarray(value, float)
+    for place in np.ndindex(values.shape):
+        at = place[0] if place else None
+        suffix = "" if at is None else f".{at}"
+        own = _in(spec, scale, at)
+        low, high = _ends(own, float(values[place]) * scale, _given(chosen, path, at, scale))
+        words = label if at is None else f"{label} {at + 1}"
+        yield Knob(path, at, name + suffix, group, words, own, scale, low, high)
+
+
+def _in(spec: Spec, scale: float, place: int | None) -> Spec:
+    units = spec.unit.split(", ")
+    unit = units[place] if place is not None and len(units) > place else units[0] if len(units) > 1 else spec.unit
+    unit = "km/h" if scale != 1.0 else unit
+    return dataclasses.replace(spec, unit=unit, low=spec.low * scale, high=spec.high * scale)
+
+
+def _given(chosen: Scenario, path: str, place: int | None, scale: float) -> tuple[float, float] | None:
+    """The range in which the scenario tunes or varies a parameter, as shown."""
+    tuned, varied = chosen.tune.free.get(path), chosen.design.over.get(path)
+    values = chosen.tune.over.get(path)
+    found = tuned or varied or ((min(values), max(values)) if values else None)
+    if found is None:
+        return None
+    ends = [np.asarray(end, float) for end in found]
+    low, high = (float(end if place is None or not end.ndim else end[place]) for end in ends)
+    return low * scale, high * scale
+
+
+def _ends(spec: Spec, value: float, given: tuple[float, float] | None) -> tuple[float | None, float | None]:
+    """Ends of a slider that has the value inside, and does not leave the range."""
+    if not math.isfinite(value):
+        return None, None
+    around = sorted((value / WIDTH, value * WIDTH)) if value else [-1.0, 1.0]
+    if not value and math.isfinite(spec.low) and math.isfinite(spec.high):
+        around = [spec.low, spec.high]
+    ends = [*around] if given is None else [*given, value * NEARBY, value / NEARBY]
+    low, high = max(min(ends), spec.low), min(max(ends), spec.high)
+    span = high - low
+    low = low + 1e-3 * span if spec.open_low and low == spec.low else low
+    high = high - 1e-3 * span if spec.open_high and high == spec.high else high
+    return (low, high) if low < high else (None, None)

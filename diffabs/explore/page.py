@@ -1,0 +1,254 @@
+"""The page: sliders on the left, curves in the middle, what is known of the loop on the right. One for each tab."""
+
+import asyncio
+import pathlib
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+
+from diffabs.core.values import ScenarioError
+from diffabs.explore import charts, curves, stability
+from diffabs.explore.canvas import Canvas
+from diffabs.explore.controls import Controls
+from diffabs.explore.look import SCRIPT, STYLE
+from diffabs.explore.results import Results
+from diffabs.explore.saver import Saver
+from diffabs.explore.session import UNKNOWN, Session, Tools, Verdict, objections
+from diffabs.explore.tuner import Tuner
+from diffabs.explore.work import Latest
+from diffabs.scenario.scenario import Scenario
+
+QUICK = 0.12  # s that a result may take to be followed while one drags
+REST = 0.15  # s without a change, after which everything is worked out
+PROVING = 0.35  # and after which a proof is looked for
+
+
+class Page:
+    """What one tab shows. Everything but what is said to run in a thread runs in the server's."""
+
+    def __init__(self, session: Session, tools: Tools, folder: pathlib.Path, thread: str):
+        """Of a session; `thread` is the name of those that work."""
+        self.session, self.tools = session, tools
+        self.client, self.server = ui.context.client, asyncio.get_running_loop()
+        self.version, self.turned_at = 0, 0.0
+        self.costs: dict[str, float] = {}
+        self.shown: curves.Curves | None = None
+        self.drawer, self.thinker = (Latest(thread, self._failed) for _ in range(2))
+        self.controls = Controls(session, self._turned, self._replaced)
+        self.results = Results()
+        self.saver = Saver(session, folder)
+        self.tuner = Tuner(self, thread)
+        self.body: Any = None
+        self.client.on_delete(self.end)
+
+    def build(self) -> None:
+        """Put everything on the page, and begin to compute."""
+        with ui.element("div").classes("explorer") as self.body:
+            self._head()
+            with ui.element("main").classes("columns"):
+                with ui.element("section").classes("left"):
+                    self.controls.build()
+                with ui.element("section").classes("middle"):
+                    self.title = ui.label().classes("title").props("data-id=title")
+                    self.place = ui.element("div").classes("curves").props("data-id=curves")
+                    self.end_line = ui.label().classes("foot").props("data-id=end")
+                with ui.element("section").classes("right"):
+                    self.tuner.build()
+                    self.results.build()
+        self.begin()
+
+    def begin(self) -> None:
+        """Show a scenario from its beginning."""
+        self.shown = None
+        self.title.set_text(self.session.given.title or self.session.given.name)
+        self.end_line.set_text("compiling …")
+        self.place.clear()
+        self.chart: Canvas | None = None
+        self.results.begin(self.session.given)
+        self.tuner.begin()
+        self.redraw()
+
+    def redraw(self, edit: int = 0) -> None:
+        """Compute anew, from the values as they are now; `edit` is the browser's number of what was changed."""
+        self.version += 1
+        self.turned_at = time.monotonic()
+        now = self.session.scenario()
+        self.results.wait()
+        self.drawer.ask(partial(self._draw, now, self.version, edit))
+        self.thinker.ask(partial(self._think, now, self.version))
+
+    def later(self, show: Callable[..., None], *given: Any) -> None:
+        """Show a result, from a thread."""
+
+        def do() -> None:
+            if not self.client.is_deleted:
+                with self.client:
+                    show(*given)
+
+        self.server.call_soon_threadsafe(do)
+
+    def pin(self, found: curves.Curves | None) -> None:
+        """Keep a run as what there was before, or none."""
+        if self.chart is not None:
+            change = charts.curves(found, "before") if found else charts.nothing("before")
+            self.chart.change(change)
+
+    def refused(self, error: Exception | None) -> None:
+        """Say why something cannot be, or that all is well."""
+        self.controls.refused("" if error is None else " ".join(str(error).split()))
+
+    def end(self) -> None:
+        """The tab is gone."""
+        self.drawer.end()
+        self.thinker.end()
+        self.tuner.end()
+
+    # In the server's thread.
+    def _head(self) -> None:
+        with ui.element("header"):
+            ui.label("diffabs").classes("brand")
+            ui.label("explore").classes("brand thin")
+            ui.element("div").classes("grow")
+            ui.html("", sanitize=False).classes("latency").props("data-id=latency")
+            ui.button("pin", on_click=lambda: self.pin(self.shown)).props("flat dense no-caps data-id=pin").tooltip(
+                "keep this run as a dashed curve to compare with"
+            )
+            ui.button("unpin", on_click=lambda: self.pin(None)).props("flat dense no-caps")
+            ui.button("reset", on_click=self._reset).props("flat dense no-caps data-id=reset").tooltip(
+                "all numbers as in the scenario"
+            )
+            ui.button("tune from here", on_click=lambda: self.tuner.ask()).props(
+                "unelevated dense no-caps data-id=tune color=primary"
+            )
+            ui.button("save", on_click=lambda: self.saver.ask()).props(
+                "outline dense no-caps data-id=save color=primary"
+            )
+
+    def _turned(self, key: str, given: Any, edit: int) -> None:
+        """A number was dragged or typed."""
+        try:
+            self.session.turn(key, given)
+        except ScenarioError as error:
+            self.refused(error)
+            self.controls.wrong(key)
+            return
+        self.refused(None)
+        self.controls.show(key)
+        self.redraw(edit)
+
+    async def _replaced(self, change: Callable[[], None]) -> None:
+        """Another scenario, another part, or another fan, with numbers of their own."""
+        try:
+            await asyncio.to_thread(change)
+        except ScenarioError as error:
+            self.refused(error)
+            self.controls.rebuild()
+            return
+        with self.client:
+            self.refused(None)
+            self.controls.rebuild()
+            self.begin()
+
+    def _reset(self) -> None:
+        self.session.reset()
+        self.refused(None)
+        self.controls.show_all()
+        self.redraw()
+
+    def _show_curves(self, found: curves.Curves, version: int, edit: int) -> None:
+        if self.chart is None:
+            with self.place:
+                self.chart = Canvas(charts.frame(found), "fill")
+        else:
+            self.chart.change(charts.curves(found), edit)
+        self.shown = found
+        self.end_line.set_text(f"{self.session.given.name} {found.end}")
+        if not found.draft:
+            self.results.metrics(found.metrics, fresh=version == self.version)
+
+    def _show_fan(self, found: curves.Fan | None) -> None:
+        if self.chart is not None:
+            self.chart.change(charts.fan(found))
+        self.controls.fan(found)
+
+    def _show_stability(self, found: stability.Stability | str, version: int) -> None:
+        self.results.stability(found, fresh=version == self.version)
+
+    def _show_verdict(self, found: Verdict, version: int) -> None:
+        if version == self.version:
+            self.results.verdict(found)
+
+    # In threads.
+    def _failed(self, error: Exception) -> None:
+        self.later(self.refused, error)
+
+    def _draw(self, now: Scenario, version: int, edit: int) -> None:
+        found = curves.curves(now, curves.draft_solver(now))
+        self.later(self._show_curves, found, version, edit)
+
+    def _think(self, now: Scenario, version: int) -> None:
+        """Everything but the curve: what is quick while one drags, the rest when one has stopped."""
+        steps: dict[str, Callable[[Scenario, int], None]] = {"poles": self._poles, "fan": self._fan}
+        done = [name for name in steps if self.costs.get(name, 1e9) < QUICK and self._timed(name, steps, now, version)]
+        if not self._rested(REST, version):
+            return
+        if curves.draft_solver(now):
+            self.later(self._show_curves, curves.curves(now), version, 0)
+        for name in steps:
+            if name not in done and version == self.version:
+                self._timed(name, steps, now, version)
+        if self._rested(PROVING, version):
+            self.later(self._show_verdict, self._proved(now), version)
+        objections(now)  # compiled now, while nobody waits
+
+    def _timed(self, name: str, steps: dict[str, Any], now: Scenario, version: int) -> bool:
+        begun = time.monotonic()
+        steps[name](now, version)
+        self.costs[name] = time.monotonic() - begun
+        return True
+
+    def _rested(self, seconds: float, version: int) -> bool:
+        """Wait until nothing was changed for so long; whether nothing was."""
+        while version == self.version and (left := self.turned_at + seconds - time.monotonic()) > 0:
+            time.sleep(min(left, 0.02))
+        return version == self.version
+
+    def _poles(self, now: Scenario, version: int) -> None:
+        try:
+            found: Any = stability.stability(now)
+        except ValueError as error:
+            found = " ".join(str(error).split())
+        self.later(self._show_stability, found, version)
+
+    def _fan(self, now: Scenario, version: int) -> None:
+        del version
+        self.later(self._show_fan, curves.fan(now, self.session.spread))
+
+    def _proved(self, now: Scenario) -> Verdict:
+        try:
+            return self.tools.prove(now)
+        except (ValueError, ArithmeticError) as error:
+            return Verdict(UNKNOWN, " ".join(str(error).split()))
+
+
+async def show(source: str, tools: Tools, folder: pathlib.Path, thread: str) -> None:
+    """Fill the page of a tab that was just opened."""
+    ui.add_css(STYLE)
+    ui.add_head_html(f"<script>{SCRIPT}</script>")
+    ui.colors(primary=charts.BLUE)
+    client = ui.context.client
+    waiting = ui.label("checking the scenario …").classes("waiting")
+    await client.connected()
+    try:
+        session = await asyncio.to_thread(Session, source)
+    except ScenarioError as error:  # of a file that has changed since the command began
+        waiting.set_text(str(error))
+        return
+    if client.is_deleted:
+        return
+    with client:
+        waiting.delete()
+        Page(session, tools, folder, thread).build()

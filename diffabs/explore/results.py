@@ -1,0 +1,131 @@
+"""The right column: the verdict, the map of poles, margins, and what was measured on the run."""
+
+import math
+from typing import Any
+
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+
+from diffabs.explore import charts
+from diffabs.explore.canvas import Canvas
+from diffabs.explore.knobs import unit_words
+from diffabs.explore.session import CERTIFIED, REFUTED, UNDECIDED, Verdict
+from diffabs.explore.stability import Stability, said
+from diffabs.scenario.registry import unit_of
+from diffabs.scenario.scenario import Scenario
+
+HEADS = {
+    CERTIFIED: "certified",
+    REFUTED: "no common Lyapunov matrix",
+    UNDECIDED: "undecided",
+}
+MARGINS = {
+    "gain_up": "gain may rise to",
+    "gain_down": "gain may fall to",
+    "phase": "phase margin",
+    "delay": "delay margin",
+    "modulus": "modulus margin 1/Ms",
+}
+
+
+NOTHING = "-"
+ROUNDING = 1e-12
+
+
+def measured(value: float) -> str:
+    """Return a metric as it is shown, without digits that are rounding errors."""
+    return NOTHING if math.isnan(value) else "0" if abs(value) < ROUNDING else f"{value:.5g}"
+
+
+class Results:
+    """What is known of the loop as it is now; what is being computed is pale, and says so."""
+
+    def build(self) -> None:
+        """Put it into the column that is open."""
+        self._verdict_card()
+        self._pole_card()
+        with ui.element("div").classes("card-title"):
+            ui.label("measured on the run")
+            self.measuring = ui.label("computing …").classes("busy")
+        self.numbers = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
+        self.numbers.props("data-id=metrics")
+
+    def begin(self, chosen: Scenario) -> None:
+        """Another scenario."""
+        self.units = {name: unit_of(one, chosen.loop.plant) for name, one in chosen.objectives.items()}
+        self.verdict_box.classes(replace="verdict stale")
+        for line in (self.word, self.why, self.none, self.loop):
+            line.set_text("")
+        self.numbers.clear()
+        self.cells: dict[str, Any] = {}
+        with self.numbers:
+            for name, unit in self.units.items():
+                ui.label(name.replace("_", " "))
+                self.cells[name] = ui.label("").classes("number").props(f"data-metric={name}")
+                ui.label(unit_words(unit)).classes("note")
+
+    def wait(self) -> None:
+        """Everything is out of date."""
+        for busy in (self.proving, self.solving, self.measuring):
+            busy.set_visibility(True)
+        self.verdict_box.classes(add="stale")
+
+    def metrics(self, found: dict[str, float], *, fresh: bool) -> None:
+        """Show what was measured."""
+        self.measuring.set_visibility(not fresh)
+        for name, value in found.items():
+            self.cells[name].set_text(measured(value))
+
+    def stability(self, found: Stability | str, *, fresh: bool) -> None:
+        """Show poles and margins, or why there are none."""
+        self.solving.set_visibility(not fresh)
+        one = None if isinstance(found, str) else found
+        self.map.change(charts.poles(one))
+        self.map.element.set_visibility(one is not None)
+        self.none.set_text(found if isinstance(found, str) else self._of_poles(found))
+        for name, (here, worst) in self.margin_cells.items():
+            here.set_text(said(name, one.margins[name]) if one else NOTHING)
+            worst.set_text(said(name, one.worst[name]) if one and name in one.worst else NOTHING)
+        self.loop.set_text("" if one is None else "stable" if one.stable else "NOT STABLE")
+
+    def verdict(self, found: Verdict) -> None:
+        """Show what can be proved."""
+        self.proving.set_visibility(False)
+        self.verdict_box.classes(replace=f"verdict {found.word}")
+        self.word.set_text(HEADS.get(found.word, "no verdict"))
+        self.why.set_text(found.sentence)
+
+    def _verdict_card(self) -> None:
+        with ui.element("div").classes("card-title"):
+            ui.label("certificate over the ranges of [design]")
+            self.proving = ui.label("computing …").classes("busy").props("data-id=proving")
+        with ui.element("div").classes("verdict stale").props("data-id=verdict") as self.verdict_box:
+            self.word = ui.label("").style("font-weight:600; font-size:13.5px").props("data-id=word")
+            self.why = ui.label("").classes("why")
+
+    def _pole_card(self) -> None:
+        with ui.element("div").classes("card-title"):
+            ui.label("poles of the linearised loop")
+            self.loop = ui.label("").classes("note").props("data-id=stable")
+            self.solving = ui.label("computing …").classes("busy")
+        self.map = Canvas(charts.pole_frame(), "poles", "poles")
+        self.none = ui.label("").classes("note").props("data-id=about-poles")
+        table = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
+        self.margin_cells: dict[str, tuple[Any, Any]] = {}
+        with table.props("data-id=margins"):
+            for words in ("margins", "here", "worst"):
+                ui.label(words).classes("head" if words == "margins" else "head number")
+            for name, words in MARGINS.items():
+                ui.label(words)
+                cells = [
+                    ui.label(NOTHING).classes("number").props(f"data-margin={name}{end}") for end in ("", "-worst")
+                ]
+                self.margin_cells[name] = (cells[0], cells[1])
+
+    @staticmethod
+    def _of_poles(found: Stability) -> str:
+        """What the map and the worst margins are about."""
+        kind = f"sampled every {1e3 * found.period:g} ms, shown as ln(z)/T" if found.period else "continuous time"
+        late = f", {1e3 * found.delay:g} ms of delay" if found.delay else ""
+        lost = f", {found.unstable} NOT stable" if found.unstable else ""
+        corners = f"; grey and worst: {found.systems} corners of [design.over]{lost}" if found.systems else ""
+        return f"{kind}{late}{corners}"

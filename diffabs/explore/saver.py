@@ -1,0 +1,51 @@
+"""The dialog that saves."""
+
+import pathlib
+import shlex
+from typing import Any
+
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+
+from diffabs.core.values import ScenarioError
+from diffabs.explore import saving
+from diffabs.explore.session import Session
+
+
+class Saver:
+    """Asks for a name, and writes the scenario as it is shown into the folder of the command."""
+
+    def __init__(self, session: Session, folder: pathlib.Path):
+        """Nothing is on the page yet."""
+        self.session, self.folder = session, folder
+
+    def ask(self) -> None:
+        """Open the dialog."""
+        name = saving.free_name(self.folder, f"{self.session.given.name}-explored")
+        with ui.dialog() as dialog, ui.card().style("min-width: 440px").props("data-id=saving"):
+            ui.label("Save the scenario with these numbers").style("font-weight:600; font-size:15px")
+            ui.label(f"in {self.folder}").classes("note")
+            self.name = ui.input("file", value=name).classes("w-full").props("dense outlined data-id=file")
+            self.replacing = ui.checkbox("replace a file of this name").props("dense data-id=replace")
+            self.told = ui.label("").classes("refused").props("data-id=save-refused")
+            self.told.set_visibility(False)
+            with ui.row().classes("w-full justify-end"):
+                ui.button("cancel", on_click=dialog.close).props("flat no-caps")
+                ui.button("save", on_click=lambda: self._save(dialog)).props("unelevated no-caps data-id=write")
+        dialog.open()
+
+    def _save(self, dialog: Any) -> None:
+        try:
+            chosen = self.session.to_save()
+            path = saving.save(chosen, self.folder, str(self.name.value), replacing=bool(self.replacing.value))
+        except ScenarioError as error:
+            self.told.set_text(str(error))
+            self.told.set_visibility(True)
+            return
+        dialog.close()
+        ui.notify(
+            f"written: {path}; run it with: diffabs simulate {shlex.quote(path.name)}",
+            type="positive",
+            position="bottom",
+            timeout=12_000,
+            close_button=True,
+        )

@@ -1,0 +1,80 @@
+"""The server of the page, on this machine only."""
+
+import pathlib
+import socket
+import sys
+import threading
+import webbrowser
+from collections.abc import Callable
+from typing import Any
+
+import uvicorn  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+from fastapi import FastAPI  # pyright: ignore[reportMissingImports]
+from nicegui import ui  # pyright: ignore[reportMissingImports]
+
+from diffabs.explore import page
+from diffabs.explore.guard import LOOPBACK, Guard
+from diffabs.explore.session import Tools
+
+PATIENCE = 1  # s that open pages may take to say good-bye
+WORKER = "diffabs worker"
+SWITCH = 5e-4  # s that a thread that thinks keeps one that draws from Python; 5e-3 by default, many times for a curve
+
+
+def listening(port: int) -> socket.socket:
+    """Return a socket that listens on loopback at a port, or at any free one for 0. Raises OSError if it is taken."""
+    there = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        there.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        there.bind((LOOPBACK, port))
+        there.listen(64)
+    except OSError:
+        there.close()
+        raise
+    return there
+
+
+def serve(
+    source: str,
+    tools: Tools,
+    folder: pathlib.Path,
+    there: socket.socket,
+    *,
+    thread: str = WORKER,
+    ready: Callable[[str], None] = lambda url: None,
+    browser: bool = False,
+) -> None:
+    """Show a scenario to whoever opens the page, a session for each tab, until the process is asked to end.
+
+    folder: into which is saved; thread: the name of threads that work
+    there: a socket that listens; ready: told the address when the server answers; browser: whether to open the page
+
+    Raises OSError if the server does not start."""
+    port = there.getsockname()[1]
+    url = f"http://{LOOPBACK}:{port}/"
+    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+
+    @ui.page("/", title="diffabs explore", favicon="📈")
+    async def opened() -> None:
+        await page.show(source, tools, folder, thread)
+
+    ui.run_with(app, show_welcome_message=False, gzip_middleware_factory=None, reconnect_timeout=5.0, tailwind=True)
+    guarded: Any = Guard(app, port)
+    config = uvicorn.Config(
+        guarded, log_level="error", access_log=False, timeout_graceful_shutdown=PATIENCE, lifespan="on", ws="auto"
+    )
+    server = uvicorn.Server(config)
+    sys.setswitchinterval(SWITCH)
+
+    def announced() -> None:
+        while not server.started and not server.should_exit:
+            threading.Event().wait(0.02)
+        if server.started:
+            ready(url)
+            if browser:
+                webbrowser.open(url)
+
+    threading.Thread(target=announced, daemon=True).start()
+    server.run(sockets=[there])
+    if not server.started:
+        raise OSError(f"no page can be served at {url}")

@@ -1,0 +1,202 @@
+"""The dialog and the card of a tuning: what is free, how far it is, before and after."""
+
+from typing import TYPE_CHECKING, Any
+
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+
+from diffabs.core.values import ScenarioError
+from diffabs.explore import curves, tuning
+from diffabs.explore.canvas import Canvas
+from diffabs.explore.results import measured
+from diffabs.explore.work import Latest
+from diffabs.scenario.scenario import Scenario
+
+if TYPE_CHECKING:
+    from diffabs.explore.page import Page
+
+WIDE = 20  # losses that differ by so much are drawn in decades
+LOSS = {
+    "animation": False,
+    "grid": {"left": 52, "right": 8, "top": 8, "bottom": 18},
+    "xAxis": {"type": "value", "minInterval": 1, "axisLabel": {"fontSize": 9}},
+    "yAxis": {"type": "value", "scale": True, "axisLabel": {"fontSize": 9}, "splitNumber": 2},
+    "series": [{"id": "loss", "type": "line", "showSymbol": False, "data": [], "lineStyle": {"width": 1.6}}],
+}
+
+
+class Tuner:
+    """One tuning at a time, in a thread of its own; what is turned meanwhile gives way to what was found."""
+
+    def __init__(self, page: "Page", thread: str):
+        """Nothing is on the page yet."""
+        self.page = page
+        self.worker = Latest(thread, self._failed)
+        self.stopping, self.running = False, False
+        self.origin: Scenario | None = None
+
+    def build(self) -> None:
+        """Put the place of its card into the column that is open."""
+        self.card = ui.element("div").classes("tuning").props("data-id=tuning")
+        self.card.set_visibility(False)
+
+    def begin(self) -> None:
+        """Another scenario: nothing of the last one is kept."""
+        self.stopping = True
+        self.origin = None
+        self.card.set_visibility(False)
+
+    def end(self) -> None:
+        """The tab is gone."""
+        self.stopping = True
+        self.worker.end()
+
+    def ask(self) -> None:
+        """Open the dialog."""
+        if self.running:
+            ui.notify("a tuning is under way", type="warning")
+            return
+        now = self.page.session.scenario()
+        paths, metric = tuning.usual(now)
+        with ui.dialog() as dialog, ui.card().style("min-width: 460px").props("data-id=ask-tuning"):
+            ui.label("Tune from here").style("font-weight:600; font-size:15px")
+            free = ui.select(tuning.free(now), value=paths, label="free parameters", multiple=True).props(
+                "dense outlined"
+            )
+            free.classes("w-full").props("use-chips data-id=free")
+            small = ui.select(list(now.objectives), value=metric, label="make small").props("dense outlined")
+            small.classes("w-full").props("data-id=metric")
+            ui.label(self._about(now)).classes("note")
+            with ui.row().classes("w-full justify-end"):
+                ui.button("cancel", on_click=dialog.close).props("flat no-caps")
+
+                def start() -> None:
+                    dialog.close()
+                    self._start(list(free.value or ()), str(small.value))
+
+                ui.button("start", on_click=start).props("unelevated no-caps data-id=start")
+        dialog.open()
+
+    @staticmethod
+    def _about(now: Scenario) -> str:
+        task = now.tune
+        lanes = " by ".join(f"{len(values)} of {path}" for path, values in task.over.items()) or "the run shown"
+        asked = [f"{name} ≤ {bound:g}" for name, bound in task.limits.items()]
+        asked += [f"certified decay ≥ {task.decay:g} 1/s"] if task.decay else []
+        asked += [f"damping ≥ {task.damping:g}"] if task.damping else []
+        return f"over {lanes}{'; such that ' + ', '.join(asked) if asked else ''}; at most {task.iterations} iterations"
+
+    def _start(self, paths: list[str], metric: str) -> None:
+        session = self.page.session
+        try:
+            chosen = tuning.goal(session.scenario(), paths, metric, session.knobs)
+        except ScenarioError as error:
+            self.page.refused(error)
+            return
+        self.page.refused(None)
+        self.stopping, self.running, self.origin = False, True, session.scenario()
+        self.points: list[tuple[int, float]] = []
+        self.card.clear()
+        with self.card:
+            with ui.element("div").classes("card-title"):
+                ui.label("tuning")
+                self.far = ui.label("compiling …").classes("busy").props("data-id=far")
+            self.bar = ui.linear_progress(0, show_value=False).props("rounded size=6px")
+            self.loss = Canvas(LOSS, "loss")
+            ui.button("stop with the best so far", on_click=self._stop).props("flat dense no-caps size=sm data-id=stop")
+        self.card.set_visibility(True)
+        self.worker.ask(lambda: self._tune(chosen))
+
+    def _stop(self) -> None:
+        self.stopping = True
+
+    # In its thread.
+    def _tune(self, chosen: Scenario) -> None:
+        posed = self.page.tools.pose(chosen)
+        before = curves.curves(chosen)
+        found = tuning.tuned(chosen, posed, lambda i, loss: self.page.later(self._told, i, loss), lambda: self.stopping)
+        after = curves.curves(found.after)
+        self.page.later(self._found, chosen, found, before, after)
+
+    def _failed(self, error: Exception) -> None:
+        self.page.later(self._gave_up, error)
+
+    # In the server's thread.
+    def _told(self, iteration: int, loss: float) -> None:
+        if self.origin is None:
+            return
+        self.points.append((iteration, float(f"{loss:.6g}")))
+        most = self.origin.tune.iterations
+        self.far.set_text(f"iteration {iteration} of at most {most}, loss {loss:.5g}")
+        self.bar.set_value(min(1.0, len(self.points) / most))
+        data = [(i, point) for i, (_, point) in enumerate(self.points)]
+        losses = [loss for _, loss in data]
+        wide = min(losses) > 0 and max(losses) > WIDE * min(losses)
+        axis = {"type": "log" if wide else "value"}
+        self.loss.change({"yAxis": [axis], "series": [{"id": "loss", "data": data}]})
+
+    def _gave_up(self, error: Exception) -> None:
+        self.running = False
+        self.card.set_visibility(False)
+        self.page.refused(error)
+
+    def _found(self, chosen: Scenario, found: tuning.Found, before: curves.Curves, after: curves.Curves) -> None:
+        self.running = False
+        if self.origin is None:
+            return
+        session = self.page.session
+        self._table(chosen, found, before, after)
+        session.adopt(found.after.loop)
+        self.page.controls.show_all()
+        self.page.pin(before)
+        self.page.redraw()
+
+    def _table(self, chosen: Scenario, found: tuning.Found, before: curves.Curves, after: curves.Curves) -> None:
+        """Before and after: what was free, and what is measured on the run shown."""
+        knobs = self.page.session.knobs
+        self.card.clear()
+        with self.card:
+            with ui.element("div").classes("card-title"):
+                ui.label("tuned").props("data-id=tuned")
+                ui.label(found.reason + ("" if found.met else "; NOT every constraint is met")).classes("note")
+            place = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
+            with place.props("data-id=before-after"):
+                for words in ("", "before", "after"):
+                    ui.label(words).classes("head number")
+                old, new = (dict(self._values(one, knobs)) for one in (chosen, found.after))
+                moved = {key: (old[key], new[key]) for key in old if knobs[key].path in chosen.tune.free}
+                for key, pair in moved.items():
+                    self._line(knobs[key].label, *(knobs[key].text(value) for value in pair))
+                for name in chosen.objectives:
+                    pair = (one.metrics[name] for one in (before, after))
+                    self._line(name.replace("_", " "), *map(measured, pair))
+            with ui.row().classes("gap-2"):
+                ui.button("keep", on_click=self._keep).props("flat dense no-caps size=sm data-id=keep")
+                ui.button("go back", on_click=self._go_back).props("flat dense no-caps size=sm data-id=go-back")
+
+    @staticmethod
+    def _line(words: str, before: str, after: str) -> None:
+        ui.label(words)
+        ui.label(before).classes("number")
+        ui.label(after).classes("number")
+
+    @staticmethod
+    def _values(one: Scenario, knobs: Any) -> Any:
+        import numpy as np
+
+        from diffabs.core.pytree import get
+
+        for key, knob in knobs.items():
+            value = np.asarray(get(one.loop, knob.path), float)
+            yield key, float(value if knob.place is None else value[knob.place])
+
+    def _keep(self) -> None:
+        self.card.set_visibility(False)
+
+    def _go_back(self) -> None:
+        """The numbers before the tuning."""
+        if self.origin is not None:
+            self.page.session.adopt(self.origin.loop)
+            self.page.controls.show_all()
+            self.page.redraw()
+        self.card.set_visibility(False)
+        self.page.pin(None)

@@ -1,0 +1,76 @@
+"""A paper's reproduction as a section."""
+
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+from diffabs.papers import MODULES, compact
+from diffabs.report.documents import Document
+from diffabs.report.page import VERDICTS, Figure, Section, Table, Verdict, command, image, model_tables, origin
+from diffabs.scenario.model import model
+from diffabs.scenario.scenario import load
+
+COLUMNS = {"name": "what", "quantity": "quantity", "unit": "unit", "ours": "ours", "published": "published",
+           "reference": "independent", "difference": "difference"}  # fmt: skip
+
+
+def paper(document: Document) -> Section:
+    """Return the section of a paper."""
+    content = document.content
+    name = content["paper"]
+    if name not in MODULES:
+        raise KeyError(f"paper {name}")
+    found = compact(content)
+    return Section(
+        title=content["title"],
+        question="Are the numbers, figures and claims of this paper true? Its experiments are computed anew, and"
+        " compared with what it prints and with independent solutions.",
+        answer=list(found.agreement),
+        verdicts=[Verdict(*verdict) for verdict in found.verdicts],
+        model=model_tables(model(load(name, integrated=False))),
+        model_note=f"The packaged scenario {name}; the first column of the tables says what a row changes.",
+        figures=figures(content["figures"], document.folder),
+        tables=[Table("In short", found.headings, found.lines), *_tables(content)],
+        certificate=_certificates(content.get("design")),
+        certificate_tables=_designs(content.get("design")),
+        notes=list(content["notes"]),
+        provenance=origin(content, **{f"solver, {name}": value for name, value in content["solver"].items()}),
+        again=command(content, f"diffabs reproduce {name}"),
+    )
+
+
+def figures(names: Any, folder: pathlib.Path) -> list[Figure]:
+    """Return those pictures of a folder that are there; names that lead out of it are none."""
+    found = [image(folder / name) for name in names if pathlib.PurePath(name).name == name]
+    return [figure for figure in found if figure]
+
+
+def _tables(content: Mapping[str, Any]) -> list[Table]:
+    titles = {"rows": "Every number", "judged": "What the paper prints of its machine"}
+    return [
+        Table(title, tuple(COLUMNS.values()), [[row.get(key) for key in COLUMNS] for row in content[part]])
+        for part, title in titles.items()
+        if content.get(part)
+    ]
+
+
+def _certificates(design: Mapping[str, Any] | None) -> list[Verdict]:
+    designs = (design or {}).get("designs") or []
+    return [
+        Verdict(VERDICTS[one["certificate"]["quadratically_stable"]],
+                f"u = K x with K = {one['gain']} is quadratically stable over the vertices"
+                f"{', verified in exact arithmetic' if one['certificate']['verified_exactly'] else ''}")
+        for one in designs
+        if one.get("certificate")
+    ]  # fmt: skip
+
+
+def _designs(design: Mapping[str, Any] | None) -> list[Table]:
+    designs = (design or {}).get("designs") or []
+    rows = [
+        [one["Q"], one["R"], one["gain"], one["certificate"]["decay_rate"], one["certificate"]["guaranteed_cost"]]
+        for one in designs
+        if one.get("certificate")
+    ]
+    headings = ("Q", "R", "gain", "decay rate [1/s]", "guaranteed cost")
+    return [Table("Designs", headings, rows)] if rows else []

@@ -1,0 +1,115 @@
+"""Designs, certificates and what they prove, as sections."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from diffabs.design.verify import verify
+from diffabs.report.documents import Document
+from diffabs.report.page import UNKNOWN, VERDICTS, Section, Table, Verdict, command, listed, model_tables, origin, unit
+
+NUMBERS = {
+    "decay_rate": "1/s",
+    "damping": "1",
+    "trace_cost": "1",
+    "guaranteed_cost": "1",
+    "lower_bound": "1",
+    "gap": "1",
+}
+
+
+def design(document: Document) -> Section:
+    """Return the section of a design, or of a gain that was looked at."""
+    content = document.content
+    units = content.get("units") or {}
+    ranges = listed(
+        f"{path} {low:.6g} to {high:.6g}{_unit(units.get(path))}" for path, (low, high) in content["over"].items()
+    )
+    designed = content["lower_bound"] is not None
+    question = "Which state feedback u = K x has the least guaranteed cost, and what is proved of it" if designed else \
+        "What is proved of the state feedback u = K x"  # fmt: skip
+    return Section(
+        title=f"{'Design for' if designed else 'Certificate of a gain of'} {content['scenario']}",
+        question=f"{question}, over {ranges}?",
+        answer=[content["reason"]] if content["reason"] else [],
+        model=model_tables(content.get("model")),
+        model_note="" if content.get("model") else UNKNOWN,
+        tables=[Table("Gain", ("state", "gain"), [*zip(content["states"], content["gain"] or (), strict=False)])],
+        certificate=verdicts(content),
+        certificate_tables=tables(content, content),
+        notes=_notes(content),
+        provenance=origin(content),
+        again=[*command(content), *(f"diffabs verify {path}" for path in content["files"].values())],
+    )  # fmt: skip
+
+
+def verdicts(proof: Mapping[str, Any]) -> list[Verdict]:
+    """Return what is proved, disproved or left open, in words; that there is no certificate, and why, else."""
+    if proof.get("gain") is None:
+        return [Verdict("no certificate", proof.get("reason") or "none was asked for")]
+    exactly = ", verified in exact arithmetic" if proof["verified_exactly"] else ""
+    stable = proof["quadratically_stable"]
+    found = [Verdict(VERDICTS[stable], f"one Lyapunov matrix for all {proof['vertices']} vertices, however fast the"
+                     f" parameters vary{exactly}")]  # fmt: skip
+    found += [Verdict("proved" if one["proved"] else "not proved", f"{one['kind']}{_value(one['kind'], proof)}")
+              for one in proof["claims"] or []]  # fmt: skip
+    if proof.get("reason"):
+        found.append(Verdict("note", proof["reason"]))
+    return found
+
+
+def _value(kind: str, proof: Mapping[str, Any]) -> str:
+    key = {"decay": "decay_rate", "cost": "guaranteed_cost"}.get(kind, kind)
+    value = proof.get(key)
+    return "" if value is None else f": {value:.8g}{_unit(NUMBERS.get(key))}"
+
+
+def _unit(text: str | None) -> str:
+    return "" if text in (None, "", "1") else f" {text}"
+
+
+def tables(proof: Mapping[str, Any], content: Mapping[str, Any]) -> list[Table]:
+    """Return the numbers of a certificate, and its vertices with their poles."""
+    if proof.get("gain") is None:
+        return []
+    units = proof.get("units") or content.get("units") or {}
+    numbers = [[name.replace("_", " "), proof[name], of] for name, of in NUMBERS.items() if proof.get(name) is not None]
+    poles = proof["poles"] or []
+    corners = proof["corners"] or [{} for _ in poles]
+    names = list(corners[0]) if corners else []
+    pole = "slowest pole, real part [1/s]" if proof["period"] is None else "largest |pole| [1]"
+    rows = [
+        [i, *(corner.get(name) for name in names), one]
+        for i, (corner, one) in enumerate(zip(corners, poles, strict=False))
+    ]
+    heads = [f"{name} [{unit(units[name])}]" if name in units else name for name in names]
+    return [Table("What is proved, in numbers", ("quantity", "value", "unit"), numbers),
+            Table(f"{proof['vertices']} vertices", ("vertex", *heads, pole), rows)]  # fmt: skip
+
+
+def _notes(content: Mapping[str, Any]) -> list[str]:
+    notes = [f"Neglected: {line}" for line in content["neglected"]]
+    if not content["exact"]:
+        notes.append("The linear model is not the loop's own linearisation; a proof is about the model.")
+    return notes
+
+
+def certificate(document: Document) -> Section:
+    """Return the section of a saved certificate, which is proved again now."""
+    content = document.content
+    proved = verify(document.path)
+    system = content["system"]
+    corners = system.get("corners") or []
+    names = list(corners[0]) if corners else []
+    states = system.get("states") or []
+    return Section(
+        title=f"Certificate {document.path.name}",
+        question="Does the saved certificate prove what it claims? It is proved again, in fractions, by code that"
+        " shares nothing with what made it.",
+        answer=[f"{sum(not one.reason for one in proved)} of {len(proved)} claims are proved."],
+        model=[Table("Vertices", ("vertex", *names), [[i, *row.values()] for i, row in enumerate(corners)], "in SI")],
+        tables=[Table("Gain", tuple(states), content["gain"])],
+        certificate=[Verdict("not proved" if one.reason else "proved",
+                             f"{one.kind}: {one.says}{one.reason and f' ({one.reason})'}") for one in proved],
+        provenance=origin(content),
+        again=[f"diffabs verify {document.path}"],
+    )  # fmt: skip

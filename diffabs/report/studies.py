@@ -1,0 +1,189 @@
+"""Sweeps and rare events as sections."""
+
+import json
+import pathlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from diffabs.core import files
+from diffabs.report.documents import LARGEST, MANIFEST, Document
+from diffabs.report.page import (
+    UNKNOWN,
+    Figure,
+    Section,
+    Table,
+    Verdict,
+    command,
+    image,
+    listed,
+    model_tables,
+    origin,
+    said,
+    unit,
+)
+from diffabs.scenario.model import model
+from diffabs.scenario.scenario import ScenarioError, loads
+
+FIGURES, UNDRAWN = "figures", "None were drawn: diffabs sweep ... --figures draws them."
+CAPTIONS = {
+    "distributions": "How the metrics are distributed, with medians, quantiles and bounds",
+    "exceedance": "How often a value is exceeded",
+    "failure_map": "Where it fails: what matters most, across and up",
+    "sensitivity": "What moves what, with intervals",
+    "worst": "The worst runs among all",
+}
+WORST = 3  # samples of a metric
+INTERVAL = ("value", "low", "high")
+
+
+def sweep(document: Document) -> Section:
+    """Return the section of a sweep."""
+    content, manifest = document.content, _manifest(document.folder)
+    study, source, units = manifest["study"], manifest["source"], manifest.get("units") or {}
+    found, note = _scenario_model(source, document.folder)
+    varied = list(next(iter(content["sensitivity"].values()), {})) or list(units)
+    percent = f"{100 * content['confidence']:g} %"
+    return Section(
+        title=f"Sweep of {source.get('name') or document.folder.name}",
+        question=f"How do {listed(content['metrics'])} spread while {listed(varied)} vary, and how probable is a"
+        " failure?",
+        answer=[_failing(content, percent)],
+        model=[*model_tables(found), _space(study["space"], units)],
+        model_note=note,
+        figures=_figures(document.folder),
+        figures_note="" if (document.folder / FIGURES).is_dir() else UNDRAWN,
+        tables=list(_tables(content, units, percent)),
+        notes=list(_notes(content)),
+        provenance=origin(
+            {"versions": manifest.get("versions"), "made": {**content.get("made", {}), **_commit(manifest)}},
+            seed=study["seed"], samples=study["samples"], numbers=study["dtype"],
+            engine=said(study.get("engine") or {}) or "xla", digest=content["digest"],
+        ),
+        again=[*command(content), *_sample(content, document.folder)],
+    )  # fmt: skip
+
+
+def _manifest(folder: pathlib.Path) -> dict[str, Any]:
+    return json.loads(files.content(folder / MANIFEST, LARGEST))
+
+
+def _commit(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    commit = manifest.get("commit")
+    return dict(commit) if isinstance(commit, dict) else {"commit": commit} if commit else {}
+
+
+def _scenario_model(source: Mapping[str, Any], folder: pathlib.Path) -> tuple[dict[str, Any] | None, str]:
+    """The model in a manifest, or why there is none."""
+    if "scenario" not in source:
+        return None, "Swept from Python, not from a scenario: the model is in the script that did it."
+    try:
+        return model(loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)), ""
+    except ScenarioError as error:
+        return None, f"The scenario in the manifest cannot be read here: {error}"
+
+
+def _space(space: Mapping[str, Any], units: Mapping[str, str]) -> Table:
+    """What varies, and how."""
+    variables = space["variables"]
+    keys = list(dict.fromkeys(key for one in variables.values() for key in one if key != "type"))
+    rows = [
+        [path, one["type"], *(one.get(key) for key in keys), unit(units.get(path))] for path, one in variables.items()
+    ]
+    design = ", ".join(map(str, space["design"].values()))
+    return Table("What varies", ("parameter", "distribution", *keys, "unit"), rows, f"sampling: {design}")
+
+
+def _failing(content: Mapping[str, Any], percent: str) -> str:
+    one = content["failures"].get("any")
+    lost = content["diverged"]["count"]
+    line = f"{content['samples']:,} runs; {lost:,} diverged, {content['refused']['count']:,} were refused."
+    if one and one["value"] is not None:
+        line += f" {one['count']:,} failed: a probability of {one['value']:.4g} ({percent} interval {one['low']:.4g} to"
+        line += f" {one['high']:.4g})."
+    return line
+
+
+def _figures(folder: pathlib.Path) -> list[Figure]:
+    return [
+        figure for path in sorted((folder / FIGURES).glob("*")) if (figure := image(path, CAPTIONS.get(path.stem, "")))
+    ]
+
+
+def _tables(content: Mapping[str, Any], units: Mapping[str, str], percent: str) -> Iterator[Table]:
+    bounds = (f"low ({percent})", f"high ({percent})")
+    failures = [[name, row["count"], *(row[key] for key in INTERVAL)] for name, row in content["failures"].items()]
+    yield Table("Failures", ("failure", "runs", "probability", *bounds), failures, f"intervals: {content['intervals']}")
+    rows = [
+        [name, unit(units.get(name)), kind, *(estimate[key] for key in INTERVAL)]
+        for name, row in content["metrics"].items()
+        for kind, estimate in (row or {}).items()
+        if isinstance(estimate, dict)
+    ]
+    yield Table("Statistics of the runs that did not diverge", ("metric", "unit", "", "value", *bounds), rows)
+    moved = [
+        [name, path, kind, *(estimate[key] for key in INTERVAL)]
+        for name, row in content["sensitivity"].items()
+        for path, kinds in row.items()
+        for kind, estimate in list(kinds.items())[-1:]
+        if estimate["value"] is not None
+    ]
+    if moved:
+        yield Table("What moves what", ("metric", "parameter", "measure", "value", *bounds), moved)
+    worst = [
+        [name, unit(units.get(name)), row["value"], row["sample"]]
+        for name, rows in content["worst"].items()
+        for row in rows[:WORST]
+    ]
+    yield Table("The greatest values", ("metric", "unit", "value", "sample"), worst)
+    if (accuracy := content.get("accuracy")) and accuracy.get("metrics"):
+        rows = [[name, row["median"], row["largest"], row["sample"]] for name, row in accuracy["metrics"].items()]
+        title = f"What a half step changes, relative, in {len(accuracy['samples'])} runs drawn from all"
+        yield Table(title, ("metric", "median", "largest", "in sample"), rows)
+
+
+def _notes(content: Mapping[str, Any]) -> Iterator[str]:
+    for reason, count in (content["refused"].get("reasons") or {}).items():
+        yield f"{count} samples were refused, and are in no number here: {reason}"
+    if content["diverged"]["count"]:
+        yield f"Diverged samples: {listed(content['diverged']['samples'][:20])}."
+
+
+def _sample(content: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
+    worst = next((rows[0]["sample"] for rows in content["worst"].values() if rows), None)
+    return [] if worst is None else [f"diffabs simulate --from-sweep {folder} --sample {worst}"]
+
+
+def rare(document: Document) -> Section:
+    """Return the section of a small probability."""
+    content = document.content
+    low, high = content["interval"]
+    failure = f"{content['metric']} >= {content['bound']:g} {content['unit']}"
+    levels = [
+        [i, row["threshold"], row["share"], row["cov"], row["acceptance"], row["diverged"]]
+        for i, row in enumerate(content["levels"], 1)
+    ]
+    estimates = [
+        [name, row["probability"], *row["interval"], row["cov"]]
+        for name in ("subset simulation", "importance sampling")
+        if (row := content[name])
+    ]
+    failing = [[path, *column] for path, column in content["failures"].items()]
+    most = max((len(row) for row in failing), default=1) - 1
+    return Section(
+        title=f"A rare failure of {content['scenario']}",
+        question=f"How probable is {failure}, while what [sweep.over] names varies?",
+        answer=[f"{content['probability']:.3g}, 95 % interval {low:.3g} to {high:.3g}."],
+        verdicts=[Verdict("ended", content["reason"])],
+        model=model_tables(content.get("model")),
+        model_note="" if content.get("model") else UNKNOWN,
+        tables=[
+            Table("Estimates", ("by", "probability", "low (95 %)", "high (95 %)", "coefficient of variation"),
+                  estimates),
+            Table("Levels", ("level", f"at least [{content['unit']}]", "share", "coefficient of variation",
+                             "accepted", "diverged"), levels),
+            Table("The likeliest failures", ("parameter", *map(str, range(1, most + 1))), failing, "in SI"),
+        ],
+        notes=[content["note"]] if content["note"] else [],
+        provenance=origin(content, seed=content["seed"], runs=content["runs"], engine=said(content["engine"])),
+        again=command(content),
+    )  # fmt: skip
