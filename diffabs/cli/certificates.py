@@ -18,11 +18,12 @@ from diffabs.controllers import ProportionalFeedback, Sampled
 from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Plant
-from diffabs.core.pytree import replace
+from diffabs.core.pytree import parameters, replace
 from diffabs.core.values import ScenarioError, shown
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import SlipModel
 from diffabs.plants import BrakeStart
+from diffabs.scenario.model import model
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -180,6 +181,8 @@ def document(
     coverage = task.polytope.coverage
     return {
         "scenario": task.chosen.name,
+        "model": model(task.chosen),
+        "made": console.made(),
         "gain": np.ravel(proof.gain).tolist() if proof else None,  # one input: the row is the gain
         "states": list(task.model.states),
         **{name: summary.get(name) for name in FROM_PROOF},
@@ -189,6 +192,7 @@ def document(
         "besides": known.document() if known else None,
         "period": task.polytope.period,
         "over": {path: list(ends) for path, ends in task.over.items()},
+        "units": {path: spec.unit for path, spec, _ in parameters(task.model) if path in task.over},
         "vertices": task.polytope.vertices,
         "corners": [dict(corner) for corner in task.polytope.corners],
         "poles": list(proof.frozen) if proof else None,

@@ -12,6 +12,8 @@ import warnings
 
 import jax
 
+from diffabs.core import files
+
 OFF = "DIFFABS_NO_CACHE"
 WORTH = 0.05  # s of compiling, from which a program is kept
 ROOM = 256 * 2**20  # bytes on disk; beyond, the oldest half goes
@@ -29,7 +31,7 @@ def keep() -> pathlib.Path | None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
             return None
-        _make_room(folder)
+        files.make_room(folder, "*", ROOM)
     except (OSError, RuntimeError):  # RuntimeError: no home
         return None
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache", UserWarning)
@@ -56,12 +58,3 @@ def _processor() -> str:
         lines = pathlib.Path("/proc/cpuinfo").read_text(errors="replace").partition("\n\n")[0].splitlines()
         known += "".join(sorted(line for line in lines if line.startswith(("model name", "flags", "Features", "CPU"))))
     return hashlib.sha256(known.encode()).hexdigest()[:12]
-
-
-def _make_room(folder: pathlib.Path) -> None:
-    """Remove the oldest half where there is more than `ROOM`."""
-    files = [(entry.stat().st_mtime, entry.stat().st_size, entry.path) for entry in os.scandir(folder)]
-    if sum(size for _, size, _ in files) > ROOM:
-        for _, _, path in sorted(files)[: (len(files) + 1) // 2]:
-            with contextlib.suppress(OSError):  # another process was quicker
-                os.unlink(path)

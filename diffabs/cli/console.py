@@ -9,6 +9,7 @@ import shlex
 import sys
 import textwrap
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, NoReturn, TypeVar
 
@@ -16,7 +17,7 @@ import typer
 from rich.console import Console
 
 from diffabs.cli import progress
-from diffabs.core import files, interrupt
+from diffabs.core import files, interrupt, provenance, stopwatch
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, load, names
 
@@ -28,7 +29,13 @@ AWAKE = 0.1  # s between looks for Ctrl-C
 LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
 CONTINUED = " \\"  # a line of a shell that goes on in the next
 WORKER = "diffabs worker"
-EXTRAS = {"sweep": ("filelock", "pyarrow", "scipy", "zarr"), "cluster": ("distributed",), "tune": ("optax", "scipy")}
+EXTRAS = {
+    "sweep": ("filelock", "pyarrow", "scipy", "zarr"),
+    "cluster": ("distributed",),
+    "tune": ("optax", "scipy"),
+    "report": ("jinja2",),
+    "explore": ("nicegui",),
+}
 PICTURES = (".png", ".pdf", ".svg")
 
 
@@ -48,12 +55,27 @@ Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout,
 
 
 _quiet = False
+_given: tuple[str, ...] = ()  # the words after `diffabs`
+_begun = time.monotonic()
 
 
 def quieten(wanted: bool) -> None:
     """Say no more than errors, warnings, and what was interrupted; or everything."""
     global _quiet
     _quiet = wanted
+
+
+def begin(words: Sequence[str]) -> None:
+    """Note the words of the command that begins."""
+    global _given, _begun
+    _given, _begun = tuple(words), time.monotonic()
+    stopwatch.listen()
+
+
+def made() -> dict[str, str | float]:
+    """Return when, where and by which command a document is made, and how long that took so far [s]."""
+    seconds, compiling = time.monotonic() - _begun, stopwatch.compiled(_begun)
+    return {**provenance.made(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
 
 
 def say(line: str) -> None:
@@ -170,9 +192,11 @@ def waited(
     told = contextlib.nullcontext(lambda: None) if _quiet else progress.shown(message, detail, say, (PATIENCE, AGAIN))
     with told as tell:
         thread.start()
-        while thread.is_alive():
+        ended = False
+        while not ended:
             if _pressed_while(thread):
                 (ending or Ending("", nothing=lambda: True)).ask()
+            ended = not thread.is_alive()
             tell()
     if errors:
         raise errors[0]
@@ -235,6 +259,14 @@ def check_picture(plot: pathlib.Path | None) -> None:
         if plot.suffix.lower() not in PICTURES:
             fail(f"--plot {plot}: the name must end in {', '.join(PICTURES)}")
         need_matplotlib()
+
+
+def check_mat(mat: pathlib.Path | None) -> None:
+    """Raises typer.Exit for a name that MATLAB would not load, or without SciPy."""
+    if mat and mat.suffix != ".mat":
+        fail(f"--mat {mat}: the name must end in .mat")
+    if mat and importlib.util.find_spec("scipy") is None:
+        fail('MAT files need scipy: pip install "diffabs[tune]"')
 
 
 def check_scenario_file(out: pathlib.Path | None) -> None:

@@ -27,7 +27,7 @@ def design(
     """Find the state feedback with the least guaranteed cost over the ranges of [design], and prove it."""
     with console.guarded(), certificates.reported():
         with console.new_file(out, "--out") as file:
-            task = console.waited(lambda: _task(scenario, changes or (), weighed=True), "computing the polytope")
+            task = _task(scenario, changes or (), weighed=True)
             from diffabs.design import synthesis
 
             try:
@@ -56,7 +56,7 @@ def certify(
     """Prove, or disprove, that a gain is stable over the ranges of [design], however fast the parameters vary."""
     with console.guarded(), certificates.reported():
         with console.new_file(out, "--out") as file:
-            task = console.waited(lambda: _task(scenario, changes or (), gain), "computing the polytope")
+            task = _task(scenario, changes or (), gain)
             found = console.waited(lambda: certificates.certified(task), f"certifying {task.chosen.name}")
             if file:
                 found.save(file)
@@ -95,7 +95,8 @@ def verify(
 def _task(
     scenario: str, changes: Sequence[str], gain: str | None = None, *, weighed: bool = False
 ) -> certificates.Task:
-    return certificates.task(console.loaded(scenario, changes, integrated=False), gain, weighed=weighed)
+    chosen = console.loaded(scenario, changes, integrated=False)
+    return console.waited(lambda: certificates.task(chosen, gain, weighed=weighed), "computing the polytope")
 
 
 def _show(result: dict[str, Any], task: certificates.Task, as_json: bool) -> None:

@@ -7,7 +7,7 @@ import typer
 
 from diffabs.cli import console
 from diffabs.core.values import unknown
-from diffabs.simulate.native import ENGINES
+from diffabs.simulate.engine import ENGINES
 
 Engine = Annotated[str, typer.Option(help="xla, kernel (a program of this machine, by its C++ compiler), or auto.")]
 

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from diffabs.cli import certificates, console, show
+from diffabs.cli import certificates, console, progress, show
 from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
 from diffabs.core.values import ScenarioError, shown, unknown
 from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import Readings, read
+from diffabs.scenario.model import model
 from diffabs.scenario.parameter_paths import flat
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.solution import Solver
@@ -137,13 +138,13 @@ def _watched(
     far: list[str] = []
 
     def told(evaluations: int, cost: float) -> None:
-        far.append(f"{evaluations} evaluations, cost {cost:.6g}")
+        far.append(f"{evaluations} evaluation{'s' if evaluations != 1 else ''}, cost {cost:.6g}")
 
     ending = console.Ending("the evaluation in hand", nothing=lambda: not far)
     found, noise = console.waited(
         lambda: _identified(chosen, readings, ranges, given, told, ending),
         f"identifying {chosen.name}",
-        lambda: far[-1] if far else "compiling",
+        lambda: far[-1] if far else progress.COMPILING,
         ending,
     )
     return found, noise, ending.asked
@@ -206,6 +207,8 @@ def _result(
     known = found.uncertainty
     return {
         "scenario": chosen.name,
+        "model": model(chosen),
+        "made": console.made(),
         "data": {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])},
         "values": _values(chosen, ranges, found),
         "correlations": [

@@ -5,12 +5,12 @@ Results go to stdout, as tables or with --json as one JSON document; everything 
 import contextlib
 import dataclasses
 import importlib
+import itertools
 import math
 import pathlib
 from typing import Annotated, Any, NoReturn
 
 import jax
-import numpy as np
 import typer
 
 from diffabs import __version__
@@ -20,10 +20,12 @@ from diffabs.cli import (
     compiled,
     console,
     design,
+    explore,
     export,
     identify,
     margins,
     rare,
+    report,
     reproduce,
     show,
     sweep,
@@ -33,9 +35,9 @@ from diffabs.cli import (
 from diffabs.cli.checking import checked, said
 from diffabs.core import interrupt, provenance
 from diffabs.core.pytree import parameters
-from diffabs.core.units import units_of
-from diffabs.scenario import registry
+from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
+from diffabs.simulate.matlab import write_mat
 from diffabs.simulate.run import measure, rollout
 from diffabs.simulate.solution import Run, described
 
@@ -93,6 +95,7 @@ def simulate(
     changes: console.Changes = None,
     as_json: console.Json = False,
     csv: Annotated[pathlib.Path | None, typer.Option(help="Write the trajectory to this file.")] = None,
+    mat: Annotated[pathlib.Path | None, typer.Option(help="Write trajectory, units and metrics for MATLAB.")] = None,
     plot: Annotated[pathlib.Path | None, typer.Option(help="Draw the run to this file (.png, .pdf, .svg).")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of noisy sensors; the same as --set solver.seed=N.")] = None,
     from_sweep: Annotated[
@@ -106,19 +109,23 @@ def simulate(
     """Run a scenario once and show its metrics."""
     with console.guarded():
         _check_source(scenario, from_sweep, sample, changes, seed)
-        _check_targets(csv, plot)
-        kept = bool(csv or plot)
+        _check_targets({"csv": csv, "mat": mat, "plot": plot})
+        kept = bool(csv or mat or plot)
         with contextlib.ExitStack() as files:
             csv_file = files.enter_context(console.new_file(csv, "--csv"))
+            mat_file = files.enter_context(console.new_file(mat, "--mat"))
             picture = files.enter_context(console.new_file(plot, "--plot"))
             chosen, key = _source(scenario, from_sweep, sample, changes, seed)
             run = console.waited(lambda: _run(chosen, key, keep=kept), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
                 show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
+            if mat_file:
+                values = {path: value for path, _, value in parameters(chosen.loop)}
+                write_mat(mat_file, run, chosen.loop.plant, parameters=values, scenario=chosen.name)
             if picture:
                 console.waited(lambda: _draw(chosen, run, picture), "drawing")
             found = console.waited(lambda: checked(chosen, key), "shortening the step") if check else None
-        result = _result(chosen, run, {"csv": csv, "plot": plot}) | ({"accuracy": found} if found else {})
+        result = _result(chosen, run, {"csv": csv, "mat": mat, "plot": plot}) | ({"accuracy": found} if found else {})
         show.as_json(result) if as_json else show.run(result, chosen)
         if found and not as_json:
             show.accuracy(found)
@@ -167,10 +174,14 @@ def _check_source(scenario: Any, from_sweep: Any, sample: int | None, changes: A
         console.fail("a sample of a sweep is run as it was: no --set, no --seed")
 
 
-def _check_targets(csv: pathlib.Path | None, plot: pathlib.Path | None) -> None:
-    console.check_picture(plot)
-    if csv and plot and console.resolved(csv, "--csv") == console.resolved(plot, "--plot"):
-        console.fail(f"--csv and --plot are the same file, {csv}")
+def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
+    """Raises typer.Exit for files that cannot be written, or are one and the same."""
+    console.check_picture(wanted["plot"])
+    console.check_mat(wanted["mat"])
+    places = {name: console.resolved(path, f"--{name}") for name, path in wanted.items() if path}
+    for one, other in itertools.combinations(places, 2):
+        if places[one] == places[other]:
+            console.fail(f"--{one} and --{other} are the same file, {wanted[one]}")
 
 
 def _run(chosen: Scenario, key: Any, keep: bool) -> Run:
@@ -196,37 +207,11 @@ def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -
         "stopped": bool(run.stopped),
         "diverged": bool(run.diverged),
         "title": chosen.title,
-        "parts": _parts(chosen),
-        "parameters": _parameters(chosen),
+        "parts": model.parts(chosen),
+        "parameters": model.numbers(chosen),
         "solver": {**described(chosen.solver), "seed": chosen.seed},
         "versions": provenance.versions(),
         "files": {name: str(path) for name, path in files.items() if path},
-    }
-
-
-def _parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
-    """Every part by its path: its type, and what it has beside parameters."""
-    objectives = {f"objective.{name}": one for name, one in chosen.objectives.items()}
-    found = dict(registry.choices(chosen.loop))
-    for path, one in objectives.items():
-        found |= registry.choices(one, path)
-    return found
-
-
-def _parameters(chosen: Scenario) -> dict[str, dict[str, Any]]:
-    """Every number by its path, in SI; what JSON has no number for is a text that an override understands."""
-
-    def plain(value: Any) -> Any:
-        return value if math.isfinite(value) else str(value)
-
-    objectives = (
-        (f"objective.{name}.{path}", spec, value)
-        for name, one in chosen.objectives.items()
-        for path, spec, value in parameters(one, units=units_of(chosen.loop.plant))
-    )
-    return {
-        path: {"value": np.vectorize(plain, otypes=[object])(np.asarray(value, float)).tolist(), "unit": spec.unit}
-        for path, spec, value in (*parameters(chosen.loop), *objectives)
     }
 
 
@@ -234,6 +219,7 @@ usage.add(app, simulate, "simulate slip-lmi --set plant.mass=6.2 --plot run.png"
 usage.add(app, design.design, "design slip-lmi --set design.decay=80 --out gain.json")
 usage.add(app, design.certify, "certify slip-lmi --gain=-11753,-76.7")
 usage.add(app, design.verify, "verify gain.json")
+usage.add(app, explore.explore, "explore slip-cured --port 8342")
 usage.add(app, margins.margins, "margins slip-cured --at speed=5 --plot loop.png")
 usage.add(app, export.export, "export slip-cured --to c -o controller.c")
 usage.add(app, tune.tune, "tune slip-cured --set reference.time_constant=0.03 --out tuned.toml")
@@ -244,3 +230,4 @@ usage.add(app, compare.compare, "compare out/sweep-slip-lmi out/sweep-mine --met
 usage.add(app, catalogue.list_parts, "list roads", "list")
 usage.add(app, catalogue.show_scenario, "show slip-lmi --set plant.mass=6.2 --out mine.toml", "show")
 usage.add(app, reproduce.reproduce, "reproduce slip-estimator")
+usage.add(app, report.report, "report out -o result.html")

@@ -93,21 +93,12 @@ def _found(
     from diffabs.linear.robustness import band
 
     loop = replace(chosen.loop, values)
-    over = {path: ends for path, ends in _ranges(chosen).items() if path not in values}
+    over = {path: ends for path, ends in chosen.design.ranges(chosen.loop).items() if path not in values}
     try:
         one = console.waited(lambda: band(loop, {}, 0, target).systems[0], f"linearising {chosen.name}")
         return one, console.waited(lambda: band(loop, over, samples, target), "over the ranges") if over else None
     except ValueError as error:
         console.fail(f"{chosen.name}: {error}", console.FAILED)
-
-
-def _ranges(chosen: Scenario) -> dict[str, tuple[float, float]]:
-    """Those of [design.over], by path of the loop; that of the speed between start and stop if none is given there."""
-    over, loop = dict(chosen.design.over), chosen.loop
-    start, end = getattr(loop.initial, "speed", None), getattr(loop.stop, "speed", None)
-    if over and hasattr(loop.plant, "frozen") and start is not None and end is not None:
-        over.setdefault("initial.speed", (float(end), float(start)))
-    return {path: ends for path, ends in over.items() if ends[0] < ends[1]}
 
 
 def _draw(chosen: Scenario, nominal: "System", found: "Band | None", picture: pathlib.Path) -> None:
@@ -150,7 +141,9 @@ def _document(
         "order": len(nominal.loop.transfer().A),
         "margins": plain(nominal),
         "units": UNITS,
-        "over": {path: list(ends) for path, ends in _ranges(chosen).items() if path not in values} if found else {},
+        "over": {path: list(ends) for path, ends in chosen.design.ranges(chosen.loop).items() if path not in values}
+        if found
+        else {},
         "systems": [{"values": one.values, **plain(one)} for one in found.systems] if found else [],
         "corners": found.corners if found else 0,
         "unstable": len(found.unstable) if found else 0,

@@ -1,4 +1,8 @@
-"""How far a command is: drawn on a terminal, a line now and then elsewhere, the same words in both."""
+"""How far a command is: drawn on a terminal, a line now and then elsewhere, the same words in both.
+
+    MESSAGE ... WHAT IS REACHED; 1 min 34 s, 12 s of it compiling, at most 40 s left
+
+What is left is worked out without the time that went into compiling: that is not needed again."""
 
 import contextlib
 import math
@@ -11,36 +15,64 @@ from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.spinner import Spinner
 
+from diffabs.core import stopwatch
+
 PATIENCE = 2.0  # s without a sign of life
 AGAIN = 5.0  # s between lines about how far work is
 FRAMES = 12.5  # per second
-INDENT = 2  # columns of the spinner
+QUIET = 1.0  # s in which nothing is said of time
+NOTED = 0.5  # s of compiling, from which it is
+COMPILING = "compiling"  # while nothing is reached
 
 
 class Far(NamedTuple):
-    """How far work is, in words; and where it is known, `done` of `total`."""
+    """How far work is, in words; and where it is known, `done` of `total`, or of as much as it can be (`at_most`)."""
 
     words: str
     done: float = 0.0
     total: float | None = None
+    at_most: bool = False
 
 
 Detail = Callable[[], Far | str]
 
 
-def left(seconds: float) -> str:
-    """A time to wait for, in words; nothing where it is not known."""
-    if not math.isfinite(seconds):
-        return ""
+def spoken(seconds: float) -> str:
+    """A length of time, in words."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    return (
-        f", {hours} h {minutes} min left"
-        if hours
-        else f", {minutes} min {rest} s left"
-        if minutes
-        else f", {rest} s left"
-    )
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+class Pace:
+    """How long work has taken, and will: since when, and since when something of it was done."""
+
+    def __init__(self) -> None:
+        """It begins now."""
+        self.begun = time.monotonic()
+        self.first: tuple[float, float] | None = None  # when anything was known, and how much was done then
+
+    def said(self, far: Far) -> str:
+        """In words, to be put behind those of `far`; nothing at first."""
+        now = time.monotonic()
+        rest = self.left(far, now)
+        if now - self.begun < QUIET:
+            return ""
+        parts = [spoken(now - self.begun)]
+        if (compiling := stopwatch.compiled(self.begun)) >= NOTED:
+            parts[0] += f", {spoken(compiling)} of it compiling"
+        if rest is not None:
+            parts.append(f"{'at most ' if far.at_most else ''}{spoken(rest)} left")
+        return f"{'; ' if far.words else ' '}{', '.join(parts)}"
+
+    def left(self, far: Far, now: float) -> float | None:
+        """How long [s] the rest takes at the pace so far, compiling left out; None where that is not known yet."""
+        if far.total is None:
+            return None
+        self.first = self.first or (now, far.done)
+        start, before = self.first
+        spent = now - start - stopwatch.compiled(start)
+        return None if far.done <= before or spent <= 0 else spent * (far.total - far.done) / (far.done - before)
 
 
 def drawable(console: Console) -> bool:
@@ -52,21 +84,21 @@ class _Picture:
     """A spinner with the words, and a bar below where the total is known."""
 
     def __init__(self, message: str, detail: Detail | None):
-        self.message, self.detail, self.spinner = message, detail, Spinner("dots")
+        self.message, self.detail, self.spinner, self.pace = message, detail, Spinner("dots"), Pace()
 
-    def far(self) -> Far:
-        """The words with the message."""
+    def far(self) -> tuple[Far, str]:
+        """How far it is; and that with the message, without times."""
         far = self.detail() if self.detail else ""
         far = Far(far) if isinstance(far, str) else far
-        return far._replace(words=f"{self.message} ... {far.words}".strip())
+        return far, f"{self.message} ... {far.words}".strip()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The spinner must be one object, or it would not turn."""
-        words, done, total = self.far()
-        self.spinner.update(text=words)
+        far, words = self.far()
+        self.spinner.update(text=words + self.pace.said(far))
         yield self.spinner
-        if total:
-            yield ProgressBar(total=total, completed=done, width=min(60, options.max_width))
+        if far.total and not far.at_most:
+            yield ProgressBar(total=far.total, completed=far.done, width=min(60, options.max_width))
 
 
 @contextlib.contextmanager
@@ -86,8 +118,9 @@ def shown(
     def line() -> None:
         nonlocal due, told
         if time.monotonic() > due:
-            if told != (told := picture.far().words):
-                tell(told)
+            far, words = picture.far()
+            if told != (told := words):
+                tell(told + picture.pace.said(far))
             due = time.monotonic() + timing[1] if detail else math.inf
 
     yield line

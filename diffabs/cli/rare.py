@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from diffabs.cli import console, show, show_samples
+from diffabs.cli import console, progress, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.core import provenance
 from diffabs.core.pytree import Spec
 from diffabs.core.values import ScenarioError, number, unknown
 from diffabs.scenario import section_sweep
+from diffabs.scenario.model import model
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.toml import value
-from diffabs.simulate.native import described
+from diffabs.simulate.engine import described
 
 if TYPE_CHECKING:
     from diffabs.reliability.subset_simulation import Progress, RareEvent
@@ -81,7 +82,7 @@ def _estimated(study: "Study", metric: str, bound: float, samples: int, gradient
 
     def far() -> str:
         if not levels:
-            return "level 1"
+            return f"level 1, {progress.COMPILING}"
         return f"level {len(levels) + 1}, {levels[-1].evaluations:,} runs, {metric} up to {levels[-1].threshold:.4g}"
 
     try:
@@ -114,6 +115,8 @@ def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str,
     rows = study.space.normal(found.failing[:SHOWN]) if len(found.failing) else {}
     return {
         "scenario": chosen.name,
+        "model": model(chosen),
+        "made": console.made(),
         "metric": metric,
         "bound": bound,
         "unit": unit_of(chosen.objectives[metric], chosen.loop.plant),

@@ -1,12 +1,11 @@
 """The command `reproduce`: a paper's whole result. It draws, and needs the extra `diffabs[plot]`."""
 
 import pathlib
-import time
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from diffabs.cli import console, show
+from diffabs.cli import console, progress, report, show
 from diffabs.core import provenance, values
 
 if TYPE_CHECKING:
@@ -23,6 +22,7 @@ def reproduce(
     """A paper's whole result: figures, summary.json, and in short what agrees with it and what is refuted."""
     with console.guarded():
         console.need_matplotlib()
+        console.need_extra("report")
         from diffabs.papers import PAPERS, compact
 
         if name != "all" and name not in PAPERS:
@@ -32,27 +32,38 @@ def reproduce(
             for paper in PAPERS if name == "all" else (name,):
                 with console.new_folder(out / paper) as folder:
                     results[paper] = _reproduced(paper, PAPERS[paper], folder)
+                    report.write([folder], folder / report.NAME)
                 if not as_json:
                     show.paper(compact(results[paper]), out / paper)
+            whole = _whole(out, results) if name == "all" else None
         except KeyboardInterrupt:
             if not results:
                 raise
             console.say(f"interrupted: whole are {', '.join(str(out / paper) for paper in results)}")
             raise typer.Exit(console.INTERRUPTED) from None
+        if whole:
+            console.say(f"report of all: {whole}")
         if as_json:
             show.as_json({"out": str(out), "papers": results, "versions": provenance.versions()})
 
 
+def _whole(out: pathlib.Path, results: dict[str, Any]) -> pathlib.Path:
+    """The report of several papers in one file."""
+    path = out / report.NAME
+    report.check(path)
+    report.write([out / paper for paper in results], path, f"{len(results)} papers, reproduced")
+    return path
+
+
 def _reproduced(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> dict[str, Any]:
     """The summary of a paper. Its steps are told beside the spinner, or in a line each where there is none."""
-    spins, steps, begun = console.animated(), ["starting"], time.monotonic()
+    spins, steps = console.animated(), [progress.COMPILING]
 
     def step(sentence: str) -> None:
         steps.append(sentence.removeprefix(f"{name}: "))
         if not spins:
             console.say(sentence)
 
-    def detail() -> str:
-        return f"{time.monotonic() - begun:.0f} s: {steps[-1]}"
-
-    return console.waited(lambda: reproduction(folder, step), f"reproducing {name}", detail if spins else None)
+    return console.waited(
+        lambda: reproduction(folder, step), f"reproducing {name}", (lambda: steps[-1]) if spins else None
+    )

@@ -90,7 +90,7 @@ def family(name: str, members: dict[str, Any]) -> None:
 def paper(digest: Digest, folder: pathlib.Path) -> None:
     """The compact result of a paper, and where everything else is."""
     _console().print(compact(digest))
-    say(f"{digest.figures} figures, every number and note (summary.json): {folder}\n")
+    say(f"{digest.figures} figures, summary.json and report.html: {folder}\n")
 
 
 def compact(digest: Digest) -> Group:

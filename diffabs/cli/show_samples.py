@@ -50,6 +50,8 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
     for name, rows in result["worst"].items():
         if rows:
             say(f"greatest {name}: {brief(rows[0]['value'])} in sample {rows[0]['sample']}")
+    if "report" in result["files"]:
+        say(f"report: {result['files']['report']}")
     say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
 
 

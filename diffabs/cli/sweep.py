@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import typer
 
-from diffabs.cli import console, progress, show, show_samples
+from diffabs.cli import console, progress, report, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.core import files
 from diffabs.core.pytree import elements
@@ -163,6 +163,7 @@ def _check_options(
         console.fail(f"--workers {workers}: the scheduler at {scheduler} has its own workers")
     if figures:
         console.need_matplotlib()
+        console.need_extra("report")
 
 
 def _check_samples(samples: int | None) -> None:
@@ -209,7 +210,7 @@ def _computer(name: str, scheduler: str | None, workers: int | None) -> Any:
 
 def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], Any]) -> "Results":
     """Raises KeyboardInterrupt, after the chunks in hand or at once."""
-    far = [progress.Far("compiling")]
+    far = [progress.Far(progress.COMPILING)]
     ending = console.Ending("the chunks in hand")
 
     def told(at: "Told") -> None:
@@ -229,10 +230,9 @@ def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: 
 def _far(at: "Told") -> progress.Far:
     """How far a sweep is."""
     if not at.here:
-        return progress.Far(f"{at.samples:,} of {at.total:,}", at.samples, at.total)
-    left = progress.left((at.total - at.samples) / at.rate)
+        return progress.Far(f"{at.samples:,} of {at.total:,}, {progress.COMPILING}", at.samples, at.total)
     bad = f"{at.failed:,} failed, {at.diverged:,} diverged" + (f", {at.refused:,} refused" if at.refused else "")
-    words = f"{at.samples:,} of {at.total:,}: {at.rate:,.0f}/s, {bad}{left}"
+    words = f"{at.samples:,} of {at.total:,}: {at.rate:,.0f}/s, {bad}"
     return progress.Far(words, at.samples, at.total)
 
 
@@ -256,7 +256,7 @@ def _result(
     from diffabs.sweep.trajectories import keep
 
     accuracy = checked(study, found, check) if check else None
-    result = {"out": str(out), **summary(found), "accuracy": accuracy, "files": {}}
+    result = {"out": str(out), **summary(found), "accuracy": accuracy, "made": console.made(), "files": {}}
     if kept:
         result["files"]["trajectories"] = str(keep(study, out, kept))
     if figures:
@@ -267,6 +267,9 @@ def _result(
         units = {path: spec.unit for path, spec in elements(study.loop).items()}
         units |= {name: unit_of(objective, study.loop.plant) for name, objective in study.objectives.items()}
         result["files"]["figures"] = [str(path) for path in draw(found, result, folder, units)]
+        result["files"]["report"] = str(out / report.NAME)
     document = json.dumps(show.finite(result), indent=1, allow_nan=False)
     files.write_durably(out / SUMMARY, document.encode())
+    if figures:
+        report.write([out], out / report.NAME)
     return result

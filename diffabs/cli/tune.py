@@ -12,12 +12,12 @@ import jax
 import numpy as np
 import typer
 
-from diffabs.cli import certificates, console, show
+from diffabs.cli import certificates, console, progress, show
 from diffabs.cli import engine as engines
 from diffabs.cli.tune_document import Proved, Work, documented
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, dump
-from diffabs.simulate.native import EngineError
+from diffabs.simulate.engine import EngineError
 from diffabs.simulate.refusals import first_line
 from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Trajectory
@@ -25,6 +25,7 @@ from diffabs.simulate.solution import Trajectory
 if TYPE_CHECKING:
     from diffabs.tune import Progress, Tuned
 
+OF_THE_COMMAND = ("scenario", "model", "made", "versions", "files")  # of a certificate: the tuning says the same
 ROUNDING = 1e-9  # relative: of a decay rate as a factor for one period, with plenty to spare
 
 
@@ -84,11 +85,11 @@ def _tuned(
 ) -> tuple[dict[str, Any], str]:
     """The JSON document and a sentence about the certificate. The files are written if all constraints are met. Ctrl-C
     leaves out what is not there yet, once there is something to show."""
-    work = console.waited(lambda: _work(chosen), "computing the lanes")
+    work = console.waited(lambda: work_of(chosen), "computing the lanes")
     found, interrupted = _watched(work, engine)
     after = chosen.with_loop(found.loop, "tuned")
     try:
-        proved = console.waited(lambda: _proved(after), "certifying the result")
+        proved = console.waited(lambda: certificate_of(after), "certifying the result")
         result = console.waited(lambda: documented(work, found, proved), "comparing with what there was before")
     except KeyboardInterrupt:
         interrupted, proved = True, _unproved("interrupted")
@@ -123,7 +124,7 @@ def _without_proof(work: Work, result: dict[str, Any]) -> dict[str, Any]:
     return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
 
 
-def _work(chosen: Scenario) -> Work:
+def work_of(chosen: Scenario) -> Work:
     """Raises ScenarioError for what does not fit together."""
     from diffabs.tune import AtMost, CertifiedDecay, Poles
 
@@ -158,6 +159,7 @@ def _watched(work: Work, engine: str) -> tuple["Tuned", bool]:
         "constraints": list(work.constraints.values()),
     }
     loop = work.chosen.loop
+    most = None if work.constraints else goal.iterations  # constraints take rounds of as many, nobody knows how many
     engine = engines.decided(engine, lambda: tune.posed(loop, **posed, engine="kernel").objection())
 
     def tuned() -> "Tuned":
@@ -165,25 +167,26 @@ def _watched(work: Work, engine: str) -> tuple["Tuned", bool]:
         return tune.tune(loop, **posed, **told_to, engine=engine)
 
     try:
-        return console.waited(tuned, f"tuning {work.chosen.name}", lambda: _said(told), ending), ending.asked
+        return console.waited(tuned, f"tuning {work.chosen.name}", lambda: _said(told, most), ending), ending.asked
     except StartError as error:
         console.fail(f"{work.chosen.name}: no start can be used: {error}", console.FAILED)
     except EngineError as error:
         console.fail(str(error))
 
 
-def _said(told: "list[Progress]") -> str:
-    """How far it is, in one line."""
+def _said(told: "list[Progress]", most: int | None = None) -> progress.Far:
+    """How far it is, in one line; of so many iterations at most, where that is known."""
     if not told:
-        return "compiling"
+        return progress.Far(progress.COMPILING)
     last, total = told[-1], len(told)
-    return (
+    words = (
         f"loss {last.point.loss:.6g}, gradient {last.point.gradient:.2g}, violation {last.point.violation:.2g},"
         f" {total} evaluations, {last.starts} under way"
     )
+    return progress.Far(words, max(one.point.iteration for one in told), most, at_most=True)
 
 
-def _proved(after: Scenario) -> Proved:
+def certificate_of(after: Scenario) -> Proved:
     """A certificate over the ranges of [design], if there can be one, of the decay that is asked for, if that can be
     proved."""
     decay = after.tune.decay
@@ -200,7 +203,7 @@ def _proved(after: Scenario) -> Proved:
     known = certificates.besides(task, found)
     reason = certificates.unproved(found, task.spec, known) or None
     document = certificates.document(task, found, reason=reason, known=known)
-    document = {key: value for key, value in document.items() if key not in ("scenario", "versions", "files")}
+    document = {key: value for key, value in document.items() if key not in OF_THE_COMMAND}
     rate = document["decay_rate"]
     over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
     said = reason or f"quadratically stable over {over}, decay rate {rate:.4g} 1/s"

@@ -27,6 +27,8 @@ class Group(typer.core.TyperGroup):
 
     def main(self, *args: Any, standalone_mode: bool = True, **more: Any) -> Any:
         """Run a command, and exit if `standalone_mode`."""
+        given = more.get("args", args[0] if args else None)
+        console.begin(sys.argv[1:] if given is None else given)
         try:
             status = super().main(*args, standalone_mode=False, **more)
         except UsageError as error:

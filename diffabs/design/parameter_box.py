@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from diffabs.core.pytree import check, parameters, replace
+from diffabs.core.pytree import parameters, replace
+from diffabs.core.validity import check
 from diffabs.design.polytopes import LARGEST, Coverage, Polytope, Schedule
 
 CHUNK = 1024  # systems computed at once

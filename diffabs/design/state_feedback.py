@@ -30,7 +30,7 @@ from diffabs.controllers import (
 )
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import check
+from diffabs.core.validity import check
 from diffabs.design.state_feedback_balance import upright
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.operating_point import OperatingPoint, loop_gain, operating_point

@@ -9,7 +9,7 @@ from diffabs.actuators import VoltageLimit
 from diffabs.controllers import BalanceFeedback, Sampled
 from diffabs.core.blocks import Direct
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import check
+from diffabs.core.validity import check
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import Continuous, Sampling
 

@@ -17,9 +17,10 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from diffabs.core.bijectors import Range, Space, space
-from diffabs.core.pytree import check, replace, strong
+from diffabs.core.pytree import replace, strong
 from diffabs.core.reason import Reason
 from diffabs.core.summary import Summary, number
+from diffabs.core.validity import check
 from diffabs.identify.residuals import Prior, Problem, Residuals, Seen, traced
 from diffabs.identify.uncertainty import Uncertainty, uncertainty
 

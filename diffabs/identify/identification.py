@@ -13,7 +13,8 @@ import jax
 
 from diffabs.core.bijectors import Range
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import check, replace, strong
+from diffabs.core.pytree import replace, strong
+from diffabs.core.validity import check
 from diffabs.identify.data import Comparison, Data
 from diffabs.identify.fit import Identified, Tolerances, fit
 from diffabs.identify.residuals import Prior

@@ -10,7 +10,8 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import check, get, parameters, replace, strong
+from diffabs.core.pytree import get, parameters, replace, strong
+from diffabs.core.validity import check
 from diffabs.identify.data import Comparison, check_positive
 from diffabs.objectives import BRAKING
 from diffabs.simulate.batch import Batch, by_structure, stacked

@@ -121,11 +121,17 @@ def stable(system: Transfer) -> bool:
 
 def unstable_poles(system: Transfer) -> int:
     """Return how many poles of the closed loop are not inside; of a system without delay."""
-    gain = 1 + system.D[0, 0]
-    if not gain:
+    if not 1 + system.D[0, 0]:
         return len(system.A) + 1
-    poles = np.linalg.eigvals(system.A - system.B @ system.C / gain)
-    return int(np.sum(poles.real >= 0 if system.period is None else np.abs(poles) >= 1))
+    poles = closed_poles(system)
+    return int(np.sum(np.real(poles) >= 0 if system.period is None else np.abs(poles) >= 1))
+
+
+def closed_poles(system: Transfer) -> np.ndarray:
+    """Return the poles (order,) of the closed loop, in z where it is sampled, else in s; a delay in continuous time,
+    which has infinitely many, is left out."""
+    system = system._replace(delay=0.0) if system.period is None else system.without_delay()
+    return np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0))
 
 
 def grid(system: Transfer) -> np.ndarray:

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from diffabs.controllers import BalanceFeedback
+from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace
 from diffabs.design.attraction import Basin, Cells, Reach, attraction, largest
@@ -253,6 +254,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
             for name, (_, reaches) in over_riders.items()
         },
         "solver": record.solver(SOLVER, counted=described(LONG)),
+        "made": provenance.made(("reproduce", "arm-balance")),
         "versions": record.origin(),
     }
     return record.write(folder, summary)

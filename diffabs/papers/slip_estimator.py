@@ -15,6 +15,7 @@ import numpy as np
 
 from diffabs import plot
 from diffabs.controllers import PID, ConstantTorque
+from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Reference
 from diffabs.objectives import BRAKING
@@ -208,6 +209,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
         "figures": names,
         "notes": [*NOTES, _step_note(results)],
         "solver": record.solver(SOLVER, speed_at_which_integration_ends=0.05),
+        "made": provenance.made(("reproduce", "slip-estimator")),
         "versions": record.origin(),
     }
     return record.write(folder, summary)

@@ -15,6 +15,7 @@ import numpy as np
 
 from diffabs import plot
 from diffabs.controllers import HoldingInput, StateFeedback
+from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_claims, lmi_design, record
@@ -228,6 +229,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
         "judged": more["judged"],
         "solver": record.solver(SOLVER),
         "convergence": {"steps": HALVINGS, "relative_error": errors},
+        "made": provenance.made(("reproduce", "slip-lmi")),
         "versions": record.origin(),
     }
     return record.write(folder, summary)

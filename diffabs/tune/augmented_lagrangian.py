@@ -15,7 +15,7 @@ import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
-from diffabs.simulate.native import described
+from diffabs.simulate.engine import described
 from diffabs.tune.descent import Descent, Lane, Optimiser, Point, lbfgs
 from diffabs.tune.problem import Multipliers, Problem, Seen
 from diffabs.tune.result import Method, Progress, Start, StartError, Tuned

@@ -25,7 +25,7 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.native import ENGINES, EngineError, tell
+from diffabs.simulate.engine import ENGINES, EngineError, tell
 from diffabs.simulate.refusals import first_line, refusals
 from diffabs.simulate.solution import Run, Solver
 from diffabs.tune.constraints import Constraint

@@ -7,11 +7,11 @@ import numpy as np
 
 from diffabs.core.bijectors import Range, space
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import check
+from diffabs.core.validity import check
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.objectives import usual
 from diffabs.simulate.batch import Batch
-from diffabs.simulate.native import EngineError
+from diffabs.simulate.engine import EngineError
 from diffabs.simulate.solution import Solver
 from diffabs.tune.augmented_lagrangian import Search
 from diffabs.tune.constraints import Constraint

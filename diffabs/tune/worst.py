@@ -20,8 +20,9 @@ from scipy.stats import qmc
 
 from diffabs.core.bijectors import Range, Space, space
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import check, replace
+from diffabs.core.pytree import replace
 from diffabs.core.reason import Reason
+from diffabs.core.validity import check
 from diffabs.objectives import usual
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.refusals import first_line
@@ -121,7 +122,7 @@ def worst_case(
     measured: objectives by metric; None is what is usual for what the plant shows
     bound: report, too, whether the metric exceeds it
     screen: points of a scrambled Sobol sequence that are run first, besides the corners (up to 64)
-    starts: how many of the worst of them are ascended from, together, for so many `iterations`
+    starts: how many of the worst of them are ascended from, together, for so many `iterations`; 0 only runs them
     seed, seed_of_noise: of the sequence, and of noisy sensors
     price: rollouts that a gradient counts as; None is 1 + 1.5 p in forward mode and 6 in reverse
     engine: what makes the runs and their derivatives, as in `run_batch`
@@ -141,7 +142,7 @@ def worst_case(
     worst = np.argsort(-np.nan_to_num(screened.metrics[metric], nan=-np.inf))[:starts]
     problem = Problem(middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), automatic(free))
     problem = problem.by(engine)
-    lanes = _ascent(problem, points[worst], iterations)
+    lanes = _ascent(problem, points[worst], iterations) if starts else []
     cost = len(points) + (price or _price(problem)) * sum(lane.evaluations for lane in lanes)
     return _found(loop, free, metric, bound, points, len(corners), screened, lanes, cost)
 
@@ -174,7 +175,8 @@ def _corners(ranges: np.ndarray) -> np.ndarray:
 def _drawn(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
     """Points spread over the box (screen, p)."""
     low, high = ranges.T
-    return low + (high - low) * qmc.Sobol(len(low), rng=np.random.default_rng(seed)).random(screen)
+    sequence = qmc.Sobol(len(low), rng=np.random.default_rng(seed))
+    return low + (high - low) * sequence.random_base2(max(screen - 1, 0).bit_length())[:screen]
 
 
 def _at(free: Space, point: Any) -> dict[str, Any]:
