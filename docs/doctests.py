@@ -1,11 +1,19 @@
-"""An extension of Griffe: an example in a docstring, `>>> ...` up to the next empty line, is code on the page."""
+"""An extension of Griffe: an example in a docstring, `>>> ...` up to the next empty line, is code on the page, and a
+part has a table of its parameters."""
 
+import importlib.util
+import pathlib
 import re
 from typing import Any
 
 import griffe
 
 EXAMPLE = re.compile(r"(?:^>>> .*\n?)(?:^.+\n?)*", re.MULTILINE)
+spec = importlib.util.spec_from_file_location("parameters", pathlib.Path(__file__).with_name("parameters.py"))
+assert spec
+assert spec.loader
+parameters = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(parameters)
 
 
 def fenced(text: str) -> str:
@@ -20,4 +28,5 @@ class Doctests(griffe.Extension):
         """Of each object, when its members are known."""
         del given
         if obj.docstring:
-            obj.docstring.value = fenced(obj.docstring.value)
+            tabled = parameters.table(obj.source) if obj.is_class else ""
+            obj.docstring.value = fenced(obj.docstring.value) + (f"\n\n{tabled}" if tabled else "")

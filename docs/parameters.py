@@ -1,0 +1,79 @@
+"""The parameters of a part, with default, unit and range, as a table for the reference. Read from the text of its
+class: nothing is imported."""
+
+import ast
+import math
+import textwrap
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import NamedTuple
+
+KNOWN = {"math": math, "np": SimpleNamespace(inf=math.inf)}  # what bounds are computed with
+LONGEST = 24  # characters of a default
+
+
+class Parameter(NamedTuple):
+    """A field that is made by `param`, as a person reads it."""
+
+    name: str
+    default: str
+    unit: str
+    interval: str
+
+
+def parameters(source: str) -> list[Parameter]:
+    """Return the parameters of the class whose text this is, in its order; none for anything else."""
+    (tree, *_) = ast.parse(textwrap.dedent(source)).body or [None]
+    return list(_found(tree)) if isinstance(tree, ast.ClassDef) else []
+
+
+def _found(tree: ast.ClassDef) -> Iterator[Parameter]:
+    for line in tree.body:
+        call = line.value if isinstance(line, ast.AnnAssign) else None
+        if isinstance(call, ast.Call) and ast.unparse(call.func) == "param":
+            said = {one.arg: one.value for one in call.keywords if one.arg}
+            yield Parameter(ast.unparse(line.target), _default(said), _unit(said), _interval(said))
+
+
+def _default(said: dict[str, ast.expr]) -> str:
+    if "default" not in said:
+        return "must be given"
+    text = ast.unparse(said["default"]).replace("np.inf", "inf").replace("math.inf", "inf")
+    return text if len(text) <= LONGEST else text[:LONGEST] + " ..."
+
+
+def _unit(said: dict[str, ast.expr]) -> str:
+    return str(ast.literal_eval(said["unit"]))
+
+
+def _interval(said: dict[str, ast.expr]) -> str:
+    """As `Spec.interval` has it, without the unit."""
+    bound = {name: _number(said[name]) for name in ("low", "high", "above", "below") if name in said}
+    low, high = bound.get("above", bound.get("low", -math.inf)), bound.get("below", bound.get("high", math.inf))
+    left = "(" if "above" in bound or low == -math.inf else "["
+    right = ")" if "below" in bound or high == math.inf else "]"
+    return f"{left}{low:g}, {high:g}{right}"
+
+
+def _number(node: ast.expr) -> float:
+    return float(eval(ast.unparse(node), {"__builtins__": {}}, KNOWN))
+
+
+def table(source: str) -> str:
+    """Return the parameters of a class as a table in Markdown, empty if it has none; and what its class attributes say
+    of units."""
+    rows = [f"| `{p.name}` | `{p.default}` | {p.unit} | {p.interval} |" for p in parameters(source)]
+    head = ["| parameter | default | unit | range |", "|---|---|---|---|"]
+    units = [f"{what}: {unit}." for what, unit in _units(source)]
+    return "\n".join(["\n".join(head + rows) if rows else "", *([""] if rows and units else []), *units]).strip()
+
+
+def _units(source: str) -> Iterator[tuple[str, str]]:
+    """The unit of an objective's value, that of a plant's control."""
+    (tree, *_) = ast.parse(textwrap.dedent(source)).body or [None]
+    named = {"unit": "Unit of the value", "control_unit": "Unit of the control"}
+    for line in tree.body if isinstance(tree, ast.ClassDef) else ():
+        if isinstance(line, ast.Assign) and isinstance(line.value, ast.Constant):
+            for name in (target.id for target in line.targets if isinstance(target, ast.Name)):
+                if name in named and line.value.value:
+                    yield named[name], str(line.value.value)
