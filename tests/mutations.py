@@ -18,6 +18,7 @@ import sys
 import tempfile
 from typing import NamedTuple
 
+from mutations_explore import EXPLORE
 from mutations_face import FACE
 from mutations_kernel import KERNEL
 from mutations_sweep import SWEEP
@@ -37,6 +38,34 @@ class Mutation(NamedTuple):
 
 
 MUTATIONS = [
+    Mutation(
+        "extremum seeking whose slope forgets the deceleration's mean",
+        "references/extremum_seeking.py",
+        "slip * deceleration - m.covariance",
+        "slip * signal.deceleration - m.covariance",
+        "test_best_slip.py::test_seeking_finds_the_slope_whatever_moves_the_slip",
+    ),
+    Mutation(
+        "extremum seeking that leaves its limits",
+        "references/extremum_seeking.py",
+        "self.gain * e * clamp(room / jnp.log1p(self.band), 0.0, 1.0)",
+        "self.gain * e",
+        "test_best_slip.py::test_seeking_climbs_at_its_gain_and_stays_within_its_limits",
+    ),
+    Mutation(
+        "extremum seeking that climbs down",
+        "references/extremum_seeking.py",
+        "return self.gain * e",
+        "return -self.gain * e",
+        "test_best_slip.py::test_seeking_ends_at_the_peak_of_a_road",
+    ),
+    Mutation(
+        "a slip by deceleration without its filter",
+        "references/by_deceleration.py",
+        "return (signal.deceleration - memory.flow) / self.time_constant",
+        "return 1e3 * (signal.deceleration - memory.flow)",
+        "test_best_slip.py::test_a_slip_by_deceleration_is_interpolated_behind_its_filter",
+    ),
     Mutation(
         "a sampled controller on the grid whose delay does nothing",
         "controllers/sampled_on_grid.py",
@@ -66,6 +95,27 @@ MUTATIONS = [
         "test_real_rig.py::test_noise_of_the_wheel_is_the_slip_s_at_any_speed",
     ),
     Mutation(
+        "a played noise that does not begin again",
+        "sensors/noise.py",
+        "played % noise.size",
+        "played",
+        "test_real_rig.py::test_a_played_noise_is_the_sequence_that_is_given",
+    ),
+    Mutation(
+        "a factor along the road by other weights",
+        "roads/along.py",
+        "4 + 3 * t * t * (t - 2)",
+        "4 + 3 * t * t * (t - 1)",
+        "test_roads.py::test_a_factor_along_the_road_is_a_b_spline",
+    ),
+    Mutation(
+        "a factor along the road whose last one does not go on",
+        "roads/along.py",
+        "c[-1] * ends",
+        "0.0 * ends",
+        "test_roads.py::test_a_factor_along_the_road_is_a_b_spline",
+    ),
+    Mutation(
         "a speed that does not drift",
         "sensors/speed.py",
         "error = self.last + (self.first - self.last) * jnp.exp(-t / self.time_constant)",
@@ -78,6 +128,27 @@ MUTATIONS = [
         "clamp(1 - slip / self.gate, 0.0, 1.0)",
         "1.0 + 0.0 * slip",
         "test_real_rig.py::test_an_estimator_is_not_led_astray_by_a_wheel_that_locks",
+    ),
+    Mutation(
+        "an estimator that never believes a wheel that seems to slip",
+        "sensors/speed_estimator.py",
+        "(slip < self.gate) | (braked >= self.rest)",
+        "(slip < 2.0)",
+        "test_real_rig.py::test_a_brake_that_was_let_go_by_mistake_bites_again",
+    ),
+    Mutation(
+        "an estimator that forgets a deceleration at once",
+        "sensors/speed_estimator.py",
+        "larger(signal.deceleration, m.braked * jnp.exp(-self.period / self.hold))",
+        "signal.deceleration",
+        "test_real_rig.py::test_a_wheel_that_does_not_push_is_believed_after_a_while",
+    ),
+    Mutation(
+        "a sliding mode that asks for twice as much",
+        "controllers/switching.py",
+        "self.gain * inside, self.torque_min",
+        "2 * self.gain * inside, self.torque_min",
+        "test_real_rig.py::test_each_committed_controller_runs_elsewhere[estimated-sliding-mode-cma-es]",
     ),
     Mutation(
         "an estimator that does not learn how much it knows",
@@ -305,7 +376,7 @@ MUTATIONS = [
     ),
     Mutation(
         "rules of a part around a part that is not sound",
-        "core/pytree.py",
+        "core/validity.py",
         "found |= bool(within)",
         "found |= False",
         "test_plants.py::test_a_lever_on_a_broken_road_is_not_asked_for",
@@ -550,7 +621,7 @@ MUTATIONS = [
     ),
     Mutation(
         "a third gain that nobody sees",
-        "core/pytree.py",
+        "core/validity.py",
         "kinds.shape(value) != spec.shape",
         "False",
         "test_kinds.py::test_wrong_shapes_are_refused_under_transformations_too",
@@ -1475,9 +1546,9 @@ MUTATIONS = [
     ),
     Mutation(
         "scheduled feedback: intervals below the speed left out",
-        "controllers/gain_schedule.py",
-        "jnp.where(v >= nodes[1:], 1.0,",
-        "jnp.where(v >= nodes[1:], 0.0,",
+        "core/numerics.py",
+        "jnp.where(x >= nodes[1:], 1.0,",
+        "jnp.where(x >= nodes[1:], 0.0,",
         "test_blocks.py::test_scheduled_feedback_interpolates_between_many_nodes",
     ),
     Mutation(
@@ -1623,6 +1694,7 @@ MUTATIONS = [
     *(Mutation(*each) for each in SWEEP),
     *(Mutation(*each) for each in KERNEL),
     *(Mutation(*each) for each in FACE),
+    *(Mutation(*each) for each in EXPLORE),
     Mutation(
         "lanes that one run would refuse are run",
         "simulate/refill.py",
@@ -1646,7 +1718,7 @@ MUTATIONS = [
     ),
     Mutation(
         "the rules between numbers are not asked",
-        "core/pytree.py",
+        "core/validity.py",
         '    yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "rules")',
         "    yield from ()",
         "test_refusals.py::TestBeforeARun::test_a_lane_is_refused_where_its_loop_alone_would_be[limits]",

@@ -36,6 +36,8 @@ ROADS: dict[str, Any] = {
         width=0.5,
     ),
     "patches, sharp": roads.Patches(width=0.0),
+    "scaled along": roads.ScaledAlong(road=roads.RIG, factors=np.array([1.0, 0.8, 1.1, 0.9, 1.2]), spacing=3.0),
+    "scaled along, once": roads.ScaledAlong(road=roads.WET_ASPHALT, factors=np.array([0.9])),
     "tabulated": roads.Tabulated(slip=np.array([0.0, 0.1, 0.3, 0.6, 1.0]), mu=np.array([0.0, 0.8, 0.6, 0.65, 0.5])),
 }
 
@@ -107,6 +109,8 @@ REFERENCES: dict[str, Any] = {
     "setpoint": references.Setpoint(value=0.3),
     "robust": references.PeakRobust(time_constant=0.002, threshold=0.01),
     "limited": references.LimitedSlip(rate=15.0, time_constant=0.003, period=2e-3),
+    "by deceleration": references.SlipByDeceleration(time_constant=0.003),
+    "extremum seeking": references.ExtremumSeeking(gain=40.0, time_constant=0.004, frequency=400.0, resolution=0.01),
 }
 
 ACTUATORS: dict[str, Any] = {
@@ -131,6 +135,7 @@ SENSORS: dict[str, Any] = {
     "speed scale": sensors.SpeedScale(factor=0.95),
     "accelerometer": sensors.IntegratedAccelerometer(bias=0.05),
     "wheel noise": sensors.WheelNoise(slip=0.01, period=2e-3),
+    "played wheel noise": sensors.PlayedWheelNoise(noise=np.array([0.01, -0.02, 0.005]), period=2e-3),
     "drifting speed": sensors.DriftingSpeed(first=0.03, last=-0.05, time_constant=0.01),
     "estimated speed": sensors.SpeedEstimator(gate=0.2, growth=0.3, period=2e-3),
     "series": blocks.Series(blocks=(sensors.Noise(deceleration=0.05), sensors.WheelSpeed())),

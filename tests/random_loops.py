@@ -353,6 +353,31 @@ def scheduled_robust(r: Draw) -> d.Loop:
     )
 
 
+def along(r: Draw, reference: Any) -> d.Loop:
+    factors = np.exp([r.within(-0.1, 0.1) for _ in range(6)])
+    return braking(
+        **r.car(roads.ScaledAlong(road=roads.MagicFormula(), factors=factors, spacing=r.near(3.0))),
+        controller=r.pid(600.0),
+        reference=reference,
+        sensor=sensors.PlayedWheelNoise(noise=[r.within(-2e-3, 2e-3) for _ in range(7)], period=5e-3),
+        actuator=actuators.Lag(time_constant=r.near(0.004)),
+    )
+
+
+def seeking(r: Draw) -> d.Loop:
+    return along(
+        r,
+        references.ExtremumSeeking(
+            slip=r.near(0.12), gain=r.near(3.0), dither=r.near(0.1), frequency=r.near(30.0), time_constant=r.near(0.1)
+        ),
+    )
+
+
+def by_deceleration(r: Draw) -> d.Loop:
+    slips = np.array([0.08, 0.1, 0.12, 0.14]) * r.near(1.0)
+    return along(r, references.SlipByDeceleration(slips=slips, time_constant=r.near(0.05)))
+
+
 def arm(r: Draw) -> d.Loop:
     return braking(
         plant=plants.ArmBalance(gear=1.1, rotor_inertia=0.3, current_max=r.near(40.0)),
@@ -417,6 +442,8 @@ STRUCTURES = {
     "rig, proportional, rate limit": Structure(rig_proportional),
     "rig, speed that drifts": Structure(rig_drifting),
     "rig, estimated speed": Structure(rig_estimated),
+    "extremum seeking": Structure(seeking),
+    "slip by deceleration": Structure(by_deceleration),
     "lab rig, relay": Structure(lab_rig),
     "lab rig, lock": Structure(lock),
     "lock and free": Structure(lock_and_free),

@@ -65,7 +65,8 @@ class Speed:
 
     def __init__(self, read: Read):
         self.read, self.kind = read, read.kinds["speed"]
-        self.v, self.variance = 0.0, None
+        self.v, self.variance, self.braked = 0.0, 0.0, 0.0
+        self.begun = False
 
     def __call__(self, t: float, v: float, w: float, deceleration: float) -> tuple[float, float]:
         """v_k and slip_k."""
@@ -75,15 +76,17 @@ class Speed:
             first, last, time = (read.sensor(kind, name) for name in ("first", "last", "time_constant"))
             v = (1 + last + (first - last) * math.exp(-t / time)) * v
             return v, (v - w) / max(v, floor)
-        noise, growth, gate, h = (read.sensor(kind, name) for name in ("noise", "growth", "gate", "period"))
-        if self.variance is None:
-            self.v = max(w, floor)
+        noise, growth, gate, rest, hold, h = (
+            read.sensor(kind, name) for name in ("noise", "growth", "gate", "rest", "hold", "period")
+        )
+        a = deceleration + read.sensor("Bias", "deceleration")
+        p, variance = max(self.v - h * a, floor), self.variance + h * growth**2
+        slip, self.braked = (p - w) / p, max(a, self.braked * math.exp(-h / hold))
+        if not self.begun or (slip >= gate and self.braked < rest):
+            self.v, self.braked, self.begun = max(w, floor), 9.81, True
             self.variance = (noise * self.v) ** 2
         else:
-            p = max(self.v - h * (deceleration + read.sensor("Bias", "deceleration")), floor)
-            variance = self.variance + h * growth**2
-            share = min(max(1 - (p - w) / p / gate, 0.0), 1.0)
-            gain = share * variance / (variance + (noise * p) ** 2)
+            gain = min(max(1 - slip / gate, 0.0), 1.0) * variance / (variance + (noise * p) ** 2)
             self.v, self.variance = max(p + gain * (w - p), floor), (1 - gain) * variance
         return self.v, (self.v - w) / self.v
 
@@ -94,23 +97,63 @@ def rounded(read: Read, w: float) -> float:
     return q * np.round(w / q) if q else w
 
 
-def control(read: Read, v: float, error: float, x: float) -> tuple[float, float]:
-    """u_k, and x_(k+1)."""
-    path, h = "controller.controller.", read("controller.sampling_period")
-    k1, k2 = read(path + "gain")
-    g = v / read(path + "reference_speed") if read.kinds["controller"] == "ProportionalFeedback" else 1.0
-    raw = read("feedforward.value") + g * (k1 * x + k2 * error)
-    u = min(max(raw, read(path + "torque_min")), read(path + "torque_max"))
-    windup = path + "antiwindup.tracking_time"
-    drain = (u - raw) / (g * k1 * read(windup)) if windup in read.values else 0.0
-    return u, x + h * (error + drain)
+class Controller:
+    """u_k, and what is remembered of it."""
+
+    def __init__(self, read: Read):
+        self.read, self.kind, self.x, self.filtered = read, read.kinds["controller"], 0.0, 0.0
+
+    def __call__(self, v: float, error: float) -> float:
+        """`error` is slip_k - target_k."""
+        if self.kind == "SlidingMode":
+            share = -error / self.of("boundary")
+            return self.within(self.read("feedforward.value") + self.of("gain") * min(max(share, -1.0), 1.0))
+        return self.pid(-error) if self.kind == "PID" else self.feedback(v, error)
+
+    def of(self, name: str) -> Any:
+        """A parameter."""
+        return self.read(f"controller.controller.{name}")
+
+    def within(self, raw: float) -> float:
+        """Within the torque's limits."""
+        return min(max(raw, self.of("torque_min")), self.of("torque_max"))
+
+    def drained(self, lost: float, gain: float) -> float:
+        """What the anti-windup adds to the integral's rate."""
+        known = "controller.controller.antiwindup.tracking_time" in self.read.values
+        return lost / (gain * self.of("antiwindup.tracking_time")) if known else 0.0
+
+    def feedback(self, v: float, error: float) -> float:
+        """With a gain that is fixed or proportional to the speed."""
+        k1, k2 = self.of("gain")
+        g = v / self.of("reference_speed") if self.kind == "ProportionalFeedback" else 1.0
+        raw = self.read("feedforward.value") + g * (k1 * self.x + k2 * error)
+        u = self.within(raw)
+        self.x += self.read("controller.sampling_period") * (error + self.drained(u - raw, g * k1))
+        return u
+
+    def pid(self, error: float) -> float:
+        """`error` is target_k - slip_k."""
+        kp, ki, kd, cutoff = (self.of(name) for name in ("kp", "ki", "kd", "cutoff"))
+        h, rate = self.read("controller.sampling_period"), cutoff * (error - self.filtered)
+        raw = self.read("feedforward.value") + kp * error + ki * self.x + kd * rate
+        u = self.within(raw)
+        self.x += h * (error + self.drained(u - raw, ki))
+        self.filtered += h * rate
+        return u
 
 
-def target(read: Read, v: float, last: float) -> float:
-    """target_k."""
+def target(read: Read, v: float, last: float, k: int) -> float:
+    """target_k; `last` is that before, of k = 0 the first slip."""
+    kind, slip = read.kinds["reference"], read("reference.slip")
+    if kind == "FixedSlip":
+        return slip
+    time = read("reference.time_constant")
+    if kind == "FilteredSlip":  # its equation by the plant's Runge-Kutta steps
+        z = -read("controller.sampling_period") / time
+        return slip - (1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24) * (slip - last) if k else last
     h = read("reference.period") * read("reference.reference_speed") / max(v, read("reference.floor"))
-    left = read("reference.slip") - last
-    return last + min(-math.expm1(-h / read("reference.time_constant")) * left, h * read("reference.rate"))
+    return last + min(-math.expm1(-h / time) * (slip - last), h * read("reference.rate"))
 
 
 def simulated(document: dict[str, Any], steps: int) -> dict[str, np.ndarray]:
@@ -123,13 +166,13 @@ def simulated(document: dict[str, Any], steps: int) -> dict[str, np.ndarray]:
     speed = Speed(read)
     _, v, w, a = seen(read, state)
     asked = Speed(read)(0.0, v, rounded(read, w), a)[1]
-    applied = x = 0.0
+    applied, controller = 0.0, Controller(read)
     found: dict[str, list[float]] = {name: [] for name in ("slip", "speed", "torque", "target")}
     for k in range(steps + 1):
         slip, v, w, a = seen(read, state)
         v_seen, slip_seen = speed(k * h, v, rounded(read, w), a)
-        asked = target(read, v_seen, asked)
-        u, x = control(read, v_seen, slip_seen - asked, x)
+        asked = target(read, v_seen, asked, k)
+        u = controller(v_seen, slip_seen - asked)
         for name, value in zip(found, (slip, v, state[2], asked), strict=True):
             found[name].append(value)
         share = min(delay / h, 1.0)

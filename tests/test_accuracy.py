@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import cases
 from oracles import brake
 
 import diffabs as d
@@ -80,6 +81,7 @@ def test_events_and_delays_are_estimated_to_their_size(make, step):
         assert float(one.error) <= 30 * error + 1e-5 * abs(float(one.value)), (name, error, one)
 
 
+@pytest.mark.slow
 def test_a_delay_keeps_its_time_at_a_shorter_step():
     """A ring of 16 steps of 1 ms holds 13.1 ms, one of 16 steps of 0.25 ms does not."""
     finer = acc.measure_finer(delayed(0.0131), d.FixedStep(1e-3, 2.0), OBJECTIVES, 4).metrics
@@ -105,7 +107,8 @@ def test_noise_with_its_own_clock_is_the_same_at_every_step():
     assert abs(other["iae"] / found.estimates["iae"].value - 1) > 1e-2  # what another realisation would do
 
 
-@pytest.mark.parametrize("period", [2.5e-4, 1.5e-3])
+@pytest.mark.slow
+@pytest.mark.parametrize("period", cases([2.5e-4, 1.5e-3], 2.5e-4))
 def test_other_noise_is_not_compared(period):
     key, solver = jax.random.key(4), d.FixedStep(1e-3, 2.0)
     found = acc.accuracy(noisy(period), solver, OBJECTIVES, key=key)
@@ -129,6 +132,7 @@ def test_what_computes_in_every_step_is_not_compared():
     assert not acc.needs_key(RIG)
 
 
+@pytest.mark.slow
 def test_lanes_are_estimated_together():
     def one(mass):
         return acc.accuracy(d.replace(RIG, {"plant.mass": mass}), d.FixedStep(4e-3, 2.0), OBJECTIVES)

@@ -48,6 +48,7 @@ def test_simulate_check_says_how_accurate_each_metric_is(file):
     assert max(map(len, shown.stdout.splitlines())) <= 100
 
 
+@pytest.mark.slow
 def test_simulate_check_gives_no_numbers_where_there_is_nothing_to_compare(file):
     result = run(
         "simulate",
@@ -67,6 +68,7 @@ def test_a_step_that_cannot_be_shortened(file):
     assert "a quarter of it takes too many steps for --check" in failed.stderr
 
 
+@pytest.mark.slow
 def test_a_sweep_says_how_accurate_it_is_without_being_asked(file, tmp_path):
     path, out = file(RELAY), tmp_path / "out"
     result = run("sweep", path, "--out", out, "--json")

@@ -38,6 +38,7 @@ def close(run, reference, tolerance, least=1e-6):
         assert np.all(off <= tolerance * np.maximum(np.abs(value), scale)), (name, run.metrics[name], value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["lab-rig", *(pytest.param(n, marks=pytest.mark.slow) for n in ("slip-estimator", "arm-hanging"))]
 )
@@ -49,6 +50,7 @@ def test_what_a_packaged_scenario_measures_is_what_fixed_steps_measure(name):
     close(run, reference, 1e-4)
 
 
+@pytest.mark.slow
 def test_every_lane_of_a_box_is_right_on_limits_that_no_part_declares():
     chosen = rig()
     mass, speed = (x.ravel() for x in np.meshgrid(np.linspace(5.3, 6.2, 6), np.linspace(8.5, 16.5, 6)))
@@ -57,6 +59,7 @@ def test_every_lane_of_a_box_is_right_on_limits_that_no_part_declares():
     close(run, d.run_batch(chosen.loop, lanes, d.FixedStep(1e-4, 2.5), MEASURED), 1e-4)
 
 
+@pytest.mark.slow
 def test_a_smaller_error_of_a_step_makes_a_smaller_error_of_the_run():
     chosen = rig()
     exact = d.measure(chosen.loop, d.FixedStep(1e-5, 2.5), {"iae": IAE()}).metrics["iae"]
@@ -80,6 +83,7 @@ def test_random_loops_of_any_parts_are_right_to_1e_4(name):
     close(run, d.measure(refined(loop, FINE), fixed, measured, key=key), 1e-4, 1e-3)
 
 
+@pytest.mark.slow
 def test_a_computer_strikes_on_its_own_clock_and_not_on_the_grid():
     chosen = load("slip-cured", ["sensor=noise", "sensor.slip=0.002"])
     key = jax.random.key(4)
@@ -91,6 +95,7 @@ def test_a_computer_strikes_on_its_own_clock_and_not_on_the_grid():
     close(fine, d.measure(chosen.loop, d.FixedStep(1e-4, 3.0), chosen.objectives, key=key), 1e-4, 1e-3)
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_kept_on_the_grid_and_changes_nothing():
     chosen = rig()
     solver = d.Adaptive(1e-6, 2.5, 1e-3, every=7)
@@ -106,6 +111,7 @@ def test_a_trajectory_is_kept_on_the_grid_and_changes_nothing():
     np.testing.assert_array_equal(seen.trajectory.running, reference.trajectory.running)
 
 
+@pytest.mark.slow
 def test_neither_the_order_of_lanes_nor_their_company_changes_a_number():
     """As many lanes each time, and as above, so that one program runs them. Those without a speed, or that begin beyond
     their stop, have diverged."""
@@ -136,6 +142,7 @@ def test_a_computer_in_single_precision_keeps_its_time():
     close(run, exact, 2e-4)
 
 
+@pytest.mark.slow
 def test_single_precision_asks_for_no_smaller_error_than_it_has():
     chosen = rig()
     exact = d.measure(chosen.loop, d.Adaptive(1e-9, 2.5), {"iae": IAE()})
@@ -168,6 +175,7 @@ def test_derivatives_on_limits_agree_with_differences_of_three_widths():
         np.testing.assert_allclose(slopes, difference.T, rtol=2e-3 if width > 5e-3 else 5e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["slip-lmi", pytest.param("slip-cured", marks=pytest.mark.slow)])
 def test_reverse_mode_is_forward_mode(name):
     chosen = load(name)
@@ -195,6 +203,7 @@ def test_a_derivative_through_a_relay_and_a_latch_is_that_of_fixed_steps():
     np.testing.assert_allclose(slope(d.Adaptive(1e-6, structure.duration)), fixed, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps():
     chosen = load("slip-lmi", ["controller=sampled", "controller.period=0.005"])
     solvers = d.Adaptive(1e-6, 0.03), d.FixedStep(1e-4, 0.03, every=10)
@@ -202,6 +211,7 @@ def test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps(
     np.testing.assert_allclose(seen, reference, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "more",
     [

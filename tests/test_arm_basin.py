@@ -32,6 +32,7 @@ OVER = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "
 AXIS = Cells(-0.1, 0.1, 9)
 
 
+@pytest.mark.slow
 def test_a_region_is_what_its_runs_do():
     """Not symmetric in the two axes. One run after the other, compiled as one, to the very end: fallen, or at rest."""
     first, second = AXIS, Cells(-0.09, 0.12, 5)
@@ -75,6 +76,7 @@ BORDER = 0.01  # relative distance from it
 COARSE = FixedStep(step=2e-3, duration=60.0)  # far closer to the border than that
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [pytest.param(SLOW, id="slow", marks=pytest.mark.slow), pytest.param(GAIN, id="LQR")])
 def test_starts_beside_the_border_end_as_scipy_says(gain):
     """Inside and outside, along each of four rays; SciPy runs until rest or ground."""
@@ -104,6 +106,7 @@ def test_a_share_is_one_by_area():
     assert Basin(cells, cells, Outcomes(no, inside, no, no, 0.0 * no)).undecided == pytest.approx(0.45)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("voltage", [48.0, *(pytest.param(v, marks=pytest.mark.slow) for v in MULTIPLES if v != 48.0)])
 def test_the_largest_multiple_that_is_recovered(voltage):
     """REFERENCE has 0.080 at 48 V, and 0.046 and 0.116 at 24 and 100 V: there SciPy falls, and agrees with us."""
@@ -115,6 +118,7 @@ def test_the_largest_multiple_that_is_recovered(voltage):
     assert not arm_stays_up(HANGING, GAIN, (found.multiple + 1e-4) * START, voltage)
 
 
+@pytest.mark.slow
 def test_nothing_and_all_can_be_recovered():
     assert recoverable(closed(), DIRECTION, SOLVER, most=0.01) == (0.01, False)
     assert recoverable(closed(controller=BalanceFeedback(gain=-GAIN)), DIRECTION, SOLVER, most=0.1) == (0.0, False)
@@ -204,6 +208,7 @@ def test_no_ellipsoid_where_the_loop_does_not_return():
     assert np.sqrt(row @ np.linalg.solve(strong, row)) > 1.0
 
 
+@pytest.mark.slow
 def test_what_is_left_of_the_equations_is_within_its_bound():
     """Of random machines at random states of a box; and the bound is not idle: some are at more than a tenth of it."""
     rng, most = np.random.default_rng(5), 0.0
@@ -226,6 +231,7 @@ def test_what_is_left_of_the_equations_is_within_its_bound():
     assert 0.1 < most <= 1
 
 
+@pytest.mark.slow
 def test_loops_of_which_no_ellipsoid_is_known_need_a_band():
     sampled = closed(controller=Sampled(controller=BalanceFeedback(gain=GAIN), period=0.01))
     starts = {"initial.theta": np.array([0.0, 0.02, 0.2]), "initial.phi": np.array([0.0, 0.008, 0.08])}
@@ -250,6 +256,7 @@ def test_float32_and_float64_agree_on_the_region():
     assert 0.2 < double.share < 0.8
 
 
+@pytest.mark.slow
 def test_the_slope_of_the_time_of_a_fall_is_a_difference():
     """In the lean that it starts with: the last step ends on the ground, wherever that is between two instants."""
     falling = closed(0.2)

@@ -186,6 +186,7 @@ def test_the_packaged_gain_is_the_designs(name):
     np.testing.assert_allclose(s.loop.controller.gain, gain, rtol=1e-6, atol=0)
 
 
+@pytest.mark.slow
 def test_a_sweep_keeps_trajectories_of_whatever_its_plant_shows(tmp_path):
     """An arm has no slip, and its control is a voltage."""
     import zarr

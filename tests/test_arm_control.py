@@ -13,7 +13,8 @@ from scipy.integrate import solve_ivp
 from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
 from diffabs.controllers.balance import Estimate
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking
-from diffabs.core.pytree import check, replace
+from diffabs.core.pytree import replace
+from diffabs.core.validity import check
 from diffabs.linear.gaussian import SELECTION, kalman, lqg
 from diffabs.linear.recoverable import mode_bounds, recoverable_bound
 from diffabs.objectives import FinalNorm
@@ -44,6 +45,7 @@ def test_the_bound_is_that_of_the_unstable_mode():
     assert (pole, bound) == (pytest.approx(2.84055, abs=5e-6), pytest.approx(expected, rel=1e-12))
 
 
+@pytest.mark.slow
 def test_the_slope_of_the_bound_is_a_difference():
     """In the length of the arm, of the closed form at 1e-5 m: second order, and 1e-9 of rounding over 1e-5."""
 
@@ -178,6 +180,7 @@ def test_an_observer_starts_at_what_is_measured(observer):
     np.testing.assert_array_equal(first.state, start.state)
 
 
+@pytest.mark.slow
 def test_without_noise_the_observer_recovers(observer):
     """As feedback of the whole state does from there: `simulate arm-hanging`."""
     loop = closed(0.06, controller=observer, sensor=AngleSensor(theta=0.0, psi=0.0))

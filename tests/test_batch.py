@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import cases
 
 import diffabs as d
 from diffabs import controllers, plants
@@ -69,7 +70,7 @@ class Slow(NamedTuple):
         return output.speed < self.speeds[jnp.minimum(number, len(self.speeds) - 1)]
 
 
-@pytest.fixture(params=["refilled", "together"])
+@pytest.fixture(params=cases(["refilled", "together"], "together"))
 def driven(request, monkeypatch):
     """`run_batch` by each of its drivers, results as NumPy arrays."""
     monkeypatch.setattr(refill, "WIDTH", SOME)
@@ -88,7 +89,7 @@ class TestLanes:
         assert np.isnan(expected.metrics["iae"]).tolist() == expected.diverged.tolist()
         assert len(np.unique(expected.metrics["iae"][[SHORT, 6]])) == 2  # noise of their own, everything else is equal
 
-    @pytest.mark.parametrize("width", WIDTHS)
+    @pytest.mark.parametrize("width", cases(WIDTHS, 4))
     def test_are_those_of_single_runs(self, width, keys, expected, monkeypatch):
         """Of whom enough is never seen: no car is slower than 0."""
         monkeypatch.setattr(refill, "WIDTH", width)
@@ -96,6 +97,7 @@ class TestLanes:
         run = d.run_batch(LOOP, Batch(VALUES, keys), SOLVER, MEASURED, accepted=True, enough=never)
         same(jax.device_get(run), expected)
 
+    @pytest.mark.slow
     def test_are_those_of_single_runs_together(self, keys, expected):
         lanes = Batch(VALUES, keys)
         once = jax.jit(lambda: d.run_batch(LOOP, lanes, SOLVER, MEASURED))()  # a trace is under way, of no argument
@@ -103,6 +105,7 @@ class TestLanes:
         at_once = d.run_batch(LOOP, lanes, SOLVER, MEASURED, together=True, accepted=True)
         same(jax.device_get(at_once), expected)
 
+    @pytest.mark.slow
     def test_without_keys_and_of_lists(self, driven):
         gains = np.where(np.arange(len(SPEEDS))[:, None] < 9, [-4000.0, -40.0], [-5000.0, -50.0])
         lanes = Batch({"initial.speed": SPEEDS, "controller.gain": gains})
@@ -112,6 +115,7 @@ class TestLanes:
             same(jax.tree.map(lambda x, i=i: x[i], found), one)
         assert found.metrics["iae"][SHORT] == found.metrics["iae"][6]
 
+    @pytest.mark.slow
     def test_may_differ_in_their_noise_alone(self, driven):
         """Keys, or the numbers that they are made of."""
         seeds = np.array([7, 3])
@@ -141,6 +145,7 @@ class TestLanes:
             Batch({"initial.speed": SPEEDS}).check(LOOP, SOLVER)
         assert d.run_batch(QUIET, Batch(), d.FixedStep(0.3, 0.6), MEASURED).diverged.tolist() == [True]
 
+    @pytest.mark.slow
     def test_in_order_when_those_of_similar_length_run_together(self, keys, expected):
         times = np.maximum(expected.ending.sample.t + 0.02, 0.13)
         times[NEVER] = SOLVER.duration
@@ -159,7 +164,7 @@ class TestLanes:
         assert refill._run._cache_size() == before
 
 
-@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("width", cases(WIDTHS, 4))
 def test_a_lane_of_which_enough_is_seen_is_taken_off(keys, expected, width, monkeypatch):
     """At the next look; it has not stopped, and the others are what they were."""
     monkeypatch.setattr(refill, "WIDTH", width)
@@ -176,6 +181,7 @@ def test_a_lane_of_which_enough_is_seen_is_taken_off(keys, expected, width, monk
     same(*(jax.tree.map(lambda x: x[~early], run) for run in (found, expected)))
 
 
+@pytest.mark.slow
 def test_trajectories():
     lanes = Batch({"initial.speed": SPEEDS[:2]})
     found = jax.device_get(d.run_batch(QUIET, lanes, SOLVER, MEASURED, trajectories=True))
@@ -194,7 +200,7 @@ def slopes_of_one():
     return jax.jit(jax.grad(one, (0, 1)))
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", cases([jax.jacfwd, jax.jacrev], jax.jacrev))
 def test_derivatives_are_those_of_single_runs(mode, slopes_of_one):
     """In the loop, which lanes share, and in their values."""
     speeds = jnp.asarray(SPEEDS[[0, 3]])

@@ -103,6 +103,7 @@ def test_times_are_taken_in_turn_and_ratios_within_a_round():
     assert record.ratio([2.0, 30.0, 4.0], [1.0, 10.0, 4.0]) == 2.0
 
 
+@pytest.mark.slow
 def test_a_peer_that_is_not_there_says_so_and_the_others_go_on(tmp_path, monkeypatch, capsys):
     bench, out = module("bench_peers"), tmp_path / "peers.json"
     monkeypatch.setattr(bench, "PEERS", ("scipy_loop", "nobody"))

@@ -385,6 +385,7 @@ def test_latch_does_not_move_for_rounding():
     close(target, [0.2] * 3 + [0.1022] * 5, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_noise_of_a_sampled_accelerometer_latches_where_it_jumps_down():
     """a = 3 + 50 t + noise that is held for 2 steps: a jump down from more than ever is a maximum, wherever it goes to,
     and the slip is the slip then."""

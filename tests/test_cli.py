@@ -21,7 +21,7 @@ import diffabs
 from diffabs.cli import console, main
 from diffabs.core.pytree import parameters
 from diffabs.objectives import BRAKING
-from diffabs.scenario import registry, scenario
+from diffabs.scenario import model, registry, scenario
 from diffabs.simulate.stable_step import stable_step
 
 SHORT = ("--set", "solver.duration=0.02", "--set", "solver.step=1e-3", "--set", "solver.every=1")
@@ -156,6 +156,7 @@ def test_diverged_could_not_be_done():
     assert "error: slip-lmi diverged" in result.stderr
 
 
+@pytest.mark.slow
 def test_seed_decides_the_noise():
     def iae(*more: str) -> float:
         noise = ("--set", "sensor=noise", "--set", "sensor.slip=0.01")
@@ -276,12 +277,12 @@ def test_json_says_all_that_it_ran_with(whole):
 @pytest.mark.parametrize("name", scenario.names())
 def test_parts_and_parameters_of_the_json_make_the_same_loop(name):
     chosen = scenario.load(name, integrated=False)
-    parts = [f"{path}={{type='{row['type']}'}}" for path, row in main._parts(chosen).items()]
-    fixed = [f"{p}.{k}={v}" for p, row in main._parts(chosen).items() for k, v in row.items() if k != "type"]
-    numbers = main._parameters(chosen)
+    parts = [f"{path}={{type='{row['type']}'}}" for path, row in model.parts(chosen).items()]
+    fixed = [f"{p}.{k}={v}" for p, row in model.parts(chosen).items() for k, v in row.items() if k != "type"]
+    numbers = model.numbers(chosen)
     values = [f"{path}={json.dumps(row['value'])}".replace('"', "") for path, row in numbers.items()]
     again = scenario.loads(b"", name, name, [*parts, *fixed, *values], integrated=False)
-    assert main._parameters(again) == numbers
+    assert model.numbers(again) == numbers
 
 
 def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
@@ -402,6 +403,7 @@ def test_version_and_usage():
     assert run("simulat", status=2).stdout == ""
 
 
+@pytest.mark.slow
 def test_as_a_module_with_double_precision():
     done = subprocess.run(
         [sys.executable, "-m", "diffabs", "simulate", "slip-lmi", *SHORT, "--json"],

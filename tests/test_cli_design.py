@@ -20,12 +20,24 @@ from diffabs.linear.linearization import StateSpace
 
 CHECKER = pathlib.Path(__file__).parent.parent / "experiments" / "check_certificate.py"
 KEYS = [
-    *("scenario", "gain", "states", "quadratically_stable", "stable", "verified_exactly", "decay_rate", "damping"),
+    *(
+        "scenario",
+        "model",
+        "made",
+        "gain",
+        "states",
+        "quadratically_stable",
+        "stable",
+        "verified_exactly",
+        "decay_rate",
+        "damping",
+    ),
     *("trace_cost", "guaranteed_cost", "worst_vertex", "margins", "claims", "lower_bound", "gap", "residual", "reason"),
     *(
         "besides",
         "period",
         "over",
+        "units",
         "vertices",
         "corners",
         "poles",

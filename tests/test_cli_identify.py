@@ -21,7 +21,20 @@ from diffabs.simulate.solution import FixedStep
 from diffabs.tune import Reason
 
 KEYS = [
-    *("scenario", "data", "values", "correlations", "undetermined", "residuals", "chi2", "degrees", "scale", "reason"),
+    *(
+        "scenario",
+        "model",
+        "made",
+        "data",
+        "values",
+        "correlations",
+        "undetermined",
+        "residuals",
+        "chi2",
+        "degrees",
+        "scale",
+        "reason",
+    ),
     *("evaluations", "parameters", "versions", "files", "interrupted"),
 ]
 UNITS = BrakeOutput.units

@@ -1,5 +1,6 @@
 """`diffabs list` and `diffabs reproduce`: what they show, and that no folder is half written or lost."""
 
+import importlib
 import json
 import os
 import pathlib
@@ -9,7 +10,7 @@ import types
 import pytest
 from commands import assert_one_error_line, left_in, run, umask
 
-from diffabs.cli import catalogue, console
+from diffabs.cli import catalogue, console, report
 from diffabs.papers.digest import Digest
 from diffabs.scenario import registry
 
@@ -76,7 +77,11 @@ def papers(monkeypatch):
         good(folder, progress)
         raise KeyboardInterrupt
 
+    importlib.import_module("diffabs.report")  # before its papers are replaced
     found = {"slip-lmi": good, "slip-estimator": good}
+    monkeypatch.setattr(
+        report, "write", lambda sources, target, title="": target.write_text(f"report of {len(sources)}")
+    )
     monkeypatch.setitem(sys.modules, "diffabs.papers", types.SimpleNamespace(PAPERS=found, compact=compact))
     return found, interrupted
 
@@ -84,14 +89,16 @@ def papers(monkeypatch):
 def test_reproduce_everything(papers, tmp_path):
     result = run("reproduce", "--out", tmp_path / "new" / "out")
     out = tmp_path / "new" / "out"
-    assert left_in(out) == {"slip-lmi", "slip-estimator"}
-    assert left_in(out / "slip-lmi") == {"figure1.png", "summary.json"}
+    assert left_in(out) == {"slip-lmi", "slip-estimator", "report.html"}
+    assert left_in(out / "slip-lmi") == {"figure1.png", "summary.json", "report.html"}
+    assert (out / "report.html").read_text() == "report of 2"
+    assert f"report of all: {out / 'report.html'}\n" in result.stderr
     lines = [line.split() for line in result.stdout.splitlines()]
     assert lines.count(["proposed", "PI", "2.99"]) == 2
     assert lines.count(["1", "of", "1", "published", "numbers", "reproduced."]) == 2
     assert lines.count(["refuted", "a", "claim:", "5"]) == 2
     assert result.stderr.count("drawing\n") == 2
-    assert f"1 figures, every number and note (summary.json): {out / 'slip-lmi'}\n" in result.stderr
+    assert f"1 figures, summary.json and report.html: {out / 'slip-lmi'}\n" in result.stderr
     assert os.stat(out / "slip-lmi").st_mode & 0o777 == 0o777 & ~umask()
 
 
@@ -107,7 +114,7 @@ def test_on_a_terminal_the_spinner_says_which_step(papers, tmp_path, monkeypatch
     monkeypatch.setattr(console, "animated", lambda: True)
     monkeypatch.setattr(console, "waited", waited)
     result = run("reproduce", "slip-lmi", "--out", tmp_path)
-    assert shown == ["reproducing slip-lmi ... 0 s: drawing"]
+    assert shown == ["reproducing slip-lmi ... drawing"]
     assert "drawing" not in result.stderr
 
 
@@ -119,7 +126,7 @@ def test_reproduce_as_json_replaces_an_older_result(papers, tmp_path):
     document = json.loads(run("reproduce", "slip-lmi", "--out", tmp_path, "--json").stdout)
     assert set(document["papers"]) == {"slip-lmi"}
     assert document["papers"]["slip-lmi"]["rows"][0]["ours"] == 2.9915
-    assert left_in(old) == {"figure1.png", "summary.json"}
+    assert left_in(old) == {"figure1.png", "summary.json", "report.html"}
     assert left_in(tmp_path) == {"slip-lmi"}
 
 

@@ -28,6 +28,7 @@ def scenario(file):
     return file(f"{RARE}[sweep.failures]\nstop_distance = 2.8\n")
 
 
+@pytest.mark.slow
 def test_the_document_is_the_librarys_answer(scenario):
     result = json.loads(run("rare", scenario, "stop_distance", "--samples", 200, "--seed", 5, "--json").stdout)
     study = dataclasses.replace(described(RARE), seed=5)  # of the noise, too
@@ -68,6 +69,7 @@ def test_what_cannot_be_asked(scenario, args, needed):
     assert needed in result.stderr
 
 
+@pytest.mark.slow
 def test_runs_that_diverge_are_an_answer_that_cannot_be_had(scenario):
     result = run("rare", scenario, "overshoot=1", "--samples", 20, "--set", "controller.gain=1e308,1e308", status=1)
     assert_one_error_line(result)

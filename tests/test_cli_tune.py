@@ -15,7 +15,7 @@ import pytest
 from commands import assert_one_error_line, left_in, run, umask
 
 import diffabs.tune as library
-from diffabs.cli import certificates, console, tune_document
+from diffabs.cli import certificates, console, progress, tune_document
 from diffabs.cli import tune as commands_tune
 from diffabs.core import interrupt
 from diffabs.core.pytree import parameters, replace
@@ -53,7 +53,8 @@ iae = 1.0
 overshoot = 0.5
 """
 KEYS = [
-    *("scenario", "lanes", "free", "objective", "metrics", "constraints", "met", "reason", "gradient_norm"),
+    *("scenario", "model", "made", "lanes", "free", "objective", "metrics", "constraints", "met", "reason"),
+    "gradient_norm",
     *("evaluations", "mode", "engine", "history", "starts", "parameters", "certificate", "versions", "files"),
     "interrupted",
 ]
@@ -142,7 +143,9 @@ def tuned(tmp_path_factory):
     (folder / "small.toml").write_text(SMALL)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(certificates, "task", lambda chosen: pytest.fail("asked for a proof too early"))
-        patch.setattr(commands_tune, "_proved", lambda after: commands_tune.Proved({"decay_rate": None}, "no proof"))
+        patch.setattr(
+            commands_tune, "certificate_of", lambda after: commands_tune.Proved({"decay_rate": None}, "no proof")
+        )
         out = ("--out", folder / "out.toml", "--plot", folder / "a.png")
         result = run("tune", folder / "small.toml", "--json", *out)
     return folder, json.loads(result.stdout), result.stderr
@@ -245,9 +248,10 @@ def test_table_for_people(small, invented):
 
 def test_how_far_it_is():
     told = [library.Progress(0, 2, point) for point in HISTORY]
-    assert commands_tune._said([]) == "compiling"
+    assert commands_tune._said([]) == progress.Far("compiling")
     line = "loss 0.75, gradient 0.01, violation 0, 2 evaluations, 2 under way"
-    assert commands_tune._said(told) == line
+    assert commands_tune._said(told) == progress.Far(line, HISTORY[-1].iteration, None, at_most=True)
+    assert commands_tune._said(told, 30).total == 30
 
 
 def test_progress_is_told_again_when_it_changes(monkeypatch, capsys):
@@ -460,7 +464,7 @@ def test_interrupted_while_it_certifies_it_shows_what_was_found(small, invented,
     def interrupted(_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands_tune, "_proved", interrupted)
+    monkeypatch.setattr(commands_tune, "certificate_of", interrupted)
     document = json.loads(run("tune", small, "--json", "--out", tmp_path / "out.toml", status=130).stdout)
     assert (document["interrupted"], document["met"]) == (True, True)
     assert document["certificate"]["reason"] == "interrupted"

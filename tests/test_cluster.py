@@ -90,6 +90,7 @@ def pids(address):
 # The same table
 
 
+@pytest.mark.slow
 def test_a_worker_makes_the_same_table(study, alone, inside, tmp_path):
     found = sweep(study, tmp_path / "out", on=Dask(inside))
     assert found.complete
@@ -339,6 +340,7 @@ def test_a_scheduler_that_cannot_be_reached(scenario, tmp_path, impatient, where
     assert f"the scheduler at {where} cannot be reached: " in result.stderr
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tmp_path, impatient):
     """No thread of a client that would block the next one, and no folder that only `resume` would take."""
     before = set(threading.enumerate())

@@ -40,6 +40,7 @@ def test_a_file_is_its_numbers(scenario):
     assert again.table() == study.table()
 
 
+@pytest.mark.slow
 def test_another_file_is_another_sweep(scenario, tmp_path):
     out, args = tmp_path / "out", ("--samples", 64, "--json")
     digest = json.loads(run("sweep", scenario, "--out", out, *args).stdout)["digest"]

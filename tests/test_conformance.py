@@ -16,7 +16,8 @@ from parts import BLOCKS, PARTS, PLANTS, ROADS, differences, jacobian, leaves, s
 
 from diffabs.core import protocols
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, Tracking
-from diffabs.core.pytree import check, get, parameters, replace, strong
+from diffabs.core.pytree import get, parameters, replace, strong
+from diffabs.core.validity import check
 from diffabs.plants import BrakeStart
 
 EVERY = [pytest.param(family, part, id=f"{family}: {name}") for family in PARTS for name, part in PARTS[family].items()]
@@ -226,11 +227,18 @@ def test_plant_in_float32(name):
 
 # Blocks: sensors, references, controllers, actuators
 
-EVERY_BLOCK = [pytest.param(*key, block, id=": ".join(key)) for key, block in BLOCKS.items()]
+LONG = (("actuator", "series"), ("actuator", "delay"))  # to compile
+
+
+def every_block(*slow):
+    return [
+        pytest.param(*key, block, id=": ".join(key), marks=pytest.mark.slow if key in slow else ())
+        for key, block in BLOCKS.items()
+    ]
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-@pytest.mark.parametrize(("family", "name", "block"), EVERY_BLOCK)
+@pytest.mark.parametrize(("family", "name", "block"), every_block())
 def test_block_keeps_the_structure_of_its_memory(family, name, block, dtype):
     """Else a scan over it fails, obscurely."""
     block, signal, t = struct((block, parts.signal_at(family, block, 0.0), 0.0), dtype)
@@ -249,7 +257,7 @@ def test_block_keeps_the_structure_of_its_memory(family, name, block, dtype):
         assert struct(jax.eval_shape(lambda b, m: b.setpoint(m), block, memory)) == t
 
 
-@pytest.mark.parametrize(("family", "name", "block"), EVERY_BLOCK)
+@pytest.mark.parametrize(("family", "name", "block"), every_block(*LONG))
 def test_block_gradient(family, name, block):
     """Finite in every parameter; in those declared tunable, that of differences, which are good to 1e-12 from curvature
     and 1e-10 from rounding, times the size of a derivative."""

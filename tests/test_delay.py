@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import cases
 from test_blocks import Mean, Script, close, seen
 
 import diffabs as d
@@ -134,6 +135,7 @@ def test_a_ramp_comes_later(back):
     close(mean, (3.0 * last + 500.0 * last**2) / (25 * H), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_sine_comes_later_to_fourth_order():
     w = 200.0
     says = Says(read=lambda t: jnp.sin(w * t))
@@ -193,7 +195,7 @@ def test_derivatives_of_the_method_of_steps(late, derivative):
 # A command that jumps
 
 
-@pytest.mark.parametrize("kinks", [False, True])
+@pytest.mark.parametrize("kinks", cases([False, True], False))
 @pytest.mark.parametrize(("first", "late"), [(7.3e-3, 2.6e-3), (7.3e-3, 2.7e-3), (7e-3, 2e-3), (7.3e-3, 1e-3)])
 def test_a_jump_comes_out_at_its_moment(first, late, kinks):
     """Wherever both fall in a step, also on its end: 2 for a while, then 5, and no value between."""
@@ -213,6 +215,7 @@ def slope_of_jump(derivative):
     return jax.jit(derivative(mean))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("first", "late"), [(7.3e-3, 2.6e-3), (7.3e-3, 2.7e-3), (7.25e-3, 0.75e-3 + H)])
 def test_the_moment_of_a_jump_is_differentiable(first, late, derivative):
@@ -221,6 +224,7 @@ def test_the_moment_of_a_jump_is_differentiable(first, late, derivative):
     close(slope_of_jump(derivative)(np.array([first, late])) * 14 * H, [-3.0, -5.0], rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [2e-3, pytest.param(2.4e-3, marks=pytest.mark.slow)])
 def test_what_a_computer_says_comes_out_later(late):
     """It says the time, each 2 ms. The control is a staircase; its mean falls with the delay as the last level."""
@@ -236,7 +240,8 @@ def test_what_a_computer_says_comes_out_later(late):
     close(jax.grad(mean)(late) * 15e-3, -levels[lengths > 1e-9][-1], rtol=1e-7)
 
 
-@pytest.mark.parametrize("kinks", [None, True])
+@pytest.mark.slow
+@pytest.mark.parametrize("kinks", cases([None, True], None))
 def test_what_bends_comes_out_bent(kinks):
     """A command cut off at 5 by a limit before the delay, in series: the mean of its square to the order of the method
     where kinks are located."""
@@ -354,6 +359,7 @@ def test_a_delay_that_has_no_room_has_no_value(every, diverges):
     assert np.all(np.isfinite(run.metrics["mean"])) is np.bool_(not diverges)
 
 
+@pytest.mark.slow
 def test_a_lag_behind_a_delay():
     """1 - exp(-(t - late)/T), and the greatest rate where the command comes."""
     late, lag = 2.37e-3, 4e-3

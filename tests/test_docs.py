@@ -1,7 +1,10 @@
-"""The site's reference: every package that exports names has a place there, and every name of it comes."""
+"""The site's reference: every package that exports names has a place there, every name of it comes, and every
+parameter with unit and range."""
 
+import dataclasses
 import importlib
 import importlib.util
+import inspect
 import pathlib
 import re
 import shutil
@@ -11,11 +14,28 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-spec = importlib.util.spec_from_file_location("exported", DOCS / "exported.py")
-exported = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(exported)
 
-INNER = {"cli", "core", "kernel", "papers", "plot", "scenario", "simulate"}  # not for import by their names, or figures
+
+def loaded(name):
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+exported, parameters = loaded("exported"), loaded("parameters")
+
+INNER = {
+    "cli",
+    "core",
+    "explore",
+    "kernel",
+    "papers",
+    "plot",
+    "report",
+    "scenario",
+    "simulate",
+}  # not for import by their names, or figures
 
 
 def packages():
@@ -45,6 +65,36 @@ def test_every_exported_name_comes_from_where_it_is_defined(package):
         assert getattr(importlib.import_module(home), last) is getattr(module, name)
 
 
+def parts():
+    """Every exported class with parameters, by where it is defined."""
+    paths = {path for package in packages() for path in exported.exported(package).values()}
+    classes = {
+        path: getattr(importlib.import_module(path.rpartition(".")[0]), path.rpartition(".")[2]) for path in paths
+    }
+    made = {path: one for path, one in classes.items() if inspect.isclass(one) and dataclasses.is_dataclass(one)}
+    return {
+        path: one for path, one in sorted(made.items()) if any("spec" in f.metadata for f in dataclasses.fields(one))
+    }
+
+
+def test_the_reference_shows_unit_and_range_of_every_parameter():
+    """Its tables are read from the text of the classes, and the classes say the same."""
+    assert len(parts()) > 60
+    for path, one in parts().items():
+        said = {p.name: (p.unit, p.interval) for p in parameters.parameters(inspect.getsource(one))}
+        fields = {f.name: f.metadata["spec"] for f in dataclasses.fields(one) if "spec" in f.metadata}
+        plain = {name: dataclasses.replace(spec, unit="1").interval() for name, spec in fields.items()}
+        assert said == {name: (fields[name].unit, plain[name]) for name in fields}, path
+        assert all(unit for unit, _ in said.values()), path
+
+
+def test_a_part_becomes_a_table():
+    text = parameters.table(inspect.getsource(importlib.import_module("diffabs.controllers").PID))
+    assert "| `kp` | `3893.0` | control/signal | [0, inf) |" in text.splitlines()
+    assert parameters.table("def f():\n    return 1\n") == ""
+    assert parameters.table("class A:\n    unit = 'm'\n") == "Unit of the value: m."
+
+
 def test_a_mark_becomes_the_names():
     text = exported.on_page_markdown("before\n\n<!-- exported: diffabs.stops -->\n", page=None)
     assert text.startswith("before\n\n::: diffabs.stops.stops.")
@@ -63,3 +113,6 @@ def test_every_page_is_in_the_navigation():
 def test_the_site_builds_strictly(tmp_path):
     subprocess.run(["mkdocs", "build", "--strict", "--site-dir", tmp_path], cwd=ROOT, check=True, capture_output=True)
     assert "margins" in (tmp_path / "reference" / "linear" / "index.html").read_text()
+    assert re.search(
+        r"<td>control/signal/s</td>\s*<td>\[0, inf\)</td>", (tmp_path / "reference/parts/index.html").read_text()
+    )

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line
 from commands import run as command
+from structured_text import Block
 
 import diffabs as d
 from diffabs.controllers import (
@@ -27,7 +28,7 @@ from diffabs.controllers import (
     StateFeedback,
 )
 from diffabs.core.protocols import BalanceOutput, BrakeOutput
-from diffabs.export import NotExported, c_source, device, equations
+from diffabs.export import NotExported, c_source, device, equations, structured_text
 from diffabs.export.device import Input
 from diffabs.plants import ArmBalance, LabRig, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip, PeakLatch
@@ -238,7 +239,9 @@ def test_the_command_writes_a_file_that_compiles(tmp_path):
         (["slip-lmi"], "controller StateFeedback runs in continuous time"),
         (["slip-estimator", "--set", 'controller={type="sampled"}'], "say --given target"),
         (["slip-cured", "--json"], "--json is for --to table"),
-        (["slip-cured", "--to", "table", "--float32"], "are for --to c"),
+        (["slip-cured", "--to", "st", "--json"], "--json is for --to table"),
+        (["slip-lmi", "--to", "st"], "controller StateFeedback runs in continuous time"),
+        (["slip-cured", "--to", "table", "--float32"], "are for --to c and --to st"),
         (["slip-cured", "--to", "fortran"], "fortran"),
     ],
 )
@@ -296,3 +299,129 @@ def test_memory_behind_memory_is_kept(tmp_path):
         [compiled(text, "unit", tmp_path)], input="0.1\n" * 4, capture_output=True, text=True, check=True
     ).stdout
     np.testing.assert_allclose([*map(float, said.split())], np.array([0.0, 0.0, 1.0, 3.0]) * 1e-6 * 0.1, rtol=1e-12)
+
+
+# Structured Text
+
+
+def commands_of_text(text, seen):
+    """What the block commands, by a reader of the language of its own."""
+    block = Block(text)
+    names = [name for name in seen._fields if name.upper() in block.inputs]
+    columns = [np.asarray(getattr(seen, name)) for name in names]
+    return np.array([block(**dict(zip(names, row, strict=True))) for row in zip(*columns, strict=True)], float)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize("name", LOOPS)
+def test_structured_text_commands_what_the_parts_do(name, dtype):
+    """Over 10,000 samples to rounding: an integral gathers some, in single precision as much as C does."""
+    loop, seen = LOOPS[name], measured(LOOPS[name], seed=11)
+    step = 4 if name == "filtered target" else None
+    found = device(loop, step=1e-3 / 4 if step else None, dtype=dtype)
+    result = commands_of_text(structured_text(found, "Unit"), seen)
+    wanted = commands_of_parts(loop, seen, dtype, step)
+    assert np.ptp(wanted) > 0
+    tolerance = 1e-11 if dtype == np.float64 else 3e-3
+    np.testing.assert_allclose(result, wanted, rtol=tolerance, atol=tolerance * np.max(np.abs(wanted)))
+    early = slice(0, 50)
+    tight = 1e-13 if dtype == np.float64 else 2e-5
+    np.testing.assert_allclose(result[early], wanted[early], rtol=tight, atol=tight * np.max(np.abs(wanted)))
+
+
+def test_a_whole_run_is_what_the_function_block_does():
+    chosen = load("slip-cured", ["initial.speed_kmh=40"])
+    every = round(float(chosen.loop.controller.period) / chosen.solver.step)
+    run = d.rollout(chosen.loop, d.FixedStep(chosen.solver.step, 0.4, every=every), chosen.objectives)
+    count = int(run.trajectory.running.sum())
+    seen = jax.tree.map(lambda x: np.asarray(x)[:count], run.trajectory.sample.output)
+    text = structured_text(device(chosen.loop, step=chosen.solver.step), "Cured")
+    assert count > 300
+    result = commands_of_text(text, seen)
+    np.testing.assert_allclose(result, np.asarray(run.trajectory.sample.command)[:count], rtol=1e-12, atol=1e-12)
+
+
+def test_a_block_begins_anew_when_it_is_told_to():
+    block = Block(structured_text(device(LOOPS["PID, filtered derivative"]), "Unit"))
+    first = [block(slip=slip) for slip in (0.1, 0.15, 0.3)]
+    assert [block(slip=slip, reset=k == 0) for k, slip in enumerate((0.1, 0.15, 0.3))] == first
+    assert [block(slip=slip, reset=False) for slip in (0.1, 0.15, 0.3)] != first
+
+
+def test_what_a_sample_stores_does_not_change_while_the_target_moves():
+    """A controller that remembers the very number that the target's own movement computes anew."""
+
+    @d.core.pytree.pytree
+    class Remember:
+        flow = d.core.protocols.no_flow
+
+        def start(self, signal):
+            return d.core.protocols.Memory(held=(0.0 * signal.target, 0.0 * signal.target))
+
+        def tick(self, clock, memory, signal):
+            return memory._replace(held=(0.2 - signal.target, memory.held[0]))
+
+        def output(self, t, memory, signal):
+            return memory.held[1] + 0.0 * signal.measured.slip
+
+    loop = rig(Remember(), reference=FilteredSlip(slip=0.2, time_constant=0.01))
+    seen = jax.tree.map(lambda x: x[:50], measured(loop, seed=2))
+    wanted = (0.2 - seen.slip[0]) * np.exp(-np.arange(-1, 49) / 10)
+    wanted[0] = 0.0
+    block = Block(structured_text(device(loop, step=1e-3 / 4), "Unit"))
+    result = [block(slip=slip) for slip in seen.slip]
+    np.testing.assert_allclose(result, wanted, rtol=1e-4)
+
+
+@d.core.pytree.pytree
+class Kinds:
+    """A controller with what the usual ones do not have: whole numbers, hyperbolic functions, a table, roundings."""
+
+    start, flow = d.core.protocols.no_memory, d.core.protocols.no_flow
+
+    def output(self, t, memory, signal):
+        slip, speed = signal.measured.slip, signal.measured.speed
+        place = jnp.clip(speed.astype(int), 0, 3)
+        entry = jnp.array([0.1, 0.4, 0.2, 0.9])[place]
+        odd = (place % 2 == 1) ^ (slip > 0.2)
+        shaped = jnp.tanh(slip) + jnp.sinh(slip) * jnp.cosh(slip) + jnp.ceil(10 * slip) - jnp.round(8 * slip)
+        shaped += jnp.floor(7 * slip)
+        return jnp.where(odd, entry, -entry) + jnp.minimum(shaped, speed) + jnp.arctan2(slip, speed) + slip**1.5
+
+
+def test_structured_text_knows_every_kind_of_operation():
+    loop = rig(Kinds())
+    seen = measured(loop, seed=3)
+    result = commands_of_text(structured_text(device(loop), "Unit"), seen)
+    wanted = commands_of_parts(loop, seen, np.float64)
+    np.testing.assert_allclose(result, wanted, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["2fast", "a b", "a__b", "Function_Block", "step"])
+def test_a_name_that_structured_text_does_not_have_is_refused(name):
+    with pytest.raises(NotExported, match="no name that Structured Text has"):
+        structured_text(device(LOOPS["state feedback"]), name)
+
+
+def test_what_structured_text_cannot_say_is_named():
+    @d.core.pytree.pytree
+    class Expm1:
+        start, flow = d.core.protocols.no_memory, d.core.protocols.no_flow
+
+        def output(self, t, memory, signal):
+            return jnp.expm1(signal.measured.slip)
+
+    with pytest.raises(NotExported, match="expm1 has no translation to Structured Text"):
+        structured_text(device(rig(Expm1())), "unit")
+
+
+def test_the_command_writes_a_function_block(tmp_path):
+    path = tmp_path / "brake--law.st"
+    result = command("export", "slip-cured", "--to", "st", "-o", path)
+    text = path.read_text()
+    assert "FUNCTION_BLOCK brake_law\n" in text
+    assert "speed : LREAL; (* [m/s] *)" in text
+    assert str(tmp_path) not in text
+    assert Block(text)(slip=0.0, speed=13.9) == pytest.approx(2.6912710579228354, rel=1e-12)
+    assert "FUNCTION_BLOCK brake_law, to be called once a period" in result.stderr
+    assert " : REAL;" in command("export", "slip-cured", "--to", "st", "--float32").stdout

@@ -1,5 +1,6 @@
 """What can be told of a figure without looking: labels that do not touch, legends beside the data, shared axes."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -74,12 +75,13 @@ def test_the_curves_of_a_loop_are_its_response():
     assert magnitude.get_xscale() == phase.get_xscale() == closed.get_xscale() == "log"
 
 
+@pytest.mark.slow
 def test_the_cure_is_drawn_on_shared_axes_with_its_legend_below():
-    cure = pytest.importorskip("cure_overshoot")
+    cure, cure_figures = (pytest.importorskip(name) for name in ("cure_overshoot", "cure_figures"))
     config = cure.Config()
     loops = cure.contenders(config, cure.start(config), (-8000.0, -100.0))
     few = cure.dataclasses.replace(config, drawn=config.drawn[:2], step=1e-3, longer=0.05)
-    figure = cure.before_and_after(few, loops)
+    figure = cure_figures.before_and_after(few, loops)
     slips, torques = figure.axes[:2], figure.axes[2:]
     assert slips[0].get_xlim() == slips[1].get_xlim() == torques[0].get_xlim()
     assert torques[0].get_ylim() == torques[1].get_ylim()
@@ -87,3 +89,17 @@ def test_the_cure_is_drawn_on_shared_axes_with_its_legend_below():
     (legend,) = figure.legends
     assert all(legend.get_window_extent().y1 <= ax.get_window_extent().y0 for ax in figure.axes)
     assert not any(ax.get_legend() for ax in figure.axes)
+
+
+@pytest.mark.slow
+def test_all_masses_are_drawn_with_the_worst_of_them():
+    cure, cure_figures = (pytest.importorskip(name) for name in ("cure_overshoot", "cure_figures"))
+    config = dataclasses.replace(cure.Config(), step=1e-3, duration=0.3)
+    figure = cure_figures.all_masses(config, {"it": cure.start(config)})
+    panel, bar = figure.axes
+    slips = [line.get_ydata() for line in panel.lines[:-1]]
+    assert len(slips) == cure_figures.MASSES * cure_figures.STARTS
+    assert {line.get_color() for line in panel.lines[:13]} != {panel.lines[0].get_color()}
+    worst = 100 * (max(map(max, slips)) / config.slip - 1)
+    assert float(panel.get_title().split(": ")[1].split(" %")[0]) == pytest.approx(worst, rel=0.1)
+    assert bar.get_ylabel() == "mass [kg]"

@@ -156,6 +156,7 @@ def test_a_tuning_has_a_table():
     assert "<table>" in found._repr_html_()
 
 
+@pytest.mark.slow
 def test_an_identification_has_a_table(run):
     frame = run.pandas()
     data = Traces(t=frame.index.to_numpy(), columns={"speed": frame["speed"].to_numpy()}, sigma={"speed": 0.01})
@@ -176,9 +177,12 @@ def swept(tmp_path_factory):
     return sweep(study, tmp_path_factory.mktemp("sweeps") / "study")
 
 
-def test_the_frame_of_a_sweep_has_units_and_says_what_failed(swept):
+@pytest.mark.slow
+def test_the_frame_of_a_sweep_has_units_and_says_what_failed(swept, monkeypatch):
     bound = float(np.median(swept.column("iae")))
-    swept.manifest["study"]["failures"] = {"iae": bound}  # of those of the study none fails, or all do
+    monkeypatch.setitem(
+        swept.manifest["study"], "failures", {"iae": bound}
+    )  # of those of the study none fails, or all do
     frame = swept.pandas()
     np.testing.assert_array_equal(frame["failed"], swept.column("iae") > bound)
     assert 0 < frame["failed"].sum() < 20
@@ -199,6 +203,7 @@ def test_what_was_missed_or_refused_is_told_apart(swept, monkeypatch):
     stopped[3], refused[5] = False, "a step that is too long"
     columns = {"stopped": stopped, "refused": refused, "diverged": refused != "", "iae": np.zeros(20)}
     monkeypatch.setattr(swept, "column", columns.__getitem__)
+    monkeypatch.setitem(swept.manifest["study"], "failures", {"iae": 0.02})
     assert np.flatnonzero(swept.failed()).tolist() == [3]
     assert np.flatnonzero(swept.failures()["not stopped"]).tolist() == [3]
 

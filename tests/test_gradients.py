@@ -8,6 +8,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import cases
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors
@@ -40,6 +41,7 @@ CAR = {
 PATCHES = roads.Patches(
     roads=(roads.DRY_CONCRETE, roads.Scaled(road=roads.SPLINE_B, scale=0.7)), edges=np.array([0.8]), width=0.3
 )
+ALONG = roads.ScaledAlong(road=roads.MagicFormula(), factors=np.array([1.0, 0.9, 1.05, 1.0]), spacing=2.0)
 # Together these hold every part that a loop can be made of; the last test of this file sees to it.
 LOOPS = {
     "feedback": braking(**RIG, controller=controllers.StateFeedback(), feedforward=controllers.HoldingInput()),
@@ -131,6 +133,19 @@ LOOPS = {
         ),
         actuator=actuators.Lag(time_constant=0.002),
     ),
+    "extremum seeking": braking(
+        **CAR | {"plant": plants.QuarterCar(road=ALONG)},
+        controller=controllers.PID(kp=600.0, torque_max=150.0),
+        reference=references.ExtremumSeeking(gain=2.0, time_constant=0.05),
+    ),
+    "by deceleration": braking(
+        **CAR | {"plant": plants.QuarterCar(road=ALONG)},
+        controller=controllers.PID(kp=600.0, torque_max=150.0),
+        reference=references.SlipByDeceleration(
+            decelerations=np.array([1.0, 6.0, 12.0]), slips=np.array([0.1, 0.12, 0.16])
+        ),
+        sensor=sensors.PlayedWheelNoise(noise=np.array([1e-3, -2e-3, 0.0]), period=5e-3),
+    ),
     "arm": braking(
         plant=plants.ArmBalance(arm_length=-0.5, gear=1.1, rotor_inertia=0.3),
         initial=plants.BalanceStart(theta=0.004, psi=0.01, phi=0.001, theta_rate=-0.001, psi_rate=0.02, phi_rate=0.002),
@@ -185,7 +200,7 @@ ACCURACY = dict.fromkeys(LOOPS, (1e-5, 1e-6)) | {
 # The largest programs to compile, and a wheel that locks, of which test_kinks.py has closed forms.
 SLOW = (
     *("estimated speed", "filtered reference", "arm, observed", "proportional", "computer", "noisy", "relay", "delay"),
-    *("lock", "arm"),
+    *("lock", "arm", "speed that drifts", "feedback", "latch", "extremum seeking", "by deceleration"),
 )
 
 
@@ -216,7 +231,7 @@ def differences(measured, x, step):
     return np.asarray((many(x + moves) - many(x - moves)) / (2 * step)).T, scale
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in LOOPS])
+@pytest.mark.parametrize("name", cases(LOOPS, *SLOW))
 def test_gradient_of_every_objective_in_every_parameter(name):
     names, x, measured, jacobian_at, measures = flat(name)
     jacobian = np.asarray(jacobian_at(x))
@@ -230,6 +245,7 @@ def test_gradient_of_every_objective_in_every_parameter(name):
         assert error[worst] <= tolerance * largest + 1e-10, (objective, names[worst], error[worst] / largest)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["feedback", pytest.param("latch", marks=pytest.mark.slow)])
 def test_reverse_mode_equals_forward_mode(name):
     _, x, measured, jacobian_at, _ = flat(name)
@@ -264,6 +280,7 @@ def _sensitivity(loop, paths, difference=None):
 FULL = braking(plant=plants.QuarterCar(road=roads.MagicFormula(), inertia=1.0539))
 
 
+@pytest.mark.slow
 def test_sensitivity_of_the_conventional_brake():
     """d(distance)/d ln p of [est]'s P loop; expected: differences (1e-3) of SciPy runs of oracles.py."""
     expected = {
@@ -276,6 +293,7 @@ def test_sensitivity_of_the_conventional_brake():
     np.testing.assert_allclose(_sensitivity(FULL, list(expected)), list(expected.values()), rtol=5e-4, atol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ki", "published"),
     [(0.0, (4.305, -4.646)), (5000.0, None)],  # by another program with the same correction
@@ -290,6 +308,7 @@ def test_gradient_through_the_latch_agrees_with_a_wide_difference(ki, published)
         np.testing.assert_allclose(ours, published, rtol=1e-3, atol=0)
 
 
+@pytest.mark.slow
 def test_a_maximum_on_a_knot_of_the_road_has_the_slip_of_the_knot():
     """Where the spline of the paper has its greatest friction, its curvature jumps; whatever the inertia."""
     loop = dataclasses.replace(FULL, reference=references.PeakLatch(), controller=controllers.PID())

@@ -259,6 +259,7 @@ class TestTraces:
         np.testing.assert_allclose(np.std(left["speed"]), 0.1, rtol=0.15, atol=0)
         np.testing.assert_allclose(np.std(left["wheel_speed"]), 0.05, rtol=0.15, atol=0)
 
+    @pytest.mark.slow
     def test_the_loop_is_compared_between_its_instants_and_stays_where_it_ended(self):
         t = np.array([0.0, 0.0103, 0.1999, 0.3, 0.41, 0.59])
         over = {"initial.speed": np.array([26.0, 30.0]), "plant.inertia": np.array([1.0, 1.2])}

@@ -25,6 +25,7 @@ from diffabs.objectives import BRAKING
 from diffabs.scenario import section_sweep
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import native
+from diffabs.simulate.engine import tell
 from diffabs.stops import SpeedReached
 from diffabs.sweep import SweepError, sweep
 
@@ -100,6 +101,7 @@ class TestRuns:
         found = jax.device_get(self._by_kernel(VALUES, KEYS, loop))
         assert not np.any(found.metrics["iae"] == runs[0].metrics["iae"])
 
+    @pytest.mark.slow
     def test_under_jit_and_vmap(self, runs):
         def at(mass):
             return self._by_kernel(VALUES, KEYS, d.replace(LOOP, {"plant.mass": mass}), live=True).metrics["iae"]
@@ -109,6 +111,7 @@ class TestRuns:
         np.testing.assert_allclose(found[1], runs[0].metrics["iae"], rtol=1e-13)
         assert not np.any(found[0] == found[1])
 
+    @pytest.mark.slow
     def test_of_lanes_in_two_parts(self, runs, monkeypatch):
         monkeypatch.setattr(native, "MOST", 32)
         found = jax.device_get(self._by_kernel(VALUES, KEYS))
@@ -139,7 +142,7 @@ class TestObjections:
 
     def test_without_a_compiler(self, monkeypatch, caplog):
         monkeypatch.setenv(compilers.COMPILER, "")
-        native.tell.cache_clear()
+        tell.cache_clear()
         native._kept.forget()
         loop = d.replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
         line = native.objection(loop, VALUES, SOLVER, {})
@@ -285,14 +288,29 @@ class TestLibrary:
     def test_is_made_once(self, tmp_path, monkeypatch):
         compilers.compiler()  # has been tried, which is noted
         monkeypatch.setenv(compilers.CACHE, str(tmp_path))
-        path, made = compilers.library(self.TEXT % 1), time.time_ns()
+        path = compilers.library(self.TEXT % 1)
         monkeypatch.setattr(compilers, "_run", None)
         assert compilers.library(self.TEXT % 1) == path
-        assert path.stat().st_mtime_ns <= made
         assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+    def test_that_was_not_used_for_longest_goes(self, tmp_path, monkeypatch):
+        compilers.compiler()
+        monkeypatch.setenv(compilers.CACHE, str(tmp_path))
+        monkeypatch.setattr(compilers, "_run", lambda command, source, result: result.write_bytes(bytes(10)))
+        first, second, third = (compilers.library(text) for text in ("first", "second", "third"))
+        for i, path in enumerate((first, second, third)):
+            os.utime(path, (i, i))
+        compilers.library("first")  # is used again
+        monkeypatch.setattr(compilers, "ROOM", 30)
+        fourth = compilers.library("fourth")
+        assert set(tmp_path.glob("*.so")) == {first, second, third, fourth}
+        monkeypatch.setattr(compilers, "ROOM", 39)
+        fifth = compilers.library("fifth")
+        assert set(tmp_path.glob("*.so")) == {first, fourth, fifth}
 
     @pytest.mark.parametrize("changed", ["FLAGS", "_processor"])
     def test_is_another_for_other_flags_and_processors(self, changed, tmp_path, monkeypatch):
+        compilers.compiler()
         monkeypatch.setenv(compilers.CACHE, str(tmp_path))
         monkeypatch.setattr(compilers, "_run", lambda command, source, result: result.write_bytes(b""))
         path, made = compilers.library("one"), compilers.compiler()

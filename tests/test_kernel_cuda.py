@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import marks
 import numpy as np
 import pytest
 import test_kernel_native
@@ -27,6 +28,7 @@ from diffabs.simulate import native
 
 pytestmark = pytest.mark.xdist_group("kernel cuda")
 ON_GPU = jax.default_backend() == "gpu"
+TANGENTS = ("of both", "eleven tangents", "several tangents for several gains")
 
 
 @pytest.fixture(autouse=True)
@@ -48,6 +50,7 @@ def processor(monkeypatch):
 class TestText:
     """By stand-ins for CUDA's own names."""
 
+    @pytest.mark.slow
     def test_runs_are_those_of_xla(self, processor):
         """Lanes that begin beyond their stop, diverge and run out of time among them; noise to the last digits."""
         found, expected = both(LOOP, VALUES, SOLVER, MEASURED, KEYS)
@@ -80,6 +83,7 @@ class TestText:
     def test_of_no_lanes(self, processor):
         assert applied({"f": jnp.sin}, np.ones(1)[:1])["f"].shape == (1,)
 
+    @pytest.mark.slow
     def test_under_vmap(self, processor):
         def at(mass):
             lanes = d.Batch(VALUES, KEYS)
@@ -91,7 +95,8 @@ class TestText:
         np.testing.assert_array_equal(two[1], at(mass)["iae"])
         assert not np.any(two[0] == two[1])
 
-    @pytest.mark.parametrize("way", ["of both", "eleven tangents", "several tangents for several gains"])
+    @pytest.mark.slow
+    @pytest.mark.parametrize("way", marks.cases(TANGENTS, *TANGENTS[:2]))
     def test_derivatives_are_those_of_xla(self, way, processor):
         test_kernel_tangents.TestLaunch().test_derivatives_are_those_of_xla(way)
 

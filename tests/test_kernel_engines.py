@@ -17,7 +17,7 @@ from diffabs.design.attraction import Cells, attraction
 from diffabs.kernel import compilers
 from diffabs.objectives import IAE, StopTime
 from diffabs.scenario.defaults import braking
-from diffabs.simulate import native
+from diffabs.simulate.engine import EngineError, tell
 from diffabs.tune.problem import Mode
 
 pytestmark = pytest.mark.xdist_group("kernel engines")
@@ -55,13 +55,14 @@ def _own_folder(monkeypatch):
 @pytest.fixture
 def no_compiler(monkeypatch):
     monkeypatch.setenv(compilers.COMPILER, "")
-    native.tell.cache_clear()
+    tell.cache_clear()
     jax.clear_caches()
     yield
     jax.clear_caches()
 
 
 class TestTune:
+    @pytest.mark.slow
     def test_is_that_of_xla(self):
         """Two starts, each with its lanes, in one launch; the values of what is tuned to the last digits."""
         method = tune.Method(starts=2)
@@ -90,15 +91,16 @@ class TestTune:
 
     def test_in_reverse_mode_is_refused(self):
         method = tune.Method(mode=Mode.REVERSE)
-        with pytest.raises(native.EngineError, match="engine = 'kernel' is not possible: a kernel has no reverse mode"):
+        with pytest.raises(EngineError, match="engine = 'kernel' is not possible: a kernel has no reverse mode"):
             tune.tune(LOOP, **TUNED, method=method, engine="kernel")
 
     def test_of_another_name(self):
         with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
             tune.tune(LOOP, **TUNED, engine="gpu")
 
+    @pytest.mark.slow
     def test_without_a_compiler(self, no_compiler, caplog):
-        with pytest.raises(native.EngineError, match=NONE):
+        with pytest.raises(EngineError, match=NONE):
             tune.tune(LOOP, **TUNED, engine="kernel")
         with caplog.at_level(logging.WARNING, "diffabs"):
             found = [tune.posed(LOOP, **TUNED, engine="auto") for _ in range(2)]
@@ -153,6 +155,7 @@ def test_a_map_of_starts_is_that_of_xla():
 
 
 class TestRare:
+    @pytest.mark.slow
     @pytest.mark.parametrize("gradients", [pytest.param(False, marks=pytest.mark.slow), True])
     def test_is_that_of_xla(self, gradients):
         """P[stop_time >= 0.878] = 1.1e-3 in closed form."""
@@ -163,6 +166,7 @@ class TestRare:
         assert found.evaluations == expected.evaluations
         assert found.gradients == expected.gradients
 
+    @pytest.mark.slow
     def test_objection(self, no_compiler):
         assert reliability.failure.objection(STUDY, "stop_time") == NONE
         study = dataclasses.replace(STUDY, engine="kernel")

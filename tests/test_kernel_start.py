@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import secrets
 import shutil
 import time
@@ -151,12 +152,16 @@ class TestPrograms:
         finally:
             folder.unlink()
 
-    def test_are_few(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(kept, "MOST", 4)
-        for i in range(5):
-            (tmp_path / f"{i}.program").write_text("")
-        kept._make_room(tmp_path)
-        assert len([*tmp_path.iterdir()]) == 3
+    def test_have_so_much_room(self, folder, monkeypatch):
+        folder.mkdir(parents=True, exist_ok=True)
+        for i in range(4):
+            path = folder / f"{i}.program"
+            path.write_bytes(bytes(10))
+            os.utime(path, (i, i))
+        monkeypatch.setattr(kept, "ROOM", 39)
+        run()
+        assert {"2.program", "3.program"} < {path.name for path in folder.iterdir()}
+        assert not (folder / "1.program").exists()
 
     def test_under_jit_are_traced(self, traced):
         found = jax.jit(lambda mass: run_live(d.replace(LOOP, {"plant.mass": mass})))(6.0)

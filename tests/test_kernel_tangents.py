@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from kernels import FOLDER
+from marks import cases
 from test_kernel_parts import CASES, VARIED, with_part
 
 import diffabs as d
@@ -75,10 +76,11 @@ WAYS = {
         jnp.stack([RATES, 2 * RATES], 1), RATES
     ),
 }
+SECOND = ("of what is the same for all", "three tangents", "eleven tangents", "for several gains", "along a batch")
 
 
 class TestLaunch:
-    @pytest.mark.parametrize("way", WAYS)
+    @pytest.mark.parametrize("way", cases(WAYS, *SECOND))
     def test_derivatives_are_those_of_xla(self, way):
         found, expected = (jax.device_get(WAYS[way](lambda g, r, e=e: chain(g, r, e))) for e in ("kernel", "xla"))
         assert np.abs(expected[..., :3]).max() > 0
@@ -118,6 +120,7 @@ class TestLaunch:
         with pytest.raises(ValueError, match="a kernel has no second derivatives"):
             jax.jacfwd(jax.jacfwd(lambda g: chain(g, RATES)))(2.0)
 
+    @pytest.mark.slow
     def test_on_two_devices(self):
         """Lanes that lie on two devices, each of which runs its own; and their derivatives."""
         environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", compilers.CACHE: FOLDER}

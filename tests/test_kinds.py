@@ -13,7 +13,8 @@ import pytest
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, roads, stops
-from diffabs.core.pytree import check, strong
+from diffabs.core.pytree import strong
+from diffabs.core.validity import check
 from diffabs.scenario.defaults import braking
 
 SOLVER = d.FixedStep(1e-3, 0.25)

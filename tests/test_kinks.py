@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import cases
 
 import diffabs as d
 from diffabs.actuators import Delay
@@ -210,7 +211,7 @@ def clockwork(rate: Any, place: Any) -> Loop:
     )
 
 
-@pytest.mark.parametrize("name", CLOSED)
+@pytest.mark.parametrize("name", cases(CLOSED, "two in a step"))
 def test_a_derivative_through_a_kink_is_that_of_the_closed_form(name):
     """However long the step: 10 ms here, and a derivative that misses a jump is 0."""
     rate, exact = CLOSED[name]
@@ -267,6 +268,7 @@ class Sliding(Clockwork):
         return Shown(0.3 - jnp.where(state.y > self.place, 1.0, -1.0), 1.0 + 0.0 * control)
 
 
+@pytest.mark.slow
 def test_an_integral_that_was_clamped_goes_on():
     """Beside a derivative the run is that of the values, to the kinks' own error: the torque leaves its limit, and the
     integral moves again."""
@@ -322,6 +324,7 @@ class Pulsed(Clockwork):
         return Shown(jnp.where(on, 3.0, 1.0) + 0.0 * control, 1.0 + 0.0 * control)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("solver", "off"), [(d.FixedStep(0.01, END), 1e-7), (d.Adaptive(1e-5, END, 0.01), 3e-5)])
 def test_a_pulse_begins_and_ends_at_its_instants(solver, off):
     """Also where the end of the run cuts it off; on the grid and off it. Adaptive values see the jump as an error."""

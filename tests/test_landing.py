@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from marks import cases
 from test_blocks import Mean, close
 from test_delay import H, Integrator, Proportional, Says, loop
 
@@ -63,7 +64,7 @@ def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
         close(mean(level) * 0.01, 2.0 * moment + 5.0 * (0.01 - moment), rtol=2e-5)
 
 
-@pytest.mark.parametrize("late", [2e-3, pytest.param(4e-3, marks=pytest.mark.slow), 2.3e-3, 5e-3])
+@pytest.mark.parametrize("late", cases([2e-3, 4e-3, 2.3e-3, 5e-3], 2e-3, 4e-3, 5e-3))
 @pytest.mark.parametrize("solver", [d.FixedStep(H, 0.03), pytest.param(d.Adaptive(1e-5, 0.03, H), id="adaptive")])
 def test_the_moment_of_an_event_on_the_grid_is_differentiable(late, solver):
     """A computer says the time, each 5 ms, and takes a while for it. Some of these moments are a rounding after the
@@ -81,7 +82,7 @@ def test_the_moment_of_an_event_on_the_grid_is_differentiable(late, solver):
     close(slope * 0.03, -levels[-1], rtol=1e-7)
 
 
-@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("derivative", cases([jax.jacfwd, jax.jacrev], jax.jacrev))
 def test_derivatives_of_a_moment_are_those_at_the_zero(derivative):
     """x' = -k x comes down to a level, at steps of 0.4/k: against differences of the runs themselves. The last try
     ends up to a ten-thousandth of a step from there, in which a derivative that is taken at its end changes by 1e-5."""

@@ -22,7 +22,8 @@ from diffabs.controllers import (
 )
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.protocols import BrakeOutput, Clock
-from diffabs.core.pytree import check, replace, strong
+from diffabs.core.pytree import replace, strong
+from diffabs.core.validity import check
 from diffabs.design.state_feedback import state_feedback
 from diffabs.linear.linearization import linearize, tracking
 from diffabs.linear.slip_model import LowPass, Sampling, SlipModel

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from marks import cases
 from scipy.integrate import solve_ivp
 
 import diffabs as d
@@ -130,7 +131,8 @@ STEPS = (1e-3, 5e-4, 2.5e-4)
 BOUNDS = {"relay": (1e-6, 2.0), "delay": (2e-9, 1.5), "rate limit": (1e-5, 1.4)}  # error at 1 ms, order
 
 
-@pytest.mark.parametrize("name", BOUNDS)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", cases(BOUNDS, "rate limit"))
 def test_converges_to_scipy(name):
     """Largest relative error of slip, speed and distance at a step of 1 ms, and the order down to a quarter of it."""
     exact, (error, order) = theirs(name), BOUNDS[name]

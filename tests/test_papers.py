@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
+from reports import Page
 from rich.console import Console
 
 from diffabs import FixedStep, measure, plot, rollout
@@ -18,6 +19,7 @@ from diffabs.cli import show
 from diffabs.objectives import BRAKING
 from diffabs.papers import PAPERS, arm_balance, compact, lmi_design, record, slip_estimator, slip_lmi
 from diffabs.references import FixedSlip
+from diffabs.report import documents, report
 from diffabs.scenario.defaults import braking
 
 SMALLEST_FIGURE = 10_000  # bytes: an empty sheet takes less than 6,000
@@ -285,6 +287,18 @@ def test_figures_are_pictures(paper):
         width, height = struct.unpack(">II", data[16:24])
         assert min(width, height) >= 400
         assert len(data) > SMALLEST_FIGURE, name
+
+
+def test_a_report_has_every_number_and_figure(paper):
+    """And stands for itself: figures are in it, notes and verdicts are as they were written."""
+    page = Page(report(documents(paper.folder)))
+    wanted = {repr(row[key]) for row in paper["rows"] + paper["judged"] for key in ("ours", "difference") if row[key]}
+    assert wanted <= set(page.numbers)
+    assert len(page.images) == len(paper["figures"])
+    assert f"diffabs reproduce {paper['paper']}" in page.text
+    for words in (*paper["notes"], *(sentence for _, sentence in compact(paper).verdicts)):
+        assert words in page.text
+    assert page.foreign == []
 
 
 def test_rows_say_how_far_they_are():

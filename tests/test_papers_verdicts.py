@@ -33,6 +33,7 @@ def runs():
     return slip_estimator.run(CAR, FixedStep(step=1e-4, duration=3.6, every=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "variation", "jerk"),
     [

@@ -143,6 +143,7 @@ def test_redundant_corners_are_dropped():
     assert polytope(made(lambda p, q: scalars(1.0 + 0 * p, 1.0 + 0 * p)), UNIT).vertices == 1
 
 
+@pytest.mark.slow
 def test_many_dimensions_by_linear_programs():
     """Seven entries that depend on seven parameters: a cube, beyond the facets; and with a bulge, spread."""
 

@@ -70,6 +70,7 @@ def check_runs(loop, values, step, measured, seed):
     return done
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 25))])
 @pytest.mark.parametrize("task", ["braking", "balance"])
 def test_no_metric_without_a_flag_is_impossible(task, seed):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import diffabs
-from diffabs.core.pytree import check, get, param, parameters, part, prepared, problems, pytree, replace, static, strong
+from diffabs.core.pytree import get, param, parameters, part, prepared, pytree, replace, static, strong
+from diffabs.core.validity import check, problems
 from diffabs.roads import DRY_ASPHALT, SPLINE_B, MagicFormula, Patches, Scaled
 
 

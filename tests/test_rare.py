@@ -359,6 +359,7 @@ class TestGradient:
         found = runs(linear(20), 20, B6, 5, gradient=gradient)
         assert np.all(np.abs(np.log(ratios(found, 1e-6))) < np.log(1.5))
 
+    @pytest.mark.slow
     def test_it_pays_in_many_dimensions(self):
         """Variance times price, without a gradient to with one: 17 for seeds 0 to 199."""
         plain, informed = (runs(linear(100), 100, B6, 20, gradient=g) for g in (None, of_linear(100)))

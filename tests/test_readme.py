@@ -34,6 +34,7 @@ def test_the_readme_prints_its_table(capsys):
     assert (at, slope) == (0.4, pytest.approx(-12.33 / 0.4, rel=0.1))
 
 
+@pytest.mark.slow
 def test_the_twelve_lines_run():
     code = CODE.replace("64)", "3)")  # 9 lanes instead of 4,096: the same call
     names = {}

@@ -181,6 +181,7 @@ class TestAfterARun:
         ):
             assert bool(_impossible(name, part, jnp.asarray(value))) is bad, (name, value)
 
+    @pytest.mark.slow
     def test_a_torque_that_drives_the_wheel_is_no_alarm(self):
         """The car speeds up, its energy grows with the torque's work: physical, if hardly a brake."""
         for plant in (plants.MirroredRig(), plants.QuarterCar()):
@@ -242,6 +243,7 @@ def swept(tmp_path_factory):
 
 
 class TestWhoeverRuns:
+    @pytest.mark.slow
     def test_a_refused_lane_is_a_row_with_a_reason_and_in_no_number(self, swept):
         below = swept.column("initial.speed") <= 25 / 3.6
         assert 8 < below.sum() < 40
@@ -264,6 +266,7 @@ class TestWhoeverRuns:
         assert found["failures"]["not stopped"]["value"] < 0.5
         assert found["failures"]["any"]["high"] < 1 / 2
 
+    @pytest.mark.slow
     def test_a_batch_does_not_run_them(self, any_step):
         values = {"initial.speed": np.array([8.0, 1.0, 9.0])}
         done = d.run_batch(RIG, d.Batch(values), SOLVER, {"stop_time": BRAKING["stop_time"]})

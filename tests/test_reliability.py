@@ -40,6 +40,7 @@ def test_scores_are_runs():
         assert value == pytest.approx(float(alone), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", ["stop_distance", pytest.param("max_slip", marks=pytest.mark.slow)])
 def test_slopes_are_differences_of_runs(metric):
     """Of a normal variable, a uniform one and a triangular one, two of which depend on each other."""

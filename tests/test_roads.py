@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from parts import ROADS, differences, jacobian
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import BSpline, PchipInterpolator
 from scipy.optimize import brentq
 
-from diffabs.core.pytree import check, problems, replace, strong
+from diffabs.core.pytree import replace, strong
+from diffabs.core.validity import check, problems
 from diffabs.roads import (
     DRY_ASPHALT,
     ICE,
@@ -22,6 +23,7 @@ from diffabs.roads import (
     Patches,
     RationalCurve,
     Scaled,
+    ScaledAlong,
     Tabulated,
     peak,
 )
@@ -164,6 +166,24 @@ def test_tabulated_is_pchip(slip, mu):
     np.testing.assert_allclose(curve(road, s), oracle(s), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(curve(road, -s), -oracle(s), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(curve(road, slip), mu, rtol=1e-15, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_a_factor_along_the_road_is_a_b_spline():
+    """SciPy's, the first and the last factor going on; within the factors, and no steeper than they are."""
+    factors, d = np.random.default_rng(5).uniform(0.5, 1.5, 9), 0.7
+    road = check(ScaledAlong(road=RIG, factors=factors, spacing=d))
+    known = BSpline(d * np.arange(-5, 9 + 5.0), np.concatenate([3 * [factors[0]], factors, 3 * [factors[-1]]]), 3)
+    x = np.linspace(-2.0 * d, 10.0 * d, 401)
+    found = np.array([float(road.friction(0.13, 8.0, at)) for at in x]) / float(RIG.friction(0.13))
+    np.testing.assert_allclose(found, known(x), rtol=1e-12)
+    slopes = np.array([float(jax.grad(road.factor)(at)) for at in x])
+    np.testing.assert_allclose(slopes, known(x, 1), rtol=1e-9, atol=1e-12)
+    assert found.min() >= factors.min()
+    assert found.max() <= factors.max()
+    assert np.abs(slopes).max() <= np.abs(np.diff(factors)).max() / d
+    for at, end in ((-50.0, factors[0]), (50.0, factors[-1])):
+        np.testing.assert_allclose(road.factor(at), end, rtol=1e-15)
 
 
 @pytest.mark.parametrize("seed", [3, 4])

@@ -155,7 +155,9 @@ def plainly(loop, objectives, method, tries):
     return judge(loop, objectives, over)[0]
 
 
-@pytest.mark.parametrize("like", [d.FixedStep(1e-3), d.Adaptive()], ids=["fixed", "adaptive"])
+@pytest.mark.parametrize(
+    "like", [d.FixedStep(1e-3), pytest.param(d.Adaptive(), marks=pytest.mark.slow)], ids=["fixed", "adaptive"]
+)
 @pytest.mark.parametrize("duration", [0.02, 0.3, 3.0])
 def test_another_duration_is_the_same_program_and_the_same_steps(duration, like):
     """Against the steps one after the other, without any driver but what renews the longest stable step."""
@@ -170,6 +172,7 @@ def test_another_duration_is_the_same_program_and_the_same_steps(duration, like)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-13), run, alone)
 
 
+@pytest.mark.slow
 def test_trajectories_of_other_durations_and_strides_are_of_one_program():
     d.rollout(RIG, d.FixedStep(1e-3, 0.5, every=5), BRAKING)
     before = _run._cache_size()
@@ -184,6 +187,7 @@ def test_trajectories_of_other_durations_and_strides_are_of_one_program():
     assert _run._cache_size() == before + 1  # of the whole trajectory's length
 
 
+@pytest.mark.slow
 def test_a_batch_ends_with_its_last_lane():
     """Behind `vmap` the condition of the loop is one for all lanes; each lane ends as it would alone, also if another
     has no time to stop."""
@@ -258,6 +262,7 @@ PASSIVE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plant", ["car", *(pytest.param(name, marks=pytest.mark.slow) for name in ("rig", "lab"))])
 def test_energy_never_increases_down_to_standstill(plant):
     """Brakes and friction only take energy, on every road, while the wheel rolls, locks, sticks and stands."""

@@ -18,8 +18,9 @@ from commands import assert_one_error_line, run
 
 from diffabs import FixedStep, Loop, measure, replace, rollout
 from diffabs.controllers import PID, Clamping, Sampled
-from diffabs.core.pytree import check, parameters
+from diffabs.core.pytree import parameters
 from diffabs.core.units import Units, in_loop
+from diffabs.core.validity import check
 from diffabs.linear.operating_point import operating_point
 from diffabs.linear.regulator import lqr
 from diffabs.objectives import IAE, ITAE, FinalError, Overshoot, SettlingTime
@@ -144,6 +145,7 @@ def test_the_servo_at_its_limits_agrees_with_scipy(servo):
     assert np.ptp(sample.control[:20]) == 0  # at the limit
 
 
+@pytest.mark.slow
 def test_the_linear_model_is_the_one_written_by_hand(servo):
     loop, gains = linear(servo, load=0.03)
     model = operating_point(loop)
@@ -298,6 +300,7 @@ def test_simulate_prints_writes_and_draws(tmp_path, monkeypatch):
     assert {*signals, "setpoint", "voltage [V]"} <= texts
 
 
+@pytest.mark.slow
 def test_certify_and_design_prove_a_gain_over_the_box():
     document = json.loads(run("certify", "servo.toml", *PARTS, "--json").stdout)
     assert document["quadratically_stable"] is True
@@ -320,6 +323,7 @@ def test_tune_is_by_gradients_over_inertia_and_load(tmp_path):
     assert float(tuned.loop.controller.kp) == document["free"]["controller.kp"]["after"]
 
 
+@pytest.mark.slow
 def test_sweep_counts_what_overshoots(tmp_path):
     out = tmp_path / "out"
     document = json.loads(run("sweep", "servo.toml", *PARTS, *FAST, "--samples", 64, "--out", out, "--json").stdout)

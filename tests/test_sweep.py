@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from marks import cases
 from sweeping import described
 
 import diffabs as d
@@ -170,6 +171,7 @@ def test_a_lane_does_not_depend_on_jaxs_precision(study):
 # What does not change it
 
 
+@pytest.mark.slow
 def test_the_length_of_a_chunk_changes_rounding_only(study, swept, tmp_path):
     found = sweep(dataclasses.replace(study, chunk=37), tmp_path / "out")
     assert len(found.files) == 5
@@ -189,6 +191,7 @@ def test_float32(tmp_path):
     same(metrics(found), one_by_one(single, range(70)), rtol=1e-4, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_objectives_of_another_precision_do_not_lower_it(study, swept, tmp_path):
     with jax.enable_x64(False):
         effort = Effort()
@@ -304,7 +307,7 @@ def test_trajectories_are_those_of_rollout(study, tmp_path):
 # From the command line
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
+@pytest.fixture(scope="module", params=cases(["float64", "float32"], "float32"))
 def by_command(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
     (folder / "small.toml").write_text(SMALL if request.param == "float64" else SINGLE)

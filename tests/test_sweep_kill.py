@@ -333,6 +333,7 @@ def test_a_damaged_chunk_is_computed_again(copy, whole, how):
     assert path.read_bytes() == data
 
 
+@pytest.mark.slow
 def test_chunks_that_are_gone_or_damaged_together(copy, whole):
     names = sorted(chunks(copy))
     (copy / "chunks" / names[0]).unlink()
@@ -402,6 +403,7 @@ def test_a_manifest_from_another_configuration_is_refused(copy, whole, change, n
     assert contents(copy) == before
 
 
+@pytest.mark.slow
 def test_another_commit_is_not_another_configuration(copy, whole):
     (copy / "manifest.json").write_text(changed((copy / "manifest.json").read_text(), "commit"))
     document = json.loads(run("sweep", whole.scenario, "--out", copy, "--resume", "--json").stdout)

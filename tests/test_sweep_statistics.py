@@ -403,6 +403,7 @@ class TestCoverage:
         )
         assert abs(found - exact) < 2
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("n", "level", "law"),
         [

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_are
 from scipy.optimize import minimize
+from scipy.stats import qmc
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, references
@@ -226,6 +227,7 @@ class TestWeights:
         k = -b.T @ solve_continuous_are(a, b, q, np.array([[2.0]])) / 2.0
         np.testing.assert_allclose(loop.closed().controller.gain, k[0], rtol=1e-8)
 
+    @pytest.mark.slow
     def test_its_derivative(self):
         loop = lq_weights(RIG, (1e6, 1e4), 1.0, regulator(SlipModel(speed=20 / 3.6)))
 
@@ -321,6 +323,16 @@ class TestWorstCase:
         np.testing.assert_allclose(found.corner, np.max(run(corners)["max_slip"]), rtol=1e-9)
         assert found.corner <= found.screened <= found.value
         assert found.report().startswith("COUNTEREXAMPLE: max_slip" if not found.met else "No counterexample in")
+
+    def test_points_without_gradients(self):
+        """Any number of points, the first of Sobol's."""
+        found = worst_case(RIG, over=BOX, metric="iae", solver=SOLVER, screen=9, starts=0)
+        low, high = np.array(list(BOX.values())).T
+        points = low + (high - low) * qmc.Sobol(3, rng=np.random.default_rng(0)).random(16)[:9]
+        points = np.concatenate([np.array(list(itertools.product(*BOX.values()))), points])
+        lanes = d.Batch(dict(zip(BOX, points.T, strict=True)))
+        worst = float(np.max(d.run_batch(RIG, lanes, SOLVER, BRAKING).metrics["iae"]))
+        np.testing.assert_allclose([found.value, found.rollouts], [worst, len(points)], rtol=1e-12)
 
     def test_the_report_says_what_is_known(self):
         found = worst_case(RIG, over=BOX, metric="iae", solver=SOLVER, bound=1.0, screen=8, starts=1, iterations=1)

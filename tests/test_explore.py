@@ -1,0 +1,387 @@
+"""The explorer without a page: what is turned, drawn, saved, refused, and who may speak to it."""
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+import threading
+
+import jax
+import numpy as np
+import pytest
+from commands import left_in, run
+
+from diffabs.cli import console
+from diffabs.core.pytree import get, parameters, replace
+from diffabs.core.values import ScenarioError
+from diffabs.explore import charts, curves, friction, saving, stability, tuning
+from diffabs.explore.curves import Curves, Fan, Line, Panel, Spread
+from diffabs.explore.guard import Guard
+from diffabs.explore.knobs import STEPS
+from diffabs.explore.session import AS_GIVEN, Session
+from diffabs.explore.work import Latest
+from diffabs.linear import margins, open_loop
+from diffabs.linear.stability_margins import closed_poles
+from diffabs.linear.transfer import Transfer
+from diffabs.scenario import dump, load, names
+from diffabs.simulate.run import rollout
+
+SHORT = """
+[plant]
+type = "mirrored-rig"
+[road]
+type = "rig"
+[initial]
+speed_kmh = 30.0
+[feedforward]
+type = "holding-input"
+[controller]
+type = "state-feedback"
+gain = [-11753.0, -48.0]
+torque_min = -inf
+torque_max = inf
+[stop]
+type = "speed-reached"
+speed_kmh = 10.0
+[solver]
+step = 1e-3
+duration = 1.0
+[design.over]
+"plant.mass" = [5.3, 6.2]
+[tune]
+iterations = 3
+[tune.free]
+"controller.gain" = [[-1e5, -300.0], [-100.0, -15.0]]
+[tune.objective]
+iae = 1.0
+[sweep.over]
+"road.w4" = [0.35, 0.45]
+"""
+
+pytestmark = pytest.mark.usefixtures("any_step_is_stable")
+
+
+@pytest.fixture
+def session(file):
+    """Of a short run."""
+    return Session(str(file(SHORT)))
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_packaged_scenario_opens_with_what_one_drags(name):
+    found = Session(name)
+    units = [found.knobs[key].spec.unit for key in found.first]
+    assert units[0] in ("kg", "kg m^2")  # what is heavy comes first
+    assert any(key.startswith("controller.") for key in found.first)
+    assert ("plant.road.scale" in found.first) == hasattr(found.given.loop.plant, "road")
+    assert ("initial.speed" in found.first) == hasattr(found.given.loop.initial, "speed")
+    assert set(found.first) <= found.knobs.keys()
+    assert {path.split(".")[0] for path in found.given.tune.free} <= {key.split(".")[0] for key in found.first}
+    for key in found.first:  # the value as it is lies on its slider
+        knob = found.knobs[key]
+        assert knob.low <= found.value(key) * knob.scale <= knob.high
+        assert knob.spec.holds(knob.low)
+        assert knob.spec.holds(knob.high)
+
+
+@pytest.mark.parametrize("name", ["slip-cured", "arm-hanging"])
+def test_places_of_a_slider_are_values(name):
+    found = Session(name)
+    for key in found.first:
+        knob = found.knobs[key]
+        for end, place in ((knob.low, 0), (knob.high, STEPS)):
+            assert knob.value_at(place) * knob.scale == pytest.approx(end, rel=1e-12, abs=1e-300)
+        for place in (1, 250, 500, 999):
+            assert knob.place_of(knob.value_at(place)) == pytest.approx(place, abs=0.51)
+
+
+def test_a_slider_over_decades_is_even_in_the_logarithm(session):
+    knob = session.knobs["controller.gain.0"]  # from -1e5 to -300
+    middle = -np.sqrt(knob.low * knob.high)
+    assert knob.value_at(STEPS / 2) == pytest.approx(middle, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("key", "given", "said"),
+    [
+        ("plant.mass", "abc", 'plant.mass = "abc" is text; a number in (0, inf) kg is needed'),
+        ("plant.mass", "", 'plant.mass = "" is text; a number in (0, inf) kg is needed'),
+        ("plant.mass", "-3", "plant.mass = -3 is outside (0, inf) kg"),
+        ("plant.mass", "nan", "plant.mass = nan is outside (0, inf) kg"),
+        ("plant.mass", "1e999", "plant.mass = inf is outside (0, inf) kg"),
+        ("plant.mass", None, "plant.mass = null is nothing; a number in (0, inf) kg is needed"),
+        ("plant.mass", True, "plant.mass = true is a boolean; a number in (0, inf) kg is needed"),
+        ("initial.speed", "900", "initial.speed_kmh = 900 is outside (0, 720] km/h"),
+        ("initial.speed", "5", "initial.speed_kmh = 5 km/h: initial.speed = 1.38889 m/s is not above stop.speed"),
+        ("controller.gain.1", "x", 'controller.gain.1 = "x" is text; a number in (-inf, inf) N m is needed'),
+        ("plant.colour", "3", "'plant.colour' is no number of this loop"),
+    ],
+)
+def test_nonsense_is_refused_with_the_field_named(session, key, given, said):
+    before = dump(session.scenario())
+    with pytest.raises(ScenarioError) as error:
+        session.turn(key, given)
+    assert str(error.value).startswith(said.replace("null", "None"))
+    assert dump(session.scenario()) == before
+
+
+@pytest.mark.parametrize("given", ["much", "-1", "91", "nan", None])
+def test_a_spread_that_is_none_is_refused(session, given):
+    with pytest.raises(ScenarioError, match=r"fan\.mass = .*\[0, 90\] %"):
+        session.widen("mass", given)
+    assert session.spread == Spread()
+
+
+def test_a_step_that_is_not_stable_is_refused(file, monkeypatch):
+    from diffabs.simulate import refusals
+
+    found = Session(str(file(SHORT)))
+    monkeypatch.setattr(refusals, "stable_step", lambda loop: 5.75e-3 / loop.plant.mass)
+    found.turn("plant.mass", "5.5")
+    with pytest.raises(ScenarioError, match=r"plant.mass = 6 kg: solver.step = 0.001 s is not stable"):
+        found.turn("plant.mass", "6")
+    assert found.value("plant.mass") == 5.5
+
+
+def test_what_is_turned_is_in_the_scenario_and_nowhere_else(file):
+    one, other = (Session(str(file(SHORT))) for _ in range(2))
+    one.turn("plant.mass", "5.5")
+    one.turn("initial.speed", "25")
+    one.turn("controller.gain.1", "-60")
+    loop = one.scenario().loop
+    assert (loop.plant.mass, loop.initial.speed) == (5.5, pytest.approx(25 / 3.6))
+    np.testing.assert_array_equal(loop.controller.gain, [-11753.0, -60.0])
+    np.testing.assert_array_equal(other.scenario().loop.controller.gain, [-11753.0, -48.0])
+    assert dump(other.scenario()) == dump(Session(str(file(SHORT))).scenario())
+    one.reset()
+    assert dump(one.scenario()) == dump(other.scenario())
+
+
+def test_another_road_leaves_what_was_turned(session):
+    session.turn("plant.mass", "5.5")
+    session.turn("plant.road.scale", "0.5")
+    session.choose("road", "snow")
+    loop = session.scenario().loop
+    assert loop.plant.mass == 5.5
+    assert loop.plant.road.scale == 1.0
+    assert "c1" in dataclasses.asdict(loop.plant.road.road)
+    session.choose("road", AS_GIVEN)
+    assert session.scenario().loop.plant.mass == 5.5
+    assert "w4" in dataclasses.asdict(session.scenario().loop.plant.road.road)
+
+
+def test_a_part_that_does_not_fit_changes_nothing(session):
+    before = dump(session.scenario())
+    with pytest.raises(ScenarioError, match="balance-feedback"):
+        session.choose("controller", "balance-feedback")
+    assert dump(session.scenario()) == before
+    assert session.parts["controller"] == AS_GIVEN
+
+
+@pytest.mark.parametrize("name", ["slip-lmi", "slip-cured", "arm-hanging"])
+def test_a_friction_factor_comes_and_goes_without_a_trace(name):
+    given = load(name)
+    with_one = friction.with_factor(given)
+    assert dump(friction.without_factor(with_one, given)) == dump(given)
+    if hasattr(given.loop.plant, "road"):
+        slippery = dataclasses.replace(with_one, loop=replace(with_one.loop, {friction.FACTOR: 0.5}))
+        again = friction.without_factor(slippery, given)
+        assert float(get(again.loop, friction.FACTOR)) == 0.5
+        assert {path.replace("plant.road.road.", "plant.road.") for path in again.sweep.over} == {*given.sweep.over}
+        there = {path for path, _, _ in parameters(again.loop)}
+        assert {*again.sweep.over, *again.design.over, *again.tune.free, *again.tune.over} <= there
+        assert get(again.loop, "plant.road.road.w4") == get(given.loop, "plant.road.w4")
+
+
+@pytest.mark.parametrize("turned", [{"plant.mass": 5.61}, {"plant.mass": 5.61, "plant.road.scale": 0.77}, {}])
+def test_the_command_line_runs_what_was_saved_to_the_same_numbers(session, tmp_path, turned):
+    for key, value in turned.items():
+        session.turn(key, value)
+    shown = curves.curves(session.scenario())
+    path = saving.save(session.to_save(), tmp_path, "explored.toml")
+    metrics = json.loads(run("simulate", path, "--json").stdout)["metrics"]
+    assert metrics == pytest.approx(shown.metrics, rel=1e-12, abs=1e-14)
+    assert ("scaled" in path.read_text()) == ("plant.road.scale" in turned)
+
+
+@pytest.mark.parametrize(
+    "name", ["mine", "../mine.toml", "/tmp/mine.toml", ".mine.toml", ".toml", "", "a/b.toml", "a\\b.toml", "a\nb.toml"]
+)
+def test_a_name_that_leads_elsewhere_is_refused(session, tmp_path, name):
+    (tmp_path / "in").mkdir()
+    with pytest.raises(ScenarioError, match="file = "):
+        saving.save(session.to_save(), tmp_path / "in", name)
+    assert left_in(tmp_path / "in") == set()
+    assert left_in(tmp_path) <= {"in", "mine.toml"}  # the scenario itself
+
+
+def test_a_file_is_only_replaced_when_that_is_said(session, tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (folder / "mine.toml").write_text("mine")
+    with pytest.raises(ScenarioError, match=r'file = "mine.toml" exists'):
+        saving.save(session.to_save(), folder, "mine.toml")
+    assert (folder / "mine.toml").read_text() == "mine"
+    assert saving.free_name(folder, "mine") == "mine-2.toml"
+    saving.save(session.to_save(), folder, "mine.toml", replacing=True)
+    assert load(folder / "mine.toml").loop.plant.mass == session.given.loop.plant.mass
+    assert left_in(folder) == {"mine.toml"}
+
+
+def test_a_fan_has_the_quantiles_of_its_runs(session, monkeypatch):
+    monkeypatch.setattr(curves, "MEMBERS", 5)
+    chosen, spread = session.scenario(), Spread(mass=0.1, road=0.3)
+    found = curves.fan(chosen, spread)
+    values, words = curves.members(chosen, spread)
+    assert words == "mass ± 10 %, friction ± 30 %"
+    by = curves.solver(chosen)
+    each = [replace(chosen.loop, {path: column[i] for path, column in values.items()}) for i in range(5)]
+    slips = [np.asarray(rollout(loop, by).trajectory.sample.output.slip) for loop in each]
+    early = slice(0, 50)  # all of them still run
+    expected = np.quantile([slip[early] for slip in slips], curves.QUANTILES, axis=0)
+    np.testing.assert_allclose(found.bands[0][:, early], expected, rtol=1e-9, atol=1e-12)
+    for path, part in ((friction.FACTOR, 0.3), ("plant.mass", 0.1)):
+        here = float(get(chosen.loop, path))
+        assert np.all(np.abs(values[path] / here - 1) <= part)
+        assert np.ptp(values[path]) > part * here
+
+
+@pytest.mark.slow
+def test_a_draft_is_the_run_to_what_can_be_seen(session):
+    exact, draft = (curves.curves(session.scenario(), by) for by in (None, curves.Adaptive(rtol=1e-3, step=2.5e-3)))
+    assert (exact.draft, draft.draft) == (False, True)
+    ends = np.interp(draft.t[:-1], exact.t, exact.panels[0].lines[0].values)
+    assert np.max(np.abs(ends - draft.panels[0].lines[0].values[:-1])) < 2e-3
+    assert [panel.unit for panel in exact.panels] == ["1", "km/h", "N m"]
+    assert exact.panels[1].lines[0].values[0] == pytest.approx(30.0)
+    assert exact.end.startswith("ends after 0.")
+
+
+def test_poles_of_a_closed_loop_are_those_of_its_polynomial():
+    def of(a, b, c, **more):
+        return Transfer(*(np.array(x, float) for x in (a, b, c, [[0.0]])))._replace(**more)
+
+    motor = of([[0, 1], [0, -1]], [[0], [1]], [[7.0, 0]])  # 7/(s (s + 1))
+    np.testing.assert_allclose(np.sort_complex(closed_poles(motor)), np.sort_complex(np.roots([1, 1, 7])), rtol=1e-12)
+    late = of([[1]], [[1]], [[0.3]], period=0.1, delay=0.1)  # 0.3/(z (z - 1))
+    np.testing.assert_allclose(np.sort_complex(closed_poles(late)), np.sort_complex(np.roots([1, -1, 0.3])), rtol=1e-12)
+
+
+def test_margins_are_those_of_the_library(session):
+    chosen = session.scenario()
+    found, oracle = stability.stability(chosen), margins(open_loop(chosen.loop))
+    assert found.stable
+    assert found.margins["phase"] == oracle.phase
+    assert found.margins["gain_up"] == oracle.gain[1]
+    assert found.systems == 4  # mass, and speed between start and stop
+    assert found.worst["phase"] <= found.margins["phase"]
+    assert np.all(found.poles.real < 0)
+
+
+def test_a_loop_without_a_linear_model_says_so():
+    with pytest.raises(ValueError, match="no linear loop"):
+        stability.stability(friction.with_factor(load("lab-rig")))
+
+
+def test_a_tuning_begins_from_what_is_shown(file):
+    session = Session(str(file(SHORT.replace("[-100.0, -15.0]", "[-100.0, -45.0]"))))
+    assert session.knobs["controller.gain.1"].high > -45  # a slider goes further than the scenario tunes
+    session.turn("controller.gain.1", "-46")
+    chosen = tuning.goal(session.scenario(), *tuning.usual(session.scenario()), session.knobs)
+    assert chosen.tune.free == {"controller.gain": ((-1e5, -300.0), (-100.0, -45.0))}
+    assert chosen.tune.objective == {"iae": 1.0}
+    assert get(chosen.loop, "controller.gain.1") == -46
+    other = tuning.goal(session.scenario(), ["reference.slip"], "stop_distance", session.knobs)
+    ends = other.tune.free["reference.slip"]
+    assert ends
+    low, high = ends
+    assert 0 < low < 0.2 < high <= 1
+    assert other.tune.objective == {"stop_distance": 1.0}
+    with pytest.raises(ScenarioError, match=r"tune\.free is empty"):
+        tuning.goal(session.scenario(), [], "iae", session.knobs)
+    with pytest.raises(ScenarioError, match="is not measured"):
+        tuning.goal(session.scenario(), ["reference.slip"], "beauty", session.knobs)
+
+
+def test_charts_are_plain_json_whatever_a_run_was():
+    lines = (Line("slip", np.array([0.1, np.nan, np.inf])), Line("target", np.array([0.0, 1e-30, 123456.789])))
+    torque = Panel("N m", (Line("control", np.array([0.0, 9.03, np.nan])), Line("command", np.array([0.0, 1e9, 5.0]))))
+    found = Curves(np.array([0.0, 0.1, 0.2]), (Panel("1", lines), torque), {}, "", draft=False)
+    change = charts.curves(found)
+    source = change["dataset"][0]["source"]
+    assert source["0.0"] == [0.1, None, None]
+    assert source["0.1"] == [0.0, 1e-30, 123460.0]
+    assert change["yAxis"] == [{}, {"min": 0, "max": 15.0, "interval": 5.0}]  # the command is beyond what can be given
+    bands = tuple(np.array([[0.0], [1.0], [2.0], [4.0], [8.0]]) for _ in range(2))
+    steps = charts.fan(Fan(np.array([0.0]), bands, 200, 0, ""))["dataset"][0]["source"]
+    assert [steps[f"0.{i}"] for i in range(4)] == [[0.0], [1.0], [3.0], [4.0]]  # each on top of the one before
+    json.dumps([charts.frame(found), change, charts.pole_frame(), charts.poles(None)], allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("allowed", "host", "origin", "client"),
+    [
+        (True, "127.0.0.1:8342", None, "127.0.0.1"),
+        (True, "localhost:8342", "http://localhost:8342", "127.0.0.1"),
+        (False, "127.0.0.1:8342", "http://evil.example", "127.0.0.1"),  # another page in the same browser
+        (False, "127.0.0.1:8342", "http://127.0.0.1:9000", "127.0.0.1"),  # and one served on this machine
+        (False, "127.0.0.1:8342", "null", "127.0.0.1"),
+        (False, "127.0.0.1:8342", "http://localhost:8342", "127.0.0.1"),
+        (False, "evil.example:8342", "http://evil.example:8342", "127.0.0.1"),  # a name that leads to 127.0.0.1
+        (False, "127.0.0.1", None, "127.0.0.1"),
+        (False, None, None, "127.0.0.1"),
+        (False, "127.0.0.1:8342", None, "192.168.0.7"),
+        (False, "127.0.0.1:8342", None, None),
+    ],
+)
+def test_only_the_own_page_on_this_machine_is_answered(allowed, host, origin, client):
+    given = {b"host": host, b"origin": origin}
+    headers = [(name, value.encode()) for name, value in given.items() if value is not None]
+    scope = {"type": "http", "headers": headers, "client": (client, 5) if client else None}
+    assert Guard(None, 8342).allowed(scope) == allowed
+
+
+def test_a_worker_does_the_newest_and_drops_what_waited():
+    gate, done, ended, errors = threading.Event(), [], threading.Event(), []
+    worker = Latest("test of a worker", errors.append)
+    began = threading.Event()
+    worker.ask(lambda: (began.set(), gate.wait(10), done.append(0)))
+    assert began.wait(10)
+    for i in range(1, 5):
+        worker.ask(lambda i=i: (done.append(i), ended.set()))
+    gate.set()
+    assert ended.wait(10)
+    assert done == [0, 4]
+    failing = threading.Event()
+    worker.ask(lambda: (failing.set(), 1 / 0))
+    assert failing.wait(10)
+    worker.ask(ended.clear)
+    worker.end()
+    assert [type(error) for error in errors] in ([ZeroDivisionError], [])
+
+
+def test_the_framework_is_only_loaded_by_the_command():
+    code = (
+        "import sys, diffabs, diffabs.explore, diffabs.cli.main, diffabs.explore.session as s; s.Session('slip-cured');"
+    )
+    code += " print(sorted({'nicegui', 'fastapi', 'uvicorn', 'optax', 'cvxpy', 'matplotlib'} & sys.modules.keys()))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(console.EXTRAS, "explore", ("no_such_framework",))
+    found = run("explore", "slip-cured", status=2)
+    assert found.stderr == 'error: no_such_framework needed: pip install "diffabs[explore]"\n'
+
+
+def test_a_scenario_that_is_wrong_is_said_before_anything_listens(monkeypatch, file):
+    monkeypatch.setitem(console.EXTRAS, "explore", ())
+    found = run("explore", file("[plant]\ntype = 'quarter-car'\nmass = -1.0"), status=2)
+    assert re.fullmatch(r"error: plant\.mass = -1 is outside \(0, inf\) kg\n", found.stderr)
+
+
+def test_precision_is_that_of_the_command_line(session):
+    assert jax.config.jax_enable_x64
+    assert curves.curves(session.scenario()).t.dtype == np.float64

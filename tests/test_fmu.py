@@ -1,0 +1,207 @@
+"""FMUs of plants: run by an importer of the tests' own and by FMPy, against the simulation."""
+
+import dataclasses
+import math
+import shutil
+import zipfile
+
+import jax
+import numpy as np
+import pytest
+from commands import assert_one_error_line, left_in
+from commands import run as command
+from fmi import Fmu
+from marks import cases
+from structured_text import Block
+
+import diffabs as d
+from diffabs.controllers import PID, ConstantInput, ConstantTorque, Sampled
+from diffabs.export import NotExported, device, fmu, structured_text
+from diffabs.kernel.compilers import COMPILER
+from diffabs.plants import MirroredRig
+from diffabs.references import FixedSlip
+from diffabs.scenario.defaults import braking
+from diffabs.scenario.scenario import load
+
+pytestmark = pytest.mark.skipif(shutil.which("c++") is None, reason="no compiler")
+STEP, PERIOD, SAMPLES = 1e-4, 1e-3, 400
+
+
+def imported(loop, folder, step=STEP, name="plant"):
+    path = folder / f"{name}.fmu"
+    path.write_bytes(fmu(loop, name, step=step))
+    return Fmu(path, folder / name)
+
+
+def trajectory(loop, duration, every=10, step=STEP):
+    """What is shown at multiples of `every` steps."""
+    run = d.rollout(loop, d.FixedStep(step, duration, every=every, kinks=False), {})
+    return jax.tree.map(np.asarray, run.trajectory.sample.output)
+
+
+def followed(one, count, control, names, period=PERIOD):
+    """What an FMU shows while it is given control(k), k = 0, 1, ..."""
+    rows = [one.get(*names)]
+    for k in range(count):
+        assert one.set("control", control(k)) == 0
+        assert one.step(k * period, period) == 0
+        rows.append(one.get(*names))
+    return np.array(rows)
+
+
+PLANTS = {
+    "mirrored rig": braking(plant=MirroredRig(), controller=ConstantTorque(torque=2.0)),
+    "a wheel that locks": braking(plant=MirroredRig(), controller=ConstantTorque(torque=20.0)),
+    "quarter car": braking(controller=ConstantTorque(torque=600.0)),
+    "laboratory rig": load("lab-rig", integrated=False).loop,
+    "balance": load("arm-hanging", integrated=False).loop,
+}
+
+
+@pytest.mark.parametrize("name", cases(PLANTS, "laboratory rig", "balance", "quarter car"))
+def test_an_fmu_runs_as_the_simulation_does(name, tmp_path):
+    """To rounding, and so to 1e-6: the control of a whole run goes in, what was shown comes out."""
+    loop = PLANTS[name]
+    if not isinstance(loop.controller, ConstantTorque):  # then one that is held for a period
+        loop = dataclasses.replace(loop, controller=Sampled(controller=loop.controller, period=PERIOD))
+    run = d.rollout(loop, d.FixedStep(STEP, 0.2, every=10, kinks=False), {})
+    kept = jax.tree.map(np.asarray, run.trajectory.sample)
+    count = int(run.trajectory.running.sum()) - 1
+    assert count > 150
+    one = imported(loop, tmp_path).begin()
+    found = followed(one, count, lambda k: float(kept.control[k]), kept.output._fields)
+    for column, field in zip(found.T, kept.output._fields, strict=True):
+        wanted = getattr(kept.output, field)[: count + 1]
+        np.testing.assert_allclose(column, wanted, rtol=1e-6, atol=1e-9, err_msg=field)
+    assert np.ptp(found[:, 0]) > 1e-3
+
+
+def test_a_loop_closed_outside_is_the_loop(tmp_path):
+    """The plant as FMU, the controller as Structured Text: together what was simulated, to 1e-6."""
+    loop = braking(
+        plant=MirroredRig(),
+        controller=Sampled(controller=PID(kp=60.0, ki=400.0, kd=0.3, torque_max=9.03), period=PERIOD),
+        reference=FixedSlip(slip=0.2),
+        feedforward=ConstantInput(value=2.7),
+    )
+    one = imported(loop, tmp_path).begin()
+    block = Block(structured_text(device(loop), "Law"))
+    wanted = trajectory(loop, SAMPLES * PERIOD)
+    names = ("slip", "speed", "wheel_speed", "distance")
+    found = followed(one, SAMPLES, lambda k: block(slip=one.get("slip")[0]), names)
+    for column, name in zip(found.T, names, strict=True):
+        np.testing.assert_allclose(column, getattr(wanted, name)[: SAMPLES + 1], rtol=1e-6, atol=1e-9, err_msg=name)
+    assert found[-1, 0] == pytest.approx(0.2, abs=0.02)
+
+
+def test_parameters_are_the_importers(tmp_path):
+    changed = d.core.pytree.replace(PLANTS["mirrored rig"], {"plant.mass": 6.2, "initial.slip": 0.1})
+    one = imported(PLANTS["mirrored rig"], tmp_path)
+    assert one.get("plant.mass", "plant.road.w4") == [5.3, 0.407]
+    one.begin(plant__mass=6.2, initial__slip=0.1)
+    found = followed(one, 100, lambda k: 2.0, ("slip", "speed"))
+    wanted = trajectory(changed, 0.1)
+    np.testing.assert_allclose(found[:, 0], wanted.slip[:101], rtol=1e-9)
+    np.testing.assert_allclose(found[:, 1], wanted.speed[:101], rtol=1e-9)
+    assert found[0, 0] == pytest.approx(0.1)
+    assert one.set("plant.mass", 5.0) == 3  # an error: it runs
+    assert one.set("slip", 0.3) == 3  # an output
+
+
+def test_a_state_can_be_kept_and_taken_again(tmp_path):
+    one = imported(PLANTS["mirrored rig"], tmp_path).begin()
+    followed(one, 20, lambda k: 2.0, ("slip",))
+    kept = one.state()
+    first = followed(one, 20, lambda k: 3.0, ("slip", "speed", "distance"))
+    one.restore(kept)
+    np.testing.assert_array_equal(followed(one, 20, lambda k: 3.0, ("slip", "speed", "distance")), first)
+
+
+def test_steps_of_any_length_are_taken_by_whole_ones(tmp_path):
+    """A step of the importer that is no multiple is divided into equal ones, none longer than that of the plant."""
+    one = imported(PLANTS["mirrored rig"], tmp_path).begin()
+    length, count = 0.02551, 256  # so many are needed
+    found = followed(one, 4, lambda k: 2.0, ("slip", "distance"), period=length)
+    wanted = trajectory(PLANTS["mirrored rig"], 4 * length, every=count, step=length / count)
+    np.testing.assert_allclose(found[:, 0], wanted.slip[:5], rtol=1e-11)
+    np.testing.assert_allclose(found[:, 1], wanted.distance[:5], rtol=1e-11)
+    assert one.step(1.0, 0.0) == 3
+    assert one.step(1.0, math.nan) == 3
+
+
+def test_who_asks_for_another_is_given_none(tmp_path):
+    path = tmp_path / "plant.fmu"
+    path.write_bytes(fmu(PLANTS["mirrored rig"], "plant", step=STEP))
+    assert Fmu(path, tmp_path / "a", guid="{no}").instance.value is None
+
+
+def test_the_description_says_what_is_what(tmp_path):
+    one = imported(PLANTS["mirrored rig"], tmp_path)
+    assert one.description.get("fmiVersion") == "2.0"
+    variables = {scalar.get("name"): scalar for scalar in one.description.iter("ScalarVariable")}
+    roles = {name: scalar.get("causality") for name, scalar in variables.items()}
+    assert {name for name, role in roles.items() if role == "input"} == {"control"}
+    assert {name for name, role in roles.items() if role == "output"} == set(MirroredRig.shows._fields)
+    assert roles["plant.road.w1"] == roles["initial.speed"] == "parameter"
+    assert variables["control"].find("Real").get("unit") == "N m"
+    assert variables["plant.wheel_inertia"].find("Real").get("unit") == "kg m^2"
+    assert {unit.get("name") for unit in one.description.iter("Unit")} >= {"N m", "kg m^2", "m/s"}
+    listed = [int(one.get("index")) for one in one.description.find("ModelStructure/Outputs")]
+    order = [*variables]
+    assert [order[index - 1] for index in listed] == list(MirroredRig.shows._fields)
+    assert (tmp_path / "plant" / "sources" / "plant.c").is_file()
+    with zipfile.ZipFile(tmp_path / "plant.fmu") as archive:
+        assert {info.date_time[0] for info in archive.infolist()} == {1980}
+    again = fmu(PLANTS["mirrored rig"], "plant", step=STEP)
+    assert again == (tmp_path / "plant.fmu").read_bytes()
+
+
+def test_fmpy_runs_it_to_the_simulation(tmp_path):
+    """A library that many use reads the description, validates it, and runs it."""
+    fmpy = pytest.importorskip("fmpy")
+    validation = pytest.importorskip("fmpy.validation")
+    path = tmp_path / "plant.fmu"
+    path.write_bytes(fmu(PLANTS["mirrored rig"], "plant", step=STEP))
+    assert validation.validate_fmu(str(path)) == []
+    found = fmpy.simulate_fmu(
+        str(path), stop_time=0.2, output_interval=PERIOD, start_values={"control": 2.0}, output=["slip", "speed"]
+    )
+    wanted = trajectory(PLANTS["mirrored rig"], 0.2)
+    for name in ("slip", "speed"):
+        np.testing.assert_allclose(found[name], getattr(wanted, name)[: len(found)], rtol=1e-6)
+    assert len(found) == 201
+
+
+def test_the_command_writes_an_fmu(tmp_path):
+    result = command("export", "slip-lmi", "--to", "fmu", "--set", "solver.step=1e-3", "-o", tmp_path / "rig-1.fmu")
+    assert "FMI 2.0 for co-simulation, input control [N m]" in result.stderr
+    assert left_in(tmp_path) == {"rig-1.fmu"}
+    one = Fmu(tmp_path / "rig-1.fmu", tmp_path / "in").begin()
+    assert one.get("speed") == [pytest.approx(50 / 3.6)]
+    assert one.description.get("modelName") == "rig_1"
+    assert one.description.find("DefaultExperiment").get("stepSize") == "0.001"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--to", "fmu"), "--to fmu needs a file: -o plant.fmu"),
+        (("--to", "fmu", "-o", "x.fmu", "--set", "solver.type=adaptive"), "an FMU takes fixed steps"),
+        (("--to", "fmu", "-o", "x.fmu", "--float32"), "--float32 and --given are for --to c and --to st"),
+    ],
+)
+def test_the_command_refuses_in_one_line(words, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = command("export", "slip-lmi", *words, status=2)
+    assert said in result.stderr
+    assert_one_error_line(result)
+    assert left_in(tmp_path) == set()
+
+
+def test_without_a_compiler_it_is_said(tmp_path, monkeypatch):
+    monkeypatch.setenv(COMPILER, "")
+    with pytest.raises(NotExported, match="needs a C compiler"):
+        fmu(PLANTS["mirrored rig"], "plant", step=STEP)
+    result = command("export", "slip-lmi", "--to", "fmu", "-o", tmp_path / "x.fmu", status=2)
+    assert "an FMU needs a C compiler" in result.stderr
+    assert left_in(tmp_path) == set()

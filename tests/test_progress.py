@@ -1,0 +1,98 @@
+"""How far work is: the same words for every command, with compiling apart from running."""
+
+import re
+import time
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from diffabs.cli import console, progress
+from diffabs.cli.progress import Far, Pace
+from diffabs.core import stopwatch
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A time that tests set, and a stopwatch with nothing on it."""
+    now = [100.0]
+    watch = stopwatch.Stopwatch()
+    monkeypatch.setattr(stopwatch, "_compiling", watch)
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    return now, watch
+
+
+def test_spans_that_overlap_count_once():
+    watch = stopwatch.Stopwatch()
+    for start, end in ((1.0, 2.0), (4.0, 5.0), (4.5, 6.0), (3.5, 7.0), (9.0, 10.0)):
+        watch.add(start, end)
+    assert watch.seconds() == pytest.approx(1.0 + 3.5 + 1.0)
+    assert watch.seconds(since=5.0) == pytest.approx(2.0 + 1.0)
+    assert watch.seconds(since=20.0) == 0.0
+
+
+def test_what_jax_compiles_is_counted():
+    stopwatch.listen()
+    stopwatch.listen()  # once is enough
+    begun = time.monotonic()
+
+    def long(x):
+        for k in range(30):
+            x = jnp.sin(x) @ x + k
+        return x
+
+    jax.jit(long)(jnp.ones((4, 4))).block_until_ready()
+    took = stopwatch.compiled(begun)
+    assert 0.0 < took <= time.monotonic() - begun
+    before = stopwatch.compiled(begun)
+    with stopwatch.compiling():
+        time.sleep(0.05)
+    assert stopwatch.compiled(begun) - before == pytest.approx(0.05, abs=0.04)
+
+
+def test_what_is_left_does_not_count_compiling(clock):
+    """30 s, of which 20 were compiling, for a tenth of the work: the rest takes 90 s, not 270."""
+    now, watch = clock
+    pace = Pace()
+    assert pace.said(Far("compiling", 0, 100)) == ""
+    now[0] = 130.0
+    watch.add(105.0, 125.0)
+    assert pace.said(Far("ten", 10, 100)) == "; 30 s, 20 s of it compiling, 1 min 30 s left"
+    assert pace.said(Far("", 10, 100, at_most=True)).endswith(", at most 1 min 30 s left")
+    assert pace.said(Far("")) == " 30 s, 20 s of it compiling"
+
+
+def test_what_was_there_before_is_no_pace(clock):
+    """A sweep that goes on: 50 of 100 were there; 10 more took 10 s."""
+    now, _ = clock
+    pace = Pace()
+    pace.said(Far("", 50, 100))
+    now[0] = 101.5
+    assert pace.said(Far("fifty", 50, 100)) == "; 2 s"
+    now[0] = 110.0
+    assert pace.said(Far("sixty", 60, 100)) == "; 10 s, 40 s left"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(0.4, "0 s"), (59.6, "1 min 0 s"), (3700.0, "1 h 1 min"), (61.0, "1 min 1 s")]
+)
+def test_a_time_in_words(seconds, words):
+    assert progress.spoken(seconds) == words
+
+
+def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
+    """Where nothing can be drawn over, in lines; those that only differ in time are not told again."""
+    monkeypatch.setattr(console, "PATIENCE", 1.0)
+    monkeypatch.setattr(console, "AGAIN", 0.1)
+    console.waited(lambda: time.sleep(1.8), "working", lambda: "somewhere")
+    said = capsys.readouterr().err
+    assert re.fullmatch(r"working ... somewhere; 1 s(, \d+ s of it compiling)?\n", said), said
+
+
+def test_documents_say_how_long_they_took():
+    console.begin(["list", "roads"])
+    with stopwatch.compiling():
+        time.sleep(0.2)
+    made = console.made()
+    assert made["command"] == "diffabs list roads"
+    assert 0.1 <= made["of it compiling"] <= made["seconds"] <= 20.0

@@ -1,0 +1,342 @@
+"""Reports: complete, equal to the documents they are made of, and safe to open."""
+
+import base64
+import itertools
+import json
+import math
+
+import pytest
+from commands import assert_one_error_line, left_in
+from commands import run as command
+from marks import cases
+from reports import Page
+from sweeping import SCENARIO
+from terminal import Terminal, assert_fits, assert_orderly
+
+pytest.importorskip("jinja2")
+pytest.importorskip("matplotlib")
+
+from diffabs.cli import report as reporting
+from diffabs.report import ReportError, documents, report
+from diffabs.report.charts import lines
+from diffabs.report.writing import SECTIONS
+
+TUNED = """
+[tune]
+iterations = 2
+[tune.free]
+"controller.gain" = [[-1e4, -60.0], [-100.0, -20.0]]
+[tune.objective]
+iae = 1.0
+[tune.over]
+"plant.mass" = [5.3, 6.2]
+[tune.limits]
+overshoot = 1.0
+"""
+HOSTILE = '<script>alert("x")</script><img src=http://x.test/a.png onerror=alert(1)>'
+HEADINGS = ["Question", "Model", "Provenance", "Run it again"]
+
+
+class Results:
+    """What the commands write, made when it is asked for: files as a shell redirects them, and a sweep's folder."""
+
+    def __init__(self, folder):
+        self.folder, self.scenario = folder, folder / "small.toml"
+        self.scenario.write_text(SCENARIO + TUNED)
+
+    def __truediv__(self, name):
+        kind = name.partition(".")[0]
+        if kind in KINDS and not (self.folder / f"{kind}.json").exists():
+            self.make(kind)
+        if kind == "certificate" and not (self.folder / name).exists():
+            self.make("design")
+        return self.folder / name
+
+    def make(self, kind):
+        still = ("--set", "sensor=direct")
+        if kind == "identify":
+            command("simulate", self.scenario, *still, "--csv", self.folder / "run.csv")
+        words = {
+            "sweep": [self.scenario, "--samples", 128, "--out", self.folder / "sweep", "--figures"],
+            "tune": [self.scenario],
+            "design": ["slip-lmi", "--out", self.folder / "certificate.json"],
+            "identify": [self.scenario, *still, "--data", self.folder / "run.csv", "--free", "plant.mass=4:8",
+                         "--column", "wheel_speed"],
+            "rare": [self.scenario, "stop_distance=2.5", "--samples", 100],
+        }[kind]  # fmt: skip
+        (self.folder / f"{kind}.json").write_text(command(kind, *words, "--json").stdout)
+
+    def all(self):
+        """The folder with everything in it."""
+        for kind in KINDS:
+            _ = self / f"{kind}.json"
+        return self.folder
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    return Results(tmp_path_factory.mktemp("results"))
+
+
+KINDS = ("sweep", "tune", "design", "identify", "rare")
+LONG = ("sweep", "identify", "rare")
+SOURCES = {"sweep": "sweep", "certificate": "certificate.json", **{kind: f"{kind}.json" for kind in
+           ("tune", "design", "identify", "rare")}}  # fmt: skip
+
+
+def page(results, kind):
+    return Page(report(documents(results / SOURCES[kind])))
+
+
+def leaves(value):
+    """All numbers of a document, as they are written."""
+    if isinstance(value, dict | list):
+        return {x for one in (value.values() if isinstance(value, dict) else value) for x in leaves(one)}
+    return {repr(value)} if isinstance(value, int | float) and not isinstance(value, bool) else set()
+
+
+@pytest.mark.parametrize("kind", cases(SOURCES, *LONG))
+def test_a_report_stands_for_itself(results, kind):
+    found = page(results, kind)
+    assert [one for one in found.headings if one in HEADINGS] == HEADINGS
+    assert found.foreign == []
+    assert "main" in found.tags
+    assert "None" not in found.text.split()
+    assert {"tune": 0, "sweep": 5}.get(kind, 0) == len(found.images)
+    assert ("svg" in found.tags) == (kind == "tune")
+    (document,) = documents(results / SOURCES[kind])
+    assert document.kind == kind
+    if kind not in ("certificate", "sweep"):
+        assert f"diffabs {kind} " in found.text
+        assert document.content["made"]["date"] in found.text
+        assert document.content["versions"]["jax"] in found.text
+
+
+def test_every_kind_of_document_has_a_section(results):
+    assert set(SECTIONS) == {*SOURCES, "reproduce"}
+
+
+SAID = {
+    "tune": ["free", "objective", "constraints", "starts"],
+    "identify": ["values", "residuals"],
+    "design": ["gain", "decay_rate", "guaranteed_cost", "poles", "corners"],
+    "rare": ["levels", "failures"],
+    "sweep": ["failures", "metrics"],
+}
+OWN = {"sweep": {"least", "greatest"}, "rare": {"spread"}, "tune": {"missed"}}  # that only the document has
+
+
+@pytest.mark.parametrize("kind", cases(SAID, *LONG))
+def test_numbers_are_those_of_the_document(results, kind):
+    """All of what matters is there with all its digits, and nothing that is nowhere in the document."""
+    found = page(results, kind)
+    path = results / SOURCES[kind]
+    content = json.loads((path / "summary.json" if path.is_dir() else path).read_text())
+
+    def kept(value):
+        if isinstance(value, dict):
+            return {key: kept(one) for key, one in value.items() if key not in OWN.get(kind, ())}
+        return [kept(one) for one in value] if isinstance(value, list) else value
+
+    wanted = leaves([kept(content[key]) for key in SAID[kind]])
+    if kind == "tune":  # the sentence has them
+        wanted -= leaves(content["objective"])
+        assert f"{content['objective']['after']:.6g}" in found.text
+    assert wanted <= set(found.numbers)
+    manifest = json.loads((path / "manifest.json").read_text()) if path.is_dir() else {}
+    known = leaves([content, manifest]) | {str(i) for i in range(20)}
+    if kind == "identify":
+        row = content["values"]["plant.mass"]
+        ends = {repr(row["value"] + sign * 1.959964 * row["deviation"]) for sign in (-1, 1)}
+        assert ends <= set(found.numbers)
+        assert len(ends - {repr(row["value"])}) == 2
+        known |= ends
+    if kind == "sweep":  # the scenario's text says them in its own way
+        known |= {number for number in found.numbers if float(number) in {math.inf, -math.inf}}
+        from diffabs.scenario.model import numbers
+        from diffabs.scenario.scenario import loads
+
+        known |= leaves(numbers(loads(manifest["source"]["scenario"].encode(), "small", "manifest")))
+    assert set(found.numbers) <= known
+
+
+def test_a_certificate_says_what_is_proved(results):
+    found = page(results, "design")
+    content = json.loads((results / "design.json").read_text())
+    assert content["quadratically_stable"] is True
+    assert "proved one Lyapunov matrix for all 4 vertices" in found.text
+    again = page(results, "certificate")
+    assert "2 of 2 claims are proved." in again.text
+    text = (results / "certificate.json").read_text()
+    wrong = results.folder / "wrong.json"
+    wrong.write_text(text.replace(repr(content["decay_rate"]), "1e3"))
+    try:
+        assert "1 of 2 claims are proved." in Page(report(documents(wrong))).text
+    finally:
+        wrong.unlink()
+
+
+def test_a_disproved_gain_is_said_to_be(tmp_path):
+    out = command("certify", "slip-lmi", "--gain=-11753,48", "--json", status=1).stdout
+    (tmp_path / "bad.json").write_text(out)
+    found = Page(report(documents(tmp_path / "bad.json")))
+    assert "disproved one Lyapunov matrix" in found.text
+    assert json.loads(out)["reason"] in found.text
+
+
+def named(value, names):
+    """A document whose names, texts and units are hostile."""
+    if isinstance(value, dict):
+        return {HOSTILE if key in names else key: named(one, names) for key, one in value.items()}
+    if isinstance(value, list):
+        return [named(one, names) for one in value]
+    return HOSTILE if value in names else value
+
+
+@pytest.mark.parametrize("kind", cases(["tune", "identify", "rare", "design"], *LONG))
+def test_hostile_names_are_text(results, tmp_path, kind):
+    content = json.loads((results / f"{kind}.json").read_text())
+    names = {
+        content["scenario"],
+        "plant.mass",
+        "iae",
+        "overshoot",
+        "kg",
+        "stop_distance",
+        "wheel_speed",
+        "mirrored-rig",
+    }
+    content = named(content, names)
+    content["made"]["command"] = content["reason"] = HOSTILE
+    (tmp_path / "x.json").write_text(json.dumps(content))
+    found = Page(report(documents(tmp_path / "x.json")))
+    assert found.foreign == []
+    assert "script" not in found.tags
+    assert found.text.count(HOSTILE) >= 5
+    assert HOSTILE in found.headings[0]
+
+
+def test_figures_outside_of_the_folder_are_not_shown(results, tmp_path):
+    """Names in a document are not trusted; and what is no picture is none."""
+    content = json.loads((results / "tune.json").read_text())
+    (tmp_path / "secret.txt").write_text("secret")
+    (tmp_path / "drawn.png").write_bytes(b"\x89PNG drawn")
+    for plot, count in (("secret.txt", 0), ("/somewhere/else/drawn.png", 1)):
+        content["files"] = {"plot": str(tmp_path / plot) if plot == "secret.txt" else plot}
+        (tmp_path / "x.json").write_text(json.dumps(content))
+        found = Page(report(documents(tmp_path / "x.json")))
+        assert len(found.images) == count
+        assert base64.b64encode(b"secret").decode() not in found.source
+    (data,) = found.images
+    assert base64.b64decode(data.partition(",")[2]) == b"\x89PNG drawn"
+
+
+@pytest.mark.slow
+def test_a_folder_of_results_is_one_file(results):
+    """What `sweep --json` has printed beside the sweep's folder is the same result, and comes once."""
+    read = documents(results.all())
+    assert sorted(one.kind for one in read) == sorted(SOURCES)
+    found = Page(report(read))
+    assert len([one for one in found.headings if one == "Question"]) == len(SOURCES)
+    assert found.headings[0] == f"{len(SOURCES)} results"
+    (printed,) = documents(results / "sweep.json")
+    assert printed.folder == results / "sweep"
+
+
+def test_the_command_says_where_it_is(results, tmp_path):
+    out = tmp_path / "mine.html"
+    result = command("report", results / "tune.json", "-o", out)
+    assert result.stderr == f"report: {out}\n"
+    assert result.stdout == ""
+    assert Page(out.read_text(encoding="utf-8")).headings[0] == "Tuning of small"
+    command("report", results / "tune.json", "-o", out)  # its own is replaced
+    assert left_in(tmp_path) == {"mine.html"}
+
+
+@pytest.mark.slow
+def test_a_sweep_with_figures_writes_its_report(results):
+    text = (results / "sweep" / "report.html").read_text(encoding="utf-8")
+    assert Page(text).numbers == page(results, "sweep").numbers
+    assert json.loads((results / "sweep.json").read_text())["files"]["report"].endswith("report.html")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "there is no such folder or file"),
+        ({}, "holds nothing that reproduce, sweep"),
+        ({"notes.txt": "hello"}, "holds nothing that reproduce, sweep"),
+        ({"manifest.json": "{}"}, "--resume goes on with it"),
+        ({"x.json": '{"free": {}, "history": [], "constraints": []}'}, "is no whole document of tune: KeyError"),
+        ({"x.json": '{"papers": 3}', "y.json": "[" * 100_000}, "holds nothing"),
+    ],
+)
+def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, words):
+    folder = tmp_path / "there"
+    if content is not None:
+        folder.mkdir()
+        for name, text in content.items():
+            (folder / name).write_text(text)
+    result = command("report", folder, status=2)
+    assert words in result.stderr
+    assert_one_error_line(result)
+    assert not (folder / "report.html").exists()
+
+
+@pytest.mark.parametrize("text", ["hello", '{"a": 1}', "[1, 2]", '{"papers": {}, "out": "x"}'])
+def test_a_file_of_others_is_refused_in_one_line(tmp_path, text):
+    (tmp_path / "x.json").write_text(text)
+    result = command("report", tmp_path / "x.json", status=2)
+    assert "document that reproduce, sweep" in result.stderr
+    assert_one_error_line(result)
+    assert left_in(tmp_path) == {"x.json"}
+
+
+def test_files_of_others_stay(results, tmp_path):
+    out = tmp_path / "report.html"
+    out.write_text("<html>a thesis</html>")
+    result = command("report", results / "tune.json", "-o", out, status=2)
+    assert "exists and is no earlier report" in result.stderr
+    assert_one_error_line(command("report", results / "tune.json", "-o", tmp_path / "report.pdf", status=2))
+    assert_one_error_line(command("report", results / "tune.json", "-o", tmp_path, status=2))
+    assert out.read_text() == "<html>a thesis</html>"
+    assert left_in(tmp_path) == {"report.html"}
+
+
+def test_the_old_report_stays_where_the_new_one_cannot_be_made(results, tmp_path, monkeypatch):
+    out = tmp_path / "report.html"
+    command("report", results / "tune.json", "-o", out)
+    before = out.read_bytes()
+    (tmp_path / "x.json").write_text('{"free": {}, "history": [], "constraints": []}')
+    command("report", tmp_path / "x.json", "-o", out, status=2)
+    monkeypatch.setattr(reporting.files, "write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    assert_one_error_line(command("report", results / "tune.json", "-o", out, status=1))
+    assert out.read_bytes() == before
+    assert left_in(tmp_path) == {"report.html", "x.json"}
+
+
+def test_a_terminal_of_80_columns(results, tmp_path):
+    with Terminal("report", results / "tune.json", "-o", tmp_path / "report.html") as terminal:
+        assert terminal.status() == 0, terminal.text
+        assert_orderly(terminal)
+        assert_fits(terminal)
+    assert "report:" in terminal.text
+    assert left_in(tmp_path) == {"report.html"}
+
+
+def test_a_chart_has_its_points_where_they_are():
+    """Of a straight line, the places are on one; a value that is no number has none."""
+    text = lines([(0, 1.0), (1, 2.0), (2, math.nan), (3, 4.0)], "x < 1", "y")
+    points = [tuple(map(float, point.split(","))) for point in text.split('points="')[1].split('"')[0].split()]
+    assert len(points) == 3
+    (a, b), (c, d) = itertools.pairwise(points)
+    assert (b[1] - a[1]) / (b[0] - a[0]) == pytest.approx((d[1] - c[1]) / (d[0] - c[0]), rel=1e-3)
+    assert points[0][1] > points[-1][1]
+    assert "x &lt; 1" in text
+    assert lines([(0, None)], "x", "y") == ""
+
+
+def test_what_a_document_lacks_is_named(tmp_path):
+    (tmp_path / "x.json").write_text('{"gain": [1.0], "states": ["a"], "over": {}, "poles": []}')
+    with pytest.raises(ReportError, match=r"no whole document of design: KeyError 'lower_bound'"):
+        report(documents(tmp_path))
