@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from diffabs.cli import certificates, console, progress, show
+from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
 from diffabs.core.values import ScenarioError, shown, unknown
@@ -59,8 +59,8 @@ def identify(
     """Find parameters of a scenario from a measured run, and say how well it determines them."""
     with console.guarded(), certificates.reported():
         console.need_extra("tune")
-        console.check_scenario_file(out)
-        with console.new_file(out, "--out") as file:
+        targets.check_scenario_file(out)
+        with targets.new_file(out, "--out") as file:
             chosen = console.loaded(scenario, changes)
             units = chosen.loop.plant.shows.units
             readings = _readings(data, column, units)

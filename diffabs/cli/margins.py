@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from diffabs.cli import console, show
+from diffabs.cli import console, show, targets
 from diffabs.core import provenance
 from diffabs.core.pytree import Spec, replace
 from diffabs.core.values import ScenarioError, inside, shown
@@ -55,8 +55,8 @@ def margins(
 ) -> None:
     """Gain, phase, delay and modulus margin of the linearised loop, and their worst over [design.over]."""
     with console.guarded():
-        console.check_picture(plot)
-        with console.new_file(plot, "--plot") as picture:
+        targets.check_picture(plot)
+        with targets.new_file(plot, "--plot") as picture:
             chosen = console.loaded(scenario, changes, integrated=False)
             values, target = _places(chosen, at or ())
             nominal, found = _found(chosen, values, target, samples)
