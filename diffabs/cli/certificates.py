@@ -23,7 +23,6 @@ from diffabs.core.values import ScenarioError, shown
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import SlipModel
 from diffabs.plants import BrakeStart
-from diffabs.scenario.model import model
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -180,9 +179,7 @@ def document(
         summary["worst_vertex"] = summary["worst_vertex"] or slowest(proof)
     coverage = task.polytope.coverage
     return {
-        "scenario": task.chosen.name,
-        "model": model(task.chosen),
-        "made": console.made(),
+        **console.about(task.chosen),
         "gain": np.ravel(proof.gain).tolist() if proof else None,  # one input: the row is the gain
         "states": list(task.model.states),
         **{name: summary.get(name) for name in FROM_PROOF},

@@ -18,6 +18,7 @@ from rich.console import Console
 from diffabs.cli import progress
 from diffabs.core import files, interrupt, provenance, stopwatch
 from diffabs.core.values import ScenarioError
+from diffabs.scenario.model import model
 from diffabs.scenario.scenario import Scenario, load, names
 
 T = TypeVar("T")
@@ -76,6 +77,11 @@ def made() -> dict[str, str | float]:
     return {**provenance.made(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
 
 
+def about(chosen: Scenario) -> dict[str, Any]:
+    """Return how every document on a scenario begins: what was asked about, and how the document is made."""
+    return {"scenario": chosen.name, "model": model(chosen), "made": made()}
+
+
 def say(line: str) -> None:
     """A line for a person, on stderr; on a terminal folded between words."""
     if not _quiet or line.startswith(LOUD):
@@ -124,9 +130,8 @@ def fail(line: str, status: int = BAD_INPUT) -> NoReturn:
 
 
 def animated() -> bool:
-    """Whether stderr shows a spinner: a terminal that can write over a line."""
-    console = Console(stderr=True)
-    return console.is_terminal and not console.is_dumb_terminal
+    """Whether stderr shows a spinner."""
+    return progress.drawable(Console(stderr=True))
 
 
 @contextlib.contextmanager

@@ -17,7 +17,6 @@ from diffabs.core.pytree import get, parameters
 from diffabs.core.values import ScenarioError, shown, unknown
 from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import Readings, read
-from diffabs.scenario.model import model
 from diffabs.scenario.parameter_paths import flat
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.solution import Solver
@@ -206,9 +205,7 @@ def _result(
     """The JSON document."""
     known = found.uncertainty
     return {
-        "scenario": chosen.name,
-        "model": model(chosen),
-        "made": console.made(),
+        **console.about(chosen),
         "data": {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])},
         "values": _values(chosen, ranges, found),
         "correlations": [

@@ -170,8 +170,7 @@ def _show(result: dict[str, Any], chosen: Scenario, nominal: "System", found: "B
     show.titled(f"{chosen.title or chosen.name}: the linearised loop, {when}{delay}", table)
     if frozen := getattr(chosen.loop.plant, "frozen", ()):
         console.say(f"note: {' and '.join(frozen)} are held where they are; limits do not act")
-    for name, path in result["files"].items():
-        console.say(f"{name}: {path}")
+    show.files(result)
 
 
 def _said(name: str, value: float) -> str:
