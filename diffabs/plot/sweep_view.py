@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.plot.runs import KMH
+from diffabs.plot.style import KMH
 from diffabs.sweep.results import Results
 
 CELLS = (4, 24)  # of a map along one variable, fewest and most; one with fewer different values has a cell for each

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.plot.runs import COLOURS, GREY, Axes, Figure, label, logarithmic, save, sheet
+from diffabs.plot.style import COLOURS, GREY, Axes, Figure, label, logarithmic, save, sheet
 from diffabs.plot.sweep_view import Variable, View, cells
 from diffabs.sweep.engines import missed, missing
 from diffabs.sweep.results import Results
