@@ -38,9 +38,7 @@ def braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
     label(top, "", "slip [1]")
     _speeds(speed, seen)
     label(speed, "", "speed [km/h]")
-    torque.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
-    torque.plot(t, sample.control, color=COLOURS[0], label="control")
-    label(torque, "time [s]", controlled(unit))
+    _control(torque, seen, unit)
     brake.plot(t, sample.output.deceleration, color=COLOURS[0])
     label(brake, "time [s]", "deceleration [m/s²]")
     return figure
@@ -56,11 +54,9 @@ def balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
     label(angles, "", "angle [rad]")
     angle_lines(rates, seen, "_rate")
     label(rates, "", "rate [rad/s]", legend=False)
-    voltage.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
-    voltage.plot(t, sample.control, color=COLOURS[0], label="control")
+    _control(voltage, seen, unit)
     most = np.max(np.abs(sample.control))
     voltage.set_ylim(-1.5 * most - 1e-9, 1.5 * most + 1e-9)  # a command far beyond the supply says no more
-    label(voltage, "time [s]", controlled(unit))
     torque.plot(t, motor_torque(sample), color=COLOURS[0])
     label(torque, "time [s]", "motor torque [N m]")
     return figure
@@ -84,13 +80,18 @@ def signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
         alone = len(names) == 1
         words = f"{spaced(names[0])} " if alone else ""
         label(ax, "time [s]", f"{words}[{of_signal}]", legend=ax is axes[0] or not alone)
-    control = axes[len(groups)]
-    control.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
-    control.plot(t, sample.control, color=COLOURS[0], label="control")
-    label(control, "time [s]", controlled(unit))
+    _control(axes[len(groups)], seen, unit)
     for ax in axes[len(groups) + 1 :]:
         ax.set_visible(False)
     return figure
+
+
+def _control(ax: Axes, seen: Trajectory, unit: str) -> None:
+    """What the controller asked for, and what the actuator delivered."""
+    t, sample = np.asarray(seen.sample.t), seen.sample
+    ax.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
+    ax.plot(t, sample.control, color=COLOURS[0], label="control")
+    label(ax, "time [s]", controlled(unit))
 
 
 FIGURES = {  # of runs, by the signals that they draw
