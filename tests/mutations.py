@@ -670,7 +670,7 @@ MUTATIONS = [
     ),
     Mutation(
         "noise drawn off its period",
-        "core/protocols.py",
+        "core/messages.py",
         "self.on_grid & (self.k % n == 0)",
         "self.on_grid & (self.k % n == 1)",
         "test_blocks.py::test_noise",
