@@ -84,9 +84,11 @@ def _headers(scope: Mapping[str, Any]) -> dict[bytes, list[str]]:
 
 
 async def _answer(send: Send, status: int, line: str, *more: tuple[bytes, bytes]) -> None:
-    headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"cache-control", b"no-store"), *more]
+    body = f"{line}\n".encode()
+    headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"content-length", str(len(body)).encode())]
+    headers += [(b"cache-control", b"no-store"), *more]
     await send({"type": "http.response.start", "status": status, "headers": headers})
-    await send({"type": "http.response.body", "body": f"{line}\n".encode()})
+    await send({"type": "http.response.body", "body": body})
 
 
 def _loopback(client: Any) -> bool:
