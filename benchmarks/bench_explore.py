@@ -46,7 +46,7 @@ def measured(scenario: str, seconds: float, chromium: str) -> dict[str, float]:
         try:
             assert server.stderr
             lines = iter(server.stderr.readline, "")
-            address = next((at for line in lines if (at := re.match(r"http://127\.0\.0\.1:\d+/", line))), None)
+            address = next((at for line in lines if (at := re.match(r"http://127\.0\.0\.1:\d+/\S*", line))), None)
             assert address, "the explorer ended without an address"
             times, moves = dragged(address[0], seconds, chromium)
         finally:

@@ -3,14 +3,16 @@
 TEST = "test_explore.py"
 NONSENSE = f"{TEST}::test_nonsense_is_refused_with_the_field_named"
 GUARDED = f"{TEST}::test_only_the_own_page_on_this_machine_is_answered"
+KNOWN = f"{TEST}::test_a_request_needs_the_token_once_and_then_its_cookie"
+CORNERS = f"{TEST}::test_corners_are_looked_at_again_only_where_they_move"
 FRICTION = f"{TEST}::test_a_friction_factor_comes_and_goes_without_a_trace"
 
 EXPLORE = [
     ("explore: any number may be typed", "explore/knobs.py", "return inside(given, self.spec, self.name) / self.scale",
      "return float(given) / self.scale", f"{NONSENSE}[plant.mass--3-plant.mass = -3 is outside (0, inf) kg]"),
-    ("explore: what is refused stays", "explore/session.py", "            self._values = before\n", "", NONSENSE),
-    ("explore: rules between numbers are not asked", "explore/session.py", "        if lines:\n", "        if False:\n",
-     NONSENSE),
+    ("explore: what is refused stays", "explore/session.py", "            self.withdraw()\n", "", NONSENSE),
+    ("explore: rules between numbers are not asked", "explore/session.py", "        if lines := objections(chosen):\n",
+     "        if (lines := []):\n", NONSENSE),
     ("explore: a step may be unstable", "explore/session.py",
      "return lines or list(unstable(chosen.loop, chosen.solver))", "return lines",
      f"{TEST}::test_a_step_that_is_not_stable_is_refused"),
@@ -56,6 +58,20 @@ EXPLORE = [
      GUARDED),
     ("explore: any page is answered", "explore/guard.py", "return here and own and", "return here and", GUARDED),
     ("explore: any machine is answered", "explore/guard.py", '_loopback(scope.get("client"))', "True", GUARDED),
+    ("explore: no cookie is needed", "explore/guard.py", "(self.allowed(scope) and self.known(scope))",
+     "self.allowed(scope)", KNOWN),
+    ("explore: any token will do", "explore/guard.py",
+     "len(given) == 1 and secrets.compare_digest(given[0].encode(), self.token.encode())", "len(given) == 1", KNOWN),
+    ("explore: scripts read the cookie", "explore/guard.py", "Path=/; HttpOnly;", "Path=/;", KNOWN),
+    ("explore: everyone reads where the browser is led", "explore/server.py", "path.touch(mode=0o600,",
+     "path.touch(mode=0o644,", f"{TEST}::test_a_browser_is_led_to_the_token_by_a_file_of_its_user"),
+    ("explore: corners are kept whatever is turned", "explore/stability.py", "known.of == of or (not anew and",
+     "known.of == of or (True and", CORNERS),
+    ("explore: corners are never kept", "explore/stability.py", "if known and (known.of == of or", "if known and (",
+     CORNERS),
+    ("explore: what was turned last is withdrawn alone", "explore/session.py", "        self.adopt(self._accepted)\n",
+     "        self._values = dict(list(self._values.items())[:-1])\n",
+     f"{TEST}::test_what_is_not_accepted_is_withdrawn_with_all_that_came_after"),
     ("explore: all that was asked is done", "explore/work.py", "            self._job = job\n",
      "            self._job = (lambda a, b: lambda: (a(), b()))(self._job, job) if self._job else job\n",
      f"{TEST}::test_a_worker_does_the_newest_and_drops_what_waited"),

@@ -117,6 +117,7 @@ FACE += [
 ]  # fmt: skip
 
 PAGE, WRITING, REPORT = "report/page.py", "report/writing.py", "test_report.py"
+NUMBERS = f"{REPORT}::test_a_picture_has_the_numbers_that_it_shows"
 SELF = f"{REPORT}::test_a_report_stands_for_itself"
 FACE += [
     ("report: names as they come", WRITING, "autoescape=True", "autoescape=False",
@@ -126,6 +127,23 @@ FACE += [
     ("report: any file is a picture", PAGE, "kind = IMAGES.get(path.suffix.lower())",
      'kind = IMAGES.get(path.suffix.lower(), "image/png")',
      f"{REPORT}::test_figures_outside_of_the_folder_are_not_shown"),
+    ("a sampled filter may be as fast as it likes", "controllers/sampled.py", "array(cutoff) * array(period) < 2",
+     "array(cutoff) * array(period) < 200",
+     "test_refusals.py::test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows"),
+    ("progress: a status wraps", "cli/progress.py", "    if len(words) > room:\n", "    if False:\n",
+     "test_progress.py::test_a_status_has_one_line"),
+    ("report: a picture's numbers are the axes'", "plot/shown.py", "line.get_xdata(), line.get_ydata())",
+     "line.get_ydata(), line.get_xdata())", NUMBERS),
+    ("report: numbers of a picture are its first", "plot/shown.py", "np.linspace(0, len(there) - 1,",
+     "np.linspace(0, min(MOST, len(there)) - 1,", NUMBERS),
+    ("report: axes upside down", "plot/shown.py", "1 - place.y1, place.x1, 1 - place.y0",
+     "place.y0, place.x1, place.y1", f"{REPORT}::test_axes_lie_where_the_picture_has_them"),
+    ("report: numbers stay in the picture", "core/pictures.py", "return picture[:start] + picture[end:],",
+     "return picture,", f"{REPORT}::test_numbers_of_a_picture_leave_no_trace_in_its_bytes"),
+    ("report: any numbers are shown", PAGE, 'all(map(_is_series, one["series"])) and',
+     'one["series"] is not None and', f"{REPORT}::test_a_picture_that_says_nonsense_is_only_a_picture"),
+    ("report: any script may run", WRITING, 'return f"sha256-{', 'return "unsafe-inline" or f"sha256-{',
+     f"{SELF}[sweep]"),
     ("report: pictures by their address", PAGE, 'f"data:{kind};base64,{text}"', "path.as_uri()", f"{SELF}[sweep]"),
     ("report: the command is not said", PAGE, '(content.get("made") or {}).get("command")', "None", f"{SELF}[tune]"),
     ("report: intervals on one side", "report/findings.py", "value - NORMAL * deviation", "value",

@@ -1,5 +1,6 @@
 """The explorer without a page: what is turned, drawn, saved, refused, and who may speak to it."""
 
+import asyncio
 import dataclasses
 import json
 import re
@@ -17,7 +18,7 @@ from diffabs.core.pytree import get, parameters, replace
 from diffabs.core.values import ScenarioError
 from diffabs.explore import charts, curves, friction, saving, stability, tuning
 from diffabs.explore.curves import Curves, Fan, Line, Panel, Spread
-from diffabs.explore.guard import Guard
+from diffabs.explore.guard import STRANGER, Guard
 from diffabs.explore.knobs import STEPS
 from diffabs.explore.session import AS_GIVEN, Session
 from diffabs.explore.work import Latest
@@ -58,6 +59,8 @@ iae = 1.0
 [sweep.over]
 "road.w4" = [0.35, 0.45]
 """
+
+TOKEN = "a-b_c"  # as in an address
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable")
 
@@ -235,7 +238,7 @@ def test_a_fan_has_the_quantiles_of_its_runs(session, monkeypatch):
     found = curves.fan(chosen, spread)
     values, words = curves.members(chosen, spread)
     assert words == "mass ± 10 %, friction ± 30 %"
-    by = curves.solver(chosen)
+    by = curves.solver(chosen, curves.ROUGH)
     each = [replace(chosen.loop, {path: column[i] for path, column in values.items()}) for i in range(5)]
     slips = [np.asarray(rollout(loop, by).trajectory.sample.output.slip) for loop in each]
     early = slice(0, 50)  # all of them still run
@@ -277,6 +280,39 @@ def test_margins_are_those_of_the_library(session):
     assert found.systems == 4  # mass, and speed between start and stop
     assert found.worst["phase"] <= found.margins["phase"]
     assert np.all(found.poles.real < 0)
+
+
+def test_corners_are_looked_at_again_only_where_they_move(session):
+    first = stability.around(session.scenario())
+    session.turn("plant.mass", "5.5")  # has a range in [design.over]
+    assert stability.around(session.scenario(), first) is first
+    session.turn("controller.gain.1", "-60")
+    moved = stability.around(session.scenario(), first)
+    assert moved is not first
+    assert stability.around(session.scenario(), first, anew=False) is first
+    fresh = stability.stability(session.scenario())
+    np.testing.assert_array_equal(moved.poles, fresh.corners)
+    assert (moved.worst, moved.unstable, moved.systems) == (fresh.worst, fresh.unstable, fresh.systems)
+    session.turn("plant.mass", "6")
+    found = stability.stability(session.scenario(), stability.around(session.scenario(), moved))
+    whole = stability.stability(session.scenario())
+    np.testing.assert_array_equal(found.corners, whole.corners)
+    assert (found.worst, found.margins) == (whole.worst, whole.margins)
+
+
+def test_what_is_not_accepted_is_withdrawn_with_all_that_came_after(session):
+    session.turn("plant.mass", "5.5")
+    session.put("initial.speed", "5")  # below the stop's
+    session.put("controller.gain.1", "-60")
+    now = session.scenario()
+    with pytest.raises(ScenarioError, match=r"controller.gain.1 = -60 N m: initial.speed"):
+        session.judge("controller.gain.1", now)
+    with pytest.raises(ScenarioError, match=r"initial.speed = 1.38889 m/s is not above"):
+        session.to_save()
+    assert sorted(session.withdraw()) == ["controller.gain.1", "initial.speed"]
+    assert session.value("plant.mass") == 5.5
+    assert session.value("controller.gain.1") == -48
+    assert session.value("initial.speed") == pytest.approx(30 / 3.6)
 
 
 def test_a_loop_without_a_linear_model_says_so():
@@ -339,7 +375,63 @@ def test_only_the_own_page_on_this_machine_is_answered(allowed, host, origin, cl
     given = {b"host": host, b"origin": origin}
     headers = [(name, value.encode()) for name, value in given.items() if value is not None]
     scope = {"type": "http", "headers": headers, "client": (client, 5) if client else None}
-    assert Guard(None, 8342).allowed(scope) == allowed
+    assert Guard(None, 8342, TOKEN).allowed(scope) == allowed
+
+
+@pytest.mark.parametrize(
+    ("path", "query", "cookie", "status"),
+    [
+        ("/", "", "", 403),
+        ("/", "token=guessed", "", 403),
+        ("/", "token=", "diffabs-explore-8342=", 403),
+        ("/", f"token={TOKEN}", "", 303),
+        ("/", "", f"diffabs-explore-8342={TOKEN}", 200),
+        ("/", "", f"other=1; diffabs-explore-8342={TOKEN}", 200),
+        ("/", "", f"diffabs-explore-8343={TOKEN}", 403),
+        ("/_nicegui/1.js", "", "", 403),
+        ("/_nicegui/1.js", "", f"diffabs-explore-8342={TOKEN}", 200),
+    ],
+)
+def test_a_request_needs_the_token_once_and_then_its_cookie(path, query, cookie, status):
+    sent = asyncio.run(answered("http", path, query, cookie))
+    assert sent[0]["status"] == status
+    headers = dict(sent[0].get("headers", []))
+    if status == 303:
+        assert headers[b"location"] == b"/"
+        assert headers[b"set-cookie"].decode() == f"diffabs-explore-8342={TOKEN}; Path=/; HttpOnly; SameSite=Lax"
+    if status == 403:
+        assert sent[1]["body"].decode() == f"{STRANGER}\n"
+        assert b"set-cookie" not in headers
+    opened = asyncio.run(answered("websocket", path, query, cookie))
+    assert (opened[0]["type"] == "reached") == (status == 200)  # no token opens a socket
+
+
+async def answered(kind, path, query, cookie):
+    """What a guard sends that knows TOKEN, or its application."""
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    async def app(scope, receive, send):
+        await send({"type": "reached", "status": 200})
+
+    async def receive():
+        return {}
+
+    headers = [(b"host", b"127.0.0.1:8342"), *([(b"cookie", cookie.encode())] if cookie else [])]
+    scope = {"type": kind, "path": path, "query_string": query.encode(), "headers": headers, "client": ("127.0.0.1", 5)}
+    await Guard(app, 8342, TOKEN)(scope, receive, send)
+    return sent
+
+
+def test_a_browser_is_led_to_the_token_by_a_file_of_its_user(tmp_path):
+    pytest.importorskip("nicegui")
+    from diffabs.explore.server import leading_to
+
+    path = leading_to(f"http://127.0.0.1:8342/?token={TOKEN}", tmp_path)
+    assert path.stat().st_mode & 0o077 == 0
+    assert f'url=http://127.0.0.1:8342/?token={TOKEN}"' in path.read_text()
 
 
 def test_a_worker_does_the_newest_and_drops_what_waited():

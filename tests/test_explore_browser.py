@@ -19,6 +19,7 @@ import time
 import pytest
 from test_explore import SHORT
 
+from diffabs.explore.guard import STRANGER
 from diffabs.scenario import load
 
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
@@ -46,10 +47,12 @@ class Explorer:
         self.process = subprocess.Popen(words, cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True)
         assert self.process.stderr
         lines = iter(self.process.stderr.readline, "")  # a busy machine says first what it waits for
-        found = next((at for line in lines if (at := re.match(r"http://127\.0\.0\.1:(\d+)/ ", line))), None)
+        found = next(
+            (at for line in lines if (at := re.match(r"(http://127\.0\.0\.1:(\d+)/\?token=(\S+)) ", line))), None
+        )
         assert found, "it ended without an address"
-        self.port = int(found[1])
-        self.url = f"http://127.0.0.1:{self.port}/"
+        self.url, self.port = found[1], int(found[2])
+        self.cookie = f"Cookie: diffabs-explore-{self.port}={found[3]}"
 
     def interrupted(self) -> tuple[int, str]:
         """Press Ctrl-C; exit status, and what it said."""
@@ -265,14 +268,26 @@ def asked(port: int, *lines: str) -> bytes:
 @needs_extra
 def test_another_page_is_not_answered(explorer):
     own = f"127.0.0.1:{explorer.port}"
-    assert asked(explorer.port, "GET / HTTP/1.1", f"Host: {own}").startswith(b"HTTP/1.1 200 ")
-    assert asked(explorer.port, "GET / HTTP/1.1", "Host: evil.example").startswith(b"HTTP/1.1 403 ")
-    foreign = ["GET /_nicegui_ws/socket.io/?EIO=4&transport=polling HTTP/1.1", f"Host: {own}"]
+    assert asked(explorer.port, "GET / HTTP/1.1", f"Host: {own}", explorer.cookie).startswith(b"HTTP/1.1 200 ")
+    assert asked(explorer.port, "GET / HTTP/1.1", "Host: evil.example", explorer.cookie).startswith(b"HTTP/1.1 403 ")
+    foreign = ["GET /_nicegui_ws/socket.io/?EIO=4&transport=polling HTTP/1.1", f"Host: {own}", explorer.cookie]
     assert asked(explorer.port, *foreign, "Origin: http://evil.example").startswith(b"HTTP/1.1 403 ")
     upgrade = ["Upgrade: websocket", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]
     path = "GET /_nicegui_ws/socket.io/?EIO=4&transport=websocket HTTP/1.1"
-    answer = asked(explorer.port, path, f"Host: {own}", "Origin: http://evil.example", *upgrade)
+    answer = asked(explorer.port, path, f"Host: {own}", "Origin: http://evil.example", explorer.cookie, *upgrade)
     assert answer.startswith(b"HTTP/1.1 403 ")
+
+
+@needs_extra
+def test_who_does_not_know_the_token_is_not_answered(explorer):
+    own = f"Host: 127.0.0.1:{explorer.port}"
+    for path in ("/", "/?token=guessed", "/_nicegui/"):
+        answer = asked(explorer.port, f"GET {path} HTTP/1.1", own)
+        assert answer.startswith(b"HTTP/1.1 403 ")
+        assert answer.partition(b"\r\n\r\n")[2].decode() == f"{STRANGER}\n"
+    upgrade = ["Upgrade: websocket", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="]
+    path = "GET /_nicegui_ws/socket.io/?EIO=4&transport=websocket HTTP/1.1"
+    assert asked(explorer.port, path, own, *upgrade).startswith(b"HTTP/1.1 403 ")
 
 
 @needs_extra

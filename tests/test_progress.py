@@ -96,3 +96,21 @@ def test_documents_say_how_long_they_took():
     made = console.made()
     assert made["command"] == "diffabs list roads"
     assert 0.1 <= made["of it compiling"] <= made["seconds"] <= 20.0
+
+
+@pytest.mark.parametrize(
+    ("width", "line"),
+    [
+        (60, "reproducing x ... nine runs on snow; 9 s left"),
+        (45, "reproducing x ... nine runs on snow; 9 s left"),
+        (44, "nine runs on snow; 9 s left"),
+        (27, "nine runs on snow; 9 s left"),
+        (26, "nine runs on sn…; 9 s left"),
+        (20, "nine runs…; 9 s left"),
+        (5, "…; 9 s left"),
+    ],
+)
+def test_a_status_has_one_line(width, line):
+    found = progress.fitted("reproducing x ... nine runs on snow", "nine runs on snow", "; 9 s left", width)
+    assert found == line
+    assert len(found) <= max(width, len("…; 9 s left"))

@@ -14,6 +14,7 @@ import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors
 from diffabs.core.protocols import BrakeOutput, Ending, Sample, still
 from diffabs.core.pytree import replace, strong
+from diffabs.core.validity import problems
 from diffabs.design.attraction import outcomes
 from diffabs.identify import Traces, identify
 from diffabs.objectives import BALANCE, BRAKING
@@ -53,6 +54,11 @@ BAD = {  # a loop, values by lane of which the first is fine, and what is said o
         dataclasses.replace(RIG, controller=controllers.Sampled(controller=controllers.StateFeedback())),
         {"controller.delay": [1e-3, 1.2e-3, 0.0], "controller.period": [2e-3, 1e-3, 2.5e-3]},
         ["controller.delay exceeds the period", "controller.period is not a multiple of solver.step = 0.001 s"],
+    ),
+    "filter": (
+        dataclasses.replace(RIG, controller=controllers.Sampled(controller=controllers.PID(kd=1.0))),
+        {"controller.controller.cutoff": [1999.0, 2001.0, 1e5]},
+        ["controller.controller.cutoff is too fast for the period"],
     ),
     "ring": (
         dataclasses.replace(RIG, actuator=actuators.Delay(capacity=16)),
@@ -321,3 +327,17 @@ def test_the_sweep_of_the_report(tmp_path):
     assert document["failures"] == {}
     assert "no sample could be run: solver.step = 0.0001 s is not stable" in result.stderr
     assert not (set(document["metrics"]) - set(BRAKING))
+
+
+@pytest.mark.parametrize(("cutoff", "grows"), [(1990.0, False), (2010.0, True)])
+def test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows(cutoff, grows):
+    """The oracle is the computer's own recursion, d + T wc (e - d), written out for e = 0."""
+    period, d = 1e-3, 1.0
+    for _ in range(2000):
+        d += period * cutoff * (0.0 - d)
+    assert (abs(d) > 1) == grows
+    loop = dataclasses.replace(RIG, controller=controllers.Sampled(controller=controllers.PID(cutoff=cutoff)))
+    line = f"controller.controller.cutoff = {cutoff:g} rad/s is outside (0, 2000) rad/s: sampled every 0.001 s"
+    said = list(problems(loop))
+    assert len(said) == grows
+    assert all(one.startswith(line) for one in said)

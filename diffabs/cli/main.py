@@ -2,6 +2,11 @@
 
 Results go to stdout, as tables or with --json as one JSON document; everything else goes to stderr."""
 
+import gc
+
+COLLECTS = gc.isenabled()
+gc.disable()  # while modules are made: a look for garbage goes through all of JAX's, a sixth of a short command
+
 import contextlib
 import dataclasses
 import importlib
@@ -42,6 +47,9 @@ from diffabs.simulate.matlab import write_mat
 from diffabs.simulate.run import measure, rollout
 from diffabs.simulate.solution import Run, described
 
+if COLLECTS:
+    gc.enable()
+
 app = typer.Typer(
     no_args_is_help=True,
     cls=usage.Group,
@@ -52,10 +60,13 @@ app = typer.Typer(
 )
 
 MOST_ROWS = 20_000  # of a trajectory
+YOUNG = 50_000  # objects between two looks for garbage; 700 by default, and tracing makes many that stay
 
 
 def main() -> NoReturn:
     """The executable: run the command line, and leave."""
+    gc.freeze()  # what was imported stays
+    gc.set_threshold(YOUNG)
     interrupt.begin()
     try:
         app()

@@ -22,6 +22,7 @@ AGAIN = 5.0  # s between lines about how far work is
 FRAMES = 12.5  # per second
 QUIET = 1.0  # s in which nothing is said of time
 NOTED = 0.5  # s of compiling, from which it is
+SPINNER = 2  # columns, with the blank behind it
 COMPILING = "compiling"  # while nothing is reached
 
 
@@ -95,10 +96,19 @@ class _Picture:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The spinner must be one object, or it would not turn."""
         far, words = self.far()
-        self.spinner.update(text=words + self.pace.said(far))
+        self.spinner.update(text=fitted(words, far.words, self.pace.said(far), options.max_width - SPINNER))
         yield self.spinner
         if far.total and not far.at_most:
             yield ProgressBar(total=far.total, completed=far.done, width=min(60, options.max_width))
+
+
+def fitted(words: str, rest: str, times: str, width: int) -> str:
+    """Return words and times in one line of a terminal: where they are too long, only the rest of the words, that is
+    without the message, and of those as much as there is room for."""
+    room = width - len(times)
+    if len(words) > room:
+        words = rest or words
+    return (words if len(words) <= room else f"{words[: max(room - 1, 0)].rstrip()}…") + times
 
 
 @contextlib.contextmanager

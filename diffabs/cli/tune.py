@@ -216,6 +216,7 @@ def _unproved(why: str) -> Proved:
 
 def _drawn(work: Work, found: "Tuned", path: pathlib.Path) -> None:
     """The history, and the lane that is the worst afterwards, before and after."""
+    from diffabs.plot.runs import write
     from diffabs.plot.tuning import tuning
 
     chosen, metrics = work.chosen, found.metrics[1]
@@ -230,4 +231,5 @@ def _drawn(work: Work, found: "Tuned", path: pathlib.Path) -> None:
     runs = {"before": seen(chosen.loop), "after": seen(found.loop)}
     where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
     title = chosen.title or chosen.name
-    tuning(found.history, runs, title=title, lane=where, unit=chosen.loop.plant.control_unit).savefig(path)
+    figure = tuning(found.history, runs, title=title, lane=where, unit=chosen.loop.plant.control_unit)
+    write(figure, path, path.suffix.lstrip("."))

@@ -98,8 +98,10 @@ class Sampled:
         return inner.tick(clock, memory, signal) if offers(inner, "tick") else memory
 
     def rules(self) -> Iterator[Rule]:
-        """A computation takes no longer than the period."""
+        """A computation takes no longer than the period; a filter follows its samples."""
         yield delay_within(self.delay, self.period)
+        if hasattr(self.controller, "cutoff"):
+            yield filter_within(self.controller.cutoff, self.period)  # pyright: ignore[reportAttributeAccessIssue]
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """The period is on the integration grid."""
@@ -117,4 +119,17 @@ def delay_within(delay: Scalar, period: Scalar) -> Rule:
         array(delay) <= array(period),
         "delay exceeds the period",
         lambda: f"delay = {delay:g} s exceeds the period of {period:g} s",
+    )
+
+
+def filter_within(cutoff: Scalar, period: Scalar) -> Rule:
+    """Return the rule that forward Euler, d_(k+1) = d_k + period cutoff (e - d_k), is stable: cutoff [rad/s] is below
+    2 / period [s]."""
+    return Rule(
+        array(cutoff) * array(period) < 2,
+        "controller.cutoff is too fast for the period",
+        lambda: (
+            f"controller.cutoff = {cutoff:g} rad/s is outside (0, {2 / period:g}) rad/s: sampled every {period:g} s, a"
+            " faster filter is not stable"
+        ),
     )

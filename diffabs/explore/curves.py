@@ -19,6 +19,7 @@ from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Adaptive, FixedStep, Run, Solver
 
 INSTANTS = 400  # of a curve
+ROUGH = 200  # instants of a fan: the browser lays all of them out again with every redraw
 LONG = 4 * INSTANTS  # steps, from which a draft is quicker
 DRAFT = 1e-3  # relative error of a draft's step
 MEMBERS = 200  # of a fan
@@ -69,9 +70,9 @@ class Spread:
     road: float = 0.2
 
 
-def solver(chosen: Scenario) -> Solver:
+def solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:
     """Return the scenario's solver, keeping as many instants as are drawn."""
-    return dataclasses.replace(chosen.solver, every=max(1, math.ceil(chosen.solver.steps / INSTANTS)))
+    return dataclasses.replace(chosen.solver, every=max(1, math.ceil(chosen.solver.steps / instants)))
 
 
 def draft_solver(chosen: Scenario) -> Solver | None:
@@ -96,7 +97,7 @@ def fan(chosen: Scenario, spread: Spread) -> Fan | None:
     values, words = members(chosen, spread)
     if not values:
         return None
-    by = draft_solver(chosen) or solver(chosen)
+    by = draft_solver(chosen) or solver(chosen, ROUGH)
     batch = Batch(values, keys=np.arange(MEMBERS) + chosen.seed)
     run: Run = jax.device_get(run_batch(chosen.loop, batch, by, {}, trajectories=True))
     lost = np.asarray(run.diverged)

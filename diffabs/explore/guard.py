@@ -2,9 +2,15 @@
 
 A server on loopback is reached by every page that the browser has open, and by a name that somebody lets point to
 127.0.0.1. So a request must come from this machine, name the explorer as its host, and if it says which page sent it
-(`Origin`, as every WebSocket of a browser does), that must be the explorer's."""
+(`Origin`, as every WebSocket of a browser does), that must be the explorer's.
 
+Who else can log in to this machine could send all that, too. So the address that is printed ends in a token; it is
+exchanged for a cookie at once, and nothing is answered without."""
+
+import http.cookies
 import ipaddress
+import secrets
+import urllib.parse
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from typing import Any
 
@@ -14,6 +20,8 @@ Send = Callable[[Any], Awaitable[None]]
 
 LOOPBACK = "127.0.0.1"
 NAMES = (LOOPBACK, "localhost")
+FOREIGN = "diffabs explore answers only its own page"
+STRANGER = "diffabs explore: the token is missing or wrong; open the whole address that the command has printed"
 # Nothing from elsewhere is loaded, whatever a page asks for; scripts in the page are those of the framework.
 POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
@@ -25,31 +33,62 @@ POLICY = (
 class Guard:
     """An ASGI application that lets through to another what is allowed, and answers 403 to the rest."""
 
-    def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], port: int):
-        """`port` is that of the explorer."""
+    def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], port: int, token: str):
+        """`port` is that of the explorer; `token` is what its user knows."""
         self.app, self.hosts = app, {f"{name}:{port}" for name in NAMES}
+        self.token, self.cookie = token, f"diffabs-explore-{port}"  # a browser sends a cookie to every port of a host
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
-        if scope["type"] == "lifespan" or self.allowed(scope):
+        if scope["type"] == "lifespan" or (self.allowed(scope) and self.known(scope)):
             await self.app(scope, receive, _with_policy(send) if scope["type"] == "http" else send)
         elif scope["type"] == "websocket":
             await receive()
             await send({"type": "websocket.close", "code": 1008})
+        elif not self.allowed(scope):
+            await _answer(send, 403, FOREIGN)
+        elif self._same(urllib.parse.parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [])):
+            cookie = f"{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"
+            await _answer(send, 303, "", (b"location", scope["path"].encode()), (b"set-cookie", cookie.encode()))
         else:
-            kind = [(b"content-type", b"text/plain; charset=utf-8")]
-            await send({"type": "http.response.start", "status": 403, "headers": kind})
-            await send({"type": "http.response.body", "body": b"diffabs explore answers only its own page\n"})
+            await _answer(send, 403, STRANGER)
 
     def allowed(self, scope: Mapping[str, Any]) -> bool:
         """Whether a request comes from this machine and from a page of the explorer."""
-        given: dict[bytes, list[str]] = {}
-        for name, value in scope["headers"]:
-            given.setdefault(name.lower(), []).append(value.decode("latin-1"))
+        given = _headers(scope)
         host, origin = given.get(b"host", []), given.get(b"origin", [])
         here = len(host) == 1 and host[0] in self.hosts
         own = origin in ([], [f"http://{host[0]}"]) if here else False
         return here and own and _loopback(scope.get("client"))
+
+    def known(self, scope: Mapping[str, Any]) -> bool:
+        """Whether a request has the cookie for which the token was exchanged."""
+        given = []
+        for line in _headers(scope).get(b"cookie", []):
+            try:
+                found = http.cookies.SimpleCookie(line).get(self.cookie)
+            except http.cookies.CookieError:
+                continue
+            given += [found.value] if found else []
+        return self._same(given)
+
+    def _same(self, given: list[str]) -> bool:
+        return len(given) == 1 and secrets.compare_digest(given[0].encode(), self.token.encode())
+
+
+def _headers(scope: Mapping[str, Any]) -> dict[bytes, list[str]]:
+    given: dict[bytes, list[str]] = {}
+    for name, value in scope["headers"]:
+        given.setdefault(name.lower(), []).append(value.decode("latin-1"))
+    return given
+
+
+async def _answer(send: Send, status: int, line: str, *more: tuple[bytes, bytes]) -> None:
+    body = f"{line}\n".encode()
+    headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"content-length", str(len(body)).encode())]
+    headers += [(b"cache-control", b"no-store"), *more]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})
 
 
 def _loopback(client: Any) -> bool:

@@ -1,6 +1,7 @@
 """The page: sliders on the left, curves in the middle, what is known of the loop on the right. One for each tab."""
 
 import asyncio
+import math
 import pathlib
 import time
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra dif
 
 from diffabs.core.values import ScenarioError
 from diffabs.explore import charts, curves, stability
-from diffabs.explore.canvas import Canvas
+from diffabs.explore.canvas import Canvas, encoded
 from diffabs.explore.controls import Controls
 from diffabs.explore.look import SCRIPT, STYLE
 from diffabs.explore.results import Results
@@ -21,7 +22,8 @@ from diffabs.explore.tuner import Tuner
 from diffabs.explore.work import Latest
 from diffabs.scenario.scenario import Scenario
 
-QUICK = 0.12  # s that a result may take to be followed while one drags
+QUICK = 0.05  # s that a result may take to be followed while one drags
+TICK = 0.004  # s between two looks whether the curve is there
 REST = 0.15  # s without a change, after which everything is worked out
 PROVING = 0.35  # and after which a proof is looked for
 
@@ -34,8 +36,12 @@ class Page:
         self.session, self.tools = session, tools
         self.client, self.server = ui.context.client, asyncio.get_running_loop()
         self.version, self.turned_at = 0, 0.0
+        self.since = 0  # the first version of this scenario
         self.costs: dict[str, float] = {}
         self.shown: curves.Curves | None = None
+        self.drawn = 0  # the newest version whose curve was made, or that was refused
+        self.around: stability.Around | None = None  # the corners that were looked at last
+        self.surrounded = False  # whether they belong to what is shown
         self.drawer, self.thinker = (Latest(thread, self._failed) for _ in range(2))
         self.controls = Controls(session, self._turned, self._replaced)
         self.results = Results()
@@ -62,6 +68,7 @@ class Page:
 
     def begin(self) -> None:
         """Show a scenario from its beginning."""
+        self.since, self.around = self.version + 1, None
         self.shown = None
         self.title.set_text(self.session.given.title or self.session.given.name)
         self.end_line.set_text("compiling …")
@@ -71,13 +78,14 @@ class Page:
         self.tuner.begin()
         self.redraw()
 
-    def redraw(self, edit: int = 0) -> None:
-        """Compute anew, from the values as they are now; `edit` is the browser's number of what was changed."""
+    def redraw(self, edit: int = 0, key: str = "") -> None:
+        """Compute anew, from the values as they are now; `edit` is the browser's number of what was changed, which was
+        `key` if it has not been judged."""
         self.version += 1
         self.turned_at = time.monotonic()
         now = self.session.scenario()
         self.results.wait()
-        self.drawer.ask(partial(self._draw, now, self.version, edit))
+        self.drawer.ask(partial(self._draw, now, self.version, edit, key))
         self.thinker.ask(partial(self._think, now, self.version))
 
     def later(self, show: Callable[..., None], *given: Any) -> None:
@@ -102,6 +110,7 @@ class Page:
 
     def end(self) -> None:
         """The tab is gone."""
+        self.version += 1
         self.drawer.end()
         self.thinker.end()
         self.tuner.end()
@@ -130,14 +139,24 @@ class Page:
     def _turned(self, key: str, given: Any, edit: int) -> None:
         """A number was dragged or typed."""
         try:
-            self.session.turn(key, given)
+            self.session.put(key, given)
         except ScenarioError as error:
             self.refused(error)
             self.controls.wrong(key)
             return
-        self.refused(None)
         self.controls.show(key)
-        self.redraw(edit)
+        self.redraw(edit, key)
+
+    def _objected(self, key: str, error: ScenarioError, version: int) -> None:
+        """A loop with this number must not be run: the last one that may is back, and with it numbers that were not
+        judged alone."""
+        if version != self.version:
+            return
+        self.refused(error)
+        self.controls.wrong(key)
+        for other in self.session.withdraw():
+            if other != key:
+                self.controls.show(other)
 
     async def _replaced(self, change: Callable[[], None]) -> None:
         """Another scenario, another part, or another fan, with numbers of their own."""
@@ -158,24 +177,29 @@ class Page:
         self.controls.show_all()
         self.redraw()
 
-    def _show_curves(self, found: curves.Curves, version: int, edit: int) -> None:
+    def _show_curves(self, found: curves.Curves, now: Scenario, change: str, version: int, edit: int) -> None:
+        if version < self.since:
+            return
+        self.session.accept(now.loop)
         if self.chart is None:
             with self.place:
                 self.chart = Canvas(charts.frame(found), "fill")
         else:
-            self.chart.change(charts.curves(found), edit)
+            self.chart.send(change, edit)
         self.shown = found
+        if version == self.version:
+            self.refused(None)
         self.end_line.set_text(f"{self.session.given.name} {found.end}")
         if not found.draft:
             self.results.metrics(found.metrics, fresh=version == self.version)
 
-    def _show_fan(self, found: curves.Fan | None) -> None:
+    def _show_fan(self, found: curves.Fan | None, change: str) -> None:
         if self.chart is not None:
-            self.chart.change(charts.fan(found))
+            self.chart.send(change)
         self.controls.fan(found)
 
-    def _show_stability(self, found: stability.Stability | str, version: int) -> None:
-        self.results.stability(found, fresh=version == self.version)
+    def _show_stability(self, found: stability.Stability | str, version: int, whole: bool) -> None:
+        self.results.stability(found, fresh=whole and version == self.version)
 
     def _show_verdict(self, found: Verdict, version: int) -> None:
         if version == self.version:
@@ -185,30 +209,51 @@ class Page:
     def _failed(self, error: Exception) -> None:
         self.later(self.refused, error)
 
-    def _draw(self, now: Scenario, version: int, edit: int) -> None:
-        found = curves.curves(now, curves.draft_solver(now))
-        self.later(self._show_curves, found, version, edit)
+    def _draw(self, now: Scenario, version: int, edit: int, key: str) -> None:
+        """The curve, if the number that was turned, `key`, may be."""
+        try:
+            if key:
+                self.session.judge(key, now)
+            self._send(curves.curves(now, curves.draft_solver(now)), now, version, edit)
+        except ScenarioError as error:
+            self.later(self._objected, key, error, version)
+        finally:
+            self.drawn = version
+
+    def _send(self, found: curves.Curves, now: Scenario, version: int, edit: int = 0) -> None:
+        self.later(self._show_curves, found, now, encoded(charts.curves(found)), version, edit)
 
     def _think(self, now: Scenario, version: int) -> None:
-        """Everything but the curve: what is quick while one drags, the rest when one has stopped."""
-        steps: dict[str, Callable[[Scenario, int], None]] = {"poles": self._poles, "fan": self._fan}
-        done = [name for name in steps if self.costs.get(name, 1e9) < QUICK and self._timed(name, steps, now, version)]
+        """Everything but the curve, which comes first: what is quick while one drags, the rest when one has stopped."""
+        if not self._curve_is_there(version):
+            return
+        steps = {"poles": self._poles, "fan": self._fan}
+        done = [name for name in steps if self.costs.get(name, math.inf) < QUICK]
+        for name in done:
+            self._timed(name, steps[name], now, version)
         if not self._rested(REST, version):
             return
         if curves.draft_solver(now):
-            self.later(self._show_curves, curves.curves(now), version, 0)
+            self._send(curves.curves(now), now, version)
         for name in steps:
             if name not in done and version == self.version:
-                self._timed(name, steps, now, version)
+                self._timed(name, steps[name], now, version)
+        if version == self.version and not self.surrounded:
+            self._poles(now, version, corners=True)
         if self._rested(PROVING, version):
             self.later(self._show_verdict, self._proved(now), version)
         objections(now)  # compiled now, while nobody waits
 
-    def _timed(self, name: str, steps: dict[str, Any], now: Scenario, version: int) -> bool:
+    def _timed(self, name: str, step: Callable[[Scenario, int], bool], now: Scenario, version: int) -> None:
         begun = time.monotonic()
-        steps[name](now, version)
-        self.costs[name] = time.monotonic() - begun
-        return True
+        useful = step(now, version)
+        self.costs[name] = time.monotonic() - begun if useful else math.inf
+
+    def _curve_is_there(self, version: int) -> bool:
+        """Wait until the curve is drawn; whether nothing was changed meanwhile."""
+        while version == self.version and self.drawn < version:
+            time.sleep(TICK)
+        return version == self.version
 
     def _rested(self, seconds: float, version: int) -> bool:
         """Wait until nothing was changed for so long; whether nothing was."""
@@ -216,16 +261,21 @@ class Page:
             time.sleep(min(left, 0.02))
         return version == self.version
 
-    def _poles(self, now: Scenario, version: int) -> None:
+    def _poles(self, now: Scenario, version: int, *, corners: bool = False) -> bool:
+        """Poles and margins here, with the corners that are known; or with those that belong to it."""
         try:
-            found: Any = stability.stability(now)
+            self.around = stability.around(now, self.around, anew=corners)
+            found: Any = stability.stability(now, self.around)
+            self.surrounded = self.around.of == stability.corners_of(now)
         except ValueError as error:
-            found = " ".join(str(error).split())
-        self.later(self._show_stability, found, version)
+            found, self.surrounded = " ".join(str(error).split()), True
+        self.later(self._show_stability, found, version, self.surrounded)
+        return not isinstance(found, str)
 
-    def _fan(self, now: Scenario, version: int) -> None:
-        del version
-        self.later(self._show_fan, curves.fan(now, self.session.spread))
+    def _fan(self, now: Scenario, version: int) -> bool:
+        found = curves.fan(now, self.session.spread)
+        self.later(self._show_fan, found, encoded(charts.fan(found)))
+        return True
 
     def _proved(self, now: Scenario) -> Verdict:
         try:

@@ -1,8 +1,11 @@
 """The server of the page, on this machine only."""
 
+import html
 import pathlib
+import secrets
 import socket
 import sys
+import tempfile
 import threading
 import webbrowser
 from collections.abc import Callable
@@ -50,8 +53,8 @@ def serve(
     there: a socket that listens; ready: told the address when the server answers; browser: whether to open the page
 
     Raises OSError if the server does not start."""
-    port = there.getsockname()[1]
-    url = f"http://{LOOPBACK}:{port}/"
+    port, token = there.getsockname()[1], secrets.token_urlsafe(24)
+    url = f"http://{LOOPBACK}:{port}/?token={token}"
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @ui.page("/", title="diffabs explore", favicon="📈")
@@ -59,7 +62,7 @@ def serve(
         await page.show(source, tools, folder, thread)
 
     ui.run_with(app, show_welcome_message=False, gzip_middleware_factory=None, reconnect_timeout=5.0, tailwind=True)
-    guarded: Any = Guard(app, port)
+    guarded: Any = Guard(app, port, token)
     config = uvicorn.Config(
         guarded, log_level="error", access_log=False, timeout_graceful_shutdown=PATIENCE, lifespan="on", ws="auto"
     )
@@ -72,9 +75,19 @@ def serve(
         if server.started:
             ready(url)
             if browser:
-                webbrowser.open(url)
+                webbrowser.open(leading_to(url, pathlib.Path(private)).as_uri())
 
-    threading.Thread(target=announced, daemon=True).start()
-    server.run(sockets=[there])
+    with tempfile.TemporaryDirectory(prefix="diffabs-explore-") as private:
+        threading.Thread(target=announced, daemon=True).start()
+        server.run(sockets=[there])
     if not server.started:
-        raise OSError(f"no page can be served at {url}")
+        raise OSError(f"no page can be served at http://{LOOPBACK}:{port}/")
+
+
+def leading_to(url: str, folder: pathlib.Path) -> pathlib.Path:
+    """Return a new file, of its owner only, which leads a browser to an address: the words by which the browser is
+    started are seen by everyone on the machine, and the address has the token."""
+    path = folder / "explore.html"
+    path.touch(mode=0o600, exist_ok=False)
+    path.write_text(f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={html.escape(url)}">', "utf-8")
+    return path

@@ -62,6 +62,7 @@ class Session:
         for key, value in turned.items():
             if key in self.knobs and not key.startswith((f"{family}.", f"plant.{family}.")):
                 self._put(key, value)
+        self.accept(self.scenario().loop)
 
     def choices(self, family: str) -> list[str]:
         """Return the parts that can be chosen, that of the scenario first; none where the loop has no such part."""
@@ -71,17 +72,42 @@ class Session:
     def turn(self, key: str, given: Any) -> float:
         """Give a number another value, as it is shown, and return it in SI. Raises ScenarioError that names the field,
         and then nothing has changed."""
+        value = self.put(key, given)
+        now = self.scenario()
+        try:
+            self.judge(key, now)
+        except ScenarioError:
+            self.withdraw()
+            raise
+        self.accept(now.loop)
+        return value
+
+    def put(self, key: str, given: Any) -> float:
+        """The same, but only look at the value itself; `judge` takes some milliseconds, and `accept` or `withdraw` must
+        follow it."""
         if key not in self.knobs:
             raise unknown(f"{key!r} is no number of this loop", key, self.knobs)
-        knob = self.knobs[key]
-        value = knob.read(given)
-        before = self._values
+        value = self.knobs[key].read(given)
         self._put(key, value)
-        lines = objections(self.scenario())
-        if lines:
-            self._values = before
-            raise ScenarioError(f"{knob.name} = {knob.text(value)} {knob.spec.unit}: {lines[0]}".replace(" 1:", ":"))
         return value
+
+    def judge(self, key: str, chosen: Scenario) -> None:
+        """Raises ScenarioError for a scenario of this session that must not be run, which names the number that was
+        turned last."""
+        if lines := objections(chosen):
+            knob = self.knobs[key]
+            text = knob.text(_value(get(chosen.loop, knob.path), knob))
+            raise ScenarioError(f"{knob.name} = {text} {knob.spec.unit}: {lines[0]}".replace(" 1:", ":"))
+
+    def accept(self, loop: Loop) -> None:
+        """Let `withdraw` come back to these numbers."""
+        self._accepted = loop
+
+    def withdraw(self) -> list[str]:
+        """Go back to what was accepted last, and return the numbers that changed by that."""
+        before = {key: self.value(key) for key in self.knobs}
+        self.adopt(self._accepted)
+        return [key for key, value in before.items() if value != self.value(key)]
 
     def widen(self, name: str, given: Any) -> None:
         """Say how far the members of the fan differ in "mass" or "road" [%]. Raises ScenarioError."""
@@ -93,11 +119,13 @@ class Session:
 
     def adopt(self, loop: Loop) -> None:
         """Take over the numbers of another loop of the same parts."""
+        self.accept(loop)
         self._values = {knob.path: np.asarray(get(loop, knob.path), float) for knob in self.knobs.values()}
 
     def reset(self) -> None:
         """Go back to the numbers of the scenario."""
         self._values = {}
+        self.accept(self._base.loop)
 
     def scenario(self) -> Scenario:
         """Return the scenario with the numbers as they were turned."""
@@ -105,8 +133,11 @@ class Session:
         return dataclasses.replace(self._base, loop=replace(self._base.loop, values)) if values else self._base
 
     def to_save(self) -> Scenario:
-        """Return the scenario as it is written to a file; a friction factor of one is left out."""
+        """Return the scenario as it is written to a file; a friction factor of one is left out. Raises ScenarioError
+        for one that must not be run."""
         now = self.scenario()
+        if lines := objections(now):
+            raise ScenarioError(lines[0])
         changed = bool(self._turned()) or any(part != AS_GIVEN for part in self.parts.values())
         return friction.without_factor(now.with_loop(now.loop, "explored") if changed else now, self.given)
 
@@ -114,8 +145,7 @@ class Session:
         """Return a number in SI."""
         knob = self.knobs[key]
         value = self._values.get(knob.path)
-        value = np.asarray(get(self._base.loop, knob.path), float) if value is None else value
-        return float(value if knob.place is None else value[knob.place])
+        return _value(get(self._base.loop, knob.path) if value is None else value, knob)
 
     def _begin(self, source: str, parts: Mapping[str, str], given: Scenario) -> None:
         self.source, self.given = source, given
@@ -124,6 +154,7 @@ class Session:
         self.knobs: dict[str, Knob] = knobs.knobs(self._base)
         self.first = knobs.first(self._base, self.knobs)
         self._values: dict[str, np.ndarray] = {}
+        self.accept(self._base.loop)
 
     def _put(self, key: str, value: float) -> None:
         knob = self.knobs[key]
@@ -137,6 +168,10 @@ class Session:
         loop = self._base.loop
         changed = {path for path, value in self._values.items() if not np.array_equal(value, get(loop, path))}
         return {key: self.value(key) for key, knob in self.knobs.items() if knob.path in changed}
+
+
+def _value(value: Any, knob: Knob) -> float:
+    return float(np.asarray(value, float)[() if knob.place is None else knob.place])
 
 
 def objections(chosen: Scenario) -> list[str]:

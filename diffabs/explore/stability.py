@@ -1,10 +1,12 @@
 """Poles and margins of the linearised loop, here and at the corners of the ranges of [design.over]."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
+from diffabs.core.pytree import replace
 from diffabs.linear.robustness import band
 from diffabs.linear.stability_margins import Margins, closed_poles
 from diffabs.scenario.scenario import Scenario
@@ -35,24 +37,54 @@ class Stability(NamedTuple):
     systems: int
 
 
-def stability(chosen: Scenario) -> Stability:
-    """Return what is known of the linearised loop. Raises ValueError for a loop that has no linear model."""
-    here = band(chosen.loop, {}, 0).systems[0]
+class Around(NamedTuple):
+    """The corners of the ranges of [design.over]. They do not depend on the values that have a range: `of` is what they
+    follow from. Poles, the worst margins, how many are not stable, how many there are."""
+
+    of: tuple[Any, ...]
+    poles: np.ndarray
+    worst: dict[str, float]
+    unstable: int
+    systems: int
+
+
+def corners_of(chosen: Scenario) -> tuple[Any, ...]:
+    """Return what the corners follow from, to be compared: their ranges, and the loop without what has a range."""
     ranges = chosen.design.ranges(chosen.loop)
-    over = band(chosen.loop, ranges, 0) if 0 < len(ranges) <= MOST_RANGES else None
-    systems = over.systems if over else ()
-    worst = {name: numbers(one.margins)[name] for name, one in over.worst().items() if name in NAMES} if over else {}
-    corners = [closed_poles(one.loop.transfer()) for one in systems]
+    rest = replace(chosen.loop, {path: low for path, (low, _) in ranges.items()})
+    leaves, kind = jax.tree.flatten(rest)
+    return kind, tuple(ranges.items()), *(np.asarray(leaf).tobytes() for leaf in leaves)
+
+
+def around(chosen: Scenario, known: Around | None = None, *, anew: bool = True) -> Around:
+    """Return the corners of a scenario; those that are known where they are the same, or not to be worked out anew."""
+    of = corners_of(chosen)
+    if known and (known.of == of or (not anew and known.of[0] == of[0])):
+        return known
+    ranges = chosen.design.ranges(chosen.loop)
+    if not anew or not 0 < len(ranges) <= MOST_RANGES:
+        return Around(of if anew else (), np.array([]), {}, 0, 0)
+    over = band(chosen.loop, ranges, 0)
+    worst = {name: numbers(one.margins)[name] for name, one in over.worst().items() if name in NAMES}
+    poles = np.concatenate([closed_poles(one.loop.transfer()) for one in over.systems])
+    return Around(of, poles, worst, len(over.unstable), len(over.systems))
+
+
+def stability(chosen: Scenario, known: Around | None = None) -> Stability:
+    """Return what is known of the linearised loop, with these corners instead of its own if they are given. Raises
+    ValueError for a loop that has no linear model."""
+    here = band(chosen.loop, {}, 0).systems[0]
+    corners = known or around(chosen)
     return Stability(
         here.loop.period,
         here.loop.delay,
         closed_poles(here.loop.transfer()),
-        np.concatenate(corners) if corners else np.array([]),
+        corners.poles,
         numbers(here.margins),
-        worst,
+        corners.worst,
         here.margins.stable,
-        len(over.unstable) if over else 0,
-        len(systems),
+        corners.unstable,
+        corners.systems,
     )
 
 

@@ -5,6 +5,7 @@ Speeds are drawn in km/h, everything else in SI units. Colours are those of M. O
 (2008), which colour-blind readers can tell apart; curves that lie close differ in their dashes as well.
 """
 
+import json
 import os
 import pathlib
 import textwrap
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.core import files
+from diffabs.core import files, pictures
 
 try:
     from matplotlib.axes import Axes
@@ -97,11 +98,22 @@ class _Powers(Formatter):
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
-    """Write a figure in the format of the path's suffix, atomically: readers see the old file or the whole new one."""
+    """Write a figure in the format of the path's suffix, atomically: readers see the old file or the whole new one. A
+    PNG has the numbers that it shows in it (`plot.shown`)."""
     path = pathlib.Path(path)
     with files.new_file(path) as temporary:
-        figure.savefig(temporary, format=path.suffix.lstrip(".") or "png", dpi=DPI)
+        write(figure, temporary, path.suffix.lstrip(".") or "png")
     return path
+
+
+def write(figure: Figure, path: pathlib.Path, kind: str) -> None:
+    """Write a figure in a format."""
+    from diffabs.plot import shown
+
+    figure.savefig(path, format=kind, dpi=DPI)
+    if kind == "png":  # drawing has set the places of the axes
+        text = json.dumps(shown.shown(figure), separators=(",", ":"), allow_nan=False)
+        path.write_bytes(pictures.with_text(path.read_bytes(), pictures.AXES, text))
 
 
 def controlled(unit: str) -> str:

@@ -2,16 +2,19 @@
 
 import base64
 import dataclasses
+import json
 import math
 import pathlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from diffabs.core import files
+from diffabs.core import files, pictures
 from diffabs.core.summary import number
 
 IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 LARGEST_IMAGE = 2**25  # bytes
+LARGEST_AXES = 2**21  # characters of the numbers that a picture shows
+ENDS = ("box", "x", "y", "log")  # numbers of axes
 SHOWN = 8  # entries of a list
 UNKNOWN = "not known: the document does not say"
 VERDICTS = {True: "proved", False: "disproved", None: "undecided"}
@@ -34,11 +37,13 @@ class Table(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """An image, by the address of its own bytes or as SVG that this package has drawn, and what it is of."""
+    """An image, by the address of its own bytes or as SVG that this package has drawn, and what it is of; `axes` are
+    the numbers that it shows, as JSON of `diffabs.plot.shown`, "" where it does not say."""
 
     caption: str
     address: str = ""
     drawn: str = ""
+    axes: str = ""
 
 
 class Verdict(NamedTuple):
@@ -94,8 +99,29 @@ def image(path: pathlib.Path, caption: str = "") -> Figure | None:
         return None
     if not data or len(data) > LARGEST_IMAGE:
         return None
+    data, axes = pictures.without_text(data, pictures.AXES)
     text = base64.b64encode(data).decode()
-    return Figure(caption or path.stem.replace("_", " "), f"data:{kind};base64,{text}")
+    return Figure(caption or path.stem.replace("_", " "), f"data:{kind};base64,{text}", axes=_axes(axes))
+
+
+def _axes(text: str) -> str:
+    """What a picture says of its axes; nothing for what a page could not show."""
+    if len(text) > LARGEST_AXES:
+        return ""
+    try:
+        given = json.loads(text or "[]")
+        good = [one for one in given if all(map(_is_series, one["series"])) and all(map(_finite, map(one.get, ENDS)))]
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return ""
+    return json.dumps(good, separators=(",", ":")) if good else ""
+
+
+def _is_series(one: Any) -> bool:
+    return _finite(one["x"]) and _finite(one["y"]) and len(one["x"]) == len(one["y"]) > 0
+
+
+def _finite(values: Any) -> bool:
+    return isinstance(values, list) and all(isinstance(x, int | float) and math.isfinite(x) for x in values)
 
 
 def model_tables(model: Mapping[str, Any] | None) -> list[Table]:

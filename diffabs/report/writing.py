@@ -1,5 +1,7 @@
-"""Sections as one HTML file: no script, nothing that is fetched from elsewhere."""
+"""Sections as one HTML file: no script but our own, which the policy names by its checksum; nothing is fetched."""
 
+import base64
+import hashlib
 import importlib.resources
 import pathlib
 from collections.abc import Callable, Sequence
@@ -32,13 +34,25 @@ def report(found: Sequence[Document], title: str = "") -> str:
     import jinja2
 
     sections = [_section(one) for one in found]
-    text = (importlib.resources.files("diffabs.report") / "report.html.j2").read_text(encoding="utf-8")
+    text, script = (_content(name) for name in ("report.html.j2", "closer.js"))
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     environment.filters["numbers"] = numbers
     whole = title or (sections[0].title if len(sections) == 1 else f"{len(sections)} results")
-    return environment.from_string(text).render(title=whole, sections=sections, version=__version__)
+    looked = any(figure.axes for section in sections for figure in section.figures)
+    return environment.from_string(text).render(
+        title=whole, sections=sections, version=__version__, script=script if looked else "", checksum=checksum(script)
+    )
+
+
+def checksum(script: str) -> str:
+    """Return how a content security policy names a script."""
+    return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
+
+
+def _content(name: str) -> str:
+    return (importlib.resources.files("diffabs.report") / name).read_text(encoding="utf-8")
 
 
 def _section(document: Document) -> Section:

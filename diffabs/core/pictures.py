@@ -1,0 +1,43 @@
+"""Text inside a PNG file: what a picture shows, as numbers, goes where the picture goes.
+
+W3C, Portable Network Graphics (third edition), section 11.3.3: a `tEXt` chunk is a keyword, a zero, and Latin-1 text;
+each chunk is its length, its type, its data and their CRC."""
+
+import struct
+import zlib
+from collections.abc import Iterator
+
+AXES = "diffabs-axes"  # the keyword of the numbers that a figure shows, as JSON
+BEGINNING = b"\x89PNG\r\n\x1a\n"
+HEADER = len(BEGINNING) + 25  # bytes until after IHDR, which is always the first chunk
+
+
+def with_text(picture: bytes, key: str, text: str) -> bytes:
+    """Return a PNG with a text of ASCII under a keyword; what is no PNG as it is."""
+    if not picture.startswith(BEGINNING):
+        return picture
+    data = b"tEXt" + key.encode("ascii") + b"\0" + text.encode("ascii")
+    chunk = struct.pack(">I", len(data) - 4) + data + struct.pack(">I", zlib.crc32(data))
+    return picture[:HEADER] + chunk + picture[HEADER:]
+
+
+def without_text(picture: bytes, key: str) -> tuple[bytes, str]:
+    """Return a picture without the text under a keyword, and that text; the same and "" for one that has none, is no
+    PNG, or is not whole."""
+    keyword = b"tEXt" + key.encode("ascii") + b"\0"
+    for start, end in _chunks(picture):
+        data = picture[start + 4 : end - 4]
+        if data.startswith(keyword):
+            return picture[:start] + picture[end:], data[len(keyword) :].decode("latin-1")
+    return picture, ""
+
+
+def _chunks(picture: bytes) -> Iterator[tuple[int, int]]:
+    """Where chunks begin and end."""
+    start = len(BEGINNING) if picture.startswith(BEGINNING) else len(picture)
+    while start + 12 <= len(picture):
+        end = start + 12 + int.from_bytes(picture[start : start + 4], "big")
+        if end > len(picture):
+            return
+        yield start, end
+        start = end
