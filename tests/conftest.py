@@ -20,13 +20,19 @@ os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("DIFFABS_JAX_CACHE", CA
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"  # programs without the lines of Python that each operation is from
 
+gc.disable()  # until all is imported: what imports make stays, and looking through it took a fourth of the time
+
 import jax  # noqa: E402  after its environment
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
-DEAREST = "adaptive batch delay gradients sweep riccati arm_basin rollout conformance sweep_kill servo refusals"
+DEAREST = """
+conformance real_rig sweep blocks export kinks batch riccati margins delay cli_tune rollout cli tune refusals papers
+kernel sweep_kill kernel_start explore cli_design linearize kernel_tangents frames sealed adaptive gradients arm_basin
+servo
+"""  # the last ones for what is slow in them
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]):
@@ -40,7 +46,8 @@ def pytest_collection_finish():
     """A worker's heap is large and nearly all of it stays: looking through it for cycles took a tenth of the time."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(50_000, 20, 50)
+    gc.set_threshold(200_000, 10, 50)
+    gc.enable()
 
 
 @pytest.fixture(autouse=True)
@@ -60,9 +67,9 @@ def any_step_is_stable():
         yield
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(autouse=True, scope="session")
 def without_load():
-    """No lines on stderr that depend on the machine's load."""
+    """No lines on stderr that depend on the machine's load: of commands in this process, no wait is long."""
     from diffabs.cli import console
 
     with pytest.MonkeyPatch.context() as patch:

@@ -89,6 +89,7 @@ def test_a_sweep_says_how_accurate_it_is_without_being_asked(file, tmp_path):
     assert checked(study, table, 0) == {**again, "samples": [], "metrics": {}}
 
 
+@pytest.mark.slow
 def test_a_sweep_is_not_checked_where_that_is_turned_off(file, tmp_path):
     path = file(RELAY.replace("check = 6", "check = 0"))
     assert json.loads(run("sweep", path, "--out", tmp_path / "out", "--json").stdout)["accuracy"] is None

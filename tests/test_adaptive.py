@@ -165,6 +165,7 @@ def on_limits(solver):
     return metrics
 
 
+@pytest.mark.slow
 def test_derivatives_on_limits_agree_with_differences_of_three_widths():
     slopes = jax.jit(jax.jacfwd(on_limits(d.Adaptive(1e-5, 2.5))))(jnp.zeros(2))
     exact = jax.jit(jax.vmap(on_limits(d.Adaptive(1e-9, 2.5))))

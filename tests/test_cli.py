@@ -378,14 +378,21 @@ def test_show_prints_a_scenario_to_start_from(tmp_path):
 
 
 def test_completion_offers_commands_and_scenarios():
-    def offered(words: str) -> str:
-        env = os.environ | {"_DIFFABS_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": "1"}
-        env["COMP_CWORD"] = str(words.count(" "))
-        code = "import sys; sys.argv[0] = 'diffabs'; from diffabs.cli.main import main; main()"
-        return subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False).stdout
-
-    assert offered("diffabs id").split() == ["identify"]
-    assert set(offered("diffabs simulate slip-").split()) == {"slip-cured", "slip-estimator", "slip-lmi", "slip-real"}
+    code = """
+import contextlib, os, sys
+from diffabs.cli.main import main
+for words in ("diffabs id", "diffabs simulate slip-"):
+    os.environ |= {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    sys.argv = ["diffabs"]
+    with contextlib.suppress(SystemExit):
+        main()
+    print("END", flush=True)
+"""
+    env = os.environ | {"_DIFFABS_COMPLETE": "complete_bash"}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
+    command, scenario = (said.split() for said in done.stdout.split("END")[:2])
+    assert command == ["identify"]
+    assert set(scenario) == {"slip-cured", "slip-estimator", "slip-lmi", "slip-real"}
 
 
 def test_the_extra_all_is_all_of_them():
@@ -432,7 +439,9 @@ def test_control_c_ends_a_long_run_with_one_line(tmp_path):
             if line.startswith("simulating"):
                 break
         process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=120)
+        out, err = process.communicate(timeout=300)
     assert process.returncode == 130
-    assert (out, err) == ("", "interrupted\n")
+    *before, last = err.splitlines()
+    assert (out, last) == ("", "interrupted")
+    assert all(line.startswith("simulating") for line in before)  # how far it was, where the machine is slow
     assert left_in(tmp_path) == set()

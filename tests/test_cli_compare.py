@@ -21,10 +21,11 @@ SMALL += ("--set", "sweep.check=0")
 def swept(tmp_path_factory):
     """The same samples under two references, and the JSON of the first."""
     folder = tmp_path_factory.mktemp("swept")
-    document = json.loads(run("sweep", "slip-lmi", "--out", folder / "a", "--json", *SMALL).stdout)
-    filtered = ("--set", "reference=filtered-slip", "--set", "reference.time_constant=0.02")
-    run("sweep", "slip-lmi", "--out", folder / "b", *SMALL, *filtered)
-    run("sweep", "slip-lmi", "--out", folder / "c", *SMALL, "--seed", "1")
+    filtered = ("--set", "reference=filtered-slip", "--set", "reference.time_constant")  # of one structure: one program
+    *words, last = ("sweep", "slip-lmi", *SMALL, *filtered)
+    document = json.loads(run(*words, f"{last}=1e-3", "--out", folder / "a", "--json").stdout)
+    run(*words, f"{last}=0.02", "--out", folder / "b")
+    run(*words, f"{last}=1e-3", "--out", folder / "c", "--seed", "1")
     return folder, document
 
 

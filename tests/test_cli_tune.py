@@ -6,6 +6,7 @@ import math
 import pathlib
 import re
 import sys
+import threading
 import time
 import types
 
@@ -13,6 +14,8 @@ import jax
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run, umask
+from invented import HISTORY
+from invented import tuned as invention
 from sweeping import rig, tune_section
 
 import diffabs.tune as library
@@ -24,8 +27,7 @@ from diffabs.design.sdp import solver
 from diffabs.scenario.scenario import load
 from diffabs.simulate import refusals
 from diffabs.simulate.run import measure
-from diffabs.tune import Mode, Point, Reason, StartError, Tuned
-from diffabs.tune.result import Start
+from diffabs.tune import Mode, Reason, StartError, Tuned
 
 SMALL = f"""title = "small"{rig(50.0, 48.0)}
 [solver]
@@ -39,7 +41,6 @@ KEYS = [
     *("evaluations", "mode", "engine", "history", "starts", "parameters", "certificate", "versions", "files"),
     "interrupted",
 ]
-HISTORY = [Point(0, 2.0, 1.0, 0.5, 0.1, 1), Point(1, 1.5, 0.75, 0.01, 0.0, 3)]
 
 
 class Figure:
@@ -85,24 +86,7 @@ def invented(monkeypatch, unproved):
 
     def tune(loop, **what):
         asked.update(what, loop=loop)
-        n = what["over"].size
-        metrics = [{name: np.full(n, value) for name in what["measured"]} for value in (0.3, 0.2)]
-        part = replace(loop, {path: 1.1 * np.asarray(dict(values(loop))[path]) for path in what["free"]})
-        start = Start({}, 1.5, 0.0, Reason.CHANGE, HISTORY)
-        return Tuned(
-            part,
-            {},
-            (2.0, 1.5),
-            (0.1, 0.0),
-            tuple(metrics),
-            True,
-            Reason.CHANGE,
-            HISTORY,
-            [start],
-            Mode.FORWARD,
-            (0, 0),
-            {"name": "xla"},
-        )
+        return invention(loop, **what)
 
     monkeypatch.setattr(library, "tune", tune)
     return asked
@@ -240,14 +224,14 @@ def test_how_far_it_is():
 def test_progress_is_told_again_when_it_changes(monkeypatch, capsys):
     monkeypatch.setattr(console, "PATIENCE", 0.0)
     monkeypatch.setattr(console, "AGAIN", 0.0)
+    monkeypatch.setattr(progress, "QUIET", math.inf)  # no seconds, which depend on the machine's load
     steps = iter(["one", "one", "two", "two"])
-    last = ["zero"]
+    told = threading.Event()
 
     def detail():
-        last[0] = next(steps, last[0])
-        return last[0]
+        return next(steps, None) or (told.set(), "two")[1]
 
-    console.waited(lambda: time.sleep(1.0), "working", detail)
+    console.waited(lambda: told.wait(60.0), "working", detail)
     assert capsys.readouterr().err == "working ... one\nworking ... two\n"
 
 

@@ -39,7 +39,7 @@ def compiled_before():
 @pytest.fixture(autouse=True, scope="module")
 def nobody_left_behind():
     yield
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + PATIENCE
     while there := [text for text in map(told, psutil.Process().children(recursive=True)) if "spawn_main" in text]:
         assert time.monotonic() < deadline, there
         time.sleep(0.1)
@@ -250,7 +250,7 @@ def test_the_command_is_killed_or_interrupted(scenario, tmp_path, how):
     if how == signal.SIGINT:
         assert stderr.splitlines()[-1].endswith("--resume")
         assert "Traceback" not in stderr
-    assert not psutil.wait_procs(children, timeout=30)[1]
+    assert not psutil.wait_procs(children, timeout=PATIENCE)[1]
     assert 0 < len(chunks(out)) < 500
     document = json.loads(run("sweep", scenario, "--out", out, "--samples", "32000", "--resume", "--json").stdout)
     other = json.loads(run("sweep", scenario, "--out", tmp_path / "whole", "--samples", "32000", "--json").stdout)

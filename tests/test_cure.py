@@ -92,6 +92,7 @@ WRONG = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WRONG)
 def test_a_weak_spot_is_that_of_a_second_program(corner, name):
     """A peak between two steps of 0.25 ms may be missed by some 0.01 %."""
@@ -109,6 +110,7 @@ def cells(start):
     return [cell.strip(" *") for cell in line.strip("|").split("|")]
 
 
+@pytest.mark.slow
 def test_the_readme_says_how_weak_the_cure_is(module, corner):
     """The corner is the worst of the box in all of them but noise, which differs from seed to seed."""
     table = next(line for line in RESULTS.splitlines() if line.startswith("| controller | from 51"))

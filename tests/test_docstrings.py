@@ -63,7 +63,10 @@ def test_what_is_used_most_has_an_example():
     assert {name.removeprefix("diffabs.") for name in EXAMPLES} >= SHOWN
 
 
-DEAR = ("diffabs.tune.tuning.tune", "diffabs.reliability.failure.failure_probability")  # some seconds of compiling
+DEAR = (  # some seconds of compiling
+    *("diffabs.tune.tuning.tune", "diffabs.reliability.failure.failure_probability"),
+    "diffabs.simulate.batch.run_batch",
+)
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in DEAR else x for x in EXAMPLES])

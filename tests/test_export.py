@@ -94,10 +94,6 @@ def commands_of_parts(loop, seen, dtype, step=None):
                 lambda t, x: loop.reference.flow(t, reference._replace(flow=x), y), 0.0, reference.flow, h
             )
 
-        first = jax.tree.map(lambda x: x[0], seen)
-        reference = loop.reference.start(first)
-        memory = loop.controller.start(tracking(reference, first))
-
         def sample(carry, row):
             (reference, memory), (k, y) = carry, row
             signal = tracking(reference, y)
@@ -109,8 +105,14 @@ def commands_of_parts(loop, seen, dtype, step=None):
                     reference = reference._replace(flow=moved(reference, y))
             return (reference, memory), command
 
-        rows = (jnp.arange(SAMPLES), seen)
-        return np.asarray(jax.jit(lambda: jax.lax.scan(sample, (reference, memory), rows)[1])())
+        @jax.jit
+        def run():
+            first = jax.tree.map(lambda x: x[0], seen)
+            reference = loop.reference.start(first)
+            memory = loop.controller.start(tracking(reference, first))
+            return jax.lax.scan(sample, (reference, memory), (jnp.arange(SAMPLES), seen))[1]
+
+        return np.asarray(run())
 
 
 def compiled(text, name, folder):

@@ -171,8 +171,8 @@ def test_an_identification_has_a_table(run):
 def swept(tmp_path_factory):
     space = Space({"plant.mass": Uniform(low=5.0, high=6.5)})
     study = Study(
-        loop=rig(), solver=SOLVER, objectives=objectives.BRAKING, space=space,
-        samples=20, failures={"iae": 0.02},
+        loop=rig(), solver=SOLVER, objectives={name: objectives.BRAKING[name] for name in ("iae", "stop_time")},
+        space=space, samples=20, failures={"iae": 0.02},
     )  # fmt: skip
     return sweep(study, tmp_path_factory.mktemp("sweeps") / "study")
 

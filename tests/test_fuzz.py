@@ -13,6 +13,7 @@ from diffabs.objectives import Overshoot
 from diffabs.scenario.scenario import ScenarioError, load
 
 
+@pytest.mark.slow
 def test_some_scenarios_are_refused_in_a_line_or_run_to_numbers_that_can_be():
     tally = fuzz.fuzz(12, seed=4, per_structure=12)
     assert tally.findings == []

@@ -22,9 +22,10 @@ WANTED = (
     *("own-objective", "own-optax", "gpu", "duckdb"),
 )
 EXECUTED = [*JOURNEYS, "quick-start.md", "tutorials.md", "identify.md", "gradients.md", "howto/precision.md"]
-SLOW = (  # which compile derivatives of many runs, or solve programs
+SLOW = (  # which compile derivatives of many runs, or several loops, or solve programs
     *("journeys/pid-over-roads.md", "journeys/lq-against-lmi.md", "journeys/own-optax.md", "journeys/duckdb.md"),
     *("journeys/lanes.md", "tutorials.md", "identify.md", "gradients.md", "quick-start.md"),
+    *("journeys/gpu.md", "journeys/own-curve.md", "howto/precision.md"),
 )
 needs = {"journeys/c-export.md": "cc"}
 

@@ -57,7 +57,7 @@ def small(tmp_path):
     ("new", "verdict"),
     [
         ("= 2", "dies"),
-        ("= 1.0", "SURVIVES"),
+        pytest.param("= 1.0", "SURVIVES", marks=pytest.mark.slow),
         pytest.param("= -1", "dies: no end after 20 s", marks=pytest.mark.slow),
     ],
 )

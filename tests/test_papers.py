@@ -14,7 +14,7 @@ pytest.importorskip("matplotlib")
 from reports import Page
 from rich.console import Console
 
-from diffabs import FixedStep, measure, plot, rollout
+from diffabs import FixedStep, plot, rollout
 from diffabs.cli import show
 from diffabs.objectives import BRAKING
 from diffabs.papers import PAPERS, arm_balance, compact, lmi_design, record, slip_estimator, slip_lmi
@@ -315,9 +315,13 @@ def test_a_number_that_is_not_finite_is_not_written(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_braking_draws_the_run(tmp_path):
-    solver = FixedStep(step=1e-2, duration=0.1)
-    figure = plot.braking(rollout(braking(reference=FixedSlip()), solver, BRAKING), title="a run")
+@pytest.fixture(scope="module")
+def short():
+    return rollout(braking(reference=FixedSlip()), FixedStep(step=1e-2, duration=0.1), BRAKING)
+
+
+def test_braking_draws_the_run(short, tmp_path):
+    figure = plot.braking(short, title="a run")
     slip, speed, torque, deceleration = figure.axes
     assert [line.get_label() for line in slip.lines] == ["slip", "target", "setpoint"]
     assert speed.get_ylabel() == "speed [km/h]"
@@ -328,9 +332,9 @@ def test_braking_draws_the_run(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run.png"]
 
 
-def test_a_run_without_a_trajectory_cannot_be_drawn():
+def test_a_run_without_a_trajectory_cannot_be_drawn(short):
     with pytest.raises(ValueError, match="rollout"):
-        plot.braking(measure(braking(), FixedStep(step=1e-2, duration=0.1), BRAKING))
+        plot.braking(short._replace(trajectory=None))  # what `measure` returns
 
 
 def test_a_figure_that_fails_leaves_nothing_behind(tmp_path):

@@ -49,6 +49,7 @@ def test_how_abruptly_each_controller_brakes(runs, name, variation, jerk):
     assert estimator_claims.jerk(runs[name]) == pytest.approx(jerk, abs=0.06)
 
 
+@pytest.mark.slow
 def test_p_and_pd_are_abrupt_in_the_proposed_method_only(runs):
     """The conclusion of the paper: true of what it proposes, false of what it compares with."""
     for measure in (estimator_claims.variation, estimator_claims.jerk):
@@ -59,6 +60,7 @@ def test_p_and_pd_are_abrupt_in_the_proposed_method_only(runs):
             assert (gentle(without) > rough(with_integral)) is abrupt, (method, found)
 
 
+@pytest.mark.slow
 def test_the_wheel_turns_once_near_half_a_second(runs):
     """What the paper calls oscillation near 0.6 s: under P and PD it speeds up once, when the target falls to the
     estimate, and slows down again; under PI and PID, and in the conventional method, it does not."""
@@ -87,6 +89,7 @@ def test_the_proposed_method_is_shorter_under_every_controller():
         assert ours[1] < theirs[1]
 
 
+@pytest.mark.slow
 def test_friction_at_low_speed(runs):
     """The claim on Fig. 12: under PI the friction is used well when the car is slow. So it is, 99.7 % of the greatest
     against 90.7 %, but the distance is gained before."""

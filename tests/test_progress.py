@@ -1,6 +1,7 @@
 """How far work is: the same words for every command, with compiling apart from running."""
 
 import re
+import threading
 import time
 
 import jax
@@ -44,10 +45,11 @@ def test_what_jax_compiles_is_counted():
     jax.jit(long)(jnp.ones((4, 4))).block_until_ready()
     took = stopwatch.compiled(begun)
     assert 0.0 < took <= time.monotonic() - begun
-    before = stopwatch.compiled(begun)
+    before, begun_again = stopwatch.compiled(begun), time.monotonic()
     with stopwatch.compiling():
         time.sleep(0.05)
-    assert stopwatch.compiled(begun) - before == pytest.approx(0.05, abs=0.04)
+    most = time.monotonic() - begun_again  # more than asked for where the machine is busy
+    assert 0.049 <= stopwatch.compiled(begun) - before <= most
 
 
 def test_what_is_left_does_not_count_compiling(clock):
@@ -84,9 +86,17 @@ def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
     """Where nothing can be drawn over, in lines; those that only differ in time are not told again."""
     monkeypatch.setattr(console, "PATIENCE", 1.0)
     monkeypatch.setattr(console, "AGAIN", 0.1)
-    console.waited(lambda: time.sleep(1.8), "working", lambda: "somewhere")
+    begun, later = time.monotonic(), threading.Event()
+    asked = []
+
+    def detail():
+        asked.append(time.monotonic() - begun > 1.8)
+        later.set() if sum(asked) == 2 else None  # the first has been told by then
+        return "somewhere"
+
+    console.waited(lambda: later.wait(60.0), "working", detail)
     said = capsys.readouterr().err
-    assert re.fullmatch(r"working ... somewhere; 1 s(, \d+ s of it compiling)?\n", said), said
+    assert re.fullmatch(r"working ... somewhere; \d+ s(, \d+ s of it compiling)?\n", said), said
 
 
 def test_documents_say_how_long_they_took():
@@ -95,7 +105,7 @@ def test_documents_say_how_long_they_took():
         time.sleep(0.2)
     made = console.made()
     assert made["command"] == "diffabs list roads"
-    assert 0.1 <= made["of it compiling"] <= made["seconds"] <= 20.0
+    assert 0.1 <= made["of it compiling"] <= made["seconds"] <= 300.0
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,7 @@ def test_the_twelve_lines_run():
     assert np.all(names["slope"] != 0)
 
 
+@pytest.mark.slow
 def test_4096_masses_and_roads_in_one_call():
     code = CODE.replace("FixedStep(1e-3, 4.0)", "FixedStep(1e-3, 0.05)").rsplit("slope", 1)[0]
     names = {}
@@ -73,6 +74,7 @@ def test_the_tuning_runs():
     assert np.max(found.metrics[1]["overshoot"]) < 0.02
 
 
+@pytest.mark.slow
 def test_the_sweep_of_the_page_on_sweeps_runs(tmp_path, monkeypatch):
     code, _ = re.findall(r"```python\n(.*?)```", SWEEPS, re.DOTALL)  # the other: test_sweep_processes.py
     monkeypatch.chdir(tmp_path)

@@ -166,6 +166,7 @@ def test_the_grid_agrees_with_located_events(rig):
     np.testing.assert_allclose(*slips, rtol=0, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_a_speed_seen_low_biases_the_slip_whatever_the_gain(rig):
     """The floor: 0.8 e of slip, 4 e of overshoot."""
     floors = []

@@ -36,7 +36,8 @@ def test_scores_are_runs():
     found = _scores(STUDY, "stop_distance", z)
     for i, value in enumerate(found):
         values = {path: column[i] for path, column in SPACE.normal(z).items()}
-        alone = d.measure(d.replace(RIG, values), STUDY.solver, STUDY.objectives).metrics["stop_distance"]
+        distance = {"stop_distance": STUDY.objectives["stop_distance"]}
+        alone = d.measure(d.replace(RIG, values), STUDY.solver, distance).metrics["stop_distance"]
         assert value == pytest.approx(float(alone), rel=1e-12)
 
 

@@ -6,6 +6,7 @@ import json
 import math
 import re
 
+import invented
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in
@@ -18,6 +19,7 @@ from terminal import Terminal, assert_fits, assert_orderly
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
+from diffabs import tune
 from diffabs.cli import report as reporting
 from diffabs.core.pictures import AXES, with_text, without_text
 from diffabs.report import ReportError, documents, report
@@ -57,7 +59,9 @@ class Results:
                          "--column", "wheel_speed"],
             "rare": [self.scenario, "stop_distance=2.5", "--samples", 100],
         }[kind]  # fmt: skip
-        (self.folder / f"{kind}.json").write_text(command(kind, *words, "--json").stdout)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(tune, "tune", invented.tuned)  # what it writes is as of a real one
+            (self.folder / f"{kind}.json").write_text(command(kind, *words, "--json").stdout)
 
     def all(self):
         """The folder with everything in it."""
@@ -212,7 +216,7 @@ def test_hostile_names_are_text(results, tmp_path, kind):
 
 def drawn(path):
     """A figure of known numbers, in a file."""
-    from diffabs.plot.runs import label, save, sheet
+    from diffabs.plot.style import label, save, sheet
 
     figure, (left, right) = sheet(1, 2)
     t = np.linspace(0.0, 2.0, 5001)

@@ -110,9 +110,11 @@ def test_two_control_libraries_agree():
 def test_lyapunov_equations_are_scipys():
     for n in (1, 3, 6):
         a, _, q, *_ = random_problem(n, 1)
-        np.testing.assert_allclose(lyapunov(a, q).P, sl.solve_continuous_lyapunov(a.T, -q), rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(
+            jax.jit(lyapunov)(a, q).P, sl.solve_continuous_lyapunov(a.T, -q), rtol=1e-9, atol=1e-9
+        )
         a = a / (1.1 * np.abs(np.linalg.eigvals(a)).max())
-        found = discrete_lyapunov(a, q)
+        found = jax.jit(discrete_lyapunov)(a, q)
         np.testing.assert_allclose(found.P, sl.solve_discrete_lyapunov(a.T, q), rtol=1e-9, atol=1e-9)
         assert found.residual < 1e-13
 
@@ -148,7 +150,7 @@ def rounding(a, b, q, r, p):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("case", cases(range(20), 0, 1, 2, 3, 12, 4, 5, 11, 14, 15, 16, 17, 18, 19))
+@pytest.mark.parametrize("case", cases(range(20), 0, 1, 2, 3, 12, 13, 4, 5, 6, 11, 14, 15, 16, 17, 18, 19))
 def test_scipys_cases_in_continuous_time(case):
     """All but two. A fourteenth example of the collection (case 13) has poles 5e-13 left of the imaginary axis; with 80
     digits SciPy's P is wrong by 2e-4. The other, a chain of 21 integrators, is one that SciPy gives up, too."""
@@ -165,7 +167,7 @@ def test_scipys_cases_in_continuous_time(case):
     assert np.linalg.eigvals(a - b @ np.linalg.solve(r, b.T @ p)).real.max() < 0
 
 
-@pytest.mark.parametrize("case", cases(range(3, 19), 3, 4, 5, 9, 10, 11, 12, 13, 14, 16, 17, 18))
+@pytest.mark.parametrize("case", cases(range(3, 19), 3, 4, 5, 7, 9, 10, 11, 12, 13, 14, 16, 17, 18))
 def test_scipys_cases_in_discrete_time(case):
     """All that are real; R is 0 in one and singular in another (6 and 7)."""
     a, b, q, r = scipys_case("TestSolveDiscreteAre", case)

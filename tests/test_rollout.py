@@ -93,6 +93,7 @@ def test_a_run_that_does_not_stop_is_charged_the_rest():
     assert d.measure(coasting, d.FixedStep(1e-3, 0.5), BRAKING).metrics["stop_distance"] > 1e4
 
 
+@pytest.mark.slow
 def test_literal_estimator_does_not_brake():
     loop = dataclasses.replace(braking(), reference=references.PeakLiteral())
     run = d.measure(loop, d.FixedStep(1e-3, 10.0), BRAKING)

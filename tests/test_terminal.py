@@ -57,6 +57,7 @@ def long_commands(folder, out):
 LONG = ["sweep", "rare", "tune", "identify", "design", "reproduce"]
 
 
+@pytest.mark.slow
 def test_a_sweep_draws_how_far_it_is(folder, tmp_path):
     with Terminal("sweep", folder / "small.toml", "--out", tmp_path / "out", "--samples", "640") as terminal:
         assert terminal.status() == 0, terminal.text

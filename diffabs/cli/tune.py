@@ -216,7 +216,7 @@ def _unproved(why: str) -> Proved:
 
 def _drawn(work: Work, found: "Tuned", path: pathlib.Path) -> None:
     """The history, and the lane that is the worst afterwards, before and after."""
-    from diffabs.plot.runs import write
+    from diffabs.plot.style import write
     from diffabs.plot.tuning import tuning
 
     chosen, metrics = work.chosen, found.metrics[1]
