@@ -375,6 +375,20 @@ MUTATIONS = [
         "test_blocks.py::test_the_integral_of_an_error_that_changes_sign",
     ),
     Mutation(
+        "the setpoint is that of the step's beginning",
+        "core/protocols.py",
+        "Shown.of(self.start), Shown.of(self.end)",
+        "Shown.of(self.start), Shown.of(self.end)._replace(setpoint=self.start.setpoint)",
+        "test_blocks.py::test_the_integral_of_an_error_whose_setpoint_moves",
+    ),
+    Mutation(
+        "a setpoint does not move within a step",
+        "core/protocols.py",
+        "ends, self.shown_rates())",
+        "ends, [rate._replace(setpoint=0.0 * rate.setpoint) for rate in self.shown_rates()])",
+        "test_blocks.py::test_the_integral_of_an_error_whose_setpoint_moves",
+    ),
+    Mutation(
         "rules of a part around a part that is not sound",
         "core/validity.py",
         "found |= bool(within)",
