@@ -389,6 +389,13 @@ MUTATIONS = [
         "test_blocks.py::test_the_integral_of_an_error_whose_setpoint_moves",
     ),
     Mutation(
+        "a central path begins nearer to its edge than rounding",
+        "design/interior/central_path.py",
+        "1e-3 * jnp.abs(first) + rounding",
+        "1e-3 * jnp.abs(first) + 1e-30",
+        "test_sensitivity.py::test_one_vertex_is_the_riccati_equation",
+    ),
+    Mutation(
         "rules of a part around a part that is not sound",
         "core/validity.py",
         "found |= bool(within)",
