@@ -91,8 +91,8 @@ def test_derivatives_at_random_weights():
 
 @pytest.mark.slow
 def test_derivatives_in_discrete_time():
-    """The logarithmic slopes of a gain add up to 0, because weights count by their ratios: ours do to 1e-6, those of the
-    solver's differences miss it by 2e-3, and cannot be asked for more."""
+    """The logarithmic slopes of a gain add up to 0, because weights count by their ratios: ours do to 1e-6, those of
+    the solver's differences miss it by 2e-3, and cannot be asked for more."""
     system, weights = sampled(RIG), (1e3, 10.0, 1e-3)
     agrees(system, weights, 2.5e-3)
     (_, gain), (_, by_gain) = by_logarithms(system.A, system.B, jnp.array(weights), discrete=True)
