@@ -1542,7 +1542,7 @@ MUTATIONS = [
         "tune/worst.py",
         "if lane.reason is not Reason.START and -float(lane.seen.objective) > value:",
         "if False:",
-        "test_tuning.py::TestWorstCase::test_it_is_at_least_as_bad_as_thousands_of_samples",
+        "test_tuning.py::TestWorstCase::test_the_ascent_finds_what_lies_between_the_points",
     ),
     Mutation(
         "tune: weights without their off-diagonal",
