@@ -106,9 +106,9 @@ FACE += [
 
 FIGURES = "test_figures.py"
 FACE += [
-    ("figures: labels at every mark", "plot/runs.py", "one.set_minor_formatter(NullFormatter())", "pass",
+    ("figures: labels at every mark", "plot/style.py", "one.set_minor_formatter(NullFormatter())", "pass",
      f"{FIGURES}::test_labels_of_a_logarithmic_axis_do_not_touch[(0.2, 0.9)]"),
-    ("figures: a long axis has numbers", "plot/runs.py", "few = low > 0 and", "few = low > 0 or",
+    ("figures: a long axis has numbers", "plot/style.py", "few = low > 0 and", "few = low > 0 or",
      f"{FIGURES}::test_a_long_axis_has_powers_and_a_short_one_numbers"),
     ("figures: T where S is", "plot/frequency.py", "(1 / (1 + main), COLOURS[1]", "(main / (1 + main), COLOURS[1]",
      f"{FIGURES}::test_the_curves_of_a_loop_are_its_response"),

@@ -232,9 +232,9 @@ SWEEP = [
     ),
     (
         "sweep: a map without those that diverged",
-        FIGURES,
-        "rules = [~view.good,",
-        "rules = [",
+        "sweep/results.py",
+        '"diverged": self.column("diverged"),',
+        '"diverged": ~run,',
         "test_plot_sweep.py::test_each_kind_of_failure_is_in_the_map",
     ),
     (

@@ -12,17 +12,39 @@ from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import loads
 from diffabs.sweep.manifest import FORMAT
 
-PATIENCE = 300.0  # s for anything that takes seconds on an idle machine
-SCENARIO = """
+
+def rig(start, stop):
+    """The head of a scenario: the mirrored rig brakes from one speed to another [km/h]."""
+    return f"""
 plant = "mirrored-rig"
 [initial]
-speed_kmh = 30.0
+speed_kmh = {start}
 [stop]
 type = "speed-reached"
-speed_kmh = 25.0
+speed_kmh = {stop}
 [controller]
 type = "state-feedback"
-gain = [-4000.0, -40.0]
+gain = [-4000.0, -40.0]"""
+
+
+def tune_section(iterations, overshoot):
+    """Its section [tune]: the gain, over two masses."""
+    return f"""
+[tune]
+iterations = {iterations}
+[tune.free]
+"controller.gain" = [[-1e4, -60.0], [-100.0, -20.0]]
+[tune.objective]
+iae = 1.0
+[tune.over]
+"plant.mass" = [5.3, 6.2]
+[tune.limits]
+overshoot = {overshoot}
+"""
+
+
+PATIENCE = 300.0  # s for anything that takes seconds on an idle machine
+SCENARIO = f"""{rig(30.0, 25.0)}
 [sensor]
 type = "noise"
 slip = 0.005

@@ -261,7 +261,7 @@ def test_the_region_of_attraction_is_that_of_fixed_steps():
 def test_there_is_room_for_smaller_steps():
     loop, sampled = rig().loop, load("slip-cured").loop
     assert room(loop, d.Adaptive(1e-5, 2.5)) == MOST
-    assert room(loop, d.Adaptive(1e-8, 2.5)) == 10 * MOST
+    assert room(loop, d.Adaptive(1e-9, 2.5)) == 10 * MOST
     assert room(sampled, d.Adaptive(1e-5, 2.0, 1e-3)) == MOST + 2 * 2000
 
 
@@ -307,9 +307,20 @@ def test_the_error_of_a_step_is_that_of_the_worst_state():
     state = state.with_flow(jax.tree.map(lambda x: x + 2.0, state.flow()))
     sample = loop.signals(0.0, state).sample
     scale = lengths.sizes(state, sample)
-    assert lengths.error(loop, state, state, scale, sample) == 0
-    coarse = state._replace(actuator=state.actuator._replace(flow=1.01 * state.actuator.flow))
-    assert lengths.error(loop, state, coarse, scale, sample) == pytest.approx(0.5 * 0.01)
+    none = jax.tree.map(lambda x: 0.0 * x, state)
+    assert lengths.error(loop, state, none.flow(), scale, sample) == 0
+    off = none._replace(actuator=none.actuator._replace(flow=0.01 * state.actuator.flow))
+    assert lengths.error(loop, state, off.flow(), scale, sample) == pytest.approx(0.01)
+    slower = none._replace(plant=none.plant._replace(wheel=0.01 * state.plant.wheel))
+    slip = abs(
+        float(
+            loop.plant.output(state._replace(plant=state.plant._replace(wheel=0.99 * state.plant.wheel)).plant)[0]
+            - sample.output[0]
+        )
+    )
+    first = lengths.error(loop, state, slower.flow(), scale, sample)
+    assert first == pytest.approx(max(0.01, slip / float(scale[0])), rel=1e-9)
+    assert slip > 0.01 * float(scale[0])
 
 
 @pytest.mark.parametrize("name", ["slip-lmi", "arm-hanging"])

@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from sweeping import rig
 
 import diffabs.identify.identification as library
 from diffabs.cli import console
@@ -40,16 +41,7 @@ KEYS = [
 UNITS = BrakeOutput.units
 HEADER = "t [s],wheel_speed [m/s],slip [1],command [N m]"
 ROWS = ["0,13.8,0.0,1", "0.1,12.9,0.05,1", "0.3,11.0,0.1,2"]
-SMALL = """
-plant = "mirrored-rig"
-[initial]
-speed_kmh = 50.0
-[stop]
-type = "speed-reached"
-speed_kmh = 48.0
-[controller]
-type = "state-feedback"
-gain = [-4000.0, -40.0]
+SMALL = f"""{rig(50.0, 48.0)}
 [solver]
 step = 1e-3
 duration = 0.5

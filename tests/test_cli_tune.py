@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run, umask
+from sweeping import rig, tune_section
 
 import diffabs.tune as library
 from diffabs.cli import certificates, console, progress, tune_document
@@ -26,32 +27,12 @@ from diffabs.simulate.run import measure
 from diffabs.tune import Mode, Point, Reason, StartError, Tuned
 from diffabs.tune.result import Start
 
-SMALL = """
-title = "small"
-plant = "mirrored-rig"
-[initial]
-speed_kmh = 50.0
-[stop]
-type = "speed-reached"
-speed_kmh = 48.0
-[controller]
-type = "state-feedback"
-gain = [-4000.0, -40.0]
+SMALL = f"""title = "small"{rig(50.0, 48.0)}
 [solver]
 step = 1e-3
 duration = 0.15
 seed = 3
-[tune]
-iterations = 2
-[tune.free]
-"controller.gain" = [[-1e4, -60.0], [-100.0, -20.0]]
-[tune.objective]
-iae = 1.0
-[tune.over]
-"plant.mass" = [5.3, 6.2]
-[tune.limits]
-overshoot = 0.5
-"""
+{tune_section(2, 0.5)}"""
 KEYS = [
     *("scenario", "model", "made", "lanes", "free", "objective", "metrics", "constraints", "met", "reason"),
     "gradient_norm",

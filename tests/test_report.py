@@ -10,7 +10,7 @@ from commands import assert_one_error_line, left_in
 from commands import run as command
 from marks import cases
 from reports import Page
-from sweeping import SCENARIO
+from sweeping import SCENARIO, tune_section
 from terminal import Terminal, assert_fits, assert_orderly
 
 pytest.importorskip("jinja2")
@@ -21,18 +21,7 @@ from diffabs.report import ReportError, documents, report
 from diffabs.report.charts import lines
 from diffabs.report.writing import SECTIONS
 
-TUNED = """
-[tune]
-iterations = 2
-[tune.free]
-"controller.gain" = [[-1e4, -60.0], [-100.0, -20.0]]
-[tune.objective]
-iae = 1.0
-[tune.over]
-"plant.mass" = [5.3, 6.2]
-[tune.limits]
-overshoot = 1.0
-"""
+TUNED = tune_section(2, 1.0)
 HOSTILE = '<script>alert("x")</script><img src=http://x.test/a.png onerror=alert(1)>'
 HEADINGS = ["Question", "Model", "Provenance", "Run it again"]
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
 from marks import cases
-from sweeping import described
+from sweeping import described, rig
 
 import diffabs as d
 from diffabs import roads
@@ -26,17 +26,7 @@ from diffabs.sweep.trajectories import keep
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
-SMALL = """
-title = "small"
-plant = "mirrored-rig"
-[initial]
-speed_kmh = 30.0
-[stop]
-type = "speed-reached"
-speed_kmh = 25.0
-[controller]
-type = "state-feedback"
-gain = [-4000.0, -40.0]
+SMALL = f"""title = "small"{rig(30.0, 25.0)}
 [sensor]
 type = "noise"
 slip = 0.005
@@ -51,8 +41,8 @@ seed = 3
 [sweep.over]
 "plant.mass" = [5.3, 6.2]
 "initial.speed_kmh" = [28.0, 34.0]
-"controller.gain.0" = { type = "triangular", low = -5e3, mode = -4e3, high = -3e3 }
-"controller.gain.1" = { type = "categorical", choices = [-40.0, 1e308], weights = [0.9, 0.1] }
+"controller.gain.0" = {{ type = "triangular", low = -5e3, mode = -4e3, high = -3e3 }}
+"controller.gain.1" = {{ type = "categorical", choices = [-40.0, 1e308], weights = [0.9, 0.1] }}
 [sweep.failures]
 overshoot = 0.3
 """

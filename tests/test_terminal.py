@@ -14,24 +14,13 @@ import types
 import pytest
 from rich.console import Console
 from rich.table import Table
-from sweeping import SCENARIO, chunks, environment
+from sweeping import SCENARIO, chunks, environment, tune_section
 from terminal import COLUMNS, SPINNER, Terminal, assert_fits, assert_orderly, words
 
 from diffabs.cli import console, tables
 from diffabs.core import interrupt
 
-TUNED = """
-[tune]
-iterations = 200
-[tune.free]
-"controller.gain" = [[-1e4, -60.0], [-100.0, -20.0]]
-[tune.objective]
-iae = 1.0
-[tune.over]
-"plant.mass" = [5.3, 6.2]
-[tune.limits]
-overshoot = 1.0
-"""
+TUNED = tune_section(200, 1.0)
 SPREAD = "sweep.over.initial.speed={ type = 'normal', mean = 8.3, deviation = 0.3, low = 7.2, high = 11.0 }"
 
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from diffabs.cli import console, show
+from diffabs.cli import console, show, targets
 from diffabs.core import values
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import dump, header, names
@@ -43,9 +43,9 @@ def show_scenario(
 ) -> None:
     """A scenario as TOML with every field, to start one's own from."""
     with console.guarded():
-        console.check_scenario_file(out)
+        targets.check_scenario_file(out)
         text = dump(console.loaded(scenario, changes, integrated=False))
-        with console.new_file(out, "--out") as file:
+        with targets.new_file(out, "--out") as file:
             file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
 
 

@@ -14,7 +14,8 @@ import jax
 import numpy as np
 
 from diffabs.cli import console
-from diffabs.controllers import ProportionalFeedback, Sampled
+from diffabs.controllers import ProportionalFeedback
+from diffabs.controllers.sampled import unsampled
 from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Plant
@@ -23,7 +24,6 @@ from diffabs.core.values import ScenarioError, shown
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import SlipModel
 from diffabs.plants import BrakeStart
-from diffabs.scenario.model import model
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) ->
 def _followed(loop: Loop, reduced: "Reduced", box: Box) -> tuple["Reduced", Any, Box]:
     """The linear model and its box; where the gain follows the speed, those in which it is one gain, whose proof covers
     every fall of the speed that friction allows."""
-    controller = loop.controller.controller if isinstance(loop.controller, Sampled) else loop.controller
+    controller = unsampled(loop.controller)
     if not isinstance(controller, ProportionalFeedback) or not isinstance(reduced.model, SlipModel):
         return reduced, reduced.model, box
     from diffabs.design.speed_scaled import SpeedScaled, fall
@@ -180,9 +180,7 @@ def document(
         summary["worst_vertex"] = summary["worst_vertex"] or slowest(proof)
     coverage = task.polytope.coverage
     return {
-        "scenario": task.chosen.name,
-        "model": model(task.chosen),
-        "made": console.made(),
+        **console.about(task.chosen),
         "gain": np.ravel(proof.gain).tolist() if proof else None,  # one input: the row is the gain
         "states": list(task.model.states),
         **{name: summary.get(name) for name in FROM_PROOF},

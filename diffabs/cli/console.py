@@ -1,10 +1,9 @@
-"""What every command does: report errors in one line, wait with a sign of life, replace files whole."""
+"""What every command does: report errors in one line, wait with a sign of life, leave."""
 
 import contextlib
 import importlib.util
 import multiprocessing
 import os
-import pathlib
 import shlex
 import sys
 import textwrap
@@ -19,6 +18,7 @@ from rich.console import Console
 from diffabs.cli import progress
 from diffabs.core import files, interrupt, provenance, stopwatch
 from diffabs.core.values import ScenarioError
+from diffabs.scenario.model import model
 from diffabs.scenario.scenario import Scenario, load, names
 
 T = TypeVar("T")
@@ -36,7 +36,6 @@ EXTRAS = {
     "report": ("jinja2",),
     "explore": ("nicegui",),
 }
-PICTURES = (".png", ".pdf", ".svg")
 
 
 # What commands take.
@@ -76,6 +75,11 @@ def made() -> dict[str, str | float]:
     """Return when, where and by which command a document is made, and how long that took so far [s]."""
     seconds, compiling = time.monotonic() - _begun, stopwatch.compiled(_begun)
     return {**provenance.made(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
+
+
+def about(chosen: Scenario) -> dict[str, Any]:
+    """Return how every document on a scenario begins: what was asked about, and how the document is made."""
+    return {"scenario": chosen.name, "model": model(chosen), "made": made()}
 
 
 def say(line: str) -> None:
@@ -126,9 +130,8 @@ def fail(line: str, status: int = BAD_INPUT) -> NoReturn:
 
 
 def animated() -> bool:
-    """Whether stderr shows a spinner: a terminal that can write over a line."""
-    console = Console(stderr=True)
-    return console.is_terminal and not console.is_dumb_terminal
+    """Whether stderr shows a spinner."""
+    return progress.drawable(Console(stderr=True))
 
 
 @contextlib.contextmanager
@@ -251,81 +254,3 @@ def need_matplotlib() -> None:
     os.environ.setdefault("MPLBACKEND", "agg")
     if importlib.util.find_spec("matplotlib") is None:
         fail('figures need matplotlib: pip install "diffabs[plot]"')
-
-
-def check_picture(plot: pathlib.Path | None) -> None:
-    """Raises typer.Exit for a name that no figure can have, or without matplotlib."""
-    if plot:
-        if plot.suffix.lower() not in PICTURES:
-            fail(f"--plot {plot}: the name must end in {', '.join(PICTURES)}")
-        need_matplotlib()
-
-
-def check_mat(mat: pathlib.Path | None) -> None:
-    """Raises typer.Exit for a name that MATLAB would not load, or without SciPy."""
-    if mat and mat.suffix != ".mat":
-        fail(f"--mat {mat}: the name must end in .mat")
-    if mat and importlib.util.find_spec("scipy") is None:
-        fail('MAT files need scipy: pip install "diffabs[tune]"')
-
-
-def check_scenario_file(out: pathlib.Path | None) -> None:
-    """Raises typer.Exit for a name under which no scenario would be found."""
-    if out and out.suffix != ".toml":
-        fail(f"--out {out}: the name must end in .toml")
-
-
-def resolved(path: pathlib.Path, option: str) -> pathlib.Path:
-    """A path without links. Raises typer.Exit for links that only lead to each other."""
-    try:
-        with contextlib.suppress(FileNotFoundError):
-            path.stat()  # some versions of Python resolve a loop
-        return path.resolve()
-    except OSError as error:
-        fail(f"{option} {path}: cannot be written, {error.strerror}")
-    except ValueError:
-        fail(f"{option} {path}: is no name of a file")
-
-
-@contextlib.contextmanager
-def new_file(target: pathlib.Path | None, option: str) -> Iterator[pathlib.Path | None]:
-    """A temporary file beside `target` that takes its place at the end, or vanishes if anything goes wrong; None where
-    no file is wanted. Whoever removes it leaves `target` as it was.
-
-    Raises typer.Exit where no file can be written.
-    """
-    if target is None:
-        yield None
-        return
-    target = resolved(target, option)
-    if target.exists() and not target.is_file():
-        fail(f"{option} {target}: is not a regular file")
-    with _made(files.new_file(target), option, target) as temporary:
-        yield temporary
-
-
-@contextlib.contextmanager
-def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A temporary folder beside `target` that takes its place at the end, or vanishes if anything goes wrong.
-
-    An older result (it has a summary.json) is replaced; any other content is left alone. Raises typer.Exit where the
-    folder cannot be made.
-    """
-    target = resolved(target, "--out")
-    if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "summary.json").exists())):
-        fail(f"--out {target}: exists and is no earlier result; move it away")
-    with _made(files.new_folder(target), "--out", target) as new:
-        yield new
-
-
-@contextlib.contextmanager
-def _made(
-    making: contextlib.AbstractContextManager[pathlib.Path], option: str, target: pathlib.Path
-) -> Iterator[pathlib.Path]:
-    """What is being made. Raises typer.Exit where it cannot be begun."""
-    with contextlib.ExitStack() as stack:
-        try:
-            made = stack.enter_context(making)
-        except OSError as error:
-            fail(f"{option} {target}: cannot be written, {error.strerror}")
-        yield made

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from diffabs.cli import certificates, console, show
+from diffabs.cli import certificates, console, show, targets
 from diffabs.core import provenance
 from diffabs.core.pytree import parameters
 
@@ -26,7 +26,7 @@ def design(
 ) -> None:
     """Find the state feedback with the least guaranteed cost over the ranges of [design], and prove it."""
     with console.guarded(), certificates.reported():
-        with console.new_file(out, "--out") as file:
+        with targets.new_file(out, "--out") as file:
             task = _task(scenario, changes or (), weighed=True)
             from diffabs.design import synthesis
 
@@ -55,7 +55,7 @@ def certify(
 ) -> None:
     """Prove, or disprove, that a gain is stable over the ranges of [design], however fast the parameters vary."""
     with console.guarded(), certificates.reported():
-        with console.new_file(out, "--out") as file:
+        with targets.new_file(out, "--out") as file:
             task = _task(scenario, changes or (), gain)
             found = console.waited(lambda: certificates.certified(task), f"certifying {task.chosen.name}")
             if file:

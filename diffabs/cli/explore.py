@@ -21,10 +21,7 @@ FIRST = "slip-cured"  # what is shown where nothing is asked for
 
 
 def explore(
-    scenario: Annotated[
-        str,
-        typer.Argument(help="A TOML file, or the name of a packaged scenario.", autocompletion=console.scenarios_like),
-    ] = FIRST,
+    scenario: console.ScenarioName = FIRST,
     port: Annotated[
         int | None, typer.Option(min=0, max=65535, help=f"Of the page; 0 for any. Default: {PORT}, else any.")
     ] = None,

@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from diffabs import __version__
-from diffabs.cli import console, show
+from diffabs.cli import console, show, targets
 from diffabs.core.provenance import versions
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
@@ -62,7 +62,7 @@ def export(
             console.fail("--to fmu needs a file: -o plant.fmu")
         if to in (Form.TABLE, Form.FMU) and (single or given):
             console.fail("--float32 and --given are for --to c and --to st")
-        with console.new_file(out, "--out") as file:
+        with targets.new_file(out, "--out") as file:
             chosen = console.loaded(scenario, changes, integrated=to is Form.FMU)
             try:
                 if to is Form.FMU and file and out:

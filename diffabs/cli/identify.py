@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from diffabs.cli import certificates, console, progress, show
+from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
 from diffabs.core.values import ScenarioError, shown, unknown
 from diffabs.scenario import section_tune, toml
 from diffabs.scenario.measurements import Readings, read
-from diffabs.scenario.model import model
 from diffabs.scenario.parameter_paths import flat
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.solution import Solver
@@ -59,8 +58,8 @@ def identify(
     """Find parameters of a scenario from a measured run, and say how well it determines them."""
     with console.guarded(), certificates.reported():
         console.need_extra("tune")
-        console.check_scenario_file(out)
-        with console.new_file(out, "--out") as file:
+        targets.check_scenario_file(out)
+        with targets.new_file(out, "--out") as file:
             chosen = console.loaded(scenario, changes)
             units = chosen.loop.plant.shows.units
             readings = _readings(data, column, units)
@@ -206,9 +205,7 @@ def _result(
     """The JSON document."""
     known = found.uncertainty
     return {
-        "scenario": chosen.name,
-        "model": model(chosen),
-        "made": console.made(),
+        **console.about(chosen),
         "data": {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])},
         "values": _values(chosen, ranges, found),
         "correlations": [

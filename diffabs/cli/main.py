@@ -29,6 +29,7 @@ from diffabs.cli import (
     reproduce,
     show,
     sweep,
+    targets,
     tune,
     usage,
 )
@@ -112,9 +113,9 @@ def simulate(
         _check_targets({"csv": csv, "mat": mat, "plot": plot})
         kept = bool(csv or mat or plot)
         with contextlib.ExitStack() as files:
-            csv_file = files.enter_context(console.new_file(csv, "--csv"))
-            mat_file = files.enter_context(console.new_file(mat, "--mat"))
-            picture = files.enter_context(console.new_file(plot, "--plot"))
+            csv_file = files.enter_context(targets.new_file(csv, "--csv"))
+            mat_file = files.enter_context(targets.new_file(mat, "--mat"))
+            picture = files.enter_context(targets.new_file(plot, "--plot"))
             chosen, key = _source(scenario, from_sweep, sample, changes, seed)
             run = console.waited(lambda: _run(chosen, key, keep=kept), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
@@ -176,9 +177,9 @@ def _check_source(scenario: Any, from_sweep: Any, sample: int | None, changes: A
 
 def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
     """Raises typer.Exit for files that cannot be written, or are one and the same."""
-    console.check_picture(wanted["plot"])
-    console.check_mat(wanted["mat"])
-    places = {name: console.resolved(path, f"--{name}") for name, path in wanted.items() if path}
+    targets.check_picture(wanted["plot"])
+    targets.check_mat(wanted["mat"])
+    places = {name: targets.resolved(path, f"--{name}") for name, path in wanted.items() if path}
     for one, other in itertools.combinations(places, 2):
         if places[one] == places[other]:
             console.fail(f"--{one} and --{other} are the same file, {wanted[one]}")

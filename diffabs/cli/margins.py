@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from diffabs.cli import console, show
+from diffabs.cli import console, show, targets
 from diffabs.core import provenance
 from diffabs.core.pytree import Spec, replace
 from diffabs.core.values import ScenarioError, inside, shown
@@ -55,8 +55,8 @@ def margins(
 ) -> None:
     """Gain, phase, delay and modulus margin of the linearised loop, and their worst over [design.over]."""
     with console.guarded():
-        console.check_picture(plot)
-        with console.new_file(plot, "--plot") as picture:
+        targets.check_picture(plot)
+        with targets.new_file(plot, "--plot") as picture:
             chosen = console.loaded(scenario, changes, integrated=False)
             values, target = _places(chosen, at or ())
             nominal, found = _found(chosen, values, target, samples)
@@ -170,8 +170,7 @@ def _show(result: dict[str, Any], chosen: Scenario, nominal: "System", found: "B
     show.titled(f"{chosen.title or chosen.name}: the linearised loop, {when}{delay}", table)
     if frozen := getattr(chosen.loop.plant, "frozen", ()):
         console.say(f"note: {' and '.join(frozen)} are held where they are; limits do not act")
-    for name, path in result["files"].items():
-        console.say(f"{name}: {path}")
+    show.files(result)
 
 
 def _said(name: str, value: float) -> str:

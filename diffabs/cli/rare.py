@@ -14,7 +14,6 @@ from diffabs.core import provenance
 from diffabs.core.pytree import Spec
 from diffabs.core.values import ScenarioError, number, unknown
 from diffabs.scenario import section_sweep
-from diffabs.scenario.model import model
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.toml import value
@@ -114,9 +113,7 @@ def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str,
     """As values of JSON; the failures, the most likely first, as values by path in SI."""
     rows = study.space.normal(found.failing[:SHOWN]) if len(found.failing) else {}
     return {
-        "scenario": chosen.name,
-        "model": model(chosen),
-        "made": console.made(),
+        **console.about(chosen),
         "metric": metric,
         "bound": bound,
         "unit": unit_of(chosen.objectives[metric], chosen.loop.plant),

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from diffabs.cli import console
+from diffabs.cli import console, targets
 from diffabs.core import files
 from diffabs.core.values import ScenarioError
 
@@ -54,6 +54,6 @@ def check(target: pathlib.Path) -> None:
     """Raises typer.Exit where a file of somebody else's has the name."""
     from diffabs.report import ours
 
-    target = console.resolved(target, "--out")
+    target = targets.resolved(target, "--out")
     if target.exists() and not (target.is_file() and ours(target)):
         console.fail(f"--out {target}: exists and is no earlier report; move it away")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from diffabs.cli import console, progress, report, show
+from diffabs.cli import console, progress, report, show, targets
 from diffabs.core import provenance, values
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def reproduce(
         results: dict[str, Any] = {}
         try:
             for paper in PAPERS if name == "all" else (name,):
-                with console.new_folder(out / paper) as folder:
+                with targets.new_folder(out / paper) as folder:
                     results[paper] = _reproduced(paper, PAPERS[paper], folder)
                     report.write([folder], folder / report.NAME)
                 if not as_json:

@@ -54,8 +54,7 @@ def run(result: dict[str, Any], chosen: Scenario) -> None:
     for name, value in result["metrics"].items():
         table.add_row(name, number(value), unit_of(chosen.objectives[name], chosen.loop.plant))
     titled(chosen.title or chosen.name, table)
-    for name, path in result["files"].items():
-        say(f"{name}: {path}")
+    files(result)
 
 
 def accuracy(found: dict[str, Any]) -> None:
@@ -174,8 +173,7 @@ def tuned(result: dict[str, Any], chosen: Scenario) -> None:
     how.add_row("greatest component of the last gradient", f"{result['gradient_norm']:.2g}")
     how.add_row("it ended because", result["reason"])
     titled("", how)
-    for name, path in result["files"].items():
-        say(f"{name}: {path}")
+    files(result)
 
 
 def missed(row: dict[str, Any]) -> str:
@@ -199,6 +197,11 @@ def identified(result: dict[str, Any]) -> None:
     for row in result["correlations"]:
         say(f"note: {row['between'][0]} and {row['between'][1]} are correlated by {row['correlation']:.4f}")
     say(f"it ended because {result['reason']}, after {result['evaluations']} evaluations")
+    files(result)
+
+
+def files(result: dict[str, Any]) -> None:
+    """What was written, and where."""
     for name, path in result["files"].items():
         say(f"{name}: {path}")
 

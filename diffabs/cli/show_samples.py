@@ -17,15 +17,7 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
         failures.add_row(name, str(row["count"]), *_estimate(row))
     percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
     titled(f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", failures)
-    kinds = list(next((row for row in result["metrics"].values() if row), {}))
-    kinds = [kind for kind in kinds if kind not in ("least", "greatest")]
-    metrics = Table("metric", "unit", "", "value", "low", "high")
-    for name, row in result["metrics"].items():
-        for i, kind in enumerate(kinds):
-            first = (name, unit_of(chosen.objectives[name], chosen.loop.plant)) if i == 0 else ("", "")
-            metrics.add_row(*first, kind, *_estimate(row[kind]))
-        metrics.add_section()
-    titled("statistics of the lanes that did not diverge", metrics)
+    titled("statistics of the lanes that did not diverge", _statistics(result["metrics"], chosen))
     paths = list(next(iter(result["sensitivity"].values()), {}))
     if paths:
         kind = list(next(iter(result["sensitivity"].values()))[paths[0]])[-1]
@@ -53,6 +45,18 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
     if "report" in result["files"]:
         say(f"report: {result['files']['report']}")
     say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
+
+
+def _statistics(metrics: dict[str, Any], chosen: Scenario) -> Table:
+    kinds = list(next((row for row in metrics.values() if row), {}))
+    kinds = [kind for kind in kinds if kind not in ("least", "greatest")]
+    table = Table("metric", "unit", "", "value", "low", "high")
+    for name, row in metrics.items():
+        for i, kind in enumerate(kinds):
+            first = (name, unit_of(chosen.objectives[name], chosen.loop.plant)) if i == 0 else ("", "")
+            table.add_row(*first, kind, *_estimate(row[kind]))
+        table.add_section()
+    return table
 
 
 def rare(result: dict[str, Any], chosen: Scenario) -> None:

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import typer
 
-from diffabs.cli import certificates, console, progress, show
+from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.cli import engine as engines
 from diffabs.cli.tune_document import Proved, Work, documented
 from diffabs.core.values import ScenarioError
@@ -46,11 +46,11 @@ def tune(
     with console.guarded(), certificates.reported():
         console.need_extra("tune")
         engines.check(engine)
-        console.check_picture(plot)
-        console.check_scenario_file(out)
+        targets.check_picture(plot)
+        targets.check_scenario_file(out)
         with contextlib.ExitStack() as files:
-            out_file = files.enter_context(console.new_file(out, "--out"))
-            picture = files.enter_context(console.new_file(plot, "--plot"))
+            out_file = files.enter_context(targets.new_file(out, "--out"))
+            picture = files.enter_context(targets.new_file(plot, "--plot"))
             chosen = console.loaded(scenario, console.changed(changes, "tune", starts=starts))
             result, told = _tuned(chosen, engine, out_file, picture)
             if not result["met"]:  # inside, so that no file is written

@@ -8,7 +8,6 @@ import numpy as np
 from diffabs.cli import certificates, console
 from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
-from diffabs.scenario.model import model
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -39,9 +38,7 @@ def documented(work: Work, found: "Tuned", proved: Proved) -> dict[str, Any]:
     """The whole document, without the files that were written."""
     chosen, goal = work.chosen, work.chosen.tune
     return {
-        "scenario": chosen.name,
-        "model": model(chosen),
-        "made": console.made(),
+        **console.about(chosen),
         "lanes": work.batch.size,
         "free": {path: _free(chosen, found, path) for path in goal.free},
         "objective": dict(zip(WHEN, map(float, found.objective), strict=True)),

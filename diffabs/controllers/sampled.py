@@ -106,6 +106,11 @@ class Sampled:
         yield whole_steps("period", self.period, step)
 
 
+def unsampled(controller: Any) -> Any:
+    """Return what a computer runs, or a controller that none runs itself."""
+    return controller.controller if isinstance(controller, Sampled) else controller
+
+
 def delay_within(delay: Scalar, period: Scalar) -> Rule:
     """Return the rule that a delay [s] does not exceed the period [s]."""
     return Rule(

@@ -79,13 +79,10 @@ class SlidingMode:
 
     start = no_memory
     flow = no_flow
+    rules = Relay.rules
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Torque [N m]."""
         del t, memory
         inside = clamp((signal.target - signal.measured[0]) / self.boundary, -1.0, 1.0)
         return clamp(signal.feedforward + self.gain * inside, self.torque_min, self.torque_max)
-
-    def rules(self) -> Iterator[Rule]:
-        """Limits that do not exclude each other."""
-        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}", equal=False)

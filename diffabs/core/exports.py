@@ -1,20 +1,27 @@
 """What a package exports, imported when it is first asked for: whoever needs one module of it does not load all."""
 
+import ast
+import functools
 import importlib
 import sys
 from collections.abc import Callable
 from typing import Any
 
 
-def lazily(package: str, *modules: str) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package (PEP 562). `modules`: of each its name and what is exported of it, as in
-    "diffabs.tune.risk CVaR Mean"."""
-    homes = {name: module for module, *names in map(str.split, modules) for name in names}
+def lazily(package: str) -> Callable[[str], Any]:
+    """Return the `__getattr__` of a package (PEP 562) that imports for type checkers alone what it exports, each name
+    `as` itself. The text of the package is read, so that it says this once."""
+
+    @functools.cache
+    def homes() -> dict[str, str]:
+        loader: Any = vars(sys.modules[package])["__loader__"]
+        imports = (x for x in ast.walk(ast.parse(loader.get_source(package))) if isinstance(x, ast.ImportFrom))
+        return {one.name: str(x.module) for x in imports for one in x.names if one.asname == one.name}
 
     def export(name: str) -> Any:
-        if name not in homes:
+        if name.startswith("__") or name not in homes():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(homes[name]), name)
+        value = getattr(importlib.import_module(homes()[name]), name)
         setattr(sys.modules[package], name, value)
         return value
 

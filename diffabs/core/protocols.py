@@ -53,159 +53,19 @@ papers', so a stabilising K is negative. A balance leans to the side of positive
 """
 
 from collections.abc import Callable
-from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
-import jax
-import jax.numpy as jnp
-
-from diffabs.core.cubic import Cubic
+from diffabs.core.messages import BalanceOutput as BalanceOutput
+from diffabs.core.messages import BrakeOutput as BrakeOutput
+from diffabs.core.messages import Clock as Clock
+from diffabs.core.messages import Ending as Ending
+from diffabs.core.messages import Memory as Memory
+from diffabs.core.messages import Sample as Sample
+from diffabs.core.messages import Segment as Segment
+from diffabs.core.messages import Shown as Shown
+from diffabs.core.messages import Tracking as Tracking
+from diffabs.core.messages import still as still
 from diffabs.core.pytree import Scalar
-from diffabs.core.timing import steps
-
-
-class BrakeOutput(NamedTuple):
-    """What a braking plant shows of itself, and what a sensor measures."""
-
-    slip: Scalar  # [1] (v - r omega)/v
-    speed: Scalar  # [m/s] of the vehicle
-    wheel_speed: Scalar  # [m/s] r omega, of the wheel's rim
-    deceleration: Scalar  # [m/s^2] of the vehicle, positive in braking
-    distance: Scalar  # [m] travelled
-
-    units = MappingProxyType({
-        **{"slip": "1", "speed": "m/s", "wheel_speed": "m/s", "deceleration": "m/s^2", "distance": "m"},
-    })  # fmt: skip
-    highest = 1.0  # that the first signal can be
-
-
-class BalanceOutput(NamedTuple):
-    """What a balancing plant shows of itself, and what a sensor measures. The motor's torque under a voltage u is
-    constant * clamp((u - emf)/resistance, -current_max, current_max)."""
-
-    theta: Scalar  # [rad] frame, from the vertical
-    psi: Scalar  # [rad] arm, from the frame
-    phi: Scalar  # [rad] rider, from the frame
-    theta_rate: Scalar  # [rad/s]
-    psi_rate: Scalar  # [rad/s]
-    phi_rate: Scalar  # [rad/s]
-    constant: Scalar  # [N m/A] torque per ampere, at the joint
-    emf: Scalar  # [V] that the turning joint induces
-    resistance: Scalar  # [ohm]
-    current_max: Scalar  # [A]
-
-    units = MappingProxyType({
-        **{"theta": "rad", "psi": "rad", "phi": "rad", "theta_rate": "rad/s", "psi_rate": "rad/s", "phi_rate": "rad/s"},
-        **{"constant": "N m/A", "emf": "V", "resistance": "ohm", "current_max": "A"},
-    })  # fmt: skip
-
-
-class Memory(NamedTuple):
-    """What a block remembers: `flow` is integrated with the plant, `held` changes only in ticks and events."""
-
-    flow: Any = ()
-    held: Any = ()
-
-
-class Clock(NamedTuple):
-    """An instant at which blocks may change: time [s]; step of the integration's grid [s] and number of the grid's last
-    instant; whether this is that instant, and no event between two of them; the run's random key (or None). `before` is
-    the block's signal until then (None: the same), which a block before it may have changed."""
-
-    t: Scalar
-    h: Scalar
-    k: Any
-    key: Any
-    on_grid: Any = True
-    before: Any = None
-
-    def ticks(self, period: Scalar | None = None) -> tuple[Any, Any]:
-        """Whether a clock of this period [s] (None: that of the grid) strikes now, and for how many times before."""
-        if period is None:
-            return jnp.asarray(self.on_grid), self.k
-        n = steps(period, self.h)
-        return self.on_grid & (self.k % n == 0), self.k // n
-
-
-class Tracking(NamedTuple):
-    """What a controller is given: target (a slip, an angle), measured output, and the feed-forward input."""
-
-    target: Scalar
-    measured: Any
-    feedforward: Scalar
-
-
-class Sample(NamedTuple):
-    """What is seen of a run at an instant; the input of an objective."""
-
-    t: Scalar  # [s]
-    output: Any  # the truth, not the measurement: what the plant shows
-    target: Scalar  # what the controller is told to follow now, in the unit of the first signal
-    setpoint: Scalar  # where the target will settle
-    feedforward: Scalar  # in the unit of the control
-    command: Scalar  # what the controller asks for
-    control: Scalar  # what the actuator delivers
-
-
-class Ending(NamedTuple):
-    """How a run ended: its last sample, whether it reached the stop, and what remains to be added after the last sample
-    (the way from the stop speed to standstill; for a run that did not stop, the pessimistic rest)."""
-
-    sample: Sample
-    stopped: Any
-    time_left: Scalar  # [s]
-    distance_left: Scalar  # [m]
-
-
-class Shown(NamedTuple):
-    """Of a sample: what the plant shows, and the setpoint of its first signal; or their rates."""
-
-    output: Any
-    setpoint: Scalar
-
-    @classmethod
-    def of(cls, sample: Sample) -> "Shown":
-        """That of a sample."""
-        return cls(sample.output, sample.setpoint)
-
-
-class Segment(NamedTuple):
-    """A step of a run, from one instant to the next, within which nothing jumps: the samples at both ends (the first
-    after the jumps there, the last before them), its length [s], and the step of the grid [s]. What `output`,
-    `error` and `sample` return is the cubic of something seen, from values and rates at both ends: its extrema, roots
-    and integrals are those of the run to the order of the method."""
-
-    start: Sample
-    end: Sample
-    h: Scalar
-    step: Scalar
-    shown_rates: Callable[[], tuple[Shown, Shown]]
-    sample_rates: Callable[[], tuple[Sample, Sample]]
-
-    def output(self, read: Callable[[Any], Scalar] = lambda output: output[0]) -> Cubic:
-        """The cubic of read(output): by default of the first signal that the plant shows."""
-        start, end = self.shown_rates()
-        return self._cubic(read, (self.start.output, self.end.output), (start.output, end.output))
-
-    def error(self) -> Cubic:
-        """The cubic of the first signal - setpoint, which a reference may move within a step."""
-        ends = Shown.of(self.start), Shown.of(self.end)
-        return self._cubic(lambda shown: shown.output[0] - shown.setpoint, ends, self.shown_rates())
-
-    def sample(self, read: Callable[[Sample], Scalar]) -> Cubic:
-        """The cubic of read(sample): of anything seen. It costs the rates of all signals."""
-        return self._cubic(read, (self.start, self.end), self.sample_rates())
-
-    def _cubic(self, read: Callable[[Any], Scalar], ends: tuple[Any, Any], rates: tuple[Any, Any]) -> Cubic:
-        (a, da), (b, db) = (jax.jvp(read, (end,), (rate,)) for end, rate in zip(ends, rates, strict=True))
-        return Cubic(a, b, self.h * da, self.h * db)
-
-
-def still(sample: Sample, h: Scalar) -> Segment:
-    """Return a step of length h [s] in which nothing moves."""
-    sample = jax.tree.map(jnp.asarray, sample)
-    rest = jax.tree.map(jnp.zeros_like, sample)
-    return Segment(sample, sample, h, h, lambda: (Shown.of(rest), Shown.of(rest)), lambda: (rest, rest))
 
 
 class Road(Protocol):

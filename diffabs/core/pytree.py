@@ -261,22 +261,22 @@ def strong(tree: T) -> T:
 def prepared(part: Any) -> Any:
     """The same parts, with everything worked out that does not change during a run: a part that has a method
     `prepared()` is replaced by what it returns. Differentiable; a run does it once, inside its compiled function."""
-    if isinstance(part, tuple):
-        return tuple(prepared(item) for item in part)
-    if not dataclasses.is_dataclass(part):
-        return part
-    inner = {f.name: prepared(getattr(part, f.name)) for f in dataclasses.fields(part) if "part" in f.metadata}
-    part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
-    return part.prepared() if hasattr(part, "prepared") else part
+    return _rebuilt(part, "prepared")
 
 
 def refined(part: Any, times: int) -> Any:
     """The same parts for steps that are so many times shorter: a part whose memory is as long as so many steps has a
     method `refined(times)`."""
+    return _rebuilt(part, "refined", times)
+
+
+def _rebuilt(part: Any, method: str, *args: Any) -> Any:
+    """The same parts, each that has this method replaced by what it returns; the innermost first."""
     if isinstance(part, tuple):
-        return tuple(refined(item, times) for item in part)
+        return tuple(_rebuilt(item, method, *args) for item in part)
     if not dataclasses.is_dataclass(part):
         return part
-    inner = {f.name: refined(getattr(part, f.name), times) for f in dataclasses.fields(part) if "part" in f.metadata}
+    fields = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
+    inner = {name: _rebuilt(getattr(part, name), method, *args) for name in fields}
     part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
-    return part.refined(times) if hasattr(part, "refined") else part
+    return getattr(part, method)(*args) if hasattr(part, method) else part

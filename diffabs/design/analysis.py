@@ -94,7 +94,7 @@ class _Analysis:
                 if found is not None:
                     return self._fastest(found) if fastest else found
             # whatever the sign of the margin: where there is no P the best is P = 0, whose margin is 0 but for rounding
-            claim = self._claim("infeasible", W=w, **self._rate(asked))
+            claim = Claim("infeasible", {"W": w, **self._rate(asked)})
             if np.isfinite(w).all() and self._proved(claim):
                 return claim
             try:
@@ -109,7 +109,7 @@ class _Analysis:
         t, factor = self.frame.T, rate.get("factor")
         for w in pairs.witnesses(scaled + rate.get("rate", 0.0) * np.eye(self.system.order), factor):
             w = he(t @ w @ t.T)
-            claim = self._claim("infeasible", W=w / np.abs(w).max(), **rate)
+            claim = Claim("infeasible", {"W": w / np.abs(w).max(), **rate})
             if self._proved(claim):
                 return claim
         return None
@@ -152,7 +152,7 @@ class _Analysis:
             return None
         for room in ROOM:
             rate = best - room * (abs(best) + asked)
-            claim = self._claim("decay", P=p, **self._rate(max(rate, asked)))
+            claim = Claim("decay", {"P": p, **self._rate(max(rate, asked))})
             if self._proved(claim):
                 return claim
             if rate <= asked:
@@ -208,9 +208,6 @@ class _Analysis:
         if self.discrete:
             return {"factor": min(1.0, math.exp(-rate * (self.system.period or 1.0)) * (1 + 1e-15))}
         return {"rate": rate}
-
-    def _claim(self, kind: str, **data: Any) -> Claim:
-        return Claim(kind, data)
 
     def _proved(self, claim: Claim) -> bool:
         return exact.verify(claim.kind, self.system, self.k, claim.data)

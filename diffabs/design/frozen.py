@@ -38,9 +38,8 @@ def frozen(gain: Any, model: Any, over: Mapping[str, Sequence[float]]) -> Frozen
     points = itertools.product(*(np.linspace(low[path], high[path], count) for path in free))
     grid = np.array(list(points)).reshape(count ** len(free), len(free))
     data = systems(replace(model, low), free, grid)
-    n, m = data.order, data.inputs
-    a, b = np.split(data.rows, [n * n], axis=1)
-    modes = np.linalg.eigvals(a.reshape(-1, n, n) + b.reshape(-1, n, m) @ checked_gain(gain, (m, n)))
+    a, b = data.matrices
+    modes = np.linalg.eigvals(a + b @ checked_gain(gain, (data.inputs, data.order)))
     if model.period is None:
         rates = -modes.real.max(axis=1)
     else:

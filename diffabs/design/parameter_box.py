@@ -40,6 +40,13 @@ class _Data(NamedTuple):
     order: int
     inputs: int
 
+    @property
+    def matrices(self) -> tuple[np.ndarray, np.ndarray]:
+        """A (N, n, n) and B (N, n, m)."""
+        n, m = self.order, self.inputs
+        a, b = np.split(self.rows, [n * n], axis=1)
+        return a.reshape(-1, n, n), b.reshape(-1, n, m)
+
 
 def polytope(model: Any, over: Mapping[str, Sequence[float]], *, grid: int = 9, most: int = 20_000) -> Polytope:
     """The polytope of `model`, which has `matrices()`, `states` and `period`, over a box {path: (low, high)}.
@@ -71,10 +78,8 @@ def polytope(model: Any, over: Mapping[str, Sequence[float]], *, grid: int = 9, 
     corners = np.array(list(itertools.product(*box))).reshape(2 ** len(free), len(free))
     data = systems(model, free, corners)
     rows, kept, coverage = _covered(model, free, box, data, grid, most)
-    n, m = data.order, data.inputs
-    a, b = np.split(rows, [n * n], axis=1)
     labels = tuple({**low, **dict(zip(free, corners[i].tolist(), strict=True))} for i in kept)
-    return Polytope(a.reshape(-1, n, n), b.reshape(-1, n, m), model.period, tuple(model.states), labels, coverage)
+    return Polytope(*data._replace(rows=rows).matrices, model.period, tuple(model.states), labels, coverage)
 
 
 def schedule(

@@ -33,7 +33,5 @@ def gridded(model: Any, over: Mapping[str, Sequence[float]], points: int = 3) ->
     axes = [np.linspace(low[path], high[path], points) for path in free]
     grid = np.array(list(itertools.product(*axes))).reshape(points ** len(free), len(free))
     data = systems(replace(model, low), free, grid)
-    n, m = data.order, data.inputs
-    a, b = np.split(data.rows, [n * n], axis=1)
     labels = tuple({**low, **dict(zip(free, row.tolist(), strict=True))} for row in grid)
-    return Polytope(a.reshape(-1, n, n), b.reshape(-1, n, m), model.period, tuple(model.states), labels)
+    return Polytope(*data.matrices, model.period, tuple(model.states), labels)

@@ -25,9 +25,9 @@ from diffabs.controllers import (
     HoldingInput,
     NoAntiWindup,
     ProportionalFeedback,
-    Sampled,
     StateFeedback,
 )
+from diffabs.controllers.sampled import Sampled, unsampled
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.loop import Loop
 from diffabs.core.validity import check
@@ -57,12 +57,12 @@ def state_feedback(loop: Loop) -> Reduced:
             loop that does not come to rest.
     """
     check(loop)
-    if isinstance(_unsampled(loop.controller), BalanceFeedback):
+    if isinstance(unsampled(loop.controller), BalanceFeedback):
         return Reduced(*upright(loop))
     if not hasattr(loop.plant, "frozen"):
         return _at_rest(loop)
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
-    controller = sampled.controller if sampled else loop.controller
+    controller = unsampled(loop.controller)
     integral, _, derivative, cutoff = map(float, _gains(controller))
     actuator, by_actuator, exact = _actuator(loop.actuator)
     setpoint = jax.jit(lambda loop: loop.reference.setpoint(loop.start().reference))(loop)
@@ -87,7 +87,7 @@ def feedback(loop: Loop, states: Sequence[str]) -> Any:
     Raises:
         ValueError: a controller that is not linear.
     """
-    controller = _unsampled(loop.controller)
+    controller = unsampled(loop.controller)
     if isinstance(controller, BalanceFeedback):
         return jnp.asarray(controller.gain, float)
     if not hasattr(loop.plant, "frozen"):
@@ -99,10 +99,6 @@ def feedback(loop: Loop, states: Sequence[str]) -> Any:
         "filtered slip error": -derivative,
     }
     return jnp.stack([jnp.asarray(gains.get(name, 0.0), float) for name in states])
-
-
-def _unsampled(controller: Any) -> Any:
-    return controller.controller if isinstance(controller, Sampled) else controller
 
 
 def _at_rest(loop: Loop) -> Reduced:

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from diffabs.actuators import VoltageLimit
-from diffabs.controllers import BalanceFeedback, Sampled
+from diffabs.controllers import BalanceFeedback
+from diffabs.controllers.sampled import Sampled, unsampled
 from diffabs.core.blocks import Direct
 from diffabs.core.loop import Loop
 from diffabs.core.validity import check
@@ -21,7 +22,7 @@ def upright(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tuple[str, ...]
         ValueError: a controller that is not feedback of the whole state, an actuator with dynamics.
     """
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
-    controller = sampled.controller if sampled else loop.controller
+    controller = unsampled(loop.controller)
     if not isinstance(controller, BalanceFeedback):
         raise ValueError(f"controller {type(controller).__name__} is not feedback of the whole state")
     if not isinstance(loop.actuator, Direct | VoltageLimit):

@@ -11,7 +11,7 @@ import jax
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import part, pytree, strong
 from diffabs.linear.linearization import StateSpace, linearize
-from diffabs.linear.slip_model import Continuous, Sampling
+from diffabs.linear.slip_model import Continuous, Sampling, SlipModel
 from diffabs.linear.zero_order_hold import held
 from diffabs.plants import ArmBalance, BalanceStart
 from diffabs.plants.arm_balance import ArmState
@@ -24,10 +24,7 @@ class BalanceModel:
     plant: Plant = part(default=ArmBalance)
     sampling: Continuous | Sampling = part(default=Continuous)
 
-    @property
-    def period(self) -> float | None:
-        """Sampling period [s], None in continuous time."""
-        return float(self.sampling.period) if isinstance(self.sampling, Sampling) else None
+    period = SlipModel.period
 
     @property
     def states(self) -> tuple[str, ...]:

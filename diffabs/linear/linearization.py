@@ -19,8 +19,8 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import strong
+from diffabs.plants.wheel import FROZEN
 
-FROZEN = ("speed", "distance")
 NEWTON = 10  # iterations for the rest of the remaining states; one is enough where their equation is linear
 
 

@@ -84,8 +84,7 @@ def operating_point(loop: Loop) -> OperatingPoint:
         if jax.tree.leaves(getattr(start, name).held):
             kind = type(getattr(loop, name)).__name__
             raise ValueError(f"{name} {kind} acts at instants: it has no linear model in continuous time")
-    fields = {f.name: getattr(loop, f.name) for f in dataclasses.fields(loop) if f.name != "stop"}  # pyright: ignore[reportArgumentType]
-    model = OperatingPoint(**fields)
+    model = _unstopped(loop)
     found = jax.device_get(_linearized(model))
     if not found.residue < RESIDUE:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
@@ -98,9 +97,14 @@ def operating_point(loop: Loop) -> OperatingPoint:
 def loop_gain(loop: Loop, states: tuple[str, ...]) -> Any:
     """Return K (n,) of a loop's controller on the states of an `OperatingPoint`, by their names. Differentiable in the
     loop's parameters."""
-    fields = {f.name: getattr(loop, f.name) for f in dataclasses.fields(loop) if f.name != "stop"}  # pyright: ignore[reportArgumentType]
     names = _names(loop)
-    return _linearized(OperatingPoint(**fields)).K[np.array([names.index(name) for name in states])]
+    return _linearized(_unstopped(loop)).K[np.array([names.index(name) for name in states])]
+
+
+def _unstopped(loop: Loop) -> OperatingPoint:
+    """The parts of a loop but its stop."""
+    fields = {f.name: getattr(loop, f.name) for f in dataclasses.fields(loop) if f.name != "stop"}  # pyright: ignore[reportArgumentType]
+    return OperatingPoint(**fields)
 
 
 def _needed(found: Closed, plant: np.ndarray) -> tuple[int, ...]:

@@ -11,9 +11,10 @@ from diffabs.actuators import Lag
 from diffabs.core.blocks import Direct
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import Scalar, param, part, pytree, static, strong
-from diffabs.linear.linearization import FROZEN, NEWTON, StateSpace, _flat, _kept, _used, tracking
+from diffabs.linear.linearization import NEWTON, StateSpace, _flat, _kept, _used, tracking
 from diffabs.linear.zero_order_hold import held
 from diffabs.plants import BrakeStart, MirroredRig
+from diffabs.plants.wheel import FROZEN
 
 
 @pytree

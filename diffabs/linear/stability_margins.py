@@ -110,7 +110,8 @@ def stable(system: Transfer) -> bool:
     if system.period is not None or not system.delay:
         return unstable_poles(system.without_delay()) == 0
     count = unstable_poles(system._replace(delay=0.0))
-    for w, phase in zip(*_turning(system), strict=True):
+    turning = crossings(system._replace(delay=0.0))
+    for w, phase in zip(turning.gain_at, turning.phases, strict=True):
         first = (phase % (2 * math.pi)) / w  # the delay at which a pair of poles is at +-jw
         if system.delay > first:
             times = 1 + math.floor((system.delay - first) * w / (2 * math.pi))
@@ -202,12 +203,6 @@ def _closed(values: np.ndarray) -> np.ndarray:
     """T, 1 where L is infinite."""
     with np.errstate(all="ignore"):
         return np.where(np.isfinite(values), values / (1 + values), 1.0)
-
-
-def _turning(system: Transfer) -> tuple[np.ndarray, np.ndarray]:
-    """Where |L| = 1, and the phase above -pi of L without its delay."""
-    found = crossings(system._replace(delay=0.0))
-    return found.gain_at, found.phases
 
 
 def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> np.ndarray:

@@ -9,14 +9,10 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, larger, sign
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, pytree
-from diffabs.objectives.tracking import FinalError, held, integral, nothing, unchanged
+from diffabs.objectives.tracking import FinalError, SettlingTime, held, integral, nothing, unchanged
 
 RATES = ("theta_rate", "psi_rate", "phi_rate")
 ANGLES = ("theta", "psi", "phi")
-
-
-def _zero(sample: Sample) -> Scalar:
-    return 0.0 * sample.t
 
 
 def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Any:
@@ -57,8 +53,13 @@ class FinalNorm:
         return _norm(ending.sample.output)
 
 
-def _angle(name: str) -> Any:
-    """`update` of the greatest |angle|, from the cubic of every step."""
+def _greatest(name: str) -> tuple[Any, Any, Any, Any]:
+    """start, flow, update and value of the greatest |angle|, from the cubic of every step."""
+
+    def start(self: Any, sample: Sample) -> Memory:
+        """The first."""
+        del self
+        return Memory(held=jnp.abs(getattr(sample.output, name)))
 
     def update(self: Any, memory: Memory, segment: Segment) -> Scalar:
         """The greatest so far."""
@@ -66,7 +67,7 @@ def _angle(name: str) -> Any:
         angle = segment.output(lambda output: getattr(output, name))
         return larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()))
 
-    return update
+    return start, nothing, update, held
 
 
 @pytree
@@ -76,11 +77,7 @@ class PeakLean:
     unit = "rad"
     physical = (0.0, math.inf)
 
-    flow, update, value = nothing, _angle("theta"), held
-
-    def start(self, sample: Sample) -> Memory:
-        """The first."""
-        return Memory(held=jnp.abs(sample.output.theta))
+    start, flow, update, value = _greatest("theta")
 
 
 @pytree
@@ -90,11 +87,7 @@ class PeakArmAngle:
     unit = "rad"
     physical = (0.0, math.inf)
 
-    flow, update, value = nothing, _angle("psi"), held
-
-    def start(self, sample: Sample) -> Memory:
-        """The first."""
-        return Memory(held=jnp.abs(sample.output.psi))
+    start, flow, update, value = _greatest("psi")
 
 
 def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
@@ -171,11 +164,7 @@ class RestTime:
 
     band: Scalar = param(default=0.01, unit="rad", above=0.0)
 
-    flow, value = nothing, held
-
-    def start(self, sample: Sample) -> Memory:
-        """Not yet."""
-        return Memory(held=_zero(sample))
+    start, flow, value = SettlingTime.start, nothing, held
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """The last of the angles' entries into the band, roots of the cubics of the step; its end where it ends
@@ -204,7 +193,7 @@ class BalanceCost:
 
     def start(self, sample: Sample) -> Memory:
         """Zero."""
-        return Memory(flow=_zero(sample))
+        return Memory(flow=0.0 * sample.t)
 
     def flow(self, memory: Memory, sample: Sample) -> Scalar:
         """The integrand."""

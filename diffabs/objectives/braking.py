@@ -106,7 +106,7 @@ class Variation:
         return Varied(total + jnp.abs(u.start - last) + inside, u.end)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Variation."""
+        """What was found."""
         del ending
         return memory.held.total
 
@@ -119,11 +119,7 @@ class TorqueRate:
     unit = "control/s"
     physical = (0.0, math.inf)
 
-    flow = nothing
-
-    def start(self, sample: Sample) -> Memory:
-        """From the first torque."""
-        return Memory(held=Varied(0.0 * sample.control, sample.control))
+    start, flow, value = Variation.start, nothing, Variation.value
 
     def update(self, memory: Memory, segment: Segment) -> Varied:
         """The jump before the step, and the rates at its ends."""
@@ -131,8 +127,3 @@ class TorqueRate:
         jump = jnp.abs(segment.start.control - last) / segment.step
         rates = (jnp.abs(rate.control) for rate in segment.sample_rates())
         return Varied(larger(larger(greatest, jump), larger(*rates)), segment.end.control)
-
-    def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Greatest rate."""
-        del ending
-        return memory.held.total

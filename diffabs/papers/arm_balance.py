@@ -241,7 +241,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
         "title": TITLE,
         "rows": rows,
         "judged": arm_equations.judged(ArmBalance()),
-        "figures": [name.name for name in arm_figures.saved(drawn, folder)],
+        "figures": record.saved(drawn, folder),
         "notes": NOTES,
         "gains": {name: np.asarray(gain).tolist() for name, (gain, _) in over_riders.items()},
         "riders": {

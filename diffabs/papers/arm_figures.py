@@ -1,6 +1,5 @@
 """Figures of `arm_balance`."""
 
-import pathlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,11 +27,6 @@ def figures(
         "attraction_48V": _maps(basins, start, hanging),
         "riders": _riders(riders, over_riders, limit),
     }
-
-
-def saved(drawn: Mapping[str, Any], folder: pathlib.Path) -> list[pathlib.Path]:
-    """Write them."""
-    return [plot.save(figure, folder / f"{name}.png") for name, figure in drawn.items()]
 
 
 def _claim(seen: Mapping[str, Run]) -> Any:

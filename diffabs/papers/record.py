@@ -57,6 +57,11 @@ def write(folder: pathlib.Path, summary: dict[str, Any], name: str = "summary.js
     return json.loads(text)
 
 
+def saved(figures: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
+    """Write figures into a folder, and return the names of their files."""
+    return [plot.save(figure, folder / f"{name}.png").name for name, figure in figures.items()]
+
+
 def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print rows of equal keys as a table; floats with five significant digits or four decimals."""
     table = Table(title=title, title_justify="left")
@@ -81,6 +86,6 @@ def experiment(config: Any, results: Mapping[str, Any], figures: Mapping[str, An
     what was written."""
     folder = pathlib.Path(config.out)
     folder.mkdir(parents=True, exist_ok=True)
-    names = [plot.save(figure, folder / f"{name}.png").name for name, figure in figures.items()]
+    names = saved(figures, folder)
     whole = {"config": dataclasses.asdict(config), **results, "figures": names, "versions": origin()}
     return write(folder, whole, "results.json")

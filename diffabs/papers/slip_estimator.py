@@ -198,7 +198,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
     """Write figures and `summary.json` into the folder; returns the summary."""
     results = compute(progress)
     progress("slip-estimator: figures")
-    names = [plot.save(figure, folder / f"{name}.png").name for name, figure in figures(results).items()]
+    names = record.saved(figures(results), folder)
     rows = table(results.runs["spline B"])
     summary = {
         "paper": "slip-estimator",

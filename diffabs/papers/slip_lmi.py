@@ -217,8 +217,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
     progress("slip-lmi: robust gains and their proofs")
     rows, pictures, more = _designed(runs, filtered)
     progress("slip-lmi: figures")
-    drawn = {**figures(runs, filtered, errors), **pictures}
-    names = [plot.save(figure, folder / f"{name}.png").name for name, figure in drawn.items()]
+    names = record.saved({**figures(runs, filtered, errors), **pictures}, folder)
     summary = {
         "paper": "slip-lmi",
         "title": TITLE,

@@ -15,17 +15,13 @@ import jax.numpy as jnp
 
 from diffabs.core.protocols import BalanceOutput, BrakeOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, param, part, pytree, static
+from diffabs.objectives.tracking import nothing
 
 FORGIVEN = 0.01  # of the energy of the start, in the whole run
 ROUNDING = 1e-6  # of it in a step, 1e-5 of the distance: single precision
 WITHIN = 2.0  # of the work, and of the way, that the ends of a step show
 SWING = 4.0  # of the decelerations at both ends: a slip may pass the friction's peak within the step
 LITTLE = 10.0  # m/s^2, and 1e-3 of the speed, that are no alarm at all
-
-
-def _no_flow(self: Any, memory: Memory, sample: Sample) -> Any:
-    del self, memory, sample
-    return ()
 
 
 def _driving(before: Any, after: Any) -> Any:
@@ -56,7 +52,7 @@ class BrakeAudit:
     scale: Scalar = param(unit="J", above=0.0)
     commanded: bool = static(default=False)
 
-    start, flow, value = _zero, _no_flow, _excess
+    start, flow, value = _zero, nothing, _excess
 
     def update(self, memory: Memory, segment: Segment) -> Any:
         """Add what a step gained without work; infinite for a step that no car makes."""
@@ -87,7 +83,7 @@ class BalanceAudit:
     first: Scalar = param(unit="J")
     scale: Scalar = param(unit="J", above=0.0)
 
-    start, flow = _zero, _no_flow
+    start, flow = _zero, nothing
 
     def update(self, memory: Memory, segment: Segment) -> Any:
         """Add the work that the motor may have done: of torques and rates in the same direction."""

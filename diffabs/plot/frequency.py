@@ -8,7 +8,7 @@ import numpy as np
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.robustness import frequencies
 from diffabs.linear.stability_margins import Margins
-from diffabs.plot.runs import COLOURS, GREY, label, logarithmic, sheet
+from diffabs.plot.style import COLOURS, GREY, label, logarithmic, sheet
 
 FAR = 3.0  # how far from 0 the Nyquist plot looks
 LIGHT = 0.25

@@ -1,116 +1,29 @@
-"""Figures of runs. The only module that needs matplotlib (`pip install "diffabs[plot]"`); it keeps no global state.
+"""Figures of runs: one at a glance, several side by side, friction and convergence."""
 
-Speeds are drawn in km/h, everything else in SI units. Colours are those of M. Okabe and K. Ito, Color Universal Design
-(2008), which colour-blind readers can tell apart; curves that lie close differ in their dashes as well.
-"""
-
-import os
-import pathlib
-import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
-from diffabs.core import files
 from diffabs.core.protocols import Plant, Road
 from diffabs.objectives.balance import motor_torque
+from diffabs.plot.style import (
+    COLOURS,
+    DASHES,
+    GREY,
+    KMH,
+    Axes,
+    Figure,
+    ListedColormap,
+    Patch,
+    controlled,
+    label,
+    logarithmic,
+    sheet,
+    spaced,
+)
 from diffabs.simulate.solution import Run, Trajectory
-
-try:
-    from matplotlib.axes import Axes
-    from matplotlib.colors import ListedColormap
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
-    from matplotlib.ticker import Formatter, LogLocator, NullFormatter
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError('figures need matplotlib: pip install "diffabs[plot]"', name=error.name) from error
-
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-DASHES = ("-", "--", "-.", ":", "-", "--", "-.")
-GREY = "#767676"
-KMH = 3.6  # km/h per m/s
-DPI = 150
-FEW_DECADES, PLAIN = 2.0, 4  # fewer have labels between them; powers of ten that are written out
-TITLE = 9  # characters per inch, with room to spare
-
-
-def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float, float] = (5.4, 3.4), **kwargs: Any):
-    """An empty figure in the house's look, and its axes, a list in reading order. `size` [inch] is that of one axes."""
-    figure = Figure(figsize=(size[0] * columns, size[1] * rows), dpi=DPI, layout="constrained")
-    axes = list(figure.subplots(rows, columns, squeeze=False, **kwargs).flat)
-    for ax in axes:
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.spines[["left", "bottom"]].set_color(GREY)
-        ax.tick_params(labelsize=10, colors="#333333")
-        ax.grid(color="#DDDDDD", linewidth=0.7)
-        ax.set_axisbelow(True)
-    if title:
-        width = int(TITLE * size[0] * columns)
-        lines = "\n".join(textwrap.fill(line, width, max_lines=4) for line in title.splitlines())
-        figure.suptitle(lines, fontsize=12.5, fontweight="bold")
-    return figure, axes
-
-
-def label(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> None:
-    """Name the axes, with units, and show the legend if there is something in it."""
-    ax.set_xlabel(x, fontsize=11)
-    ax.set_ylabel(y, fontsize=11)
-    if title:
-        ax.set_title(title, fontsize=11)
-    if legend and ax.get_legend_handles_labels()[1]:
-        ax.legend(fontsize=9.5, framealpha=0.9, edgecolor="none")
-
-
-def logarithmic(ax: Axes, axis: str) -> None:
-    """Make an axis, "x" or "y", logarithmic, with as many labels as have room: over less than two decades 1, 2 and 5
-    of each, as plain numbers, over more the decades."""
-    (ax.set_xscale if axis == "x" else ax.set_yscale)("log")
-    one = ax.xaxis if axis == "x" else ax.yaxis
-    one.set_major_locator(_Decades())
-    one.set_major_formatter(_Powers())
-    one.set_minor_formatter(NullFormatter())
-
-
-class _Decades(LogLocator):
-    """Decades, and 2 and 5 of each where there are few."""
-
-    def tick_values(self, vmin: float, vmax: float) -> Any:
-        """Where labels are."""
-        decades = np.log10(vmax / vmin) if vmin > 0 else np.inf
-        self.set_params(subs=(1.0, 2.0, 5.0) if decades < FEW_DECADES else (1.0,))
-        found = np.asarray(super().tick_values(vmin, vmax))
-        return found if decades >= FEW_DECADES else found[(found >= vmin) & (found <= vmax)]
-
-
-class _Powers(Formatter):
-    """Powers of ten over many decades, plain numbers over few, unless they are long."""
-
-    def __call__(self, x: float, pos: int | None = None) -> str:
-        """The label of a place."""
-        del pos
-        low, high = np.sort(self.axis.get_view_interval())  # pyright: ignore[reportOptionalMemberAccess]
-        few = low > 0 and np.log10(high / low) < FEW_DECADES
-        if few and 10.0**-PLAIN <= x < 10.0 ** (PLAIN + 1):
-            return f"{x:g}"
-        power = int(np.floor(np.log10(x) + 1e-9)) if x > 0 else 0
-        mantissa = x / 10.0**power
-        head = "" if abs(mantissa - 1) < 1e-9 else rf"{mantissa:.0f}\times"
-        return rf"${head}10^{{{power}}}$"
-
-
-def save(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
-    """Write a figure in the format of the path's suffix, atomically: readers see the old file or the whole new one."""
-    path = pathlib.Path(path)
-    with files.new_file(path) as temporary:
-        figure.savefig(temporary, format=path.suffix.lstrip(".") or "png", dpi=DPI)
-    return path
-
-
-def controlled(unit: str) -> str:
-    """What an axis says of a plant's control in this unit."""
-    return {"N m": "brake torque [N m]", "V": "voltage [V]"}.get(unit, f"control [{unit}]")
 
 
 def braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
@@ -125,9 +38,7 @@ def braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
     label(top, "", "slip [1]")
     _speeds(speed, seen)
     label(speed, "", "speed [km/h]")
-    torque.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
-    torque.plot(t, sample.control, color=COLOURS[0], label="control")
-    label(torque, "time [s]", controlled(unit))
+    _control(torque, seen, unit)
     brake.plot(t, sample.output.deceleration, color=COLOURS[0])
     label(brake, "time [s]", "deceleration [m/s²]")
     return figure
@@ -143,11 +54,9 @@ def balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
     label(angles, "", "angle [rad]")
     angle_lines(rates, seen, "_rate")
     label(rates, "", "rate [rad/s]", legend=False)
-    voltage.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
-    voltage.plot(t, sample.control, color=COLOURS[0], label="control")
+    _control(voltage, seen, unit)
     most = np.max(np.abs(sample.control))
     voltage.set_ylim(-1.5 * most - 1e-9, 1.5 * most + 1e-9)  # a command far beyond the supply says no more
-    label(voltage, "time [s]", controlled(unit))
     torque.plot(t, motor_torque(sample), color=COLOURS[0])
     label(torque, "time [s]", "motor torque [N m]")
     return figure
@@ -164,30 +73,25 @@ def signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
     figure, axes = sheet(-(-(len(groups) + 1) // 2), 2, title=title, size=(5.6, 3.0), sharex=True)
     for ax, (of_signal, names) in zip(axes, groups.items(), strict=False):
         for i, name in enumerate(names):
-            ax.plot(t, getattr(sample.output, name), DASHES[i % 7], color=COLOURS[i % 7], label=_words(name))
+            ax.plot(t, getattr(sample.output, name), DASHES[i % 7], color=COLOURS[i % 7], label=spaced(name))
         if ax is axes[0]:
             ax.plot(t, sample.target, "--", color=GREY, label="target")
             ax.plot(t, sample.setpoint, ":", color="black", label="setpoint")
         alone = len(names) == 1
-        words = f"{_words(names[0])} " if alone else ""
+        words = f"{spaced(names[0])} " if alone else ""
         label(ax, "time [s]", f"{words}[{of_signal}]", legend=ax is axes[0] or not alone)
-    control = axes[len(groups)]
-    control.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
-    control.plot(t, sample.control, color=COLOURS[0], label="control")
-    label(control, "time [s]", controlled(unit))
+    _control(axes[len(groups)], seen, unit)
     for ax in axes[len(groups) + 1 :]:
         ax.set_visible(False)
     return figure
 
 
-def named(output: Any) -> str:
-    """Return what an axis says of the first signal of an output."""
-    name, unit = next(iter(output.units.items()))
-    return f"{_words(name)} [{unit}]"
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
+def _control(ax: Axes, seen: Trajectory, unit: str) -> None:
+    """What the controller asked for, and what the actuator delivered."""
+    t, sample = np.asarray(seen.sample.t), seen.sample
+    ax.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
+    ax.plot(t, sample.control, color=COLOURS[0], label="control")
+    label(ax, "time [s]", controlled(unit))
 
 
 FIGURES = {  # of runs, by the signals that they draw
@@ -310,7 +214,7 @@ def convergence(
     h = np.asarray(steps)
     for i, (ax, order, (name, curves)) in enumerate(zip(axes, orders, panels.items(), strict=True)):
         for j, (quantity, errors) in enumerate(curves.items()):
-            words = "IAE" if quantity == "iae" else _words(quantity)
+            words = "IAE" if quantity == "iae" else spaced(quantity)
             ax.loglog(h, errors, "o" + DASHES[j], color=COLOURS[j], markersize=4.5, label=words)
         top = 3.0 * np.max([np.max(e) for e in curves.values()])
         ax.loglog(h, top * (h / h.max()) ** order, color=GREY, linewidth=0.9, label=f"slope {order}")

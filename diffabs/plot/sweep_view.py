@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.plot.runs import KMH
+from diffabs.plot.style import KMH
 from diffabs.sweep.results import Results
 
 CELLS = (4, 24)  # of a map along one variable, fewest and most; one with fewer different values has a cell for each
@@ -37,8 +37,7 @@ class View:
         least = ROUNDING * np.finfo(found.study["dtype"]).eps
         columns = ((name, found.column(name)[self.rows]) for name in found.metrics if self.rows.any())
         self.varying = [name for name, x in columns if np.ptp(x) > least * max(1.0, np.abs(x).max())]
-        first = [*found.study["failures"], *self.bounds, *self.varying]
-        self.leading = next((name for name in first if name in self.varying), "")
+        self.leading = next((name for name in [*self.bounds, *self.varying] if name in self.varying), "")
 
     def named(self, name: str) -> str:
         """A column's name with its unit."""

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.plot.runs import COLOURS, GREY, Axes, Figure, label, logarithmic, save, sheet
+from diffabs.plot.style import COLOURS, GREY, Axes, Figure, label, logarithmic, save, sheet
 from diffabs.plot.sweep_view import Variable, View, cells
-from diffabs.sweep.engines import missed, missing
+from diffabs.sweep.engines import missing
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics.estimates import Count, Tail
 
@@ -136,9 +136,7 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     if too few failed, or did not; cells without a run are grey. Where none failed the colour is the greatest value of
     that metric in a cell. None where no variable varies, or nothing failed and no metric varies."""
     view = View(found, units)
-    late = missed(found.column("stopped"), success := found.study["success"])
-    rules = [~view.good, late, *(found.column(name) > view.bounds[name] for name in view.bounds)]
-    failed = np.any(rules, axis=0)[every := view.accepted]
+    failed = found.failed()[every := view.accepted]
     if not (failed.any() or view.leading):
         return None
     rows, result = every, failed
@@ -163,7 +161,7 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     ax.yaxis.set_visible(len(ones) > 1)
     _name_axes(ax, ones)
     bounds = "".join(f", {name} > {bound:g}" for name, bound in view.bounds.items())
-    ax.set_title(f"failed: diverged, {missing(success)}{bounds}", fontsize=9.5)
+    ax.set_title(f"failed: diverged, {missing(found.study['success'])}{bounds}", fontsize=9.5)
     return figure
 
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.plot.runs import COLOURS, DASHES, GREY, Axes, Figure, controlled, label, logarithmic, named, sheet
+from diffabs.plot.style import COLOURS, DASHES, GREY, Axes, Figure, controlled, label, logarithmic, named, sheet
 from diffabs.simulate.solution import Trajectory
 
 MARKS = "osD^v"

@@ -16,6 +16,13 @@ from diffabs.core.numerics import odd, ratio, searchsorted
 from diffabs.core.pytree import Scalar, Vector, param, pytree
 from diffabs.core.rules import Rule, array, increasing
 
+KNOTS = (  # of the identified spline: slip and friction
+    (0, 0.02108, 0.04215, 0.06323, 0.08431, 0.09696, 0.10539, 0.12039, 0.14539,
+     0.17539, 0.19039, 0.20539, 0.23539, 0.28539, 0.40539, 0.60539, 1.0),
+    (0, 0.51493, 0.72745, 0.86912, 0.96331, 0.98097, 0.99064, 0.98201, 0.95733,
+     0.92939, 0.91484, 0.90622, 0.88005, 0.85317, 0.81806, 0.79436, 0.75761),
+)  # fmt: skip
+
 
 @pytree
 class Tabulated:
@@ -31,49 +38,8 @@ class Tabulated:
     0.70 0.656
     """
 
-    slip: Vector = param(
-        default=(
-            0,
-            0.02108,
-            0.04215,
-            0.06323,
-            0.08431,
-            0.09696,
-            0.10539,
-            0.12039,
-            0.14539,
-            0.17539,
-            0.19039,
-            0.20539,
-            0.23539,
-        )
-        + (0.28539, 0.40539, 0.60539, 1.0),
-        unit="1",
-        low=0.0,
-        high=1.0,
-        free=True,
-    )
-    mu: Vector = param(
-        default=(
-            0,
-            0.51493,
-            0.72745,
-            0.86912,
-            0.96331,
-            0.98097,
-            0.99064,
-            0.98201,
-            0.95733,
-            0.92939,
-            0.91484,
-            0.90622,
-            0.88005,
-        )
-        + (0.85317, 0.81806, 0.79436, 0.75761),
-        unit="1",
-        low=0.0,
-        free=True,
-    )
+    slip: Vector = param(default=KNOTS[0], unit="1", low=0.0, high=1.0, free=True)
+    mu: Vector = param(default=KNOTS[1], unit="1", low=0.0, free=True)
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
         """mu [1]; constant beyond the last knot; does not depend on speed or distance."""

@@ -12,4 +12,4 @@ if TYPE_CHECKING:
     from diffabs.scenario.scenario import loads as loads
     from diffabs.scenario.scenario import names as names
 
-__getattr__ = lazily(__name__, "diffabs.scenario.scenario Scenario ScenarioError dump load loads names")
+__getattr__ = lazily(__name__)

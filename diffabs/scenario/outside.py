@@ -46,16 +46,13 @@ def exports(module: ModuleType) -> Iterator[tuple[str, Any]]:
     for name in getattr(module, "__all__", [name for name in vars(module) if not name.startswith("_")]):
         item = getattr(module, name)
         cls = item if isinstance(item, type) else type(item)
-        if not dataclasses.is_dataclass(cls) or not all(
-            {"spec", "part", "static"} & {*f.metadata} for f in _fields(cls)
-        ):
+        if not dataclasses.is_dataclass(cls):
+            continue
+        fields: Any = dataclasses.fields(cls)
+        if not all({"spec", "part", "static"} & {*field.metadata} for field in fields):
             continue
         if not (isinstance(item, type) and cls.__module__.partition(".")[0] == "diffabs"):
             yield name, item
-
-
-def _fields(cls: Any) -> tuple[Any, ...]:
-    return dataclasses.fields(cls)
 
 
 def _imported(name: str, whose: str) -> ModuleType:

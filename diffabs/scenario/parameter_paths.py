@@ -16,7 +16,7 @@ import numpy as np
 
 from diffabs.core.pytree import Spec, parameters
 from diffabs.core.values import ScenarioError, inside, number, shown, unknown, wrong
-from diffabs.scenario.registry import DEEPEST, KMH
+from diffabs.scenario.registry import DEEPEST, KMH, in_kmh
 
 Ends = tuple[Any, Any]  # low and high, tuples where the parameter is a list
 
@@ -144,7 +144,7 @@ def entries(
     """What was given, by parameter. `there`: spec and shape of what may be, by path of the loop; `otherwise`: what to
     say of a name that is not. Raises ScenarioError."""
     known = {canonical(path): (path, spec, shape, 1.0) for path, (spec, shape) in there.items()}
-    known |= {f"{k}_kmh": (path, _kmh(spec), n, KMH) for k, (path, spec, n, _) in known.items() if spec.unit == "m/s"}
+    known |= {f"{k}_kmh": (path, in_kmh(spec), n, KMH) for k, (path, spec, n, _) in known.items() if spec.unit == "m/s"}
     seen = set()
     for key, given in flat(table, section).items():
         if key not in known:
@@ -159,10 +159,6 @@ def entries(
 def parameters_of(loop: Any) -> dict[str, tuple[Spec, tuple[int, ...]]]:
     """Return spec and shape of every parameter by path."""
     return {path: (spec, np.shape(value)) for path, spec, value in parameters(loop)}
-
-
-def _kmh(spec: Spec) -> Spec:
-    return dataclasses.replace(spec, unit="km/h", low=spec.low * KMH, high=spec.high * KMH)
 
 
 def _where(section: str, path: str) -> str:

@@ -179,7 +179,7 @@ def filled(template: Any, table: dict[str, Any], family: str, path: str, units: 
         if field.name in values:
             raise ScenarioError(f"{joined(path, field.name)} is given twice, in m/s and in km/h")
         if key in edge:
-            values[field.name] = _metres_per_second(given, field.metadata["spec"], where)
+            values[field.name] = inside(given, in_kmh(field.metadata["spec"]), where) / KMH
         else:
             values[field.name] = _value(given, field, getattr(template, key), (family, where), units)
     return dataclasses.replace(template, **values) if values else template
@@ -246,10 +246,9 @@ def _parts(family: str, given: Any, default: tuple[Any, ...], path: str, units: 
     return tuple(parts)
 
 
-def _metres_per_second(given: Any, spec: Spec, path: str) -> float:
-    """Checked here, in the unit in which it was given."""
-    there = dataclasses.replace(spec, unit="km/h", low=spec.low * KMH, high=spec.high * KMH)
-    return inside(given, there, path) / KMH
+def in_kmh(spec: Spec) -> Spec:
+    """Return what a speed may be, in km/h."""
+    return dataclasses.replace(spec, unit="km/h", low=spec.low * KMH, high=spec.high * KMH)
 
 
 def described(family: str, part: Any) -> dict[str, dict[str, Any]]:

@@ -69,20 +69,21 @@ class Task:
     def box(self, loop: Loop) -> dict[str, Range]:
         """The ranges by path of the loop's linear model, that of the speed between the loop's start and its stop if
         none was given."""
-        start, end = getattr(loop.initial, "speed", None), getattr(loop.stop, "speed", None)
-        over, known = dict(self.over), _known(loop)
-        if start is not None and end is not None:
-            over.setdefault("initial.speed", (float(end), float(start)))
-        return {known[path].model: ends for path, ends in over.items()}
+        known = _known(loop)
+        return {known[path].model: ends for path, ends in self._with_speed(loop).items()}
 
     def ranges(self, loop: Loop) -> dict[str, Range]:
         """The ranges by path of the loop, without those of a single value; that of the speed between the loop's start
         and its stop if others are given and none of it."""
+        over = self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else self.over
+        return {path: ends for path, ends in over.items() if ends[0] < ends[1]}
+
+    def _with_speed(self, loop: Loop) -> dict[str, Range]:
         over = dict(self.over)
         start, end = getattr(loop.initial, "speed", None), getattr(loop.stop, "speed", None)
-        if over and hasattr(loop.plant, "frozen") and start is not None and end is not None:
+        if start is not None and end is not None:
             over.setdefault("initial.speed", (float(end), float(start)))
-        return {path: ends for path, ends in over.items() if ends[0] < ends[1]}
+        return over
 
     def table(self) -> dict[str, Any]:
         """As values of TOML."""

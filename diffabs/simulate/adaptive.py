@@ -1,7 +1,8 @@
 """Steps as long as an error allows, of one lane each: how a run under `Adaptive` goes on.
 
-    length     0.85 r^(-5/16) times the last, r = |error|/rtol: the error is that of the embedded second-order
-               solution, which goes as h^3; at most 2.4/rho, rho the spectral radius of the loop's Jacobian
+    length     0.85 r^(-1/4) times the last, r = |error|/rtol: the error is that of the cubic in the step's middle,
+               through which everything in a step is seen; at most 3/rho, rho the spectral radius of the loop's
+               Jacobian
     kinks      a step ends where a comparison in the flow is predicted to change (`foresight`); one within which
                another did is tried again, up to there
     events     a step within which a margin falls through zero is tried again until one ends on it (`landing`)
@@ -27,9 +28,9 @@ from diffabs.simulate.dynamics import FREE, Dynamics, Objectives, Tally, dynamic
 from diffabs.simulate.foresight import kinks
 from diffabs.simulate.landing import Search, aimed, earliest, falls_through, init_search, land, seek, select
 from diffabs.simulate.lengths import FIRST, SHRINK, Pace, allowed, error, longest_stable, planned, sizes
-from diffabs.simulate.rk4 import rk4_pair
 from diffabs.simulate.span import Span
 from diffabs.simulate.stepper import MISSED, typed
+from diffabs.simulate.tsit5 import off_in_the_middle, tsit5_pair
 
 MOST, EACH = 100_000, 16  # tries of a run, and for each instant of its grid: more of them lead nowhere
 COUNTED = ("tries", "condition")  # what is still looked at when a run is over
@@ -194,7 +195,7 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
     def flow(t: Any, z: Any) -> Any:
         return system.rates(t, z, held, FREE)
 
-    z, coarse = rk4_pair(flow, point.t, z, point.rate, h)
+    z, so_far = tsit5_pair(flow, point.t, z, point.rate, h)
     state = point.state.with_flow(z[0])
     state = state._replace(plant=loop.plant.project(state.plant))
     tallied = {name: memory._replace(flow=z[1][name]) for name, memory in point.tally.items()}
@@ -215,7 +216,8 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
     ahead, late = kinks(comparisons, carry.natural, pace.least, pace.care, changed, h)
     new = Point(end, state, tally, sample, moving, recorded, seen[:2], seen.margins, words, ahead)
     scale = jax.tree.map(jnp.maximum, carry.scale, sizes(state, sample))
-    off = error(loop, state, point.state.with_flow(coarse[0]), scale, sample) / pace.rtol
+    off = off_in_the_middle(so_far[0], seen.rate, h)
+    off = error(loop, state, off, scale, sample) / pace.rtol
     middle = _middle(system, point, new, h) if pace.notes else ()
     return Arrival(new, seen.signals, off, scale, late, middle)
 

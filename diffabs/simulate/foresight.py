@@ -50,17 +50,17 @@ def kinks(margins: Sequence[Margin], natural: Any, shortest: Any, care: Care, ch
     changed: bits of the comparisons whose answers are others than at the beginning of the step
     length: of the step [s]"""
     least, low, high = jnp.maximum(care.now * natural, shortest), (1 - care.end) * length, (1 - care.start) * length
-    ahead, late = jnp.full_like(length, FAR), jnp.zeros_like(length)
+    next, first = jnp.full_like(length, -FAR), low
     for one in margins:
         was = bit(changed, one.numbers)
         for on, since in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, one.value / one.rate)), strict=True):
-            ahead = jnp.minimum(ahead, jnp.where(since < -least, -since, FAR))
-            late = jnp.maximum(late, jnp.where(on & (since > low) & (since < high), since, 0.0))
-    return Kinks(ahead, late)
+            next = jnp.where((since < -least) & (since > next), since, next)
+            first = jnp.where(on & (since < high) & (since > first), since, first)
+    return Kinks(-next, jnp.where(first > low, first, 0.0))
 
 
 def bit(words: Words, numbers: Any) -> Any:
     """Return the bits of these numbers."""
     numbers = jnp.asarray(numbers)
     word = sum(jnp.where(numbers // WORD == i, one, jnp.uint32(0)) for i, one in enumerate(words))
-    return (word >> (numbers % WORD).astype(jnp.uint32)) & 1 != 0
+    return word & (jnp.uint32(1) << (numbers % WORD).astype(jnp.uint32)) != 0

@@ -19,7 +19,7 @@ SHRINK, GROW = 0.25, 2.5  # times the last step, at least and at most
 LEAST = 1e-9  # of the duration: the shortest step; or 4 times its rounding
 SHORT = 1.2  # times the present length: a kink so near is reached in two steps
 FULL = 0.99  # of the way to a clock's instant: a step so long goes there
-STABLE = 2.4  # times the inverse of the spectral radius: the longest step
+STABLE = 3.0  # times the inverse of the spectral radius: the longest step
 MULTIPLIED, TINY = 12, 1e-20
 
 
@@ -56,21 +56,19 @@ def sizes(state: LoopState, sample: Sample) -> Any:
     return first, jax.tree.map(jnp.abs, state.flow())
 
 
-def error(loop: Loop, state: LoopState, coarse: LoopState, scale: Any, sample: Sample) -> Any:
-    """Return half of how far the embedded solution is off, as a fraction of the largest values so far: the greatest of
-    the first signal and of every state."""
-    first = loop.plant.output(coarse.plant)[0]
-    pairs = ((sample.output[0], *jax.tree.leaves(state.flow())), (first, *jax.tree.leaves(coarse.flow())))
-    triples = zip(*pairs, jax.tree.leaves(scale), strict=True)
-    off = [jnp.max(jnp.abs(a - b) / jnp.where(c > 0, c, 1.0)) for a, b, c in triples if jnp.size(c)]
-    return 0.5 * jnp.max(jnp.stack(off))
+def error(loop: Loop, state: LoopState, off: Any, scale: Any, sample: Sample) -> Any:
+    """Return how far states are off, as a fraction of the largest values so far: the greatest of every one, and of the
+    first signal, which they move at the end of the step as they would in its middle."""
+    moved = state.with_flow(jax.tree.map(lambda x, d: x - d, state.flow(), off))
+    all_off = (loop.plant.output(moved.plant)[0] - sample.output[0], *jax.tree.leaves(off))
+    pairs = zip(all_off, jax.tree.leaves(scale), strict=True)
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(d) / jnp.where(c > 0, c, 1.0)) for d, c in pairs if jnp.size(c)]))
 
 
 def allowed(length: Any, error: Any) -> Any:
-    """Return the length that an error allows, which is 1 in a step as long as it may be: 0.85/error^(5/16) times the
-    present one, by roots alone."""
-    fourth = jnp.sqrt(jnp.sqrt(error + LITTLE))
-    return length * clamp(SAFETY / (fourth * jnp.sqrt(jnp.sqrt(fourth))), SHRINK, GROW)
+    """Return the length that an error allows, which is 1 in a step as long as it may be: 0.85/error^(1/4) times the
+    present one."""
+    return length * clamp(SAFETY / jnp.sqrt(jnp.sqrt(error + LITTLE)), SHRINK, GROW)
 
 
 def planned(length: Any, ahead: Any, left: Any, pace: Pace) -> tuple[Any, Any]:
@@ -84,7 +82,7 @@ def planned(length: Any, ahead: Any, left: Any, pace: Pace) -> tuple[Any, Any]:
 
 
 def longest_stable(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any:
-    """Return 2.4/rho [s], rho about the spectral radius of the flow's Jacobian: how much longer a vector becomes each
+    """Return 3/rho [s], rho about the spectral radius of the flow's Jacobian: how much longer a vector becomes each
     time that it is multiplied by that, measured in the largest values so far."""
     flow, unflatten = ravel_pytree(state.flow())
     size = ravel_pytree(scale[1])[0]

@@ -30,10 +30,10 @@ from diffabs.simulate.foresight import bit
 from diffabs.simulate.landing import select
 from diffabs.simulate.methods import AtPace
 from diffabs.simulate.outcome import observe
-from diffabs.simulate.rk4 import rk4_step_from
 from diffabs.simulate.solution import ORDER, Adaptive, Trajectory
 from diffabs.simulate.span import Span
 from diffabs.simulate.stepper import typed
+from diffabs.simulate.tsit5 import tsit5_step_from
 
 MOST, TICKED = 2048, 2  # tries that can be noted at an error of 1e-5, and for each instant of a grid with clocks
 FAR = 0.5  # of a step: no comparison that changes at its end is so far from changing there
@@ -213,7 +213,7 @@ def _step(
     def flow(t: Any, z: Any, given: tuple[Any, Regime]) -> Any:
         return system.rates(t, z, *given)
 
-    z = rk4_step_from(flow, place.t, z, begin.seen[:2], h, (held, within))
+    z = tsit5_step_from(flow, place.t, z, begin.seen[:2], h, (held, within))
     state, tally = _whole(loop, place, z)
     end = system.ahead(one.t, state, tally, within)
     changed = tuple(a ^ b for a, b in zip(one.words, one.next, strict=True))

@@ -29,16 +29,6 @@ def rk4_step(derivative: Callable[[Scalar, X], X], t: Scalar, x: X, h: Scalar) -
     return _written_out(derivative, t, x, derivative(t, x), h)
 
 
-def rk4_pair(derivative: Callable[[Scalar, X], X], t: Scalar, x: X, rate: X, h: Scalar) -> tuple[X, X]:
-    """The same step, whose first rate k1 is known, and x + h k3, at which its last rate is taken: of second order."""
-    middle = derivative(t + 0.5 * h, axpy(0.5 * h, rate, x))
-    third = derivative(t + 0.5 * h, axpy(0.5 * h, middle, x))
-    coarse = axpy(h, third, x)
-    last = derivative(t + h, coarse)
-    total = jax.tree.map(lambda a, b, c, d: a + 2.0 * (b + c) + d, rate, middle, third, last)
-    return axpy(h / 6, total, x), coarse
-
-
 def rk4_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, rate: X, h: Scalar, given: Any) -> X:
     """The same step of dx/dt = derivative(t, x, given), whose first rate k1 is known. What is no real number must come
     in by `given`. For the body of a scan.

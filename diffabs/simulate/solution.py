@@ -55,7 +55,7 @@ class Adaptive:
 
 Solver = FixedStep | Adaptive
 TYPES: dict[str, type[Any]] = {"fixed": FixedStep, "adaptive": Adaptive}  # by their names in a scenario
-ORDER = 3  # of the error of an adaptive step, in its length
+ORDER = 4  # of the error of an adaptive step, in its length
 
 
 def finer(solver: Solver, times: int) -> Solver:

@@ -42,10 +42,7 @@ class Standstill:
 
     success = True
     otherwise = EXTRAPOLATED
-
-    def margin(self, output: BrakeOutput) -> Scalar:
-        """Speed above the end of integration [m/s]."""
-        return output.speed - self.speed
+    margin = SpeedReached.margin
 
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
         """v/a and v^2/(2 a)."""
@@ -76,15 +73,11 @@ class NoStop:
     """No stop: the run goes on for the whole duration of the solver."""
 
     success = False
+    remainder = Fallen.remainder
 
     def margin(self, output: Any) -> Scalar:
         """1: never crossed."""
         return 1.0 + 0.0 * output[0]
-
-    def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
-        """Nothing is left."""
-        del stopped
-        return 0.0 * sample.t, 0.0 * sample.t
 
 
 def _braked(sample: Sample, end: Scalar, stopped: Any) -> tuple[Any, Any]:

@@ -27,15 +27,4 @@ if TYPE_CHECKING:
     from diffabs.sweep.variables import Correlation as Correlation
     from diffabs.sweep.variables import Space as Space
 
-__getattr__ = lazily(
-    __name__,
-    "diffabs.sweep.discrete Categorical Empirical Rows",
-    "diffabs.sweep.distributions LogNormal Normal Triangular Uniform",
-    "diffabs.sweep.engines Local",
-    "diffabs.sweep.results Results",
-    "diffabs.sweep.run Progress sweep",
-    "diffabs.sweep.sampling Corners Grid LatinHypercube Random Saltelli Sobol",
-    "diffabs.sweep.store SweepError",
-    "diffabs.sweep.study Study",
-    "diffabs.sweep.variables Correlation Space",
-)
+__getattr__ = lazily(__name__)

@@ -27,15 +27,4 @@ if TYPE_CHECKING:
     from diffabs.tune.worst import WorstCase as WorstCase
     from diffabs.tune.worst import worst_case as worst_case
 
-__getattr__ = lazily(
-    __name__,
-    "diffabs.core.reason Reason",
-    "diffabs.simulate.batch grid latin",
-    "diffabs.tune.constraints AtMost CertifiedDecay Poles",
-    "diffabs.tune.descent Point Stopping",
-    "diffabs.tune.problem Mode",
-    "diffabs.tune.result Method Progress StartError Tuned",
-    "diffabs.tune.risk CVaR Mean Quantile SmoothWorst",
-    "diffabs.tune.tuning posed tune",
-    "diffabs.tune.worst WorstCase worst_case",
-)
+__getattr__ = lazily(__name__)

@@ -16,7 +16,7 @@ import optax
 
 from diffabs.core.reason import Reason
 from diffabs.simulate.engine import described
-from diffabs.tune.descent import Descent, Lane, Optimiser, Point, lbfgs
+from diffabs.tune.descent import Descent, Lane, Optimiser, Point, at, lbfgs
 from diffabs.tune.problem import Multipliers, Problem, Seen
 from diffabs.tune.result import Method, Progress, Start, StartError, Tuned
 
@@ -46,7 +46,7 @@ class Search:
         drawn = problem.space.spread(jax.random.key(method.seed), method.starts - 1)
         self.starts = np.concatenate([own, drawn])
         alike = np.repeat(own, len(self.starts), axis=0)  # one program serves this and the search
-        self.before: Seen = jax.device_get(_first(problem.evaluator(1.0)(alike, self._multipliers()).seen))
+        self.before: Seen = jax.device_get(at(problem.evaluator(1.0)(alike, self._multipliers()).seen, 0))
         if self.refused:  # its numbers mean nothing
             self.before = jax.tree.map(lambda x: np.full(np.shape(x), np.nan), self.before)._replace(diverged=0)
         size = abs(float(self.before.objective))
@@ -158,10 +158,6 @@ class Search:
 
     def _values(self, z: np.ndarray) -> dict[str, Any]:
         return {path: np.asarray(value) for path, value in self.problem.space.values(z).items()}
-
-
-def _first(tree: Any) -> Any:
-    return jax.tree.map(lambda x: x[0], tree)
 
 
 def _violations(lanes: list[Lane]) -> np.ndarray:

@@ -158,7 +158,7 @@ class Descent:
         self.multipliers = multipliers
         first, fine = self._evaluated(starts)
         lanes = [
-            Lane(z, float(first.loss[i]), first.gradient[i], _at(first.seen, i), np.zeros_like(z))
+            Lane(z, float(first.loss[i]), first.gradient[i], at(first.seen, i), np.zeros_like(z))
             for i, z in enumerate(starts)
         ]
         for lane, ok in zip(lanes, fine, strict=True):
@@ -179,7 +179,7 @@ class Descent:
         found, fine = self._evaluated(trials)
         moved = []
         for i, lane in enumerate(lanes):
-            taken = self._judged(lane, fine[i], trials[i], _at(found, i)) if lane.reason is None else None
+            taken = self._judged(lane, fine[i], trials[i], at(found, i)) if lane.reason is None else None
             if taken:
                 self._take(lane, *taken)
             moved.append(taken is not None and lane.reason is None)
@@ -273,5 +273,6 @@ def _chosen(which: np.ndarray, a: Any, b: Any) -> Any:
     return jax.tree.map(lambda x, y: jnp.where(which.reshape(-1, *[1] * (jnp.ndim(x) - 1)), x, y), a, b)
 
 
-def _at(tree: Any, i: int) -> Any:
+def at(tree: Any, i: int) -> Any:
+    """Return what is said of one start."""
     return jax.tree.map(lambda x: x[i], tree)
