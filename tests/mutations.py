@@ -328,8 +328,8 @@ MUTATIONS = [
     Mutation(
         "comparisons are seen a step too late",
         "simulate/foresight.py",
-        "jnp.where(since < -least, -since, FAR)",
-        "FAR",
+        "next = jnp.where((since < -least) & (since > next), since, next)",
+        "del least",
         "test_adaptive.py::test_lines_say_when_comparisons_change_and_when_they_did",
     ),
     Mutation(
@@ -401,6 +401,27 @@ MUTATIONS = [
         "cubic.start * cubic.end < 0",
         "cubic.start * cubic.end < -1e9",
         "test_blocks.py::test_the_integral_of_an_error_that_changes_sign",
+    ),
+    Mutation(
+        "the setpoint is that of the step's beginning",
+        "core/messages.py",
+        "Shown.of(self.start), Shown.of(self.end)",
+        "Shown.of(self.start), Shown.of(self.end)._replace(setpoint=self.start.setpoint)",
+        "test_blocks.py::test_the_integral_of_an_error_whose_setpoint_moves",
+    ),
+    Mutation(
+        "a setpoint does not move within a step",
+        "core/messages.py",
+        "ends, self.shown_rates())",
+        "ends, [rate._replace(setpoint=0.0 * rate.setpoint) for rate in self.shown_rates()])",
+        "test_blocks.py::test_the_integral_of_an_error_whose_setpoint_moves",
+    ),
+    Mutation(
+        "a central path begins nearer to its edge than rounding",
+        "design/interior/central_path.py",
+        "1e-3 * jnp.abs(first) + rounding",
+        "1e-3 * jnp.abs(first) + 1e-30",
+        "test_sensitivity.py::test_one_vertex_is_the_riccati_equation",
     ),
     Mutation(
         "rules of a part around a part that is not sound",
@@ -1549,7 +1570,7 @@ MUTATIONS = [
         "tune/worst.py",
         "if lane.reason is not Reason.START and -float(lane.seen.objective) > value:",
         "if False:",
-        "test_tuning.py::TestWorstCase::test_it_is_at_least_as_bad_as_thousands_of_samples",
+        "test_tuning.py::TestWorstCase::test_the_ascent_finds_what_lies_between_the_points",
     ),
     Mutation(
         "tune: weights without their off-diagonal",

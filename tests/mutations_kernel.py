@@ -18,6 +18,7 @@ KEPT, FINGERPRINT = "kernel/kept.py", "core/fingerprint.py"
 BINDING, TANGENTS, LAUNCH = "kernel/binding.py", "kernel/tangents.py", "test_kernel_tangents.py::TestLaunch"
 LINEAR = "kernel/linear.py"
 PUSHED, ENGINES = f"{LAUNCH}::test_derivatives_are_those_of_xla", "test_kernel_engines.py"
+TWO = f"{LAUNCH}::test_on_two_devices"
 SCENARIO = "test_kernel_tangents.py::test_a_scenario[slip-lmi"
 
 KERNEL = [
@@ -164,5 +165,18 @@ KERNEL = [
      f"{ENGINES}::TestRare::test_objection"),
     ("kernel: design points in reverse mode", "reliability/failure.py",
      'forward if study.engine == "kernel" else slopes', "slopes", f"{ENGINES}::TestRare::test_is_that_of_xla[True]"),
-
+    ("kernel: a worst case is screened by XLA", "tune/worst.py", "accepted=True, engine=engine)", "accepted=True)",
+     f"{ENGINES}::test_the_worst_case_is_that_of_xla"),
+    ("kernel: a worst case is ascended to by XLA", "tune/worst.py", "    problem = problem.by(engine)\n", "",
+     f"{ENGINES}::test_the_worst_case_is_that_of_xla"),
+    ("kernel: of many parameters in reverse mode", "tune/problem.py", 'engine="kernel", mode=Mode.FORWARD)',
+     'engine="kernel")', f"{ENGINES}::TestTune::test_without_lanes_of_its_own_and_of_many_parameters"),
+    ("kernel: a tuning takes any name of an engine", "tune/problem.py", "if engine not in ENGINES:", "if False:",
+     f"{ENGINES}::TestTune::test_of_another_name"),
+    ("kernel: the commands take any name of an engine", "cli/engine.py", "if engine not in ENGINES:", "if False:",
+     f"{ENGINES}::TestTune::test_another_engine_is_refused_by_the_command"),
+    ("kernel: what is kept for a device is for the other, too", KEPT, "jax.typeof, leaves)), device, jax",
+     "jax.typeof, leaves)), None, jax", TWO),
+    ("kernel: what lies on two devices is kept for one", KEPT, "None if homes or device.platform",
+     "None if device.platform", TWO),
 ]  # fmt: skip

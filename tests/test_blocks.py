@@ -29,9 +29,9 @@ from diffabs.controllers.pid import PIDMemory
 from diffabs.core.blocks import Series, offers
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, Sample, Tracking
 from diffabs.core.pytree import pytree, static
-from diffabs.objectives import IAE, ITAE, MaxSlip
+from diffabs.objectives import IAE, ITAE, MaxSlip, SettlingTime
 from diffabs.plants import BrakeStart, MirroredRig
-from diffabs.references import FilteredSlip, FixedSlip, PeakLatch, PeakLiteral, PeakRobust
+from diffabs.references import FilteredSlip, FixedSlip, PeakLatch, PeakLiteral, PeakRobust, SlipByDeceleration
 from diffabs.sensors import Bias, IntegratedAccelerometer, Noise, Quantisation, SpeedScale, WheelSpeed
 from diffabs.simulate.rk4 import rk4_step
 from diffabs.stops import NoStop, SpeedReached, Standstill
@@ -281,6 +281,37 @@ def test_the_integral_of_an_error_that_changes_sign(h):
     close(found["peak"], 0.23, rtol=4e-8 * (h / 1e-3) ** 4)
     close(found["iae"], 0.03 * 21 / w, rtol=3e-6 * (h / 1e-3) ** 4)
     close(found["itae"], np.trapezoid(t * 0.03 * np.abs(np.sin(w * t)), t), rtol=3e-6 * (h / 1e-3) ** 4)
+
+
+@pytest.mark.parametrize(
+    ("solver", "rtol"),
+    [
+        (d.FixedStep(1e-3, 1.0), 3e-6),
+        (d.FixedStep(5e-4, 1.0), 2e-7),
+        # No state moves as fast as this script, so its steps are long.
+        pytest.param(d.Adaptive(1e-7, 1.0), 1e-4, marks=pytest.mark.slow),
+    ],
+)
+def test_the_integral_of_an_error_whose_setpoint_moves(solver, rtol):
+    """A filtered ramp of deceleration moves the setpoint within every step: a = 5 + 30 t, and from the first sample on
+    a_f = 5 + 30 (t - T (1 - exp(-t/T)))."""
+    w, end, lag, band = 100.0, 0.33, 0.05, 0.07
+    loop = d.Loop(
+        plant=Script(
+            read=lambda t: seen(0.2 - 0.03 * jnp.sin(w * t), deceleration=5.0 + 30.0 * t, speed=1.0 + end - t)
+        ),
+        initial=0.0,
+        reference=SlipByDeceleration(decelerations=(0.0, 20.0), slips=(0.1, 0.2), time_constant=lag),
+        controller=ConstantTorque(),
+        stop=SpeedReached(speed=1.0),
+    )
+    t = np.linspace(0.0, end, 2_000_001)
+    setpoint = 0.1 + 0.005 * (5.0 + 30.0 * (t + lag * np.expm1(-t / lag)))
+    e = np.abs(0.2 - 0.03 * np.sin(w * t) - setpoint)
+    found = d.measure(loop, solver, {"iae": IAE(), "itae": ITAE(), "settling": SettlingTime(band=band)}).metrics
+    close(found["iae"], np.trapezoid(e, t), rtol=rtol)
+    close(found["itae"], np.trapezoid(t * e, t), rtol=rtol)
+    close(found["settling"], t[np.flatnonzero(e > band)[-1]], rtol=rtol + 1e-6)  # to the points of t
 
 
 def test_sliding_mode():

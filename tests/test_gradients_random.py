@@ -14,14 +14,8 @@ COUNTS = dict.fromkeys(random_loops.STRUCTURES, 3) | {"relay, latch, lag": 6}  #
 LEFT_OUT = {"Quantisation", "PeakLiteral"}  # parts whose derivative says nothing of their jumps, as they document
 
 
-OFF = pytest.mark.xfail(
-    strict=True, reason="iae of one of three is off by 0.3 % at 0.1 ms; by 0.04 % at a quarter of it"
-)
-CASES = [pytest.param(name, marks=OFF) if name == "slip by deceleration" else name for name in COUNTS]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", COUNTS)
 def test_gradients_are_those_of_wide_differences(name):
     founds = studied(name, range(COUNTS[name]), seed=1, told=False)
     assert all(found.ended for found in founds)

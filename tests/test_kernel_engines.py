@@ -14,9 +14,10 @@ import diffabs as d
 from diffabs import actuators, controllers, plants, reliability, roads, scenario, stops, sweep, tune
 from diffabs.core.pytree import get
 from diffabs.design.attraction import Cells, attraction
-from diffabs.kernel import compilers
+from diffabs.kernel import compilers, kept, launch
 from diffabs.objectives import IAE, StopTime
 from diffabs.scenario.defaults import braking
+from diffabs.simulate import native
 from diffabs.simulate.engine import EngineError, tell
 from diffabs.tune.problem import Mode
 
@@ -131,7 +132,12 @@ class TestTune:
 
 
 @pytest.mark.slow
-def test_the_worst_case_is_that_of_xla():
+def test_the_worst_case_is_that_of_xla(monkeypatch):
+    """Screened without derivatives and ascended with them, both by a kernel."""
+    native._kept.forget()
+    launches, launched = [], launch._launched
+    monkeypatch.setenv(kept.OFF, "1")
+    monkeypatch.setattr(launch, "_launched", lambda made, *a, **k: launches.append(made) or launched(made, *a, **k))
     over = {"plant.mass": (14.0, 16.0), "initial.speed": (25.0, 28.0)}
     given = {"over": over, "metric": "iae", "solver": TUNED["solver"], "measured": TUNED["measured"]}
     found, expected = (
@@ -139,6 +145,7 @@ def test_the_worst_case_is_that_of_xla():
     )
     assert found.value == pytest.approx(expected.value, rel=1e-9)
     assert found.values.keys() == expected.values.keys()
+    assert {any(made.tangents.values()) for made in launches} == {False, True}
 
 
 @pytest.mark.slow

@@ -137,7 +137,8 @@ class TestLaunch:
 
     @pytest.mark.slow
     def test_on_two_devices(self):
-        """Lanes that lie on two devices, each of which runs its own; and their derivatives."""
+        """Lanes that lie on two devices, each of which runs its own; and their derivatives. Then those of a batch: on
+        either device, and on both."""
         environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", compilers.CACHE: FOLDER}
         environment["PYTHONPATH"] = os.pathsep.join([os.path.dirname(__file__), *sys.path])
         done = subprocess.run([sys.executable, "-c", ON_TWO], env=environment, capture_output=True, text=True)
@@ -146,7 +147,11 @@ class TestLaunch:
 
 ON_TWO = """
 import jax, jax.numpy as jnp, numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+
+import diffabs as d
+from diffabs.objectives import IAE
+from diffabs.scenario.defaults import braking
 from test_kernel_tangents import chain
 
 jax.config.update("jax_enable_x64", True)
@@ -160,6 +165,17 @@ for f in (own, jax.jit(chain)):
     found = f(2.0, apart), jax.jacfwd(lambda g: f(g, apart))(2.0)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-13, atol=1e-13), found, known)
 assert len(own(2.0, apart).sharding.device_set) == 2
+
+loop, masses = braking(), np.linspace(400.0, 420.0, 38)
+both = NamedSharding(jax.make_mesh((2,), ("lanes",), axis_types=(AxisType.Auto,)), lanes)
+
+def iae(masses, engine):
+    given = loop, d.Batch({"plant.mass": masses}), d.FixedStep(2e-3, 0.1), {"iae": IAE()}
+    return np.asarray(d.run_batch(*given, accepted=True, together=False, engine=engine).metrics["iae"])
+
+known = iae(masses, "xla")
+for place in (*jax.devices(), both):
+    np.testing.assert_allclose(iae(jax.device_put(masses, place), "kernel"), known, rtol=1e-12)
 print("on two devices")
 """
 

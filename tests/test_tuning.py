@@ -13,11 +13,13 @@ from scipy.stats import qmc
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, references
-from diffabs.core.pytree import strong
+from diffabs.core.protocols import Memory
+from diffabs.core.pytree import pytree, strong
 from diffabs.design.polytopes import Polytope
 from diffabs.design.speed_scaled import SpeedScaled, fall
 from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
+from diffabs.objectives.tracking import nothing, unchanged
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.stable_step import stable_step, stable_steps
 from diffabs.stops import SpeedReached
@@ -306,6 +308,23 @@ def test_a_worst_case_says_what_found_it(corner, screened, words):
 
 
 @pytest.mark.slow
+@pytree
+class Shortness:
+    """-distance: what is greatest somewhere within."""
+
+    unit = "m"
+    physical = (-np.inf, 0.0)
+    flow, update = nothing, unchanged
+
+    def start(self, sample):
+        """Nothing to remember."""
+        return Memory()
+
+    def value(self, memory, ending):
+        """-distance."""
+        return -ending.sample.output.distance
+
+
 class TestWorstCase:
     def test_it_is_at_least_as_bad_as_thousands_of_samples(self):
         found = worst_case(RIG, over=BOX, metric="max_slip", solver=SOLVER, bound=0.25, screen=16, starts=3)
@@ -323,6 +342,15 @@ class TestWorstCase:
         np.testing.assert_allclose(found.corner, np.max(run(corners)["max_slip"]), rtol=1e-9)
         assert found.corner <= found.screened <= found.value
         assert found.report().startswith("COUNTEREXAMPLE: max_slip" if not found.met else "No counterexample in")
+
+    @pytest.mark.slow
+    def test_the_ascent_finds_what_lies_between_the_points(self):
+        """The shortest way of all slips, beside a thousand of them: at no corner."""
+        box, measured = {"reference.slip": (0.08, 0.4)}, {"short": Shortness()}
+        found = worst_case(RIG, over=box, metric="short", solver=SOLVER, measured=measured, screen=3, starts=2)
+        lanes = d.Batch({"reference.slip": np.linspace(0.08, 0.4, 1000)})
+        best = float(np.max(d.run_batch(RIG, lanes, SOLVER, measured).metrics["short"]))
+        assert found.screened < best <= found.value + 1e-9
 
     def test_points_without_gradients(self):
         """Any number of points, the first of Sobol's."""

@@ -106,22 +106,40 @@ class Ending(NamedTuple):
     distance_left: Scalar  # [m]
 
 
+class Shown(NamedTuple):
+    """Of a sample: what the plant shows, and the setpoint of its first signal; or their rates."""
+
+    output: Any
+    setpoint: Scalar
+
+    @classmethod
+    def of(cls, sample: Sample) -> "Shown":
+        """That of a sample."""
+        return cls(sample.output, sample.setpoint)
+
+
 class Segment(NamedTuple):
     """A step of a run, from one instant to the next, within which nothing jumps: the samples at both ends (the first
-    after the jumps there, the last before them), its length [s], and the step of the grid [s]. What `output` and
-    `sample` return is the cubic of something seen, from values and rates at both ends: its extrema, roots and integrals
-    are those of the run to the order of the method."""
+    after the jumps there, the last before them), its length [s], and the step of the grid [s]. What `output`,
+    `error` and `sample` return is the cubic of something seen, from values and rates at both ends: its extrema, roots
+    and integrals are those of the run to the order of the method."""
 
     start: Sample
     end: Sample
     h: Scalar
     step: Scalar
-    output_rates: Callable[[], tuple[Any, Any]]
+    shown_rates: Callable[[], tuple[Shown, Shown]]
     sample_rates: Callable[[], tuple[Sample, Sample]]
 
     def output(self, read: Callable[[Any], Scalar] = lambda output: output[0]) -> Cubic:
         """The cubic of read(output): by default of the first signal that the plant shows."""
-        return self._cubic(read, (self.start.output, self.end.output), self.output_rates())
+        start, end = self.shown_rates()
+        return self._cubic(read, (self.start.output, self.end.output), (start.output, end.output))
+
+    def error(self) -> Cubic:
+        """The cubic of the first signal - setpoint, which a reference may move within a step."""
+        ends = Shown.of(self.start), Shown.of(self.end)
+        return self._cubic(lambda shown: shown.output[0] - shown.setpoint, ends, self.shown_rates())
 
     def sample(self, read: Callable[[Sample], Scalar]) -> Cubic:
         """The cubic of read(sample): of anything seen. It costs the rates of all signals."""
@@ -136,4 +154,4 @@ def still(sample: Sample, h: Scalar) -> Segment:
     """Return a step of length h [s] in which nothing moves."""
     sample = jax.tree.map(jnp.asarray, sample)
     rest = jax.tree.map(jnp.zeros_like, sample)
-    return Segment(sample, sample, h, h, lambda: (rest.output,) * 2, lambda: (rest,) * 2)
+    return Segment(sample, sample, h, h, lambda: (Shown.of(rest), Shown.of(rest)), lambda: (rest, rest))

@@ -59,11 +59,6 @@ def _side(sample: Sample) -> Any:
     return jnp.where(sample.setpoint < 0, -1.0, 1.0)
 
 
-def error_cubic(segment: Segment) -> Cubic:
-    """The cubic of the error over a step: its setpoint does not change within one."""
-    return segment.output().minus(segment.start.setpoint)
-
-
 def absolute(cubic: Cubic, integral: Callable[[Any], Any]) -> Any:
     """The integral of |p| over [0, 1], where `integral(x)` is that of p, or of p times something positive, to x."""
     whole = integral(1.0)
@@ -94,7 +89,7 @@ class IAE:
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Add |e| over the step."""
-        e = error_cubic(segment)
+        e = segment.error()
         return memory.held + segment.h * absolute(e, e.integral)
 
 
@@ -109,7 +104,7 @@ class ITAE:
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Add t |e| over the step."""
-        e, t, h = error_cubic(segment), segment.start.t, segment.h
+        e, t, h = segment.error(), segment.start.t, segment.h
         return memory.held + h * absolute(e, lambda x: t * e.integral(x) + h * e.moment(x))
 
 
@@ -192,7 +187,7 @@ class SettlingTime:
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Note the last entry; while outside, the present time."""
-        e = error_cubic(segment)
+        e = segment.error()
         outside = e.times(sign(jax.lax.stop_gradient(e.start))).minus(self.band)
         beyond = jnp.abs(e.end) > self.band
         entered = segment.start.t + segment.h * outside.root()

@@ -19,7 +19,7 @@ from diffabs.core.blocks import Passage
 from diffabs.core.cubic import Cubic
 from diffabs.core.log import lend, tables, written
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
-from diffabs.core.protocols import Clock, Memory, Sample, Segment
+from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
 from diffabs.core.regime import Words
 from diffabs.simulate.advance import start
 from diffabs.simulate.checkpoint import anyone, apart
@@ -206,7 +206,7 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
         sample,
         h,
         pace.h,
-        lambda: (point.moving.output, moving.output),
+        lambda: (Shown.of(point.moving), Shown.of(moving)),
         lambda: (point.moving, moving),
     )
     tally = {name: Memory(z[1][name], o.update(tallied[name], segment)) for name, o in system.objectives.items()}

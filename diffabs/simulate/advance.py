@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from diffabs.core.blocks import Passage
 from diffabs.core.log import lend
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
-from diffabs.core.protocols import Clock, Memory, Sample, Segment
+from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
 from diffabs.core.regime import Regime, Words, crossing, only
 from diffabs.simulate.checkpoint import apart
 from diffabs.simulate.dynamics import Dynamics, Objectives, Tally, dynamics, parted
@@ -152,9 +152,7 @@ def _segment(system: Dynamics, point: Point, end: Any, sample: Sample, one: Try)
     def each(of: Any) -> Any:
         return cache(lambda: tuple(system.moving(of, end, within) for end in ends))
 
-    return Segment(
-        point.sample, sample, one.h, one.step, each(lambda sample: sample.output), each(lambda sample: sample)
-    )
+    return Segment(point.sample, sample, one.h, one.step, each(Shown.of), each(lambda sample: sample))
 
 
 def _passed(system: Dynamics, point: Point, end: Any, one: Try) -> dict[str, Passage]:

@@ -18,7 +18,7 @@ from diffabs.core.blocks import Passage
 from diffabs.core.log import lend, tables, written
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.numerics import axpy
-from diffabs.core.protocols import Clock, Memory, Segment
+from diffabs.core.protocols import Clock, Memory, Segment, Shown
 from diffabs.core.regime import Regime, Words
 from diffabs.simulate.adaptive import Carry, passed
 from diffabs.simulate.advance import start
@@ -229,7 +229,7 @@ def _step(
         sample,
         h + shift,
         pace.h,
-        lambda: (begin.moving.output, end.moving.output),
+        lambda: (Shown.of(begin.moving), Shown.of(end.moving)),
         lambda: (begin.moving, end.moving),
     )
     tally = {name: Memory(tally[name].flow, o.update(tally[name], segment)) for name, o in objectives.items()}

@@ -79,8 +79,10 @@ def begun(T: Any, K: Any, mu: Any) -> Path:
 def followed(problem: Problem, path: Path, onwards: Callable, *, discrete: bool) -> Path:
     """Newton steps until `onwards(path, least shift, trace P)` says that the last centre is reached, or that there is
     none (`stuck`)."""
-    first = least_shift(seen(problem, path.point), discrete=discrete)
-    path = path._replace(shift=jnp.maximum(2 * first, 0.0) + 1e-3 * jnp.abs(first) + 1e-30)
+    here = seen(problem, path.point)
+    first = least_shift(here, discrete=discrete)
+    rounding = jnp.finfo(first.dtype).eps ** 0.5 * jnp.max(jnp.abs(here.c))  # a Riccati solution has a first of 0
+    path = path._replace(shift=jnp.maximum(2 * first, 0.0) + 1e-3 * jnp.abs(first) + rounding)
 
     def going(path: Path) -> Any:
         return (path.steps < LIMIT) & (path.settled < SETTLED) & ~path.stuck & jnp.isfinite(path.decrement)
