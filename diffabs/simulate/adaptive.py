@@ -10,7 +10,7 @@
 
 The grid of `Adaptive.step` is only where clocks strike and what a trajectory keeps: no step has to end on it."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from diffabs.core.blocks import Passage
 from diffabs.core.cubic import Cubic
 from diffabs.core.log import lend, tables, written
-from diffabs.core.loop import Loop, LoopState, Margins, Signals
-from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
+from diffabs.core.loop import Loop, LoopState, Margins
+from diffabs.core.protocols import Clock, Memory, Segment, Shown
 from diffabs.core.regime import Words
 from diffabs.simulate.advance import start
 from diffabs.simulate.checkpoint import anyone, apart
@@ -30,81 +30,11 @@ from diffabs.simulate.landing import Search, aimed, earliest, falls_through, ini
 from diffabs.simulate.lengths import FIRST, SHRINK, Pace, allowed, error, longest_stable, planned, sizes
 from diffabs.simulate.span import Span
 from diffabs.simulate.stepper import MISSED, typed
+from diffabs.simulate.tries import Arrival, Carry, Point, Verdict
 from diffabs.simulate.tsit5 import off_in_the_middle, tsit5_pair
 
 MOST, EACH = 100_000, 16  # tries of a run, and for each instant of its grid: more of them lead nowhere
 COUNTED = ("tries", "condition")  # what is still looked at when a run is over
-
-
-class Point(NamedTuple):
-    """A run at an instant, after what changes there: the loop's state and the objectives' accumulators; what is seen,
-    and its rates; what blocks record, and its rates; the rates of what is integrated; the margins of the stop and of
-    the blocks' events; the answers to the comparisons, and in how many seconds the first of them will change."""
-
-    t: Any
-    state: LoopState
-    tally: Tally
-    sample: Sample
-    moving: Sample
-    recorded: tuple[dict[str, Any], dict[str, Any]]
-    rate: tuple[Any, Any]
-    margins: Margins
-    words: Words
-    ahead: Any
-
-
-class Arrival(NamedTuple):
-    """The end of a try, before what changes there: the point, its signals, the error as a multiple of what is allowed,
-    the largest values of the states so far, for how many seconds a comparison has been another one, and, where it is
-    noted, the regime in the middle."""
-
-    point: Point
-    signals: Signals
-    error: Any
-    scale: Any
-    late: Any
-    middle: Any
-
-
-class Carry(NamedTuple):
-    """A run on its way."""
-
-    point: Point
-    k: Any  # number of the last instant of the grid at which a clock struck
-    since: Any  # for how long [s]: differences of times would lose digits
-    natural: Any  # the length that the error allows [s]
-    length: Any  # of the step to try [s]
-    ends: Any  # whether that ends where a clock strikes, or with the run
-    limit: Any  # the longest stable step [s]
-    scale: Any  # the largest values of the states so far
-    base: Any  # length of the try that an event was first seen in [s]
-    search: Search
-    tries: Any
-    renewed: Any  # how many of these there were when the longest stable step was last looked at
-    past: Any  # the last step, as a `Span`; () where nobody asks
-    note: Any  # of the last try: a bit for each event at its end, and the regime in its middle; () likewise
-    condition: Any
-
-    @property
-    def running(self) -> Any:
-        """Whether another step is to be made or tried."""
-        return self.condition <= Condition.REFRESHING
-
-    @property
-    def stopped(self) -> Any:
-        """Whether the stop was reached."""
-        return self.condition == Condition.STOPPED
-
-
-class Verdict(NamedTuple):
-    """What is made of a try: whether its numbers are finite; whether it is taken; whether an event was seen in it, and
-    is to be looked for; which events happen at its end, and whether the run is over there."""
-
-    fine: Any
-    taken: Any
-    seeks: Any
-    fired: Margins
-    over: Any
 
 
 def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carry:

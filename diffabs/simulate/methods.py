@@ -16,6 +16,7 @@ from diffabs.simulate.landing import select
 from diffabs.simulate.lengths import Pace, longest_stable
 from diffabs.simulate.outcome import observe
 from diffabs.simulate.solution import Adaptive, Solver, Trajectory
+from diffabs.simulate.tries import Carry
 
 ROUNDING = 32  # times the precision of a number: the least error that is asked of a step
 PART = 0.25  # of the error that a step may have, where a derivative is asked for
@@ -77,17 +78,15 @@ class OnGrid:
 class AtPace(Pace):
     """The steps of `Adaptive`."""
 
-    def start(self, loop: Loop, objectives: Objectives, key: Any) -> adaptive.Carry:
+    def start(self, loop: Loop, objectives: Objectives, key: Any) -> Carry:
         """Return the carry at t = 0."""
         return adaptive.init_carry(loop, objectives, self, key)
 
-    def step(
-        self, loop: Loop, objectives: Objectives, key: Any, carry: adaptive.Carry, until: Any = None
-    ) -> adaptive.Carry:
+    def step(self, loop: Loop, objectives: Objectives, key: Any, carry: Carry, until: Any = None) -> Carry:
         """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
         return adaptive.step(loop, objectives, self, key, carry, until)
 
-    def renew(self, loop: Loop, carry: adaptive.Carry) -> adaptive.Carry:
+    def renew(self, loop: Loop, carry: Carry) -> Carry:
         """Return the carry with the longest stable step, if that was not looked at for ROUND tries."""
         due, at = carry.running & (carry.tries - carry.renewed >= ROUND), carry.point
         limit = jax.lax.cond(
@@ -95,11 +94,11 @@ class AtPace(Pace):
         )
         return carry._replace(limit=limit, renewed=jnp.where(due, carry.tries, carry.renewed))
 
-    def before(self, carry: adaptive.Carry, instant: Any) -> Any:
+    def before(self, carry: Carry, instant: Any) -> Any:
         """Return whether the run goes on, and has not come to this instant."""
         return adaptive.before(self, carry, instant)
 
-    def seen(self, loop: Loop, carry: adaptive.Carry, instant: Any) -> Trajectory:
+    def seen(self, loop: Loop, carry: Carry, instant: Any) -> Trajectory:
         """Return what is seen at this instant of the grid, which lies within the last step."""
         now, t = carry.point, instant * self.h
         inside = (t < now.t) & (carry.past.until > carry.past.t)

@@ -12,20 +12,20 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.loop import Loop
-from diffabs.simulate import adaptive
 from diffabs.simulate.checkpoint import anyone
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.dynamics import Objectives
 from diffabs.simulate.landing import select
 from diffabs.simulate.methods import AtPace
 from diffabs.simulate.replay import Notes, Place, noted, place_at_start, repeat_try
+from diffabs.simulate.tries import Carry
 
 
 class Pursuit(NamedTuple):
     """A run on its way, ahead, and its repetition: the note of the last step that led on, whether that is still to be
     repeated, and where the repetition is."""
 
-    ahead: adaptive.Carry
+    ahead: Carry
     note: Notes
     waits: Any
     point: Place

@@ -20,7 +20,7 @@ from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment, Shown
 from diffabs.core.regime import Regime, Words
-from diffabs.simulate.adaptive import Carry, passed
+from diffabs.simulate.adaptive import passed
 from diffabs.simulate.advance import start
 from diffabs.simulate.checkpoint import anyone, forgetful
 from diffabs.simulate.condition import Condition
@@ -33,6 +33,7 @@ from diffabs.simulate.outcome import observe
 from diffabs.simulate.solution import ORDER, Adaptive, Trajectory
 from diffabs.simulate.span import Span
 from diffabs.simulate.stepper import typed
+from diffabs.simulate.tries import Carry
 from diffabs.simulate.tsit5 import tsit5_step_from
 
 MOST, TICKED = 2048, 2  # tries that can be noted at an error of 1e-5, and for each instant of a grid with clocks

@@ -1,0 +1,81 @@
+"""What a run under `Adaptive` has in hand: where it is, where a try has led, what is made of that."""
+
+from typing import Any, NamedTuple
+
+from diffabs.core.loop import LoopState, Margins, Signals
+from diffabs.core.protocols import Sample
+from diffabs.core.regime import Words
+from diffabs.simulate.condition import Condition
+from diffabs.simulate.dynamics import Tally
+from diffabs.simulate.landing import Search
+
+
+class Point(NamedTuple):
+    """A run at an instant, after what changes there: the loop's state and the objectives' accumulators; what is seen,
+    and its rates; what blocks record, and its rates; the rates of what is integrated; the margins of the stop and of
+    the blocks' events; the answers to the comparisons, and in how many seconds the first of them will change."""
+
+    t: Any
+    state: LoopState
+    tally: Tally
+    sample: Sample
+    moving: Sample
+    recorded: tuple[dict[str, Any], dict[str, Any]]
+    rate: tuple[Any, Any]
+    margins: Margins
+    words: Words
+    ahead: Any
+
+
+class Arrival(NamedTuple):
+    """The end of a try, before what changes there: the point, its signals, the error as a multiple of what is allowed,
+    the largest values of the states so far, for how many seconds a comparison has been another one, and, where it is
+    noted, the regime in the middle."""
+
+    point: Point
+    signals: Signals
+    error: Any
+    scale: Any
+    late: Any
+    middle: Any
+
+
+class Carry(NamedTuple):
+    """A run on its way."""
+
+    point: Point
+    k: Any  # number of the last instant of the grid at which a clock struck
+    since: Any  # for how long [s]: differences of times would lose digits
+    natural: Any  # the length that the error allows [s]
+    length: Any  # of the step to try [s]
+    ends: Any  # whether that ends where a clock strikes, or with the run
+    limit: Any  # the longest stable step [s]
+    scale: Any  # the largest values of the states so far
+    base: Any  # length of the try that an event was first seen in [s]
+    search: Search
+    tries: Any
+    renewed: Any  # how many of these there were when the longest stable step was last looked at
+    past: Any  # the last step, as a `Span`; () where nobody asks
+    note: Any  # of the last try: a bit for each event at its end, and the regime in its middle; () likewise
+    condition: Any
+
+    @property
+    def running(self) -> Any:
+        """Whether another step is to be made or tried."""
+        return self.condition <= Condition.REFRESHING
+
+    @property
+    def stopped(self) -> Any:
+        """Whether the stop was reached."""
+        return self.condition == Condition.STOPPED
+
+
+class Verdict(NamedTuple):
+    """What is made of a try: whether its numbers are finite; whether it is taken; whether an event was seen in it, and
+    is to be looked for; which events happen at its end, and whether the run is over there."""
+
+    fine: Any
+    taken: Any
+    seeks: Any
+    fired: Margins
+    over: Any
