@@ -288,8 +288,8 @@ def test_the_integral_of_an_error_that_changes_sign(h):
     [
         (d.FixedStep(1e-3, 1.0), 3e-6),
         (d.FixedStep(5e-4, 1.0), 2e-7),
-        # No state moves as fast as this script, so its steps are long.
-        pytest.param(d.Adaptive(1e-7, 1.0), 1e-4, marks=pytest.mark.slow),
+        # No state moves as fast as this script, so its steps are long, a tenth of a period.
+        pytest.param(d.Adaptive(1e-8, 1.0), 1.5e-4, marks=pytest.mark.slow),
     ],
 )
 def test_the_integral_of_an_error_whose_setpoint_moves(solver, rtol):

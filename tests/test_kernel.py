@@ -245,6 +245,7 @@ class TestSweep:
     @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA: "), ("kernel", "")])
     def test_by_the_command(self, engine, line, tmp_path, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, "")
+        native._kept.forget()
         changes = [part for setting in self.SETTINGS for part in ("--set", setting)]
         status = 0 if line else 2
         done = run("sweep", "slip-lmi", *changes, "--out", tmp_path / "out", "--engine", engine, status=status)

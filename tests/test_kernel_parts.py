@@ -27,8 +27,12 @@ SOLVERS = {"fixed": d.FixedStep(1e-3, 0.12), "adaptive": d.Adaptive(rtol=1e-6, d
 # What a lane's step sequence may make of its last bit, with steps that end on kinks: the solver's own reproducibility.
 CLOSE = {"fixed": {"rtol": 1e-13, "atol": 1e-14}, "adaptive": {"rtol": 1e-7, "atol": 1e-9}}
 
-# In XLA a last digit of the initial speed changes its final error by 1.6e-11.
-LAST_DIGIT = {("slip-real", "fixed"): {"rtol": 5e-11, "atol": 1e-14}}
+# In XLA a last digit of the initial speed changes the final slip error by 8e-12 of slip-real, and of extremum seeking,
+# which waits for a peak to have passed, by 8e-8 and the IAE by 9e-9.
+LAST_DIGIT = {
+    ("slip-real", "fixed"): {"rtol": 1e-13, "atol": 2e-11},
+    ("extremum seeking", "adaptive"): {"rtol": 1e-7, "atol": 2e-7},
+}
 
 
 @pytest.fixture(autouse=True)
@@ -36,6 +40,11 @@ def _own_folder(monkeypatch):
     monkeypatch.setenv(compilers.CACHE, FOLDER)
     monkeypatch.setenv(kept.OFF, "1")
     monkeypatch.setattr(launch, "VECTORS", 2)
+
+
+def close(name, kind):
+    """How close two engines are, of a part or a scenario."""
+    return LAST_DIGIT.get((name, kind), CLOSE[kind])
 
 
 def with_part(family, name):
@@ -55,7 +64,7 @@ def test_a_part(family, name, kind):
         pytest.skip("1e-15 of its speed decides which lanes diverge")
     loop, path = with_part(family, name)
     values = {path: np.asarray(get(loop, path), float) * np.linspace(1 - SPREAD, 1 + SPREAD, LANES) + 1e-3}
-    same(*both(loop, values, SOLVERS[kind], usual(loop.plant), np.arange(LANES)), **CLOSE[kind])
+    same(*both(loop, values, SOLVERS[kind], usual(loop.plant), np.arange(LANES)), **close(name, kind))
 
 
 @pytest.mark.parametrize("kind", SOLVERS)
@@ -68,8 +77,7 @@ def test_a_scenario(name, kind):
     solver = one.solver
     if kind == "adaptive":
         solver = d.Adaptive(rtol=1e-6, duration=solver.duration, step=solver.step)
-    close = LAST_DIGIT.get((name, kind), CLOSE[kind])
-    same(*both(one.loop, values, solver, dict(one.objectives), np.arange(LANES)), **close)
+    same(*both(one.loop, values, solver, dict(one.objectives), np.arange(LANES)), **close(name, kind))
 
 
 def test_objectives():
