@@ -32,6 +32,8 @@ pytestmark = pytest.mark.xdist_group("kernel tangents")
 LANES, STEPS = 37, 5
 RTOL = 1e-5  # of a run with adaptive steps: ten times that of a step
 EXACT, LANDED, SWITCHING = 1e-12, 1e-6, 2e-3  # of the largest derivative among the lanes, or of the metric
+# of a stop that is extrapolated over 400 s: XLA's own derivative moves by 1e-12 where the start does by an ulp
+ROUNDED = {"literal": 3e-12}
 LEAST = 1e-2  # a final slip error of 3e-4 is a difference of slips near 1, and has their digits
 PARTS_HERE = [case for case in CASES if case[0] != "stop"]
 
@@ -211,7 +213,7 @@ def compare(given, close, values=1e-13):
 def test_a_part(family, name):
     """With steps of the grid alone."""
     loop, path = with_part(family, name)
-    compare((loop, d.FixedStep(1e-3, 0.06, kinks=False), usual(loop.plant), path), EXACT)
+    compare((loop, d.FixedStep(1e-3, 0.06, kinks=False), usual(loop.plant), path), ROUNDED.get(name, EXACT))
 
 
 @pytest.mark.slow
