@@ -112,6 +112,21 @@ class TestLaunch:
         np.testing.assert_allclose(found[1], known[1], rtol=2e-13)
         assert not np.any(found[2])
 
+    def test_what_is_not_chosen_does_not_matter(self):
+        """A try may lead to what is no number, and is then not taken: neither are its tangents."""
+
+        def step(rate, carry):
+            i, y, z, none = carry
+            tried, new = none * y + rate * z, (y + 0.1 * rate * y, z + y)
+            return i + 1, *(jnp.where(i >= 0, a, b + tried) for a, b in zip(new, (y, z), strict=True)), none
+
+        def run(gains):
+            carry = jnp.zeros(LANES, int), jnp.sum(gains) * RATES, jnp.sum(gains) * RATES, jnp.full(LANES, jnp.nan)
+            return run_lanes(lambda _, c: c, step, lambda _, c: c[0] < STEPS, RATES, carry, steps=STEPS, rounds=1)[1]
+
+        known = jnp.outer((1 + 0.1 * RATES) ** STEPS * RATES, jnp.ones(3))
+        np.testing.assert_allclose(jax.jacfwd(run)(jnp.arange(3.0)), known, rtol=1e-13)
+
     @pytest.mark.parametrize(("many", "launches"), [(8, 1), (9, 2)])
     def test_tangents_are_one_launch(self, many, launches, monkeypatch):
         made = []

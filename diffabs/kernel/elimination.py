@@ -10,8 +10,6 @@ import numpy as np
 from diffabs.kernel.graph import Graph, Level, Node
 from diffabs.kernel.linear import ONE, Algebra, Factor, Sum, Vertex, steps, terms
 
-TAME = {"add", "sub", "mul", "neg", "select", "lower", "higher", "max", "min", "abs", "sin", "cos", "tanh", "atan"}
-
 
 class Elimination:
     """The tangents of a program, made fewer."""
@@ -22,7 +20,6 @@ class Elimination:
         self.vertices: dict[int, Vertex] = {}
         self.readers: dict[int, set[int]] = {}
         self.kept: set[int] = set()  # as they are read by name
-        self.sure: set[int] = set()
         self.levels: dict[int, Level] = {}
         self.some = graph.input(dtype, Level.STEP, "any factor")
 
@@ -53,8 +50,10 @@ class Elimination:
         return min(cost, self._decided_cost(vertex)) if self._decides(vertex) else cost
 
     def _decides(self, vertex: Vertex) -> bool:
-        """Whether factors may be chosen, in place of tangents: what is not chosen must not be what is no number."""
-        return vertex.which is not None and all(x in self.sure for x in set(vertex.sum) ^ set(vertex.others))
+        """Whether factors may be chosen in place of tangents. A tangent that is not chosen, and no number, must not
+        matter: 0 times it would. Only what is given to the steps is a number for certain: a try may lead anywhere."""
+        once = set(vertex.sum) ^ set(vertex.others)
+        return vertex.which is not None and all(x not in self.vertices and self.levels[x] < Level.STEP for x in once)
 
     def _decided_cost(self, vertex: Vertex) -> int:
         keys = set(vertex.sum) | set(vertex.others)
@@ -94,30 +93,12 @@ class Elimination:
     def reduce(self, roots: Iterable[int]) -> None:
         """Eliminate what costs more than it spares."""
         self.kept.update(roots)
-        self._see_sure()
         left = True
         while left:
             before = len(self.vertices)
             for key in sorted(self.vertices, reverse=True):
                 self._try(key)
             left = len(self.vertices) < before
-
-    def _see_sure(self) -> None:
-        """What is no number only if a result is none, because no choice hides it; and what follows from such by factors
-        that are numbers."""
-        ends = set(self.kept)
-        for key in sorted(self.vertices, reverse=True):
-            vertex = self.vertices[key]
-            if key in self.kept and vertex.which is not None:
-                ends.update(x for sum in vertex.sums() for x in sum)
-            elif key in ends and vertex.which is None:
-                ends.update(vertex.sum)
-        self.sure = ends | (set(self.readers) - set(self.vertices))
-        tame = _tame(self.graph.nodes)
-        for key, vertex in sorted(self.vertices.items()):
-            factors = [(x, one.number) for sum in vertex.sums() for x, one in sum.items()]
-            if not vertex.reads and all(x in self.sure and (n is None or n.id in tame) for x, n in factors):
-                self.sure.add(key)
 
     def _try(self, key: int) -> None:
         vertex = self.vertices[key]
@@ -183,13 +164,3 @@ class Elimination:
         del self.vertices[key]
         for x in inner.sum:
             self.readers[x].discard(key)
-
-
-def _tame(nodes: list[Node]) -> set[int]:
-    """What is a number if those are of which it is made: nothing is divided by what changes in a step."""
-    found: set[int] = set()
-    for node in nodes:
-        given = node.level < Level.STEP or node.op == "input" or node.dtype == bool
-        if given or (node.op in TAME and all(x.id in found for x in node.args)):
-            found.add(node.id)
-    return found
