@@ -16,6 +16,7 @@ CUDA_RULES = f"{CUDA}::TestText::test_rules_are_those_of_jax"
 TOLD = f"{CUDA}::TestDriver::test_is_told_of_arrays_threads_and_lanes"
 KEPT, FINGERPRINT = "kernel/kept.py", "core/fingerprint.py"
 BINDING, TANGENTS, LAUNCH = "kernel/binding.py", "kernel/tangents.py", "test_kernel_tangents.py::TestLaunch"
+LINEAR = "kernel/linear.py"
 PUSHED, ENGINES = f"{LAUNCH}::test_derivatives_are_those_of_xla", "test_kernel_engines.py"
 TWO = f"{LAUNCH}::test_on_two_devices"
 SCENARIO = "test_kernel_tangents.py::test_a_scenario[slip-lmi"
@@ -122,12 +123,18 @@ KERNEL = [
     ("kernel: a sweep writes before it is refused", "sweep/run.py", 'if study.engine != "xla" and', "if False and",
      "test_kernel.py::TestSweep::test_is_refused_before_anything_is_written"),
     ("kernel: bits are counted in pairs", NUMBERS, "x, 0, 0x33333333", "x, 0, 0x13333333", RULES),
-    ("tangents: are multiplied by what they are divided by", TANGENTS,
-     'graph.op("mul", args[0], graph.op("div", graph.const(1, node.dtype), args[1]))',
-     'graph.op("mul", args[0], args[1])', f"{PUSHED}[of both]"),
+    ("tangents: are multiplied by what they are divided by", LINEAR,
+     'self.graph.op("div", self.graph.const(1, node.dtype), value(args[1]))', "value(args[1])", f"{PUSHED}[of both]"),
+    ("tangents: a product of factors is one of them", LINEAR, 'self.graph.op("mul", x.number, y.number)', "x.number",
+     f"{PUSHED}[three tangents]"),
+    ("tangents: what is not chosen matters", "kernel/elimination.py",
+     "all(x not in self.vertices and self.levels[x] < Level.STEP for x in once)", "True",
+     f"{LAUNCH}::test_what_is_not_chosen_does_not_matter"),
+    ("tangents: what nobody asks for is carried", TANGENTS, "if wanted is not None:", "if False:",
+     f"{LAUNCH}::test_only_what_is_asked_for_is_carried"),
     ("tangents: nothing follows from what moves later", TANGENTS, "if reached == do[Level.STEP]:", "if True:",
      f"{LAUNCH}::test_only_what_moves_is_carried"),
-    ("tangents: the second is the first", TANGENTS, "values + [_copy(new[x.id], k)", "values + [_copy(new[x.id], 0)",
+    ("tangents: the second is the first", TANGENTS, "copy_of(new[x.id], k) for", "copy_of(new[x.id], 0) for",
      f"{PUSHED}[three tangents]"),
     ("tangents: each launch has the first ones", BINDING, "jnp.pad(x, wide), first, first + each,",
      "jnp.pad(x, wide), 0, each,", f"{PUSHED}[eleven tangents]"),

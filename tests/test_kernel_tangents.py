@@ -32,6 +32,9 @@ pytestmark = pytest.mark.xdist_group("kernel tangents")
 LANES, STEPS = 37, 5
 RTOL = 1e-5  # of a run with adaptive steps: ten times that of a step
 EXACT, LANDED, SWITCHING = 1e-12, 1e-6, 2e-3  # of the largest derivative among the lanes, or of the metric
+# of a stop that is extrapolated over 400 s: XLA's own derivative moves by 1e-12 where the start does by an ulp
+ROUNDED = {"literal": 3e-12}
+LEAST = 1e-2  # a final slip error of 3e-4 is a difference of slips near 1, and has their digits
 PARTS_HERE = [case for case in CASES if case[0] != "stop"]
 
 
@@ -41,7 +44,7 @@ def _own_folder(monkeypatch):
     monkeypatch.setattr(launch, "VECTORS", 2)
 
 
-def chain(gain, rates, engine="kernel"):
+def chain(gain, rates, engine="kernel", wanted=None):
     """What follows from what, step by step: y from the gain, z from y, w from z; and what moves with nothing."""
 
     def step(rate, carry):
@@ -52,7 +55,9 @@ def chain(gain, rates, engine="kernel"):
     ones = jnp.ones(len(rates))
     carry = (jnp.zeros(len(rates), int), ones, ones, ones, ones)
     if engine == "kernel":
-        carry = run_lanes(lambda _, c: c, step, lambda _, c: c[0] < STEPS, rates, carry, steps=2, rounds=1)
+        carry = run_lanes(
+            lambda _, c: c, step, lambda _, c: c[0] < STEPS, rates, carry, steps=2, rounds=1, wanted=wanted
+        )
     else:
         for _ in range(STEPS):
             carry = jax.vmap(step)(rates, carry)
@@ -94,6 +99,33 @@ class TestLaunch:
         jax.jvp(lambda g: chain(g, RATES), (2.0,), (1.0,))
         assert seen[-1][Level.STEP] == (1, 2, 3)
         assert seen[-1][Level.LANE] == ()
+
+    def test_only_what_is_asked_for_is_carried(self, monkeypatch):
+        """The third number leads to nothing but itself, and has no tangent; the second has those that it has anyway."""
+        seen = []
+        spread = tangents.spread
+        monkeypatch.setattr(tangents, "spread", lambda f, one, *more: seen.append(one.do) or spread(f, one, *more))
+        wanted = (False, False, True, False, False)
+        found = jax.jvp(lambda g: chain(g, RATES, wanted=wanted), (2.0,), (1.0,))[1]
+        known = jax.jvp(lambda g: chain(g, RATES, "xla"), (2.0,), (1.0,))[1]
+        assert seen[-1][Level.STEP] == (1, 2)
+        np.testing.assert_allclose(found[1], known[1], rtol=2e-13)
+        assert not np.any(found[2])
+
+    def test_what_is_not_chosen_does_not_matter(self):
+        """A try may lead to what is no number, and is then not taken: neither are its tangents."""
+
+        def step(rate, carry):
+            i, y, z, none = carry
+            tried, new = none * y + rate * z, (y + 0.1 * rate * y, z + y)
+            return i + 1, *(jnp.where(i >= 0, a, b + tried) for a, b in zip(new, (y, z), strict=True)), none
+
+        def run(gains):
+            carry = jnp.zeros(LANES, int), jnp.sum(gains) * RATES, jnp.sum(gains) * RATES, jnp.full(LANES, jnp.nan)
+            return run_lanes(lambda _, c: c, step, lambda _, c: c[0] < STEPS, RATES, carry, steps=STEPS, rounds=1)[1]
+
+        known = jnp.outer((1 + 0.1 * RATES) ** STEPS * RATES, jnp.ones(3))
+        np.testing.assert_allclose(jax.jacfwd(run)(jnp.arange(3.0)), known, rtol=1e-13)
 
     @pytest.mark.parametrize(("many", "launches"), [(8, 1), (9, 2)])
     def test_tangents_are_one_launch(self, many, launches, monkeypatch):
@@ -188,7 +220,7 @@ def compare(given, close, values=1e-13):
     for name, slope in expected.items():
         np.testing.assert_allclose(metrics[name], known[name], rtol=values, atol=1e-12, err_msg=name)
         size = max(np.nanmax(np.abs(x), initial=0.0) for x in (slope, known[name]))
-        np.testing.assert_allclose(found[name], slope, rtol=0, atol=close * max(size, 1e-3), err_msg=name)
+        np.testing.assert_allclose(found[name], slope, rtol=0, atol=close * max(size, LEAST), err_msg=name)
 
 
 @pytest.mark.slow
@@ -196,7 +228,7 @@ def compare(given, close, values=1e-13):
 def test_a_part(family, name):
     """With steps of the grid alone."""
     loop, path = with_part(family, name)
-    compare((loop, d.FixedStep(1e-3, 0.06, kinks=False), usual(loop.plant), path), EXACT)
+    compare((loop, d.FixedStep(1e-3, 0.06, kinks=False), usual(loop.plant), path), ROUNDED.get(name, EXACT))
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
@@ -55,6 +56,23 @@ def follows(function: Callable[[Any], Any], signal: Any) -> bool:
         if not _zero(step) and any(not hasattr(v, "val") and v in reached for v in step.invars):
             reached.update(step.outvars)
     return any(not hasattr(v, "val") and v in reached for v in program.outvars)
+
+
+def moving(function: Callable[[Any, Any], Any], fixed: Any, batch: Any) -> Any:
+    """Return by which leaves of `batch` (n, ...) function(fixed, batch), of one member, has derivatives: truths, as
+    `batch`. What only decides has none."""
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (fixed, batch))
+    program = jax.make_jaxpr(function)(*one).jaxpr
+
+    def moves(atom: Any) -> bool:
+        return not hasattr(atom, "val") and jnp.issubdtype(atom.aval.dtype, jnp.inexact)
+
+    needed = {atom for atom in program.outvars if moves(atom)}
+    for step in reversed(program.eqns):
+        if not needed.isdisjoint(step.outvars):
+            needed.update(atom for atom in step.invars if moves(atom))
+    leaves, tree = jax.tree.flatten(batch)
+    return tree.unflatten([atom in needed for atom in program.invars[-len(leaves) :]])
 
 
 def _zero(step: Any) -> bool:

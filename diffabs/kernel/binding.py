@@ -26,10 +26,15 @@ REVERSE = "a kernel has no reverse mode: forward mode (jax.jvp, jax.jacfwd) has 
 class Lanes:
     """Functions of one lane, and what was made of them so far. Equal only to itself."""
 
-    def __init__(self, functions: Functions, launch: Callable[[Program, list[Any], list[Any]], list[Any]]):
-        """launch: of a program, the arrays before those of the carry, and these; returns the carry. Translated at once:
-        raises Unsupported."""
-        self.functions, self.launch = functions, launch
+    def __init__(
+        self,
+        functions: Functions,
+        launch: Callable[[Program, list[Any], list[Any]], list[Any]],
+        wanted: tuple[int, ...] | None = None,
+    ):
+        """launch: of a program, the arrays before those of the carry, and these; returns the carry. wanted: arrays of
+        the carry whose tangents matter in the end, None for all. Translated at once: raises Unsupported."""
+        self.functions, self.launch, self.wanted = functions, launch, wanted
         self._made: dict[Any, Any] = {}
         self.derivative(None)
 
@@ -39,7 +44,7 @@ class Lanes:
             moving = {level: tuple(i for one, i in begins or () if one == level) for level in LEVELS}
             plain = begins is None
             self._made[begins] = (
-                tangents.plain(self.functions) if plain else tangents.derivative(self.functions, moving)
+                tangents.plain(self.functions) if plain else tangents.derivative(self.functions, moving, self.wanted)
             )
         return self._made[begins]
 

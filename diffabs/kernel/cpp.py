@@ -13,7 +13,6 @@ from diffabs.kernel.graph import Level, Node, real
 from diffabs.kernel.program import Block, Branch, Place, Program, live, ordered
 
 ONE = range(1)
-CHAINS = 4  # vectors times tangents that are worked out at a time: more do not fit into the registers
 SHORT = 24  # operations in a branch: fewer are worked out anyway
 TYPES = {
     "float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "uint32": "u32", "uint64": "u64",
@@ -243,7 +242,7 @@ class Text:
 
     def _lines(self, block: Block, vectors: range, indent: str) -> Iterator[str]:
         """The lines of a block, for these vectors."""
-        for item in apart(block, self.program.tangents, max(1, CHAINS // len(vectors))):
+        for item in block:
             if isinstance(item, Branch):
                 yield from self._branch(item, vectors, indent)
             else:
@@ -297,24 +296,6 @@ class Text:
             return args[0]
         assert node.op == "table", node.op
         return f"entry(s.{self.columns[tuple(x.id for x in node.args[1:])][0]}, {args[0]})"
-
-
-def apart(block: Block, tangents: dict[int, int], together: int) -> Iterator[Node | Branch]:
-    """Values before tangents, and these one group of so many after the other, up to the next branch: so much is in
-    registers at a time."""
-    line: list[Node] = []
-
-    def sorted_line() -> list[Node]:
-        return sorted(line, key=lambda node: tangents.get(node.id, -together) // together)
-
-    for item in block:
-        if isinstance(item, Branch):
-            yield from sorted_line()
-            yield item
-            line = []
-        else:
-            line.append(item)
-    yield from sorted_line()
 
 
 def _spread(node: Node, value: str) -> str:

@@ -30,6 +30,7 @@ def run_lanes(
     *,
     steps: int,
     rounds: int,
+    wanted: Any = None,
 ) -> Any:
     """Return the carry (pytree, n lanes first) of lanes that are all over.
 
@@ -37,6 +38,7 @@ def run_lanes(
     running: (lane, carry) -> whether it goes on; asked after so many `rounds` of these. Until then `step` must do
         nothing that matters in a lane that is over
     lane: what is a lane's own, (n, ...) each; what the functions close over is the same for all
+    wanted: truths as the carry, of which derivatives are asked for afterwards: those of the rest are zero; None for all
 
     Works under jit and vmap, with derivatives forward. Raises Unsupported for an operation that has no rule, NoCompiler
     where there is none, ValueError for reverse mode."""
@@ -48,7 +50,8 @@ def run_lanes(
     leaves, tree = jax.tree.flatten(carry)
     given = [data(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
     launch = functools.partial(_launched, shape=cpp.Shape(VECTORS, steps, rounds))
-    lanes = binding.Lanes(functions._replace(uniform=[]), launch)
+    which = None if wanted is None else tuple(i for i, on in enumerate(jax.tree.leaves(wanted)) if on)
+    lanes = binding.Lanes(functions._replace(uniform=[]), launch, which)
     found = binding.bound(lanes, given)
     return tree.unflatten([_like(x, leaf) for x, leaf in zip(found, leaves, strict=True)])
 
@@ -68,8 +71,7 @@ def _launched(made: program.Program, before: list[Any], carry: list[Any], shape:
 
 def target(made: program.Program, shape: cpp.Shape) -> str:
     """Return the name under which XLA knows a program; compiled, if it was not before. Raises NoCompiler."""
-    many = 1 + max(made.tangents.values(), default=0)
-    shape = shape._replace(vectors=max(1, shape.vectors // many))  # tangents, too, do not wait for each other
+    shape = shape._replace(vectors=max(1, shape.vectors // max(1, made.tangents)))  # tangents do not wait, either
     source = cpp.text(made, shape)
     while cpp.operations(source) * shape.vectors > LINES and shape.vectors > 1:
         shape = shape._replace(vectors=shape.vectors // 2)

@@ -29,14 +29,14 @@ class Place(NamedTuple):
 class Program:
     """inputs: numbers of the carry, of the lanes, and uniform ones, by place; results: for each function by name its
     outputs, number by number; uniform: arrays that all lanes share; sizes: how many numbers of a lane the arrays of
-    each level have; dtype: of the real numbers; tangents: of what is one of several tangents, which one, by node"""
+    each level have; dtype: of the real numbers; tangents: how many there are of each number that has one"""
 
     inputs: dict[Place, Node]
     results: dict[str, list[Node]]
     uniform: list[Any]
     sizes: dict[Level, list[int]]
     dtype: np.dtype
-    tangents: dict[int, int] = dataclasses.field(default_factory=dict)
+    tangents: int = 0
 
     def carried(self) -> list[Node]:
         """The numbers of the carry, in their order."""

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.extend.core as jex
 
+from diffabs.kernel.copies import copy_of, following, rebuilt
 from diffabs.kernel.graph import Graph, Level, Node, real
 from diffabs.kernel.program import Function, Functions, Place, Program, checked, live, translated
 
@@ -35,11 +36,16 @@ class Derivative(NamedTuple):
     do: Moving
 
 
-def derivative(functions: Functions, begins: Moving) -> Derivative:
-    """Return the derivative of functions where these arrays have tangents to begin with. Raises Unsupported."""
+def derivative(functions: Functions, begins: Moving, wanted: Iterable[int] | None = None) -> Derivative:
+    """Return the derivative of functions where these arrays have tangents to begin with; `wanted`: arrays of the carry
+    whose tangents matter in the end, None for all. Raises Unsupported."""
     could = begins | {Level.STEP: tuple(i for i, x in enumerate(functions.types[Level.STEP]) if real(x.dtype))}
     program = translated(_pushed(functions, could))
-    return Derivative(program, could, begins | {Level.STEP: _reached(program, functions, could, begins)})
+    reached = _reached(program, functions, could, begins)
+    if wanted is not None:
+        needed = _needed(program, functions, could, set(wanted))
+        reached = tuple(i for i in reached if i in needed)
+    return Derivative(program, could, begins | {Level.STEP: reached})
 
 
 def plain(functions: Functions) -> Derivative:
@@ -65,7 +71,7 @@ def spread(functions: Functions, one: Derivative, many: int, as_lanes: frozenset
     Unsupported for one of too many operations."""
     graph, old = Graph(), one.program
     inputs: dict[Place, Node] = {}
-    new: dict[int, list[Node]] = {}
+    given: dict[int, list[Node]] = {}
     sizes: dict[Level, list[int]] = {level: [] for level in LEVELS}
     for level, keys in arranged(functions, one.do, as_lanes).items():
         for array, key in enumerate(keys):
@@ -75,17 +81,17 @@ def spread(functions: Functions, one: Derivative, many: int, as_lanes: frozenset
                 for entry in range(size):
                     node, place = old.inputs[Place(key.level, number, entry)], Place(level, array, k * size + entry)
                     inputs[place] = graph.input(node.dtype, level, place)
-                    new.setdefault(node.id, []).append(inputs[place])
+                    given.setdefault(node.id, []).append(inputs[place])
             sizes[level].append(size * copies)
-    _rebuild(graph, functions, old, new)
-    results = {name: [new[node.id][0] for node in nodes] for name, nodes in old.results.items() if name == ASKED}
-    for name in (name for name in old.results if name != ASKED):
-        arrays = _arrays(functions, one, name)
-        values = [new[node.id][0] for nodes in arrays[: len(functions.types[Level.STEP])] for node in nodes]
-        slopes = [arrays[_number(functions, one, Key(Level.STEP, i, True))] for i in one.do[Level.STEP]]
-        results[name] = values + [_copy(new[x.id], k) for nodes in slopes for k in range(many) for x in nodes]
-    copies = {node.id: k for nodes in new.values() if len(nodes) > 1 for k, node in enumerate(nodes)}
-    return checked(Program(inputs, results, functions.uniform, sizes, old.dtype, copies), len(graph.nodes))
+    slopes = {node.id for place, node in old.inputs.items() if place.array >= len(functions.types[place.level])}
+    ends = {name: _results(functions, one, name) for name in old.results}
+    roots = [node for arrays in ends.values() for nodes, _ in arrays for node in nodes]
+    new = rebuilt(graph, roots, given, slopes, (many, old.dtype))
+    results = {
+        name: [copy_of(new[x.id], k) for nodes, moves in arrays for k in range(many if moves else 1) for x in nodes]
+        for name, arrays in ends.items()
+    }
+    return checked(Program(inputs, results, functions.uniform, sizes, old.dtype, many), len(graph.nodes))
 
 
 def _number(functions: Functions, one: Derivative, key: Key) -> int:
@@ -94,67 +100,59 @@ def _number(functions: Functions, one: Derivative, key: Key) -> int:
     return first + one.could[key.level].index(key.number) if key.tangent else key.number
 
 
+def _results(functions: Functions, one: Derivative, name: str) -> list[tuple[list[Node], bool]]:
+    """What a function of the program of several tangents returns, array by array: those that it has of one tangent, and
+    whether they are tangents."""
+    if name == ASKED:
+        return [(one.program.results[name], False)]
+    arrays = _arrays(functions, one, name)
+    slopes = [arrays[_number(functions, one, Key(Level.STEP, i, True))] for i in one.do[Level.STEP]]
+    values = arrays[: len(functions.types[Level.STEP])]
+    return [(nodes, False) for nodes in values] + [(nodes, True) for nodes in slopes]
+
+
 def _arrays(functions: Functions, one: Derivative, name: str) -> list[list[Node]]:
     """The results of a function that changes the carry, array by array."""
     rest = iter(one.program.results[name])
     return [[next(rest) for _ in range(size)] for size in one.program.sizes[Level.STEP]]
 
 
-def _copy(nodes: list[Node], k: int) -> Node:
-    return nodes[k if len(nodes) > 1 else 0]
-
-
-def _rebuild(graph: Graph, functions: Functions, old: Program, new: dict[int, list[Node]]) -> None:
-    """Put beside each node what becomes of it, as stands there beside inputs: itself, one for each tangent, or zero."""
-    nodes = live([node for results in old.results.values() for node in results])
-    slopes = {node.id for place, node in old.inputs.items() if place.array >= len(functions.types[place.level])}
-    moving = _following(nodes, {i for i in slopes if i in new})
-    slopes = _following(nodes, slopes)
-    for node in nodes:
-        if node.id in moving and node.op != "input":
-            copies = range(max(len(new[x.id]) for x in node.args))
-            new[node.id] = [_again(graph, node, [_copy(new[x.id], k) for x in node.args], slopes) for k in copies]
-        elif node.id in slopes and node.id not in moving:
-            new[node.id] = [graph.const(0, node.dtype)]
-        elif node.op != "input":
-            new[node.id] = [graph.again(node, [new[x.id][0] for x in node.args])]
-
-
-def _again(graph: Graph, node: Node, args: list[Node], slopes: set[int]) -> Node:
-    """The same of a tangent; all that are divided by a number share its inverse."""
-    if node.op == "div" and node.args[1].id not in slopes:
-        return graph.op("mul", args[0], graph.op("div", graph.const(1, node.dtype), args[1]))
-    return graph.again(node, args)
-
-
-def _following(nodes: Iterable[Node], first: set[int]) -> set[int]:
-    """What is made of these, themselves included; nodes with arguments first."""
-    found = set(first)
-    found.update(node.id for node in nodes if any(x.id in found for x in node.args))
-    return found
-
-
 def _reached(program: Program, functions: Functions, could: Moving, begins: Moving) -> tuple[int, ...]:
     """The arrays of the carry that have tangents in the end."""
-    one = Derivative(program, could, could)
-    names = [name for name in program.results if name != ASKED]
-    ends = {
-        i: [
-            node
-            for name in names
-            for node in _arrays(functions, one, name)[_number(functions, one, Key(Level.STEP, i, True))]
-        ]
-        for i in could[Level.STEP]
-    }
+    one, ends = Derivative(program, could, could), _ends(program, functions, could)
     nodes = live([node for nodes in ends.values() for node in nodes])
     do = begins
     while True:
         starts = {(level, _number(functions, one, Key(level, i, True))) for level in LEVELS for i in do[level]}
-        found = _following(nodes, {node.id for p, node in program.inputs.items() if (p.level, p.array) in starts})
+        found = following(nodes, {node.id for p, node in program.inputs.items() if (p.level, p.array) in starts})
         reached = tuple(i for i, nodes in ends.items() if i in do[Level.STEP] or any(x.id in found for x in nodes))
         if reached == do[Level.STEP]:
             return reached
         do = do | {Level.STEP: reached}
+
+
+def _needed(program: Program, functions: Functions, could: Moving, wanted: set[int]) -> set[int]:
+    """The arrays of the carry whose tangents lead to those that are wanted."""
+    ends, found = _ends(program, functions, could), set(wanted)
+    first = len(functions.types[Level.STEP])
+    numbers = {first + at: i for at, i in enumerate(could[Level.STEP])}
+    left = [i for i in wanted if i in ends]
+    while left:
+        read = [n.attr for n in live(ends[left.pop()]) if n.op == "input" and n.attr.level == Level.STEP]
+        new = {numbers[place.array] for place in read if place.array >= first} - found
+        found |= new
+        left += new
+    return found
+
+
+def _ends(program: Program, functions: Functions, could: Moving) -> dict[int, list[Node]]:
+    """What becomes of the tangents of each array of the carry."""
+    one = Derivative(program, could, could)
+    arrays = [_arrays(functions, one, name) for name in program.results if name != ASKED]
+    return {
+        i: [node for each in arrays for node in each[_number(functions, one, Key(Level.STEP, i, True))]]
+        for i in could[Level.STEP]
+    }
 
 
 def _pushed(functions: Functions, could: Moving) -> Functions:

@@ -14,7 +14,7 @@ from diffabs.core.compiling import traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
-from diffabs.core.tracing import pushed
+from diffabs.core.tracing import moving, pushed
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.kept import Kept
 from diffabs.kernel.launch import run_lanes
@@ -101,16 +101,21 @@ def _run(
         output = built(lane[0])[0].plant.output(carry.point.state.plant)
         return carry.running & ~enough.reached(lane[2], output)
 
+    def judged(mine: Any, carry: Any) -> Run:
+        return judge(*built(mine), carry)[0]
+
+    begins = jax.vmap(start)(leaves, keys, accepted)
     carry = run_lanes(
         lambda lane, carry: method.renew(built(lane[0])[0], carry),
         lambda lane, carry: method.step(*built(lane[0]), lane[1], carry),
         running,
         (leaves, keys, own),
-        jax.vmap(start)(leaves, keys, accepted),
+        begins,
         steps=BLOCK,
         rounds=1 if enough is None else ROUND // BLOCK,
+        wanted=moving(judged, leaves, begins),
     )
-    return jax.vmap(lambda mine, carry: judge(*built(mine), carry)[0])(leaves, carry)
+    return jax.vmap(judged)(leaves, carry)
 
 
 def _only(accepted: Any, carry: Any) -> Any:
