@@ -1,6 +1,6 @@
-"""Run a loop: a scan over Runge-Kutta steps that returns a trajectory, or only what is measured.
+"""Run a loop, by fixed or adaptive Runge-Kutta steps, and return a trajectory, or only what is measured.
 
-A step that crosses the stop, or an event of a block, is tried again, shorter, until it ends there (`stepper`). Every
+A step that crosses the stop, or an event of a block, is tried again, shorter, until it ends there (`landing`). Every
 objective is thus exact to the order of the method and differentiable, wherever the crossing falls."""
 
 import math
