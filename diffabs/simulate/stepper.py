@@ -1,4 +1,4 @@
-"""Which steps a run takes: those of the grid, cut where an event lies between.
+"""Which steps a run under `FixedStep` takes: those of the grid, cut where an event lies between.
 
 A step within which a margin falls through zero (the stop's, a block's, that of a comparison in the flow) is tried
 again, shorter, until one ends on the zero (`landing`). So the run is a discretisation of the exact solution on both
