@@ -130,6 +130,8 @@ FACE += [
     ("a sampled filter may be as fast as it likes", "controllers/sampled.py", "array(cutoff) * array(period) < 2",
      "array(cutoff) * array(period) < 200",
      "test_refusals.py::test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows"),
+    ("a docstring names a module that has moved", "tune/constraints.py", "`design.interior.differentiable`",
+     "`design.sensitivity`", "test_docstrings.py::test_what_is_named_is_there"),
     ("a filter sampled on the grid may be as fast as it likes", "controllers/sampled_on_grid.py",
      "within_period(self.controller,", "within_period(None,",
      "test_refusals.py::test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows"),

@@ -183,7 +183,7 @@ def _linearized(model: OperatingPoint) -> Closed:
         moved = z.at[~inside].set(free[:-1])
         return jnp.append(one.flow(moved, free[-1])[~inside], one.tracking(moved)[0][0] - setpoint)
 
-    free = _root(still, jnp.append(z[~inside], 0.0))
+    free = root(still, jnp.append(z[~inside], 0.0))
     z = z.at[~inside].set(free[:-1])
 
     def holding(memory: Any, z: Any = z) -> Any:
@@ -191,14 +191,14 @@ def _linearized(model: OperatingPoint) -> Closed:
         moved = z.at[inside].set(memory)
         return jnp.append(one.flow(moved, free[-1])[inside], one.command(moved) - free[-1])
 
-    z = z.at[inside].set(_root(holding, z[inside]))
+    z = z.at[inside].set(root(holding, z[inside]))
     a, b = jax.jacfwd(one.flow, (0, 1))(z, free[-1])
     residue = jnp.max(jnp.abs(still(free))) / (1 + jnp.max(jnp.abs(free)))
     return Closed(a, b[:, None], jax.jacfwd(one.command)(z), residue)
 
 
-def _root(function: Any, x: Any) -> Any:
-    """Where a function is zero, or least in squares, by Gauss and Newton. Its derivative is that of the last step, the
+def root(function: Any, x: Any) -> Any:
+    """Return where a function is zero, or least in squares, by Gauss and Newton. Its derivative is that of the last step, the
     implicit function theorem's."""
 
     def step(x: Any, function: Any = function) -> Any:
