@@ -132,6 +132,8 @@ FACE += [
      "test_refusals.py::test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows"),
     ("a docstring names a module that has moved", "tune/constraints.py", "`design.interior.differentiable`",
      "`design.sensitivity`", "test_docstrings.py::test_what_is_named_is_there"),
+    ("every control is a torque", "design/state_feedback.py", "in_words(line, units) for line",
+     "line.replace('{control}', 'N m') for line", "test_linearize.py::test_what_is_neglected"),
     ("a filter sampled on the grid may be as fast as it likes", "controllers/sampled_on_grid.py",
      "within_period(self.controller,", "within_period(None,",
      "test_refusals.py::test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows"),

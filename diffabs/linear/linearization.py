@@ -107,8 +107,8 @@ def untouched(plant: Plant, state: Any, outputs: Sequence[str]) -> np.ndarray:
 
 
 def used_leaves(plant: Plant, state: Any, outputs: Sequence[str]) -> list[bool]:
-    """Return of each leaf of the state whether some output is computed from it. From the traced program, not from values: it
-    must be known while the parameters are tracers."""
+    """Return of each leaf of the state whether some output is computed from it. From the traced program, not from
+    values: it must be known while the parameters are tracers."""
     leaves, tree = jax.tree.flatten(state)
 
     def select(*leaves: Any) -> Any:

@@ -198,8 +198,8 @@ def _linearized(model: OperatingPoint) -> Closed:
 
 
 def root(function: Any, x: Any) -> Any:
-    """Return where a function is zero, or least in squares, by Gauss and Newton. Its derivative is that of the last step, the
-    implicit function theorem's."""
+    """Return where a function is zero, or least in squares, by Gauss and Newton. Its derivative is that of the last
+    step, the implicit function theorem's."""
 
     def step(x: Any, function: Any = function) -> Any:
         return x - jax.lax.stop_gradient(jnp.linalg.pinv(jax.jacfwd(function)(x))) @ function(x)
