@@ -1,4 +1,4 @@
-"""Simulate, differentiate, tune and certify controllers for braking wheels."""
+"""Simulate, differentiate, tune and certify controllers for braking wheels and two-wheelers."""
 
 from diffabs.core import interrupt as _interrupt
 

@@ -19,7 +19,6 @@ from diffabs import Loop, replace
 WIDTHS = (1e-3, 1e-4, 1e-5)  # of differences, in units of the bounds
 GRAVITY = 9.81
 DENSE = 40  # points of a period at which the slip is looked at
-EARLY = (0, 1, 2, 3)  # factors of the road near the start, of which differences are taken
 
 
 def by_block(attack: Attack, z: np.ndarray) -> dict[str, float]:

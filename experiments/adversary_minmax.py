@@ -67,7 +67,7 @@ def hardened(
         lanes[config.box + count : config.box + count + len(found)] = found
         count += len(found)
         loops.append(_tuned(loops[-1], bounds, config, attack, lanes))
-        told(f"round {number}: {_said(loops[-1], config)}")
+        told(f"round {number}: {_said(loops[-1])}")
     return loops, lanes[config.box : config.box + count]
 
 
@@ -86,7 +86,7 @@ def _tuned(loop: Loop, bounds: Bounds, config: Rounds, attack: Attack, lanes: np
     return found.part
 
 
-def _said(loop: Loop, config: Rounds) -> str:
+def _said(loop: Loop) -> str:
     one: Any = loop
     gain = ", ".join(f"{k:.0f}" for k in np.asarray(one.controller.controller.gain))
     tracking = float(one.controller.controller.antiwindup.tracking_time)

@@ -27,26 +27,23 @@ import arm_draws
 import jax
 import jax.numpy as jnp
 import numpy as np
+from arm_machine import CLEAR, Machine
 from scipy.optimize import minimize
 
 from diffabs import Batch, FixedStep, Loop, plot
-from diffabs.core.pytree import Scalar, Vector, param, part, pytree, replace, static
+from diffabs.core.pytree import replace
 from diffabs.design import certify
 from diffabs.design.attraction import Reach, largest
 from diffabs.design.parameter_grid import gridded
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import recoverable_bound
-from diffabs.linear.regulator import lqr
 from diffabs.objectives import BALANCE, SoftLoss
 from diffabs.papers import record
-from diffabs.plants import ArmBalance
 from diffabs.scenario.scenario import load
 from diffabs.simulate.run import rollout
 from diffabs.tune import Method, Stopping, tune
 
 START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])
-CLEAR = 0.05  # m, between the hanging arm and the ground
-ROTOR = 2e-4  # kg m^2
 SHARP = 40.0  # of the smooth minimum over riders
 DIRECTION = {"initial.theta": START[0], "initial.phi": START[2]}
 # The multiple that the paper's machine with a hanging arm recovers under its LQR: `reproduce arm-balance`.
@@ -84,51 +81,6 @@ class Config:
     alone: tuple[int, str] | None = (2, "flywheel")  # which of those tuned is then improved for one rider
     draws: arm_draws.Draws = dataclasses.field(default_factory=arm_draws.Draws)
     out: str = "out/experiments/arm_codesign"
-
-
-@pytree
-class Machine:
-    """A machine and its LQR weights; `closed()` is the loop."""
-
-    loop: Loop = part(default=Loop)
-    mount: Scalar = param(default=0.7, unit="m")
-    reach: Scalar = param(default=0.95, unit="1")
-    offset: Scalar = param(default=0.5, unit="1")
-    arm_mass: Scalar = param(default=30.0, unit="kg")
-    constant: Scalar = param(default=0.1, unit="N m/A")
-    gear: Scalar = param(default=60.0, unit="1")
-    rider: Scalar = param(default=95.0, unit="kg")
-    log_q: Vector = param(default=(0.0,) * 6, unit="1")
-    log_r: Scalar = param(default=-6.0, unit="1")
-    resistance: float = static(default=3.0)
-    current: float = static(default=16.0)
-
-    def plant(self) -> ArmBalance:
-        """The two-wheeler with this arm and motor."""
-        span = self.reach * (self.mount - CLEAR)
-        length, half = -self.offset * span, (1 - self.offset) * span
-        return dataclasses.replace(
-            self.loop.plant,
-            mount_height=self.mount,
-            arm_length=length,
-            arm_mass=self.arm_mass,
-            arm_inertia=self.arm_mass * half**2 / 3,
-            torque_constant=self.constant,
-            back_emf=self.constant,
-            gear=self.gear,
-            rotor_inertia=ROTOR + 0.0 * self.gear,
-            resistance=self.resistance + 0.0 * self.gear,
-            current_max=self.current + 0.0 * self.gear,
-        )
-
-    def closed(self) -> Loop:
-        """The loop with the LQR for one rider."""
-        plant = self.plant()
-        a, b = BalanceModel(plant=dataclasses.replace(plant, rider_mass=self.rider)).matrices()
-        gain = lqr(a, b, jnp.diag(jnp.exp(jnp.asarray(self.log_q))), jnp.exp(jnp.asarray(self.log_r))[None, None]).gain[
-            0
-        ]
-        return replace(dataclasses.replace(self.loop, plant=plant), {"controller.gain": gain})
 
 
 WEIGHTS = {"log_q": (-8.0, 12.0), "log_r": (-9.0, 4.0)}

@@ -3,7 +3,7 @@
 The region of attraction is a strip, bounded by what 48 V can do about the one unstable mode. Its share of the box
 |theta0|, |phi0| <= 0.1, by area, is a count, which has no derivative; minimised is the mean of `SoftLoss` over starts,
 a sigmoid of log |x(T)|, through the closed loop and through the Riccati equation, in the weights Q = diag(q) and R. The
-count is shown beside it, and the share that some control at 48 V recovers in the linear model (`design.recovery`).
+count is shown beside it, and the share that some control at 48 V recovers in the linear model (`linear.recoverable`).
 
 What comes out is then certified at the linearisation: a common Lyapunov matrix for riders of 40 to 100 kg whose spring
 and damper are off by 30 %.

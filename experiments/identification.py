@@ -18,9 +18,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from identification_figures import UNITS, draw_curves, draw_residuals
 from jax.tree_util import Partial
 
-from diffabs import FixedStep, Loop, plot
+from diffabs import FixedStep, Loop
 from diffabs.controllers import PID, ConstantTorque
 from diffabs.core.pytree import Scalar, Vector, param, pytree, strong
 from diffabs.identify.fit import Identified, Tolerances
@@ -30,14 +31,13 @@ from diffabs.identify.table import Table
 from diffabs.papers import record, slip_estimator
 from diffabs.plants import QuarterCar
 from diffabs.references import FixedSlip, PeakLatch
-from diffabs.roads import SPLINE_B, MagicFormula, Tabulated
+from diffabs.roads import MagicFormula, Tabulated
 from diffabs.roads.tabulated import PiecewiseCubic
 from diffabs.scenario.defaults import braking
 from diffabs.stops import Standstill
 
 PATHS = ("plant.inertia", "plant.road.B", "plant.road.C", "plant.road.D", "plant.road.E")
 METRICS = ("stop_time", "stop_distance")
-UNITS = ("s", "m")
 # Knots as parts of the peak's slip, and of the way from there to slip 1: dense where the latch and the two targets lie.
 BELOW = (0.15, 0.3, 0.45, 0.6, 0.75, 0.88)
 ABOVE = (0.02, 0.05, 0.08, 0.105, 0.13, 0.2, 0.35, 0.6, 1.0)
@@ -210,44 +210,6 @@ def known(found: Identified) -> list[dict[str, Any]]:
     values = np.concatenate([np.ravel(x) for x in found.values.values()])
     rows = zip(found.uncertainty.deviations.items(), values, strict=True)
     return [{"parameter": name, "value": float(value), "deviation": sd} for (name, sd), value in rows]
-
-
-def draw_curves(config: Config, formula: Identified, splines: dict[str, Identified]) -> Any:
-    """Stated curves, and what the tables make of them."""
-    figure, axes = plot.sheet(1, 2, title="Friction curves from Tables 1 and 2", size=(6, 4))
-    s = np.linspace(0, 1, 2001)
-    for ax in axes:
-        for i, (name, means) in enumerate(config.priors):
-            road = MagicFormula(**dict(zip("BCDE", means[1:], strict=True)))
-            ax.plot(s, road.friction(s), ":", color=plot.COLOURS[i], linewidth=1.1)
-            curve = jax.vmap(splines[name].part.plant.road.friction)(s)
-            ax.plot(s, curve, color=plot.COLOURS[i], linewidth=1.4, label=f"spline, {name}")
-        ax.plot(s, formula.part.plant.road.friction(s), "--", color="black", linewidth=1.6, label="Magic Formula, all")
-        ax.plot(s, jax.vmap(SPLINE_B.friction)(s), "-.", color=plot.GREY, linewidth=1.8, label="spline B, to compare")
-        plot.label(ax, "slip [1]", "friction coefficient [1]", legend=ax is axes[0])
-    axes[0].set_title("dotted: the stated priors", fontsize=11)
-    axes[1].set_title("where the runs have been", fontsize=11)
-    axes[1].set_xlim(0, 0.3)
-    axes[1].set_ylim(0.8, 1.02)
-    return figure
-
-
-def draw_residuals(config: Config, fits: dict[str, Identified]) -> Any:
-    """Differences from the tables by row."""
-    figure, axes = plot.sheet(1, 2, title="What the fits leave of Tables 1 and 2", size=(6, 4), sharey=True)
-    rows = list(slip_estimator.PUBLISHED)
-    for j, (ax, unit) in enumerate(zip(axes, UNITS, strict=True)):
-        for i, (name, found) in enumerate(fits.items()):
-            y = np.arange(len(rows)) + 0.12 * (i - (len(fits) - 1) / 2)
-            ax.plot(found.residuals.reshape(-1, 2)[:, j], y, "osD^v"[i % 5], color=plot.COLOURS[i], label=name, ms=5)
-        ax.axvspan(-config.rounding[j], config.rounding[j], color="#DDDDDD", zorder=0)
-        for sign in (-1, 1):
-            ax.axvline(sign * config.weights[j], color=plot.GREY, linewidth=1, linestyle="--")
-        ax.set_yticks(range(len(rows)), rows)
-        quantity = ("stopping time", "stopping distance")[j]
-        plot.label(ax, f"{quantity}, ours - published [{unit}]", "", "grey: rounding; dashed: bound", legend=j == 0)
-    axes[0].invert_yaxis()
-    return figure
 
 
 def from_tables(config: Config) -> tuple[list[dict[str, Any]], dict[str, Identified]]:

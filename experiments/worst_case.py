@@ -54,7 +54,7 @@ class Config:
     out: str = "out/experiments/worst_case"
 
 
-def loops(config: Config) -> dict[str, Loop]:
+def loops() -> dict[str, Loop]:
     """The cure, and the published gain in its place."""
     cure = load("slip-cured").loop
     feedback = StateFeedback(gain=np.array(lmi_design.PUBLISHED), torque_min=0.0, torque_max=9.03)
@@ -143,7 +143,7 @@ def figures(config: Config, worst: dict[str, WorstCase], those: dict[str, Loop],
 def main(config: Config | None = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
-    those, rows, worst, random, reports, at_corner = loops(config), [], {}, {}, {}, {}
+    those, rows, worst, random, reports, at_corner = loops(), [], {}, {}, {}, {}
     for name, one in those.items():
         begun = time.perf_counter()
         worst[name] = found(config, one)

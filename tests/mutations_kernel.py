@@ -1,7 +1,7 @@
 """Mutations of the kernel for `mutations.py`: name, file, old, new, test."""
 
-GRAPH, ARRAYS, NUMBERS, DRAWS, NESTED = (
-    f"kernel/{name}.py" for name in ("graph", "arrays", "elementwise", "draws", "nested")
+GRAPH, OPERATIONS, ARRAYS, NUMBERS, DRAWS, NESTED = (
+    f"kernel/{name}.py" for name in ("graph", "operations", "arrays", "elementwise", "draws", "nested")
 )
 HEADER = "kernel/native/functions.h"
 RUNS, FUNCTIONS = "test_kernel.py::TestRuns::test_are_those_of_xla", "test_kernel_native.py"
@@ -30,9 +30,10 @@ KERNEL = [
      "lane[p] >= 0 && !get(on[q], 0)", RUNS),
     ("kernel: what belongs to a lane is not worked out anew", "kernel/native/drive.h", "if (fresh) begin(b, s, q);",
      "", RUNS),
-    ("kernel: equal operations are those of equal arguments in any order", GRAPH, '"add", "mul", "and"',
+    ("kernel: equal operations are those of equal arguments in any order", OPERATIONS, '"add", "mul", "and"',
      '"add", "sub", "mul", "and"', "test_kernel.py::TestGraph::test_equal_operations_are_one"),
-    ("kernel: a NaN is not less, so it is not greater or equal", GRAPH, 'CONTRARY = {"eq": "ne", "ne": "eq"}',
+    ("kernel: a NaN is not less, so it is not greater or equal", OPERATIONS,
+     'CONTRARY = {"eq": "ne", "ne": "eq"}',
      'CONTRARY = {"eq": "ne", "ne": "eq", "lt": "le"}', RULES),
     ("kernel: an infinite inverse", GRAPH, "if inverse.op == \"const\" and not",
      "if False and not", "test_kernel.py::TestGraph::test_a_divisor_of_before_the_step_is_inverted_there"),

@@ -8,7 +8,7 @@ STATISTICS, SENSITIVITY, COMPARISON = (f"sweep/statistics/{name}.py" for name in
 RARE, PROPOSALS, RELIABILITY = (
     f"reliability/{name}.py" for name in ("subset_simulation", "importance_sampling", "failure")
 )
-STORE, RUNNER, CLUSTER, RUN = (f"sweep/{name}.py" for name in ("store", "runner", "cluster", "run"))
+RUNNER, CLUSTER, RUN = (f"sweep/{name}.py" for name in ("runner", "cluster", "run"))
 SEAL, MANIFEST, RESULTS = (f"sweep/{name}.py" for name in ("seal", "manifest", "results"))
 FIGURES = "plot/sweeps.py"
 

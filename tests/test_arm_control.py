@@ -11,7 +11,7 @@ from balancing import EFFORT, HANGING, MULTIPLES, START, WEIGHTS, closed, model
 from scipy.integrate import solve_ivp
 
 from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
-from diffabs.controllers.balance import Estimate
+from diffabs.controllers.balance import ObserverMemory
 from diffabs.core.protocols import BalanceOutput, Clock, Memory, Tracking
 from diffabs.core.pytree import replace
 from diffabs.core.validity import check
@@ -148,7 +148,7 @@ def test_poles_of_the_loop_are_those_of_regulator_and_filter(observer):
     a, b, inner = whole[:, :6], whole[:, 6], observer.controller
 
     def period(z):
-        x, last = z[:6], Estimate(z[6:], inner.gain @ z[6:])
+        x, last = z[:6], ObserverMemory(z[6:], inner.gain @ z[6:])
         now = corrected(inner, last, x)
         return jnp.concatenate([a @ x + b * now.voltage, now.state])
 
@@ -165,7 +165,7 @@ def test_an_observer_knows_the_limit_of_its_voltage(observer):
     """From the last estimate under 48 V, however much was asked for."""
     inner, last = observer.controller, np.linspace(-0.1, 0.2, 6)
     predicted = inner.transition @ last + inner.entry * 48.0
-    found = corrected(inner, Estimate(jnp.asarray(last), jnp.asarray(5e3)), predicted)
+    found = corrected(inner, ObserverMemory(jnp.asarray(last), jnp.asarray(5e3)), predicted)
     np.testing.assert_allclose(found.state, predicted, rtol=1e-12, atol=1e-15)
     assert float(found.voltage) == pytest.approx(float(inner.gain @ predicted), rel=1e-12)
 

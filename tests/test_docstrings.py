@@ -1,12 +1,16 @@
-"""Every function that a package exports says what it returns, and names each of its arguments. Examples run."""
+"""Every function that a package exports says what it returns, and names each of its arguments. Examples run. What texts
+name is there."""
 
 import ast
 import doctest
 import importlib
 import inspect
+import pathlib
 import re
 
 import pytest
+
+import diffabs
 
 PACKAGES = ("design", "identify", "linear", "reliability", "roads", "scenario", "sweep", "tune")
 PACKAGES = ("diffabs", *(f"diffabs.{name}" for name in PACKAGES))
@@ -73,3 +77,35 @@ DEAR = (  # some seconds of compiling
 def test_the_example_prints_what_it_says(name):
     told = []
     assert doctest.DocTestRunner().run(EXAMPLES[name], out=told.append).failed == 0, "".join(told)
+
+
+HOME = pathlib.Path(diffabs.__file__).parent
+OURS = "|".join(sorted(path.parent.name for path in HOME.glob("*/__init__.py")))
+DOTTED = re.compile(rf"`(?:diffabs\.)?((?:{OURS})(?:\.[A-Za-z_]\w*)+)[`(]")
+PLACE = re.compile(rf"`(?:diffabs/)?((?:{OURS})/\w[\w/]*\w)")
+FILES = {"html"}  # endings of files that have a package's name
+
+
+def is_there(dotted):
+    """Whether a name of the package leads to a module or to what is in one."""
+    found = diffabs
+    for name in dotted.split("."):
+        try:
+            found = getattr(found, name, None) or importlib.import_module(f"{found.__name__}.{name}")
+        except ImportError:
+            return False
+    return True
+
+
+def is_a_place(place):
+    """Whether a module, a package or another file stands there."""
+    return (HOME / place).is_dir() or any((HOME / place).parent.glob(f"{pathlib.Path(place).name}.*"))
+
+
+def test_what_is_named_is_there():
+    """In the text of the package and on the pages: dotted names, and places such as `simulate/batch`."""
+    for path in [*HOME.rglob("*.py"), *(HOME.parent / "docs").rglob("*.md")]:
+        text = path.read_text(encoding="utf-8")
+        names = [name for name in DOTTED.findall(text) if name.rpartition(".")[2] not in FILES]
+        assert [name for name in names if not is_there(name)] == [], path
+        assert [place for place in PLACE.findall(text) if not is_a_place(place)] == [], path

@@ -85,7 +85,8 @@ def test_each_specification_of_a_robust_gain_is_kept(tmp_path):
     assert rows["scheduled"]["decay proved [1/s]"] > rows["cost alone"]["decay proved [1/s]"]
 
 
-def test_one_prior_is_enough_to_identify_a_magic_formula():
+def test_one_prior_is_enough_to_identify_a_magic_formula(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
     module = experiment("identification")
     config = module.Config()
     *_, found = module.from_prior(config, config.priors[0][1])

@@ -358,6 +358,8 @@ def test_what_is_neglected():
     assert state_feedback(braking(controller=StateFeedback(), feedforward=HoldingInput())).neglected == (
         "The fall of the speed: it is frozen.",
     )
+    commanded = braking(plant=LabRig(), controller=StateFeedback(torque_min=0.0, torque_max=1.0))
+    assert state_feedback(commanded).neglected[0] == "The controller's torque limits of 0 and 1."  # of no unit
 
 
 @pytest.mark.parametrize(

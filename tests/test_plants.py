@@ -15,7 +15,7 @@ from diffabs.plants.lab_rig import LabRigState
 from diffabs.roads import DRY_ASPHALT, RIG, SNOW, SPLINE_B, Burckhardt, Patches, RationalCurve, Tabulated
 
 NO_FRICTION = Burckhardt(c1=0.0, c3=0.0)
-MU, SLOPE = 0.39575220833898, -0.00641755652574  # of the rig's curve at slip 0.2
+MU = 0.39575220833898  # of the rig's curve at slip 0.2
 K = 1 / 3.6
 
 

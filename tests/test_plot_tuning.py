@@ -55,7 +55,7 @@ def test_tuning_has_history_and_both_runs():
 
 def test_runs_are_shown_until_they_have_settled():
     """To 2 % after ln(50)/10 s."""
-    for ax in plots.before_after({"before": SLOW, "after": FAST}).axes:
+    for ax in plots.tuning(HISTORY, {"before": SLOW, "after": FAST}).axes[2:4]:
         assert ax.get_xlim()[1] == pytest.approx(1.5 * np.log(50) / 10, abs=0.02)
 
 

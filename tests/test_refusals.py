@@ -336,8 +336,8 @@ def test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows(cutoff, gro
     for _ in range(2000):
         d += period * cutoff * (0.0 - d)
     assert (abs(d) > 1) == grows
-    loop = dataclasses.replace(RIG, controller=controllers.Sampled(controller=controllers.PID(cutoff=cutoff)))
     line = f"controller.controller.cutoff = {cutoff:g} rad/s is outside (0, 2000) rad/s: sampled every 0.001 s"
-    said = list(problems(loop))
-    assert len(said) == grows
-    assert all(one.startswith(line) for one in said)
+    for computer in (controllers.Sampled, controllers.SampledOnGrid):
+        said = list(problems(dataclasses.replace(RIG, controller=computer(controller=controllers.PID(cutoff=cutoff)))))
+        assert len(said) == grows
+        assert all(one.startswith(line) for one in said)

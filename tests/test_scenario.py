@@ -70,40 +70,42 @@ def test_packaged_scenario_survives_dump_and_load(name, file):
     assert_same(first, load(file(dump(first), f"{name}.toml")))
 
 
+NESTED = """
+title = 'quotes " and \\ and ü'
+description = "two\\nlines, \\u007f"
+[plant]
+mass = 0.1
+[road]
+type = "patches"
+roads = ["snow", {type = "scaled", scale = 0.7, road = "ice"}, {type = "magic-formula", B = 9.0}]
+edges = [5.0, 7.123456789012345]
+[controller]
+type = "sampled"
+period = 0.002
+[controller.controller]
+kp = 0.1
+torque_max = inf
+antiwindup = {type = "back-calculation", tracking_time = 0.3}
+[sensor]
+type = "series"
+blocks = [{type = "noise", slip = 0.01}, "wheel-speed", {type = "bias", slip = 1e-300}]
+[actuator]
+type = "series"
+blocks = ["lag", {type = "delay", time = 0.02, capacity = 99}]
+[solver]
+step = 1e-3
+duration = 1.25
+every = 7
+seed = 42
+[objective]
+effort = "effort"
+"odd name" = {type = "quadratic-cost", q = [2.0, 3.0]}
+settling_time = {band = 0.02}
+"""
+
+
 def test_everything_nested_survives_dump_and_load(file):
-    text = """
-    title = 'quotes " and \\ and ü'
-    description = "two\\nlines, \\u007f"
-    [plant]
-    mass = 0.1
-    [road]
-    type = "patches"
-    roads = ["snow", {type = "scaled", scale = 0.7, road = "ice"}, {type = "magic-formula", B = 9.0}]
-    edges = [5.0, 7.123456789012345]
-    [controller]
-    type = "sampled"
-    period = 0.002
-    [controller.controller]
-    kp = 0.1
-    torque_max = inf
-    antiwindup = {type = "back-calculation", tracking_time = 0.3}
-    [sensor]
-    type = "series"
-    blocks = [{type = "noise", slip = 0.01}, "wheel-speed", {type = "bias", slip = 1e-300}]
-    [actuator]
-    type = "series"
-    blocks = ["lag", {type = "delay", time = 0.02, capacity = 99}]
-    [solver]
-    step = 1e-3
-    duration = 1.25
-    every = 7
-    seed = 42
-    [objective]
-    effort = "effort"
-    "odd name" = {type = "quadratic-cost", q = [2.0, 3.0]}
-    settling_time = {band = 0.02}
-    """
-    first = load(file(text))
+    first = load(file(NESTED))
     assert first.description == "two\nlines, \x7f"
     assert_same(first, load(file(dump(first))))
     assert first.loop.plant.road.roads[1].road is roads.ICE

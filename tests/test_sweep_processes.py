@@ -98,10 +98,7 @@ def test_a_process_that_dies_ends_the_others_and_the_commands_go_on(folder, dige
 
 
 def test_a_full_disk_of_one_process_is_said_after_the_other_has_finished(folder):
-    full = (
-        "def full(*_):\n    raise OSError(28, 'No space left on device')\n\nif number == '1':\n    Store.write = full\n"
-    )
-    broken = SCRIPT.replace("\nprint(", f"from diffabs.sweep.store import Store\n{full}print(")
+    broken = SCRIPT.replace("\nprint(", f"{FULL}print(")
     (folder / "many.py").write_text(broken.replace(".digest", ".complete"))
     processes = all_started(folder)
     outputs = ended(processes)

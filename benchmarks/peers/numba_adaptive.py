@@ -9,18 +9,16 @@ from peers.problem import J1, K1, K2, R1, R2, SLIP, STOP, W1, W2, W3, W4, A, G, 
 
 TITLE, PACKAGES, MANY = "Numba, adaptive RK4 (prange)", ("numba", "llvmlite", "numpy"), None
 LADDER = (1e-5, 5e-6, 3e-6, 1e-6, 3e-7, 1e-7)
-FIRST, LONGEST, LEAST = 1e-4, 7e-3, 2e-5
+FIRST, LONGEST, LEAST = 1e-4, 7e-3, 2e-5  # s
+LOW = 1e-6  # slip, below which friction is taken as there; and s
 
 
-def functions(real):
-    """Return run(masses, holds, speeds, tolerance, out), compiled for numbers of the type `real`."""
-    r1, r2, slip, most, stop = (real(x) for x in (R1, R2, SLIP, U, STOP))
+def model(real):
+    """Return rates(omega2, omega1, x1, mass, hold): d2, d1, the slip's error, slip, torque and the slip's rate;
+    compiled for numbers of the type `real`, as all that follows."""
+    r1, r2, slip, most, one, zero, low = (real(x) for x in (R1, R2, SLIP, U, 1, 0, LOW))
     a, p, w1, w2, w3, w4, k1, k2 = (real(x) for x in (A, P, W1, W2, W3, W4, K1, K2))
     body, push, per_inertia = real(-2 * G / R2), real(G * R1 / J1), real(1 / J1)
-    zero, one, two, three, half = (real(x) for x in (0, 1, 2, 3, 0.5))
-    sixth, twelfth, first, longest, least = (real(x) for x in (1 / 6, 1 / 12, FIRST, LONGEST, LEAST))
-    low, tiny, part, near, safe, floor, shrink, grow = (real(x) for x in (1e-6, 1e-20, 0.6, 1.2, 0.85, 1e-4, 0.25, 2.5))
-    share = real(R2 * 0.72)
 
     @numba.njit(fastmath=True, inline="always")
     def rates(y2, y1, y3, m, hold):
@@ -34,9 +32,25 @@ def functions(real):
         d2, d1 = body * mu, m * push * mu - min(max(torque, zero), most) * per_inertia
         return d2, d1, error, s, torque, (-r1 * d1 + (one - s) * r2 * d2) * inverse
 
+    return rates
+
+
+def between(real):
+    """Return gained(z, whole, start, end): what a cubic with this gain over a step, and these gains at the rates of its
+    ends, has gained up to the part z of it."""
+    one, two, three = (real(x) for x in (1, 2, 3))
+
     @numba.njit(fastmath=True, inline="always")
     def gained(z, whole, start, end):
         return z * z * ((three - two * z) * whole - (one - z) * end) + z * (one - z) * (one - z) * start
+
+    return gained
+
+
+def limits(real):
+    """Return to_limit(step, torque, rate): the step, or one that ends where the torque comes to a limit."""
+    most, zero = real(U), real(0)
+    low, tiny, part, near, least = (real(x) for x in (LOW, 1e-20, 0.6, 1.2, LEAST))
 
     @numba.njit(fastmath=True, inline="always")
     def to_limit(h, torque, rate):
@@ -48,6 +62,18 @@ def functions(real):
         if low < ahead < h:
             return max(ahead, least)
         return part * h if h <= ahead < near * h else h
+
+    return to_limit
+
+
+def functions(real):
+    """Return run(masses, holds, speeds, tolerance, out)."""
+    rates, gained, to_limit = model(real), between(real), limits(real)
+    r1, r2, stop, k1, k2 = (real(x) for x in (R1, R2, STOP, K1, K2))
+    zero, one, two, half = (real(x) for x in (0, 1, 2, 0.5))
+    sixth, twelfth, first, longest, least = (real(x) for x in (1 / 6, 1 / 12, FIRST, LONGEST, LEAST))
+    safe, floor, shrink, grow = (real(x) for x in (0.85, 1e-4, 0.25, 2.5))
+    share = real(R2 * 0.72)
 
     @numba.njit(fastmath=True)
     def lane(m, hold, speed, tolerance):

@@ -19,7 +19,7 @@ class Limits:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """Torque [N m]."""
+        """Control: a brake's torque [N m]."""
         del t, memory
         return clamp(signal, self.low, self.high)
 
@@ -44,7 +44,7 @@ class Lag:
         return quotient(signal - memory.flow, self.time_constant)
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """Torque [N m]."""
+        """Control: a brake's torque [N m]."""
         del t, signal
         return memory.flow
 

@@ -50,7 +50,7 @@ class BalanceFeedback:
         yield from _shape_problems(self, gain=(6,))
 
 
-class Estimate(NamedTuple):
+class ObserverMemory(NamedTuple):
     """Estimated state (6,), and the voltage that was asked for at it."""
 
     state: Any
@@ -75,7 +75,7 @@ class ObserverFeedback:
         """At the measured angles, the rest zero."""
         zero = 0.0 * signal.target
         angles = [getattr(signal.measured, name) if name in MEASURED else zero for name in STATES]
-        return Memory(held=Estimate(jnp.stack(angles), zero))
+        return Memory(held=ObserverMemory(jnp.stack(angles), zero))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Voltage [V]."""
@@ -85,13 +85,13 @@ class ObserverFeedback:
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
         """Predict from the last sample, correct by this one."""
         now, number = clock.ticks()
-        estimate: Estimate = memory.held
+        estimate: ObserverMemory = memory.held
         voltage = clamp(estimate.voltage, -self.voltage_max, self.voltage_max)
         predicted = self.transition @ estimate.state + self.entry * voltage
         predicted = jnp.where(number > 0, predicted, estimate.state)
         error = jnp.stack([getattr(signal.measured, name) - predicted[STATES.index(name)] for name in MEASURED])
         state = predicted + self.correction @ error
-        new = Estimate(state, self.gain @ state)
+        new = ObserverMemory(state, self.gain @ state)
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, estimate))
 
     def problems(self) -> Iterator[str]:

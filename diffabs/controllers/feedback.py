@@ -37,7 +37,7 @@ class StateFeedback:
         return self.antiwindup.rate(error, self.gain[0], raw, limited)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Torque [N m]."""
+        """Control: a brake's torque [N m]."""
         return self._torque(memory, signal)[1]
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:

@@ -13,7 +13,7 @@ class ConstantInput:
     value: Scalar = param(default=0.0, unit="control")
 
     def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
-        """The number [N m]."""
+        """The number."""
         del plant, output, target
         return self.value
 
@@ -24,5 +24,5 @@ class HoldingInput:
     controller does that knows them exactly."""
 
     def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
-        """tau* [N m]."""
+        """tau*, in the unit of the plant's control."""
         return plant.holding(output, target)

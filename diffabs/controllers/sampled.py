@@ -99,9 +99,7 @@ class Sampled:
 
     def rules(self) -> Iterator[Rule]:
         """A computation takes no longer than the period; a filter follows its samples."""
-        yield delay_within(self.delay, self.period)
-        if hasattr(self.controller, "cutoff"):
-            yield filter_within(self.controller.cutoff, self.period)  # pyright: ignore[reportAttributeAccessIssue]
+        yield from within_period(self.controller, self.delay, self.period)
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """The period is on the integration grid."""
@@ -111,6 +109,13 @@ class Sampled:
 def unsampled(controller: Any) -> Any:
     """Return what a computer runs, or a controller that none runs itself."""
     return controller.controller if isinstance(controller, Sampled) else controller
+
+
+def within_period(controller: Any, delay: Scalar, period: Scalar) -> Iterator[Rule]:
+    """Yield what must hold between a period [s] and the controller that is computed in it, `delay` [s] long."""
+    yield delay_within(delay, period)
+    if hasattr(controller, "cutoff"):
+        yield filter_within(controller.cutoff, period)
 
 
 def delay_within(delay: Scalar, period: Scalar) -> Rule:

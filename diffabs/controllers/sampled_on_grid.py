@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.controllers.pid import PID
-from diffabs.controllers.sampled import Sampled, delay_within
+from diffabs.controllers.sampled import Sampled, within_period
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import Scalar, param, part, pytree
@@ -38,6 +38,7 @@ class SampledOnGrid:
     the mean over the step."""
 
     controller: Block = part(default=PID)
+    # not `period`, at whose instants alone steps would end: it ticks at every instant of the grid
     sampling_period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
 
@@ -66,8 +67,8 @@ class SampledOnGrid:
         return Memory(held=m._replace(applied=jnp.where(clock.ticks()[0], applied, m.applied)))
 
     def rules(self) -> Iterator[Rule]:
-        """A computation takes no longer than the period."""
-        yield delay_within(self.delay, self.sampling_period)
+        """A computation takes no longer than the period; a filter follows its samples."""
+        yield from within_period(self.controller, self.delay, self.sampling_period)
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """The period is on the integration grid."""

@@ -21,7 +21,7 @@ class ConstantTorque:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Torque [N m]."""
+        """Control: a brake's torque [N m]."""
         del t, memory, signal
         return self.torque
 
@@ -45,7 +45,7 @@ class Relay:
         return Memory(held=jnp.where(excess < 0, 1.0, 0.0) + 0.0 * excess)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Torque [N m]."""
+        """Control: a brake's torque [N m]."""
         del t, signal
         return self.torque_min + memory.held * (self.torque_max - self.torque_min)
 
@@ -82,7 +82,7 @@ class SlidingMode:
     rules = Relay.rules
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Torque [N m]."""
+        """Control: a brake's torque [N m]."""
         del t, memory
         inside = clamp((signal.target - signal.measured[0]) / self.boundary, -1.0, 1.0)
         return clamp(signal.feedforward + self.gain * inside, self.torque_min, self.torque_max)

@@ -76,7 +76,7 @@ class Loop:
     stop: Stop = part()
 
     def start(self) -> LoopState:
-        """State at t = 0, before the first jump."""
+        """State at t = 0, before the first tick."""
         x = self.plant.start(self.initial)
         y = self.plant.output(x)
         sensor = self.sensor.start(y)

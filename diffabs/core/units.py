@@ -3,7 +3,7 @@
     "control/signal"     a gain: N m around a brake, whose slip is a number; V/rad around a servo
     "control^2 s"        N^2 m^2 s, or V^2 s
 
-`control` is the unit of the plant's control, `signal` that of the first signal it shows, which the target is of.
+`control` is the unit of the plant's control, `signal` that of the first signal it shows, and so of the target.
 """
 
 import re

@@ -30,6 +30,7 @@ from diffabs.controllers import (
 from diffabs.controllers.sampled import Sampled, unsampled
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.loop import Loop
+from diffabs.core.units import in_words, units_of
 from diffabs.core.validity import check
 from diffabs.design.state_feedback_balance import upright
 from diffabs.linear.balance_model import BalanceModel
@@ -76,7 +77,9 @@ def state_feedback(loop: Loop) -> Reduced:
         integral=integral != 0,
     )
     gain = np.asarray(feedback(loop, check(model).states), float)
-    neglected = (*_of_controller(controller), *by_actuator, *_around(loop))
+    units = units_of(loop.plant)
+    left_out = (*_of_controller(controller), *by_actuator, *_around(loop))
+    neglected = tuple(in_words(line, units) for line in left_out)
     return Reduced(model, gain, exact and isinstance(loop.sensor, Direct | Noise | Bias), neglected)
 
 
@@ -134,9 +137,11 @@ def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
                 lags.append(block)
             case RateLimit():
                 lags.append(Lag(time_constant=block.time_constant))
-                neglected.append(f"The actuator's rate limit of {float(block.rate):g} N m/s.")
+                neglected.append(f"The actuator's rate limit of {float(block.rate):g} {{control}}/s.")
             case Limits():
-                neglected.append(f"The actuator's limits of {float(block.low):g} and {float(block.high):g} N m.")
+                neglected.append(
+                    f"The actuator's limits of {float(block.low):g} and {float(block.high):g} {{control}}."
+                )
             case Delay():
                 exact = False
                 neglected.append(f"The actuator's delay of {float(block.time):g} s, which can destabilise.")
@@ -152,7 +157,7 @@ def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
 def _of_controller(controller: Any) -> Iterator[str]:
     low, high = float(controller.torque_min), float(controller.torque_max)
     if np.isfinite([low, high]).any():
-        yield f"The controller's torque limits of {low:g} and {high:g} N m."
+        yield f"The controller's torque limits of {low:g} and {high:g} {{control}}."
         if not isinstance(controller.antiwindup, NoAntiWindup):
             yield "Anti-windup, which acts at the torque limits only."
 

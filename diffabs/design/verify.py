@@ -1,4 +1,5 @@
-"""A saved certificate proved again, in fractions, by code that shares nothing with what made it.
+"""A saved certificate proved again, in fractions, by code that shares nothing with what made it. This file needs no
+other: whoever doubts the rest can take it out, read it and run it alone.
 
 Floats are the rationals that they are, and nothing is rounded: what is proved is about the stored matrices A, B and
 everything in their hull, C = A + B K. A file's words are not believed: names of corners and states are not read, and

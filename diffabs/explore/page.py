@@ -14,6 +14,7 @@ from diffabs.core.values import ScenarioError
 from diffabs.explore import charts, curves, stability
 from diffabs.explore.canvas import Canvas, encoded
 from diffabs.explore.controls import Controls
+from diffabs.explore.header import header
 from diffabs.explore.look import SCRIPT, STYLE
 from diffabs.explore.results import Results
 from diffabs.explore.saver import Saver
@@ -53,7 +54,7 @@ class Page:
     def build(self) -> None:
         """Put everything on the page, and begin to compute."""
         with ui.element("div").classes("explorer") as self.body:
-            self._head()
+            header(self)
             with ui.element("main").classes("columns"):
                 with ui.element("section").classes("left"):
                     self.controls.build()
@@ -108,6 +109,13 @@ class Page:
         """Say why something cannot be, or that all is well."""
         self.controls.refused("" if error is None else " ".join(str(error).split()))
 
+    def reset(self) -> None:
+        """All numbers as in the scenario."""
+        self.session.reset()
+        self.refused(None)
+        self.controls.show_all()
+        self.redraw()
+
     def end(self) -> None:
         """The tab is gone."""
         self.version += 1
@@ -116,26 +124,6 @@ class Page:
         self.tuner.end()
 
     # In the server's thread.
-    def _head(self) -> None:
-        with ui.element("header"):
-            ui.label("diffabs").classes("brand")
-            ui.label("explore").classes("brand thin")
-            ui.element("div").classes("grow")
-            ui.html("", sanitize=False).classes("latency").props("data-id=latency")
-            ui.button("pin", on_click=lambda: self.pin(self.shown)).props("flat dense no-caps data-id=pin").tooltip(
-                "keep this run as a dashed curve to compare with"
-            )
-            ui.button("unpin", on_click=lambda: self.pin(None)).props("flat dense no-caps")
-            ui.button("reset", on_click=self._reset).props("flat dense no-caps data-id=reset").tooltip(
-                "all numbers as in the scenario"
-            )
-            ui.button("tune from here", on_click=lambda: self.tuner.ask()).props(
-                "unelevated dense no-caps data-id=tune color=primary"
-            )
-            ui.button("save", on_click=lambda: self.saver.ask()).props(
-                "outline dense no-caps data-id=save color=primary"
-            )
-
     def _turned(self, key: str, given: Any, edit: int) -> None:
         """A number was dragged or typed."""
         try:
@@ -170,12 +158,6 @@ class Page:
             self.refused(None)
             self.controls.rebuild()
             self.begin()
-
-    def _reset(self) -> None:
-        self.session.reset()
-        self.refused(None)
-        self.controls.show_all()
-        self.redraw()
 
     def _show_curves(self, found: curves.Curves, now: Scenario, change: str, version: int, edit: int) -> None:
         if version < self.since:

@@ -19,7 +19,7 @@ from xml.etree import ElementTree as xml
 
 from diffabs.core.loop import Loop
 from diffabs.export.device import NotExported
-from diffabs.export.plant_c import Plant, Variable, plant_source
+from diffabs.export.plant_c import PlantSource, Variable, plant_source
 from diffabs.kernel.compilers import NoCompiler, compiler
 
 FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-fPIC")
@@ -59,7 +59,7 @@ def fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str
     return archive.getvalue()
 
 
-def _source(plant: Plant, guid: str, step: float) -> str:
+def _source(plant: PlantSource, guid: str, step: float) -> str:
     """All of its C in one file."""
     outputs = sum(one.role == "output" for one in plant.variables)
     begun = ", ".join(_number(one.value) for one in plant.variables)
@@ -93,7 +93,7 @@ def _compiled(source: str) -> bytes:
         return result.read_bytes()
 
 
-def _description(plant: Plant, name: str, guid: str, step: float, duration: float, about: str) -> bytes:
+def _description(plant: PlantSource, name: str, guid: str, step: float, duration: float, about: str) -> bytes:
     """modelDescription.xml."""
     root = xml.Element("fmiModelDescription", {
         **{"fmiVersion": "2.0", "modelName": name, "guid": guid, "generationTool": "diffabs", "description": about},

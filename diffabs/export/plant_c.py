@@ -32,7 +32,7 @@ class Variable(NamedTuple):
     unit: str
 
 
-class Plant(NamedTuple):
+class PlantSource(NamedTuple):
     """C functions `plant_start(m)`, `plant_step(m, t, h)` and `plant_show(m)`, of a struct `m` of arrays `v` of the
     variables, in their order, and `x` of so many states; the text lacks the struct."""
 
@@ -41,7 +41,7 @@ class Plant(NamedTuple):
     states: int
 
 
-def plant_source(loop: Loop) -> Plant:
+def plant_source(loop: Loop) -> PlantSource:
     """Return the plant of a loop, at the loop's start, as C.
 
     Raises:
@@ -55,7 +55,7 @@ def plant_source(loop: Loop) -> Plant:
             text = "\n".join(written.parts())
         except Unsupported as error:
             raise NotExported(f"{error.primitive} has no translation to C: {error.reason}") from None
-    return Plant(f"{text}\n", variables, written.states)
+    return PlantSource(f"{text}\n", variables, written.states)
 
 
 def _variables(loop: Loop) -> tuple[Variable, ...]:

@@ -9,27 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.kernel.graph import Level, Node, real
+from diffabs.kernel.cpp_words import INFIX, NAMED, PREFIX, kind, literal, truth, vector
+from diffabs.kernel.graph import Level, Node
 from diffabs.kernel.program import Block, Branch, Place, Program, live, ordered
 
 ONE = range(1)
 SHORT = 24  # operations in a branch: fewer are worked out anyway
-TYPES = {
-    "float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "uint32": "u32", "uint64": "u64",
-}  # fmt: skip
-INFIX = {
-    "add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/", "and": "&", "or": "|", "xor": "^",
-    "shift_left": "<<", "shift_right_logical": ">>",
-}  # fmt: skip
-PREFIX = {"neg": "-", "not": "~"}
-NAMED = {
-    "lt": "lt", "le": "le", "eq": "eq", "ne": "ne", "max": "most", "min": "least", "lower": "lower",
-    "higher": "higher", "abs": "size", "sqrt": "root",
-    "rint": "whole", "floor": "down", "ceil": "up", "rem": "rest", "is_finite": "finite",
-    **{name: f"k_{name}" for name in (
-        "exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan", "asin", "acos", "sinh", "cosh", "atan2",
-        "pow")},
-}  # fmt: skip
 
 
 class Shape(NamedTuple):
@@ -46,43 +31,9 @@ def text(program: Program, shape: Shape) -> str:
     return "\n".join(Text(program, shape).parts()) + "\n"
 
 
-def truth(dtype: np.dtype) -> bool:
-    """Return whether numbers of this type are truths."""
-    return dtype.kind == "b"
-
-
-def kind(dtype: np.dtype) -> str:
-    """Return the type of one number."""
-    return "u8" if truth(dtype) else TYPES[dtype.name]
-
-
-def vector(dtype: np.dtype) -> str:
-    """Return the type of a vector of them."""
-    return "mask" if truth(dtype) else "v" + TYPES[dtype.name]
-
-
 def reads(node: Node) -> tuple[Node, ...]:
     """Return what an operation reads by name; the entries of a table lie in a column."""
     return node.args[:1] if node.op == "table" else node.args
-
-
-def literal(node: Node) -> str:
-    """Return a known number in every lane."""
-    x = node.attr
-    if truth(node.dtype):
-        return f"all({'true' if x else 'false'})"
-    name = TYPES[node.dtype.name]
-    if not real(node.dtype):
-        ends = {"i32": "", "u32": "u", "i64": "ll", "u64": "ull"}[name]
-        number = (
-            f"INT{x.itemsize * 8}_MIN" if node.dtype.kind == "i" and x == np.iinfo(x.dtype).min else f"{int(x)}{ends}"
-        )
-        return f"all(({name}){number})"
-    if np.isnan(x):
-        return f"all(({name})NAN)"
-    if np.isinf(x):
-        return f"all(({name}){'-' if x < 0 else ''}INFINITY)"
-    return f"all(({name}){float(x).hex()})"
 
 
 class Text:

@@ -1,11 +1,9 @@
-"""Linear models of a braking wheel, by automatic differentiation.
+"""Linear models of a plant, by automatic differentiation.
 
     linearize    x' = f(x, u) at any point:  A = df/dx, B = df/du
     tracking     the dynamics of a tracked output while other outputs are frozen
-    SlipModel    the slip error of a plant with what is around it, the model a feedback u = K x is designed for
 
-Maeda and Sugiura, eqs. (15)-(21), are `SlipModel()`: x = (integral of (slip - target), slip - target), tau - tau* = u.
-Speed is frozen, so a fall of the speed is a change of the model's parameter, not of its state.
+What is frozen (a brake's speed) is a parameter of the model: its fall is a change of the model, not of its state.
 """
 
 from collections.abc import Sequence
@@ -43,7 +41,7 @@ def linearize(plant: Plant, state: Any, control: Any) -> StateSpace:
     >>> linearize(car, car.start(BrakeStart(speed=20.0, slip=0.1)), 90.0).B.shape  # speed, spin, distance
     (3, 1)
     """
-    flow, x, u = _flat(plant, state, control)
+    flow, x, u = as_vectors(plant, state, control)
     return StateSpace(*jax.jacfwd(flow, (0, 1))(x, u))
 
 
@@ -62,9 +60,9 @@ def tracking(
             only outside of jit; inside, the matrices are not finite).
     """
     plant, state, control = strong((plant, state, control))
-    flow, x, u = _flat(plant, state, control)
+    flow, x, u = as_vectors(plant, state, control)
     unravel = ravel_pytree(state)[1]
-    kept = _kept(plant, state, (*tracked, *frozen))
+    kept = untouched(plant, state, (*tracked, *frozen))
 
     def chart(x: Any) -> Any:
         y = plant.output(unravel(x))
@@ -78,8 +76,8 @@ def tracking(
     return StateSpace(jnp.linalg.solve(by_x.T, a.T).T[:n, :n], b[:n])
 
 
-def _flat(plant: Plant, state: Any, control: Any) -> Any:
-    """f(x, u) on vectors, and the vectors x and u."""
+def as_vectors(plant: Plant, state: Any, control: Any) -> Any:
+    """Return f(x, u) on vectors, and the vectors x and u."""
     plant, state, control = strong((plant, state, control))
     (x, unravel), (u, unravel_control) = ravel_pytree(state), ravel_pytree(control)
 
@@ -101,16 +99,16 @@ def _check_chart(by_x: Any, outputs: Sequence[str]) -> None:
             raise ValueError(f"{named} are no coordinates here: they depend on each other (singular Jacobian)")
 
 
-def _kept(plant: Plant, state: Any, outputs: Sequence[str]) -> np.ndarray:
-    """Places in the raveled state of the components that none of the outputs depends on."""
-    used = _used(plant, state, outputs)
+def untouched(plant: Plant, state: Any, outputs: Sequence[str]) -> np.ndarray:
+    """Return the places in the raveled state of the components that none of the outputs depends on."""
+    used = used_leaves(plant, state, outputs)
     sizes = [np.size(leaf) for leaf in jax.tree.leaves(state)]
     return np.flatnonzero(np.repeat([not u for u in used], sizes))
 
 
-def _used(plant: Plant, state: Any, outputs: Sequence[str]) -> list[bool]:
-    """Of each leaf of the state, whether some output is computed from it. From the traced program, not from values: it
-    must be known while the parameters are tracers."""
+def used_leaves(plant: Plant, state: Any, outputs: Sequence[str]) -> list[bool]:
+    """Return of each leaf of the state whether some output is computed from it. From the traced program, not from
+    values: it must be known while the parameters are tracers."""
     leaves, tree = jax.tree.flatten(state)
 
     def select(*leaves: Any) -> Any:

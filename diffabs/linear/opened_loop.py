@@ -24,8 +24,8 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import strong
 from diffabs.core.tracing import follows
-from diffabs.linear.linearization import StateSpace, _kept
-from diffabs.linear.operating_point import RESIDUE, _root
+from diffabs.linear.linearization import StateSpace, untouched
+from diffabs.linear.operating_point import RESIDUE, root
 from diffabs.linear.transfer import WHOLE, Transfer
 from diffabs.linear.zero_order_hold import held
 
@@ -157,7 +157,7 @@ class _Surroundings:
         self.frozen: Any = tuple(getattr(loop.plant, "frozen", ()))
         first = loop.plant.shows._fields[0]
         size = ravel_pytree(state.plant)[0].size
-        kept = _kept(loop.plant, state.plant, (first, *self.frozen)) if self.frozen else np.arange(size)
+        kept = untouched(loop.plant, state.plant, (first, *self.frozen)) if self.frozen else np.arange(size)
         self.kept, self.size, self.held = kept, size, len(self.frozen)
 
     def output(self, z: Any) -> Any:
@@ -211,9 +211,9 @@ def _rest(loop: Loop, setpoint: Any) -> tuple[_Surroundings, Any, Any]:
     around = _Surroundings(loop, setpoint)
     there = around.chart(around.start)
     there = there.at[0].set(around.setpoint) if around.frozen else there
-    near = _root(lambda z: around.chart(z) - there, around.start)  # on the setpoint, the rest as it starts
+    near = root(lambda z: around.chart(z) - there, around.start)  # on the setpoint, the rest as it starts
     guess = loop.plant.holding(around.output(near), around.setpoint)
-    free = _root(around.still, jnp.append(near, guess))
+    free = root(around.still, jnp.append(near, guess))
     return around, free, jnp.max(jnp.abs(around.still(free))) / (1 + jnp.max(jnp.abs(free)))
 
 
@@ -243,7 +243,7 @@ def _controller(loop: Loop, signal: Any, as_signal: Any, command: Any) -> Any:
         setpoint itself the command may begin at a limit."""
         size = jnp.where(signal[0] == 0, 1.0, jnp.abs(signal[0]))
         slopes = jax.jacfwd(holding)(inside, signal.at[0].add(offset * size))
-        c = _root(holding, inside - jnp.linalg.pinv(slopes) @ holding(inside))
+        c = root(holding, inside - jnp.linalg.pinv(slopes) @ holding(inside))
         return c, jnp.sum(jnp.abs(holding(c)))
 
     if inside.size:

@@ -138,26 +138,28 @@ def _names(loop: Loop) -> list[str]:
     return names
 
 
-@jax.jit
-def _linearized(model: OperatingPoint) -> Closed:
-    loop = strong(model).loop
-    setpoint = loop.reference.setpoint(loop.start().reference)
-    z, unravel = ravel_pytree(_start(loop))
-    at = _Integrated(*(np.size(ravel_pytree(part)[0]) for part in _start(loop)))
-    inside = np.repeat(np.arange(4) == _Integrated._fields.index("controller"), at)
+class _AsVector(NamedTuple):
+    """A loop on a setpoint, whose integrated states are one vector z; the actuator is given a command v."""
 
-    def tracking(x: _Integrated) -> tuple[Any, Tracking]:
+    loop: Loop
+    setpoint: Any
+    unravel: Any
+
+    def tracking(self, z: Any) -> tuple[Any, Tracking]:
+        """What the plant shows, and what the controller sees."""
+        loop, x = self.loop, self.unravel(z)
         y = loop.plant.output(x.plant)
         measured = loop.sensor.output(0.0, Memory(x.sensor), y)
-        return y, Tracking(setpoint, measured, loop.feedforward.input(loop.plant, measured, setpoint))
+        return y, Tracking(self.setpoint, measured, loop.feedforward.input(loop.plant, measured, self.setpoint))
 
-    def command(z: Any) -> Any:
-        x = unravel(z)
-        return loop.controller.output(0.0, Memory(x.controller), tracking(x)[1])
+    def command(self, z: Any) -> Any:
+        """The controller's."""
+        return self.loop.controller.output(0.0, Memory(self.unravel(z).controller), self.tracking(z)[1])
 
-    def flow(z: Any, v: Any) -> Any:
-        x = unravel(z)
-        y, seen = tracking(x)
+    def flow(self, z: Any, v: Any) -> Any:
+        """dz/dt."""
+        loop, x = self.loop, self.unravel(z)
+        y, seen = self.tracking(z)
         rates = _Integrated(
             loop.plant.derivative(0.0, x.plant, loop.actuator.output(0.0, Memory(x.actuator), v)),
             loop.sensor.flow(0.0, Memory(x.sensor), y),
@@ -166,28 +168,38 @@ def _linearized(model: OperatingPoint) -> Closed:
         )
         return ravel_pytree(rates)[0]
 
+
+@jax.jit
+def _linearized(model: OperatingPoint) -> Closed:
+    loop = strong(model).loop
+    setpoint = loop.reference.setpoint(loop.start().reference)
+    z, unravel = ravel_pytree(_start(loop))
+    one = _AsVector(loop, setpoint, unravel)
+    at = _Integrated(*(np.size(ravel_pytree(part)[0]) for part in _start(loop)))
+    inside = np.repeat(np.arange(4) == _Integrated._fields.index("controller"), at)
+
     def still(free: Any) -> Any:
         """Zero where everything but the controller is at rest, the first signal on the setpoint."""
         moved = z.at[~inside].set(free[:-1])
-        return jnp.append(flow(moved, free[-1])[~inside], tracking(unravel(moved))[0][0] - setpoint)
+        return jnp.append(one.flow(moved, free[-1])[~inside], one.tracking(moved)[0][0] - setpoint)
 
-    free = _root(still, jnp.append(z[~inside], 0.0))
+    free = root(still, jnp.append(z[~inside], 0.0))
     z = z.at[~inside].set(free[:-1])
 
     def holding(memory: Any, z: Any = z) -> Any:
         """Zero where the controller is at rest and commands what holds the plant."""
         moved = z.at[inside].set(memory)
-        return jnp.append(flow(moved, free[-1])[inside], command(moved) - free[-1])
+        return jnp.append(one.flow(moved, free[-1])[inside], one.command(moved) - free[-1])
 
-    z = z.at[inside].set(_root(holding, z[inside]))
-    a, b = jax.jacfwd(flow, (0, 1))(z, free[-1])
+    z = z.at[inside].set(root(holding, z[inside]))
+    a, b = jax.jacfwd(one.flow, (0, 1))(z, free[-1])
     residue = jnp.max(jnp.abs(still(free))) / (1 + jnp.max(jnp.abs(free)))
-    return Closed(a, b[:, None], jax.jacfwd(command)(z), residue)
+    return Closed(a, b[:, None], jax.jacfwd(one.command)(z), residue)
 
 
-def _root(function: Any, x: Any) -> Any:
-    """Where a function is zero, or least in squares, by Gauss and Newton. Its derivative is that of the last step, the
-    implicit function theorem's."""
+def root(function: Any, x: Any) -> Any:
+    """Return where a function is zero, or least in squares, by Gauss and Newton. Its derivative is that of the last
+    step, the implicit function theorem's."""
 
     def step(x: Any, function: Any = function) -> Any:
         return x - jax.lax.stop_gradient(jnp.linalg.pinv(jax.jacfwd(function)(x))) @ function(x)

@@ -1,4 +1,7 @@
-"""The slip loop as a linear system: plant, sensor filter, actuator lag and sampling, at a frozen speed."""
+"""The slip loop as a linear system: plant, sensor filter, actuator lag and sampling, at a frozen speed.
+
+The model for which a feedback u = K x is designed. Maeda and Sugiura, eqs. (15)-(21), are `SlipModel()`:
+x = (integral of (slip - target), slip - target), u = tau - tau*."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -11,7 +14,7 @@ from diffabs.actuators import Lag
 from diffabs.core.blocks import Direct
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import Scalar, param, part, pytree, static, strong
-from diffabs.linear.linearization import NEWTON, StateSpace, _flat, _kept, _used, tracking
+from diffabs.linear.linearization import NEWTON, StateSpace, as_vectors, tracking, untouched, used_leaves
 from diffabs.linear.zero_order_hold import held
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.plants.wheel import FROZEN
@@ -71,7 +74,7 @@ class SlipModel:
         self._supported()
         start = jax.eval_shape(self.plant.start, BrakeStart(speed=self.speed, slip=self.slip))
         paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(start)]
-        used = _used(self.plant, start, ("slip", *FROZEN))
+        used = used_leaves(self.plant, start, ("slip", *FROZEN))
         kept = [jax.tree_util.keystr(p, simple=True) for p, u in zip(paths, used, strict=True) if not u]
         return (
             *(["integral of slip error"] if self.integral else []),
@@ -95,10 +98,10 @@ class SlipModel:
         """State and control of the linearisation: the slip is held, what remains is at rest, the speed falls."""
         start = self.plant.start(BrakeStart(speed=self.speed, slip=self.slip))
         control = self.plant.holding(self.plant.output(start), self.slip)
-        kept = _kept(self.plant, start, ("slip", *FROZEN))
+        kept = untouched(self.plant, start, ("slip", *FROZEN))
         if not len(kept):
             return start, control
-        flow, x, u = _flat(self.plant, start, control)
+        flow, x, u = as_vectors(self.plant, start, control)
 
         def rate(z: Any) -> Any:
             return flow(x.at[kept].set(z), u)[kept]

@@ -63,7 +63,7 @@ class LockedTime:
 
 @pytree
 class Effort:
-    """Integral of u^2 dt [N^2 m^2 s], u the torque that the actuator delivers."""
+    """Integral of u^2 dt, u what the actuator delivers: of a torque [N^2 m^2 s]."""
 
     unit = "control^2 s"
     physical = (0.0, math.inf)
@@ -85,7 +85,8 @@ class Varied(NamedTuple):
 
 @pytree
 class Variation:
-    """Total variation of the torque [N m], |du| added up along the run, jumps included: what chattering costs."""
+    """Total variation of the control, a brake's torque [N m]: |du| added up along the run, jumps included. That is what
+    chattering costs."""
 
     unit = "control"
     physical = (0.0, math.inf)
@@ -113,7 +114,7 @@ class Variation:
 
 @pytree
 class TorqueRate:
-    """Greatest |du/dt| [N m/s] of the torque that the actuator delivers, at the instants of the integration. A jump
+    """Greatest |du/dt| of what the actuator delivers, a torque [N m/s], at the instants of the integration. A jump
     counts as jump/step: behind a lag there is none."""
 
     unit = "control/s"

@@ -33,13 +33,6 @@ def tuning(
     return figure
 
 
-def before_after(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
-    """Slip and torque of runs by name, over time."""
-    figure, axes = sheet(1, 2, title=title, size=(5.6, 3.4))
-    _runs(axes[0], axes[1], runs)
-    return figure
-
-
 def pareto(
     fronts: Mapping[str, tuple[Any, Any]],
     *,

@@ -1,4 +1,4 @@
-"""Slip references: measured output -> target slip."""
+"""References: measured output -> target, of the first signal that the plant shows."""
 
 from diffabs.references.by_deceleration import SlipByDeceleration as SlipByDeceleration
 from diffabs.references.extremum_seeking import ExtremumSeeking as ExtremumSeeking

@@ -15,10 +15,10 @@ total is taken from the failures' ancestors among the first samples, sum_a (shar
 Biometrika 105 (2018)), but no less than for independent levels and no more than for fully dependent ones (the bounds
 of Au and Beck). Its interval is log-normal, with quantiles of Student's t of one degree for each effective ancestor.
 
-Importance sampling (`proposals`) follows if the failures foretell that it will halve the coefficient of variation at
-least. It replaces the estimate unless it proves more uncertain, or is far below, as it would be if it missed some.
-Failures that a few normal distributions do not cover (the surface of a sphere in ten dimensions) thus stay with subset
-simulation. Choosing one of two consistent estimates makes a small bias of its own, too."""
+Importance sampling follows if the failures foretell that it will halve the coefficient of variation at least
+(`importance_sampling`). It replaces the estimate unless it proves more uncertain, or is far below, as it would be if it
+missed some. Failures that a few normal distributions do not cover (the surface of a sphere in ten dimensions) thus stay
+with subset simulation. Choosing one of two consistent estimates makes a small bias of its own, too."""
 
 import dataclasses
 import enum

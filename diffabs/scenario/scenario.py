@@ -4,9 +4,9 @@
     [solver]       type (fixed, adaptive), step [s], duration [s], every (trajectories keep every so many steps), rtol
                    (of adaptive steps), kinks (of fixed ones), seed (of noisy sensors)
     [objective]    name = a part; adds to, or changes, those of every report on such a plant
-    [design]       what a robust gain is asked for, and over which ranges: see `robust`
-    [tune]         which parameters are free, what is made small, and over which runs: see `goal`
-    [sweep]        what varies in a Monte-Carlo sweep, and what counts as a failure: see `variation`
+    [design]       what a robust gain is asked for, and over which ranges: see `section_design`
+    [tune]         which parameters are free, what is made small, and over which runs: see `section_tune`
+    [sweep]        what varies in a Monte-Carlo sweep, and what counts as a failure: see `section_sweep`
 
 What is left out has its default, if the plant says one; else it is asked for. Speeds may be given in km/h:
 `speed_kmh`. A value is never evaluated as code."""

@@ -23,13 +23,13 @@ from diffabs.core.protocols import Clock, Memory, Segment, Shown
 from diffabs.core.regime import Words
 from diffabs.simulate.advance import start
 from diffabs.simulate.checkpoint import anyone, apart
-from diffabs.simulate.condition import Condition
+from diffabs.simulate.condition import Condition, after_step
 from diffabs.simulate.dynamics import FREE, Dynamics, Objectives, Tally, dynamics, parted
 from diffabs.simulate.foresight import kinks
 from diffabs.simulate.landing import Search, aimed, earliest, falls_through, init_search, land, seek, select
 from diffabs.simulate.lengths import FIRST, SHRINK, Pace, allowed, error, longest_stable, planned, sizes
 from diffabs.simulate.span import Span
-from diffabs.simulate.stepper import MISSED, typed
+from diffabs.simulate.stepper import typed
 from diffabs.simulate.tries import Arrival, Carry, Point, Verdict
 from diffabs.simulate.tsit5 import off_in_the_middle, tsit5_pair
 
@@ -93,7 +93,7 @@ def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict
     length, ends = planned(jnp.minimum(natural, carry.limit), point.ahead, left, pace)
     late = trying & (here.late > 0) & verdict.fine
     length = jnp.where(late, jnp.maximum(carry.length - here.late, pace.least), length)
-    condition = jnp.where(verdict.taken, _ended(loop, carry, here, verdict), carry.condition)
+    condition = jnp.where(verdict.taken, after_step(loop, carry, here.point.margins, verdict), carry.condition)
     refreshes = condition == Condition.REFRESHING
     length = jnp.where(refreshes, 0.0, length)
     looking = trying & verdict.seeks
@@ -255,14 +255,3 @@ def _look(carry: Carry, here: Arrival) -> tuple[Search, Any, Any]:
 def _margins(carry: Carry, here: Arrival) -> tuple[list[Any], list[Any]]:
     """At the beginning and at the end of the try."""
     return jax.tree.leaves(carry.point.margins), jax.tree.leaves(here.point.margins)
-
-
-def _ended(loop: Loop, carry: Carry, here: Arrival, verdict: Verdict) -> Any:
-    """The condition after a step that is taken. A landing that does not come to rest on the stop is none."""
-    left, scale = jnp.abs(here.point.margins["stop"][0]), carry.point.margins["stop"][0] + jnp.abs(carry.search.at_full)
-    landed = jnp.where(left <= MISSED * scale, Condition.STOPPED, Condition.DIVERGED)
-    goes_on = jnp.asarray(Condition.RUNNING)
-    if loop.eventful and not loop.ticks:
-        happened = jnp.any(jnp.stack(jax.tree.leaves(verdict.fired)))
-        goes_on = jnp.where(happened, Condition.REFRESHING, Condition.RUNNING)
-    return jnp.where(verdict.fired["stop"][0], landed, jnp.where(verdict.over, Condition.TIMED_OUT, goes_on))

@@ -1,4 +1,4 @@
-"""What happens in one step of a run, whatever chose its length: the only place where that is said.
+"""What happens in one step of the grid, or in a part of one; `adaptive` says the same of steps that it chooses.
 
 integrate to t + h, within one regime;  the plant's projection;  the objectives' update over the step;  at t + h the
 blocks' events and ticks;  the rates from there, with which the next step begins"""

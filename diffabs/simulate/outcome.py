@@ -29,13 +29,14 @@ def judge(loop: Loop, objectives: dict[str, Objective], carry: Any) -> tuple[Run
     """The result of a run that is over, and its last instant; of the carry of whatever chose its steps. `objectives`
     with the plant's audit."""
     last = observe(loop, carry.point.t, carry.point.state, carry.running)
-    ending = Ending(last.sample, carry.stopped, *loop.stop.remainder(last.sample, carry.stopped))
+    stopped = carry.condition == Condition.STOPPED
+    ending = Ending(last.sample, stopped, *loop.stop.remainder(last.sample, stopped))
     metrics = {name: o.value(carry.point.tally[name], ending) for name, o in objectives.items()}
     wrong = [_impossible(name, objectives[name], value) for name, value in metrics.items()]
     diverged = jnp.any(jnp.stack([carry.condition == Condition.DIVERGED, *wrong]))
     metrics = {n: jnp.where(diverged, jnp.nan, value) for n, value in metrics.items() if n != AUDIT}
     timed_out = (carry.condition == Condition.TIMED_OUT) & ~diverged
-    return Run(metrics, carry.stopped & ~diverged, diverged, timed_out, ending, None), last
+    return Run(metrics, stopped & ~diverged, diverged, timed_out, ending, None), last
 
 
 def observe(loop: Loop, t: Any, state: LoopState, running: Any) -> Trajectory:

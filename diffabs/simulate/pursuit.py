@@ -13,7 +13,6 @@ import jax.numpy as jnp
 
 from diffabs.core.loop import Loop
 from diffabs.simulate.checkpoint import anyone
-from diffabs.simulate.condition import Condition
 from diffabs.simulate.dynamics import Objectives
 from diffabs.simulate.landing import select
 from diffabs.simulate.methods import AtPace
@@ -34,11 +33,6 @@ class Pursuit(NamedTuple):
     def running(self) -> Any:
         """Whether another step is to be made, tried or repeated."""
         return self.ahead.running | self.waits
-
-    @property
-    def stopped(self) -> Any:
-        """Whether the stop was reached."""
-        return self.condition == Condition.STOPPED
 
     @property
     def condition(self) -> Any:

@@ -23,7 +23,7 @@ from diffabs.core.regime import Regime, Words
 from diffabs.simulate.adaptive import passed
 from diffabs.simulate.advance import start
 from diffabs.simulate.checkpoint import anyone, forgetful
-from diffabs.simulate.condition import Condition
+from diffabs.simulate.condition import Condition, goes_on
 from diffabs.simulate.drivers import BLOCK
 from diffabs.simulate.dynamics import Ahead, Dynamics, Objectives, Tally, dynamics, parted
 from diffabs.simulate.foresight import bit
@@ -80,15 +80,7 @@ class Repeated(NamedTuple):
     point: Place
     condition: Any
 
-    @property
-    def running(self) -> Any:
-        """Whether another step is to be made: never."""
-        return self.condition < 0
-
-    @property
-    def stopped(self) -> Any:
-        """Whether the stop was reached."""
-        return self.condition == Condition.STOPPED
+    running = property(goes_on)  # never
 
 
 def room(loop: Loop, solver: Adaptive) -> int:

@@ -1,4 +1,4 @@
-"""The classical fourth-order Runge-Kutta step on any pytree, and many steps with little memory for reverse mode."""
+"""The classical fourth-order Runge-Kutta step on any pytree: stages written out for values, a loop for derivatives."""
 
 from collections.abc import Callable
 from functools import partial

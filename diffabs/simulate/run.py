@@ -1,6 +1,6 @@
-"""Run a loop: a scan over Runge-Kutta steps that returns a trajectory, or only what is measured.
+"""Run a loop, by fixed or adaptive Runge-Kutta steps, and return a trajectory, or only what is measured.
 
-A step that crosses the stop, or an event of a block, is tried again, shorter, until it ends there (`stepper`). Every
+A step that crosses the stop, or an event of a block, is tried again, shorter, until it ends there (`landing`). Every
 objective is thus exact to the order of the method and differentiable, wherever the crossing falls."""
 
 import math
@@ -40,8 +40,8 @@ def rollout(loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | No
     >>> print(*(f"{speed:.1f}" for speed in run.trajectory.sample.output.speed))  # after 0, 1, 2, 3 s
     27.8 19.1 10.0 1.0
 
-    Pure and jit-compiled, once per structure of the loop: new values and another duration do not compile again, but for
-    the length of a trajectory, and of a derivative, in steps of an eighth.
+    Pure and jit-compiled, once per structure of the loop: new values and another duration do not compile again. A
+    trajectory or a derivative does where it becomes longer than the room that it has, up to an eighth more than asked.
     Raises ValueError for a step, duration or stride that is not positive, a step longer than the duration, and
     parameters that are no real numbers of 32 bits or more, or have another shape than they need.
     """

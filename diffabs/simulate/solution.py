@@ -34,8 +34,8 @@ class FixedStep:
 @dataclasses.dataclass(frozen=True)
 class Adaptive:
     """Steps as long as their error allows, up to `duration` [s]; they end where a comparison in the flow changes (a
-    limit, the knot of a measured road, a wheel that locks), on events, and where a clock strikes. Runge-Kutta's method
-    of fourth order, whose reference fixed steps remain.
+    limit, the knot of a measured road, a wheel that locks), on events, and where a clock strikes. The method is
+    Tsitouras' of fifth order; the reference remains `FixedStep`.
 
     rtol: the error of a step, as a fraction of the greatest value so far of each state and of the first signal that the
         plant shows. What a run measures is off by some ten times as much (`accuracy` estimates it)

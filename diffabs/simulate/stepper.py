@@ -1,4 +1,4 @@
-"""Which steps a run takes: those of the grid, cut where an event lies between.
+"""Which steps a run under `FixedStep` takes: those of the grid, cut where an event lies between.
 
 A step within which a margin falls through zero (the stop's, a block's, that of a comparison in the flow) is tried
 again, shorter, until one ends on the zero (`landing`). So the run is a discretisation of the exact solution on both
@@ -24,7 +24,7 @@ from diffabs.core.loop import Loop, Margins
 from diffabs.core.protocols import Clock
 from diffabs.simulate.advance import Arrival, Point, Try, arrive, begin, depart
 from diffabs.simulate.checkpoint import anyone, apart
-from diffabs.simulate.condition import Condition
+from diffabs.simulate.condition import Condition, after_step, goes_on
 from diffabs.simulate.dynamics import Objectives, dynamics
 from diffabs.simulate.landing import (
     BEYOND,
@@ -45,7 +45,6 @@ EXTRA, SPARE = 4, 64  # tries beyond a step of the grid for each of them, about 
 KINKS = 1  # tries for each step of the grid, up to now, that comparisons may take; then steps are blunt
 MOST = 32  # tries within one step of the grid, likewise
 FASTER, PART = 4, 1e-3  # times the rates at both ends of a step, and part of the state: the most that it may change
-MISSED = 0.1  # of the change of the stop's margin in the step: the most that may be left of it
 
 
 class Carry(NamedTuple):
@@ -60,15 +59,7 @@ class Carry(NamedTuple):
     blunt: Any  # whether steps are
     condition: Any
 
-    @property
-    def running(self) -> Any:
-        """Whether another step is to be made or tried."""
-        return self.condition <= Condition.REFRESHING
-
-    @property
-    def stopped(self) -> Any:
-        """Whether the stop was reached."""
-        return self.condition == Condition.STOPPED
+    running = property(goes_on)
 
 
 class Verdict(NamedTuple):
@@ -146,7 +137,7 @@ def step(
 
 def _ahead(loop: Loop, carry: Carry, here: Arrival, verdict: Verdict, h: Any, left: Any) -> tuple[Any, ...]:
     """What a try that is taken leaves: next length, whether steps are blunt, and the condition; `left` to the grid."""
-    ended = _ended(loop, carry, here, verdict)
+    ended = after_step(loop, carry, here.margins, verdict)
     left = jnp.where(ended == Condition.REFRESHING, 0.0, jnp.where(verdict.on_grid, h, left))
     same = [a == b for a, b in zip(here.regime, carry.point.regime, strict=True)]
     calm = verdict.on_grid & jnp.all(jnp.array(same))
@@ -215,17 +206,6 @@ def _crossings(carry: Carry, here: Arrival, kinks: int) -> Crossings:
 def _margins(carry: Carry, here: Arrival) -> tuple[list[Any], list[Any]]:
     """At the beginning and at the end of the try."""
     return jax.tree.leaves(carry.point.margins), jax.tree.leaves(here.margins)
-
-
-def _ended(loop: Loop, carry: Carry, here: Arrival, verdict: Verdict) -> Any:
-    """The condition after a step that is taken. A landing that does not come to rest on the stop is none."""
-    left, scale = jnp.abs(here.margins["stop"][0]), carry.point.margins["stop"][0] + jnp.abs(carry.search.at_full)
-    landed = jnp.where(left <= MISSED * scale, Condition.STOPPED, Condition.DIVERGED)
-    goes_on = jnp.asarray(Condition.RUNNING)
-    if loop.eventful and not loop.ticks:
-        happened = jnp.any(jnp.stack(jax.tree.leaves(verdict.fired)))
-        goes_on = jnp.where(happened, Condition.REFRESHING, Condition.RUNNING)
-    return jnp.where(verdict.fired["stop"][0], landed, jnp.where(verdict.over, Condition.TIMED_OUT, goes_on))
 
 
 def _last(here: Arrival, point: Point) -> Point:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 from diffabs.core.loop import LoopState, Margins, Signals
 from diffabs.core.protocols import Sample
 from diffabs.core.regime import Words
-from diffabs.simulate.condition import Condition
+from diffabs.simulate.condition import goes_on
 from diffabs.simulate.dynamics import Tally
 from diffabs.simulate.landing import Search
 
@@ -59,15 +59,7 @@ class Carry(NamedTuple):
     note: Any  # of the last try: a bit for each event at its end, and the regime in its middle; () likewise
     condition: Any
 
-    @property
-    def running(self) -> Any:
-        """Whether another step is to be made or tried."""
-        return self.condition <= Condition.REFRESHING
-
-    @property
-    def stopped(self) -> Any:
-        """Whether the stop was reached."""
-        return self.condition == Condition.STOPPED
+    running = property(goes_on)
 
 
 class Verdict(NamedTuple):

@@ -1,4 +1,4 @@
-"""Tuning by gradients, worst cases, identification: what a differentiable model is for."""
+"""Tuning by gradients, and worst cases: what a differentiable model is for."""
 
 from typing import TYPE_CHECKING
 

@@ -1,5 +1,5 @@
 """What a tuned loop must satisfy. Each constraint is an array of excesses, positive where it is violated, in units of
-its own scale; the augmented Lagrangian (`lagrangian`) has a multiplier for each. Met is met: no excess above zero."""
+its own scale; `augmented_lagrangian` has a multiplier for each. Met is met: no excess above zero."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -75,8 +75,8 @@ class Poles:
 @dataclasses.dataclass(frozen=True, eq=False)
 class CertifiedDecay:
     """A common Lyapunov matrix proves a decay of at least `decay` [1/s] at every vertex, however fast the system varies
-    between them (`design.sensitivity.certified_decay`). The gain is seen as by `Poles`. In floating point: `certify`
-    proves it of the result."""
+    between them (`certified_decay` of `design.interior.differentiable`). The gain is seen as by `Poles`. In floating
+    point: `certify` proves it of the result."""
 
     system: Polytope
     decay: float

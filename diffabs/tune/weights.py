@@ -5,8 +5,8 @@
 The log-Cholesky coordinates (d, the rest of L, rho) reach every positive definite pair, and nothing else. Only Q/R
 matters to the gain, so rho is usually left where it is. `design` is any differentiable function of (Q, R):
 
-    regulator(model)       the LQ regulator of one linear model, by `design.lqr` or `dlqr`
-    robust(polytope)       eqs. (29)-(32) of Maeda and Sugiura over a polytope, by `design.sensitivity.robust_gain`
+    regulator(model)       the LQ regulator of one linear model, by `linear.lqr` or `dlqr`
+    robust(polytope)       eqs. (29)-(32) of Maeda and Sugiura over a polytope, by `robust_gain`
 """
 
 from collections.abc import Callable

@@ -23,7 +23,7 @@ from diffabs.design.proof.dyadic import Dyadic, Matrix, about, exactly, positive
 from diffabs.design.proof.schema import check
 
 
-class Condition(NamedTuple):
+class Inequality(NamedTuple):
     """sum(terms) > 0 (>= 0 where not `strict`), all of (..., k, k).
 
     `vertex` is the number of the first vertex where there is one for each vertex, ALL where it is about them together,
@@ -38,7 +38,7 @@ class Condition(NamedTuple):
 ALL = -1
 
 
-class Loop(NamedTuple):
+class ClosedLoop(NamedTuple):
     """Gain and C of the vertices, as floats or Dyadic."""
 
     K: Matrix
@@ -69,7 +69,7 @@ def block(rows: list[list[Matrix]]) -> Matrix:
     )
 
 
-def decrease(loop: Loop, P: Matrix, data: Mapping[str, Matrix]) -> tuple[Matrix, ...]:
+def decrease(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> tuple[Matrix, ...]:
     """Terms of -He(P C) - 2 rate P, in discrete time of factor^2 P - C' P C."""
     if loop.discrete:
         factor = data.get("factor", 1)
@@ -77,81 +77,81 @@ def decrease(loop: Loop, P: Matrix, data: Mapping[str, Matrix]) -> tuple[Matrix,
     return -he(P @ loop.C), -2 * data.get("rate", 0) * P
 
 
-def decay(loop: Loop, data: Mapping[str, Matrix]) -> Iterator[Condition]:
+def decay(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """V = x' P x falls at least like exp(-2 rate t), in discrete time by factor^2 a period."""
-    yield Condition((data["P"],))
-    yield Condition(decrease(loop, data["P"], data), 0)
+    yield Inequality((data["P"],))
+    yield Inequality(decrease(loop, data["P"], data), 0)
 
 
-def cost(loop: Loop, data: Mapping[str, Matrix]) -> Iterator[Condition]:
+def cost(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """V' <= -x' (Q + K' R K) x: the integral (sum) of the right side from x0 is at most x0' P x0.
 
     V falls without Q and R too, so that V -> 0 and the bound need no sign of Q, which may have been rounded.
     """
     terms = decrease(loop, data["P"], {})
-    yield Condition((data["P"],))
-    yield Condition(terms)
-    yield Condition((*terms, -data["Q"], -(loop.K.mT @ data["R"] @ loop.K)), 0)
+    yield Inequality((data["P"],))
+    yield Inequality(terms)
+    yield Inequality((*terms, -data["Q"], -(loop.K.mT @ data["R"] @ loop.K)), 0)
 
 
-def damping(loop: Loop, data: Mapping[str, Matrix]) -> Iterator[Condition]:
+def damping(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """With M = P C, -[[He(M), cot (M - M')], [cot (M' - M), He(M)]] > 0, cot >= zeta / sqrt(1 - zeta^2).
 
     Eigenvalues of every fixed system of the hull then lie in |Im| < |Re| / cot, left of 0 (Chilali and Gahinet 1996).
     """
     M, cot, zeta = data["P"] @ loop.C, data["cot"], data["zeta"]
     skew = cot * (M - M.mT)
-    yield Condition((data["P"],))
-    yield Condition(((cot * cot * (1 - zeta * zeta) - zeta * zeta) * np.eye(1),), strict=False)
-    yield Condition((-block([[he(M), skew], [skew.mT, he(M)]]),), 0)
+    yield Inequality((data["P"],))
+    yield Inequality(((cot * cot * (1 - zeta * zeta) - zeta * zeta) * np.eye(1),), strict=False)
+    yield Inequality((-block([[he(M), skew], [skew.mT, he(M)]]),), 0)
 
 
-def l2(loop: Loop, data: Mapping[str, Matrix]) -> Iterator[Condition]:
+def l2(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """V' + |z|^2 - gamma^2 |w|^2 < 0 with x' = C x + Bw w, z = (C + D K) x: the gain from w to z is below gamma.
 
     Bounded real lemma; in discrete time V' is the difference V(x+) - V(x).
     """
     P, Bw, Z = data["P"], data["Bw"], data["C"] + data["D"] @ loop.K
     none, supply = np.zeros((P.shape[-1], Bw.shape[-1])), data["gamma"] * data["gamma"] * np.eye(Bw.shape[-1])
-    yield Condition((P,))
+    yield Inequality((P,))
     if loop.discrete:
         F = block([[loop.C, Bw]])
-        yield Condition((block([[P - Z.mT @ Z, none], [none.T, supply]]), -(F.mT @ P @ F)), 0)
+        yield Inequality((block([[P - Z.mT @ Z, none], [none.T, supply]]), -(F.mT @ P @ F)), 0)
     else:
         cross = -(P @ Bw)
-        yield Condition((block([[-he(P @ loop.C) - Z.mT @ Z, cross], [cross.mT, supply]]),), 0)
+        yield Inequality((block([[-he(P @ loop.C) - Z.mT @ Z, cross], [cross.mT, supply]]),), 0)
 
 
-def inputs(loop: Loop, data: Mapping[str, Matrix]) -> Iterator[Condition]:
+def inputs(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """|u_j| <= limit_j for ever from the hull of `points`: they lie in {x' P x <= 1}, which no x leaves, and there
     (K_j x)^2 <= K_j P^-1 K_j' < limit_j^2, by [[P, K_j'], [K_j, limit_j^2]] > 0."""
     P, limit, points = data["P"], data["limit"], data["points"]
-    yield Condition((P,))
-    yield Condition(decrease(loop, P, {}), 0)
+    yield Inequality((P,))
+    yield Inequality(decrease(loop, P, {}), 0)
     for x in (points[i : i + 1] for i in range(points.shape[0])):
-        yield Condition((1 - x @ P @ x.mT,), strict=False)
+        yield Inequality((1 - x @ P @ x.mT,), strict=False)
     for j in range(limit.shape[0]):
         row = loop.K[j : j + 1]
-        yield Condition((block([[P, row.mT], [row, limit[j] * limit[j] * np.eye(1)]]),))
+        yield Inequality((block([[P, row.mT], [row, limit[j] * limit[j] * np.eye(1)]]),))
 
 
-def infeasible(loop: Loop, data: Mapping[str, Matrix]) -> Iterator[Condition]:
+def infeasible(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """No P > 0 has He(P (C_i + rate I)) <= 0 at all vertices: W_i >= 0 and S = sum_i He((C_i + rate I) W_i) > 0.
 
     Such a P would give 0 >= sum_i tr(W_i He(P (C_i + rate I))) = tr(P S) > 0. In discrete time C_i' P C_i <= factor^2 P
     and S = sum_i (C_i W_i C_i' - factor^2 W_i).
     """
     W, factor = data["W"], data.get("factor", 1)
-    yield Condition((W,), strict=False)
+    yield Inequality((W,), strict=False)
     S = he(loop.C @ W) + 2 * data.get("rate", 0) * W
     if loop.discrete:
         S = loop.C @ W @ loop.C.mT - factor * factor * W
-    yield Condition(tuple(S[i] for i in range(W.shape[0])), ALL)
+    yield Inequality(tuple(S[i] for i in range(W.shape[0])), ALL)
 
 
 def scheduled(
     cells: list[tuple[Matrix, Matrix]], nodes: Matrix, gain: Matrix, data: Mapping[str, Matrix]
-) -> Iterator[Condition]:
+) -> Iterator[Inequality]:
     """V = x' P(p) x with V' <= -2 rate V - x' (Q + K' R K) x, P and K linear in the parameter p between nodes.
 
     In a cell, p = a + l (b - a), V' + ... is x' G(l) x with G quadratic in l, affine in (A, B) and in p' in `rates`.
@@ -161,7 +161,7 @@ def scheduled(
     cell they are anywhere in its hull. V is continuous, so its kinks at nodes do no harm. Shown is -(b - a) G > 0.
     """
     P, vertex = data["P"], 0
-    yield Condition((P,))
+    yield Inequality((P,))
     for c, (A, B) in enumerate(cells):
         width = nodes[c + 1] - nodes[c]
         ends = [(P[i], A + B @ K, K) for i in (c, c + 1) for K in (gain[i] if len(gain.shape) == 3 else gain,)]
@@ -171,9 +171,9 @@ def scheduled(
             spent += (-0.5 * width * he(Kx.mT @ data["R"] @ Ky),) if "R" in data else ()
             for s in (data["rates"][0], data["rates"][1]):
                 moved = (*terms, -s * (P[c + 1] - P[c]))
-                yield Condition(moved, vertex)
+                yield Inequality(moved, vertex)
                 if spent:
-                    yield Condition((*moved, *spent), vertex)
+                    yield Inequality((*moved, *spent), vertex)
         vertex += A.shape[0]
 
 
@@ -185,7 +185,7 @@ KINDS = {
 
 def conditions(
     kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any], proof: bool
-) -> Iterator[Condition]:
+) -> Iterator[Inequality]:
     """What a claim of `kind` says, for `proof` in exact numbers. Raises ValueError for data that do not fit."""
     check(kind, system, gain, data)
     known, vertex = (exactly, about) if proof else (np.asarray, np.asarray)
@@ -194,18 +194,18 @@ def conditions(
     if isinstance(system, Schedule):
         cells = [(vertex(cell.A), vertex(cell.B)) for cell in system.cells]
         return scheduled(cells, known(system.nodes), K, lifted)
-    return KINDS[kind](Loop(K, vertex(system.A) + vertex(system.B) @ K, system.period is not None), lifted)
+    return KINDS[kind](ClosedLoop(K, vertex(system.A) + vertex(system.B) @ K, system.period is not None), lifted)
 
 
-def true(condition: Condition) -> bool:
-    """Whether a condition over Dyadic matrices holds, errors included. Matrices that are not symmetric do not."""
-    total = functools.reduce(operator.add, condition.terms)
+def true(inequality: Inequality) -> bool:
+    """Whether an inequality over Dyadic matrices holds, errors included. Matrices that are not symmetric do not."""
+    total = functools.reduce(operator.add, inequality.terms)
     k = total.shape[-1]
     matrices = total.ints.reshape(-1, k, k)
     if not (matrices == matrices.mT).all():
         return False
     if total.error is None:
-        return all(positive(matrix, condition.strict) for matrix in matrices.tolist())
+        return all(positive(matrix, inequality.strict) for matrix in matrices.tolist())
     errors = np.broadcast_to(total.error, total.shape).reshape(-1, k, k)
     return all(robust(matrix, error, total.bits) for matrix, error in zip(matrices, errors, strict=True))
 
