@@ -73,6 +73,15 @@ class Cubic(NamedTuple):
         top = self(x)
         return jnp.where(inside & (top > ends), top, ends)
 
+    def greatest_of_parabola(self) -> Any:
+        """The greatest value in [0, 1] of the parabola through both ends with the slope at the start: to O(h^3), and of
+        what may have a kink at the end, behind which its slope is another."""
+        rise = self.end - self.start
+        inside = (self.start_slope > 0) & (2.0 * rise < self.start_slope)
+        bend = jnp.where(inside, self.start_slope - rise, 1.0)
+        top = self.start + 0.25 * self.start_slope * self.start_slope / bend
+        return jnp.where(inside, top, jnp.where(self.start >= self.end, self.start, self.end))
+
     def _coefficients(self) -> tuple[Any, Any, Any]:
         rise = self.end - self.start
         c2 = 3.0 * rise - 2.0 * self.start_slope - self.end_slope

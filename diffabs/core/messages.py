@@ -122,7 +122,8 @@ class Segment(NamedTuple):
     """A step of a run, from one instant to the next, within which nothing jumps: the samples at both ends (the first
     after the jumps there, the last before them), its length [s], and the step of the grid [s]. What `output`,
     `error` and `sample` return is the cubic of something seen, from values and rates at both ends: its extrema, roots
-    and integrals are those of the run to the order of the method."""
+    and integrals are those of the run to the order of the method. `smooth`: no limit is reached within, either, because
+    the step would end there; else the cubic of a signal that has limits may leave them."""
 
     start: Sample
     end: Sample
@@ -130,6 +131,7 @@ class Segment(NamedTuple):
     step: Scalar
     shown_rates: Callable[[], tuple[Shown, Shown]]
     sample_rates: Callable[[], tuple[Sample, Sample]]
+    smooth: bool = False
 
     def output(self, read: Callable[[Any], Scalar] = lambda output: output[0]) -> Cubic:
         """The cubic of read(output): by default of the first signal that the plant shows."""

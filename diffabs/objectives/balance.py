@@ -91,8 +91,8 @@ class PeakArmAngle:
 
 
 def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
-    """start, flow, update and value of the greatest size(sample), at either end of every step: control jumps and has
-    limits, and a cubic would leave them."""
+    """start, flow, update and value of the greatest size(sample): at either end of every step, and between where the
+    step would end on a limit. Where it would not, a cubic leaves limits."""
 
     def start(self: Any, sample: Sample) -> Memory:
         """The first."""
@@ -100,9 +100,10 @@ def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
         return Memory(held=size(sample))
 
     def update(self: Any, memory: Memory, segment: Segment) -> Scalar:
-        """The greater of what was, and of both ends of the step."""
+        """The greater of what was, and of the greatest of the step."""
         del self
-        return larger(memory.held, larger(size(segment.start), size(segment.end)))
+        ends = larger(size(segment.start), size(segment.end))
+        return larger(memory.held, segment.sample(size).greatest_of_parabola() if segment.smooth else ends)
 
     return start, nothing, update, held
 

@@ -138,6 +138,7 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, pace: Pace) -> A
         pace.h,
         lambda: (Shown.of(point.moving), Shown.of(moving)),
         lambda: (point.moving, moving),
+        smooth=True,
     )
     tally = {name: Memory(z[1][name], o.update(tallied[name], segment)) for name, o in system.objectives.items()}
     if loop.changes and not loop.ticks:

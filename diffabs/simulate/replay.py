@@ -224,6 +224,7 @@ def _step(
         pace.h,
         lambda: (Shown.of(begin.moving), Shown.of(end.moving)),
         lambda: (begin.moving, end.moving),
+        smooth=True,
     )
     tally = {name: Memory(tally[name].flow, o.update(tally[name], segment)) for name, o in objectives.items()}
     ends = (t, state.flow(), system.rates(t, z, held, within)[0]) if pace.keeps else ()
