@@ -1615,6 +1615,20 @@ MUTATIONS = [
         "test_rollout.py::test_the_torque_rate_of_a_lag_is_that_of_its_exponential",
     ),
     Mutation(
+        "balance: a voltage is seen at the ends of a step alone",
+        "objectives/balance.py",
+        "if segment.smooth else ends",
+        "if False else ends",
+        "test_peaks.py::test_a_voltage_rises_and_falls_within_a_long_step[True-24.0]",
+    ),
+    Mutation(
+        "balance: a voltage leaves its limit in the middle of a step",
+        "core/cubic.py",
+        "inside = (self.start_slope > 0) & (2.0 * rise < self.start_slope)",
+        "inside = self.start_slope > 0",
+        "test_peaks.py::test_a_voltage_that_rises_to_a_limit_does_not_leave_it",
+    ),
+    Mutation(
         "balance: gravity pulls the arm up",
         "plants/arm_balance.py",
         "r2 = torque - c2 * sin2 * v1**2 + arm",
