@@ -116,7 +116,7 @@ def test_control_c_at_any_moment(folder, measured, tmp_path, command, moment):
     longer = {
         "sweep": ["--samples", "1000000"],
         "rare": ["--samples", "20000"],
-        "tune": ["--set", "tune.iterations=100000", "--set", "tune.starts=8", "--out", tmp_path / "tuned.toml"],
+        "tune": ["--set", "tune.iterations=100000", "--set", "solver.step=1e-5", "--out", tmp_path / "tuned.toml"],
         "identify": ["--set", "solver.step=1e-5", "--out", tmp_path / "found.toml"],
     }
     begun = {
