@@ -37,6 +37,9 @@ class Adaptive:
     limit, the knot of a measured road, a wheel that locks), on events, and where a clock strikes. The method is
     Tsitouras' of fifth order; the reference remains `FixedStep`.
 
+    A signal that depends on time alone limits no step unless states follow it: an integral over a setpoint that swings
+    faster than everything else is as wrong as a cubic over a step is. Take fixed steps for it.
+
     rtol: the error of a step, as a fraction of the greatest value so far of each state and of the first signal that the
         plant shows. What a run measures is off by some ten times as much (`accuracy` estimates it)
     step: of a grid [s] on which clocks strike, delays remember, and of which a trajectory keeps every `every`-th
