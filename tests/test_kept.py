@@ -2,6 +2,7 @@
 same. What decides a program is tested in `test_kernel_start`, too."""
 
 import dataclasses
+import platform
 
 import jax
 import jax.numpy as jnp
@@ -98,8 +99,10 @@ class TestPrograms:
 
     def test_of_another_processor_are_others(self, folder, traced, monkeypatch):
         margin()
-        monkeypatch.setattr(provenance, "processor", lambda: "another")
+        provenance.processor.cache_clear()
+        monkeypatch.setattr(platform, "processor", lambda: "another")
         margin()
+        provenance.processor.cache_clear()
         assert len(traced) == len(programs(folder)) == 2
 
     def test_of_other_options_are_others(self, folder, traced, monkeypatch):
