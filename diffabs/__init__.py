@@ -1,5 +1,10 @@
 """Simulate, differentiate, tune and certify controllers for braking wheels."""
 
+import gc as _gc
+
+_collects = _gc.isenabled()
+_gc.disable()  # while modules are made, which stay: a look for garbage goes through all of JAX's
+
 from diffabs.core import interrupt as _interrupt
 
 _interrupt.early()  # before JAX, whose import takes seconds
@@ -17,5 +22,8 @@ from diffabs.simulate.run import rollout as rollout
 from diffabs.simulate.solution import Adaptive as Adaptive
 from diffabs.simulate.solution import FixedStep as FixedStep
 from diffabs.simulate.solution import Run as Run
+
+if _collects:
+    _gc.enable()
 
 __version__ = "0.1.0"

@@ -160,6 +160,13 @@ class TestArguments:
         assert len(programs(folder)) == 1
 
 
+@pytest.mark.parametrize("seed", [0, 7, 2**31 - 1, 2**40])
+def test_the_key_of_a_run_is_that_of_jax(seed):
+    found, wanted = scenario.Scenario("mine", seed=seed).key(), jax.random.key(seed)
+    assert found.dtype == wanted.dtype
+    np.testing.assert_array_equal(jax.random.key_data(found), jax.random.key_data(wanted))
+
+
 def test_what_has_the_name_of_another_function_is_refused():
     with pytest.raises(TypeError, match="that of another"):
         compile_once(options=SAME)(jax.vmap(jnp.sin))

@@ -41,8 +41,8 @@ class Shelf(Protocol):
         """What decides a program besides its function, its arguments and what is the same for all."""
         ...
 
-    def libraries(self, text: str) -> list[str]:
-        """The names of those that a lowered program calls."""
+    def libraries(self, lowered: jax.stages.Lowered) -> list[str]:
+        """The names of those that a program calls."""
         ...
 
     def load(self, library: str) -> None:
@@ -67,8 +67,8 @@ class Simple:
     def around(self) -> Any:
         return provenance.processor(), os.cpu_count()
 
-    def libraries(self, text: str) -> list[str]:
-        del text
+    def libraries(self, lowered: jax.stages.Lowered) -> list[str]:
+        del lowered
         return []
 
     def load(self, library: str) -> None:
@@ -163,7 +163,7 @@ class Programs:
             return jax.tree.leaves(found)
 
         lowered = jax.jit(kept).lower(*map(_data, leaves))
-        libraries = self.shelf.libraries(lowered.as_text())
+        libraries = self.shelf.libraries(lowered)
         with _written_nowhere():
             compiled = lowered.compile(compiler_options=self._options)
         return Program(compiled, results[0], libraries)

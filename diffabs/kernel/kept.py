@@ -6,6 +6,8 @@ import pathlib
 import re
 from typing import Any
 
+import jax
+
 from diffabs.core.compiling import traced
 from diffabs.core.kept import Programs
 from diffabs.kernel import compilers, launch
@@ -23,8 +25,9 @@ class Libraries:
         """Raises NoCompiler."""
         return launch.described(), launch.threads()
 
-    def libraries(self, text: str) -> list[str]:
-        return [launch.path(name).name for name in sorted(set(re.findall(launch.NAME + r"\w+", text)))]
+    def libraries(self, lowered: jax.stages.Lowered) -> list[str]:
+        names = set(re.findall(launch.NAME + r"\w+", lowered.as_text()))
+        return [launch.path(name).name for name in sorted(names)]
 
     def load(self, library: str) -> None:
         try:

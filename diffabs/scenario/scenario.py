@@ -60,7 +60,8 @@ class Scenario:
     def key(self) -> jax.Array:
         """The random key of a run, `jax.random.key(seed)`."""
         if jax.config.jax_default_prng_impl == "threefry2x32" and 0 <= self.seed < 2**31:  # pyright: ignore
-            return jax.random.wrap_key_data(np.array([0, self.seed], np.uint32))  # what JAX compiles a program for
+            words: Any = np.array([0, self.seed], np.uint32)
+            return jax.random.wrap_key_data(words)  # JAX would compile a program for it
         return jax.random.key(self.seed)
 
     def with_loop(self, loop: Loop, how: str) -> "Scenario":
