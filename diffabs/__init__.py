@@ -1,9 +1,4 @@
-"""Simulate, differentiate, tune and certify controllers for braking wheels."""
-
-import gc as _gc
-
-_collects = _gc.isenabled()
-_gc.disable()  # while modules are made, which stay: a look for garbage goes through all of JAX's
+"""Simulate, differentiate, tune and certify controllers for braking wheels and two-wheelers."""
 
 from diffabs.core import interrupt as _interrupt
 
@@ -22,8 +17,5 @@ from diffabs.simulate.run import rollout as rollout
 from diffabs.simulate.solution import Adaptive as Adaptive
 from diffabs.simulate.solution import FixedStep as FixedStep
 from diffabs.simulate.solution import Run as Run
-
-if _collects:
-    _gc.enable()
 
 __version__ = "0.1.0"

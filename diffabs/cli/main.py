@@ -5,7 +5,7 @@ Results go to stdout, as tables or with --json as one JSON document; everything 
 import gc
 
 COLLECTS = gc.isenabled()
-gc.disable()  # while modules are made, as in the package itself
+gc.disable()  # while modules are made: a look for garbage goes through all of JAX's, a sixth of a short command
 
 import contextlib
 import dataclasses
