@@ -524,7 +524,7 @@ MUTATIONS = [
     Mutation(
         "weak types stay weak",
         "core/pytree.py",
-        "return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)",
+        "return jax.tree.map(converted, tree)",
         "return tree",
         "test_conformance.py::test_new_values_do_not_compile_again[plant: quarter car]",
     ),

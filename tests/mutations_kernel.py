@@ -9,12 +9,12 @@ RULES = f"{FUNCTIONS}::test_rules_are_those_of_jax"
 ULPS = f"{FUNCTIONS}::test_elementary_functions_are_right_to_a_unit_in_the_last_place[float64-]"
 OBJECTION = "test_kernel.py::TestObjections"
 
-START, CUDA = "test_kernel_start.py", "test_kernel_cuda.py"
+START, PROGRAMS, CUDA = "test_kernel_start.py", "test_kept.py", "test_kernel_cuda.py"
 LANE, THREADS, GPU = "kernel/native/lane.h", "kernel/native/threads.h", "kernel/gpu.py"
 CUDA_RUNS = f"{CUDA}::TestText::test_runs_are_those_of_xla"
 CUDA_RULES = f"{CUDA}::TestText::test_rules_are_those_of_jax"
 TOLD = f"{CUDA}::TestDriver::test_is_told_of_arrays_threads_and_lanes"
-KEPT, FINGERPRINT = "kernel/kept.py", "core/fingerprint.py"
+KEPT, FINGERPRINT = "core/kept.py", "core/fingerprint.py"
 BINDING, TANGENTS, LAUNCH = "kernel/binding.py", "kernel/tangents.py", "test_kernel_tangents.py::TestLaunch"
 LINEAR = "kernel/linear.py"
 PUSHED, ENGINES = f"{LAUNCH}::test_derivatives_are_those_of_xla", "test_kernel_engines.py"
@@ -53,10 +53,29 @@ KERNEL = [
      f"{START}::TestPrograms::test_are_whole_though_jax_has_a_cache_of_its_own"),
     ("start: a damaged program is taken", KEPT, 'hashlib.sha256(body).hexdigest() != told["digest"]', "not body",
      f"{START}::TestPrograms::test_that_are_not_whole_are_made_anew[damaged]"),
-    ("start: constants do not name a program", KEPT, "(self.told, *around)", "around",
+    ("start: constants do not name a program", KEPT, "(self.told, fixed,", "(fixed,",
      f"{START}::TestPrograms::test_of_other_constants_are_others"),
-    ("start: arguments do not name a program", KEPT, "fingerprint.digest(args,", "fingerprint.digest(None,",
+    ("start: arguments do not name a program", KEPT, "fingerprint.digest(jax.tree.map(_described, given),",
+     "fingerprint.digest(None,",
      f"{START}::TestPrograms::test_of_another_structure_are_others[name]"),
+    ("start: another equation is the same program", KEPT, "(self.told, fixed,", "(self.told,",
+     f"{PROGRAMS}::TestArguments::test_static_ones_are_part_of_a_program"),
+    ("start: options do not name a program", KEPT, "fixed, self._options, *around", "fixed, *around",
+     f"{PROGRAMS}::TestPrograms::test_of_other_options_are_others"),
+    ("start: the processor does not name a program", KEPT, "return provenance.processor(), os", "return os",
+     f"{PROGRAMS}::TestPrograms::test_of_another_processor_are_others"),
+    ("start: plain numbers are part of a program", KEPT, "jax.tree.map(_described, given)", "given",
+     f"{PROGRAMS}::TestArguments::test_plain_numbers_are_not"),
+    ("start: a program that is not whole stays", KEPT, "            _write(path, program)", "            pass",
+     f"{PROGRAMS}::TestPrograms::test_that_are_not_whole_are_made_anew[half]"),
+    ("start: numbers are constants of a program", KEPT, "tree.unflatten(whole)", "tree.unflatten(leaves)",
+     f"{PROGRAMS}::test_a_run_has_the_bits_of_a_trace"),
+    ("start: the words of a key in another order", "scenario/scenario.py", "[0, self.seed]", "[self.seed, 0]",
+     f"{PROGRAMS}::test_the_key_of_a_run_is_that_of_jax[7]"),
+    ("start: large seeds are cut off", "scenario/scenario.py", "and 0 <= self.seed < 2**31:", ":",
+     f"{PROGRAMS}::test_the_key_of_a_run_is_that_of_jax[1099511627776]"),
+    ("start: the name of another function", "core/compiling.py", 'hasattr(function, "__wrapped__")', "False",
+     f"{PROGRAMS}::test_what_has_the_name_of_another_function_is_refused"),
     ("start: a part from outside is known by its name", FINGERPRINT,
      "if found is None or inspect.unwrap(found) is not x:", "if False:",
      f"{START}::TestWhatNobodyCanTell::test_a_part_from_outside"),

@@ -9,18 +9,21 @@ import jax
 import pytest
 
 from diffabs.cli import compiled
+from diffabs.core import kept
+from diffabs.core.compiling import shelf
 
 
 @pytest.fixture
 def user(tmp_path, monkeypatch):
     """A user who has decided nothing, and the home."""
     before = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
-    for name in (*compiled.CHOSEN, compiled.OFF, "XDG_CACHE_HOME", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
+    for name in (*compiled.CHOSEN, kept.OFF, "XDG_CACHE_HOME", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(sys, "platform", "linux")
     jax.config.update("jax_compilation_cache_dir", None)
     yield tmp_path
+    shelf.put(None)
     jax.config.update("jax_compilation_cache_dir", before[0])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", before[1])
 
@@ -44,6 +47,7 @@ def test_where_each_system_wants_it(user, monkeypatch, system, variable, folder)
     assert found.parent == user / folder / "diffabs"
     assert found.is_dir()
     assert jax.config.jax_compilation_cache_dir == str(found)
+    assert shelf.folder() == found
     assert jax.config.jax_persistent_cache_min_compile_time_secs == compiled.WORTH
 
 
@@ -54,12 +58,13 @@ def test_a_relative_folder_is_none(user, monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [(compiled.OFF, "1"), ("JAX_COMPILATION_CACHE_DIR", "elsewhere"), ("JAX_ENABLE_COMPILATION_CACHE", "false")],
+    [(kept.OFF, "1"), ("JAX_COMPILATION_CACHE_DIR", "elsewhere"), ("JAX_ENABLE_COMPILATION_CACHE", "false")],
 )
 def test_who_has_decided_is_asked_no_more(user, monkeypatch, name, value):
     monkeypatch.setenv(name, value)
     assert compiled.keep() is None
     assert jax.config.jax_compilation_cache_dir is None
+    assert shelf.folder() is None
     assert not list(user.iterdir())
 
 
@@ -109,14 +114,14 @@ def test_commands_share_what_they_compile(tmp_path):
         return done.stdout
 
     def entries() -> set[pathlib.Path]:
-        return set(tmp_path.rglob("*-cache"))
+        return {path for path in tmp_path.rglob("*") if path.is_file()}
 
     home = {"XDG_CACHE_HOME": str(tmp_path)}
     alone = simulated(**home, DIFFABS_NO_CACHE="1")
     assert not entries()
     assert simulated(**home) == alone
     first = entries()
-    assert any(path.name.startswith("jit__run-") for path in first)
+    assert len([path for path in first if path.suffix == ".program"]) == 4  # two checks, the stable step, the run
     assert simulated(**home) == alone
     assert entries() == first
     for path in first:

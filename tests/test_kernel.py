@@ -18,7 +18,8 @@ from kernels import FOLDER, applied, both, same
 
 import diffabs as d
 from diffabs import controllers, plants, scenario, sensors
-from diffabs.kernel import compilers, kept, launch
+from diffabs.core import kept
+from diffabs.kernel import compilers, launch
 from diffabs.kernel.graph import Graph, Level
 from diffabs.kernel.primitives import Unsupported, known, translate
 from diffabs.objectives import BRAKING

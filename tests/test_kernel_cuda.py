@@ -21,7 +21,8 @@ from test_kernel import AT_ONCE, DIVERGING, KEYS, LOOP, MEASURED, NEVER, SOLVER,
 
 import diffabs as d
 from diffabs import scenario
-from diffabs.kernel import compilers, cuda, gpu, kept, nvrtc
+from diffabs.core import kept
+from diffabs.kernel import compilers, cuda, gpu, nvrtc
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import native

@@ -12,9 +12,10 @@ from kernels import FOLDER
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, reliability, roads, scenario, stops, sweep, tune
+from diffabs.core import kept
 from diffabs.core.pytree import get
 from diffabs.design.attraction import Cells, attraction
-from diffabs.kernel import compilers, kept, launch
+from diffabs.kernel import compilers, launch
 from diffabs.objectives import IAE, StopTime
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import native

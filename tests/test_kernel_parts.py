@@ -10,8 +10,9 @@ from kernels import FOLDER, both, same
 
 import diffabs as d
 from diffabs import scenario
+from diffabs.core import kept
 from diffabs.core.pytree import get
-from diffabs.kernel import compilers, kept, launch
+from diffabs.kernel import compilers, launch
 from diffabs.objectives import usual
 from diffabs.scenario.defaults import balancing, braking
 

@@ -17,6 +17,7 @@ from marks import cases
 import diffabs as d
 from diffabs import controllers, scenario, stops
 from diffabs.core import fingerprint
+from diffabs.core import kept as kept_files
 from diffabs.core.fingerprint import Unknown
 from diffabs.core.pytree import get, pytree
 from diffabs.kernel import compilers, kept, launch, program
@@ -38,7 +39,7 @@ def folder(monkeypatch):
     monkeypatch.setenv(compilers.CACHE, FOLDER)
     monkeypatch.setattr(kept, "FOLDER", f"programs-{secrets.token_hex(4)}")
     monkeypatch.setattr(launch, "VECTORS", 1)
-    monkeypatch.delenv(kept.OFF, raising=False)
+    monkeypatch.delenv(kept_files.OFF, raising=False)
     native._kept.forget()
     place = compilers.cache_folder() / kept.FOLDER
     yield place
@@ -86,7 +87,7 @@ class TestPrograms:
     def test_are_those_of_a_trace(self, monkeypatch):
         run()
         found = again()
-        monkeypatch.setenv(kept.OFF, "1")
+        monkeypatch.setenv(kept_files.OFF, "1")
         same_bits(again(), found)
 
     def test_are_whole_though_jax_has_a_cache_of_its_own(self, folder):
@@ -159,7 +160,7 @@ class TestPrograms:
             path = folder / f"{i}.program"
             path.write_bytes(bytes(10))
             os.utime(path, (i, i))
-        monkeypatch.setattr(kept, "ROOM", 39)
+        monkeypatch.setattr(kept_files, "ROOM", 39)
         run()
         assert {"2.program", "3.program"} < {path.name for path in folder.iterdir()}
         assert not (folder / "1.program").exists()

@@ -2,19 +2,16 @@
 
 Compiling is most of what a command costs. Who configures JAX's own cache decides; DIFFABS_NO_CACHE=1 turns it off."""
 
-import contextlib
-import hashlib
 import os
 import pathlib
-import platform
 import sys
 import warnings
 
 import jax
 
-from diffabs.core import files
+from diffabs.core import files, kept, provenance
+from diffabs.core.compiling import shelf
 
-OFF = "DIFFABS_NO_CACHE"
 WORTH = 0.05  # s of compiling, from which a program is kept
 ROOM = 256 * 2**20  # bytes on disk; beyond, the oldest half goes
 CHOSEN = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")  # by which a user has decided
@@ -24,10 +21,10 @@ def keep() -> pathlib.Path | None:
     """Return the folder that JAX from now on keeps compiled programs in, or None: without one everything works, and
     compiles. Nothing is said of a folder that cannot be written or of a damaged entry."""
     chosen = jax.config.values.get("jax_compilation_cache_dir")
-    if os.environ.get(OFF) or any(name in os.environ for name in CHOSEN) or chosen:
+    if os.environ.get(kept.OFF) or any(name in os.environ for name in CHOSEN) or chosen:
         return None
     try:
-        folder = _user_folder() / "diffabs" / f"jax-{_processor()}"
+        folder = _user_folder() / "diffabs" / f"jax-{provenance.processor()}"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
             return None
@@ -38,6 +35,7 @@ def keep() -> pathlib.Path | None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH)
+    shelf.put(folder)
     return folder
 
 
@@ -49,12 +47,3 @@ def _user_folder() -> pathlib.Path:
     if given.is_absolute():
         return given
     return pathlib.Path.home() / ("AppData/Local" if sys.platform == "win32" else ".cache")
-
-
-def _processor() -> str:
-    """Return a name of this kind of processor: programs compiled for another may not run here, and homes are shared."""
-    known = f"{platform.machine()} {platform.processor()}"
-    with contextlib.suppress(OSError):
-        lines = pathlib.Path("/proc/cpuinfo").read_text(errors="replace").partition("\n\n")[0].splitlines()
-        known += "".join(sorted(line for line in lines if line.startswith(("model name", "flags", "Features", "CPU"))))
-    return hashlib.sha256(known.encode()).hexdigest()[:12]

@@ -1,6 +1,9 @@
 """Where a number comes from: versions of what computed it, and the commit."""
 
+import contextlib
 import datetime
+import functools
+import hashlib
 import importlib.metadata
 import os
 import pathlib
@@ -21,6 +24,16 @@ def versions(*packages: str) -> dict[str, str]:
 def origin(*packages: str) -> dict[str, str]:
     """Return what can change a bit of a result: `versions`, JAX's backend, and the processor."""
     return versions(*packages) | {"backend": jax.default_backend(), "machine": platform.machine()}
+
+
+@functools.cache
+def processor() -> str:
+    """Return a name of this kind of processor: programs compiled for another may not run here, and homes are shared."""
+    known = f"{platform.machine()} {platform.processor()}"
+    with contextlib.suppress(OSError):
+        lines = pathlib.Path("/proc/cpuinfo").read_text(errors="replace").partition("\n\n")[0].splitlines()
+        known += "".join(sorted(line for line in lines if line.startswith(("model name", "flags", "Features", "CPU"))))
+    return hashlib.sha256(known.encode()).hexdigest()[:12]
 
 
 def made(words: Sequence[str]) -> dict[str, str | int]:

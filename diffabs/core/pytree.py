@@ -22,6 +22,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from diffabs.core import kinds
+from diffabs.core.compiling import traced
 from diffabs.core.rules import array
 from diffabs.core.units import Units, in_loop, units_of
 
@@ -255,7 +256,15 @@ def strong(tree: T) -> T:
         x.dtype for x in jax.tree.leaves(tree) if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)
     ]
     dtype = jnp.result_type(*arrays) if arrays else jnp.result_type(float)
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)
+    known = not traced()
+
+    def converted(x: Any) -> Any:
+        """By NumPy where that is possible: JAX would compile a program for it, and call that for each leaf."""
+        by_numpy = known and not isinstance(x, jax.Array)
+        return jax.device_put(np.asarray(x, dtype)) if by_numpy else jnp.asarray(x, dtype)
+
+    with np.errstate(over="ignore"):  # what single precision cannot hold is infinite
+        return jax.tree.map(converted, tree)
 
 
 def prepared(part: Any) -> Any:

@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 
 from diffabs.core import files
 from diffabs.core.loop import Loop
@@ -57,7 +58,10 @@ class Scenario:
     sweep: section_sweep.Variation = dataclasses.field(default_factory=section_sweep.Variation)
 
     def key(self) -> jax.Array:
-        """The random key of a run."""
+        """The random key of a run, `jax.random.key(seed)`."""
+        if jax.config.jax_default_prng_impl == "threefry2x32" and 0 <= self.seed < 2**31:  # pyright: ignore
+            words: Any = np.array([0, self.seed], np.uint32)
+            return jax.random.wrap_key_data(words)  # JAX would compile a program for it
         return jax.random.key(self.seed)
 
     def with_loop(self, loop: Loop, how: str) -> "Scenario":

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.core.log import lend
 from diffabs.core.loop import Loop
@@ -121,7 +122,7 @@ class AtPace(Pace):
 
 def method_of(solver: Solver, dtype: Any) -> OnGrid | AtPace:
     """Return what chooses the steps of a solver, its numbers of this type."""
-    h, steps = jnp.asarray(solver.step, dtype), jnp.asarray(solver.steps)
+    h, steps = jax.device_put((np.asarray(solver.step, dtype), solver.steps))  # `asarray` would compile programs
     if isinstance(solver, Adaptive):
         return AtPace(h, steps, _possible(jnp.asarray(solver.rtol, dtype)))
     return OnGrid(h, steps, solver.kinks)

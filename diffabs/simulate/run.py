@@ -123,7 +123,7 @@ def _wrong_number(solver: Solver, name: str) -> str:
 def _simulated(places: Places, run: Any) -> Run:
     """The run of (loop, objectives, method, key)."""
     loop, objectives, method, key = run
-    return _run(loop, objectives, method, key, jnp.asarray(places.every), places=places.instants)
+    return _run(loop, objectives, method, key, jax.device_put(places.every), places=places.instants)
 
 
 def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:

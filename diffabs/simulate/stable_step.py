@@ -176,7 +176,11 @@ def _jacobians_of(loop: Loop) -> jax.Array:
 
 
 _jacobian = compile_once(options=SAME)(_jacobians_of)
-_jacobians = compile_once(options=SAME)(jax.vmap(_jacobians_of))
+
+
+@compile_once(options=SAME)
+def _jacobians(loops: Loop) -> jax.Array:
+    return jax.vmap(_jacobians_of)(loops)
 
 
 @pytree
