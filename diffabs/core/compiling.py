@@ -45,4 +45,10 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | Non
 def traced(*trees: Any) -> bool:
     """Return whether a trace is under way (jit), or these are no numbers yet (also grad, vmap): options are for a whole
     program, and of what is no number nothing can be asked."""
-    return isinstance(jax.device_put(0), Tracer) or any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
+    return isinstance(_zero(), Tracer) or any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
+
+
+@jax.jit
+def _zero() -> int:
+    """A number that is traced wherever anything is."""
+    return 0

@@ -12,6 +12,7 @@ of `core.validity` does it on the host, and names every offender at once.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar, dataclass_transform
@@ -22,6 +23,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from diffabs.core import kinds
+from diffabs.core.compiling import traced
 from diffabs.core.rules import array
 from diffabs.core.units import Units, in_loop, units_of
 
@@ -248,14 +250,35 @@ def strong(tree: T) -> T:
     Python numbers are weakly typed: mixed with arrays they would cause a second compilation of the same function.
     Raises ValueError for a leaf that is no real number, or a float of fewer than 32 bits.
     """
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if line := kinds.objection(leaf):
-            raise ValueError(f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.shown(leaf)} {line}")
-    arrays = [
-        x.dtype for x in jax.tree.leaves(tree) if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)
-    ]
+    leaves, structure = jax.tree.flatten(tree)
+    if any(map(kinds.objection, leaves)):
+        raise ValueError(_unfit(tree))
+    arrays = {x.dtype for x in leaves if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)}
     dtype = jnp.result_type(*arrays) if arrays else jnp.result_type(float)
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)
+    live = traced(leaves)
+    return structure.unflatten([jnp.asarray(x, dtype) if live else as_array(x, dtype) for x in leaves])
+
+
+def _unfit(tree: Any) -> str:
+    """The first leaf that is no number of a run."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    path, leaf = next((path, leaf) for path, leaf in leaves if kinds.objection(leaf))
+    return f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.shown(leaf)} {kinds.objection(leaf)}"
+
+
+def as_array(x: Any, dtype: Any) -> jax.Array:
+    """Return `jnp.asarray(x, dtype)`, where nothing is traced. The array of a Python number is made once: that takes
+    longer than what many calls do with it."""
+    if isinstance(x, float):
+        return _number(float(x), math.copysign(1.0, x), np.dtype(dtype), jax.config.jax_default_device)  # pyright: ignore
+    return jnp.asarray(x, dtype)
+
+
+@functools.lru_cache(maxsize=4096)
+def _number(x: float, sign: float, dtype: np.dtype, device: Any) -> jax.Array:
+    """Of a sign, since 0 equals -0, on a device."""
+    del sign, device
+    return jnp.asarray(x, dtype)
 
 
 def prepared(part: Any) -> Any:

@@ -9,6 +9,7 @@ Only this module knows `jax.experimental.serialize_executable`. Such a file is c
 import contextlib
 import hashlib
 import importlib
+import itertools
 import json
 import math
 import os
@@ -129,8 +130,10 @@ def _device(leaves: list[Any]) -> Any:
 
 
 def _callable(program: Program) -> Callable[..., Any]:
+    results = jax.tree.structure(_rebuilt(program.results, itertools.repeat(0)))
+
     def call(*args: Any) -> Any:
-        return _rebuilt(program.results, iter(program.compiled(*map(launch.data, jax.tree.leaves(args)))))
+        return results.unflatten(program.compiled(*map(launch.data, jax.tree.leaves(args))))
 
     return call
 

@@ -15,7 +15,7 @@ from diffabs.core.pytree import arrayed, get, parameters, replace
 from diffabs.simulate.engine import by_engine
 from diffabs.simulate.refill import Enough, run_refilled
 from diffabs.simulate.refusals import first_line, refusals
-from diffabs.simulate.run import arguments, measure, rollout
+from diffabs.simulate.run import measure, refuse, rollout
 from diffabs.simulate.solution import Run, Solver
 
 TOGETHER = "lanes run together, for trajectories or for derivatives in either mode"
@@ -143,7 +143,7 @@ def run_batch(
     objectives, count = objectives or {}, batch.size
     columns = {path: jnp.asarray(x) if isinstance(x, list | tuple) else x for path, x in batch.values.items()}
     batch = dataclasses.replace(batch, values=columns)
-    arguments(replace(loop, {path: column[0] for path, column in batch.values.items()}), solver, objectives)
+    refuse(replace(loop, {path: column[0] for path, column in batch.values.items()}), solver, objectives)
     live = traced(loop, dict(batch.values), dict(objectives))
     if accepted is None:
         asked = bool(batch.values) and not live
