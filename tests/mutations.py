@@ -1780,6 +1780,13 @@ MUTATIONS = [
         "test_refusals.py::TestBeforeARun::test_the_step_is_judged_as_by_the_eigenvalues",
     ),
     Mutation(
+        "a bound on the modes of many lanes that is none",
+        "simulate/stable_step.py",
+        "bound = jnp.max(jnp.minimum(rows, columns))",
+        "bound = 0.5 * jnp.max(jnp.minimum(rows, columns))",
+        "test_refusals.py::TestBeforeARun::test_the_bound_of_many_lanes_is_that_of_few",
+    ),
+    Mutation(
         "a start beyond the stop is a run",
         "simulate/stepper.py",
         "zero + Condition.RUNNING, zero + Condition.DIVERGED",
