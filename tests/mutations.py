@@ -1780,6 +1780,13 @@ MUTATIONS = [
         "test_refusals.py::TestBeforeARun::test_the_step_is_judged_as_by_the_eigenvalues",
     ),
     Mutation(
+        "lanes on a mesh of Explicit axes stay there",
+        "simulate/placement.py",
+        "    if not meshes:",
+        "    if True:",
+        "test_batch.py::test_lanes_may_lie_on_a_mesh_of_either_type",
+    ),
+    Mutation(
         "a bound on the modes of many lanes that is none",
         "simulate/stable_step.py",
         "bound = jnp.max(jnp.minimum(rows, columns))",
