@@ -1784,7 +1784,7 @@ MUTATIONS = [
         "simulate/placement.py",
         "    if not meshes:",
         "    if True:",
-        "test_batch.py::test_lanes_may_lie_on_a_mesh_of_either_type",
+        "test_batch.py::test_lanes_on_an_explicit_mesh_are_run_on_an_auto_one",
     ),
     Mutation(
         "a bound on the modes of many lanes that is none",

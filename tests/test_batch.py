@@ -1,5 +1,6 @@
 """One contract for many lanes, however they are run: `run_batch` against `measure` of one lane after the other."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from diffabs.scenario.defaults import braking
 from diffabs.sensors import Noise
 from diffabs.simulate import refill
 from diffabs.simulate.batch import Batch, by_structure, grid, latin, stacked
+from diffabs.simulate.placement import divided
 from diffabs.simulate.refill import ROUND
 from diffabs.stops import SpeedReached, Standstill
 
@@ -303,6 +305,20 @@ def placed(values, keys, kind):
     return {path: jax.device_put(x, place) for path, x in values.items()}, jax.device_put(keys, place)
 
 
+def test_lanes_on_an_explicit_mesh_are_run_on_an_auto_one():
+    """Gathers say nothing of where they lie there; results come back."""
+    (speeds,), numbers = (given := placed({"speed": SPEEDS[:4]}, np.arange(4), AxisType.Explicit))[0].values(), given[1]
+    with pytest.raises(Exception, match="out_sharding"):
+        speeds[numbers]
+    for around in (contextlib.nullcontext, jax.set_mesh):
+        with around(speeds.sharding.mesh):
+            found = divided(lambda x, which, one: {"x": x[which], "one": one}, (speeds, numbers, 3.0))
+        np.testing.assert_array_equal(found["x"], SPEEDS[:4])
+        assert found["x"].sharding.mesh == speeds.sharding.mesh
+        assert found["one"] == 3.0
+
+
+@pytest.mark.slow
 def test_lanes_may_lie_on_a_mesh_of_either_type():
     """With and without the mesh around; the results lie there, too, and can be worked with."""
     values, numbers = {"initial.speed": SPEEDS[:4]}, np.arange(4)

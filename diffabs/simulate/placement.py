@@ -9,15 +9,13 @@ import jax
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding
 
-from diffabs.simulate.solution import Run
-
 TRACED = (
     "lanes lie on a mesh with axes of type Explicit, within jit or a derivative; there they need Auto ones:"
     " jax.make_mesh(..., axis_types=(jax.sharding.AxisType.Auto,))"
 )
 
 
-def divided(run: Callable[..., Run], given: tuple[Any, ...]) -> Run:
+def divided(run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
     """Return run(*given); what of it lies on a mesh of Explicit axes is handed over on one of Auto axes of the same
     devices, nothing moved, and the results come back on the first.
 
