@@ -524,7 +524,7 @@ MUTATIONS = [
     Mutation(
         "weak types stay weak",
         "core/pytree.py",
-        "return jax.tree.map(converted, tree)",
+        "return structure.unflatten([as_array(x, dtype) for x in leaves])",
         "return tree",
         "test_conformance.py::test_new_values_do_not_compile_again[plant: quarter car]",
     ),
@@ -1526,7 +1526,7 @@ MUTATIONS = [
     Mutation(
         "batch: a trace of no argument is not seen",
         "core/compiling.py",
-        "isinstance(jax.device_put(0), Tracer) or any(",
+        "isinstance(_zero(), Tracer) or any(",
         "any(",
         "test_batch.py::TestLanes::test_are_those_of_single_runs_together",
     ),
@@ -1792,6 +1792,27 @@ MUTATIONS = [
         "bound = jnp.max(jnp.exp(log)",
         "bound = 0.5 * jnp.max(jnp.exp(log)",
         "test_refusals.py::TestBeforeARun::test_the_step_is_judged_as_by_the_eigenvalues",
+    ),
+    Mutation(
+        "arrays of numbers: minus zero is zero",
+        "core/pytree.py",
+        "_number(float(x), math.copysign(1.0, x), ",
+        "_number(float(x), 1.0, ",
+        "test_pytree.py::test_an_array_is_made_once_of_each_number",
+    ),
+    Mutation(
+        "lanes on a mesh of Explicit axes stay there",
+        "simulate/placement.py",
+        "    if not meshes:",
+        "    if True:",
+        "test_batch.py::test_lanes_on_an_explicit_mesh_are_run_on_an_auto_one",
+    ),
+    Mutation(
+        "a bound on the modes of many lanes that is none",
+        "simulate/stable_step.py",
+        "bound = jnp.max(jnp.minimum(rows, columns))",
+        "bound = 0.5 * jnp.max(jnp.minimum(rows, columns))",
+        "test_refusals.py::TestBeforeARun::test_the_bound_of_many_lanes_is_that_of_few",
     ),
     Mutation(
         "a start beyond the stop is a run",

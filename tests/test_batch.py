@@ -1,11 +1,16 @@
 """One contract for many lanes, however they are run: `run_batch` against `measure` of one lane after the other."""
 
+import contextlib
+import os
+import subprocess
+import sys
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from marks import cases
 
 import diffabs as d
@@ -16,6 +21,7 @@ from diffabs.scenario.defaults import braking
 from diffabs.sensors import Noise
 from diffabs.simulate import refill
 from diffabs.simulate.batch import Batch, by_structure, grid, latin, stacked
+from diffabs.simulate.placement import divided
 from diffabs.simulate.refill import ROUND
 from diffabs.stops import SpeedReached, Standstill
 
@@ -291,3 +297,74 @@ class TestBatch:
     def test_says_what_does_not_fit(self, batch, message):
         with pytest.raises(ValueError, match=message):
             batch.check(QUIET)
+
+
+def placed(values, keys, kind):
+    """Lanes on all devices, along a mesh with an axis of this type."""
+    place = NamedSharding(jax.make_mesh((jax.device_count(),), ("lanes",), axis_types=(kind,)), PartitionSpec("lanes"))
+    return {path: jax.device_put(x, place) for path, x in values.items()}, jax.device_put(keys, place)
+
+
+def test_lanes_on_an_explicit_mesh_are_run_on_an_auto_one():
+    """Gathers say nothing of where they lie there; results come back."""
+    (speeds,), numbers = (given := placed({"speed": SPEEDS[:4]}, np.arange(4), AxisType.Explicit))[0].values(), given[1]
+    with pytest.raises(Exception, match="out_sharding"):
+        speeds[numbers]
+    for around in (contextlib.nullcontext, jax.set_mesh):
+        with around(speeds.sharding.mesh):
+            found = divided(lambda x, which, one: {"x": x[which], "one": one}, (speeds, numbers, 3.0))
+        np.testing.assert_array_equal(found["x"], SPEEDS[:4])
+        assert found["x"].sharding.mesh == speeds.sharding.mesh
+        assert found["one"] == 3.0
+
+
+@pytest.mark.slow
+def test_lanes_may_lie_on_a_mesh_of_either_type():
+    """With and without the mesh around; the results lie there, too, and can be worked with."""
+    values, numbers = {"initial.speed": SPEEDS[:4]}, np.arange(4)
+    known = d.run_batch(LOOP, Batch(values, numbers), SOLVER, MEASURED)
+    for kind in (AxisType.Auto, AxisType.Explicit):
+        lanes = Batch(*placed(values, numbers, kind))
+        run = d.run_batch(LOOP, lanes, SOLVER, MEASURED)
+        with jax.set_mesh(run.metrics["iae"].sharding.mesh):
+            again = d.run_batch(LOOP, lanes, SOLVER, MEASURED)
+        for found in (run, again):
+            same(jax.device_get(found), jax.device_get(known))
+            assert found.metrics["iae"].sharding.mesh.axis_types == (kind,)
+            np.testing.assert_array_equal(lanes.values["initial.speed"] + found.metrics["iae"] > 0, True)
+
+
+def test_lanes_on_an_explicit_mesh_are_refused_within_jit():
+    lanes = placed({"initial.speed": SPEEDS[:4]}, np.arange(4), AxisType.Explicit)
+    with pytest.raises(
+        ValueError, match="axes of type Explicit, within jit or a derivative; there they need Auto ones"
+    ):
+        jax.jit(lambda values, keys: d.run_batch(LOOP, Batch(values, keys), SOLVER, MEASURED))(*lanes)
+
+
+@pytest.mark.slow
+def test_lanes_lie_on_two_devices_of_a_mesh_of_either_type():
+    """By either engine."""
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    environment["PYTHONPATH"] = os.pathsep.join([os.path.dirname(__file__), *sys.path])
+    done = subprocess.run([sys.executable, "-c", ON_TWO], env=environment, capture_output=True, text=True)
+    assert done.stdout == "on two devices\n", done.stderr[-2000:]
+
+
+ON_TWO = """
+import jax, numpy as np
+from jax.sharding import AxisType
+
+import diffabs as d
+from test_batch import LOOP, MEASURED, SOLVER, SPEEDS, placed, same
+
+jax.config.update("jax_enable_x64", True)
+values, numbers = {"initial.speed": SPEEDS[:4]}, np.arange(4)
+known = d.run_batch(LOOP, d.Batch(values, numbers), SOLVER, MEASURED)
+for kind in (AxisType.Auto, AxisType.Explicit):
+    lanes = d.Batch(*placed(values, numbers, kind))
+    assert len(lanes.values["initial.speed"].sharding.device_set) == 2
+    for how in ({"together": True}, {"together": False}, {"engine": "kernel"}):
+        same(jax.device_get(d.run_batch(LOOP, lanes, SOLVER, MEASURED, **how)), jax.device_get(known))
+print("on two devices")
+"""

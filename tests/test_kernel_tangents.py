@@ -35,6 +35,9 @@ EXACT, LANDED, SWITCHING = 1e-12, 1e-6, 2e-3  # of the largest derivative among 
 # of a stop that is extrapolated over 400 s: XLA's own derivative moves by 1e-12 where the start does by an ulp
 ROUNDED = {"literal": 3e-12}
 LEAST = 1e-2  # a final slip error of 3e-4 is a difference of slips near 1, and has their digits
+# Of these the wheel turns freely until its computer brakes for the first time. Which comparisons of its slip hold there
+# is rounding's to say, and a landing on one ends 7e-12 s beyond: XLA's own values then differ by as much.
+BY_ROUNDING, SWAY = {("slip-real", "kinks")}, 3
 PARTS_HERE = [case for case in CASES if case[0] != "stop"]
 
 
@@ -197,28 +200,38 @@ print("on two devices")
 """
 
 
-def moved(loop, solver, objectives, path, engine):
-    """Values and derivatives of all metrics along changes of everything in a loop, and of what its lanes begin with."""
+def moved(loop, solver, objectives, path, engine, ulps=0):
+    """Values and derivatives of all metrics along changes of everything in a loop, and of what its lanes begin with. A
+    list of these where lanes begin so many last digits away, each."""
     leaves, tree = jax.tree.flatten(arrayed(loop))
     ways = [np.random.default_rng(i).uniform(0.5, 1.0, np.shape(x)) for i, x in enumerate(leaves)]
     spread = float(get(loop, path)) * np.linspace(0.96, 1.04, 12) + 1e-3
 
-    def metrics(z):
+    def metrics(z, spread):
         one = tree.unflatten([jnp.asarray(x, float) * (1 + w * z[0]) for x, w in zip(leaves, ways, strict=True)])
         lanes = d.Batch({path: spread * (1 + z[1])}, np.arange(12))
         run = d.run_batch(one, lanes, solver, objectives, accepted=True, engine=engine)
         return run.metrics, (run.metrics, run.diverged)
 
-    return jax.device_get(jax.jit(jax.jacfwd(metrics, has_aux=True))(jnp.zeros(2)))
+    derived = jax.jit(jax.jacfwd(metrics, has_aux=True))
+    found = [jax.device_get(derived(jnp.zeros(2), spread + n * np.spacing(spread))) for n in np.atleast_1d(ulps)]
+    return found if np.ndim(ulps) else found[0]
 
 
-def compare(given, close, values=1e-13):
-    """By a kernel and by XLA."""
+def swayed(given):
+    """What each metric changes by, at most, in XLA, if its lanes begin one or two last digits away."""
+    known, *others = (values for _, (values, _) in moved(*given, "xla", ulps=(0, -2, -1, 1, 2)))
+    return {name: max(np.nanmax(np.abs(one[name] - known[name])) for one in others) for name in known}
+
+
+def compare(given, close, values=1e-13, sways=None):
+    """By a kernel and by XLA. `sways`: of metrics, what last digits make of them."""
     (found, (metrics, diverged)), (expected, (known, lost)) = (moved(*given, engine) for engine in ("kernel", "xla"))
     np.testing.assert_array_equal(diverged, lost)
     assert any(np.nanmax(np.abs(slope)) > 0 for slope in expected.values())
     for name, slope in expected.items():
-        np.testing.assert_allclose(metrics[name], known[name], rtol=values, atol=1e-12, err_msg=name)
+        least = 1e-12 + SWAY * (sways or {}).get(name, 0.0)
+        np.testing.assert_allclose(metrics[name], known[name], rtol=values, atol=least, err_msg=name)
         size = max(np.nanmax(np.abs(x), initial=0.0) for x in (slope, known[name]))
         np.testing.assert_allclose(found[name], slope, rtol=0, atol=close * max(size, LEAST), err_msg=name)
 
@@ -264,4 +277,4 @@ def test_a_scenario(name, kind):
     if (name, kind) == ("lab-rig", "adaptive"):
         close = SWITCHING  # noise, by a computer
     values = {"grid": 1e-13, "kinks": 1e-12, "adaptive": SWITCHING if name == "slip-cured" else RTOL}[kind]
-    compare(given, close, values)
+    compare(given, close, values, swayed(given) if (name, kind) in BY_ROUNDING else None)

@@ -209,3 +209,13 @@ def test_structures_of_different_classes_differ():
 def test_leaves_have_the_names_of_the_fields():
     keys = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(Pair())]
     assert keys[:2] == [".springs[0].stiffness", ".springs[0].damping"]
+
+
+def test_an_array_is_made_once_of_each_number():
+    """Of each type, and of 0 and -0, which are equal; within jit none is kept."""
+    first, second = (strong([0.0, -0.0, 1.5]) for _ in range(2))
+    assert all(a is b for a, b in zip(first, second, strict=True))
+    assert np.signbit(first).tolist() == [False, True, False]
+    assert strong([1.5, jnp.float32(2.0)])[0].dtype == np.float32
+    jax.jit(lambda: strong([7.25]))()
+    assert not isinstance(strong([7.25])[0], jax.core.Tracer)

@@ -9,6 +9,7 @@ Only this module knows `jax.experimental.serialize_executable`. Such a file is c
 import contextlib
 import hashlib
 import importlib
+import itertools
 import json
 import math
 import os
@@ -169,9 +170,11 @@ class Programs:
         return Program(compiled, results[0], libraries)
 
     def _callable(self, program: Program) -> Callable[..., Any]:
+        results = jax.tree.structure(_rebuilt(program.results, itertools.repeat(0)))
+
         def call(*args: Any, **more: Any) -> Any:
             leaves = jax.tree.leaves(self._apart(args, more)[1])
-            return _rebuilt(program.results, iter(program.compiled(*map(_data, leaves))))
+            return results.unflatten(program.compiled(*map(_data, leaves)))
 
         return call
 

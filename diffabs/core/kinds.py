@@ -1,6 +1,7 @@
 """What can be a number of a run. JAX converts far more than that: text is parsed, an imaginary part dropped, truth
 becomes 1, and one leaf in 16 bits makes a whole run of 16 bits."""
 
+import functools
 import math
 import numbers
 import sys
@@ -17,6 +18,8 @@ LONGEST = 60  # characters of a value in a message
 def objection(value: Any) -> str:
     """What keeps a value from being a number of a run, or an array of them, such as `is text`; empty if nothing does.
     Types alone are looked at, so it may be traced."""
+    if type(value) is float:
+        return ""
     if isinstance(value, list | tuple):
         return next(filter(None, map(objection, value)), "")
     if hasattr(value, "dtype"):
@@ -34,6 +37,7 @@ def _overflows(value: Any) -> bool:
     return sys.float_info.max < abs(value) < math.inf
 
 
+@functools.cache
 def _of_type(dtype: Any) -> str:
     if jnp.issubdtype(dtype, jax.dtypes.extended) or np.dtype(dtype).kind in "mM":  # keys, dates
         return f"is of type {dtype}"

@@ -12,6 +12,7 @@ of `core.validity` does it on the host, and names every offender at once.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar, dataclass_transform
@@ -249,22 +250,39 @@ def strong(tree: T) -> T:
     Python numbers are weakly typed: mixed with arrays they would cause a second compilation of the same function.
     Raises ValueError for a leaf that is no real number, or a float of fewer than 32 bits.
     """
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if line := kinds.objection(leaf):
-            raise ValueError(f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.shown(leaf)} {line}")
-    arrays = [
-        x.dtype for x in jax.tree.leaves(tree) if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)
-    ]
+    leaves, structure = jax.tree.flatten(tree)
+    if any(map(kinds.objection, leaves)):
+        raise ValueError(_unfit(tree))
+    arrays = {x.dtype for x in leaves if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)}
     dtype = jnp.result_type(*arrays) if arrays else jnp.result_type(float)
-    known = not traced()
-
-    def converted(x: Any) -> Any:
-        """By NumPy where that is possible: JAX would compile a program for it, and call that for each leaf."""
-        by_numpy = known and not isinstance(x, jax.Array)
-        return jax.device_put(np.asarray(x, dtype)) if by_numpy else jnp.asarray(x, dtype)
-
+    if traced(leaves):
+        return structure.unflatten([jnp.asarray(x, dtype) for x in leaves])
     with np.errstate(over="ignore"):  # what single precision cannot hold is infinite
-        return jax.tree.map(converted, tree)
+        return structure.unflatten([as_array(x, dtype) for x in leaves])
+
+
+def _unfit(tree: Any) -> str:
+    """The first leaf that is no number of a run."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    path, leaf = next((path, leaf) for path, leaf in leaves if kinds.objection(leaf))
+    return f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.shown(leaf)} {kinds.objection(leaf)}"
+
+
+def as_array(x: Any, dtype: Any) -> jax.Array:
+    """Return `jnp.asarray(x, dtype)`, where nothing is traced, by NumPy: JAX would compile a program for it. That of
+    a Python number is made once: that takes longer than what many calls do with it."""
+    if isinstance(x, jax.Array):
+        return jnp.asarray(x, dtype)
+    if isinstance(x, float):
+        return _number(float(x), math.copysign(1.0, x), np.dtype(dtype), jax.config.jax_default_device)  # pyright: ignore
+    return jax.device_put(np.asarray(x, dtype))
+
+
+@functools.lru_cache(maxsize=4096)
+def _number(x: float, sign: float, dtype: np.dtype, device: Any) -> jax.Array:
+    """Of a sign, since 0 equals -0, on a device."""
+    del sign, device
+    return jax.device_put(np.asarray(x, dtype))
 
 
 def prepared(part: Any) -> Any:

@@ -6,6 +6,7 @@
 `control` is the unit of the plant's control, `signal` that of the first signal it shows, and so of the target.
 """
 
+import functools
 import re
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ def units_of(plant: Any) -> Units | None:
     return Units(plant.control_unit, next(iter(shown.values()))) if shown else None
 
 
+@functools.lru_cache(maxsize=1024)
 def in_loop(unit: str, units: Units | None) -> str:
     """Return a unit with `control` and `signal` worked out: "V s/rad". Without a loop (None) it stays as it is. Units
     of a list's elements are separated by commas."""

@@ -130,7 +130,9 @@ def _one(x: Any) -> Any:
 
 def data(x: Any) -> Any:
     """Return an array, of a key its words."""
-    return jax.random.key_data(x) if is_key(x) else jnp.asarray(x)
+    if is_key(x):
+        return jax.random.key_data(x)
+    return x if isinstance(x, jax.Array) else jnp.asarray(x)
 
 
 def _like(x: Any, leaf: Any) -> Any:

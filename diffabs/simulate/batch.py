@@ -13,9 +13,10 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, get, parameters, replace
 from diffabs.simulate.engine import by_engine
+from diffabs.simulate.placement import divided
 from diffabs.simulate.refill import Enough, run_refilled
 from diffabs.simulate.refusals import first_line, refusals
-from diffabs.simulate.run import arguments, measure, rollout
+from diffabs.simulate.run import measure, refuse, rollout
 from diffabs.simulate.solution import Run, Solver
 
 TOGETHER = "lanes run together, for trajectories or for derivatives in either mode"
@@ -126,7 +127,8 @@ def run_batch(
         rounding, and derivatives, forward (`jax.jvp`, `jax.jacfwd`) and not in reverse; no trajectories. "auto" does so
         for values where it can, and otherwise what "xla" does
 
-    Compiled once for a structure and a number of lanes, not for new values, keys or durations.
+    Compiled once for a structure and a number of lanes, not for new values, keys or durations. Lanes that lie on
+    several devices run there, whatever the type of their mesh's axes; on Explicit ones not within jit.
 
     >>> import diffabs as d
     >>> from diffabs.objectives import StopDistance
@@ -140,10 +142,29 @@ def run_batch(
             stands against the engine "kernel" (`simulate.native.objection` says it without running anything).
         KeyError: a path that does not exist.
     """
-    objectives, count = objectives or {}, batch.size
+
+    def run(loop: Loop, values: Any, keys: Any, objectives: Any, accepted: Any, enough: Any) -> Run:
+        lanes = dataclasses.replace(batch, values=values, keys=keys)
+        return _made(loop, lanes, solver, objectives, trajectories, together, accepted, enough, engine)
+
+    return divided(run, (loop, dict(batch.values), batch.keys, dict(objectives or {}), accepted, enough))
+
+
+def _made(
+    loop: Loop,
+    batch: Batch,
+    solver: Solver,
+    objectives: dict[str, Objective],
+    trajectories: bool,
+    together: bool | None,
+    accepted: Any,
+    enough: Enough | None,
+    engine: str,
+) -> Run:
+    count = batch.size
     columns = {path: jnp.asarray(x) if isinstance(x, list | tuple) else x for path, x in batch.values.items()}
     batch = dataclasses.replace(batch, values=columns)
-    arguments(replace(loop, {path: column[0] for path, column in batch.values.items()}), solver, objectives)
+    refuse(replace(loop, {path: column[0] for path, column in batch.values.items()}), solver, objectives)
     live = traced(loop, dict(batch.values), dict(objectives))
     if accepted is None:
         asked = bool(batch.values) and not live

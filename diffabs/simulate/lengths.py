@@ -1,11 +1,12 @@
 """How long an adaptive step may be: by its error, by stability, by the kinks and clocks ahead."""
 
 import dataclasses
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from diffabs.core.loop import Loop, LoopState
@@ -94,14 +95,21 @@ def longest_stable(loop: Loop, t: Any, state: LoopState, scale: Any) -> Any:
 
     moves = jnp.eye(size.size, dtype=size.dtype) * size
     columns = jax.vmap(lambda one: jax.jvp(rates, (flow,), (one,))[1])(moves) / size
+    # Number by number: for sums over so few XLA on a CPU calls a library, which takes ten times as long.
+    rows = [[columns[j, i] for j in range(size.size)] for i in range(size.size)]
 
-    def multiplied(at: tuple[Any, Any], counts: Any) -> tuple[tuple[Any, Any], None]:
+    def longest(vector: list[Any]) -> Any:
+        return reduce(jnp.maximum, map(jnp.abs, vector)) + TINY
+
+    def multiplied(at: tuple[list[Any], Any], counts: Any) -> tuple[tuple[list[Any], Any], None]:
         vector, log = at
-        vector = jnp.sum(columns * vector[:, None], axis=0)
-        norm = jnp.max(jnp.abs(vector)) + TINY
-        return (vector / norm, log + counts * jnp.log(norm)), None
+        norm = longest(vector)
+        vector = [x / norm for x in vector]
+        vector = [sum(a * x for a, x in zip(row, vector, strict=True)) for row in rows]
+        return (vector, log + counts * jnp.log(norm)), None
 
     # A loop, and not its rounds one by one: XLA would work the matrix out anew in each of them.
-    later = jnp.repeat(jnp.array([0.0, 1.0], t.dtype), MULTIPLIED // 2)
-    log = jax.lax.scan(multiplied, (jnp.ones_like(size), 0.0 * t), later)[0][1]
-    return STABLE * jnp.exp(-log / (MULTIPLIED // 2))
+    half = MULTIPLIED // 2
+    later = jnp.asarray(np.arange(MULTIPLIED) > half, t.dtype)  # of the norms before, and the last one, below
+    vector, log = jax.lax.scan(multiplied, (list(jnp.ones_like(size)), 0.0 * t), later)[0]
+    return STABLE * jnp.exp(-(log + jnp.log(longest(vector))) / half)

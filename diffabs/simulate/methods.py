@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.compiling import traced
 from diffabs.core.log import lend
 from diffabs.core.loop import Loop
+from diffabs.core.pytree import as_array
 from diffabs.simulate import adaptive, stepper
 from diffabs.simulate.checkpoint import anyone
 from diffabs.simulate.dynamics import Objectives
@@ -122,12 +124,14 @@ class AtPace(Pace):
 
 def method_of(solver: Solver, dtype: Any) -> OnGrid | AtPace:
     """Return what chooses the steps of a solver, its numbers of this type."""
-    h, steps = jax.device_put((np.asarray(solver.step, dtype), solver.steps))  # `asarray` would compile programs
+    number = jnp.asarray if traced() else as_array
+    h, steps = number(float(solver.step), dtype), jax.device_put(solver.steps)  # `asarray` would compile a program
     if isinstance(solver, Adaptive):
-        return AtPace(h, steps, _possible(jnp.asarray(solver.rtol, dtype)))
+        return AtPace(h, steps, number(float(_possible(np.asarray(solver.rtol, dtype))), dtype))
     return OnGrid(h, steps, solver.kinks)
 
 
 def _possible(rtol: Any) -> Any:
     """No less than the precision of its type allows."""
-    return jnp.maximum(rtol, ROUNDING * jnp.finfo(rtol.dtype).eps)
+    most = np if isinstance(rtol, np.ndarray) else jnp
+    return most.maximum(rtol, ROUNDING * jnp.finfo(rtol.dtype).eps)

@@ -4,6 +4,7 @@ Starts and judgements are XLA's, as for every other run; what lies between, the 
 as it is, with everything in it that the parts have, is translated from its jaxpr (package `kernel`). A lane that has
 ended makes room for the next one, as on the belt of `refill`."""
 
+import operator
 from collections.abc import Mapping
 from typing import Any
 
@@ -51,12 +52,14 @@ def run_native(
     own = None if enough is None else jax.vmap(enough.own)(jnp.arange(count))
     lanes = values, keys, accepted, own
 
-    def some(start: int) -> Run:
-        mine = jax.tree.map(lambda x: x[start : start + MOST], lanes)
-        return _made((loop, mine[0], dict(objectives), method, *mine[1:], enough))
+    def made(mine: Any) -> Run:
+        given = loop, mine[0], dict(objectives), method, *mine[1:], enough
+        return _made(given) if traced(given) else _kept(*given)  # a rule for derivatives takes longer than a short run
 
-    runs = [some(start) for start in range(0, count, MOST)]
-    return runs[0] if len(runs) == 1 else jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
+    if count <= MOST:
+        return made(lanes)
+    runs = [made(jax.tree.map(operator.itemgetter(slice(i, i + MOST)), lanes)) for i in range(0, count, MOST)]
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
 
 
 @jax.custom_jvp

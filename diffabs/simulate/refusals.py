@@ -17,7 +17,7 @@ import numpy as np
 
 from diffabs.core.compiling import QUICK, compile_once, traced
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import replace, strong
+from diffabs.core.pytree import as_array, replace, strong
 from diffabs.core.rules import Rule
 from diffabs.core.validity import broken, grid_rules, rules
 from diffabs.core.validity import check as check_parts
@@ -110,7 +110,8 @@ def refusals(loop: Loop | None, values: Any, solver: Solver) -> Refusals:
     values = {path: np.asarray(x, float) for path, x in values.items()} if isinstance(values, Mapping) else values
     loop, values = jax.tree.map(lambda x: np.asarray(x, float), (loop, values))
     with jax.enable_x64(True):
-        codes = np.array(_codes(loop, values, step=solver.step))
+        known = jax.tree.map(lambda x: x if np.ndim(x) else as_array(float(x), x.dtype), (loop, values))
+        codes = np.array(_codes(*known, step=solver.step))
     if not codes.all() and not isinstance(solver, Adaptive):
         fine = np.flatnonzero(codes == 0)
         asked = values if len(fine) == len(codes) else jax.tree.map(lambda x: x[np.resize(fine, len(codes))], values)
@@ -120,7 +121,7 @@ def refusals(loop: Loop | None, values: Any, solver: Solver) -> Refusals:
 
 def _named(loop: Loop | None, values: Any, step: float, codes: np.ndarray) -> Refusals:
     """Only those reasons that occur; -1 is the step's."""
-    there = [code for code in np.unique(codes).tolist() if code]
+    there = [code for code in np.unique(codes).tolist() if code] if codes.any() else []
     named = {-1: f"solver.step = {step:g} s is not stable"}
     if any(code > 0 for code in there):
         with jax.enable_x64(True):

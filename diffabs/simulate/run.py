@@ -90,12 +90,17 @@ def _shortened(trajectory: Any, count: int) -> Any:
 
 def arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
     """Loop, objectives, and what chooses the steps, of one data type. Raises ValueError."""
+    refuse(loop, solver, objectives)
+    loop, objectives = strong((arrayed(loop), {name: arrayed(part) for name, part in objectives.items()}))
+    return loop, objectives, method_of(solver, jax.tree.leaves(loop)[0].dtype)
+
+
+def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
+    """Raise ValueError for what is no run, whatever its numbers are."""
     lines = [*_wrong_solver(solver), *misshapen(loop)]
     lines += [line for name, part in objectives.items() for line in misshapen(part, f"objectives.{name}.")]
     if lines:
         raise ValueError("; ".join(lines))
-    loop, objectives = strong((arrayed(loop), {name: arrayed(part) for name, part in objectives.items()}))
-    return loop, objectives, method_of(solver, jax.tree.leaves(loop)[0].dtype)
 
 
 def _wrong_solver(solver: Solver) -> Iterator[str]:

@@ -10,7 +10,7 @@ with the D that balances the matrices of the first lane k = 1 is mostly enough, 
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import jax
@@ -27,6 +27,7 @@ from diffabs.core.tracing import separated
 
 SQUARINGS = 4  # k = 16: within 3 % of the radius for the loops of the papers
 TOGETHER = 256  # lanes whose matrices stay in a processor's cache
+MANY = 1 << 17  # matrices of all lanes, from which on they are worked out number by number
 BALANCING = 30  # rounds
 SAFE = 1.01  # what single precision may take away from a bound
 RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 3.5 of the origin
@@ -104,8 +105,13 @@ def _bounds(loop: Any, values: Any, *, squarings: int) -> jax.Array:
         return jnp.full(count, _fastest(one, balance, squarings))
     places = jnp.minimum(jnp.arange(-(-count // TOGETHER) * TOGETHER), count - 1)  # whole batches: one program
     filled = jax.tree.map(lambda x: x[places], values) if count > TOGETHER else values
-    bounds = jax.lax.map(lambda v: _fastest(matrices(v), balance, squarings), filled, batch_size=min(TOGETHER, count))
-    return bounds[:count]
+
+    def bound(values: Any) -> jax.Array:
+        if squarings or len(one) * count < MANY:
+            return _fastest(matrices(values), balance, squarings)
+        return _norm(_probed(_entries, _lane(loop)(values)), balance)
+
+    return jax.lax.map(bound, filled, batch_size=min(TOGETHER, count))[:count]
 
 
 def _fastest(matrices: jax.Array, balance: jax.Array, squarings: int) -> jax.Array:
@@ -118,6 +124,15 @@ def _fastest(matrices: jax.Array, balance: jax.Array, squarings: int) -> jax.Arr
         a = jnp.matmul(a, a, precision="highest")
     rows, columns = (jnp.max(jnp.sum(jnp.abs(a), axis), -1) for axis in (-1, -2))
     bound = jnp.max(jnp.exp(log) * jnp.minimum(rows, columns) ** (1 / 2**squarings))
+    return jnp.where(jnp.isfinite(bound), SAFE * bound, jnp.inf)
+
+
+def _norm(entries: list[list[jax.Array]], balance: jax.Array) -> jax.Array:
+    """The same without squarings, of n rows of n numbers (k,): for sums over so few XLA on a CPU calls a library, and
+    stores all matrices for it."""
+    sizes = [[jnp.abs(x * (balance[:, j] / balance[:, i])) for j, x in enumerate(row)] for i, row in enumerate(entries)]
+    rows, columns = (reduce(jnp.maximum, map(sum, lines)) for lines in (sizes, zip(*sizes, strict=True)))
+    bound = jnp.max(jnp.minimum(rows, columns))
     return jnp.where(jnp.isfinite(bound), SAFE * bound, jnp.inf)
 
 
@@ -160,19 +175,24 @@ WITHIN = float(REACH.min())  # a damped mode of whatever direction is stable up 
 
 
 def _jacobians_of(loop: Loop) -> jax.Array:
-    """d(flow)/d(flow) (k, n, n) where the plant says that its loop may be stiffest (`probes`); else at its start and at
-    a start of zero, far from the target and on it."""
+    """d(flow)/d(flow) (k, n, n) where `_probed` looks."""
+    return _probed(_of_flow, loop)
+
+
+def _probed(function: Callable[[Loop], Any], loop: Loop) -> Any:
+    """What a function says of the loop (k, ...) where the plant says that it may be stiffest (`probes`); else at its
+    start and at a start of zero, far from the target and on it."""
     probes = getattr(loop.plant, "probes", None)
     if probes:
         starts = probes(loop.initial, loop.reference.setpoint(loop.start().reference), loop.stop)
-        return jax.vmap(lambda start: _of_flow(dataclasses.replace(loop, initial=start)))(starts)
+        return jax.vmap(lambda start: function(dataclasses.replace(loop, initial=start)))(starts)
     starts = jax.tree.map(lambda x: jnp.array([0.0, 1.0]) * x, loop.initial)
     arrived = dataclasses.replace(loop, reference=_Arrived(reference=loop.reference))
     found = [
-        jax.vmap(lambda start, one=one: _of_flow(dataclasses.replace(one, initial=start)))(starts)
+        jax.vmap(lambda start, one=one: function(dataclasses.replace(one, initial=start)))(starts)
         for one in (loop, arrived)
     ]
-    return jnp.concatenate(found)
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
 
 _jacobian = compile_once(options=SAME)(_jacobians_of)
@@ -212,3 +232,22 @@ def _of_flow(loop: Loop) -> jax.Array:
         return jax.flatten_util.ravel_pytree(loop.flow(0.0, at, loop.signals(0.0, at)))[0]
 
     return jax.jacfwd(jax.extend.core.jaxpr_as_fun(jax.make_jaxpr(flow)(z)))(z)[0]  # half the time of tracing `flow`
+
+
+def _entries(loop: Loop) -> list[list[jax.Array]]:
+    """The same number by number, n rows of n: compiles longer, and runs faster for many lanes."""
+    state = loop.start()
+    leaves, tree = jax.tree.flatten(state.flow())
+
+    def flow(*z: jax.Array) -> list[jax.Array]:
+        at = state.with_flow(tree.unflatten(z))
+        return jax.tree.leaves(loop.flow(0.0, at, loop.signals(0.0, at)))
+
+    once = jax.extend.core.jaxpr_as_fun(jax.make_jaxpr(flow)(*leaves))
+    columns = []
+    for number, leaf in enumerate(leaves):
+        moved = partial(lambda number, one: once(*leaves[:number], one, *leaves[number + 1 :]), number)
+        for at in np.ndindex(leaf.shape):
+            rates = jax.jvp(moved, (leaf,), (jnp.zeros_like(leaf).at[at].set(1.0),))[1]
+            columns.append([rate[i] for rate in rates for i in np.ndindex(rate.shape)])
+    return [list(row) for row in zip(*columns, strict=True)]
