@@ -35,9 +35,10 @@ EXACT, LANDED, SWITCHING = 1e-12, 1e-6, 2e-3  # of the largest derivative among 
 # of a stop that is extrapolated over 400 s: XLA's own derivative moves by 1e-12 where the start does by an ulp
 ROUNDED = {"literal": 3e-12}
 LEAST = 1e-2  # a final slip error of 3e-4 is a difference of slips near 1, and has their digits
-# Of these the wheel turns freely until its computer brakes for the first time. Which comparisons of its slip hold there
-# is rounding's to say, and a landing on one ends 7e-12 s beyond: XLA's own values then differ by as much.
-BY_ROUNDING, SWAY = {("slip-real", "kinks")}, 3
+# What last digits decide in XLA as well, and is measured there: which comparisons of the slip hold when the computer of
+# slip-real brakes for the first time a wheel that turned freely; how many ticks the noisy computer of lab-rig takes;
+# whether the step with the peak of the voltage of arm-hanging ends at its limit or a little behind.
+BY_ROUNDING, SWAY = {("slip-real", "kinks"), ("lab-rig", "adaptive"), ("arm-hanging", "adaptive")}, 3
 PARTS_HERE = [case for case in CASES if case[0] != "stop"]
 
 
@@ -219,21 +220,25 @@ def moved(loop, solver, objectives, path, engine, ulps=0):
 
 
 def swayed(given):
-    """What each metric changes by, at most, in XLA, if its lanes begin one or two last digits away."""
-    known, *others = (values for _, (values, _) in moved(*given, "xla", ulps=(0, -2, -1, 1, 2)))
-    return {name: max(np.nanmax(np.abs(one[name] - known[name])) for one in others) for name in known}
+    """What each metric and its derivatives change by, at most, in XLA, if lanes begin one or two last digits away."""
+    (slopes, (known, _)), *others = moved(*given, "xla", ulps=(0, -2, -1, 1, 2))
+
+    def most(name, pick, base):
+        return max(np.nanmax(np.abs(pick(one)[name] - base[name])) for one in others)
+
+    return {n: (most(n, lambda one: one[1][0], known), most(n, lambda one: one[0], slopes)) for n in known}
 
 
 def compare(given, close, values=1e-13, sways=None):
-    """By a kernel and by XLA. `sways`: of metrics, what last digits make of them."""
+    """By a kernel and by XLA. `sways`: of metrics and their derivatives, what last digits make of them."""
     (found, (metrics, diverged)), (expected, (known, lost)) = (moved(*given, engine) for engine in ("kernel", "xla"))
     np.testing.assert_array_equal(diverged, lost)
     assert any(np.nanmax(np.abs(slope)) > 0 for slope in expected.values())
     for name, slope in expected.items():
-        least = 1e-12 + SWAY * (sways or {}).get(name, 0.0)
-        np.testing.assert_allclose(metrics[name], known[name], rtol=values, atol=least, err_msg=name)
+        least, less = (SWAY * x for x in (sways or {}).get(name, (0.0, 0.0)))
+        np.testing.assert_allclose(metrics[name], known[name], rtol=values, atol=1e-12 + least, err_msg=name)
         size = max(np.nanmax(np.abs(x), initial=0.0) for x in (slope, known[name]))
-        np.testing.assert_allclose(found[name], slope, rtol=0, atol=close * max(size, LEAST), err_msg=name)
+        np.testing.assert_allclose(found[name], slope, rtol=0, atol=close * max(size, LEAST) + less, err_msg=name)
 
 
 @pytest.mark.slow
