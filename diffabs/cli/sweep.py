@@ -9,6 +9,7 @@ import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
@@ -255,8 +256,11 @@ def _result(
     from diffabs.sweep.statistics.summary import summary
     from diffabs.sweep.trajectories import keep
 
-    accuracy = checked(study, found, check) if check else None
-    result = {"out": str(out), **summary(found), "accuracy": accuracy, "made": console.made(), "files": {}}
+    with ThreadPoolExecutor(1) as beside:
+        accuracy = beside.submit(checked, study, found, check) if check else None
+        said = summary(found)
+    found_off = accuracy.result() if accuracy else None
+    result = {"out": str(out), **said, "accuracy": found_off, "made": console.made(), "files": {}}
     if kept:
         result["files"]["trajectories"] = str(keep(study, out, kept))
     if figures:

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -42,13 +43,18 @@ class Local:
         self.devices = list(devices or jax.local_devices())
 
     def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Generator[Done, None, None]:
-        """In order."""
+        """In order. While chunks are counted, encoded and written, the next ones run."""
         runner, seals = Runner(study, self.devices), Seals(described(study))
-        for together in batched(chunks[jax.process_index() :: jax.process_count()], len(self.devices)):
-            for chunk, columns in zip(together, runner.run(together), strict=True):
-                yield done(study, seals.of(chunk), columns)
-            if stopping():
-                return
+        rest = batched(chunks[jax.process_index() :: jax.process_count()], len(self.devices))
+        with ThreadPoolExecutor(1) as beside:
+            together = next(rest, None)
+            coming = beside.submit(runner.run, together) if together else None
+            while together and coming:
+                here, found = together, coming.result()
+                together = None if stopping() else next(rest, None)
+                coming = beside.submit(runner.run, together) if together else None
+                for chunk, columns in zip(here, found, strict=True):
+                    yield done(study, seals.of(chunk), columns)
 
 
 def done(study: Study, seal: Seal, columns: Columns) -> Done:
