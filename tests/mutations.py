@@ -1795,7 +1795,7 @@ MUTATIONS = [
     ),
     Mutation(
         "arrays of numbers: minus zero is zero",
-        "core/pytree.py",
+        "core/arrays.py",
         "_number(float(x), math.copysign(1.0, x), ",
         "_number(float(x), 1.0, ",
         "test_pytree.py::test_an_array_is_made_once_of_each_number",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import diffabs
+from diffabs.core.arrays import as_array
 from diffabs.core.pytree import get, param, parameters, part, prepared, pytree, replace, static, strong
 from diffabs.core.validity import check, problems
 from diffabs.roads import DRY_ASPHALT, SPLINE_B, MagicFormula, Patches, Scaled
@@ -219,3 +220,9 @@ def test_an_array_is_made_once_of_each_number():
     assert strong([1.5, jnp.float32(2.0)])[0].dtype == np.float32
     jax.jit(lambda: strong([7.25]))()
     assert not isinstance(strong([7.25])[0], jax.core.Tracer)
+
+
+def test_an_array_of_a_number_has_the_precision_of_now():
+    with jax.enable_x64(False):
+        assert as_array(2.7, np.float64).dtype == np.float32
+    assert as_array(2.7, np.float64).dtype == np.float64

@@ -257,10 +257,10 @@ def _result(
     from diffabs.sweep.trajectories import keep
 
     with ThreadPoolExecutor(1) as beside:
-        accuracy = beside.submit(checked, study, found, check) if check else None
+        halved = beside.submit(checked, study, found, check) if check else None
         said = summary(found)
-    found_off = accuracy.result() if accuracy else None
-    result = {"out": str(out), **said, "accuracy": found_off, "made": console.made(), "files": {}}
+    accuracy = halved.result() if halved else None
+    result = {"out": str(out), **said, "accuracy": accuracy, "made": console.made(), "files": {}}
     if kept:
         result["files"]["trajectories"] = str(keep(study, out, kept))
     if figures:

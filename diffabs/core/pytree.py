@@ -12,7 +12,6 @@ of `core.validity` does it on the host, and names every offender at once.
 """
 
 import dataclasses
-import functools
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar, dataclass_transform
@@ -23,6 +22,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from diffabs.core import kinds
+from diffabs.core.arrays import as_array
 from diffabs.core.compiling import traced
 from diffabs.core.rules import array
 from diffabs.core.units import Units, in_loop, units_of
@@ -266,23 +266,6 @@ def _unfit(tree: Any) -> str:
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     path, leaf = next((path, leaf) for path, leaf in leaves if kinds.objection(leaf))
     return f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.shown(leaf)} {kinds.objection(leaf)}"
-
-
-def as_array(x: Any, dtype: Any) -> jax.Array:
-    """Return `jnp.asarray(x, dtype)`, where nothing is traced, by NumPy: JAX would compile a program for it. That of
-    a Python number is made once: that takes longer than what many calls do with it."""
-    if isinstance(x, jax.Array):
-        return jnp.asarray(x, dtype)
-    if isinstance(x, float):
-        return _number(float(x), math.copysign(1.0, x), np.dtype(dtype), jax.config.jax_default_device)  # pyright: ignore
-    return jax.device_put(np.asarray(x, dtype))
-
-
-@functools.lru_cache(maxsize=4096)
-def _number(x: float, sign: float, dtype: np.dtype, device: Any) -> jax.Array:
-    """Of a sign, since 0 equals -0, on a device."""
-    del sign, device
-    return jax.device_put(np.asarray(x, dtype))
 
 
 def prepared(part: Any) -> Any:

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.arrays import as_array
 from diffabs.core.compiling import traced
 from diffabs.core.log import lend
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import as_array
 from diffabs.simulate import adaptive, stepper
 from diffabs.simulate.checkpoint import anyone
 from diffabs.simulate.dynamics import Objectives

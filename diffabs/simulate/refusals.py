@@ -15,9 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from diffabs.core.arrays import as_array
 from diffabs.core.compiling import QUICK, compile_once, traced
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import as_array, replace, strong
+from diffabs.core.pytree import replace, strong
 from diffabs.core.rules import Rule
 from diffabs.core.validity import broken, grid_rules, rules
 from diffabs.core.validity import check as check_parts

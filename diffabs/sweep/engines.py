@@ -30,7 +30,8 @@ class Engine(Protocol):
     """Computes chunks in any order."""
 
     def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Generator[Done, None, None]:
-        """Every chunk once; ends early, after what it has begun, when `stopping()`, and at once when it is closed."""
+        """Every chunk once; ends early, after what it has begun, when `stopping()`, and without giving that when it is
+        closed."""
         ...
 
 
