@@ -20,7 +20,7 @@ import pytest
 from test_explore import SHORT
 
 from diffabs.explore.guard import STRANGER
-from diffabs.scenario import load
+from diffabs.scenario import load, names
 
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = ["--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"]
@@ -39,11 +39,11 @@ pytestmark = pytest.mark.slow
 class Explorer:
     """The command, in a folder of its own."""
 
-    def __init__(self, folder: pathlib.Path):
+    def __init__(self, folder: pathlib.Path, scenario: str = "mine.toml"):
         """Start it, and wait until it says where it is."""
         self.folder = folder
         (folder / "mine.toml").write_text(SHORT)
-        words = [sys.executable, "-m", "diffabs", "explore", "mine.toml", "--port", "0", "--no-browser"]
+        words = [sys.executable, "-m", "diffabs", "explore", scenario, "--port", "0", "--no-browser"]
         self.process = subprocess.Popen(words, cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True)
         assert self.process.stderr
         lines = iter(self.process.stderr.readline, "")  # a busy machine says first what it waits for
@@ -155,6 +155,32 @@ def test_dragging_a_slider_moves_the_curve_and_its_number(tabs):
     assert page.evaluate("explorer.times.length") >= 1
     assert page.inner_text("[data-id=word]") in ("certified", "no common Lyapunov matrix", "undecided")
     assert re.search(r"\d°", page.inner_text("[data-margin=phase]"))
+
+
+@needs_browser
+@pytest.mark.parametrize("name", names())
+def test_every_packaged_scenario_is_dragged_from_the_first_second(name, tmp_path, browser):
+    """Also while everything is still being compiled; in the end nothing computes any more, and nothing failed."""
+    one = Explorer(tmp_path, name)
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    try:
+        page = context.new_page()
+        page.set_default_timeout(2 * PATIENCE)
+        page.goto(one.url)
+        page.wait_for_selector("[data-slider]")
+        first = page.locator("[data-slider]").first.get_attribute("data-slider")
+        for places in (30, -20, 12, -15):
+            drag(page, first, places, 15)
+            page.wait_for_timeout(300)
+        page.wait_for_function("explorer.last === explorer.edit")
+        page.wait_for_function("[...document.querySelectorAll('.busy')].every(e => !e.checkVisibility())")
+        assert not page.locator("[data-id=refused]").is_visible(), page.inner_text("[data-id=refused]")
+        assert "Error" not in page.inner_text(".right")
+        assert "index" not in page.inner_text(".right")
+        assert one.interrupted()[0] == 130
+    finally:
+        context.close()
+        one.end()
 
 
 @needs_browser

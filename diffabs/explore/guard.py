@@ -49,7 +49,8 @@ class Guard:
             await _answer(send, 403, FOREIGN)
         elif self._same(urllib.parse.parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [])):
             cookie = f"{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"
-            await _answer(send, 303, "", (b"location", scope["path"].encode()), (b"set-cookie", cookie.encode()))
+            # There is one page. The path of the request could name another host ("//name") or end the header.
+            await _answer(send, 303, "", (b"location", b"/"), (b"set-cookie", cookie.encode()))
         else:
             await _answer(send, 403, STRANGER)
 

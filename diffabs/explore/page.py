@@ -40,6 +40,7 @@ class Page:
         self.since = 0  # the first version of this scenario
         self.costs: dict[str, float] = {}
         self.shown: curves.Curves | None = None
+        self.objected = 0  # the version that followed a refusal, whose line stays
         self.drawn = 0  # the newest version whose curve was made, or that was refused
         self.around: stability.Around | None = None  # the corners that were looked at last
         self.surrounded = False  # whether they belong to what is shown
@@ -107,7 +108,7 @@ class Page:
 
     def refused(self, error: Exception | None) -> None:
         """Say why something cannot be, or that all is well."""
-        self.controls.refused("" if error is None else " ".join(str(error).split()))
+        self.controls.refused("" if error is None else _sentence(error))
 
     def reset(self) -> None:
         """All numbers as in the scenario."""
@@ -145,6 +146,11 @@ class Page:
         for other in self.session.withdraw():
             if other != key:
                 self.controls.show(other)
+        self.version += 1  # what is still to be worked out is that of the numbers that are back
+        self.objected = self.drawn = self.version
+        if self.shown is not None and not self.shown.draft:
+            self.results.metrics(self.shown.metrics, fresh=True)
+        self.thinker.ask(partial(self._think, self.session.scenario(), self.version))
 
     async def _replaced(self, change: Callable[[], None]) -> None:
         """Another scenario, another part, or another fan, with numbers of their own."""
@@ -169,11 +175,17 @@ class Page:
         else:
             self.chart.send(change, edit)
         self.shown = found
-        if version == self.version:
+        if version == self.version != self.objected:
             self.refused(None)
         self.end_line.set_text(f"{self.session.given.name} {found.end}")
         if not found.draft:
             self.results.metrics(found.metrics, fresh=version == self.version)
+
+    def _gave_up(self, error: Exception) -> None:
+        self.refused(error)
+        self.results.stop_waiting()
+        if self.shown is None:
+            self.end_line.set_text("no run")
 
     def _show_fan(self, found: curves.Fan | None, change: str) -> None:
         if self.chart is not None:
@@ -189,7 +201,8 @@ class Page:
 
     # In threads.
     def _failed(self, error: Exception) -> None:
-        self.later(self.refused, error)
+        """Show once what nobody foresaw; nothing goes on computing."""
+        self.later(self._gave_up, error)
 
     def _draw(self, now: Scenario, version: int, edit: int, key: str) -> None:
         """The curve, if the number that was turned, `key`, may be."""
@@ -244,13 +257,16 @@ class Page:
         return version == self.version
 
     def _poles(self, now: Scenario, version: int, *, corners: bool = False) -> bool:
-        """Poles and margins here, with the corners that are known; or with those that belong to it."""
+        """Show poles and margins of this loop, with the corners that are known or, on request, with its own. Return
+        whether there were any."""
+        found: Any
         try:
-            self.around = stability.around(now, self.around, anew=corners)
-            found: Any = stability.stability(now, self.around)
-            self.surrounded = self.around.of == stability.corners_of(now)
-        except ValueError as error:
-            found, self.surrounded = " ".join(str(error).split()), True
+            if corners:
+                self.around = stability.around(now, self.around)
+            found = stability.stability(now, self.around)
+            self.surrounded = self.around is not None and self.around.of == stability.corners_of(now)
+        except Exception as error:  # whatever it is, the card shows it and computes no longer
+            found, self.surrounded = _sentence(error), True
         self.later(self._show_stability, found, version, self.surrounded)
         return not isinstance(found, str)
 
@@ -262,8 +278,14 @@ class Page:
     def _proved(self, now: Scenario) -> Verdict:
         try:
             return self.tools.prove(now)
-        except (ValueError, ArithmeticError) as error:
-            return Verdict(UNKNOWN, " ".join(str(error).split()))
+        except Exception as error:  # whatever it is, the card shows it and computes no longer
+            return Verdict(UNKNOWN, _sentence(error))
+
+
+def _sentence(error: Exception) -> str:
+    """The message of an error in one line; of one that is no refusal with its kind, for a report of the fault."""
+    words = " ".join(str(error).split())
+    return words if isinstance(error, (ValueError, ArithmeticError)) and words else f"{type(error).__name__}: {words}"
 
 
 async def show(source: str, tools: Tools, folder: pathlib.Path, thread: str) -> None:

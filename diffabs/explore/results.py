@@ -69,6 +69,11 @@ class Results:
             busy.set_visibility(True)
         self.verdict_box.classes(add="stale")
 
+    def stop_waiting(self) -> None:
+        """Nothing is computed any more."""
+        for busy in (self.proving, self.solving, self.measuring):
+            busy.set_visibility(False)
+
     def metrics(self, found: dict[str, float], *, fresh: bool) -> None:
         """Show what was measured."""
         self.measuring.set_visibility(not fresh)

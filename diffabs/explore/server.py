@@ -1,6 +1,7 @@
 """The server of the page, on this machine only."""
 
 import html
+import logging
 import pathlib
 import secrets
 import socket
@@ -67,6 +68,7 @@ def serve(
         guarded, log_level="error", access_log=False, timeout_graceful_shutdown=PATIENCE, lifespan="on", ws="auto"
     )
     server = uvicorn.Server(config)
+    logging.getLogger("nicegui").setLevel(logging.ERROR)  # a page that is not there is the browser's to tell
     sys.setswitchinterval(SWITCH)
 
     def announced() -> None:

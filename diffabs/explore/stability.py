@@ -56,25 +56,32 @@ def corners_of(chosen: Scenario) -> tuple[Any, ...]:
     return kind, tuple(ranges.items()), *(np.asarray(leaf).tobytes() for leaf in leaves)
 
 
-def around(chosen: Scenario, known: Around | None = None, *, anew: bool = True) -> Around:
-    """Return the corners of a scenario; those that are known where they are the same, or not to be worked out anew."""
+def around(chosen: Scenario, known: Around | None = None) -> Around:
+    """Return the corners of a scenario: `known` itself where they have not moved."""
     of = corners_of(chosen)
-    if known and (known.of == of or (not anew and known.of[0] == of[0])):
+    if known and known.of == of:
         return known
     ranges = chosen.design.ranges(chosen.loop)
-    if not anew or not 0 < len(ranges) <= MOST_RANGES:
-        return Around(of if anew else (), np.array([]), {}, 0, 0)
+    if not 0 < len(ranges) <= MOST_RANGES:
+        return Around(of, np.array([]), {}, 0, 0)
     over = band(chosen.loop, ranges, 0)
     worst = {name: numbers(one.margins)[name] for name, one in over.worst().items() if name in NAMES}
     poles = np.concatenate([closed_poles(one.loop.transfer()) for one in over.systems])
     return Around(of, poles, worst, len(over.unstable), len(over.systems))
 
 
-def stability(chosen: Scenario, known: Around | None = None) -> Stability:
-    """Return what is known of the linearised loop, with these corners instead of its own if they are given. Raises
-    ValueError for a loop that has no linear model."""
+def stability(chosen: Scenario, corners: Around | None) -> Stability:
+    """Return poles and margins of the linearised loop.
+
+    Args:
+        chosen: the scenario
+        corners: those that are shown with it, or None where none are known yet
+
+    Raises:
+        ValueError: the loop has no linear model
+    """
     here = band(chosen.loop, {}, 0).systems[0]
-    corners = known or around(chosen)
+    corners = corners or Around((), np.array([]), {}, 0, 0)
     return Stability(
         here.loop.period,
         here.loop.delay,
