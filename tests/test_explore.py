@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import threading
+from types import MappingProxyType
 
 import jax
 import numpy as np
@@ -19,7 +20,7 @@ from diffabs.core.values import ScenarioError
 from diffabs.explore import charts, curves, friction, saving, stability, tuning
 from diffabs.explore.curves import Curves, Fan, Line, Panel, Spread
 from diffabs.explore.guard import STRANGER, Guard
-from diffabs.explore.knobs import STEPS
+from diffabs.explore.knobs import STEPS, is_vehicle
 from diffabs.explore.session import AS_GIVEN, Session
 from diffabs.explore.work import Latest
 from diffabs.linear import margins, open_loop
@@ -337,6 +338,53 @@ def test_a_tuning_begins_from_what_is_shown(file):
         tuning.goal(session.scenario(), [], "iae", session.knobs)
     with pytest.raises(ScenarioError, match="is not measured"):
         tuning.goal(session.scenario(), ["reference.slip"], "beauty", session.knobs)
+
+
+def test_a_tuning_stays_between_the_bounds_that_are_typed(file):
+    session = Session(str(file(SHORT)))
+    now, known = session.scenario(), session.knobs
+    assert tuning.bounds(now, "controller.gain", known)["controller.gain.1"] == (-300.0, -15.0)
+    typed = {"controller.gain.1": ("-60", "-20.5")}
+    chosen = tuning.goal(now, ["controller.gain", "reference.slip"], "iae", known, typed)
+    assert chosen.tune.free["controller.gain"] == ((-1e5, -60.0), (-100.0, -20.5))
+    assert chosen.tune.free["reference.slip"] == tuple(tuning.bounds(now, "reference.slip", known)["reference.slip"])
+    for pair, words in (
+        (("-20", "-60"), r"tune\.free\.controller\.gain\.1: -20 is not below -60 N m"),
+        (("low", "-60"), 'controller.gain.1 = "low" is text'),
+        (("nan", "-60"), "controller.gain.1 = nan"),
+    ):
+        with pytest.raises(ScenarioError, match=words):
+            tuning.goal(now, ["controller.gain"], "iae", known, {"controller.gain.1": pair})
+
+
+def test_each_gain_of_a_balance_has_the_unit_of_its_state():
+    known = Session("arm-hanging").knobs
+    units = [known[f"controller.gain.{i}"].spec.unit for i in range(6)]
+    assert units == ["V/rad"] * 3 + ["V s/rad"] * 3
+
+
+def test_speeds_of_a_plant_without_a_wheel_stay_in_si(session):
+    class Cart:
+        class shows:
+            units = MappingProxyType({"position": "m", "speed": "m/s"})
+
+    assert not is_vehicle(Cart())
+    assert is_vehicle(session.given.loop.plant)
+    assert session.knobs["initial.speed"].spec.unit == "km/h"
+
+
+def test_a_transient_ends_when_the_signal_has_settled_to_its_target():
+    t = np.linspace(0.0, 10.0, 1001)
+    decay = np.exp(-t) * np.cos(3 * t)  # inside 5 % of its start from t = 2.98 s on (where exp(-t) < 0.05 and cos is 0)
+    lines = (Line("slip", 0.2 + decay), Line("target", np.full_like(t, 0.2)))
+    found = Curves(t, (Panel("1", lines),), {}, "", draft=False)
+    last = t[np.flatnonzero(np.abs(decay) > 0.05)[-1]]
+    assert curves.transient(found) == pytest.approx(1.5 * last, abs=0.02)
+    never = found._replace(panels=(Panel("1", (Line("slip", np.cos(t)), lines[1])),))
+    assert curves.transient(never) == 10.0
+    still = found._replace(panels=(Panel("1", (Line("slip", lines[1].values), lines[1])),))
+    assert curves.transient(still) == 10.0
+    assert charts.until(1.23456789) == {"dataZoom": [{"startValue": 0, "endValue": 1.2346}]}
 
 
 def test_charts_are_plain_json_whatever_a_run_was():

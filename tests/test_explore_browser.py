@@ -269,6 +269,21 @@ def test_tuned_saved_and_run_by_the_command_line(tabs, explorer):
 
 
 @needs_browser
+def test_the_time_axis_fits_the_transient_and_the_whole_run_again(tabs):
+    page = tabs()
+    rested(page)
+    shown = """() => { const box = document.querySelector('[data-id=curves] .nicegui-echart');
+      return getElement(+box.id.slice(1)).chart.getModel().getComponent('xAxis', 0).axis.scale.getExtent()[1]; }"""
+    whole = page.evaluate(shown)
+    page.click("[data-id=fit]")
+    page.wait_for_function(f"whole => ({shown})() < 0.95 * whole", arg=whole)
+    page.click("[data-id=whole]")
+    page.wait_for_function(f"whole => ({shown})() === whole", arg=whole)
+    assert page.inner_text("[data-id=poles-of]") == "of the linear model: torque limits are not in this"
+    assert page.inner_text("[data-id=proved-of]") == page.inner_text("[data-id=poles-of]")
+
+
+@needs_browser
 def test_another_scenario_and_another_road(tabs):
     page = tabs()
     page.click("[data-id=scenario]")

@@ -36,6 +36,12 @@ def in_loop(unit: str, units: Units | None) -> str:
     return ", ".join(_multiplied(one, units._asdict()) for one in unit.split(", "))
 
 
+def unit_at(unit: str, place: int, count: int) -> str:
+    """Return the unit of entry `place` of `count`: of a list of k units each holds for count/k entries, in order."""
+    units = unit.split(", ")
+    return units[place * len(units) // count]
+
+
 def in_words(text: str, units: Units | None) -> str:
     """Return a sentence with the control's unit in the place of ` {control}`, or nothing where that is not known."""
     return text.replace(" {control}", f" {units.control}" if units and units.control != "1" else "")

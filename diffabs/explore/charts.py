@@ -70,6 +70,11 @@ def fan(found: Fan | None) -> dict[str, Any]:
     return {"dataset": [{"id": "fan", "source": source}]}
 
 
+def until(end: float | None) -> dict[str, Any]:
+    """Return the change of the chart that shows the time up to an instant [s], or the whole run."""
+    return {"dataZoom": [{"start": 0, "end": 100} if end is None else {"startValue": 0, "endValue": rounded([end])[0]}]}
+
+
 def nothing(which: str) -> dict[str, Any]:
     """Return the change of the chart that takes curves away."""
     return {"dataset": [{"id": which, "source": {"t": []}}]}
@@ -138,7 +143,7 @@ def _points(values: np.ndarray, period: float | None) -> list[list[float]]:
     return [[float(f"{p.real:.5g}"), float(f"{p.imag:.5g}")] for p in poles]
 
 
-def rounded(values: np.ndarray) -> list[float | None]:
+def rounded(values: Any) -> list[float | None]:
     """Return numbers with as many digits as a screen can show; None where there is none."""
     values = np.asarray(values, float)
     finite = np.isfinite(values)

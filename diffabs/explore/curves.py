@@ -9,7 +9,7 @@ import numpy as np
 
 from diffabs.core.pytree import get, parameters
 from diffabs.explore.friction import FACTOR
-from diffabs.explore.knobs import mass
+from diffabs.explore.knobs import is_vehicle, mass
 from diffabs.linear.robustness import even
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
@@ -24,6 +24,8 @@ LONG = 4 * INSTANTS  # steps, from which a draft is quicker
 DRAFT = 1e-3  # relative error of a draft's step
 MEMBERS = 200  # of a fan
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+SETTLED = 0.05  # of the greatest distance from the end: what is nearer from some instant on has settled
+AFTER = 1.5  # times the transient is shown where the time axis is fitted to it
 FEWEST = 0.1  # of the members must still run where a fan is drawn
 
 
@@ -92,6 +94,18 @@ def curves(chosen: Scenario, by: Solver | None = None) -> Curves:
     return Curves(t, panels, metrics, _ended(chosen, run, t), by is not None)
 
 
+def transient(found: Curves) -> float:
+    """Return the end [s] of a time axis that fits the transient: 1.5 times the instant after which the first signal
+    stays near its target, or near its last value without a target. A run that does not settle is shown whole."""
+    lines = {line.name: line.values for line in found.panels[0].lines}
+    signal = found.panels[0].lines[0].values
+    target = lines["target"]
+    away = np.abs(signal - np.where(np.isfinite(target), target, signal[-1]))
+    far = np.flatnonzero(away > SETTLED * np.max(away, initial=0.0))
+    end = float(found.t[-1])
+    return end if not far.size or far[-1] + 1 >= len(signal) else min(end, AFTER * float(found.t[far[-1] + 1]))
+
+
 def fan(chosen: Scenario, spread: Spread) -> Fan | None:
     """Return the fan of many runs whose masses and roads differ, all at once; None where neither is there."""
     values, words = members(chosen, spread)
@@ -157,7 +171,8 @@ def _layout(run: Run, plant: Any) -> list[Panel]:
     units = list(groups)
     aims = [Line("target", np.asarray(sample.target, float)), Line("setpoint", np.asarray(sample.setpoint, float))]
     shown = [Panel(units[0], (*groups[units[0]], *aims))]
-    shown += [_in_kmh(Panel(unit, tuple(groups[unit]))) for unit in units[1:2]]
+    shown += [Panel(unit, tuple(groups[unit])) for unit in units[1:2]]
+    shown = [_in_kmh(panel) for panel in shown] if is_vehicle(plant) else shown
     control = [Line(name, np.asarray(getattr(sample, name), float)) for name in ("control", "command")]
     return [*shown, Panel(plant.control_unit, tuple(control))]
 

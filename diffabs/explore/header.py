@@ -15,6 +15,12 @@ def header(page: "Page") -> None:
         ui.label("explore").classes("brand thin")
         ui.element("div").classes("grow")
         ui.html("", sanitize=False).classes("latency").props("data-id=latency")
+        ui.button("fit", on_click=lambda: page.show_until_settled(whole=False)).props(
+            "flat dense no-caps data-id=fit"
+        ).tooltip("the time axis ends when the transient has")
+        ui.button("whole run", on_click=lambda: page.show_until_settled(whole=True)).props(
+            "flat dense no-caps data-id=whole"
+        )
         ui.button("pin", on_click=lambda: page.pin(page.shown)).props("flat dense no-caps data-id=pin").tooltip(
             "keep this run as a dashed curve to compare with"
         )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.pytree import Spec, parameters
+from diffabs.core.units import unit_at
 from diffabs.core.values import inside, wrong
 from diffabs.explore.friction import FACTOR
 from diffabs.scenario.parameter_paths import canonical
@@ -18,7 +19,7 @@ STEPS = 1000  # of a slider, end to end
 DECADE = 10.0  # a slider over so many times its lower end is logarithmic
 WIDTH = 2.0  # how many times more, and less, than its value a number without a range can be dragged to
 NEARBY = 1.25  # beyond the range of a scenario a slider goes on to so many times its value
-SPEEDS = ("speed", "reference_speed")  # in km/h, as everywhere where a person reads
+SPEEDS = ("speed", "reference_speed")  # of a vehicle, in km/h
 FILTERS = ("time_constant", "cutoff")
 LIMITS = ("torque_min", "torque_max", "reference_speed", "period")  # of a controller, hardly dragged
 MOST_FIRST = 14
@@ -100,6 +101,11 @@ def knobs(chosen: Scenario) -> dict[str, Knob]:
     return {knob.key: knob for knob in found}
 
 
+def is_vehicle(plant: Any) -> bool:
+    """Return whether a plant shows the speed of a wheel, so that a person reads its speeds in km/h."""
+    return "wheel_speed" in plant.shows.units
+
+
 def unit_words(unit: str) -> str:
     """Return a unit as the page shows it; nothing for plain numbers."""
     return "" if unit == "1" else unit.replace("^2", "²")
@@ -134,26 +140,22 @@ def mass(chosen: Scenario) -> str | None:
 
 def _of(chosen: Scenario, path: str, spec: Spec, value: Any) -> Iterator[Knob]:
     tail = path.rpartition(".")[2]
-    scale = KMH if spec.unit == "m/s" and tail in SPEEDS else 1.0
+    scale = KMH if spec.unit == "m/s" and tail in SPEEDS and is_vehicle(chosen.loop.plant) else 1.0
     name = canonical(path) + ("_kmh" if scale != 1.0 else "")
     group, _, label = canonical(path).partition(".")
     label = label.removeprefix(f"{group}.").replace("_", " ")
     label = "friction factor" if path == FACTOR else label
     values = np.asarray(value, float)
+    if values.ndim > 1:
+        return  # nobody drags the entries of a matrix
     for place in np.ndindex(values.shape):
         at = place[0] if place else None
         suffix = "" if at is None else f".{at}"
-        own = _in(spec, scale, at)
+        unit = "km/h" if scale != 1.0 else unit_at(spec.unit, at or 0, values.size)
+        own = dataclasses.replace(spec, unit=unit, low=spec.low * scale, high=spec.high * scale)
         low, high = _ends(own, float(values[place]) * scale, _given(chosen, path, at, scale))
         words = label if at is None else f"{label} {at + 1}"
         yield Knob(path, at, name + suffix, group, words, own, scale, low, high)
-
-
-def _in(spec: Spec, scale: float, place: int | None) -> Spec:
-    units = spec.unit.split(", ")
-    unit = units[place] if place is not None and len(units) > place else units[0] if len(units) > 1 else spec.unit
-    unit = "km/h" if scale != 1.0 else unit
-    return dataclasses.replace(spec, unit=unit, low=spec.low * scale, high=spec.high * scale)
 
 
 def _given(chosen: Scenario, path: str, place: int | None, scale: float) -> tuple[float, float] | None:

@@ -106,6 +106,11 @@ class Page:
             change = charts.curves(found, "before") if found else charts.nothing("before")
             self.chart.change(change)
 
+    def show_until_settled(self, *, whole: bool) -> None:
+        """Fit the time axis to the transient of the run that is shown, or to the whole run."""
+        if self.chart is not None and self.shown is not None:
+            self.chart.change(charts.until(None if whole else curves.transient(self.shown)))
+
     def refused(self, error: Exception | None) -> None:
         """Say why something cannot be, or that all is well."""
         self.controls.refused("" if error is None else _sentence(error))

@@ -53,6 +53,9 @@ class Results:
         """Another scenario."""
         self.units = {name: unit_of(one, chosen.loop.plant) for name, one in chosen.objectives.items()}
         self.verdict_box.classes(replace="verdict stale")
+        control = charts.QUANTITIES.get(chosen.loop.plant.control_unit, "control")
+        for line in (self.proved_of, self.poles_of):
+            line.set_text(f"of the linear model: {control} limits are not in this")
         for line in (self.word, self.why, self.none, self.loop):
             line.set_text("")
         self.numbers.clear()
@@ -106,6 +109,7 @@ class Results:
         with ui.element("div").classes("verdict stale").props("data-id=verdict") as self.verdict_box:
             self.word = ui.label("").style("font-weight:600; font-size:13.5px").props("data-id=word")
             self.why = ui.label("").classes("why")
+        self.proved_of = ui.label("").classes("note").props("data-id=proved-of")
 
     def _pole_card(self) -> None:
         with ui.element("div").classes("card-title"):
@@ -114,6 +118,7 @@ class Results:
             self.solving = ui.label("computing …").classes("busy")
         self.map = Canvas(charts.pole_frame(), "poles", "poles")
         self.none = ui.label("").classes("note").props("data-id=about-poles")
+        self.poles_of = ui.label("").classes("note").props("data-id=poles-of")
         table = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
         self.margin_cells: dict[str, tuple[Any, Any]] = {}
         with table.props("data-id=margins"):

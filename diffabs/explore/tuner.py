@@ -1,5 +1,6 @@
 """The dialog and the card of a tuning: what is free, how far it is, before and after."""
 
+import html
 from typing import TYPE_CHECKING, Any
 
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
@@ -7,6 +8,7 @@ from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra dif
 from diffabs.core.values import ScenarioError
 from diffabs.explore import curves, tuning
 from diffabs.explore.canvas import Canvas
+from diffabs.explore.knobs import unit_words
 from diffabs.explore.results import measured
 from diffabs.explore.work import Latest
 from diffabs.scenario.scenario import Scenario
@@ -14,6 +16,7 @@ from diffabs.scenario.scenario import Scenario
 if TYPE_CHECKING:
     from diffabs.explore.page import Page
 
+Fields = tuple[Any, Any, tuple[str, str]]  # of the low and the high end, and what they said at first
 WIDE = 20  # losses that differ by so much are drawn in decades
 LOSS = {
     "animation": False,
@@ -63,6 +66,11 @@ class Tuner:
                 "dense outlined"
             )
             free.classes("w-full").props("use-chips data-id=free")
+            fields: dict[str, Fields] = {}
+            ranges = ui.element("div").classes("grid-table bounds").props("data-id=bounds")
+            ranges.style("grid-template-columns: 1fr 92px 92px auto")
+            free.on_value_change(lambda: self._bounds(ranges, now, list(free.value or ()), fields))
+            self._bounds(ranges, now, paths, fields)
             small = ui.select(list(now.objectives), value=metric, label="make small").props("dense outlined")
             small.classes("w-full").props("data-id=metric")
             ui.label(self._about(now)).classes("note")
@@ -71,10 +79,36 @@ class Tuner:
 
                 def start() -> None:
                     dialog.close()
-                    self._start(list(free.value or ()), str(small.value))
+                    typed = {key: (low.value, high.value) for key, (low, high, _) in fields.items()}
+                    bounded = {key: pair for key, pair in typed.items() if pair != fields[key][2]}
+                    self._start(list(free.value or ()), str(small.value), bounded)
 
                 ui.button("start", on_click=start).props("unelevated no-caps data-id=start")
         dialog.open()
+
+    def _bounds(self, place: Any, now: Scenario, paths: list[str], fields: dict[str, Fields]) -> None:
+        """A low and a high end for each number that is free, between which the tuning stays."""
+        known = self.page.session.knobs
+        place.clear()
+        fields.clear()
+        with place:
+            for words in ("stays between", "low", "high", ""):
+                ui.label(words).classes("head number" if words in ("low", "high") else "head")
+            for path in paths:
+                try:
+                    ends = tuning.bounds(now, path, known)
+                except ScenarioError as error:
+                    ui.label(str(error)).style("grid-column: 1 / 5")
+                    continue
+                for key, pair in ends.items():
+                    ui.label(known[key].name)
+                    shown = (f"{pair[0]:.6g}", f"{pair[1]:.6g}")
+                    low, high = (
+                        ui.input(value=text).props(f'dense outlined data-bound="{html.escape(key)}-{side}"')
+                        for text, side in zip(shown, ("low", "high"), strict=True)
+                    )
+                    fields[key] = (low, high, shown)
+                    ui.label(unit_words(known[key].spec.unit)).classes("note")
 
     @staticmethod
     def _about(now: Scenario) -> str:
@@ -85,10 +119,10 @@ class Tuner:
         asked += [f"damping ≥ {task.damping:g}"] if task.damping else []
         return f"over {lanes}{'; such that ' + ', '.join(asked) if asked else ''}; at most {task.iterations} iterations"
 
-    def _start(self, paths: list[str], metric: str) -> None:
+    def _start(self, paths: list[str], metric: str, bounded: dict[str, tuple[Any, Any]]) -> None:
         session = self.page.session
         try:
-            chosen = tuning.goal(session.scenario(), paths, metric, session.knobs)
+            chosen = tuning.goal(session.scenario(), paths, metric, session.knobs, bounded)
         except ScenarioError as error:
             self.page.refused(error)
             return

@@ -46,15 +46,48 @@ def usual(chosen: Scenario) -> tuple[list[str], str]:
     return paths, next(iter(chosen.tune.objective or chosen.objectives), "")
 
 
-def goal(chosen: Scenario, paths: Sequence[str], metric: str, known: Mapping[str, Knob]) -> Scenario:
-    """Return the scenario with these parameters free and this metric made small; ranges and constraints are those of
-    its [tune], else ranges are those of the sliders. Raises ScenarioError where nothing is free or no such metric is
-    there."""
+def bounds(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> dict[str, tuple[float, float]]:
+    """Return the bounds of a free parameter as the page shows them, by the key of each of its numbers: those of [tune],
+    else the ends of its sliders. Raises ScenarioError for a parameter without a range."""
+    mine = {key: knob for key, knob in known.items() if knob.path == path}
+    given = chosen.tune.free.get(path)
+    if given is None and any(knob.low is None or knob.high is None for knob in mine.values()):
+        raise ScenarioError(f"tune.free.{path} has no range: it is not finite here")
+
+    def end(knob: Knob, side: int) -> float:
+        if given is None:
+            return float((knob.low, knob.high)[side] or 0.0)
+        values = np.asarray(given[side], float)
+        return float(values if knob.place is None or not values.ndim else values[knob.place]) * knob.scale
+
+    return {key: (end(knob, 0), end(knob, 1)) for key, knob in mine.items()}
+
+
+def goal(
+    chosen: Scenario,
+    paths: Sequence[str],
+    metric: str,
+    known: Mapping[str, Knob],
+    bounded: Mapping[str, tuple[Any, Any]] | None = None,
+) -> Scenario:
+    """Return the scenario with these parameters free and this metric made small.
+
+    Args:
+        chosen: the scenario; its constraints stay
+        paths: of the free parameters
+        metric: name of the objective
+        known: the numbers of the loop by key
+        bounded: low and high end by key of a number, as typed on the page; without one those of `bounds`
+
+    Raises:
+        ScenarioError: nothing is free; there is no such metric; a bound is not in the parameter's range; the low end is
+            not below the high one
+    """
     if not paths:
         raise ScenarioError("tune.free is empty: choose at least one parameter")
     if metric not in chosen.objectives:
         raise ScenarioError(f"tune.objective = {metric!r} is not measured; there is {', '.join(chosen.objectives)}")
-    ranges = {path: chosen.tune.free.get(path) or _range(chosen, path, known) for path in paths}
+    ranges = {path: _range(chosen, path, known, bounded or {}) for path in paths}
     weights = chosen.tune.objective if metric in chosen.tune.objective else {metric: 1.0}
     task = dataclasses.replace(chosen.tune, free=ranges, objective=weights, starts=1)
     return dataclasses.replace(chosen, tune=task)
@@ -84,12 +117,17 @@ def tuned(chosen: Scenario, posed: Posed, told: Callable[[int, float], None], st
     return Found(dataclasses.replace(chosen, loop=found.loop), losses, found.met, found.reason.value)
 
 
-def _range(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> tuple[Any, Any]:
-    """The ends of the sliders of a parameter, in SI, with the value well inside."""
-    shape = np.shape(get(chosen.loop, path))
-    mine = [knob for knob in known.values() if knob.path == path]
-    if any(knob.low is None or knob.high is None for knob in mine):
-        raise ScenarioError(f"tune.free.{path} has no range: it is not finite here")
-    ends = [[getattr(knob, end) / knob.scale for knob in mine] for end in ("low", "high")]
-    low, high = (tuple(end) if shape else end[0] for end in ends)
-    return low, high
+def _range(
+    chosen: Scenario, path: str, known: Mapping[str, Knob], bounded: Mapping[str, tuple[Any, Any]]
+) -> tuple[Any, Any]:
+    """Low and high end of a parameter in SI, in its shape."""
+    ends = {**bounds(chosen, path, known), **{key: ends for key, ends in bounded.items() if known[key].path == path}}
+    read = {key: tuple(known[key].read(end) for end in pair) for key, pair in ends.items()}
+    for key, (low, high) in read.items():
+        if not low < high:
+            knob = known[key]
+            raise ScenarioError(
+                f"tune.free.{knob.name}: {knob.text(low)} is not below {knob.text(high)} {knob.spec.unit}"
+            )
+    low, high = zip(*read.values(), strict=True)
+    return (low, high) if np.shape(get(chosen.loop, path)) else (low[0], high[0])
