@@ -15,7 +15,6 @@ spills of the packaged scenarios for sm_80 and sm_90, as NVRTC's assembler tells
 import argparse
 import ctypes
 import functools
-import os
 import pathlib
 import statistics
 from typing import Any
@@ -33,7 +32,7 @@ from rich.table import Column, Table
 import diffabs
 from diffabs import scenario
 from diffabs.core.pytree import get
-from diffabs.kernel import cuda, gpu, kept, launch, nvrtc
+from diffabs.kernel import cuda, gpu, launch, nvrtc
 from diffabs.kernel.graph import Level, real
 from diffabs.kernel.program import Program, live
 from diffabs.simulate import native
@@ -164,9 +163,8 @@ def translated(name, dtype):
     one, path = scenario.load(name), "initial.theta" if name.startswith("arm") else "initial.speed"
     lanes = diffabs.Batch({path: np.full(2, float(get(one.loop, path)))}, np.arange(2))
     given = (one.loop, lanes, one.solver, one.objectives)
-    off = mock.patch.dict(os.environ, {kept.OFF: "1"})
-    with jax.enable_x64(dtype == "float64"), mock.patch.object(launch, "_launched", launched), off:
-        native._kept.forget()
+    with jax.enable_x64(dtype == "float64"), mock.patch.object(launch, "_launched", launched):
+        native._run.clear_cache()
         try:
             diffabs.run_batch(*given, together=False, accepted=True, engine="kernel")
         except Translated as done:

@@ -18,8 +18,7 @@ from kernels import FOLDER, applied, both, same
 
 import diffabs as d
 from diffabs import controllers, plants, scenario, sensors
-from diffabs.core import kept
-from diffabs.kernel import compilers, launch
+from diffabs.kernel import binaries, compilers, launch
 from diffabs.kernel.graph import Graph, Level
 from diffabs.kernel.primitives import Unsupported, known, translate
 from diffabs.objectives import BRAKING
@@ -66,15 +65,13 @@ def _(size, batched, x):
 
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
-    monkeypatch.setenv(compilers.CACHE, FOLDER)
-    monkeypatch.setenv(kept.OFF, "1")  # what is kept between processes has a file of its own
+    monkeypatch.setenv(binaries.CACHE, FOLDER)
 
 
 @pytest.fixture(scope="module")
 def runs():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(compilers.CACHE, FOLDER)
-        patch.setenv(kept.OFF, "1")
+        patch.setenv(binaries.CACHE, FOLDER)
         return both(LOOP, VALUES, SOLVER, MEASURED, KEYS)
 
 
@@ -89,7 +86,7 @@ class TestRuns:
 
     def test_do_not_depend_on_their_order_nor_on_threads(self, runs, monkeypatch):
         monkeypatch.setattr(launch, "threads", lambda: 3)
-        native._kept.forget()
+        native._run.clear_cache()
         order = np.random.default_rng(1).permutation(LANES)
         values = {path: column[order] for path, column in VALUES.items()}
         found, _ = (lambda run: (run, None))(self._by_kernel(values, KEYS[order]))
@@ -144,7 +141,7 @@ class TestObjections:
     def test_without_a_compiler(self, monkeypatch, caplog):
         monkeypatch.setenv(compilers.COMPILER, "")
         tell.cache_clear()
-        native._kept.forget()
+        native._run.clear_cache()
         loop = d.replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
         line = native.objection(loop, VALUES, SOLVER, {})
         assert line == f"{compilers.COMPILER} is empty"
@@ -236,7 +233,7 @@ class TestSweep:
 
     def test_is_refused_before_anything_is_written(self, tmp_path, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, "")
-        native._kept.forget()
+        native._run.clear_cache()
         study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
         with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {compilers.COMPILER} is empty"):
             sweep(dataclasses.replace(study, engine="kernel"), tmp_path / "out")
@@ -246,7 +243,7 @@ class TestSweep:
     @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA: "), ("kernel", "")])
     def test_by_the_command(self, engine, line, tmp_path, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, "")
-        native._kept.forget()
+        native._run.clear_cache()
         changes = [part for setting in self.SETTINGS for part in ("--set", setting)]
         status = 0 if line else 2
         done = run("sweep", "slip-lmi", *changes, "--out", tmp_path / "out", "--engine", engine, status=status)
@@ -289,32 +286,75 @@ class TestLibrary:
 
     def test_is_made_once(self, tmp_path, monkeypatch):
         compilers.compiler()  # has been tried, which is noted
-        monkeypatch.setenv(compilers.CACHE, str(tmp_path))
+        monkeypatch.setenv(binaries.CACHE, str(tmp_path))
         path = compilers.library(self.TEXT % 1)
         monkeypatch.setattr(compilers, "_run", None)
         assert compilers.library(self.TEXT % 1) == path
         assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
+    @pytest.mark.parametrize("how", ["empty", "cut off", "one bit", "another library"])
+    def test_that_is_damaged_is_compiled_again(self, how, tmp_path, monkeypatch, caplog):
+        """Also one whose file is a library, but another one: no damaged file is ever loaded."""
+        compilers.compiler()
+        monkeypatch.setenv(binaries.CACHE, str(tmp_path))
+        monkeypatch.setattr(compilers, "_run", lambda words, source, result, s: result.write_bytes(source.read_bytes()))
+        path, other = compilers.library("one library"), compilers.library("another")
+        whole = path.read_bytes()
+        damaged = {
+            "empty": b"",
+            "cut off": whole[:-1],
+            "one bit": b"p" + whole[1:],
+            "another library": other.read_bytes(),
+        }
+        path.write_bytes(damaged[how])
+        assert compilers.library("one library").read_bytes() == whole
+        assert [record.message for record in caplog.records] == [f"{path} is damaged; it is compiled again"]
+        assert sorted(tmp_path.iterdir()) == sorted([path, other])
+
+    @pytest.mark.skipif(not hasattr(os, "getuid"), reason="Windows has no such modes")
+    def test_in_a_folder_that_others_may_write_to_is_refused(self, tmp_path, monkeypatch):
+        compilers.compiler()
+        tmp_path.chmod(0o770)
+        monkeypatch.setenv(binaries.CACHE, str(tmp_path))
+        with pytest.raises(
+            compilers.NoCompiler, match=r"other users may write to it: `chmod go-w` it, or name another"
+        ):
+            compilers.library(self.TEXT % 1)
+        assert list(tmp_path.iterdir()) == []
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="the compiler of this test is a shell script")
+    def test_by_a_compiler_that_hangs_says_so(self, tmp_path, monkeypatch):
+        """A compiler's own children hold its output: they are ended with it."""
+        path = tmp_path / "hangs"
+        path.write_text("#!/bin/sh\nsleep 60 &\nwait\n")
+        path.chmod(0o755)
+        monkeypatch.setenv(compilers.COMPILER, str(path))
+        monkeypatch.setattr(compilers, "LONGEST_TRY_S", 0.2)
+        begun = time.monotonic()
+        with pytest.raises(compilers.NoCompiler, match=rf"{path} did not end within 0\.2 s and was stopped"):
+            compilers.compiler()
+        assert time.monotonic() - begun < 20
+
     def test_that_was_not_used_for_longest_goes(self, tmp_path, monkeypatch):
         compilers.compiler()
-        monkeypatch.setenv(compilers.CACHE, str(tmp_path))
-        monkeypatch.setattr(compilers, "_run", lambda command, source, result: result.write_bytes(bytes(10)))
+        monkeypatch.setenv(binaries.CACHE, str(tmp_path))
+        monkeypatch.setattr(compilers, "_run", lambda words, source, result, s: result.write_bytes(bytes(10)))
         first, second, third = (compilers.library(text) for text in ("first", "second", "third"))
         for i, path in enumerate((first, second, third)):
             os.utime(path, (i, i))
         compilers.library("first")  # is used again
-        monkeypatch.setattr(compilers, "ROOM", 30)
+        monkeypatch.setattr(binaries, "ROOM", 30)
         fourth = compilers.library("fourth")
         assert set(tmp_path.glob("*.so")) == {first, second, third, fourth}
-        monkeypatch.setattr(compilers, "ROOM", 39)
+        monkeypatch.setattr(binaries, "ROOM", 39)
         fifth = compilers.library("fifth")
         assert set(tmp_path.glob("*.so")) == {first, fourth, fifth}
 
     @pytest.mark.parametrize("changed", ["FLAGS", "_processor"])
     def test_is_another_for_other_flags_and_processors(self, changed, tmp_path, monkeypatch):
         compilers.compiler()
-        monkeypatch.setenv(compilers.CACHE, str(tmp_path))
-        monkeypatch.setattr(compilers, "_run", lambda command, source, result: result.write_bytes(b""))
+        monkeypatch.setenv(binaries.CACHE, str(tmp_path))
+        monkeypatch.setattr(compilers, "_run", lambda words, source, result, s: result.write_bytes(b""))
         path, made = compilers.library("one"), compilers.compiler()
         monkeypatch.setattr(compilers, "compiler", lambda: made)
         monkeypatch.setattr(compilers, changed, ("-O1",) if changed == "FLAGS" else lambda: "another")
@@ -322,7 +362,7 @@ class TestLibrary:
 
     def test_in_a_folder_that_cannot_be_made(self, tmp_path, monkeypatch):
         (tmp_path / "file").write_text("")
-        monkeypatch.setenv(compilers.CACHE, str(tmp_path / "file" / "kernel"))
+        monkeypatch.setenv(binaries.CACHE, str(tmp_path / "file" / "kernel"))
         with pytest.raises(compilers.NoCompiler, match=r"no kernel in .*file.kernel: Not a directory"):
             compilers.library(self.TEXT % 3)
 
@@ -338,7 +378,7 @@ class TestLibrary:
         code += (
             "f = ctypes.CDLL(str(p)).answer; f.restype, f.argtypes = ctypes.c_double, [ctypes.c_double]; print(f(0.0))"
         )
-        environment = os.environ | {compilers.CACHE: str(tmp_path)}
+        environment = os.environ | {binaries.CACHE: str(tmp_path)}
         begun = [
             subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
             for _ in range(3)

@@ -21,8 +21,7 @@ from test_kernel import AT_ONCE, DIVERGING, KEYS, LOOP, MEASURED, NEVER, SOLVER,
 
 import diffabs as d
 from diffabs import scenario
-from diffabs.core import kept
-from diffabs.kernel import compilers, cuda, gpu, nvrtc
+from diffabs.kernel import binaries, cuda, gpu, nvrtc
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import native
@@ -34,11 +33,10 @@ TANGENTS = ("of both", "eleven tangents", "several tangents for several gains")
 
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
-    monkeypatch.setenv(compilers.CACHE, FOLDER)
-    monkeypatch.setenv(kept.OFF, "1")
-    native._kept.forget()
+    monkeypatch.setenv(binaries.CACHE, FOLDER)
+    native._run.clear_cache()
     yield
-    native._kept.forget()
+    native._run.clear_cache()
 
 
 @pytest.fixture
@@ -147,7 +145,7 @@ class TestMachineCode:
         assert used["spilled"] <= LARGE.get(name, {}).get(dtype, spilled)
 
     def test_of_a_wrong_text_is_an_objection(self, tmp_path, monkeypatch):
-        monkeypatch.setenv(compilers.CACHE, str(tmp_path))
+        monkeypatch.setenv(binaries.CACHE, str(tmp_path))
         with pytest.raises(NoCompiler, match=r"NVRTC, sm_90: kernel.cu\(1\): error"):
             nvrtc.machine_code("nonsense", "sm_90")
         assert not [*tmp_path.iterdir()]
@@ -156,7 +154,7 @@ class TestMachineCode:
 def test_machine_code_is_made_once(tmp_path, monkeypatch):
     """For the same text, flags and architecture."""
     made = []
-    monkeypatch.setenv(compilers.CACHE, str(tmp_path))
+    monkeypatch.setenv(binaries.CACHE, str(tmp_path))
     monkeypatch.setattr(nvrtc, "version", lambda: (13, 5))
     monkeypatch.setattr(nvrtc, "_compiled", lambda *args: (made.append(args), (b"code", "what was said"))[1])
     path = nvrtc.machine_code("text", "sm_90")

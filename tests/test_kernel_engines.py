@@ -12,10 +12,9 @@ from kernels import FOLDER
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, reliability, roads, scenario, stops, sweep, tune
-from diffabs.core import kept
 from diffabs.core.pytree import get
 from diffabs.design.attraction import Cells, attraction
-from diffabs.kernel import compilers, launch
+from diffabs.kernel import binaries, compilers, launch
 from diffabs.objectives import IAE, StopTime
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import native
@@ -51,7 +50,7 @@ NONE = f"{compilers.COMPILER} is empty"
 
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
-    monkeypatch.setenv(compilers.CACHE, FOLDER)
+    monkeypatch.setenv(binaries.CACHE, FOLDER)
 
 
 @pytest.fixture
@@ -135,9 +134,8 @@ class TestTune:
 @pytest.mark.slow
 def test_the_worst_case_is_that_of_xla(monkeypatch):
     """Screened without derivatives and ascended with them, both by a kernel."""
-    native._kept.forget()
+    native._run.clear_cache()
     launches, launched = [], launch._launched
-    monkeypatch.setenv(kept.OFF, "1")
     monkeypatch.setattr(launch, "_launched", lambda made, *a, **k: launches.append(made) or launched(made, *a, **k))
     over = {"plant.mass": (14.0, 16.0), "initial.speed": (25.0, 28.0)}
     given = {"over": over, "metric": "iae", "solver": TUNED["solver"], "measured": TUNED["measured"]}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from kernels import FOLDER, applied
 
-from diffabs.kernel import compilers, launch
+from diffabs.kernel import binaries, compilers, launch
 
 pytestmark = pytest.mark.xdist_group("kernel")
 
@@ -21,7 +21,7 @@ PLAIN = [False, pytest.param(True, marks=pytest.mark.slow)]
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
     """And blocks of one vector, which are compiled in a fourth of the time."""
-    monkeypatch.setenv(compilers.CACHE, FOLDER)
+    monkeypatch.setenv(binaries.CACHE, FOLDER)
     monkeypatch.setattr(launch, "VECTORS", 1)
 
 

@@ -10,9 +10,8 @@ from kernels import FOLDER, both, same
 
 import diffabs as d
 from diffabs import scenario
-from diffabs.core import kept
 from diffabs.core.pytree import get
-from diffabs.kernel import compilers, launch
+from diffabs.kernel import binaries, launch
 from diffabs.objectives import usual
 from diffabs.scenario.defaults import balancing, braking
 
@@ -38,8 +37,7 @@ LAST_DIGIT = {
 
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
-    monkeypatch.setenv(compilers.CACHE, FOLDER)
-    monkeypatch.setenv(kept.OFF, "1")
+    monkeypatch.setenv(binaries.CACHE, FOLDER)
     monkeypatch.setattr(launch, "VECTORS", 2)
 
 

@@ -21,7 +21,7 @@ from test_kernel_parts import CASES, VARIED, with_part
 import diffabs as d
 from diffabs import controllers, plants, scenario
 from diffabs.core.pytree import arrayed, get
-from diffabs.kernel import compilers, launch, tangents
+from diffabs.kernel import binaries, launch, tangents
 from diffabs.kernel.graph import Level
 from diffabs.kernel.launch import run_lanes
 from diffabs.objectives import IAE, usual
@@ -44,7 +44,7 @@ PARTS_HERE = [case for case in CASES if case[0] != "stop"]
 
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
-    monkeypatch.setenv(compilers.CACHE, FOLDER)
+    monkeypatch.setenv(binaries.CACHE, FOLDER)
     monkeypatch.setattr(launch, "VECTORS", 2)
 
 
@@ -160,7 +160,7 @@ class TestLaunch:
     def test_on_two_devices(self):
         """Lanes that lie on two devices, each of which runs its own; and their derivatives. Then those of a batch: on
         either device, and on both."""
-        environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", compilers.CACHE: FOLDER}
+        environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", binaries.CACHE: FOLDER}
         environment["PYTHONPATH"] = os.pathsep.join([os.path.dirname(__file__), *sys.path])
         done = subprocess.run([sys.executable, "-c", ON_TWO], env=environment, capture_output=True, text=True)
         assert done.stdout == "on two devices\n", done.stderr[-2000:]

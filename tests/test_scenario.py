@@ -472,3 +472,10 @@ def test_another_part_takes_what_is_tuned_with_it(change):
     assert set(load("slip-cured", ["controller.controller=pid"]).tune.free) == {"reference.time_constant"}
     again = load("slip-lmi", [change, "tune.free.controller.kp=1000,5000"]).tune
     assert again.free == {"controller.kp": (1000.0, 5000.0)}
+
+
+@pytest.mark.parametrize("seed", [0, 7, 2**31 - 1, 2**40])
+def test_the_key_of_a_run_is_that_of_jax(seed):
+    found, wanted = scenario.Scenario("mine", seed=seed).key(), jax.random.key(seed)
+    assert found.dtype == wanted.dtype
+    np.testing.assert_array_equal(jax.random.key_data(found), jax.random.key_data(wanted))

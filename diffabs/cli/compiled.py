@@ -2,6 +2,7 @@
 
 Compiling is most of what a command costs. Who configures JAX's own cache decides; DIFFABS_NO_CACHE=1 turns it off."""
 
+import logging
 import os
 import pathlib
 import sys
@@ -9,9 +10,9 @@ import warnings
 
 import jax
 
-from diffabs.core import files, kept, provenance
-from diffabs.core.compiling import shelf
+from diffabs.core import files, provenance
 
+OFF = "DIFFABS_NO_CACHE"  # if set, nothing is kept
 WORTH = 0.05  # s of compiling, from which a program is kept
 ROOM = 256 * 2**20  # bytes on disk; beyond, the oldest half goes
 CHOSEN = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")  # by which a user has decided
@@ -21,11 +22,16 @@ def keep() -> pathlib.Path | None:
     """Return the folder that JAX from now on keeps compiled programs in, or None: without one everything works, and
     compiles. Nothing is said of a folder that cannot be written or of a damaged entry."""
     chosen = jax.config.values.get("jax_compilation_cache_dir")
-    if os.environ.get(kept.OFF) or any(name in os.environ for name in CHOSEN) or chosen:
+    if os.environ.get(OFF) or any(name in os.environ for name in CHOSEN) or chosen:
         return None
     try:
         folder = _user_folder() / "diffabs" / f"jax-{provenance.processor()}"
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if files.others_may_write(folder):  # what is read from there is run
+            logging.getLogger("diffabs").warning(
+                "%s: nothing is kept there, because other users may write to it", folder
+            )
+            return None
         if not os.access(folder, os.R_OK | os.W_OK | os.X_OK):
             return None
         files.make_room(folder, "*", ROOM)
@@ -35,7 +41,6 @@ def keep() -> pathlib.Path | None:
     jax.config.update("jax_compilation_cache_dir", str(folder))
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", WORTH)
-    shelf.put(folder)
     return folder
 
 

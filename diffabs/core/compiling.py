@@ -1,7 +1,7 @@
 """Programs that run once: compiling them is what they cost.
 
-XLA is told to compile faster where a function is called with numbers, and what it compiles may be kept for the next
-process (`core.kept`; the command line does). Inside jit, and so under vmap and grad, what surrounds it decides."""
+XLA is told to compile faster where a function is called with numbers. Inside jit, and so under vmap and grad, what
+surrounds it decides."""
 
 import functools
 import os
@@ -11,8 +11,6 @@ from typing import Any, TypeVar
 import jax
 from jax.core import Tracer
 
-from diffabs.core import kept
-
 F = TypeVar("F", bound=Callable)
 
 # JAX 0.10: its older emitters make the same numbers as the newer ones in half the time; later JAX has no such option.
@@ -21,31 +19,24 @@ SAME: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_i
 if SAME and "codegen_split_count" not in os.environ.get("XLA_FLAGS", ""):
     SAME["xla_cpu_parallel_codegen_split_count"] = 4
 QUICK: dict[str, Any] = {**SAME, "xla_backend_optimization_level": 0}  # rounds differently
-shelf = kept.Simple()  # of what is compiled once
 
 
 def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | None = None) -> Callable[[F], F]:
     """Return the decorator `jax.jit` for a function that is mostly called with numbers, once for each of its shapes.
 
     static: names of static arguments, by which they are given, or the number of leading ones. options: of XLA (`SAME`,
-    `QUICK`), which apply where nothing is traced. Raises TypeError for a function that `jax.vmap` or the like made."""
+    `QUICK`), which apply where nothing is traced."""
     leading, names = (static, ()) if isinstance(static, int) else (0, tuple(static))
     fixed: dict[str, Any] = {"static_argnums": tuple(range(leading)), "static_argnames": names}
 
     def decorate(function: F) -> F:
-        if hasattr(function, "__wrapped__"):
-            raise TypeError(f"a program is kept by the name of its function, and {function!r} has that of another")
         plain: Any = jax.jit(function, **fixed)
         quick: Any = jax.jit(function, **fixed, compiler_options=options) if options else plain
-        programs = kept.Programs(plain, function, shelf, leading=leading, names=names, options=options)
 
         @functools.wraps(function)
         def call(*args: Any, **more: Any) -> Any:
-            if traced(args, more):
-                return plain(*args, **more)
-            return (programs.find(args, more) or quick)(*args, **more)
+            return (plain if traced(args, more) else quick)(*args, **more)
 
-        call._programs = programs  # pyright: ignore
         call._cache_size = lambda: plain._cache_size() + quick._cache_size()  # pyright: ignore
         return call  # pyright: ignore[reportReturnType]
 

@@ -84,6 +84,24 @@ def write(target: pathlib.Path, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
+def write_synced(target: pathlib.Path, data: bytes) -> pathlib.Path:
+    """Write a file that is whole at every instant at which it is there, also after a power cut. Several processes may
+    write it at once: the last one's stays. Returns the path. Raises OSError."""
+    with new_file(target) as temporary, temporary.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    return target
+
+
+def others_may_write(folder: pathlib.Path) -> bool:
+    """Return whether users other than this one and root may write to a folder. Raises OSError."""
+    if not hasattr(os, "getuid"):
+        return False  # Windows: a user's folders are the user's
+    there = folder.stat()
+    return bool(there.st_mode & (stat.S_IWGRP | stat.S_IWOTH)) or there.st_uid not in (os.getuid(), 0)
+
+
 def write_durably(target: pathlib.Path, data: bytes) -> pathlib.Path:
     """Write a file that is whole at every instant at which it is there, also after a power cut; only one process may.
     What a kill leaves behind ends in `.tmp`. Returns the path. Raises OSError."""

@@ -1,7 +1,6 @@
-"""C++ to a shared library, by a compiler of this machine, kept in the user's cache folder.
+"""C++ to a shared library, by a compiler of this machine, kept in the user's cache folder (`binaries`).
 
-A library's name is the digest of everything that it is made of: text, headers, compiler, flags, processor. It is
-written whole and then named, so that two processes, or one that was killed, leave nothing that is half a library."""
+A library is found by the digest of everything that it is made of: text, headers, compiler, flags, processor."""
 
 import contextlib
 import ctypes
@@ -12,6 +11,7 @@ import os
 import pathlib
 import platform
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 import jax.ffi
 
-from diffabs.core import files, stopwatch
+from diffabs.core import stopwatch
+from diffabs.kernel.binaries import cache_folder, find, own_folder, write
 
 NATIVE = pathlib.Path(__file__).parent / "native"
-CACHE = "DIFFABS_KERNEL_CACHE"  # the folder of the libraries, if set
 COMPILER = "DIFFABS_KERNEL_COMPILER"  # the command, if set; an empty one is none
 CANDIDATES = (["c++"], ["clang++"], ["g++"])
 # No flag may change what is finite, nor what a comparison with NaN says: nothing of -ffast-math but what concerns the
@@ -32,8 +32,8 @@ FLAGS = (
     *("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
     *("-fno-exceptions", "-fno-rtti", "-fPIC", "-shared", "-pthread", "-w"),
 )
-LONGEST = 600  # s
-ROOM = 1 << 28  # bytes of libraries, some 800; beyond, the half that was not used for longest goes
+LONGEST_S = 300  # that a compiler may take for a kernel; the largest take some 20 s
+LONGEST_TRY_S = 30  # and to say its version, or to make a library of one line
 
 
 class NoCompiler(Exception):
@@ -52,15 +52,14 @@ def _tried(command: tuple[str, ...]) -> Compiler | str:
     """The compiler of a command, or why it is none: it has to make a library that this process can load. That it did so
     once is noted beside the libraries."""
     try:
-        version = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=LONGEST)
+        version = _output([*command, "--version"], LONGEST_TRY_S)
         made = Compiler(command, version.stdout.partition("\n")[0].strip())
         note = cache_folder() / f".{_digest('works', made)[:32]}"
         if not note.is_file():
             _try(command)
             with contextlib.suppress(OSError):
-                note.parent.mkdir(parents=True, exist_ok=True)
-                note.touch()
-    except (OSError, subprocess.TimeoutExpired, NoCompiler) as error:
+                (own_folder() / note.name).touch()
+    except (OSError, NoCompiler) as error:
         return f"{' '.join(command)}: {error}"
     return made
 
@@ -69,7 +68,7 @@ def _try(command: tuple[str, ...]) -> None:
     with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
         source, library = pathlib.Path(folder) / "one.cpp", pathlib.Path(folder) / "one.so"
         source.write_text('#include "functions.h"\nextern "C" double one(double x) { return k_exp(all(x))[0]; }\n')
-        _run(command, source, library)
+        _run(command, source, library, LONGEST_TRY_S)
         ctypes.CDLL(str(library))
 
 
@@ -90,36 +89,20 @@ def compiler() -> Compiler:
 
 def library(text: str) -> pathlib.Path:
     """Return the file of the library of a text, which is compiled if it is not there yet. Raises NoCompiler, also for a
-    folder that cannot be written."""
+    folder that cannot be written or that others may write to."""
     made = compiler()
     digest = _digest(text, made)
-    folder = cache_folder()
-    path = folder / f"{digest}.so"
-    if path.is_file():
-        with contextlib.suppress(OSError):  # of somebody else
-            os.utime(path)
-        return path
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        files.make_room(folder, "*.so", ROOM)
-        with tempfile.TemporaryDirectory(prefix=f".{digest[:16]}-", dir=folder) as own:
+        if path := find(digest, ".so"):
+            return path
+        with tempfile.TemporaryDirectory(prefix=f".{digest[:16]}-", dir=own_folder()) as own:
             source, result = pathlib.Path(own) / "kernel.cpp", pathlib.Path(own) / "kernel.so"
             source.write_text(text)
             with stopwatch.compiling():
-                _run(made.command, source, result)
-            os.replace(result, path)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise NoCompiler(f"no kernel in {folder}: {getattr(error, 'strerror', None) or error}") from None
-    return path
-
-
-def cache_folder() -> pathlib.Path:
-    """Return the folder in which libraries are kept: $DIFFABS_KERNEL_CACHE, or the user's for caches."""
-    if said := os.environ.get(CACHE):
-        return pathlib.Path(said)
-    if sys.platform == "darwin":
-        return pathlib.Path.home() / "Library" / "Caches" / "diffabs" / "kernel"
-    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "diffabs" / "kernel"
+                _run(made.command, source, result, LONGEST_S)
+            return write(digest, ".so", result.read_bytes())
+    except OSError as error:
+        raise NoCompiler(f"no kernel in {cache_folder()}: {error.strerror or error}") from None
 
 
 def described() -> dict[str, str]:
@@ -127,19 +110,29 @@ def described() -> dict[str, str]:
     return {"compiler": compiler().version, "flags": " ".join(FLAGS), "processor": _processor()}
 
 
-def _run(command: tuple[str, ...], source: pathlib.Path, result: pathlib.Path) -> None:
+def _run(command: tuple[str, ...], source: pathlib.Path, result: pathlib.Path, longest: float) -> None:
     include = [f"-I{NATIVE}", f"-I{jax.ffi.include_dir()}"]
-    done = subprocess.run(
-        [*command, *FLAGS, *include, "-o", str(result), str(source), "-lm"],
-        capture_output=True,
-        text=True,
-        timeout=LONGEST,
-        stdin=subprocess.DEVNULL,
-    )
+    done = _output([*command, *FLAGS, *include, "-o", str(result), str(source), "-lm"], longest)
     if done.returncode or not result.is_file():
         lines = [line for line in done.stderr.splitlines() if line.strip()] or [f"exit status {done.returncode}"]
         errors = [line for line in lines if "error" in line]
         raise NoCompiler(f"{' '.join(command)}: {(errors or lines)[0][:300]}")
+
+
+def _output(words: list[str], longest: float) -> subprocess.CompletedProcess[str]:
+    """Run a command for at most so many seconds. Raises NoCompiler for one that takes longer, OSError for none."""
+    told = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, **told, start_new_session=True) as process:
+        try:
+            out, errors = process.communicate(timeout=longest)
+        except BaseException as error:
+            # A compiler starts others, which hold the pipes: all of its session are ended, or `with` waits for them.
+            with contextlib.suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL) if hasattr(os, "killpg") else process.kill()
+            if isinstance(error, subprocess.TimeoutExpired):
+                raise NoCompiler(f"{words[0]} did not end within {longest:g} s and was stopped") from None
+            raise
+        return subprocess.CompletedProcess(words, process.returncode, out, errors)
 
 
 def _digest(text: str, made: Compiler) -> str:

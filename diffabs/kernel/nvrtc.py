@@ -11,7 +11,8 @@ import re
 from typing import Any
 
 from diffabs.core import files
-from diffabs.kernel.compilers import NATIVE, NoCompiler, cache_folder
+from diffabs.kernel import binaries
+from diffabs.kernel.compilers import NATIVE, NoCompiler
 
 HEADERS = ("lane.h", "threads.h")
 # Nothing that changes what is finite: the smallest numbers stay, division and roots are IEEE's. The last two only tell.
@@ -29,16 +30,15 @@ def machine_code(text: str, architecture: str) -> pathlib.Path:
     headers = [(NATIVE / name).read_bytes() for name in HEADERS]
     said = [text.encode(), *headers, repr((FLAGS, version(), architecture)).encode()]
     digest = hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in said)).hexdigest()
-    path = cache_folder() / f"{digest}.cubin"
-    if not path.is_file():
+    try:
+        if path := binaries.find(digest, ".cubin"):
+            return path
         code, log = _compiled(text, architecture, headers)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            files.write(path.with_suffix(".log"), log.encode())
-            files.write(path, code)
-        except OSError as error:
-            raise NoCompiler(f"no kernel in {path.parent}: {error.strerror or error}") from None
-    return path
+        path = binaries.write(digest, ".cubin", code)
+        files.write(path.with_suffix(".log"), log.encode())
+        return path
+    except OSError as error:
+        raise NoCompiler(f"no kernel in {binaries.cache_folder()}: {error.strerror or error}") from None
 
 
 def registers(log: str) -> dict[str, dict[str, int]]:

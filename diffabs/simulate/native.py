@@ -5,6 +5,7 @@ as it is, with everything in it that the parts have, is translated from its jaxp
 ended makes room for the next one, as on the belt of `refill`."""
 
 import operator
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,7 +18,6 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
 from diffabs.core.tracing import moving, pushed
 from diffabs.kernel.compilers import NoCompiler
-from diffabs.kernel.kept import Kept
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
 from diffabs.simulate.condition import Condition
@@ -29,6 +29,7 @@ from diffabs.simulate.refill import ROUND, Enough, by_lane
 from diffabs.simulate.run import arguments
 from diffabs.simulate.solution import Run, Solver
 
+PROCESS = os.getpid()  # in which XLA's threads are
 MOST = 1 << 17  # lanes that are started together: the carries of more would fill the memory
 
 
@@ -44,7 +45,9 @@ def run_native(
     """Return what `refill.run_refilled` returns, to rounding; with derivatives, forward.
 
     Raises Unsupported for a step that cannot be translated, NoCompiler where there is none, ValueError for what
-    `measure` objects to."""
+    `measure` objects to, RuntimeError in a process that was forked from one with kernels."""
+    if os.getpid() != PROCESS:
+        raise RuntimeError("no kernel runs after os.fork: XLA's threads stay in the parent; start processes by `spawn`")
     loop, objectives, method = arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     count = len(accepted)
@@ -54,7 +57,7 @@ def run_native(
 
     def made(mine: Any) -> Run:
         given = loop, mine[0], dict(objectives), method, *mine[1:], enough
-        return _made(given) if traced(given) else _kept(*given)  # a rule for derivatives takes longer than a short run
+        return _made(given) if traced(given) else _run(*given)  # a rule for derivatives takes longer than a short run
 
     if count <= MOST:
         return made(lanes)
@@ -65,7 +68,7 @@ def run_native(
 @jax.custom_jvp
 def _made(given: Any) -> Run:
     """The runs of (loop, values, objectives, method, keys, accepted), and what is enough of each, and when."""
-    return _kept(*given)
+    return _run(*given)
 
 
 def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
@@ -129,9 +132,6 @@ def _only(accepted: Any, carry: Any) -> Any:
     return carry._replace(condition=condition.astype(carry.condition.dtype))
 
 
-_kept = Kept(_run, _run)
-
-
 def objection(loop: Loop, values: Mapping[str, Any], solver: Solver, objectives: Mapping[str, Objective]) -> str | None:
     """Return why these runs cannot be made by a kernel, or None: an operation of a part that has no translation, no
     compiler on this machine, numbers that are not known yet.
@@ -146,7 +146,7 @@ def objection(loop: Loop, values: Mapping[str, Any], solver: Solver, objectives:
     count = len(next(iter(columns.values())))
     keys = jax.vmap(jax.random.key)(jnp.arange(count))
     try:
-        _kept.ready(checked, columns, dict(measured), method, keys, jnp.ones(count, bool), None, None)
+        _run.lower(checked, columns, dict(measured), method, keys, jnp.ones(count, bool), None, None)
     except (Unsupported, NoCompiler) as error:
         return str(error)
     return None

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from diffabs.kernel.kept import Kept
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.refusals import refusals
 from diffabs.sweep.study import FLAGS, Study, noise_key, numbers, precision
@@ -100,7 +99,7 @@ class Runner:
     def _compiled(self, names: tuple[str, ...], block: _Block) -> None:
         """Have the program of some parts traced, and its kernel compiled."""
         with precision(self.study.dtype):
-            self._program(names).ready(*self._arguments(block, np.ones(self.size, bool)))
+            self._program(names).lower(*self._arguments(block, np.ones(self.size, bool)))
 
     def _variant(self, names: tuple[str, ...]) -> Any:
         return self.study.variant(dict(zip(self.study.parts, names, strict=True)))
@@ -111,9 +110,7 @@ class Runner:
                 lambda x: np.asarray(x, self.study.dtype), (self._variant(names), dict(self.study.objectives))
             )
             study = dataclasses.replace(self.study, objectives=objectives)
-            program = jax.jit(partial(_block, study, loop))
-            told = (_block, study.seed, study.solver, study.engine, loop, objectives)
-            self._programs[names] = Kept(program, told) if study.engine == "kernel" else program
+            self._programs[names] = jax.jit(partial(_block, study, loop))
         return self._programs[names]
 
 
