@@ -207,7 +207,7 @@ def test_a_derivative_through_a_relay_and_a_latch_is_that_of_fixed_steps():
 
 @pytest.mark.slow
 def test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps():
-    chosen = load("slip-lmi", ["controller=sampled", "controller.period=0.005"])
+    chosen = load("slip-lmi", ["controller={type='sampled',controller='pid',period=0.005}"])
     solvers = d.Adaptive(1e-6, 0.03), d.FixedStep(1e-4, 0.03, every=10)
     seen, reference = (d.rollout(chosen.loop, one, {}).trajectory.sample.output.slip for one in solvers)
     np.testing.assert_allclose(seen, reference, atol=1e-6)
@@ -218,7 +218,9 @@ def test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps(
     "more",
     [
         pytest.param([], id="limits"),
-        pytest.param(["controller=sampled", "controller.period=0.005"], id="sampled", marks=pytest.mark.slow),
+        pytest.param(
+            ["controller={type='sampled',controller='pid',period=0.005}"], id="sampled", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_the_derivative_of_a_trajectory_is_that_of_fixed_steps(more):

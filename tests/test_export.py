@@ -1,7 +1,9 @@
 """Exported controllers: compiled, and against the parts themselves and against whole runs."""
 
+import dataclasses
 import json
 import math
+import re
 import shutil
 import subprocess
 
@@ -23,6 +25,7 @@ from diffabs.controllers import (
     ObserverFeedback,
     ProportionalFeedback,
     Sampled,
+    SampledOnGrid,
     ScheduledFeedback,
     SlidingMode,
     StateFeedback,
@@ -239,7 +242,12 @@ def test_the_command_writes_a_file_that_compiles(tmp_path):
     ("arguments", "words"),
     [
         (["slip-lmi"], "controller StateFeedback runs in continuous time"),
-        (["slip-estimator", "--set", 'controller={type="sampled"}'], "say --given target"),
+        (["slip-lmi"], "say --period SECONDS"),
+        (["slip-estimator", "--period", "1e-3"], "say --given target"),
+        (["slip-estimator", "--set", 'controller={type="sampled"}'], "controller.controller is missing"),
+        (["slip-lmi", "--period", "0"], "controller.period = 0 is outside (0, inf) s"),
+        (["slip-estimator", "--period", "0.1"], "controller.cutoff = 55 rad/s is outside (0, 20) rad/s"),
+        (["slip-cured", "--period", "1e-3"], "--period: the scenario's controller is sampled"),
         (["slip-cured", "--json"], "--json is for --to table"),
         (["slip-cured", "--to", "st", "--json"], "--json is for --to table"),
         (["slip-lmi", "--to", "st"], "controller StateFeedback runs in continuous time"),
@@ -253,6 +261,42 @@ def test_the_command_refuses_in_one_line(arguments, words, tmp_path):
     assert words in result.stderr
     assert_one_error_line(result)
     assert not list(tmp_path.iterdir())
+
+
+@needs_cc
+def test_the_controller_of_the_scenario_is_exported(tmp_path):
+    """A period wraps the controller that is there, with the user's gains: against the PID's difference equations."""
+    path, gains = tmp_path / "pid.c", {"kp": 20003.0, "ki": 5000.0, "kd": 5.67, "cutoff": 55.0}
+    tuned = ["--set", f"controller.kp={gains['kp']}"]
+    command("export", "slip-estimator", *tuned, "--period", "1e-3", "--given", "target", "-o", path)
+    text = path.read_text()
+    head = text[: text.index("*/")]
+    for name, value in gains.items():
+        assert re.search(rf"\bcontroller\.controller\.{name} = {value:g}\b", head)
+    limits = load("slip-estimator", integrated=False).loop.controller
+    low, high = float(limits.torque_min), float(limits.torque_max)
+    slips = 0.2 - 0.003 * np.cos(np.arange(40.0))
+    lines = "".join(f"{slip!r} 0.2\n" for slip in slips.tolist())
+    program = compiled(text, "pid", tmp_path)
+    said = subprocess.run([program], input=lines, capture_output=True, text=True, check=True).stdout
+    integral, filtered, wanted = 0.0, 0.0, []
+    for slip in slips:
+        error = 0.2 - slip
+        rate = gains["cutoff"] * (error - filtered)
+        raw = gains["kp"] * error + gains["ki"] * integral + gains["kd"] * rate
+        wanted.append(min(max(raw, low), high))
+        integral, filtered = integral + 1e-3 * error, filtered + 1e-3 * rate
+    np.testing.assert_allclose([*map(float, said.split())], wanted, rtol=1e-12)
+    assert low < np.median(wanted) < high
+
+
+def test_a_computer_without_events_is_exported_as_one_with():
+    inner = PID(kp=60.0, ki=400.0)
+    texts = [
+        c_source(device(dataclasses.replace(rig(inner), controller=one)), "unit")
+        for one in (Sampled(controller=inner, period=2e-3), SampledOnGrid(controller=inner, sampling_period=2e-3))
+    ]
+    assert texts[0] == texts[1]
 
 
 def test_inputs_are_what_the_plant_shows():

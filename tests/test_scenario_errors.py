@@ -23,6 +23,9 @@ BAD = [
     ("plant.type=quarter-cart", 'plant.type = "quarter-cart" is unknown', "did you mean quarter-car?", "lab-rig"),
     ("road=snw", "road.type", '"snw"', "did you mean snow?"),
     ("road.c9=1", "road.c9 is not a field", "there is slip, mu"),
+    ("controller=sampled", "controller.controller is missing: sampled is around another controller"),
+    ("controller={type='sampled',controller={kp=3}}", "controller.controller is missing"),
+    ("road=scaled", "road.road is missing: scaled is around another road"),
     ("controller.antiwindup=clamp", "controller.antiwindup.type", "did you mean clamping?"),
     ("controller.type=clamping", "controller.type", "unknown", "pid"),
     ("controller.type=3", "controller.type = 3 is a number", "pid"),
@@ -72,7 +75,7 @@ BAD = [
     ("solver.step=20", "solver.step = 20 s is outside (0, 10] s"),
     ("solver.step=1e-9", "solver.step = 1e-09 s is outside [1e-07, 10] s"),
     (
-        "controller={type='sampled',period=0.0015}",
+        "controller={type='sampled',controller='pid',period=0.0015}",
         "controller.period = 0.0015 s is not a multiple",
         "solver.step = 0.001 s",
     ),

@@ -1,6 +1,7 @@
 """The command `export`: the computer's part of a scenario as C, Structured Text or difference equations; the plant as
 an FMU."""
 
+import dataclasses
 import enum
 import pathlib
 import re
@@ -13,6 +14,8 @@ from rich.table import Table
 from diffabs import __version__
 from diffabs.cli import console, show, targets
 from diffabs.core.provenance import versions
+from diffabs.core.units import units_of
+from diffabs.core.validity import problems
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.solution import FixedStep
@@ -49,6 +52,10 @@ def export(
     given: Annotated[
         Given | None, typer.Option(help="What the code is given from outside, beside measurements.")
     ] = None,
+    period: Annotated[
+        float | None,
+        typer.Option(metavar="SECONDS", help="Sample the scenario's controller, which runs in continuous time, so."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="With --to table: one JSON document on stdout.")] = False,
 ) -> None:
     """The sampled controller, with filter, limits, anti-windup, schedule and target, as code for a computer; or the
@@ -62,8 +69,11 @@ def export(
             console.fail("--to fmu needs a file: -o plant.fmu")
         if to in (Form.TABLE, Form.FMU) and (single or given):
             console.fail("--float32 and --given are for --to c and --to st")
+        if to is Form.FMU and period is not None:
+            console.fail("--period is for a controller; --to fmu writes the plant")
         with targets.new_file(out, "--out") as file:
             chosen = console.loaded(scenario, changes, integrated=to is Form.FMU)
+            chosen = chosen if period is None else _sampled(chosen, period)
             try:
                 if to is Form.FMU and file and out:
                     _fmu(chosen, file, out)
@@ -83,7 +93,22 @@ def export(
 
 def _hinted(line: str) -> str:
     """With what the command line can do about it."""
-    return line.replace("give the target from outside", "say --given target")
+    line = line.replace("give the target from outside", "say --given target")
+    return line.replace("give the period at which", "say --period SECONDS, at which")
+
+
+def _sampled(chosen: Scenario, period: float) -> Scenario:
+    """The scenario with its controller as it is, sampled. Raises ScenarioError."""
+    from diffabs.controllers import Sampled, SampledOnGrid
+
+    inner = chosen.loop.controller
+    if isinstance(inner, Sampled | SampledOnGrid):
+        raise ScenarioError("--period: the scenario's controller is sampled; change it with --set controller.period=")
+    controller = Sampled(controller=inner, period=period)
+    if lines := list(problems(controller, "controller.", units_of(chosen.loop.plant))):
+        raise ScenarioError("; ".join(lines))
+    loop = dataclasses.replace(chosen.loop, controller=controller)
+    return dataclasses.replace(chosen, loop=loop)
 
 
 def _name(chosen: Scenario, out: pathlib.Path | None) -> str:

@@ -68,6 +68,8 @@ class _Text:
         yield f"/* {self.name}: the controller, to be called every {self.device.period:g} s{delay}."
         for note in self.notes:
             yield f"   {note.replace('*/', '* /')}"
+        for number in self.device.numbers:
+            yield f"   {number}"
         yield (
             f"   Call {self.name}_start once with the first measurements, then {self.name}_step at every sample,\n"
             "   the first among them. Nothing is allocated and nothing is global; two states are two controllers. */"

@@ -7,18 +7,18 @@ with the numbers of its parameters. A target that moves by itself, such as a fil
 Runge-Kutta steps that the simulation takes. Sensors and actuators are the machine's, not the computer's."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.controllers import Sampled
+from diffabs.controllers import Sampled, SampledOnGrid
 from diffabs.core.blocks import offers
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
-from diffabs.core.pytree import prepared, strong
+from diffabs.core.pytree import parameters, prepared, strong
 from diffabs.core.tracing import follows
 from diffabs.simulate.rk4 import rk4_step
 
@@ -44,11 +44,25 @@ class State(NamedTuple):
     reference: Memory
 
 
+class Number(NamedTuple):
+    """A parameter of a part: its path in the loop, value (...) and unit."""
+
+    path: str
+    value: np.ndarray
+    unit: str
+
+    def __str__(self) -> str:
+        """One line for the head of a file."""
+        values = " ".join(f"{x:.17g}" if float(f"{x:.9g}") != x else f"{x:.9g}" for x in self.value.flat)
+        return f"{self.path} = {values}{'' if self.unit in ('', '1') else f' {self.unit}'}"
+
+
 @dataclasses.dataclass(frozen=True)
 class Device:
     """start(input) -> state, before the first sample. At each sample step(state, input) -> (controller's memory,
     samples, command), and then `moves` times move(state, i) -> reference's memory, i = 0, 1, ...; units of the inputs,
-    by name; shapes of input and state, of numbers of `dtype`; period and computing delay [s]."""
+    by name; shapes of input and state, of numbers of `dtype`; period and computing delay [s]; the numbers of its parts,
+    those of the plant only where the feed-forward is made of them."""
 
     start: Callable[[Input], State]
     step: Callable[[State, Input], tuple[Memory, Any, Any]]
@@ -61,6 +75,7 @@ class Device:
     period: float
     delay: float
     control_unit: str
+    numbers: tuple[Number, ...]
 
 
 def device(loop: Loop, *, step: float | None = None, dtype: Any = np.float64, given_target: bool = False) -> Device:
@@ -72,10 +87,8 @@ def device(loop: Loop, *, step: float | None = None, dtype: Any = np.float64, gi
         NotExported: a controller in continuous time; a reference that follows what is measured, unless the target is
             given.
     """
-    controller = loop.controller
-    if not isinstance(controller, Sampled):
-        name = type(controller).__name__
-        raise NotExported(f"controller {name} runs in continuous time: a computer needs it within a sampled controller")
+    loop = sampled(loop)
+    controller: Any = loop.controller
     with jax.enable_x64(True):
         typed: Loop = prepared(jax.tree.map(lambda x: jnp.asarray(x, dtype), strong(loop)))
         shapes = jax.eval_shape(lambda: _given(typed, given_target))
@@ -91,7 +104,40 @@ def device(loop: Loop, *, step: float | None = None, dtype: Any = np.float64, gi
     return Device(
         work.start, work.step, work.move, moves, units, shapes, state, np.dtype(dtype), float(controller.period),
         float(controller.delay), loop.plant.control_unit,
+        tuple(_numbers(loop, typed, shapes, given_target)),
     )  # fmt: skip
+
+
+def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Iterator[Number]:
+    """The parameters of what the computer works out."""
+    measured = given.measured
+
+    def ahead(plant: Any) -> Any:
+        return typed.feedforward.input(plant, measured, measured[0])
+
+    families = ["controller", "feedforward", *(() if given_target else ("reference",))]
+    with jax.enable_x64(True):
+        measured = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), measured)
+        families += ["plant"] if follows(ahead, typed.plant) else []
+    for path, spec, value in parameters(loop):
+        if path.partition(".")[0] in families:
+            yield Number(path, np.asarray(value, float), spec.unit)
+
+
+def sampled(loop: Loop) -> Loop:
+    """Return the loop with its controller as `Sampled`; `SampledOnGrid` is the same on a computer.
+
+    Raises:
+        NotExported: a controller in continuous time.
+    """
+    controller: Any = loop.controller
+    if isinstance(controller, SampledOnGrid):
+        inner, period = controller.controller, controller.sampling_period
+        controller = Sampled(controller=inner, period=period, delay=controller.delay)
+    if not isinstance(controller, Sampled):
+        name = type(controller).__name__
+        raise NotExported(f"controller {name} runs in continuous time: give the period at which a computer samples it")
+    return dataclasses.replace(loop, controller=controller)
 
 
 def _given(loop: Loop, target: bool) -> Input:

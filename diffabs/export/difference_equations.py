@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.loop import Loop
-from diffabs.export.device import NotExported
+from diffabs.export.device import NotExported, sampled
 from diffabs.linear.opened_loop import open_loop
 
 ROUNDING = 1e-12  # relative to the greatest coefficient of a matrix: less is none
@@ -18,13 +18,11 @@ def equations(loop: Loop, target: Any = None) -> dict[str, Any]:
     Raises:
         NotExported: a controller in continuous time, or a loop without a linear model.
     """
+    loop = sampled(loop)
     try:
         found = open_loop(loop, target).controller
     except ValueError as error:
         raise NotExported(str(error)) from None
-    if found.period is None:
-        name = type(loop.controller).__name__
-        raise NotExported(f"controller {name} runs in continuous time: a computer needs it within a sampled controller")
     found = found._replace(**{name: _cleaned(getattr(found, name)) for name in "ABCD"})
     names = ["target", *loop.plant.shows._fields, "feedforward"]
     used = (np.abs(found.B).max(axis=0, initial=0) > 0) | (np.abs(found.D[0]) > 0)

@@ -99,6 +99,7 @@ class _Block:
         lines = [
             f"{self.name}: the controller, to be called every {self.device.period:g} s{delay}.",
             *self.notes,
+            *map(str, self.device.numbers),
             "Nothing is global: two instances are two controllers.",
         ]
         text = "\n   ".join(line.replace("*)", "* )").replace("(*", "( *") for line in lines)

@@ -131,6 +131,18 @@ def family_of(field: str, enclosing: str) -> str:
     return next((name for name in (field, field.removesuffix("s")) if name in FAMILIES), enclosing)
 
 
+def type_name(given: Any) -> Any:
+    """The type that a section of a scenario names, as a bare word or in its table; None where it names none."""
+    return given.get("type") if isinstance(given, dict) else given
+
+
+def inner_fields(family: str, name: str) -> list[str]:
+    """The fields of a part that hold one part of its own family: the controller that `sampled` runs."""
+    part = types(family)[name]
+    own = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
+    return [field for field in own if family_of(field, "") == family and not isinstance(getattr(part, field), tuple)]
+
+
 def summary(part: Any) -> str:
     """The first paragraph of a part's docstring, on one line."""
     return " ".join((inspect.getdoc(type(part)) or "").split("\n\n")[0].split())

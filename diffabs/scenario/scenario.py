@@ -32,7 +32,7 @@ from diffabs.objectives import BRAKING, usual
 from diffabs.scenario import parameter_paths, section_design, section_solver, section_sweep, section_tune, toml
 from diffabs.scenario.compatibility import misfits
 from diffabs.scenario.defaults import braking
-from diffabs.scenario.registry import OTHERS, build, joined, loop_of
+from diffabs.scenario.registry import FAMILIES, OTHERS, build, inner_fields, joined, loop_of, type_name, types
 from diffabs.simulate.refusals import together, unstable
 from diffabs.simulate.solution import Adaptive, Solver
 
@@ -119,8 +119,10 @@ def loads(
 
     Raises ScenarioError, as `load`."""
     table = _parsed(raw, origin)
+    before = {family: type_name(table.get(family)) for family in FAMILIES}
     for override in overrides:
         _override(table, override)
+    _refuse(_without_inner(before, table))
     if overrides:
         table |= _titled(name, overrides)
     scenario = _assembled(name, table, folder)
@@ -134,6 +136,19 @@ def _titled(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     said = {override.partition("=")[0].strip() for override in overrides}
     new = {"title": f"{name} with {', '.join(overrides)}", "description": ""}
     return {key: text for key, text in new.items() if key not in said}
+
+
+def _without_inner(before: Mapping[str, Any], table: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for each section that an override replaced by a part around others, without saying which: the
+    scenario's own part would silently become the default one."""
+    for family, old in before.items():
+        name, given = type_name(table.get(family)), table.get(family)
+        if name in (None, old) or name not in types(family):
+            continue
+        for field in inner_fields(family, name):
+            inner = given.get(field) if isinstance(given, dict) else None
+            if inner is None or (isinstance(inner, dict) and "type" not in inner):
+                yield f"{family}.{field} is missing: {name} is around another {family}; say which, with its type"
 
 
 def _refuse(*objections: Iterable[str]) -> None:
