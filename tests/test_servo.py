@@ -239,6 +239,11 @@ def test_a_scenario_never_imports_code():
         ("os; import sys", None, "--parts os; import sys is no name of a Python module"),
         ("empty", "from diffabs.controllers import PID", "--parts empty: there is no part in this module"),
         (
+            "leaving",
+            "import sys; sys.exit()",
+            "--parts leaving: cannot be imported: it ends the program by SystemExit(None)",
+        ),
+        (
             "clashing",
             f"from dc_servo import DCMotor\n{OF_PARTS}@pytree\nclass QuarterCar(DCMotor): ...",
             "parts of clashing: there is a plant quarter-car already, of diffabs",
@@ -257,6 +262,45 @@ def test_a_module_that_cannot_be_used_is_one_line(tmp_path, monkeypatch, module,
         (tmp_path / f"{module}.py").write_text(text)
     assert_one_error_line(result := run("list", "--parts", module, status=2))
     assert line in result.stderr
+
+
+METHOD = f"""
+import sys
+print("imported")
+{OF_PARTS}
+from diffabs.roads import RationalCurve
+
+@pytree
+class Talking(RationalCurve):
+    def friction(self, slip, speed=0.0, distance=0.0):
+        print("called")
+        %s
+        return super().friction(slip, speed, distance)
+"""
+
+
+@pytest.mark.parametrize(
+    ("statement", "said"),
+    [("raise KeyError('mu')", "line 12: KeyError: 'mu'"), ("sys.exit()", "line 12: SystemExit")],
+)
+def test_a_part_that_raises_or_exits_is_one_line(tmp_path, monkeypatch, statement, said):
+    monkeypatch.chdir(tmp_path)
+    module = "raising" if "raise" in statement else "exiting"
+    (tmp_path / f"{module}.py").write_text(METHOD % statement)
+    words = ("--set", "road=talking", "--parts", module, "--json")
+    assert f"{module}.py, {said}" in (result := run("simulate", "slip-lmi", *words, status=2)).stderr
+    assert result.stdout == ""
+    assert "Traceback" not in result.stderr
+
+
+def test_a_part_that_prints_does_not_spoil_the_document(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "printing.py").write_text(METHOD % "pass")
+    words = ("--set", "road=talking", "--set", "solver.duration=0.01", "--parts", "printing", "--json")
+    result = run("simulate", "slip-lmi", *words)
+    assert json.loads(result.stdout)["parts"]
+    assert "imported" in result.stderr
+    assert "called" in result.stderr
 
 
 def test_an_installed_module_is_known_by_its_entry_point(tmp_path, monkeypatch):

@@ -18,6 +18,7 @@ from rich.console import Console
 from diffabs.cli import progress
 from diffabs.core import files, interrupt, provenance, stopwatch
 from diffabs.core.values import ScenarioError
+from diffabs.scenario import outside
 from diffabs.scenario.model import model
 from diffabs.scenario.scenario import Scenario, load, names
 
@@ -136,7 +137,8 @@ def animated() -> bool:
 
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
-    """Bad input, a full disk, and Ctrl-C end a command with one line and their exit status."""
+    """Bad input, a full disk, Ctrl-C, and parts from outside that raise or exit end a command with one line and their
+    exit status."""
     try:
         yield
     except ScenarioError as error:
@@ -150,6 +152,10 @@ def guarded() -> Iterator[None]:
     except KeyboardInterrupt:
         say("interrupted")
         raise typer.Exit(INTERRUPTED) from None
+    except (Exception, SystemExit) as error:
+        if not (where := outside.line_of(error)):
+            raise
+        fail(f"{where}: {type(error).__name__}: {' '.join(str(error).split())}")
 
 
 class Ending:
@@ -187,7 +193,8 @@ def waited(
 
     def run() -> None:
         try:
-            result.append(work())
+            with contextlib.redirect_stdout(sys.stderr):  # a part from outside may print: stdout is for the result
+                result.append(work())
         except BaseException as error:
             errors.append(error)
 

@@ -1,11 +1,13 @@
 """Parts from outside: the modules of installed packages, by entry points of the group `diffabs.parts`, and those that a
 person names (`--parts`). A scenario file never names one: a file that somebody sends must not import code."""
 
+import contextlib
 import dataclasses
 import importlib
 import importlib.metadata
 import os
 import sys
+import traceback
 from collections.abc import Iterable, Iterator
 from functools import cache
 from types import ModuleType
@@ -55,11 +57,22 @@ def exports(module: ModuleType) -> Iterator[tuple[str, Any]]:
             yield name, item
 
 
+def line_of(error: BaseException) -> str:
+    """Return the file and line of a module with parts from outside in which an error was raised, or through which it
+    came last; nothing for an error that came through none."""
+    files = {getattr(module, "__file__", None) for module in modules()}
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename in files]
+    return f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else ""
+
+
 def _imported(name: str, whose: str) -> ModuleType:
     try:
-        return importlib.import_module(name)
+        with contextlib.redirect_stdout(sys.stderr):  # what a module prints is no part of a command's document
+            return importlib.import_module(name)
     except ModuleNotFoundError as error:
         where = "" if error.name != name.partition(".")[0] else ", on the Python path or in the working directory"
         raise ValueError(f"{whose}: there is no module {error.name}{where}") from None
+    except SystemExit as error:
+        raise ValueError(f"{whose}: cannot be imported: it ends the program by SystemExit({error.code!r})") from None
     except Exception as error:
         raise ValueError(f"{whose}: cannot be imported: {type(error).__name__}: {error}") from None
