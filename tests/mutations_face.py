@@ -29,7 +29,7 @@ FACE = [
      f"{TEST}::test_a_sampled_loop_behind_a_delay_is_that_of_a_step_response"),
     ("margins: a command at its limit stays there", OPENED, "OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)",
      "OFFSETS = (0.0,)", f"{TEST}::test_noise_is_a_disturbance_and_limits_do_not_act"),
-    ("margins: noise acts at instants", "core/tracing.py", "not _zero(step) and any(", "any(",
+    ("margins: noise acts at instants", "core/tracing.py", "not _zero(step) and not needed", "not needed",
      f"{TEST}::test_noise_is_a_disturbance_and_limits_do_not_act"),
     ("margins: the search for rest begins where the run does", OPENED,
      "there.at[0].set(around.setpoint) if around.frozen else there", "there",

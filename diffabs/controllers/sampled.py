@@ -3,9 +3,13 @@
     u(t) = u_k for t_k + delay <= t < t_(k+1) + delay,   t_k = k period,   I_(k+1) = I_k + period I'(t_k)
 
 The continuous memory of the inner controller is advanced by forward Euler at the sampling period, as such code is
-usually written. The change of the output after the delay is an event."""
+usually written. The change of the output after the delay is an event.
+
+A sample is not used if a number that the controller reads is NaN, or if its memory or output would not be finite:
+memory and output stay those of the sample before."""
 
 from collections.abc import Iterator
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -18,6 +22,7 @@ from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.core.rules import Rule, array
 from diffabs.core.timing import whole_steps
+from diffabs.core.tracing import leaves_followed
 
 CLOSE = 16.0  # precisions of the time: instants that are one
 
@@ -56,7 +61,7 @@ class Sampled:
         """At a sampling instant: compute. What still waits is applied."""
         m: SampledMemory = memory.held
         now, number = clock.ticks(self.period)
-        inner, output = self.computed(clock._replace(h=self.period, k=number), m.inner, signal)
+        inner, output, _ = self.guarded(clock._replace(h=self.period, k=number), m.inner, m.next, signal)
         waits = jnp.greater(self.delay, 0)
         applied = jnp.where(waits, jnp.where(m.waits > 0.5, m.next, m.applied), output)
         new = SampledMemory(inner, applied, output, self._until(clock.t), jnp.where(waits, 1.0, 0.0))
@@ -69,6 +74,18 @@ class Sampled:
         output = self.controller.output(clock.t, inner, signal)
         flow = axpy(clock.h, self.controller.flow(clock.t, inner, signal), inner.flow)
         return Memory(flow, inner.held), output
+
+    def guarded(self, clock: Clock, memory: Memory, last: Scalar, signal: Tracking) -> tuple[Memory, Scalar, Any]:
+        """What `computed` returns, and False; or, where the sample cannot be used, the memory and the `last` output as
+        they are, and True."""
+        new = self.computed(clock, memory, signal)
+        read = leaves_followed(lambda signal: self.computed(clock, memory, signal), signal)
+        numbers = [x for x, on in zip(jax.tree.leaves(signal), read, strict=True) if on]
+        results = [x for x in jax.tree.leaves(new) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
+        unfit = [jnp.any(jnp.isnan(x)) for x in numbers] + [~jnp.all(jnp.isfinite(x)) for x in results]
+        held = reduce(jnp.logical_or, unfit)
+        inner, output = jax.tree.map(lambda old, new: jnp.where(held, old, new), (memory, last), new)
+        return inner, output, held
 
     def _until(self, t: Scalar) -> Any:
         """When what is sampled now is applied: a rounding before the next sample at the latest, or the moment of a

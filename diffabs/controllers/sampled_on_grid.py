@@ -43,7 +43,7 @@ class SampledOnGrid:
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
 
     flow = no_flow
-    computed, _sampled = Sampled.computed, Sampled._sampled
+    computed, guarded, _sampled = Sampled.computed, Sampled.guarded, Sampled._sampled
 
     def start(self, signal: Tracking) -> Memory:
         """Output zero until the first sample has been computed."""
@@ -59,7 +59,7 @@ class SampledOnGrid:
         """At a sampling instant: compute. At every instant of the grid: what is applied until the next."""
         m: GridMemory = memory.held
         now, number = clock.ticks(self.sampling_period)
-        inner, output = self.computed(clock._replace(h=self.sampling_period, k=number), m.inner, signal)
+        inner, output, _ = self.guarded(clock._replace(h=self.sampling_period, k=number), m.inner, m.next, signal)
         new = GridMemory(inner, output, m.next, clock.t + self.delay, m.applied)
         m = jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m)
         waits = clamp((m.until - clock.t) / clock.h, 0.0, 1.0)

@@ -50,12 +50,17 @@ def separated(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[An
 def follows(function: Callable[[Any], Any], signal: Any) -> bool:
     """Return whether what a function of a signal returns depends on it, as its program has it; a product with a zero
     that stands there does not."""
+    return any(leaves_followed(function, signal))
+
+
+def leaves_followed(function: Callable[[Any], Any], signal: Any) -> list[bool]:
+    """Return for each leaf of a signal whether what a function of it returns depends on the leaf, as in `follows`."""
     program = jax.make_jaxpr(function)(signal).jaxpr
-    reached = set(program.invars)
-    for step in program.eqns:
-        if not _zero(step) and any(not hasattr(v, "val") and v in reached for v in step.invars):
-            reached.update(step.outvars)
-    return any(not hasattr(v, "val") and v in reached for v in program.outvars)
+    needed = {atom for atom in program.outvars if not hasattr(atom, "val")}
+    for step in reversed(program.eqns):
+        if not _zero(step) and not needed.isdisjoint(step.outvars):
+            needed.update(atom for atom in step.invars if not hasattr(atom, "val"))
+    return [atom in needed for atom in program.invars]
 
 
 def moving(function: Callable[[Any, Any], Any], fixed: Any, batch: Any) -> Any:

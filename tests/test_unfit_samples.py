@@ -1,0 +1,104 @@
+"""Samples that are not numbers: a sampled controller holds its memory and its command, in runs and on a computer."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import diffabs as d
+from diffabs.controllers import PID, ConstantInput, Sampled, SampledOnGrid
+from diffabs.core.protocols import no_flow, no_memory
+from diffabs.core.pytree import param, pytree
+from diffabs.plants import BrakeStart, MirroredRig
+from diffabs.references import FixedSlip
+from diffabs.scenario.defaults import braking
+
+PERIOD, STEP, SAMPLES = 1e-3, 5e-4, 60
+LOST = slice(20, 26)  # samples
+
+
+@pytree
+class Loses:
+    """A sensor that shows a NaN for a while: the slip or, which no controller here reads, the wheel's speed."""
+
+    first: Any = param(default=19.5 * PERIOD, unit="s")
+    last: Any = param(default=25.5 * PERIOD, unit="s")
+    other: Any = param(default=0.0, unit="1")
+
+    start, flow = no_memory, no_flow
+
+    def output(self, t, memory, signal):
+        lost = jnp.where((t > self.first) & (t < self.last), jnp.nan, 0.0)
+        slip = signal.slip + jnp.where(self.other > 0, 0.0, lost)
+        return signal._replace(slip=slip, wheel_speed=signal.wheel_speed + jnp.where(self.other > 0, lost, 0.0))
+
+
+def rig(controller, **sensor):
+    return braking(
+        plant=MirroredRig(),
+        reference=FixedSlip(slip=0.2),
+        feedforward=ConstantInput(value=2.7),
+        sensor=Loses(**sensor),
+        controller=controller,
+        initial=BrakeStart(speed=10.0, slip=0.19),
+    )
+
+
+def computers(inner):
+    return (
+        Sampled(controller=inner, period=PERIOD),
+        SampledOnGrid(controller=inner, sampling_period=PERIOD),
+    )
+
+
+def trajectory(loop):
+    """Slip and command at the samples."""
+    run = d.rollout(loop, d.FixedStep(STEP, SAMPLES * PERIOD, every=round(PERIOD / STEP), kinks=False), {})
+    kept = run.trajectory.sample
+    return np.asarray(kept.output.slip)[:SAMPLES], np.asarray(kept.command)[:SAMPLES]
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["sampled", "sampled on the grid"])
+def test_a_lost_sample_holds_memory_and_command(which):
+    """Against the difference equations of the PID, which skip the samples that are lost."""
+    slips, commands = trajectory(rig(computers(PID(kp=60.0, ki=400.0, kd=0.3, torque_max=9.03))[which]))
+    integral, filtered, wanted = 0.0, 0.0, []
+    for k, slip in enumerate(slips):
+        if k in range(LOST.start, LOST.stop):
+            wanted.append(wanted[-1])
+            continue
+        error = 0.2 - slip
+        rate = 55.0 * (error - filtered)
+        wanted.append(min(max(2.7 + 60.0 * error + 400.0 * integral + 0.3 * rate, 0.0), 9.03))
+        integral, filtered = integral + PERIOD * error, filtered + PERIOD * rate
+    np.testing.assert_allclose(commands, wanted, rtol=1e-9)
+    assert np.ptp(commands[LOST]) == 0.0
+    assert np.ptp(commands[LOST.stop :]) > 1e-3
+
+
+def test_what_the_controller_does_not_read_is_not_missed():
+    inner = PID(kp=60.0, ki=400.0, torque_max=9.03)
+    _, whole = trajectory(rig(computers(inner)[0], first=1.0, last=2.0))
+    _, other = trajectory(rig(computers(inner)[0], other=1.0))
+    np.testing.assert_array_equal(other, whole)
+    assert np.ptp(other[LOST]) > 0
+
+
+@pytree
+class Switch:
+    """3 N m below the target, else 1 N m: a comparison with a NaN is false, so a lost sample would command 1 N m."""
+
+    start, flow = no_memory, no_flow
+
+    def output(self, t, memory, signal):
+        return jnp.where(signal.measured.slip < signal.target, 3.0, 1.0)
+
+
+def test_a_comparison_does_not_hide_that_a_sample_is_lost():
+    slips, commands = trajectory(rig(computers(Switch())[0]))
+    kept = np.r_[: LOST.start, LOST.stop : SAMPLES]
+    np.testing.assert_array_equal(commands[kept], np.where(slips[kept] < 0.2, 3.0, 1.0))
+    np.testing.assert_array_equal(commands[LOST], commands[LOST.start - 1])
+    assert set(commands) == {1.0, 3.0}
+    assert commands[LOST.start] == 3.0
