@@ -8,10 +8,7 @@ import sys
 import pytest
 from kernels import FOLDER
 
-import diffabs as d
-from diffabs import scenario
 from diffabs.kernel import binaries
-from diffabs.simulate import native
 
 pytestmark = pytest.mark.xdist_group("kernel")
 
@@ -76,9 +73,37 @@ def test_a_patched_part_gets_its_own_numbers(kind, tmp_path):
     assert min(scaled["xla"]) > 1.1 * max(plain["xla"][:1])
 
 
-def test_a_fork_cannot_use_the_kernels_of_its_parent(monkeypatch):
-    """XLA's threads are not in a process that was forked: a launch would wait for them for ever."""
-    monkeypatch.setattr(native, "PROCESS", -1)
-    lanes = d.Batch({"initial.speed": [8.0, 9.0]})
-    with pytest.raises(RuntimeError, match=r"os\.fork: .* start processes by `spawn`"):
-        d.run_batch(scenario.load("slip-lmi").loop, lanes, d.FixedStep(1e-3, 0.02), {}, engine="kernel")
+FORKED = """
+import os
+import diffabs as d
+from diffabs import scenario
+from diffabs.simulate import engine, native
+
+def in_a_child(task):
+    if child := os.fork():
+        assert os.waitpid(child, 0)[1] == 0
+        return
+    try:
+        task()
+        print("runs", flush=True)
+    except RuntimeError as error:
+        print(error, flush=True)
+    os._exit(0)
+
+in_a_child(engine.check_process)
+loop = scenario.load("slip-lmi").loop
+lanes = d.Batch({"initial.speed": [8.0, 9.0]})
+in_a_child(lambda: d.run_batch(loop, lanes, d.FixedStep(1e-3, 0.02), {}, engine="kernel"))
+in_a_child(lambda: in_a_child(lambda: d.run_batch(loop, lanes, d.FixedStep(1e-3, 0.02), {}, engine="auto")))
+in_a_child(lambda: native.objection(loop, {"initial.speed": [8.0, 9.0]}, d.FixedStep(1e-3, 0.02), {}))
+engine.check_process()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_a_kernel_in_a_forked_process_is_an_error():
+    """XLA's threads stay in the parent, also where it has only read a scenario: the child would wait for ever."""
+    words = [sys.executable, "-W", "ignore:os.fork", "-c", FORKED]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60)
+    refused = "no kernel runs after os.fork: XLA's threads stay in the parent; start processes by `spawn`"
+    assert done.stdout.splitlines() == ["runs", refused, refused, "runs", refused]

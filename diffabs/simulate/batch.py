@@ -12,7 +12,7 @@ from diffabs.core.compiling import traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, get, parameters, replace
-from diffabs.simulate.engine import by_engine
+from diffabs.simulate.engine import by_engine, check_process
 from diffabs.simulate.placement import divided
 from diffabs.simulate.refill import Enough, run_refilled
 from diffabs.simulate.refusals import first_line, refusals
@@ -141,7 +141,10 @@ def run_batch(
         ValueError: columns of different lengths; what `measure` objects to; `enough` for lanes that run together; what
             stands against the engine "kernel" (`simulate.native.objection` says it without running anything).
         KeyError: a path that does not exist.
+        RuntimeError: a kernel in a process that was forked after JAX had started.
     """
+    if engine != "xla":
+        check_process()
 
     def run(loop: Loop, values: Any, keys: Any, objectives: Any, accepted: Any, enough: Any) -> Run:
         lanes = dataclasses.replace(batch, values=values, keys=keys)

@@ -2,13 +2,34 @@
 
 import functools
 import logging
+import os
 from collections.abc import Callable
 from typing import Any
+
+from jax._src.xla_bridge import backends_are_initialized  # no public function says so without starting them
 
 from diffabs.simulate.solution import Run
 
 ENGINES = ("auto", "xla", "kernel")
 log = logging.getLogger("diffabs")
+_threads_in = 0  # the process that had XLA's threads when it, or a child of it, was forked
+
+
+def _before_fork() -> None:
+    global _threads_in
+    if not _threads_in and backends_are_initialized():
+        _threads_in = os.getpid()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
+    os.register_at_fork(before=_before_fork)
+
+
+def check_process() -> None:
+    """Raise RuntimeError in a process that was forked after JAX had started. XLA's threads stay in the parent; a kernel
+    would wait for them for ever."""
+    if _threads_in not in (0, os.getpid()):
+        raise RuntimeError("no kernel runs after os.fork: XLA's threads stay in the parent; start processes by `spawn`")
 
 
 class EngineError(ValueError):

@@ -5,7 +5,6 @@ as it is, with everything in it that the parts have, is translated from its jaxp
 ended makes room for the next one, as on the belt of `refill`."""
 
 import operator
-import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,6 +21,7 @@ from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.drivers import BLOCK
+from diffabs.simulate.engine import check_process
 from diffabs.simulate.methods import AtPace
 from diffabs.simulate.outcome import judge
 from diffabs.simulate.pursuit import Pursuing, Pursuit
@@ -29,7 +29,6 @@ from diffabs.simulate.refill import ROUND, Enough, by_lane
 from diffabs.simulate.run import arguments
 from diffabs.simulate.solution import Run, Solver
 
-PROCESS = os.getpid()  # in which XLA's threads are
 MOST = 1 << 17  # lanes that are started together: the carries of more would fill the memory
 
 
@@ -45,9 +44,7 @@ def run_native(
     """Return what `refill.run_refilled` returns, to rounding; with derivatives, forward.
 
     Raises Unsupported for a step that cannot be translated, NoCompiler where there is none, ValueError for what
-    `measure` objects to, RuntimeError in a process that was forked from one with kernels."""
-    if os.getpid() != PROCESS:
-        raise RuntimeError("no kernel runs after os.fork: XLA's threads stay in the parent; start processes by `spawn`")
+    `measure` objects to."""
     loop, objectives, method = arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     count = len(accepted)
@@ -138,7 +135,8 @@ def objection(loop: Loop, values: Mapping[str, Any], solver: Solver, objectives:
 
     values: by path (lanes, ...); no lane is run, but the kernel is compiled, and kept
 
-    Raises ValueError for what `measure` objects to."""
+    Raises ValueError for what `measure` objects to, RuntimeError in a process that was forked after JAX had started."""
+    check_process()
     if traced(loop, dict(values), dict(objectives)):
         return "this is traced; ask with numbers"
     checked, measured, method = arguments(loop, solver, objectives)
