@@ -74,17 +74,13 @@ class TestMoments:
 
     def test_are_those_of_numpy(self):
         one, d = Moments.of(self.X), self.X - np.mean(self.X)
-        found = [one.count, one.centre, one.second, one.fourth]
-        np.testing.assert_allclose(found, [1000, self.X.mean(), np.sum(d**2), np.sum(d**4)], rtol=1e-12, atol=0)
+        found = [one.count, one.centre, one.second]
+        np.testing.assert_allclose(found, [1000, self.X.mean(), np.sum(d**2)], rtol=1e-12, atol=0)
         np.testing.assert_allclose(one.deviation().value, np.std(self.X, ddof=1), rtol=1e-12, atol=0)
 
     def test_the_mean_has_the_interval_of_the_t_test(self):
         theirs = stats.ttest_1samp(self.X, 0.0).confidence_interval(0.9)
         np.testing.assert_allclose(ends(Moments.of(self.X).mean(confidence=0.9)), theirs, rtol=1e-12, atol=0)
-
-    def test_equal_samples_have_no_deviation_and_four_no_sure_one(self):
-        assert ends(Moments.of(np.full(10, 0.25)).deviation()) == [0.0, 0.0]
-        assert ends(Moments.of([1.0, 2.0, 3.0, 5.0]).deviation(confidence=0.99)) == [0.0, math.inf]
 
 
 class TestCount:
@@ -387,11 +383,13 @@ class TestCoverage:
         found = coverage(lambda x: Moments.of(x).mean(), lambda: random.exponential(size=400), 1.0)
         assert abs(found - 95) < 2
 
-    def test_deviation(self):
-        """Gamma(4), skewness 1, excess kurtosis 1.5: the chi-square interval would cover 86 %."""
+    @pytest.mark.parametrize("n", [50, 1000])
+    @pytest.mark.parametrize("law", [stats.lognorm(1.0), stats.t(4)], ids=["log-normal", "t4"])
+    def test_deviation(self, law, n):
+        """An interval that is stated covers at least 93 % whatever the law; one that is not stated covers all."""
         random = np.random.default_rng(31)
-        found = coverage(lambda x: Moments.of(x).deviation(), lambda: random.gamma(4.0, size=1000), 2.0)
-        assert abs(found - 95) < 2
+        found = coverage(lambda x: Moments.of(x).deviation(), lambda: law.rvs(size=n, random_state=random), law.std())
+        assert found >= 93
 
     def test_quantile(self):
         n, level, random = 1000, 0.9, np.random.default_rng(32)

@@ -112,7 +112,7 @@ def _metric(view: _View, name: str, confidence: float) -> dict[str, Any]:
     found = summarised(values, confidence, LEVELS, TAIL)
     if view.replicates > 1:
         blocks = view.blocks(name)
-        kinds = {"mean": np.mean, "deviation": lambda x: np.std(x, ddof=1)}
+        kinds: dict[str, Any] = {"mean": np.mean}
         kinds |= {f"quantile {level:g}": lambda x, level=level: quantile(x, level).value for level in LEVELS}
         kinds[f"cvar {TAIL:g}"] = lambda x: cvar(x, TAIL, replicates=100).value
         found |= {
