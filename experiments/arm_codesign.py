@@ -181,17 +181,31 @@ def for_one(config: Config, machine: Machine, shape: str, rider: float = 50.0) -
     return replace(machine, arm_draws.improved(config.draws, centre, ranges, judge, least)[0])
 
 
+def motor_power(voltage: float, resistance: float, current: float) -> float:
+    """Return the greatest mechanical power of the motor [W]: I (U - R I), at I = U/(2 R) or at the current's limit.
+
+    Args:
+        voltage: limit of the voltage [V].
+        resistance: of the winding [ohm].
+        current: limit of the current [A].
+    """
+    at = min(voltage / (2 * resistance), current)
+    return at * (voltage - resistance * at)
+
+
 def described(config: Config, machine: Machine) -> dict[str, Any]:
     """A machine's numbers, as values of a table."""
     plant = machine.plant()
     return {
         "winding [ohm]": machine.resistance,
         "current [A]": machine.current,
-        "power [W]": config.voltage**2 / 4 / machine.resistance,
+        "power [W]": motor_power(config.voltage, machine.resistance, machine.current),
         "mount [m]": float(machine.mount),
         "arm centre [m]": float(plant.arm_length),
         "arm [kg]": float(machine.arm_mass),
-        "k N [N m/A]": float(machine.constant * machine.gear),
+        "arm inertia [kg m^2]": float(plant.arm_inertia),
+        "k [N m/A]": float(machine.constant),
+        "gear": float(machine.gear),
         "bound, worst": float(jnp.min(bounds(config, machine))),
         "bound, 50 kg": float(bounds(dataclasses.replace(config, riders=(50.0,)), machine)[0]),
     }

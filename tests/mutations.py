@@ -1666,8 +1666,8 @@ MUTATIONS = [
     Mutation(
         "balance: an observer that predicts before its first sample",
         "controllers/balance.py",
-        "jnp.where(number > 0, predicted, estimate.state)",
-        "predicted",
+        "jnp.where(number > 0, predicted + self.correction @ error, self.start(signal).held.state)",
+        "predicted + self.correction @ error",
         "test_arm_control.py::test_an_observer_starts_at_what_is_measured",
     ),
     Mutation(

@@ -238,6 +238,15 @@ def test_a_stronger_motor_raises_the_bound_as_the_root_of_its_power(monkeypatch)
     assert 6 < float(found[0].gear) < 390
 
 
+@pytest.mark.parametrize(("resistance", "watts"), [(3.0, 192.0), (1.0, 576.0), (0.3, 1800.0), (0.1, 2520.0)])
+def test_the_power_of_a_motor_knows_the_limit_of_its_current(monkeypatch, resistance, watts):
+    """The greatest I (U - R I) over currents within 60 A, on a grid."""
+    monkeypatch.syspath_prepend(FOLDER)
+    currents = np.linspace(0.0, 60.0, 60_001)
+    assert np.max(currents * (48.0 - resistance * currents)) == pytest.approx(watts, rel=1e-9)
+    assert experiment("arm_codesign").motor_power(48.0, resistance, 60.0) == pytest.approx(watts, rel=1e-12)
+
+
 def test_drawn_designs_climb_to_where_most_is_recovered():
     """A known top, 0.5 at x = 0.7 and y = 100, where x is counted in its range and y in logarithms of its own."""
     module = experiment("arm_draws")

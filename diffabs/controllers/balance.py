@@ -83,14 +83,16 @@ class ObserverFeedback:
         return memory.held.voltage
 
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """Predict from the last sample, correct by this one."""
+        """Begin at the angles of the first sample; then predict from the last sample and correct by this one.
+
+        The memory of `start` does not serve: a sensor has no noise before its first sample.
+        """
         now, number = clock.ticks()
         estimate: ObserverMemory = memory.held
         voltage = clamp(estimate.voltage, -self.voltage_max, self.voltage_max)
         predicted = self.transition @ estimate.state + self.entry * voltage
-        predicted = jnp.where(number > 0, predicted, estimate.state)
         error = jnp.stack([getattr(signal.measured, name) - predicted[STATES.index(name)] for name in MEASURED])
-        state = predicted + self.correction @ error
+        state = jnp.where(number > 0, predicted + self.correction @ error, self.start(signal).held.state)
         new = ObserverMemory(state, self.gain @ state)
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, estimate))
 
