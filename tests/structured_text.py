@@ -9,7 +9,8 @@ import numpy as np
 TOKEN = re.compile(
     r"\s*(?:(:=|<>|<=|>=|\.\.|[-+*/()<>=,;:\[\]&])|(\d+\.\d+(?:E[+-]?\d+)?)|(\w+#-?\d+)|(\d+)|([A-Za-z]\w*))"
 )
-REALS, WHOLE = {"LREAL": float, "REAL": np.float32}, {"LINT": 64, "ULINT": 64, "DINT": 32, "UDINT": 32}
+REALS = {"LREAL": float, "REAL": np.float32}
+WHOLE = {"LINT": 64, "ULINT": 64, "DINT": 32, "UDINT": 32, "INT": 16}
 FUNCTIONS = {
     **{"EXP": np.exp, "LN": np.log, "SIN": np.sin, "COS": np.cos, "TAN": np.tan, "ATAN": np.arctan},
     **{"ASIN": np.arcsin, "ACOS": np.arccos, "SQRT": np.sqrt, "ABS": np.abs},
@@ -77,11 +78,11 @@ class Block:
                 size = int(self._next()) + 1
                 self._take("]", "OF")
                 kind = self._next()
+            zero = False if kind == "BOOL" else 0 if kind in WHOLE else REALS[kind](0)
             if self._peek() == ":=":
                 self._next()
-                assert self._next() == "FALSE"
+                zero = self._initial(kind)
             self._take(";")
-            zero = {"BOOL": False}.get(kind, 0 if kind in WHOLE else REALS.get(kind, float)(0))
             for name in names:
                 assert name not in self.types, f"{name} is declared twice"
                 assert "__" not in name
@@ -89,6 +90,17 @@ class Block:
                 self.values[name] = zero if size is None else [zero] * size
             self.inputs += names if section == "VAR_INPUT" else []
         self._next()
+
+    def _initial(self, kind):
+        """The value of a literal."""
+        if kind == "BOOL":
+            assert self._next() == "FALSE"
+            return False
+        sign = -1 if self._peek() == "-" and self._next() else 1
+        word = self._next()
+        assert kind in REALS
+        assert re.fullmatch(r"\d+\.\d+(E[+-]?\d+)?", word), word
+        return REALS[kind](sign * float(word))
 
     def _statements(self, ends):
         lines = []
@@ -107,6 +119,7 @@ class Block:
         if self._peek() == "FOR":
             self._next()
             name = self._next().upper()
+            assert self.types[name] == "INT"
             self._take(":=")
             low = int(self._next())
             self._take("TO")
@@ -184,7 +197,8 @@ class Block:
         kind = self.types[name]
         if self._peek() == "[":
             self._next()
-            index = self._expression("LINT")
+            index, whole = self._level(0)
+            assert whole in WHOLE
             self._take("]")
             return f"V['{name}'][{index}]", kind[0]
         return f"V['{name}']", kind

@@ -41,7 +41,8 @@ from diffabs.scenario.scenario import load
 
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 SAMPLES = 10_000
-FLAGS = ("-std=c99", "-O2", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wconversion")
+SANITIZED = ("-fsanitize=undefined,float-cast-overflow", "-fno-sanitize-recover=all")
+FLAGS = ("-std=c99", "-O2", "-pedantic", "-Wall", "-Wextra", "-Werror", "-Wconversion", "-Wshadow", *SANITIZED)
 
 
 def rig(controller, **parts):
@@ -72,14 +73,19 @@ LOOPS = {
 }  # fmt: skip
 
 
-def measured(loop, seed):
-    """Random signals (SAMPLES,) of whatever the plant shows: of a brake within what it can show."""
+def measured(loop, seed, lost=True):
+    """Random signals (SAMPLES,) of whatever the plant shows: of a brake within what it can show. Some samples of each
+    are `lost`, a NaN."""
     draw = np.random.default_rng(seed)
     if loop.plant.shows is BalanceOutput:
-        return BalanceOutput(*(0.3 * draw.normal(size=SAMPLES) for _ in BalanceOutput._fields))
-    speed = draw.uniform(0.5, 20.0, SAMPLES)
-    slip = np.clip(0.2 + 0.15 * draw.normal(size=SAMPLES), 0.0, 1.0)
-    return BrakeOutput(slip, speed, speed * (1 - slip), 6 * draw.uniform(size=SAMPLES), 0 * slip)
+        found = BalanceOutput(*(0.3 * draw.normal(size=SAMPLES) for _ in BalanceOutput._fields))
+    else:
+        speed = draw.uniform(0.5, 20.0, SAMPLES)
+        slip = np.clip(0.2 + 0.15 * draw.normal(size=SAMPLES), 0.0, 1.0)
+        found = BrakeOutput(slip, speed, speed * (1 - slip), 6 * draw.uniform(size=SAMPLES), 0 * slip)
+    for k, column in enumerate(found if lost else ()):
+        column[[10 + 4 * k, 11 + 4 * k, 5000 + 4 * k]] = np.nan
+    return found
 
 
 def commands_of_parts(loop, seen, dtype, step=None):
@@ -154,6 +160,78 @@ def test_what_is_exported_commands_what_the_parts_do(name, dtype, tmp_path):
     early = slice(0, 50)
     tight = 1e-13 if dtype == np.float64 else 2e-5
     np.testing.assert_allclose(result[early], wanted[early], rtol=tight, atol=tight * np.max(np.abs(wanted)))
+
+
+CALLER = """
+#include "unit.c"
+#include <stdio.h>
+
+int main(void)
+{
+  unit_parameters p = unit_defaults;
+  const unit_input in[] = {{0.1}, {NAN}, {0.1}, {0.3}};
+  unit_state s;
+  unit_start(&s, &p, &in[1]);
+  for (int k = 0; k < 4; k++) {
+    printf("%.17g", unit_step(&s, &p, &in[k]));
+    printf(" %d\\n", s.held);
+    p.kp = 80.0;
+    p.torque_max = 4.0;
+  }
+  return 0;
+}
+"""
+
+
+def limited():
+    """A PID whose numbers are changed after the first sample; what it then commands, by hand, and whether it holds."""
+    first = 2.7 + 60.0 * 0.1
+    integral = 1e-3 * 0.1
+    then = [min(2.7 + 80.0 * 0.1 + 400.0 * integral, 4.0), max(2.7 - 80.0 * 0.1 + 400.0 * 2 * integral, 0.0)]
+    pid = PID(kp=60.0, ki=400.0, torque_min=0.0, torque_max=9.03)
+    return rig(pid), [first, first, *then], [0, 1, 0, 0]
+
+
+@needs_cc
+def test_parameters_can_be_changed_and_a_lost_sample_is_told_in_c(tmp_path):
+    """Also the first measurement, at the start, may be lost."""
+    loop, wanted, held = limited()
+    (tmp_path / "unit.c").write_text(c_source(device(loop), "unit"))
+    (tmp_path / "caller.c").write_text(CALLER)
+    flags = [flag for flag in FLAGS if flag != "-pedantic"]
+    subprocess.run(["cc", *flags, "caller.c", "-o", "caller", "-lm"], check=True, cwd=tmp_path)
+    said = subprocess.run([tmp_path / "caller"], capture_output=True, text=True, check=True).stdout
+    rows = np.array([line.split() for line in said.splitlines()], float)
+    np.testing.assert_allclose(rows[:, 0], wanted, rtol=1e-12)
+    assert rows[:, 1].tolist() == held
+
+
+def test_parameters_can_be_changed_and_a_lost_sample_is_told_in_structured_text():
+    loop, wanted, held = limited()
+    text = structured_text(device(loop), "Unit")
+    block, found = Block(text), []
+    for slip in (0.1, np.nan, 0.1, 0.3):
+        found.append((block(slip=slip), int(block.values["HELD"])))
+        block.values |= {"KP": 80.0, "TORQUE_MAX": 4.0}
+    np.testing.assert_allclose([command for command, _ in found], wanted, rtol=1e-12)
+    assert [flag for _, flag in found] == held
+    assert "kp : LREAL := 60.0; (* [N m] in [0, inf) *)" in text
+
+
+def test_numbers_are_called_as_in_the_source():
+    """No number has a name that says nothing."""
+    text = c_source(device(LOOPS["PID, filtered derivative"]), "unit")
+    assert "error = " in text
+    assert "derivative_2 = p->cutoff * derivative;" in text
+    assert not re.search(r"\b[a-z]\d+\b", text.replace("int64_t", ""))
+
+
+@needs_cc
+def test_a_compiler_that_assumes_that_there_is_no_nan_is_refused(tmp_path):
+    (tmp_path / "unit.c").write_text(c_source(device(LOOPS["state feedback"]), "unit"))
+    result = subprocess.run(["cc", "-ffast-math", "-c", "unit.c"], cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode != 0
+    assert "compile without -ffast-math" in result.stderr
 
 
 @needs_cc
@@ -411,7 +489,7 @@ def test_what_a_sample_stores_does_not_change_while_the_target_moves():
             return memory.held[1] + 0.0 * signal.measured.slip
 
     loop = rig(Remember(), reference=FilteredSlip(slip=0.2, time_constant=0.01))
-    seen = jax.tree.map(lambda x: x[:50], measured(loop, seed=2))
+    seen = jax.tree.map(lambda x: x[:50], measured(loop, seed=2, lost=False))
     wanted = (0.2 - seen.slip[0]) * np.exp(-np.arange(-1, 49) / 10)
     wanted[0] = 0.0
     block = Block(structured_text(device(loop, step=1e-3 / 4), "Unit"))

@@ -49,6 +49,7 @@ class Sampled:
 
     def start(self, signal: Tracking) -> Memory:
         """Output zero until the first sample has been computed."""
+        signal = usable(signal)
         zero = 0.0 * signal.target
         return Memory(held=SampledMemory(self.controller.start(signal), zero, zero, zero, zero))
 
@@ -75,15 +76,20 @@ class Sampled:
         flow = axpy(clock.h, self.controller.flow(clock.t, inner, signal), inner.flow)
         return Memory(flow, inner.held), output
 
-    def guarded(self, clock: Clock, memory: Memory, last: Scalar, signal: Tracking) -> tuple[Memory, Scalar, Any]:
-        """What `computed` returns, and False; or, where the sample cannot be used, the memory and the `last` output as
-        they are, and True."""
-        new = self.computed(clock, memory, signal)
+    def guarded(
+        self, clock: Clock, memory: Memory, last: Scalar, signal: Tracking, lost: Any = False
+    ) -> tuple[Memory, Scalar, Any]:
+        """What `computed` returns, and False; or, where the sample is `lost` or cannot be used, the memory and the
+        `last` output as they are, and True."""
+        # on numbers, also where there are none: nothing that is not defined for NaN is computed or differentiated
+        before = None if clock.before is None else usable(clock.before)
+        new = self.computed(clock._replace(before=before), memory, usable(signal))
         read = leaves_followed(lambda signal: self.computed(clock, memory, signal), signal)
         numbers = [x for x, on in zip(jax.tree.leaves(signal), read, strict=True) if on]
         results = [x for x in jax.tree.leaves(new) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
-        unfit = [jnp.any(jnp.isnan(x)) for x in numbers] + [~jnp.all(jnp.isfinite(x)) for x in results]
-        held = reduce(jnp.logical_or, unfit)
+        missing = [jnp.any(jnp.isnan(x)) for x in numbers]
+        infinite = [~jnp.all(jnp.isfinite(x)) for x in results]
+        held = reduce(jnp.logical_or, [*missing, *infinite], lost)
         inner, output = jax.tree.map(lambda old, new: jnp.where(held, old, new), (memory, last), new)
         return inner, output, held
 
@@ -121,6 +127,11 @@ class Sampled:
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """The period is on the integration grid."""
         yield whole_steps("period", self.period, step)
+
+
+def usable(signal: Any) -> Any:
+    """Return a signal with 0 for NaN: a memory that begins on it is finite."""
+    return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), 0.0, x), signal)
 
 
 def unsampled(controller: Any) -> Any:

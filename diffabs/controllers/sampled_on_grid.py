@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.controllers.pid import PID
-from diffabs.controllers.sampled import Sampled, within_period
+from diffabs.controllers.sampled import Sampled, usable, within_period
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import Scalar, param, part, pytree
@@ -47,6 +47,7 @@ class SampledOnGrid:
 
     def start(self, signal: Tracking) -> Memory:
         """Output zero until the first sample has been computed."""
+        signal = usable(signal)
         zero = 0.0 * signal.target
         return Memory(held=GridMemory(self.controller.start(signal), zero, zero, zero, zero))
 

@@ -1,4 +1,4 @@
-"""A device as one file of C99: a struct of memory, a function for the start, one for a sample; no allocation."""
+"""A device as one file of C99: structs of memory and parameters, a function for the start, one for a sample."""
 
 import keyword
 import re
@@ -7,23 +7,24 @@ from collections.abc import Iterator, Sequence
 import jax
 import numpy as np
 
-from diffabs.export.c_words import RESERVED, Words, identifier
+from diffabs.export.c_words import RESERVED, Words, commented, identifiers
 from diffabs.export.device import Device, NotExported
-from diffabs.export.lowered import INPUTS, MEMORY, Lowered
+from diffabs.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
 from diffabs.kernel.graph import Node
 from diffabs.kernel.primitives import Unsupported
 from diffabs.kernel.program import live
 
 
 def c_source(found: Device, name: str, notes: Sequence[str] = ()) -> str:
-    """Return a device as C99: `NAME_state`, `NAME_input`, `NAME_start`, `NAME_step`, and a main for tests under
-    `#ifdef NAME_MAIN` that reads a line of inputs for each sample and writes the command.
+    """Return a device as C99: `NAME_state`, `NAME_input`, `NAME_parameters` with `NAME_defaults`, `NAME_start`,
+    `NAME_step`, and a main for tests under `#ifdef NAME_MAIN` that reads a line of inputs for each sample and writes
+    the command.
 
     name: an identifier; notes: lines of the comment at its head
     Raises:
         NotExported: an operation that has no translation.
     """
-    if not re.fullmatch(r"[A-Za-z]\w*", name) or keyword.iskeyword(name) or name in RESERVED:
+    if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) or keyword.iskeyword(name) or name in RESERVED:
         raise NotExported(f"{name!r} is no name that C has for a function: letters, digits and _")
     with jax.enable_x64(True):
         try:
@@ -36,68 +37,87 @@ class _Text:
     def __init__(self, found: Device, name: str, notes: Sequence[str]):
         self.device, self.name, self.notes = found, name, notes
         self.real = f"{name}_real"
-        self.program = Lowered(found)
-        self.words = Words(self.real, _place, single=found.dtype == np.float32)
+        self.program = program = Lowered(found)
+        self.fields = {
+            where: identifiers(paths)
+            for where, paths in ((INPUTS, program.read), (MEMORY, [*program.kept, "held"]), (NUMBERS, program.used))
+        }
+        self.words = Words(self.real, self._place, single=found.dtype == np.float32)
+
+    def _place(self, where: str, path: str) -> str:
+        return f"{where}->{self.fields[where][path]}" if where else path
 
     def parts(self) -> Iterator[str]:
         """The lines of the text."""
         yield from self._head()
         yield f"typedef {'float' if self.device.dtype == np.float32 else 'double'} {self.real};\n"
-        yield "/* What is measured at a sample. */\ntypedef struct {"
-        for name in self.program.read:
-            yield f"  {self.real} {identifier(name)}; /* [{self.device.units.get(name, '1')}] */"
-        yield ("" if self.program.read else "  char none;\n") + f"}} {self.name}_input;\n"
-        yield "/* What is remembered from one sample to the next. */\ntypedef struct {"
-        for name in self.program.kept:
-            yield f"  {self.words.type(self.program.state[name])} {identifier(name)};"
-        yield ("" if self.program.kept else "  char none;\n") + f"}} {self.name}_state;\n"
-        yield f"void {self.name}_start({self.name}_state *s, const {self.name}_input *in);"
-        yield f"{self.real} {self.name}_step({self.name}_state *s, const {self.name}_input *in);\n"
-        yield "/* Before the first sample, with what is measured then. */"
-        yield f"void {self.name}_start({self.name}_state *s, const {self.name}_input *in)\n{{"
+        yield from self._structs()
+        arguments = f"{self.name}_state *s, const {self.name}_parameters *p, const {self.name}_input *in"
+        start, step = f"void {self.name}_start({arguments})", f"{self.real} {self.name}_step({arguments})"
+        yield f"{start};\n{step};\n"
+        yield from self._defaults()
+        yield f"/* Before the first sample, with what is measured then. */\n{start}\n{{"
         yield from self._body(self.program.begun, ())
-        yield "}\n"
-        yield f"/* At each sample: the command [{self.device.control_unit}]. */"
-        yield f"{self.real} {self.name}_step({self.name}_state *s, const {self.name}_input *in)\n{{"
-        yield from self._body(self.program.stored, [self.program.command])
-        yield f"  return {self._now(self.program.command)};\n}}\n"
+        yield "  s->held = false;\n}\n"
+        yield f"/* At each sample: the command [{commented(self.device.control_unit)}]. */\n{step}\n{{"
+        yield from self._body(self.program.stored, [self.program.held])
+        yield "  return s->command;\n}\n"
         yield from self._main()
 
     def _head(self) -> Iterator[str]:
         delay = f", output it {self.device.delay:g} s after that" if self.device.delay else ""
         yield f"/* {self.name}: the controller, to be called every {self.device.period:g} s{delay}."
-        for note in self.notes:
-            yield f"   {note.replace('*/', '* /')}"
-        for number in self.device.numbers:
-            yield f"   {number}"
+        for line in [*self.notes, *map(str, self.device.numbers)]:
+            yield f"   {commented(line)}"
         yield (
             f"   Call {self.name}_start once with the first measurements, then {self.name}_step at every sample,\n"
-            "   the first among them. Nothing is allocated and nothing is global; two states are two controllers. */"
+            f"   the first among them, both with parameters: {self.name}_defaults, or a changed copy.\n"
+            "   A sample with a NaN, or that leads to one, is not used: memory and command stay, and held is true.\n"
+            "   Nothing is allocated and nothing changes that is global; two states are two controllers. */"
         )
         yield "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>\n"
+        yield "#ifdef __FAST_MATH__\n#error compile without -ffast-math: a NaN must be seen\n#endif\n"
+
+    def _structs(self) -> Iterator[str]:
+        """Inputs, parameters and memory."""
+        program, real = self.program, self.real
+        specs = {name: spec for number in self.device.numbers for name, spec in number.named()}
+        inputs, numbers, memory = (self.fields[where] for where in (INPUTS, NUMBERS, MEMORY))
+        read = [f"{real} {inputs[x]}; /* [{commented(self.device.units.get(x, '1'))}] */" for x in program.read]
+        yield from self._struct("What is measured at a sample.", "input", read)
+        used = [f"{real} {numbers[x]}; /* {commented(specs[x])} */" for x in program.used]
+        yield from self._struct("What can be changed, also between two samples.", "parameters", used)
+        kept = [f"{self.words.type(program.state[x])} {memory[x]};" for x in program.kept]
+        held = f"bool {memory['held']}; /* whether the last sample could not be used */"
+        yield from self._struct("What is remembered from one sample to the next.", "state", [*kept, held])
+
+    def _struct(self, about: str, name: str, members: Sequence[str]) -> Iterator[str]:
+        yield f"/* {about} */\ntypedef struct {{"
+        yield from (f"  {member}" for member in members or ["char none;"])
+        yield f"}} {self.name}_{name};\n"
+
+    def _defaults(self) -> Iterator[str]:
+        """The parameters of the scenario."""
+        names, values = self.fields[NUMBERS], self.program.values
+        rows = [f".{names[x]} = {self.words.literal(self.device.dtype.type(values[x]))}" for x in self.program.used]
+        yield f"const {self.name}_parameters {self.name}_defaults = {{"
+        yield from (f"  {row}," for row in rows or [".none = 0"])
+        yield "};\n"
 
     def _body(self, stored: dict[str, Node], more: Sequence[Node]) -> Iterator[str]:
         """The operations that these need, and the memory's new values."""
         nodes = live([*stored.values(), *more])
         moving = self.program.moving if more else {}
         used = {node.id for node in nodes} | {node.id for node in live(list(moving.values()))}
-        for struct, wanted, names in (
-            (MEMORY, self.program.kept, self.program.state),
-            (INPUTS, self.program.read, self.program.inputs),
-        ):
-            if not any(names[name].id in used for name in wanted) and not (struct == MEMORY and stored):
+        for struct, names in ((INPUTS, self.program.inputs), (NUMBERS, self.program.numbers)):
+            if not any(node.id in used for node in names.values()):
                 yield f"  (void){struct};"
         yield from self.words.operations(nodes, "  ")
-        # What is stored, or returned, may be what was read before.
-        read = self.program.memory
-        late = {node.id: node for node in [*stored.values(), *more] if node.id in read}
-        for node in late.values():
-            yield f"  const {self.words.type(node)} old_{identifier(read[node.id])} = s->{identifier(read[node.id])};"
         if moving:
             yield from self._moves(moving)
-        for name, node in stored.items():
-            if node is not self.program.state[name]:
-                yield f"  s->{identifier(name)} = {self._now(node)};"
+        for name, node in [*stored.items(), *(("held", node) for node in more)]:
+            if node is not self.program.state.get(name):
+                yield f"  s->{self.fields[MEMORY][name]} = {self.words.name(node)};"
 
     def _moves(self, moving: dict[str, Node]) -> Iterator[str]:
         """What moves by itself until the next sample, by as many steps as the simulation takes."""
@@ -105,12 +125,8 @@ class _Text:
         yield from self.words.operations(live(list(moving.values())), "    ")
         for name, node in moving.items():
             if node is not self.program.state[name]:
-                yield f"    s->{identifier(name)} = {self.words.name(node)};"
+                yield f"    s->{self.fields[MEMORY][name]} = {self.words.name(node)};"
         yield "  }"
-
-    def _now(self, node: Node) -> str:
-        read = self.program.memory
-        return f"old_{identifier(read[node.id])}" if node.id in read else self.words.name(node)
 
     def _main(self) -> Iterator[str]:
         scan = "%f" if self.device.dtype == np.float32 else "%lf"
@@ -120,15 +136,11 @@ class _Text:
         yield "#include <stdio.h>\n\nint main(void)\n{"
         yield f"  {self.name}_state s;\n  {self.name}_input in;\n  bool first = true;"
         if count:
-            targets = ", ".join(f"&in.{identifier(name)}" for name in self.program.read)
+            targets = ", ".join(f"&in.{self.fields[INPUTS][name]}" for name in self.program.read)
             yield f'  while (scanf("{" ".join([scan] * count)}", {targets}) == {count}) {{'
         else:
             yield "  in.none = 0;\n  while (getchar() == '\\n') {"
-        yield f"    if (first)\n      {self.name}_start(&s, &in);"
+        yield f"    if (first)\n      {self.name}_start(&s, &{self.name}_defaults, &in);"
         yield "    first = false;"
-        yield f'    printf("%.17g\\n", (double){self.name}_step(&s, &in));\n  }}'
+        yield f'    printf("%.17g\\n", (double){self.name}_step(&s, &{self.name}_defaults, &in));\n  }}'
         yield "  return 0;\n}\n#endif"
-
-
-def _place(where: str, path: str) -> str:
-    return f"{where}->{identifier(path)}" if where else path

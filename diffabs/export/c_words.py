@@ -3,7 +3,8 @@
 An operation that C has no word for is an objection that names it."""
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,7 @@ WORDS = (
     "bool true false"
 )
 RESERVED = set(WORDS.split())
+TAKEN = {*FUNCTIONS.values(), "s", "p", "in", "i", "m", "t", "h"}  # which a variable must not hide
 
 
 class Words:
@@ -37,6 +39,8 @@ class Words:
     def __init__(self, real: str, place: Callable[[str, str], str], single: bool = False):
         """Nothing is written yet."""
         self.real, self.place, self.single = real, place, single
+        self._names: dict[int, str] = {}
+        self._taken = {*TAKEN, real}
 
     def operations(self, nodes: Sequence[Node], indent: str) -> Iterator[str]:
         """The lines that work these out, arguments first."""
@@ -45,8 +49,8 @@ class Words:
                 continue
             if node.op == "table":
                 rows = ", ".join(self.name(x) for x in node.args[1:])
-                yield f"{indent}const {self.type(node)} t{node.id}[] = {{{rows}}};"
-            yield f"{indent}const {self.type(node)} v{node.id} = {self._expression(node)};"
+                yield f"{indent}const {self.type(node)} {self.name(node)}_table[] = {{{rows}}};"
+            yield f"{indent}const {self.type(node)} {self.name(node)} = {self._expression(node)};"
 
     def type(self, node: Node) -> str:
         """Of a number."""
@@ -56,16 +60,20 @@ class Words:
         """What stands for a number: a literal, a variable, a place."""
         if node.op == "const":
             return self._literal(node)
-        if node.op != "input":
-            return f"v{node.id}"
-        return self.place(*node.attr)
+        if node.op == "input":
+            return self.place(*node.attr)
+        if node.id not in self._names:
+            self._names[node.id] = fresh(identifier(node.label) or node.op, self._taken)
+        return self._names[node.id]
 
     def _literal(self, node: Node) -> str:
         x = node.attr
         if node.dtype.kind == "b":
             return "true" if x else "false"
-        if not real(node.dtype):
-            return f"(({TYPES[node.dtype.name]}){int(x)})"
+        return self.literal(x) if real(node.dtype) else f"(({TYPES[node.dtype.name]}){int(x)})"
+
+    def literal(self, x: Any) -> str:
+        """A real number, of NumPy, as it is written."""
         if np.isnan(x):
             return "NAN"
         if np.isinf(x):
@@ -78,6 +86,8 @@ class Words:
     def _expression(self, node: Node) -> str:
         args = [self.name(x) for x in node.args]
         suffix = "f" if self.single else ""
+        if node.op == "ne" and node.args[0] is node.args[1]:
+            return f"isnan({args[0]}) != 0"
         if node.op in INFIX:
             return f"{args[0]} {INFIX[node.op]} {args[1]}"
         if node.op in CHOSEN:
@@ -103,11 +113,33 @@ class Words:
         if node.op == "convert":
             return f"({self.type(node)}){args[0]}"
         if node.op == "table":
-            return f"t{node.id}[{args[0]}]"
+            return f"{self.name(node)}_table[{args[0]}]"
         raise Unsupported(node.op, "there is none")
 
 
 def identifier(path: str) -> str:
-    """Return a path as a name of C."""
-    name = re.sub(r"\W", "_", path)
+    """Return a path as a name of C; empty where nothing of it can be in one."""
+    name = re.sub(r"\W+", "_", path, flags=re.ASCII).strip("_")
+    name = f"x{name}" if name[:1].isdigit() else name
     return f"{name}_" if name in RESERVED else name
+
+
+def identifiers(paths: Iterable[str]) -> dict[str, str]:
+    """Return paths as names of C, each another."""
+    taken: set[str] = set()
+    return {path: fresh(identifier(path) or "x", taken) for path in paths}
+
+
+def fresh(name: str, taken: set[str]) -> str:
+    """Return a name that is not taken, with a number where it must be; it is taken then."""
+    number, new = 2, name
+    while new in taken:
+        number, new = number + 1, f"{name}_{number}"
+    taken.add(new)
+    return new
+
+
+def commented(text: str) -> str:
+    """Return a text as it may stand in a comment of any language: on one line, of an alphabet in which no comment ends,
+    begins or goes on."""
+    return re.sub(r"[^A-Za-z0-9 .,:;=+_/()\[\]<>'^%&|-]", "_", " ".join(text.split()))

@@ -2,12 +2,14 @@
 
     memory, measured --> target, feed-forward, controller --> memory, command
 
-It is the loop's own code, traced: reference, feed-forward and the controller within `Sampled` (`Sampled.computed`),
-with the numbers of its parameters. A target that moves by itself, such as a filtered one, is advanced by the
-Runge-Kutta steps that the simulation takes. Sensors and actuators are the machine's, not the computer's."""
+It is the loop's own code, traced: reference, feed-forward and the controller within `Sampled` (`Sampled.guarded`). The
+parameters of these three can be changed; those of the plant, period and delay are constants. A target that moves by
+itself, such as a filtered one, is advanced by the Runge-Kutta steps that the simulation takes. Sensors and actuators
+are the machine's, not the computer's."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -15,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.controllers import Sampled, SampledOnGrid
+from diffabs.controllers.sampled import usable
 from diffabs.core.blocks import offers
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
-from diffabs.core.pytree import parameters, prepared, strong
-from diffabs.core.tracing import follows
+from diffabs.core.pytree import Spec, arrayed, parameters, prepared, strong
+from diffabs.core.tracing import follows, leaves_followed
 from diffabs.simulate.rk4 import rk4_step
 
 MOST_STEPS = 64  # of the simulation in a period, for a target that moves by itself
@@ -37,40 +40,61 @@ class Input(NamedTuple):
 
 
 class State(NamedTuple):
-    """What it remembers: of the controller, how many samples there were, and of the reference."""
+    """What it remembers: of the controller, how many samples there were, the last command, and of the reference."""
 
     controller: Memory
     samples: Any
+    command: Any
     reference: Memory
 
 
+class Parts(NamedTuple):
+    """The parts whose parameters can be changed; no reference where the target is given."""
+
+    controller: Any
+    feedforward: Any
+    reference: Any = ()
+
+
 class Number(NamedTuple):
-    """A parameter of a part: its path in the loop, value (...) and unit."""
+    """A parameter of a part: its path in the loop, value (...), and what it may be."""
 
     path: str
     value: np.ndarray
-    unit: str
+    spec: Spec
 
     def __str__(self) -> str:
         """One line for the head of a file."""
         values = " ".join(f"{x:.17g}" if float(f"{x:.9g}") != x else f"{x:.9g}" for x in self.value.flat)
-        return f"{self.path} = {values}{'' if self.unit in ('', '1') else f' {self.unit}'}"
+        return f"{self.path} = {values}{'' if self.spec.unit in ('', '1') else f' {self.spec.unit}'}"
+
+    def named(self) -> Iterator[tuple[str, str]]:
+        """Each of its numbers as the code has it, by name, with what is said of it."""
+        path = self.path.removeprefix("controller.").removeprefix("controller.")
+        units = [unit.strip() for unit in self.spec.unit.split(",")]
+        for k, at in enumerate(np.ndindex(self.value.shape)):
+            spec = dataclasses.replace(self.spec, unit="1")
+            yield ".".join([path, *map(str, at)]), f"[{units[min(k, len(units) - 1)]}] in {spec.interval()}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Device:
-    """start(input) -> state, before the first sample. At each sample step(state, input) -> (controller's memory,
-    samples, command), and then `moves` times move(state, i) -> reference's memory, i = 0, 1, ...; units of the inputs,
-    by name; shapes of input and state, of numbers of `dtype`; period and computing delay [s]; the numbers of its parts,
-    those of the plant only where the feed-forward is made of them."""
+    """What a computer works out, as functions to trace. start(parts, input) -> state, before the first sample. At each
+    sample step(parts, state, input) -> (controller's memory, samples, command, whether they are held because the sample
+    cannot be used), and then `moves` times move(parts, state, i) -> reference's memory, i = 0, 1, ...
 
-    start: Callable[[Input], State]
-    step: Callable[[State, Input], tuple[Memory, Any, Any]]
-    move: Callable[[State, Any], Memory]
+    units: of the inputs, by name; input, state: shapes, of numbers of `dtype`; parts: with the numbers that they begin
+    with; period, delay: of sampling and computing [s]; numbers: all parameters, those of the plant only where the
+    feed-forward is made of them"""
+
+    start: Callable[[Parts, Input], State]
+    step: Callable[[Parts, State, Input], tuple[Memory, Any, Any, Any]]
+    move: Callable[[Parts, State, Any], Memory]
     moves: int
     units: dict[str, str]
     input: Input
     state: State
+    parts: Parts
     dtype: np.dtype
     period: float
     delay: float
@@ -90,19 +114,22 @@ def device(loop: Loop, *, step: float | None = None, dtype: Any = np.float64, gi
     loop = sampled(loop)
     controller: Any = loop.controller
     with jax.enable_x64(True):
-        typed: Loop = prepared(jax.tree.map(lambda x: jnp.asarray(x, dtype), strong(loop)))
+        typed: Loop = jax.tree.map(lambda x: jnp.asarray(x, dtype), strong(arrayed(loop)))
+        computer: Any = typed.controller
+        parts = Parts(computer.controller, typed.feedforward, () if given_target else typed.reference)
+        typed = prepared(typed)
         shapes = jax.eval_shape(lambda: _given(typed, given_target))
         if not given_target:
             _check_reference(typed, _given(typed, False).measured)
         count = _steps(float(controller.period), step)
         work = _Work(typed, count, given_target, shapes)
-        state = jax.eval_shape(work.start, shapes)
+        state = jax.eval_shape(work.start, parts, shapes)
     units = dict(loop.plant.shows.units)
     if given_target:
         units["target"] = units[loop.plant.shows._fields[0]]
     moves = count if jax.tree.leaves(state.reference.flow) else 0
     return Device(
-        work.start, work.step, work.move, moves, units, shapes, state, np.dtype(dtype), float(controller.period),
+        work.start, work.step, work.move, moves, units, shapes, state, parts, np.dtype(dtype), float(controller.period),
         float(controller.delay), loop.plant.control_unit,
         tuple(_numbers(loop, typed, shapes, given_target)),
     )  # fmt: skip
@@ -121,7 +148,7 @@ def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Itera
         families += ["plant"] if follows(ahead, typed.plant) else []
     for path, spec, value in parameters(loop):
         if path.partition(".")[0] in families:
-            yield Number(path, np.asarray(value, float), spec.unit)
+            yield Number(path, np.asarray(value, float), spec)
 
 
 def sampled(loop: Loop) -> Loop:
@@ -169,41 +196,59 @@ class _Work:
     def __init__(self, loop: Loop, count: int, given_target: bool, given: Input):
         self.loop, self.count, self.given_target, self.given = loop, count, given_target, given
         assert isinstance(loop.controller, Sampled)
-        self.controller: Sampled = loop.controller
+        self.sampled = loop.controller
 
-    def start(self, given: Input) -> State:
+    def start(self, parts: Parts, given: Input) -> State:
         """The memories at the first sample."""
-        reference = Memory() if self.given_target else self.loop.reference.start(given.measured)
-        tracking = self._tracking(reference, given, 0.0)
-        return State(self.controller.controller.start(tracking), jnp.zeros((), jnp.int64), reference)
+        loop, given = self._with(parts), usable(given)
+        reference = Memory() if self.given_target else loop.reference.start(given.measured)
+        tracking, _ = self._tracking(loop, reference, given, 0.0)
+        zero = jnp.zeros_like(tracking.target)
+        return State(loop.controller.controller.start(tracking), jnp.zeros((), jnp.int64), zero, reference)
 
-    def step(self, state: State, given: Input) -> tuple[Memory, Any, Any]:
-        """The controller's memory after a sample, how many samples there were, and the command."""
-        period, t = self.controller.period, self._time(state)
-        tracking = self._tracking(state.reference, given, t)
-        clock = Clock(t, period, state.samples, None, before=tracking)
-        inner, command = self.controller.computed(clock, state.controller, tracking)
-        return inner, state.samples + 1, command
+    def step(self, parts: Parts, state: State, given: Input) -> tuple[Memory, Any, Any, Any]:
+        """The controller's memory after a sample, how many samples there were, the command, and whether memory and
+        command are held."""
+        loop, t = self._with(parts), self._time(state)
+        tracking, lost = self._tracking(loop, state.reference, given, t)
+        clock = Clock(t, loop.controller.period, state.samples, None, before=tracking)
+        inner, command, held = loop.controller.guarded(clock, state.controller, state.command, tracking, lost)
+        return inner, state.samples + 1, command, held
 
-    def move(self, state: State, i: Any) -> Memory:
+    def move(self, parts: Parts, state: State, i: Any) -> Memory:
         """The reference's memory after the i-th step of the simulation in a period."""
-        h, memory = self.controller.period / self.count, state.reference
+        loop = self._with(parts)
+        h, memory = loop.controller.period / self.count, state.reference
         zero = jax.tree.map(jnp.zeros_like, self.given.measured)
 
         def rate(t: Any, x: Any) -> Any:
-            return self.loop.reference.flow(t, memory._replace(flow=x), zero)
+            return loop.reference.flow(t, memory._replace(flow=x), zero)
 
         return memory._replace(flow=rk4_step(rate, self._time(state) + i * h, memory.flow, h))
 
+    def _with(self, parts: Parts) -> Any:
+        """The loop with these parts in it."""
+        controller = dataclasses.replace(self.sampled, controller=prepared(parts.controller))
+        loop = dataclasses.replace(self.loop, controller=controller, feedforward=prepared(parts.feedforward))
+        return loop if self.given_target else dataclasses.replace(loop, reference=prepared(parts.reference))
+
     def _time(self, state: State) -> Any:
         """Of the sample [s]."""
-        period = self.controller.period
+        period = self.sampled.period
         return state.samples.astype(jnp.result_type(period)) * period
 
-    def _tracking(self, reference: Memory, given: Input, t: Any) -> Tracking:
+    def _tracking(self, loop: Loop, reference: Memory, given: Input, t: Any) -> tuple[Tracking, Any]:
+        """What the controller is given, and whether the feed-forward would be made of a NaN."""
+        measured = usable(given.measured)
         if self.given_target:
-            target = setpoint = given.target
+            target, setpoint = given.target, usable(given.target)
         else:
-            target = self.loop.reference.output(t, reference, given.measured)
-            setpoint = self.loop.reference.setpoint(reference)
-        return Tracking(target, given.measured, self.loop.feedforward.input(self.loop.plant, given.measured, setpoint))
+            target = loop.reference.output(t, reference, measured)
+            setpoint = loop.reference.setpoint(reference)
+
+        def ahead(measured: Any) -> Any:
+            return loop.feedforward.input(loop.plant, measured, setpoint)
+
+        followed = zip(jax.tree.leaves(given.measured), leaves_followed(ahead, measured), strict=True)
+        lost = reduce(jnp.logical_or, [jnp.isnan(x) for x, on in followed if on], False)
+        return Tracking(target, given.measured, ahead(measured)), lost

@@ -10,60 +10,66 @@ import jax
 import numpy as np
 
 from diffabs.export.device import Device
+from diffabs.export.labels import Labelled, label
 from diffabs.kernel.graph import Array, Graph, Level, Node
 from diffabs.kernel.primitives import known, translate
 from diffabs.kernel.program import RULES, live
 
 assert RULES is not None  # registered where they are imported
 
-MEMORY, INPUTS = "s", "in"  # where an input of the graph is, the first word of its `attr`
+MEMORY, INPUTS, NUMBERS = "s", "in", "p"  # where an input of the graph is, the first word of its `attr`
 
 
 class Lowered:
-    """A device whose memory and inputs are numbers with names. By name: `inputs` and `state`, as they come in; `begun`,
-    the memory before the first sample; `after`, what a sample makes of it; `moving`, what it becomes by itself, `moves`
-    times a sample, with the counter `place`; then the `command`. What a command depends on, now or later, is `kept` of
-    the memory and `read` of the inputs.
+    """A device whose memory, inputs and parameters are numbers with names. By name: `inputs`, `numbers` and `state`, as
+    they come in; `begun`, the memory before the first sample; `after`, what a sample makes of it; `moving`, what it
+    becomes by itself, `moves` times a sample, with the counter `place`; then the `command`, and whether it is `held`.
+    What a command depends on, now or later, is `kept` of the memory, `read` of the inputs and `used` of the parameters.
 
     Raises Unsupported for an operation that has no rule."""
 
     def __init__(self, found: Device):
         """Trace start, step and move."""
         self.device = found
-        graph = Graph()
+        graph = Labelled()
         self.inputs = named(found.input, graph, INPUTS, lambda path: path.removeprefix("measured."))
+        self.numbers = named(found.parts, graph, NUMBERS, lambda path: path.removeprefix("controller."))
         self.state = named(found.state, graph, MEMORY, _flat)
-        given = filled(found.input, self.inputs)
-        started = outputs(graph, found.start, found.input, given)
-        held, both = filled(found.state, self.state), (found.state, found.input)
-        *after, self.command = outputs(graph, lambda both: found.step(*both), both, [*held, *given])
+        self.values = dict(zip(self.numbers, _numbers_of(found.parts), strict=True))
+        given, parts = filled(found.input, self.inputs), filled(found.parts, self.numbers)
+        started = outputs(graph, lambda both: found.start(*both), (found.parts, found.input), [*parts, *given])
+        held = filled(found.state, self.state)
+        shapes = (found.parts, found.state, found.input)
+        *after, self.held = outputs(graph, lambda all: found.step(*all), shapes, [*parts, *held, *given])
         self.place = graph.input(np.int64, Level.UNIFORM, ("", "i"))
         moved: list[Node] = []
         if found.moves:
             place, count = np.full((), self.place, object), jax.ShapeDtypeStruct((), np.int64)
-            moved = outputs(graph, lambda both: found.move(*both), (found.state, count), [*held, place])
+            shapes = (found.parts, found.state, count)
+            moved = outputs(graph, lambda all: found.move(*all), shapes, [*parts, *held, place])
         moving = dict(zip([*self.state][len(after) :], moved, strict=bool(moved)))
         self.after = dict(zip(self.state, after, strict=False)) | moving
+        self.command = self.after["command"]
         self.kept = self._kept()
         self.moving = {name: node for name, node in moving.items() if name in self.kept}
         self.begun = {name: node for name, node in zip(self.state, started, strict=True) if name in self.kept}
         self.stored = {name: self.after[name] for name in self.kept if name in self.after and name not in moving}
-        roots = [self.command, *(self.after[name] for name in self.kept if name in self.after), *self.begun.values()]
+        roots = [self.held, *(self.after[name] for name in self.kept if name in self.after), *self.begun.values()]
         seen = {node.id for node in live(roots)}
         self.read = [name for name, node in self.inputs.items() if node.id in seen]
-        self.memory = {self.state[name].id: name for name in self.kept}
+        self.used = [name for name, node in self.numbers.items() if node.id in seen]
 
     def _kept(self) -> list[str]:
         """What of memory the command depends on, from one sample to the next."""
-        kept: set[str] = set()
-        roots = [self.command]
+        kept = {"command"}
+        roots = [self.command, self.held]
         while True:
             needed = {node.id for node in live(roots)}
             more = {name for name, node in self.state.items() if node.id in needed} - kept
             if not more:
                 break
             kept |= more
-            roots = [self.command, *(self.after[name] for name in kept if name in self.after)]
+            roots = [self.command, self.held, *(self.after[name] for name in kept if name in self.after)]
         return [name for name in self.state if name in kept]
 
 
@@ -89,11 +95,17 @@ def filled(shape: Any, nodes: dict[str, Node]) -> list[Array]:
     return arrays
 
 
-def outputs(graph: Graph, function: Any, shape: Any, inputs: list[Array]) -> list[Node]:
+def outputs(graph: Labelled, function: Any, shape: Any, inputs: list[Array]) -> list[Node]:
     """Return what a function returns, number by number; what it closes over is known."""
     closed = jax.make_jaxpr(function)(shape)
+    graph.labels = {id(eqn): label(eqn) for eqn in closed.jaxpr.eqns}
     constants = [known(graph, np.asarray(x)) for x in closed.consts]
     return [node for array in translate(graph, closed.jaxpr, constants, inputs) for node in array.flat]
+
+
+def _numbers_of(parts: Any) -> list[float]:
+    """The numbers of parts, one by one, in the order of `named`."""
+    return [float(x) for leaf in jax.tree.leaves(parts) for x in np.asarray(leaf, float).flat]
 
 
 def _flat(path: str) -> str:

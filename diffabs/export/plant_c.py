@@ -13,8 +13,9 @@ from diffabs.core.loop import Loop
 from diffabs.core.pytree import parameters, prepared, strong
 from diffabs.export.c_words import Words
 from diffabs.export.device import NotExported
+from diffabs.export.labels import Labelled
 from diffabs.export.lowered import filled, named, outputs
-from diffabs.kernel.graph import Graph, Level, Node, real
+from diffabs.kernel.graph import Level, Node, real
 from diffabs.kernel.primitives import Unsupported
 from diffabs.kernel.program import live
 from diffabs.simulate.rk4 import rk4_step
@@ -77,7 +78,7 @@ class _Written:
     def __init__(self, typed: tuple[Any, Any], variables: Sequence[Variable]):
         self.places = {one.name: k for k, one in enumerate(variables)}
         self.words = Words("double", self._place)
-        graph = Graph()
+        graph = Labelled()
         plant, initial = typed
         given = [
             number

@@ -11,8 +11,9 @@ from collections.abc import Iterator, Sequence
 import jax
 import numpy as np
 
+from diffabs.export.c_words import commented
 from diffabs.export.device import Device, NotExported
-from diffabs.export.lowered import INPUTS, MEMORY, Lowered
+from diffabs.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
 from diffabs.kernel.graph import Node, real
 from diffabs.kernel.primitives import Unsupported
 from diffabs.kernel.program import live
@@ -41,12 +42,13 @@ WORDS = (
     "usint var while with word wstring write xor le ge gt eq ne add sub mul div r s n p l d sd ds sl"
 )
 RESERVED = set(WORDS.split())
-OWN = {"command", "reset", "started", "i"}  # names of the block itself
+OWN = {"command", "held", "reset", "started", "i"}  # names of the block itself
 
 
 def structured_text(found: Device, name: str, notes: Sequence[str] = ()) -> str:
-    """Return a device as a FUNCTION_BLOCK with an input for each measurement and `reset`, and the output `command`; it
-    is to be called once a period, and begins with its first call or where `reset` is true.
+    """Return a device as a FUNCTION_BLOCK with an input for each measurement and `reset`, the parameters as variables,
+    and the outputs `command` and `held`; it is to be called once a period, and begins with its first call or where
+    `reset` is true.
 
     name: an identifier; notes: lines of the comment at its head
     Raises:
@@ -67,26 +69,32 @@ class _Block:
         self.device, self.name, self.notes = found, name, notes
         self.program = program = Lowered(found)
         self.real = "REAL" if found.dtype == np.float32 else "LREAL"
-        taken = set(OWN)
+        self.taken = taken = set(OWN)
         self.names = {(INPUTS, path): _fresh(path, taken) for path in program.read}
-        self.names |= {(MEMORY, path): _fresh(f"m_{path}", taken) for path in program.kept}
+        self.names |= {(NUMBERS, path): _fresh(path, taken) for path in program.used}
+        self.names |= {(MEMORY, path): _fresh(f"m_{path}", taken) for path in program.kept if path != "command"}
+        self.names[MEMORY, "command"] = "command"
         self.temporary: dict[str, str] = {}  # its type, by name
-        self.letter = "v"
+        self.called: dict[int, str] = {}  # variables of numbers
 
     def parts(self) -> Iterator[str]:
         """The lines of the text."""
-        program = self.program
+        program, units = self.program, self.device.units
         body = list(self._body())  # makes the temporaries
         yield from self._head()
         yield f"FUNCTION_BLOCK {self.name}"
         yield "VAR_INPUT"
         for path in program.read:
-            yield f"  {self.names[INPUTS, path]} : {self.real}; (* [{self.device.units.get(path, '1')}] *)"
+            yield f"  {self.names[INPUTS, path]} : {self.real}; (* [{commented(units.get(path, '1'))}] *)"
         yield "  reset : BOOL; (* begin anew, with what is measured now *)\nEND_VAR"
-        yield f"VAR_OUTPUT\n  command : {self.real}; (* [{self.device.control_unit}] *)\nEND_VAR"
+        yield f"VAR_OUTPUT\n  command : {self.real}; (* [{commented(self.device.control_unit)}] *)"
+        yield "  held : BOOL; (* whether the last sample could not be used: memory and command stay *)\nEND_VAR"
+        if program.used:
+            yield from ["VAR (* parameters *)", *self._parameters(), "END_VAR"]
         yield "VAR"
         for path in program.kept:
-            yield f"  {self.names[MEMORY, path]} : {self._type(program.state[path])};"
+            if path != "command":
+                yield f"  {self.names[MEMORY, path]} : {self._type(program.state[path])};"
         yield "  started : BOOL := FALSE;\nEND_VAR"
         if self.temporary:
             yield from ["VAR_TEMP", *self._declared(), "END_VAR"]
@@ -94,15 +102,22 @@ class _Block:
         yield from body
         yield "END_FUNCTION_BLOCK"
 
+    def _parameters(self) -> Iterator[str]:
+        specs = {name: spec for number in self.device.numbers for name, spec in number.named()}
+        for path in self.program.used:
+            value = self._real(self.program.values[path]).strip("()")
+            yield f"  {self.names[NUMBERS, path]} : {self.real} := {value}; (* {commented(specs[path])} *)"
+
     def _head(self) -> Iterator[str]:
         delay = f", its command to be output {self.device.delay:g} s after that" if self.device.delay else ""
         lines = [
             f"{self.name}: the controller, to be called every {self.device.period:g} s{delay}.",
             *self.notes,
             *map(str, self.device.numbers),
+            "A sample with a NaN, or that leads to one, is not used: memory and command stay, and held is TRUE.",
             "Nothing is global: two instances are two controllers.",
         ]
-        text = "\n   ".join(line.replace("*)", "* )").replace("(*", "( *") for line in lines)
+        text = "\n   ".join(map(commented, lines))
         yield f"(* {text} *)"
 
     def _declared(self) -> Iterator[str]:
@@ -119,40 +134,30 @@ class _Block:
     def _body(self) -> Iterator[str]:
         program = self.program
         yield "IF reset OR NOT started THEN"
-        self.letter = "b"
         yield from self._assigned(program.begun, (), "  ")
         yield "  started := TRUE;\nEND_IF;"
-        self.letter = "v"
-        yield from self._assigned(program.stored, [program.command], "")
+        yield from self._assigned(program.stored, [program.held], "")
 
     def _assigned(self, stored: dict[str, Node], more: Sequence[Node], indent: str) -> Iterator[str]:
         """The operations that these need, the command, and the memory's new values."""
         yield from self._operations(live([*stored.values(), *more]), indent)
         for node in more:
-            yield f"{indent}command := {self._value(node)};"
-        changed = {name: node for name, node in stored.items() if node is not self.program.state[name]}
-        values = {}
-        for name, node in changed.items():  # what is stored may be what was read before
-            values[name] = self._value(node)
-            if node.op == "input":
-                values[name] = self._new(node, f"o{node.id}")
-                yield f"{indent}{values[name]} := {self._value(node)};"
+            yield f"{indent}held := {self._value(node)};"
         if more and self.program.moving:
             yield from self._moves(indent)
-        for name, value in values.items():
-            yield f"{indent}{self.names[MEMORY, name]} := {value};"
+        for name, node in stored.items():
+            if node is not self.program.state[name]:
+                yield f"{indent}{self.names[MEMORY, name]} := {self._value(node)};"
 
     def _moves(self, indent: str) -> Iterator[str]:
         """What moves by itself until the next sample, by as many steps as the simulation takes."""
         moving = self.program.moving
-        self.temporary["i"] = "LINT"
+        self.temporary["i"] = "INT"
         yield f"{indent}FOR i := 0 TO {self.device.moves - 1} DO"
-        self.letter = "w"
         yield from self._operations(live(list(moving.values())), indent + "  ")
         for name, node in moving.items():
             if node is not self.program.state[name]:
                 yield f"{indent}  {self.names[MEMORY, name]} := {self._value(node)};"
-        self.letter = "v"
         yield f"{indent}END_FOR;"
 
     def _operations(self, nodes: Sequence[Node], indent: str) -> Iterator[str]:
@@ -160,18 +165,24 @@ class _Block:
             if node.op in ("const", "input"):
                 continue
             if node.op == "table":
-                table = f"t{self.letter}{node.id}"
+                table = f"{self._variable(node)}_table"
                 self.temporary[table] = f"ARRAY[0..{len(node.args) - 2}] OF {self._type(node)}"
                 for k, entry in enumerate(node.args[1:]):
                     yield f"{indent}{table}[{k}] := {self._value(entry)};"
             expression = self._expression(node)
             yield f"{indent}{self._new(node)} := {expression};"
 
-    def _new(self, node: Node, name: str = "") -> str:
+    def _new(self, node: Node) -> str:
         """A variable for a number, declared."""
-        name = name or f"{self.letter}{node.id}"
+        name = self._variable(node)
         self.temporary[name] = self._type(node)
         return name
+
+    def _variable(self, node: Node) -> str:
+        """The name of a number."""
+        if node.id not in self.called:
+            self.called[node.id] = _fresh(node.label or node.op, self.taken)
+        return self.called[node.id]
 
     def _type(self, node: Node) -> str:
         if real(node.dtype):
@@ -182,15 +193,18 @@ class _Block:
         if node.op == "const":
             return self._literal(node.attr, node)
         if node.op != "input":
-            return f"{self.letter}{node.id}"
+            return self._variable(node)
         where, path = node.attr
-        return self.names[where, path] if where else path
+        return self.names[where, path] if where else "INT_TO_LINT(i)"
 
     def _literal(self, x: float, node: Node) -> str:
         if node.dtype.kind == "b":
             return "TRUE" if x else "FALSE"
         if not real(node.dtype):
             return f"{self._type(node)}#{int(x)}"
+        return self._real(x)
+
+    def _real(self, x: float) -> str:
         if np.isnan(x):
             raise Unsupported("nan", "there is no such number in it")
         limit = np.finfo(self.device.dtype).max
@@ -222,7 +236,7 @@ class _Block:
         if op == "rem" and not real(node.dtype):
             return f"{args[0]} MOD {args[1]}"
         if op == "table":
-            return f"t{self.letter}{node.id}[{args[0]}]"
+            return f"{self._variable(node)}_table[{args[0]}]"
         if op == "is_finite":
             return f"ABS({args[0]}) <= {_scientific(np.finfo(self.device.dtype).max)}"
         if op == "convert":
@@ -265,10 +279,10 @@ def _scientific(x: float) -> str:
 
 def _fresh(path: str, taken: set[str]) -> str:
     """A name that the language has, that no other is, whatever the case; which is then taken."""
-    name = re.sub(r"[\W_]+", "_", path).strip("_")
-    name = f"in_{name}" if name.lower() in RESERVED or not name[:1].isalpha() else name
+    name = re.sub(r"[\W_]+", "_", path, flags=re.ASCII).strip("_")
+    name = f"x_{name}" if name.lower() in RESERVED or not name[:1].isalpha() else name
     number, fresh = 2, name
-    while fresh.lower() in taken or re.fullmatch(r"[bvwo]\d+|t[bvw]\d+", fresh.lower()):
+    while fresh.lower() in taken:
         number, fresh = number + 1, f"{name}_{number}"
-    taken.add(fresh.lower())
+    taken |= {fresh.lower(), f"{fresh}_table".lower()}
     return fresh

@@ -23,11 +23,12 @@ class Level(enum.IntEnum):
 class Node:
     """A number: an operation on others. `attr` is what is particular to it: a constant's value, an input's place."""
 
-    __slots__ = ("args", "attr", "dtype", "id", "level", "op")
+    __slots__ = ("args", "attr", "dtype", "id", "label", "level", "op")
 
     def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: Any, level: Level):
         """Made by a `Graph` alone."""
         self.id, self.op, self.args, self.dtype, self.attr, self.level = id, op, args, dtype, attr, level
+        self.label = ""  # what the source calls it, of a graph that asks
 
     def is_number(self, value: float) -> bool:
         """Whether it is known to be this number."""
@@ -49,6 +50,9 @@ class Graph:
         self.nodes: list[Node] = []
         self._known: dict[Any, Node] = {}
         self._gates = 0
+
+    def begins(self, eqn: Any) -> None:
+        """Be told that the nodes that follow are of this operation of JAX."""
 
     def _make(self, op: str, args: tuple[Node, ...], dtype: Any, attr: Any = None, level: Level | None = None) -> Node:
         dtype = np.dtype(dtype)

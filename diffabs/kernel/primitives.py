@@ -59,6 +59,7 @@ def translate(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Sequ
         return known(graph, atom.val, _dtype(atom)) if isinstance(atom, jex.Literal) else at[atom]
 
     for eqn in jaxpr.eqns:
+        graph.begins(eqn)
         at.update(zip(eqn.outvars, _applied(graph, eqn, [read(atom) for atom in eqn.invars]), strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
