@@ -8,10 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
+from diffabs.core.first_order import first_order
 
-def pushed(function: Callable[..., Any], primals: Any, tangents: Any) -> tuple[Any, Any]:
+
+def pushed(function: Callable[..., Any], primals: Any, tangents: Any, once: str = "") -> tuple[Any, Any]:
     """Return function(*primals) and its derivative along tangents, of a rule with `symbolic_zeros`. Only what has a
-    tangent is differentiated: zeros worked out would cost as much as any other."""
+    tangent is differentiated: zeros worked out would cost as much as any other.
+
+    once: why a function has no second derivatives; whoever asks for them gets a ValueError with this line"""
     values, tree = jax.tree.flatten(primals)
     moves = tree.flatten_up_to(tangents)
     live = [type(move) is not SymbolicZero for move in moves]
@@ -21,7 +25,10 @@ def pushed(function: Callable[..., Any], primals: Any, tangents: Any) -> tuple[A
         return function(*tree.unflatten([next(left) if on else x for x, on in zip(values, live, strict=True)]))
 
     moving, rates = ([x for x, on in zip(xs, live, strict=True) if on] for xs in (values, moves))
-    return jax.jvp(run, (moving,), (rates,))
+    if not once:
+        return jax.jvp(run, (moving,), (rates,))
+    found, rate = jax.jvp(run, (moving,), (first_order(rates, once),))
+    return found, first_order(rate, once)
 
 
 def separated(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[Any], Any]]:

@@ -57,5 +57,6 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     low, high = jax.lax.fori_loop(0, BISECTIONS, halve, bracket)
     s0 = jax.lax.stop_gradient(0.5 * (low + high))
     curvature = jax.lax.stop_gradient(jax.jvp(slope, (s0,), (jnp.ones_like(s0),))[1])
-    best = jnp.where(inside, clamp(s0 - ratio(slope(s0), curvature), 0.0, 1.0), 1.0)
+    near = s0 - ratio(slope(s0), curvature)
+    best = jnp.where(inside, clamp(near - ratio(slope(near), curvature), 0.0, 1.0), 1.0)  # each doubles the order
     return Peak(best, mu(best))

@@ -247,8 +247,9 @@ def _look(carry: Carry, here: Arrival) -> tuple[Search, Any, Any]:
     tells = earliest(carry.search.which, 0, *_margins(carry, here))
     search, length, enough = seek(carry.search, carry.length, new, tells, base)
     seeking = search, length, jnp.where(enough, Condition.PROBING, Condition.SEEKING)
-    end, again = aimed(carry.search, carry.length, land(carry.search, carry.length, tells, 0.0 * base))
-    landing = carry.search, end, jnp.where(again, Condition.SEEKING, Condition.LANDING)
+    found, end = land(carry.search, carry.length, tells, 0.0 * base)
+    end, again = aimed(found, carry.length, end)
+    landing = found, end, jnp.where(again, Condition.SEEKING, Condition.LANDING)
     search, length, condition = select(carry.condition == Condition.PROBING, landing, seeking)
     return search, length, condition.astype(carry.condition.dtype)
 

@@ -12,10 +12,10 @@ MISSED = 0.1  # of the change of the stop's margin in the step: the most that ma
 
 
 class Condition(enum.IntEnum):
-    """A run goes on, or looks for an event, or for how its margin falls, or is to land on it, or to look around after
-    it; or it is over."""
+    """A run goes on; or looks for an event, for how its margin falls, or for second derivatives of its moment; or is to
+    land on it, or to look around after it; or it is over."""
 
-    RUNNING, SEEKING, PROBING, LANDING, REFRESHING, STOPPED, TIMED_OUT, DIVERGED = range(8)
+    RUNNING, SEEKING, PROBING, REFINING, LANDING, REFRESHING, STOPPED, TIMED_OUT, DIVERGED = range(9)
 
 
 def goes_on(carry: Any) -> Any:

@@ -4,6 +4,8 @@ seek    tries shrink a bracket, by secant, Newton's step on a parabola, or halvi
 probe   one more, on the same side: how the margin falls there
 land    place - margin(place)/fall: the last try's length. Its derivative is that of the event's moment, by the
         implicit function theorem: the margin at the end of a try carries it
+refine  for derivatives: one more try of this length. A Newton step from it is right to the second derivative, as the
+        one before was to the first: each doubles the order (A. Griewank, A. Walther, Evaluating Derivatives, 15.3)
 
 Margins are those of comparisons, then those of the stop and of the blocks' events; of the first only the end of a try
 tells them."""
@@ -28,7 +30,8 @@ PART = 0.5  # of the fall: the most by which it may change where the margin is s
 class Search(NamedTuple):
     """Where an event is looked for: the number of its margin; the length that was tried first [s]; the bracket; the
     margin at these (infinite where nobody knows it); how many times it was tried. Near the zero: the length, the
-    margin there, whether there is a zero, and whether that is where the step begins."""
+    margin there, whether there is a zero, and whether that is where the step begins. Where the step ends that lands:
+    how the margin falls [1/s], 0 where its moment has no derivative."""
 
     which: Any
     full: Any
@@ -42,6 +45,7 @@ class Search(NamedTuple):
     margin: Any
     found: Any
     at_once: Any
+    fall: Any
 
 
 class Crossed(NamedTuple):
@@ -65,7 +69,7 @@ class Crossings(NamedTuple):
 def init_search(h: Any) -> Search:
     """Return a search for nothing."""
     none, zero = 0.0 * h, jnp.asarray(0)
-    return Search(zero, h, none, none, none, h, none, zero, h, none, *2 * (jnp.asarray(False),))
+    return Search(zero, h, none, none, none, h, none, zero, h, none, *2 * (jnp.asarray(False),), none)
 
 
 def falls_through(before: list[Any], after: list[Any]) -> list[Any]:
@@ -118,10 +122,11 @@ def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Se
     return search, jnp.where(earlier, before, jnp.where(enough, x + apart, guess)), enough & ~earlier
 
 
-def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> Any:
-    """Return the length that ends on the zero, or so much `beyond` that its margin has changed its sign for certain,
-    after the probe of length x. The fall is that of the parabola through the place, the probe, and an end of the first
-    try: that on the same side, or where that says nothing the other, if the margin is smooth up to there."""
+def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> tuple[Search, Any]:
+    """Return the search, which then knows the fall, and the length that ends on the zero, after the probe of length x;
+    or so much `beyond` that the margin has changed its sign for certain. The fall is that of the parabola through the
+    place, the probe, and an end of the first try: that on the same side, or where that says nothing the other, if the
+    margin is smooth up to there."""
     x = jax.lax.stop_gradient(x)
     g, start = jax.lax.stop_gradient(tells.sought[1:])
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
@@ -142,8 +147,19 @@ def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> Any:
     slope += jnp.where(jnp.abs(more) <= SMOOTH * jnp.abs(slope), more, 0.0)
     far = jnp.abs(length - place) > jnp.abs(x - place)
     length = jnp.where(far, jnp.maximum(jnp.minimum(length, search.far), search.near), length)
+    known = search.found & (slope < 0) & ~far
     moved = length + jnp.where(far, 0.0, _moves(search, x, tells.sought.end, length, slope))
-    return jnp.where(search.at_once, _at_once(search, at_place, start, moved), moved) + beyond
+    steep = _falls_at_once(search, at_place, start)
+    known &= ~search.at_once | steep
+    at_once = jnp.where(steep, moved - jax.lax.stop_gradient(jnp.minimum(moved, 0.0)), 0.0)
+    return search._replace(fall=jnp.where(known, slope, 0.0)), jnp.where(search.at_once, at_once, moved) + beyond
+
+
+def refine(search: Search, x: Any, tells: Crossings) -> Any:
+    """Return the same length x, with the second derivatives of the event's moment as well: by a Newton step from the
+    margin at the end of a try of length x."""
+    left = jnp.where((search.fall < 0) & jnp.isfinite(tells.sought.end), tells.sought.end, 0.0)
+    return x - (left - jax.lax.stop_gradient(left)) / jnp.where(search.fall < 0, search.fall, -1.0)
 
 
 def aimed(search: Search, x: Any, length: Any) -> tuple[Any, Any]:
@@ -172,14 +188,13 @@ def _tells(end: tuple[Any, Any], place: Any, probe: Any) -> Any:
     return (jnp.abs(length - place) > 4 * jnp.abs(place - probe)) & jnp.isfinite(margin)
 
 
-def _at_once(search: Search, fall: Any, start: Any, length: Any) -> Any:
-    """The length of a step at whose beginning the event happens. It has a derivative if the margin falls there as
-    steeply as it does on the whole; not if it jumps, or has its maximum there."""
+def _falls_at_once(search: Search, fall: Any, start: Any) -> Any:
+    """Whether a margin falls at the beginning of a step as steeply as it does on the whole. Then the moment of an event
+    there has a derivative; not if the margin jumps, or has its maximum there."""
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
     smooth = jnp.where(jnp.isfinite(start), jnp.abs(margin - fall * place - start) <= -PART * fall * place, True)
     mean = jnp.where(jnp.isfinite(search.at_full), search.at_full / search.full, 0.0)
-    steep = (fall < 0) & (fall <= GRAZES * jax.lax.stop_gradient(mean))
-    return jnp.where(smooth & steep, length - jax.lax.stop_gradient(jnp.minimum(length, 0.0)), 0.0)
+    return smooth & (fall < 0) & (fall <= GRAZES * jax.lax.stop_gradient(mean))
 
 
 def _narrowed(old: Search, x: Any, first: Any, sought: Crossed) -> tuple[Search, Any]:

@@ -26,15 +26,16 @@ PART = 0.25  # of the error that a step may have, where a derivative is asked fo
 ROUND = 16  # tries between two looks at what is stable
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["kinks"])
+@partial(jax.tree_util.register_dataclass, data_fields=["h", "steps"], meta_fields=["kinks", "refines"])
 @dataclasses.dataclass(frozen=True)
 class OnGrid:
-    """The steps of a `FixedStep`: their length [s], how many there are, and whether comparisons are located; None for
-    derivatives, and where a rate jumps."""
+    """The steps of a `FixedStep`: their length [s], how many there are, whether comparisons are located (None for
+    derivatives, and where a rate jumps), and whether the moments of events have second derivatives."""
 
     h: Any
     steps: Any
     kinks: bool | None = None
+    refines: bool = False
 
     def start(self, loop: Loop, objectives: Objectives, key: Any) -> stepper.Carry:
         """Return the carry at t = 0."""
@@ -44,7 +45,8 @@ class OnGrid:
         self, loop: Loop, objectives: Objectives, key: Any, carry: stepper.Carry, until: Any = None
     ) -> stepper.Carry:
         """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
-        return stepper.step(loop, objectives, self.h, key, self.steps, carry, until, kinks=self._locates(loop))
+        how = {"kinks": self._locates(loop), "refines": self.refines}
+        return stepper.step(loop, objectives, self.h, key, self.steps, carry, until, **how)
 
     def renew(self, loop: Loop, carry: stepper.Carry) -> stepper.Carry:
         """Return the carry: nothing has to be looked at but in the steps."""
@@ -66,7 +68,7 @@ class OnGrid:
 
     def located(self) -> "OnGrid":
         """Return the method for derivatives."""
-        return dataclasses.replace(self, kinks=self.kinks is not False)
+        return dataclasses.replace(self, kinks=self.kinks is not False, refines=True)
 
     def room(self, loop: Loop, steps: int) -> int:
         """Return how many tries so many steps may take."""

@@ -132,7 +132,17 @@ def _simulated(places: Places, run: Any) -> Run:
 
 
 def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
-    return pushed(lambda run: _reversible(*run, places=places), primals, tangents)
+    loop, _, method, _ = primals[0]
+    return pushed(lambda run: _reversible(*run, places=places), primals, tangents, once=_only_once(loop, method))
+
+
+def _only_once(loop: Loop, method: Any) -> str:
+    """Why a run has no second derivatives; nothing where it has."""
+    if isinstance(method, AtPace):
+        return "runs with adaptive steps have no second derivatives; d.FixedStep has"
+    if loop.recorders:
+        return "runs with a pure delay have no second derivatives; controllers.Sampled(delay=) and actuators.Lag have"
+    return ""
 
 
 _simulated.defjvp(_rule, symbolic_zeros=True)

@@ -6,6 +6,9 @@ sides of the event, and nothing is corrected afterwards. The next step goes on t
 
     RUNNING  --a margin falls through zero-->  SEEKING  -->  PROBING  -->  LANDING  -->  RUNNING, or STOPPED
 
+For derivatives REFINING lies between PROBING and LANDING: a try of the same length, from which the length has the
+second derivatives of the event's moment.
+
 Where a block has changed in an event, and no clock is looked at after each step anyway, the rates are worked out by a
 step of no length, REFRESHING.
 
@@ -37,6 +40,7 @@ from diffabs.simulate.landing import (
     falls_through,
     init_search,
     land,
+    refine,
     seek,
     select,
 )
@@ -74,8 +78,10 @@ class Verdict(NamedTuple):
 
 
 def room(loop: Loop, steps: int, *, kinks: bool = False) -> int:
-    """Return how many tries a run of so many steps of the grid may take: what a scan must have room for."""
-    return (1 + (KINKS if kinks else 0) + (EXTRA if loop.eventful else 0)) * steps + 2 * SPARE
+    """Return how many tries a run of so many steps of the grid may take: what a scan must have room for. Of three tries
+    about an event, at least, one is made twice: REFINING."""
+    about = ((KINKS if kinks else 0) + (EXTRA if loop.eventful else 0)) * steps + SPARE
+    return steps + SPARE + about + about // 3
 
 
 def init_carry(loop: Loop, objectives: Objectives, h: Any, key: Any, *, kinks: bool = False) -> Carry:
@@ -96,10 +102,12 @@ def step(
     until: Any = None,
     *,
     kinks: bool = False,
+    refines: bool = False,
 ) -> Carry:
     """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`.
 
-    kinks: whether comparisons are located, as derivatives need it"""
+    kinks: whether comparisons are located, as derivatives need it
+    refines: whether the moment of an event has second derivatives; its value is the same"""
     active = carry.running if until is None else carry.running & (carry.k < until)
     logs = tables(carry.point.state)
     carry = carry._replace(point=carry.point._replace(state=lend(carry.point.state, None)))
@@ -120,13 +128,14 @@ def step(
     trying, plan = active & ~verdict.taken, (carry.search, carry.length, carry.blunt, carry.condition)
 
     def looked() -> Any:
-        return select(trying, _look(carry, here, verdict.fine, count, h), plan)
+        return select(trying, _look(carry, here, verdict.fine, count, h, refines), plan)
 
     search, *tried = jax.lax.cond(anyone(trying), looked, lambda: plan)
     length, blunt, condition = select(
         verdict.taken, _ahead(loop, carry, here, verdict, h, (k + 1) * h - end), tuple(tried)
     )
-    extra = carry.extra + jnp.where(active & ~verdict.on_grid, 1, 0)
+    counts = active & ~verdict.on_grid & (carry.condition != Condition.REFINING)
+    extra = carry.extra + jnp.where(counts, 1, 0)
     since = jnp.where(verdict.on_grid, 0, carry.here + extra - carry.extra)
     lost = active & ((~verdict.fine & (carry.blunt if count else True)) | (extra > (EXTRA + KINKS) * steps + SPARE))
     condition = jnp.where(lost, Condition.DIVERGED, condition).astype(carry.condition.dtype)
@@ -170,14 +179,17 @@ def _plausible(carry: Carry, here: Arrival) -> Any:
     return jnp.all(jnp.array(sane))
 
 
-def _look(carry: Carry, here: Arrival, fine: Any, kinks: int, h: Any) -> tuple[Search, Any, Any, Any]:
+def _look(carry: Carry, here: Arrival, fine: Any, kinks: int, h: Any, refines: bool) -> tuple[Search, Any, Any, Any]:
     """What a try that is not taken tells: the search, the next length, and how that is tried."""
     tells, new = _crossings(carry, here, kinks), carry.condition == Condition.RUNNING
     search, length, enough = seek(carry.search, carry.length, new, tells, h)
     seeking = search, length, jnp.where(enough, Condition.PROBING, Condition.SEEKING)
     beyond = jnp.where(carry.search.which < kinks, h * jnp.finfo(h.dtype).eps ** BEYOND, 0.0)
-    landing = _landing(carry, land(carry.search, carry.length, tells, beyond))
+    landing = _landing(carry, *land(carry.search, carry.length, tells, beyond), refines)
     search, length, condition = select(carry.condition == Condition.PROBING, landing, seeking)
+    if refines:
+        refined = carry.search, refine(carry.search, carry.length, tells), condition * 0 + Condition.LANDING
+        search, length, condition = select(carry.condition == Condition.REFINING, refined, (search, length, condition))
     tired = (search.tries >= TRIES) | (carry.here >= MOST) | (carry.extra > KINKS * carry.k + SPARE)
     blunt = carry.blunt | ~fine | (tired & (search.which < kinks))
     begins = blunt & ~carry.blunt
@@ -186,10 +198,10 @@ def _look(carry: Carry, here: Arrival, fine: Any, kinks: int, h: Any) -> tuple[S
     return search, length, blunt, condition.astype(carry.condition.dtype)
 
 
-def _landing(carry: Carry, length: Any) -> tuple[Search, Any, Any]:
+def _landing(carry: Carry, search: Search, length: Any, refines: bool) -> tuple[Search, Any, Any]:
     """A step of this length, or a search that goes on: the condition last."""
-    length, again = aimed(carry.search, carry.length, length)
-    return carry.search, length, jnp.where(again, Condition.SEEKING, Condition.LANDING)
+    length, again = aimed(search, carry.length, length)
+    return search, length, jnp.where(again, Condition.SEEKING, Condition.REFINING if refines else Condition.LANDING)
 
 
 def _crossings(carry: Carry, here: Arrival, kinks: int) -> Crossings:
