@@ -233,16 +233,12 @@ def test_a_scenario_never_imports_code():
 @pytest.mark.parametrize(
     ("module", "text", "line"),
     [
-        ("broken", "1 / 0", "--parts broken: cannot be imported: ZeroDivisionError: division by zero"),
+        ("broken", "1 / 0", "broken.py, line 1: ZeroDivisionError: division by zero"),
         ("lacking", "import nowhere_to_be_found", "--parts lacking: there is no module nowhere_to_be_found"),
         ("absent", None, "--parts absent: there is no module absent, on the Python path or in the working directory"),
         ("os; import sys", None, "--parts os; import sys is no name of a Python module"),
         ("empty", "from diffabs.controllers import PID", "--parts empty: there is no part in this module"),
-        (
-            "leaving",
-            "import sys; sys.exit()",
-            "--parts leaving: cannot be imported: it ends the program by SystemExit(None)",
-        ),
+        ("leaving", "import sys\nsys.exit(3)", "leaving.py, line 2: SystemExit: 3"),
         (
             "clashing",
             f"from dc_servo import DCMotor\n{OF_PARTS}@pytree\nclass QuarterCar(DCMotor): ...",
@@ -280,25 +276,36 @@ class Talking(RationalCurve):
 
 
 @pytest.mark.parametrize(
-    ("statement", "said"),
-    [("raise KeyError('mu')", "line 12: KeyError: 'mu'"), ("sys.exit()", "line 12: SystemExit")],
+    ("file", "statement", "said"),
+    [
+        ("raising.py", "raise KeyError('mu')", "KeyError: 'mu'"),
+        ("exiting.py", "sys.exit()", "SystemExit"),
+        ("packaged/road.py", "raise KeyError('mu')", "KeyError: 'mu'"),
+    ],
 )
-def test_a_part_that_raises_or_exits_is_one_line(tmp_path, monkeypatch, statement, said):
+def test_a_part_that_raises_or_exits_is_one_line(tmp_path, monkeypatch, file, statement, said):
+    """Also one whose package only hands it on."""
     monkeypatch.chdir(tmp_path)
-    module = "raising" if "raise" in statement else "exiting"
-    (tmp_path / f"{module}.py").write_text(METHOD % statement)
+    module = file.removesuffix("/road.py").removesuffix(".py")
+    if module == "packaged":
+        pathlib.Path(module).mkdir()
+        pathlib.Path(module, "__init__.py").write_text("from packaged.road import Talking")
+    pathlib.Path(file).write_text(METHOD % statement)
     words = ("--set", "road=talking", "--parts", module, "--json")
-    assert f"{module}.py, {said}" in (result := run("simulate", "slip-lmi", *words, status=2)).stderr
+    result = run("simulate", "slip-lmi", *words, status=2)
+    assert f"{file}, line 12: {said}" in result.stderr
     assert result.stdout == ""
     assert "Traceback" not in result.stderr
 
 
-def test_a_part_that_prints_does_not_spoil_the_document(tmp_path, monkeypatch):
+@pytest.mark.parametrize("command", ["simulate", "design"])
+def test_a_part_that_prints_does_not_spoil_the_document(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "printing.py").write_text(METHOD % "pass")
-    words = ("--set", "road=talking", "--set", "solver.duration=0.01", "--parts", "printing", "--json")
-    result = run("simulate", "slip-lmi", *words)
-    assert json.loads(result.stdout)["parts"]
+    module = f"printing_{command}"
+    (tmp_path / f"{module}.py").write_text(METHOD % "pass")
+    words = ("--set", "road=talking", "--set", "solver.duration=0.01", "--parts", module, "--json")
+    result = run(command, "slip-lmi", *words)
+    assert json.loads(result.stdout)["scenario"] == "slip-lmi"
     assert "imported" in result.stderr
     assert "called" in result.stderr
 

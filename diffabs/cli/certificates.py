@@ -49,6 +49,7 @@ class Task(NamedTuple):
     reduced: "Reduced"
     gain: np.ndarray
     model: Any  # of which the gain is one gain, and whose parameters the box is about
+    states: tuple[str, ...]  # of the model
     over: Box
     polytope: "Polytope"
     spec: "Spec"
@@ -76,7 +77,7 @@ def task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) ->
     solver.solvers()  # says what is missing before anything is computed
     reduced, model, over = _followed(chosen.loop, reduced, wanted.box(chosen.loop))
     systems = gridded(model, over) if isinstance(model, BalanceModel) else polytope(model, over)
-    return Task(chosen, reduced, values, model, over, systems, spec)
+    return Task(chosen, reduced, values, model, tuple(model.states), over, systems, spec)
 
 
 def _followed(loop: Loop, reduced: "Reduced", box: Box) -> tuple["Reduced", Any, Box]:
@@ -182,7 +183,7 @@ def document(
     return {
         **console.about(task.chosen),
         "gain": np.ravel(proof.gain).tolist() if proof else None,  # one input: the row is the gain
-        "states": list(task.model.states),
+        "states": list(task.states),
         **{name: summary.get(name) for name in FROM_PROOF},
         **dict.fromkeys(FROM_DESIGN),
         **numbers,

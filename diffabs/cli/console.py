@@ -153,9 +153,9 @@ def guarded() -> Iterator[None]:
         say("interrupted")
         raise typer.Exit(INTERRUPTED) from None
     except (Exception, SystemExit) as error:
-        if not (where := outside.line_of(error)):
+        if not (line := outside.described(error)):
             raise
-        fail(f"{where}: {type(error).__name__}: {' '.join(str(error).split())}")
+        fail(line)
 
 
 class Ending:

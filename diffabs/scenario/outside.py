@@ -57,12 +57,18 @@ def exports(module: ModuleType) -> Iterator[tuple[str, Any]]:
             yield name, item
 
 
-def line_of(error: BaseException) -> str:
-    """Return the file and line of a module with parts from outside in which an error was raised, or through which it
-    came last; nothing for an error that came through none."""
-    files = {getattr(module, "__file__", None) for module in modules()}
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename in files]
-    return f"{frames[-1].filename}, line {frames[-1].lineno}" if frames else ""
+def described(error: BaseException, names: Iterable[str] | None = None) -> str:
+    """Return one line about an error that came through code from outside: its file, line, type and message; nothing for
+    another error. That code is the packages that these modules belong to, or all modules with parts."""
+    known = names or [module.__name__ for module in modules()]
+    outer = {name.partition(".")[0] for name in known} - {"diffabs"}
+    frames = [
+        f"{frame.f_code.co_filename}, line {line}"
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if frame.f_globals.get("__name__", "").partition(".")[0] in outer
+    ]
+    said = [type(error).__name__, " ".join(str(error).split())]
+    return ": ".join([frames[-1], *filter(None, said)]) if frames else ""
 
 
 def _imported(name: str, whose: str) -> ModuleType:
@@ -72,7 +78,6 @@ def _imported(name: str, whose: str) -> ModuleType:
     except ModuleNotFoundError as error:
         where = "" if error.name != name.partition(".")[0] else ", on the Python path or in the working directory"
         raise ValueError(f"{whose}: there is no module {error.name}{where}") from None
-    except SystemExit as error:
-        raise ValueError(f"{whose}: cannot be imported: it ends the program by SystemExit({error.code!r})") from None
-    except Exception as error:
-        raise ValueError(f"{whose}: cannot be imported: {type(error).__name__}: {error}") from None
+    except (Exception, SystemExit) as error:
+        line = described(error, [name]) or f"{type(error).__name__}: {error}"
+        raise ValueError(f"{whose}: cannot be imported: {line}") from None
