@@ -229,7 +229,8 @@ FACE += [
      f"{FMU}::test_a_state_can_be_kept_and_taken_again"),
     ("fmu: indices from 0", MOCKUP, "enumerate(variables, 1)", "enumerate(variables)",
      f"{FMU}::test_the_description_says_what_is_what"),
-    ("fmu: units are forgotten", MOCKUP, '{"unit": one.unit}', "{}", f"{FMU}::test_the_description_says_what_is_what"),
+    ("fmu: units are forgotten", MOCKUP, '{"unit": printable(one.unit)}', "{}",
+     f"{FMU}::test_the_description_says_what_is_what"),
     ("fmu: the archive has the hour", MOCKUP, "zipfile.ZipInfo(path, LONG_AGO)", "path",
      f"{FMU}::test_the_description_says_what_is_what"),
 ]  # fmt: skip

@@ -218,6 +218,41 @@ def test_parameters_can_be_changed_and_a_lost_sample_is_told_in_structured_text(
     assert "kp : LREAL := 60.0; (* [N m] in [0, inf) *)" in text
 
 
+HOSTILE = [
+    "a *\\\n/ int x = 1/0; /* b",
+    "a *??/\n/ int x = 1/0; /* b",
+    "a */ #error b",
+    "a /* b",
+    "a (* b *) x := 1; (* {pragma} $N",
+    "// ??/ \\",
+    "\u202e\x1b[2J \0 \u65e5\u672c \r\n #include",
+]
+
+
+@needs_cc
+@pytest.mark.parametrize("text", HOSTILE)
+def test_a_comment_ends_where_it_should(text, tmp_path):
+    """Whatever stands in a title, in the unit of a part from outside, or in that of its control."""
+
+    @d.core.pytree.pytree
+    class Gain:
+        start, flow = d.core.protocols.no_memory, d.core.protocols.no_flow
+        k: float = d.core.pytree.param(default=3.0, unit=text)
+
+        def output(self, t, memory, signal):
+            return self.k * signal.measured.slip
+
+    found = device(rig(Gain()))
+    found = dataclasses.replace(found, control_unit=text, units={name: text for name in found.units})
+    program = compiled(c_source(found, "unit", [text]), "unit", tmp_path)
+    said = subprocess.run([program], input="0.5\n", capture_output=True, text=True, check=True).stdout
+    assert float(said) == 1.5
+    written = structured_text(found, "Unit", [text])
+    assert Block(written)(slip=0.5) == 1.5
+    assert written.isascii()
+    assert not re.search(r"[{}$]", written)
+
+
 def test_numbers_are_called_as_in_the_source():
     """No number has a name that says nothing."""
     text = c_source(device(LOOPS["PID, filtered derivative"]), "unit")

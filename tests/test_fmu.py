@@ -156,6 +156,21 @@ def test_the_description_says_what_is_what(tmp_path):
     assert again == (tmp_path / "plant.fmu").read_bytes()
 
 
+@pytest.mark.parametrize("about", ["bell \x07, null \0", "\x1b[2J", "<a b='&'> ]]>", "\ud800", "\ufffe"])
+def test_a_description_is_xml_whatever_the_title(about, tmp_path):
+    path = tmp_path / "plant.fmu"
+    path.write_bytes(fmu(PLANTS["mirrored rig"], "plant", step=STEP, about=about))
+    one = Fmu(path, tmp_path / "in")  # reads it
+    assert len(one.description.get("description")) == len(about)
+    assert one.description.get("description").isprintable()
+
+
+@pytest.mark.parametrize("name", ["../../x", "a b", "int", "é", ""])
+def test_a_name_that_c_does_not_have_is_refused(name):
+    with pytest.raises(NotExported, match="no name that C has"):
+        fmu(PLANTS["mirrored rig"], name, step=STEP)
+
+
 def test_fmpy_runs_it_to_the_simulation(tmp_path):
     """A library that many use reads the description, validates it, and runs it."""
     fmpy = pytest.importorskip("fmpy")

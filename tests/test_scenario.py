@@ -72,7 +72,7 @@ def test_packaged_scenario_survives_dump_and_load(name, file):
 
 NESTED = """
 title = 'quotes " and \\ and ü'
-description = "two\\nlines, \\u007f"
+description = "two\\nlines, \\u00df"
 [plant]
 mass = 0.1
 [road]
@@ -106,7 +106,7 @@ settling_time = {band = 0.02}
 
 def test_everything_nested_survives_dump_and_load(file):
     first = load(file(NESTED))
-    assert first.description == "two\nlines, \x7f"
+    assert first.description == "two\nlines, \xdf"
     assert_same(first, load(file(dump(first))))
     assert first.loop.plant.road.roads[1].road is roads.ICE
     assert first.loop.controller.controller.antiwindup.tracking_time == 0.3

@@ -113,7 +113,7 @@ def _sampled(chosen: Scenario, period: float) -> Scenario:
 
 def _name(chosen: Scenario, out: pathlib.Path | None) -> str:
     """What functions begin with: the file's name, or the scenario's."""
-    name = re.sub(r"[\W_]+", "_", out.stem if out else chosen.name).strip("_")
+    name = re.sub(r"[\W_]+", "_", out.stem if out else chosen.name, flags=re.ASCII).strip("_")
     return name if name[:1].isalpha() else f"controller_{name}"
 
 

@@ -154,6 +154,27 @@ def text(given: Any, path: str) -> str:
     return given
 
 
+def printed_line(given: Any, path: str) -> str:
+    """Return a text that is one printable line. Raises ScenarioError for anything else."""
+    found = text(given, path)
+    if not found.isprintable():
+        raise ScenarioError(f"{path} = {shown(found)} is outside one line of printable characters")
+    return found
+
+
+def printed_lines(given: Any, path: str) -> str:
+    """Return a text of printable lines. Raises ScenarioError for anything else."""
+    found = text(given, path)
+    if not all(line.isprintable() for line in found.split("\n")):
+        raise ScenarioError(f"{path} = {shown(found)} is outside lines of printable characters")
+    return found
+
+
+def printable(text: str) -> str:
+    """Return a text as one printable line, with another character for each that is not printable."""
+    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+
+
 def switch(given: Any, path: str) -> bool:
     """Return true or false. Raises ScenarioError for anything else."""
     if not isinstance(given, bool):

@@ -1,13 +1,11 @@
 """A device as one file of C99: structs of memory and parameters, a function for the start, one for a sample."""
 
-import keyword
-import re
 from collections.abc import Iterator, Sequence
 
 import jax
 import numpy as np
 
-from diffabs.export.c_words import RESERVED, Words, commented, identifiers
+from diffabs.export.c_words import Words, commented, identifiers, is_name
 from diffabs.export.device import Device, NotExported
 from diffabs.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
 from diffabs.kernel.graph import Node
@@ -24,7 +22,7 @@ def c_source(found: Device, name: str, notes: Sequence[str] = ()) -> str:
     Raises:
         NotExported: an operation that has no translation.
     """
-    if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII) or keyword.iskeyword(name) or name in RESERVED:
+    if not is_name(name):
         raise NotExported(f"{name!r} is no name that C has for a function: letters, digits and _")
     with jax.enable_x64(True):
         try:

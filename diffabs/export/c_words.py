@@ -117,6 +117,11 @@ class Words:
         raise Unsupported(node.op, "there is none")
 
 
+def is_name(name: str) -> bool:
+    """Return whether C has such a name for a function."""
+    return bool(re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII)) and name not in RESERVED
+
+
 def identifier(path: str) -> str:
     """Return a path as a name of C; empty where nothing of it can be in one."""
     name = re.sub(r"\W+", "_", path, flags=re.ASCII).strip("_")

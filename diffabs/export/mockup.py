@@ -18,6 +18,8 @@ from typing import Any
 from xml.etree import ElementTree as xml
 
 from diffabs.core.loop import Loop
+from diffabs.core.values import printable
+from diffabs.export.c_words import is_name
 from diffabs.export.device import NotExported
 from diffabs.export.plant_c import PlantSource, Variable, plant_source
 from diffabs.kernel.compilers import NoCompiler, compiler
@@ -42,6 +44,9 @@ def fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str
     Raises:
         NotExported: an operation that has no translation, or no C compiler that works.
     """
+    if not is_name(name):
+        raise NotExported(f"{name!r} is no name that C has for a function: letters, digits and _")
+    about = printable(about)
     plant = plant_source(loop)
     guid = str(uuid.UUID(hashlib.sha256(f"{plant} {name} {step} {about}".encode()).hexdigest()[:32]))
     source = _source(plant, guid, step)
@@ -108,7 +113,7 @@ def _description(plant: PlantSource, name: str, guid: str, step: float, duration
     if units:
         definitions = xml.SubElement(root, "UnitDefinitions")
         for unit in units:
-            xml.SubElement(definitions, "Unit", {"name": unit})
+            xml.SubElement(definitions, "Unit", {"name": printable(unit)})
     xml.SubElement(root, "DefaultExperiment", {"startTime": "0.0", "stopTime": repr(duration), "stepSize": repr(step)})
     variables = xml.SubElement(root, "ModelVariables")
     for reference, one in enumerate(plant.variables):
@@ -124,7 +129,7 @@ def _variable(parent: Any, one: Variable, reference: int) -> None:
         "name": one.name, "valueReference": str(reference), **CAUSES[one.role],
     })  # fmt: skip
     start = {} if one.role == "output" else {"start": repr(one.value).replace("inf", "INF")}
-    xml.SubElement(scalar, "Real", {**start, **({} if one.unit in ("", "1") else {"unit": one.unit})})
+    xml.SubElement(scalar, "Real", {**start, **({} if one.unit in ("", "1") else {"unit": printable(one.unit)})})
 
 
 def _unknowns(structure: Any, variables: Sequence[Variable]) -> None:

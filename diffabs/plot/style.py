@@ -20,6 +20,7 @@ try:
     from matplotlib.colors import ListedColormap as ListedColormap
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch as Patch
+    from matplotlib.text import Text
     from matplotlib.ticker import Formatter, LogLocator, NullFormatter
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError('figures need matplotlib: pip install "diffabs[plot]"', name=error.name) from error
@@ -30,12 +31,25 @@ GREY = "#767676"
 KMH = 3.6  # km/h per m/s
 DPI = 150
 FEW_DECADES, PLAIN = 2.0, 4  # fewer have labels between them; powers of ten that are written out
+RAISED = str.maketrans("-0123456789", "\u207b\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079")
 TITLE = 9  # characters per inch, with room to spare
+
+
+class Sheet(Figure):
+    """A figure that shows every text as it stands: a dollar sign, of a title or a name, begins no formula."""
+
+    def draw(self, renderer: Any) -> None:
+        """Draw it."""
+        for ax in self.axes:
+            _ = ax.get_xticklabels() + ax.get_yticklabels()  # made where they are asked for
+        for words in self.findobj(Text):
+            words.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
+        super().draw(renderer)
 
 
 def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float, float] = (5.4, 3.4), **kwargs: Any):
     """An empty figure in the house's look, and its axes, a list in reading order. `size` [inch] is that of one axes."""
-    figure = Figure(figsize=(size[0] * columns, size[1] * rows), dpi=DPI, layout="constrained")
+    figure = Sheet(figsize=(size[0] * columns, size[1] * rows), dpi=DPI, layout="constrained")
     axes = list(figure.subplots(rows, columns, squeeze=False, **kwargs).flat)
     for ax in axes:
         ax.spines[["top", "right"]].set_visible(False)
@@ -93,8 +107,8 @@ class _Powers(Formatter):
             return f"{x:g}"
         power = int(np.floor(np.log10(x) + 1e-9)) if x > 0 else 0
         mantissa = x / 10.0**power
-        head = "" if abs(mantissa - 1) < 1e-9 else rf"{mantissa:.0f}\times"
-        return rf"${head}10^{{{power}}}$"
+        head = "" if abs(mantissa - 1) < 1e-9 else f"{mantissa:.0f}\N{MULTIPLICATION SIGN}"
+        return f"{head}10{str(power).translate(RAISED)}"
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:

@@ -27,7 +27,7 @@ from diffabs.core.protocols import Objective
 from diffabs.core.units import units_of
 from diffabs.core.validity import cautions, problems
 from diffabs.core.values import ScenarioError as ScenarioError
-from diffabs.core.values import plain, shown, text, unknown, wrong
+from diffabs.core.values import plain, printable, printed_line, printed_lines, shown, unknown, wrong
 from diffabs.objectives import BRAKING, usual
 from diffabs.scenario import parameter_paths, section_design, section_solver, section_sweep, section_tune, toml
 from diffabs.scenario.compatibility import misfits
@@ -38,7 +38,7 @@ from diffabs.simulate.solution import Adaptive, Solver
 
 LARGEST_FILE = 1_000_000  # bytes
 LONGEST_PATH = 4096  # characters of it in a message
-TEXTS = ("title", "description")
+TEXTS = {"title": printed_line, "description": printed_lines}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +82,7 @@ def names() -> list[str]:
 def header(name_or_path: str | pathlib.Path) -> dict[str, str]:
     """Title and description of a scenario, without building it. Raises ScenarioError."""
     table = _parsed(_read(name_or_path)[1], str(name_or_path))
-    return {key: text(table.get(key, ""), key) for key in TEXTS}
+    return {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
 
 
 def load(name_or_path: str | pathlib.Path, overrides: Sequence[str] = (), *, integrated: bool = True) -> Scenario:
@@ -134,7 +134,7 @@ def loads(
 def _titled(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """Title and description of what is no longer what the file says, but for what the overrides say themselves."""
     said = {override.partition("=")[0].strip() for override in overrides}
-    new = {"title": f"{name} with {', '.join(overrides)}", "description": ""}
+    new = {"title": printable(f"{name} with {', '.join(overrides)}"), "description": ""}
     return {key: text for key, text in new.items() if key not in said}
 
 
@@ -175,7 +175,7 @@ def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
         raise ScenarioError(f"cannot read scenario {quoted}: {why}") from None
     if len(raw) > LARGEST_FILE:
         raise ScenarioError(f"{quoted} is larger than {LARGEST_FILE} bytes; it is no scenario")
-    return path.stem, raw
+    return printable(path.stem), raw
 
 
 def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
@@ -236,7 +236,7 @@ def _place(node: Any, key: str, path: str) -> Any:
 
 
 def _assembled(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenario:
-    texts = {key: text(table.get(key, ""), key) for key in TEXTS}
+    texts = {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
     sections = {key: value for key, value in table.items() if key not in OTHERS}
     if "road" in table:
         plant = sections.get("plant", {})
@@ -248,10 +248,10 @@ def _assembled(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenar
         raise wrong("objective", given, "a table of objectives")
     loop = loop_of(sections)
     report = usual(loop.plant)
-    measured = {
-        key: build("objective", value, report.get(key), joined("objective", key), units_of(loop.plant))
-        for key, value in given.items()
-    }
+    measured = {}
+    for key, value in given.items():
+        place = joined("objective", printed_line(key, "a name in objective"))
+        measured[key] = build("objective", value, report.get(key), place, units_of(loop.plant))
     objectives = {**report, **measured}
     _refuse(_wrong_values(loop, objectives), misfits(loop, objectives))  # before what is said of their parameters
     return Scenario(
