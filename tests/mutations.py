@@ -277,13 +277,6 @@ MUTATIONS = [
         "test_adaptive.py::test_derivatives_on_limits_agree_with_differences_of_three_widths",
     ),
     Mutation(
-        "what was not taken is repeated in no regime",
-        "simulate/replay.py",
-        "words = select(notes.moved, notes.words, following)",
-        "words = notes.words",
-        "test_adaptive.py::test_reverse_mode_is_forward_mode[slip-lmi]",
-    ),
-    Mutation(
         "a repeated step ends where it was noted",
         "simulate/replay.py",
         "    t = one.t + shift\n",
@@ -291,10 +284,10 @@ MUTATIONS = [
         "test_adaptive.py::test_a_derivative_through_a_relay_and_a_latch_is_that_of_fixed_steps",
     ),
     Mutation(
-        "a derivative takes the steps of values",
-        "simulate/lengths.py",
-        "DERIVATIVES if self.notes else VALUES",
-        "VALUES",
+        "no comparison is located for a derivative",
+        "simulate/adaptive.py",
+        "system.kinks if pace.notes else 0",
+        "0",
         "test_adaptive.py::test_derivatives_on_limits_agree_with_differences_of_three_widths",
     ),
     Mutation(
@@ -321,8 +314,8 @@ MUTATIONS = [
     Mutation(
         "a repeated step has the rates of its beginning at its end",
         "simulate/replay.py",
-        "system.rates(t, z, held, within)[0]) if pace.keeps",
-        "begin.seen.rate) if pace.keeps",
+        "(t, state.flow(), end.seen.rate) if pace.keeps",
+        "(t, state.flow(), begin.seen.rate) if pace.keeps",
         "test_adaptive.py::test_the_derivative_of_a_trajectory_is_that_of_fixed_steps[limits]",
     ),
     Mutation(

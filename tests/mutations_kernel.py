@@ -375,17 +375,10 @@ KERNEL = [
         f"{ENGINES}::TestTune::test_of_what_has_no_rule_names_the_part",
     ),
     (
-        "tangents: a step is repeated before one knows what follows",
+        "tangents: only steps that end on events are repeated",
         "simulate/pursuit.py",
-        "next=select(last.moved, last.words, new.point.words)",
-        "next=before.words",
-        f"{SCENARIO}-adaptive]",
-    ),
-    (
-        "tangents: the last step is not repeated",
-        "simulate/pursuit.py",
-        "return self.ahead.running | self.waits",
-        "return self.ahead.running",
+        "anyone(note.moved)",
+        "anyone(note.fired != 0)",
         f"{SCENARIO}-adaptive]",
     ),
     (

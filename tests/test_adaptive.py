@@ -11,12 +11,14 @@ import pytest
 import random_loops
 
 import diffabs as d
-from diffabs.core.pytree import arrayed, prepared, refined, strong
+from diffabs import actuators, controllers, plants, references, roads, stops
+from diffabs.core.cubic import Cubic
+from diffabs.core.pytree import arrayed, get, prepared, refined, strong
 from diffabs.design.attraction import Cells, attraction
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
 from diffabs.simulate import lengths
-from diffabs.simulate.foresight import VALUES, Margin, bit, kinks
+from diffabs.simulate.foresight import Margin, bit, kinks
 from diffabs.simulate.replay import MOST, room
 from diffabs.simulate.run import arguments
 from diffabs.tune import worst_case
@@ -177,6 +179,71 @@ def test_derivatives_on_limits_agree_with_differences_of_three_widths():
         np.testing.assert_allclose(slopes, difference.T, rtol=2e-3 if width > 5e-3 else 5e-4)
 
 
+def clamped_rig():
+    """Conditional integration: a rate jumps a dozen times within 20 ms, each time after a tick of the reference."""
+    return d.Loop(
+        plant=plants.MirroredRig(),
+        initial=d.BrakeStart(speed=11.0, slip=0.03),
+        stop=stops.SpeedReached(speed=8.0),
+        reference=references.LimitedSlip(slip=0.15, rate=2.0, time_constant=0.02, period=2e-3),
+        feedforward=controllers.HoldingInput(),
+        controller=controllers.StateFeedback(
+            gain=np.array([-3000.0, -90.0]), torque_min=0.3, torque_max=5.0, antiwindup=controllers.Clamping()
+        ),
+    )
+
+
+def relay_at_its_rate():
+    """A limit cycle at the greatest rate of the actuator: each of its corners moves the ends of two steps."""
+    return d.Loop(
+        plant=plants.QuarterCar(road=roads.DRY_COBBLESTONE, inertia=0.6),
+        initial=d.BrakeStart(speed=6.0, slip=0.03),
+        stop=stops.SpeedReached(speed=3.5),
+        reference=references.FixedSlip(slip=0.3),
+        controller=controllers.Relay(band=0.05, torque_min=6.0, torque_max=130.0),
+        actuator=actuators.RateLimit(rate=3000.0, time_constant=0.004),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [clamped_rig, relay_at_its_rate])
+def test_derivatives_through_many_comparisons_agree_with_differences(make):
+    """Two widths of differences of runs at a far smaller error. The scale is the derivative, or a thousandth of the
+    value where that is more: 1 % of it is 10 rtol of the value."""
+    loop = make()
+    paths = ["plant.mass", "initial.speed", "controller.torque_max"]
+    start = np.array([float(get(loop, path)) for path in paths])
+    lanes = np.random.default_rng(3).uniform(-0.12, 0.12, (6, len(paths)))
+
+    def metrics(solver):
+        def of(z):
+            run = d.measure(d.replace(loop, dict(zip(paths, start * jnp.exp(z), strict=True))), solver, MEASURED)
+            return jnp.stack([run.metrics[name] for name in MEASURED])
+
+        return of
+
+    slopes = np.asarray(jax.jit(jax.vmap(jax.jacfwd(metrics(d.Adaptive(1e-6, 2.0, 2e-4)))))(lanes))
+    exact = jax.jit(jax.vmap(metrics(d.Adaptive(1e-10, 2.0, 2e-4))))
+    widths = (1e-3, 3e-4)
+    moved = [[np.asarray(exact(lanes + sign * w * row)) for row in np.eye(3) for sign in (1, -1)] for w in widths]
+    differences = [
+        np.stack([a - b for a, b in zip(m[::2], m[1::2], strict=True)], -1) / (2 * w)
+        for m, w in zip(moved, widths, strict=True)
+    ]
+    scale = np.maximum(np.abs(differences[1]), 1e-3 * np.abs(np.asarray(exact(lanes)))[..., None])
+    agree = np.abs(differences[0] - differences[1]) <= 3e-3 * scale
+    assert agree.mean() > 0.6
+    assert np.max(np.where(agree, np.abs(slopes - differences[1]) / scale, 0.0)) <= 1e-2
+
+
+def test_the_root_of_a_bent_cubic_and_its_derivative_are_exact():
+    """(x + 1)^3 = level over a step of length 1: far from a line, as the error of a long step is."""
+    for level in (1.2, 2.0, 5.0, 7.5):
+        root, slope = jax.value_and_grad(lambda level: Cubic(1.0, 8.0, 3.0, 12.0).minus(level).root())(level)
+        assert root == pytest.approx(level ** (1 / 3) - 1, abs=1e-12)
+        assert slope == pytest.approx(level ** (-2 / 3) / 3, rel=1e-9)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["slip-lmi", pytest.param("slip-cured", marks=pytest.mark.slow)])
 def test_reverse_mode_is_forward_mode(name):
@@ -298,10 +365,10 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
     margins = [Margin(*one) for one in zip(numbers, values, rates, strict=True)]
     words = (jnp.uint32(0b1100), jnp.uint32(0b10))
     np.testing.assert_array_equal(bit(words, np.array([2, 3, 33, 1])), [True, True, True, False])
-    found = kinks(margins, jnp.asarray(1.0), 0.0, VALUES, words, jnp.asarray(1.0))
+    found = kinks(margins, jnp.asarray(1.0), 0.0, words, jnp.asarray(1.0))
     assert found.ahead == pytest.approx(0.1)  # 4 falls by 40/s
     assert found.late == pytest.approx(0.5)  # of bits 2 and 33, 0.5 s and 0.25 s ago
-    none = kinks(margins, jnp.asarray(1.0), 0.0, VALUES, (jnp.uint32(0),) * 2, jnp.asarray(1.0))
+    none = kinks(margins, jnp.asarray(1.0), 0.0, (jnp.uint32(0),) * 2, jnp.asarray(1.0))
     assert none.late == 0
 
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp
 from diffabs.core.pytree import Scalar
 
-NEWTON = 1  # iterations from the secant, before the last: the cubic of a step is nearly a line
+NEWTON = 4  # iterations from the secant, before the last: in a long step the cubic is no line
 
 
 class Cubic(NamedTuple):
@@ -59,8 +59,13 @@ class Cubic(NamedTuple):
         still = jax.lax.stop_gradient(self)
         spread = still.start - still.end
         x = clamp(still.start / jnp.where(spread == 0, 1.0, spread), 0.0, 1.0)
-        for _ in range(NEWTON):
-            x = clamp(x - _quotient(still(x), still.slope(x)), 0.0, 1.0)
+        low, high = jnp.zeros_like(x), jnp.ones_like(x)
+        for _ in range(NEWTON):  # a derivative by the root is wrong by as much as the root is
+            value = still(x)
+            before = (value < 0) == (still.start < 0)
+            low, high = jnp.where(before, x, low), jnp.where(before, high, x)
+            newton = x - _quotient(value, still.slope(x))
+            x = jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
         x = clamp(x - _quotient(self(x), still.slope(x)), 0.0, 1.0)
         return _refined(x, self, still.slope(jax.lax.stop_gradient(x)))
 

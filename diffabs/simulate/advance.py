@@ -104,7 +104,9 @@ def arrive(system: Dynamics, point: Point, one: Try, active: Any) -> Arrival:
     state = jax.tree.map(partial(jnp.where, one.blunt), rests, state) if system.kinks else rests
 
     def look() -> Any:
-        seen, answers = system.look(one.end, state, tallied, _at_end(system, point.regime, one))
+        seen, answers = system.look(
+            one.end, state, tallied, at_end(system, point.regime, one.which, one.lands, one.blunt | one.anew)
+        )
         return seen, Kink(*crossing(answers, one.which, one.h)), answers.words
 
     seen, kink, words = apart(active, look) if system.kinks else look()
@@ -126,8 +128,7 @@ def depart(system: Dynamics, clock: Clock, here: Arrival, fired: Margins, one: T
         state = lend(system.loop.change(clock, lend(state, logs), signals, margins, fired, passed), None)
     if not system.loop.ticks:
         return Point(t, state, tally, signals.sample, rate, margins, regime)
-    kept = (jnp.where(one.lands, bit, jnp.uint32(0)) for bit in only(one.which, system.words))
-    return _leave(system, t, state, tally, Regime(regime, ~one.lands, tuple(~bit for bit in kept)))
+    return _leave(system, t, state, tally, after_changes(system, regime, one.which, one.lands))
 
 
 def _leave(system: Dynamics, t: Any, state: LoopState, tally: Tally, regime: Regime) -> Point:
@@ -135,14 +136,21 @@ def _leave(system: Dynamics, t: Any, state: LoopState, tally: Tally, regime: Reg
     return Point(t, state, tally, seen.signals.sample, seen[:2], seen.margins, answers.words)
 
 
-def _at_end(system: Dynamics, words: Words, one: Try) -> Regime:
-    """At the end of a step its regime still holds; where it lands on a comparison, that has changed, and all others may
-    with it."""
-    one_bit = only(one.which, system.words)
+def at_end(system: Dynamics, words: Words, which: Any, lands: Any, free: Any) -> Regime:
+    """Return the regime for the end of a step made in the regime `words`: the same, or as the numbers say where it is
+    `free`. A step that `lands` on the comparison `which` changes its answer, and others may follow."""
+    one_bit = only(which, system.words)
     none, all = jnp.uint32(0), ~jnp.uint32(0)
-    flipped = tuple(word ^ jnp.where(one.lands, bit, none) for word, bit in zip(words, one_bit, strict=True))
-    loose = tuple(jnp.where(one.blunt | one.anew, all, jnp.where(one.lands, ~bit, none)) for bit in one_bit)
-    return Regime(flipped, one.blunt | one.anew, loose)
+    flipped = tuple(word ^ jnp.where(lands, bit, none) for word, bit in zip(words, one_bit, strict=True))
+    loose = tuple(jnp.where(free, all, jnp.where(lands, ~bit, none)) for bit in one_bit)
+    return Regime(flipped, free, loose)
+
+
+def after_changes(system: Dynamics, words: Words, which: Any, lands: Any) -> Regime:
+    """Return the regime after the ticks and events at the end of a step: as the numbers say, but for the comparison on
+    which the step `lands`."""
+    kept = (jnp.where(lands, bit, jnp.uint32(0)) for bit in only(which, system.words))
+    return Regime(words, ~lands, tuple(~bit for bit in kept))
 
 
 def _segment(system: Dynamics, point: Point, end: Any, sample: Sample, one: Try) -> Segment:

@@ -35,13 +35,14 @@ class Seen(NamedTuple):
 
 class Ahead(NamedTuple):
     """At an instant: what is seen, the rates of the sample, of what blocks record and of the margins of the events, the
-    answers to the comparisons, and their margins with the rates of these."""
+    answers to the comparisons, those that the numbers contradict, and their margins with the rates of these."""
 
     seen: Seen
     moving: Sample
     recorded: dict[str, Any]
     falls: Margins
     words: Words
+    crossed: Words
     comparisons: list[Margin]
 
 
@@ -90,7 +91,7 @@ class Dynamics(NamedTuple):
         (*_, values), (sample, recorded, falls, rates), answers = jax.jvp(moves, (t, z), moving, has_aux=True)
         numbers = [number for number, _ in answers.margins]
         comparisons = [Margin(*one) for one in zip(numbers, values, rates, strict=True)]
-        return Ahead(now, sample, recorded, falls, answers.words, comparisons)
+        return Ahead(now, sample, recorded, falls, answers.words, answers.crossed, comparisons)
 
     def moving(self, of: Callable[[Sample], Any], end: tuple[Any, LoopState, Tally, Any], regime: Regime) -> Any:
         """d(of(sample))/dt within a regime, at a time, state and tally where d(state.flow())/dt is the last one."""

@@ -13,18 +13,9 @@ from diffabs.core.regime import WORD, Words
 FAR = 1e9  # s, as good as never
 
 
-class Care(NamedTuple):
-    """How exactly steps end on comparisons. As fractions of the present length of a step: what changes so soon changes
-    now; the shortest step that ends there. And of a step: outside of these two a comparison changed at one end."""
-
-    now: float
-    least: float
-    start: float
-    end: float
-
-
-VALUES = Care(2e-4, 4e-3, 0.02, 0.95)
-DERIVATIVES = Care(2e-6, 1e-5, 1e-3, 0.999)  # as exactly as an event, in two or three steps
+# How exactly steps end on comparisons. As fractions of the length that the error allows: what changes so soon changes
+# now; the shortest step that ends there. And of a step: outside of these two a comparison changed at one end.
+NOW, SHORTEST, START, END = 2e-4, 4e-3, 0.02, 0.95
 
 
 class Margin(NamedTuple):
@@ -43,13 +34,13 @@ class Kinks(NamedTuple):
     late: Any
 
 
-def kinks(margins: Sequence[Margin], natural: Any, shortest: Any, care: Care, changed: Words, length: Any) -> Kinks:
+def kinks(margins: Sequence[Margin], natural: Any, shortest: Any, changed: Words, length: Any) -> Kinks:
     """Return what the margins at the end of a step say.
 
-    natural: the length that the error allows [s], of which `care` has fractions; shortest: that of any step [s]
+    natural: the length that the error allows [s]; shortest: that of any step [s]
     changed: bits of the comparisons whose answers are others than at the beginning of the step
     length: of the step [s]"""
-    least, low, high = jnp.maximum(care.now * natural, shortest), (1 - care.end) * length, (1 - care.start) * length
+    least, low, high = jnp.maximum(NOW * natural, shortest), (1 - END) * length, (1 - START) * length
     next, first = jnp.full_like(length, -FAR), low
     for one in margins:
         was = bit(changed, one.numbers)

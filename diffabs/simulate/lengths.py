@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from diffabs.core.loop import Loop, LoopState
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Sample
-from diffabs.simulate.foresight import DERIVATIVES, VALUES, Care
+from diffabs.simulate.foresight import SHORTEST
 
 FIRST = 1e-4  # s, the first step
 SAFETY, LITTLE = 0.85, 1e-6  # of the length that the error asks for; an error below which none counts
@@ -40,11 +40,6 @@ class Pace:
     def least(self) -> Any:
         """The shortest step [s]."""
         return self.h * self.steps * jnp.maximum(LEAST, 4 * jnp.finfo(self.h.dtype).eps)
-
-    @property
-    def care(self) -> Care:
-        """How exactly steps end on comparisons."""
-        return DERIVATIVES if self.notes else VALUES
 
     def strike(self, loop: Loop, k: Any) -> Any:
         """The number of the first instant after the k-th at which a clock strikes, or the run ends."""
@@ -77,7 +72,7 @@ def planned(length: Any, ahead: Any, left: Any, pace: Pace) -> tuple[Any, Any]:
 
     length: that the error and stability allow; ahead, left: seconds to the next kink, and to the clock's instant"""
     near = jnp.where(ahead < SHORT * length, 0.5 * SHORT * length, length)
-    length = jnp.where(ahead < length, jnp.maximum(ahead, jnp.maximum(pace.care.least * length, pace.least)), near)
+    length = jnp.where(ahead < length, jnp.maximum(ahead, jnp.maximum(SHORTEST * length, pace.least)), near)
     ends = length > FULL * left
     return jnp.where(ends, left, jnp.where(2 * length > left, 0.5 * left, length)), ends
 

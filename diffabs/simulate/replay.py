@@ -1,9 +1,9 @@
 """Derivatives of a run with adaptive steps: the run is made once for its values and noted, and its steps are repeated.
 
-    noted      of each step: when it ends, the regime in its middle, the events and the instant of a clock at its end
-    repeated   Runge-Kutta steps to the same ends within the same regimes, which are smooth; a step at whose end the
-               regime changes, or an event happens, ends where the margin g of that is zero, by Newton's step
-               -g/(dg/dt) from the noted end, whose derivative is that of the moment by the implicit function theorem
+    noted      of each step: when it ends, its regime, the comparison, the events and the instant of a clock at its end
+    repeated   the same steps within the same regimes, which are smooth; a step at whose end a comparison changes, or an
+               event happens, ends where the margin g of that is zero, by Newton's step -g/(dg/dt) from the noted end,
+               whose derivative is that of the moment by the implicit function theorem
 
 So the derivative is that of the run whose steps end at these times, and on its kinks and events; the lengths of the
 others do not depend on anything."""
@@ -26,7 +26,6 @@ from diffabs.simulate.checkpoint import anyone, forgetful
 from diffabs.simulate.condition import Condition, goes_on
 from diffabs.simulate.drivers import BLOCK
 from diffabs.simulate.dynamics import Ahead, Dynamics, Objectives, Tally, dynamics, parted
-from diffabs.simulate.foresight import bit
 from diffabs.simulate.landing import select
 from diffabs.simulate.methods import AtPace
 from diffabs.simulate.outcome import observe
@@ -36,24 +35,25 @@ from diffabs.simulate.stepper import typed
 from diffabs.simulate.tries import Carry
 from diffabs.simulate.tsit5 import tsit5_step_from
 
-MOST, TICKED = 2048, 2  # tries that can be noted at an error of 1e-5, and for each instant of a grid with clocks
-FAR = 0.5  # of a step: no comparison that changes at its end is so far from changing there
-NEAR = 1e-3  # of the length that the error allows: nor is an event, or a comparison that changes with one
+MOST, TICKED = 4096, 2  # tries that can be noted at an error of 1e-5, and for each instant of a grid with clocks
+NEAR = 1e-3  # of the try in which it was seen: no event or comparison at the end of a step is so far from its zero
 
 
 class Notes(NamedTuple):
-    """Of every try, in blocks (blocks, BLOCK, ...): whether it led on; the time at its end, its length, and that which
-    the error allowed; the number of the instant of the grid at which a clock has struck last; a bit for each event at
-    its end; the regime in its middle, and in that of the next that led on."""
+    """Of every try, in blocks (blocks, BLOCK, ...): whether it led on; the time at its end and its length; the length
+    of the first try from there; the number of the instant of the grid at which a clock has struck last; a bit for each
+    event at its end; its regime, and whether that did not count; the number of the comparison that changes at its end,
+    or -1."""
 
     moved: Any
     t: Any
     length: Any
-    natural: Any
+    base: Any
     k: Any
     fired: Any
     words: Words
-    next: Words
+    blunt: Any
+    lands: Any
 
 
 class Place(NamedTuple):
@@ -89,10 +89,11 @@ def room(loop: Loop, solver: Adaptive) -> int:
 
 
 def noted(old: Carry, new: Carry) -> Notes:
-    """Return the notes of one try, between these carries; the regime of the next is not known yet."""
-    fired, words = new.note
-    moved = (new.point.t > old.point.t) | (fired != 0)
-    return Notes(moved, new.point.t, old.length, old.natural, new.k, fired, words, words)
+    """Return the notes of one try, between these carries."""
+    moved = (new.point.t > old.point.t) | (new.fired != 0)
+    landed = (old.condition == Condition.LANDING) & (new.fired == 0)
+    lands = jnp.where(landed, old.search.which, -1)
+    return Notes(moved, new.point.t, old.length, old.base, new.k, new.fired, old.point.words, old.blunt, lands)
 
 
 def note(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, tries: int) -> tuple[Notes, Any]:
@@ -105,19 +106,10 @@ def note(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, tries: int)
     def some(carry: Carry) -> tuple[Carry, Notes]:
         return jax.lax.scan(one, pace.renew(loop, carry), length=BLOCK)
 
-    def back(words: Words, note: Notes) -> tuple[Words, Words]:
-        return select(note.moved, note.words, words), words
-
     carry = pace.start(loop, objectives, key)
     carry, notes = _skipping(some, lambda carry, _: carry.running, carry, None, -(-tries // BLOCK))
 
-    def followed(words: Words, block: Notes) -> tuple[Words, Words]:
-        return jax.lax.scan(back, words, block, reverse=True)
-
-    following = _skipping(followed, lambda _, block: jnp.any(block.moved), carry.point.words, notes, reverse=True)[1]
-    # A step that was not taken is repeated, too, for nobody: in a regime of its place, so that it has numbers.
-    words = select(notes.moved, notes.words, following)
-    notes = jax.tree.map(jax.lax.stop_gradient, notes._replace(words=words, next=following))
+    notes = jax.tree.map(jax.lax.stop_gradient, notes)
     return notes, jnp.where(carry.running, Condition.DIVERGED, carry.condition)
 
 
@@ -199,7 +191,7 @@ def _step(
     """One step within its regime, and what happens at its end; its `Span`, where they are kept. The rows of the logs,
     which the state is without."""
     system = dynamics(loop, objectives, place.t, place.state, place.tally, kinks=True)
-    within, h = Regime(one.words), one.length - place.late
+    within, h = Regime(one.words, one.blunt), one.length - place.late
     begin = system.ahead(place.t, place.state, place.tally, within)
     z, held = parted(place.state, place.tally)
 
@@ -207,16 +199,15 @@ def _step(
         return system.rates(t, z, *given)
 
     z = tsit5_step_from(flow, place.t, z, begin.seen[:2], h, (held, within))
-    state, tally = _whole(loop, place, z)
-    end = system.ahead(one.t, state, tally, within)
-    changed = tuple(a ^ b for a, b in zip(one.words, one.next, strict=True))
+    noted_end = system.ahead(one.t, *_with_flow(place, z), within)
     strikes = (one.k != place.k) & (one.k < pace.steps)
-    shift = _shift(end, changed, one, h, one.k != place.k)
+    shift = _shift(noted_end, one, one.k != place.k)
     t = one.t + shift
-    z = axpy(shift, end.seen[:2], z)
-    state, tally = _whole(loop, place, z)
-    sample = axpy(shift, end.moving, end.seen.signals.sample)
-    sample = sample._replace(t=t)
+    z = axpy(shift, noted_end.seen[:2], z)
+    state, tally = _with_flow(place, z)
+    end = system.ahead(t, state, tally, within)  # rates, too, are those of the shifted end
+    state = state._replace(plant=loop.plant.project(state.plant))
+    sample = end.seen.signals.sample
     segment = Segment(
         begin.seen.signals.sample,
         sample,
@@ -227,38 +218,35 @@ def _step(
         smooth=True,
     )
     tally = {name: Memory(tally[name].flow, o.update(tally[name], segment)) for name, o in objectives.items()}
-    ends = (t, state.flow(), system.rates(t, z, held, within)[0]) if pace.keeps else ()
+    ends = (t, state.flow(), end.seen.rate) if pace.keeps else ()
     span = Span(place.t, place.state, begin.seen.rate, *ends) if pace.keeps else ()
     if loop.changes:
-        late = axpy(shift, end.recorded, end.seen.signals.recorded)
-        ends = (begin.seen.signals.recorded, begin.recorded), (late, end.recorded)
+        ends = (begin.seen.signals.recorded, begin.recorded), (end.seen.signals.recorded, end.recorded)
         step = passed(*(Recorded(*both) for both in zip((place.t, t), ends, strict=True)))
         clock, state = Clock(t, pace.h, one.k, key, strikes), lend(state, logs)
         state = lend(_changed(system, clock, state, end.seen.margins, one.fired, step), None)
     return Place(t, shift, state, tally, one.k), span
 
 
-def _whole(loop: Loop, place: Place, z: Any) -> tuple[LoopState, Tally]:
-    state = place.state.with_flow(z[0])
-    state = state._replace(plant=loop.plant.project(state.plant))
-    return state, {name: memory._replace(flow=z[1][name]) for name, memory in place.tally.items()}
+def _with_flow(place: Place, z: Any) -> tuple[LoopState, Tally]:
+    """State and accumulators with other continuous memories, not projected: a projection may end at a comparison."""
+    return place.state.with_flow(z[0]), {name: memory._replace(flow=z[1][name]) for name, memory in place.tally.items()}
 
 
-def _shift(end: Ahead, changed: Words, one: Notes, h: Any, strikes: Any) -> Any:
-    """How much later [s] than its noted end a step has come to its event, or to the comparison that changes there, with
-    which an event may come whose margin jumps; 0 where there is none, or a clock decides."""
-    happens = one.fired != 0
-    shift, nearest = jnp.zeros_like(h), jnp.where(happens, NEAR * one.natural, FAR * h)
+def _shift(end: Ahead, one: Notes, strikes: Any) -> Any:
+    """How much later [s] than its noted end a step has come to its event, or to the comparison that changes there; 0
+    where there is none, or a clock decides."""
+    shift, most = jnp.zeros_like(one.length), NEAR * one.base
     for comparison in end.comparisons:
-        was = bit(changed, comparison.numbers)
-        each = (jnp.ravel(jnp.asarray(x)) for x in (was, comparison.value, comparison.rate))
-        for on, margin, rate in zip(*each, strict=True):
-            close, later = _until(on, margin, rate, nearest)
-            shift, nearest = jnp.where(close, later, shift), jnp.where(close, jnp.abs(later), nearest)
-    shift = jnp.where(strikes & ~happens, 0.0, shift)
+        on = comparison.numbers == one.lands
+        each = (jnp.ravel(jnp.asarray(x)) for x in (on, comparison.value, comparison.rate))
+        for which, margin, rate in zip(*each, strict=True):
+            close, later = _until(which, margin, rate, most)
+            shift = jnp.where(close, later, shift)
+    shift = jnp.where(strikes, 0.0, shift)
     events = zip(jax.tree.leaves(end.seen.margins), jax.tree.leaves(end.falls), strict=True)
     for i, (margin, fall) in reversed(list(enumerate(events))):
-        close, later = _until(one.fired & (1 << i) != 0, margin, fall, NEAR * one.natural)
+        close, later = _until(one.fired & (1 << i) != 0, margin, fall, most)
         shift = jnp.where(close, later, shift)
     return shift
 

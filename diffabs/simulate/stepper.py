@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from diffabs.core.log import lend, settle, tables
 from diffabs.core.loop import Loop, Margins
 from diffabs.core.protocols import Clock
-from diffabs.simulate.advance import Arrival, Point, Try, arrive, begin, depart
+from diffabs.simulate.advance import Arrival, Kink, Point, Try, arrive, begin, depart
 from diffabs.simulate.checkpoint import anyone, apart
 from diffabs.simulate.condition import Condition, after_step, goes_on
 from diffabs.simulate.dynamics import Objectives, dynamics
@@ -181,7 +181,8 @@ def _plausible(carry: Carry, here: Arrival) -> Any:
 
 def _look(carry: Carry, here: Arrival, fine: Any, kinks: int, h: Any, refines: bool) -> tuple[Search, Any, Any, Any]:
     """What a try that is not taken tells: the search, the next length, and how that is tried."""
-    tells, new = _crossings(carry, here, kinks), carry.condition == Condition.RUNNING
+    tells = crossings(carry.search.which, kinks, here.kink, *_margins(carry, here))
+    new = carry.condition == Condition.RUNNING
     search, length, enough = seek(carry.search, carry.length, new, tells, h)
     seeking = search, length, jnp.where(enough, Condition.PROBING, Condition.SEEKING)
     beyond = jnp.where(carry.search.which < kinks, h * jnp.finfo(h.dtype).eps ** BEYOND, 0.0)
@@ -204,10 +205,9 @@ def _landing(carry: Carry, search: Search, length: Any, refines: bool) -> tuple[
     return search, length, jnp.where(again, Condition.SEEKING, Condition.REFINING if refines else Condition.LANDING)
 
 
-def _crossings(carry: Carry, here: Arrival, kinks: int) -> Crossings:
-    """Comparisons first, then events."""
-    which, kink = carry.search.which, here.kink
-    events = earliest(which, kinks, *_margins(carry, here))
+def crossings(which: Any, kinks: int, kink: Kink, before: list[Any], after: list[Any]) -> Crossings:
+    """Return what a try tells of the comparisons, first, and of the margins of the events at its ends."""
+    events = earliest(which, kinks, before, after)
     unknown, bends = jnp.full_like(kink.margin, jnp.inf), kink.other >= 0
     at = [jnp.where(kink.chosen == one, kink.margin, jnp.inf) for one in (which, kink.other)]
     sought = select(which < kinks, Crossed(which, at[0], unknown), events.sought)

@@ -29,15 +29,15 @@ class Point(NamedTuple):
 
 class Arrival(NamedTuple):
     """The end of a try, before what changes there: the point, its signals, the error as a multiple of what is allowed,
-    the largest values of the states so far, for how many seconds a comparison has been another one, and, where it is
-    noted, the regime in the middle."""
+    the largest values of the states so far, for how many seconds a comparison has been another one, and, where steps
+    keep to a regime, the comparisons that say something else at the end."""
 
     point: Point
     signals: Signals
     error: Any
     scale: Any
     late: Any
-    middle: Any
+    kink: Any
 
 
 class Carry(NamedTuple):
@@ -56,7 +56,9 @@ class Carry(NamedTuple):
     tries: Any
     renewed: Any  # how many of these there were when the longest stable step was last looked at
     past: Any  # the last step, as a `Span`; () where nobody asks
-    note: Any  # of the last try: a bit for each event at its end, and the regime in its middle; () likewise
+    turns: Any  # steps in a row that ended where a comparison changes
+    blunt: Any  # whether the comparisons in a step say at each stage what the numbers say, where steps keep to a regime
+    fired: Any  # a bit for each event at the end of the last try
     condition: Any
 
     running = property(goes_on)
