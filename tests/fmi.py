@@ -2,7 +2,9 @@
 
 import ctypes
 import pathlib
+import subprocess
 import zipfile
+from collections.abc import Sequence
 from xml.etree import ElementTree
 
 REFERENCE = ctypes.c_uint
@@ -10,14 +12,19 @@ COSIMULATION = 1
 
 
 class Fmu:
-    """An instance of the FMU in a file, unpacked into a folder. Functions return the status: 0 ok, 3 error."""
+    """An instance of the FMU in a file, unpacked into a folder. Functions return the status: 0 ok, 3 error. With
+    `flags` the library is compiled anew, from the source that is in it."""
 
-    def __init__(self, path: pathlib.Path, folder: pathlib.Path, guid: str | None = None):
+    def __init__(self, path: pathlib.Path, folder: pathlib.Path, guid: str | None = None, flags: Sequence[str] = ()):
         with zipfile.ZipFile(path) as archive:
             archive.extractall(folder)
         self.description = ElementTree.parse(folder / "modelDescription.xml").getroot()
         name = self.description.find("CoSimulation").get("modelIdentifier")
         (binary,) = (folder / "binaries").glob(f"*/{name}.*")
+        if flags:
+            source, binary = folder / "sources" / f"{name}.c", folder / "again.so"
+            command = ["cc", "-std=c99", "-shared", "-fPIC", *flags, str(source), "-o", str(binary), "-lm"]
+            subprocess.run(command, check=True)
         self.library = ctypes.CDLL(str(binary))
         self.library.fmi2Instantiate.restype = ctypes.c_void_p
         self.references = {
@@ -25,6 +32,10 @@ class Fmu:
         }
         given = (b"one", COSIMULATION, (guid or self.description.get("guid")).encode(), b"", None, 0, 0)
         self.instance = ctypes.c_void_p(self.library.fmi2Instantiate(*given))
+
+    def call(self, name: str, *args) -> int:
+        """A function of the standard by its name without `fmi2`, of this instance."""
+        return getattr(self.library, f"fmi2{name}")(self.instance, *args)
 
     def begin(self, **parameters):
         """Set parameters ("__" for dots), and initialise."""

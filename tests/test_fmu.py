@@ -1,5 +1,7 @@
 """FMUs of plants: run by an importer of the tests' own and by FMPy, against the simulation."""
 
+import copy
+import ctypes
 import dataclasses
 import math
 import shutil
@@ -154,6 +156,130 @@ def test_the_description_says_what_is_what(tmp_path):
         assert {info.date_time[0] for info in archive.infolist()} == {1980}
     again = fmu(PLANTS["mirrored rig"], "plant", step=STEP)
     assert again == (tmp_path / "plant.fmu").read_bytes()
+
+
+STRICT = ("-O1", "-Wall", "-Wextra", "-Werror", "-Wshadow", "-fsanitize=undefined", "-fno-sanitize-recover=all")
+
+
+@pytest.fixture(scope="module")
+def strict(tmp_path_factory):
+    """A function that makes an instance of the mirrored rig, compiled with all warnings as errors, and with checks."""
+    folder = tmp_path_factory.mktemp("strict")
+    path = folder / "plant.fmu"
+    path.write_bytes(fmu(PLANTS["mirrored rig"], "plant", step=STEP))
+    first = Fmu(path, folder / "in", flags=STRICT)
+    return lambda: _another(first)
+
+
+def _another(one):
+    """A new instance of the same library."""
+    new = copy.copy(one)
+    given = (b"one", 1, one.description.get("guid").encode(), b"", None, 0, 0)
+    new.instance = ctypes.c_void_p(one.library.fmi2Instantiate(*given))
+    return new
+
+
+ZERO = ctypes.c_double(0.0)
+CALLS = {
+    "setup": ("SetupExperiment", 0, ZERO, ZERO, 0, ZERO),
+    "enter": ("EnterInitializationMode",),
+    "exit": ("ExitInitializationMode",),
+    "step": ("DoStep", ZERO, ctypes.c_double(1e-3), 1),
+    "terminate": ("Terminate",),
+    "reset": ("Reset",),
+}
+
+
+@pytest.mark.parametrize(
+    ("calls", "refused"),
+    [
+        ("enter", "enter"),  # before the experiment is set up
+        ("setup exit", "exit"),
+        ("setup step", "step"),
+        ("setup terminate", "terminate"),
+        ("setup enter step", "step"),
+        ("setup enter enter", "enter"),
+        ("setup enter setup", "setup"),
+        ("setup enter terminate", "terminate"),
+        ("setup enter exit exit", "exit"),
+        ("setup enter exit enter", "enter"),
+        ("setup enter exit setup", "setup"),
+        ("setup enter exit step terminate step", "step"),
+        ("setup enter exit step terminate terminate", "terminate"),
+        ("setup enter exit reset step", "step"),
+        ("setup enter exit step step terminate reset setup enter exit step", ""),
+    ],
+)
+def test_calls_out_of_order_are_errors(calls, refused, strict):
+    one = strict()
+    *before, last = calls.split()
+    assert [one.call(*CALLS[name]) for name in before] == [0] * len(before)
+    assert one.call(*CALLS[last]) == (3 if refused else 0)
+
+
+def test_calls_without_an_instance_are_errors(strict):
+    one = strict()
+    one.instance = None
+    value, size, nothing = ctypes.c_double(), ctypes.c_size_t(), ctypes.c_void_p(None)
+    more = {
+        "get": ("GetReal", None, size, ctypes.byref(value)),
+        "set": ("SetReal", None, size, ctypes.byref(value)),
+        "keep": ("GetFMUstate", ctypes.byref(nothing)),
+        "restore": ("SetFMUstate", nothing),
+        "size": ("SerializedFMUstateSize", nothing, ctypes.byref(size)),
+        "time": ("GetRealStatus", 2, ctypes.byref(value)),
+    }
+    for name, call in (CALLS | more).items():
+        assert one.call(*call) == 3, name
+
+
+def test_parameters_have_limits(strict):
+    """In the description and in the library, the same, from the ranges of the parts."""
+    one = strict()
+    variables = {scalar.get("name"): scalar.find("Real") for scalar in one.description.iter("ScalarVariable")}
+    specs = d.core.pytree.elements(PLANTS["mirrored rig"].plant)
+    assert float(variables["plant.mass"].get("min")) > 0
+    assert variables["plant.mass"].get("max") is None
+    assert (variables["initial.slip"].get("min"), variables["initial.slip"].get("max")) == ("0.0", "1.0")
+    assert variables["control"].get("min") is variables["slip"].get("min") is None
+    assert one.call(*CALLS["setup"]) == one.call(*CALLS["enter"]) == 0
+    for name, spec in specs.items():
+        real = variables[f"plant.{name}"]
+        low, high = float(real.get("min", -math.inf)), float(real.get("max", math.inf))
+        start = float(real.get("start"))
+        assert spec.holds(start)
+        for value in (low, high, start, -1.0, 0.0, 2.0, 1e300, math.inf, -math.inf, math.nan):
+            assert one.set(f"plant.{name}", value) == (0 if spec.holds(value) else 3), (name, value)
+        assert all(spec.holds(x) for x in (low, high) if math.isfinite(x))
+        assert one.set(f"plant.{name}", start) == 0
+    assert one.set("control", math.nan) == 3
+    assert one.call(*CALLS["exit"]) == 0
+    assert one.set("control", math.inf) == 3
+    assert one.set("control", 2.0) == 0
+    assert one.step(0.0, 1e-3) == 0
+
+
+def test_a_value_out_of_range_changes_nothing(strict):
+    one = strict()
+    both = (ctypes.c_uint * 2)(one.references["plant.wheel_radius"], one.references["plant.mass"])
+    values = (ctypes.c_double * 2)(0.2, -1.0)
+    before = one.get("plant.wheel_radius", "plant.mass")
+    assert one.call("SetReal", both, ctypes.c_size_t(2), values) == 3
+    assert one.get("plant.wheel_radius", "plant.mass") == before
+
+
+def test_what_is_no_state_of_this_plant_is_refused(strict):
+    one = strict().begin()
+    kept, size = one.state(), ctypes.c_size_t()
+    assert one.call("SerializedFMUstateSize", kept, ctypes.byref(size)) == 0
+    data, restored = (ctypes.c_char * size.value)(), ctypes.c_void_p(None)
+    assert one.call("SerializeFMUstate", kept, data, size) == 0
+    assert one.call("DeSerializeFMUstate", data, size, ctypes.byref(restored)) == 0
+    one.restore(restored)
+    assert one.step(0.0, 1e-3) == 0
+    data[:] = b"\xff" * size.value
+    assert one.call("DeSerializeFMUstate", data, size, ctypes.byref(ctypes.c_void_p(None))) == 3
+    one.restore(kept)
 
 
 @pytest.mark.parametrize("about", ["bell \x07, null \0", "\x1b[2J", "<a b='&'> ]]>", "\ud800", "\ufffe"])

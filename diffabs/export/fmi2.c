@@ -1,5 +1,7 @@
 /* FMI 2.0 for co-simulation around a plant: the struct `model`, plant_start, plant_step and plant_show stand before this,
-   with GUID, VARIABLES, STATES, STEP and `begun`, the values of the variables before anything is set. */
+   with GUID, VARIABLES, OUTPUTS, STATES, STEP, and of the variables `begun`, the values before anything is set, and
+   `low` and `high`, between which they may be set. What is called out of order, or with a value out of range, is an
+   error that changes nothing; after a step that failed only a reset, another state or the end are left. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -19,10 +21,15 @@ typedef char fmi2Byte;
 EXPORT const char *fmi2GetTypesPlatform(void) { return "default"; }
 EXPORT const char *fmi2GetVersion(void) { return "2.0"; }
 
+enum { INSTANTIATED, INITIALISING, RUNNING, FAILED, TERMINATED };
+
+static bool in(const model *m, int phase) { return m != NULL && m->phase == phase; }
+
 static void begin(model *m)
 {
   memset(m, 0, sizeof *m);
   memcpy(m->v, begun, sizeof begun);
+  memcpy(m->guid, GUID, sizeof m->guid);
 }
 
 EXPORT fmi2Component fmi2Instantiate(fmi2String name, int type, fmi2String guid, fmi2String place, const void *functions,
@@ -49,33 +56,48 @@ EXPORT fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n,
 EXPORT fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean tolerant, double tolerance, double start,
                                       fmi2Boolean stops, double stop)
 {
-  (void)tolerant, (void)tolerance, (void)stops, (void)stop;
-  ((model *)c)->time = start;
+  model *m = c;
+  (void)tolerant, (void)tolerance;
+  if (!in(m, INSTANTIATED) || !isfinite(start) || (stops && !(stop >= start)))
+    return fmi2Error;
+  m->time = start;
+  m->ready = 1;
   return fmi2OK;
 }
 
 EXPORT fmi2Status fmi2EnterInitializationMode(fmi2Component c)
 {
-  (void)c;
+  model *m = c;
+  if (!in(m, INSTANTIATED) || !m->ready)
+    return fmi2Error;
+  m->phase = INITIALISING;
   return fmi2OK;
 }
 
 EXPORT fmi2Status fmi2ExitInitializationMode(fmi2Component c)
 {
-  plant_start(c);
-  plant_show(c);
-  ((model *)c)->running = true;
+  model *m = c;
+  if (!in(m, INITIALISING))
+    return fmi2Error;
+  plant_start(m);
+  plant_show(m);
+  m->phase = RUNNING;
   return fmi2OK;
 }
 
 EXPORT fmi2Status fmi2Terminate(fmi2Component c)
 {
-  (void)c;
+  model *m = c;
+  if (!in(m, RUNNING))
+    return fmi2Error;
+  m->phase = TERMINATED;
   return fmi2OK;
 }
 
 EXPORT fmi2Status fmi2Reset(fmi2Component c)
 {
+  if (c == NULL)
+    return fmi2Error;
   begin(c);
   return fmi2OK;
 }
@@ -83,10 +105,12 @@ EXPORT fmi2Status fmi2Reset(fmi2Component c)
 EXPORT fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference at[], size_t n, double value[])
 {
   model *m = c;
+  if (m == NULL || (n > 0 && (at == NULL || value == NULL)))
+    return fmi2Error;
   for (size_t i = 0; i < n; i++)
     if (at[i] >= VARIABLES)
       return fmi2Error;
-  if (!m->running) { /* what is shown before the start is that of the parameters set so far */
+  if (m->phase < RUNNING) { /* what is shown before the start is that of the parameters set so far */
     plant_start(m);
     plant_show(m);
   }
@@ -98,8 +122,11 @@ EXPORT fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference at[], si
 EXPORT fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference at[], size_t n, const double value[])
 {
   model *m = c;
+  if (m == NULL || m->phase > RUNNING || (n > 0 && (at == NULL || value == NULL)))
+    return fmi2Error;
   for (size_t i = 0; i < n; i++)
-    if (at[i] >= VARIABLES || at[i] < OUTPUTS || (m->running && at[i] != OUTPUTS))
+    if (at[i] >= VARIABLES || at[i] < OUTPUTS || (m->phase == RUNNING && at[i] != OUTPUTS) ||
+        !(value[i] >= low[at[i]] && value[i] <= high[at[i]]))
       return fmi2Error; /* only the control is an input; parameters are fixed once it runs */
   for (size_t i = 0; i < n; i++)
     m->v[at[i]] = value[i];
@@ -112,7 +139,7 @@ EXPORT fmi2Status fmi2DoStep(fmi2Component c, double from, double length, fmi2Bo
   const double whole = length / STEP, nearest = floor(whole + 0.5);
   const double count = fabs(whole - nearest) <= 1e-6 * nearest ? nearest : ceil(whole);
   (void)no_return;
-  if (!m->running || !(length > 0) || !(count < 1e9))
+  if (!in(m, RUNNING) || !isfinite(from) || !(length > 0) || !(count < 1e9))
     return fmi2Error;
   for (long i = 0; i < (long)count; i++) {
     const double h = length / count;
@@ -121,30 +148,37 @@ EXPORT fmi2Status fmi2DoStep(fmi2Component c, double from, double length, fmi2Bo
   m->time = from + length;
   plant_show(m);
   for (size_t i = 0; i < STATES; i++)
-    if (!isfinite(m->x[i]))
+    if (!isfinite(m->x[i])) {
+      m->phase = FAILED;
       return fmi2Error;
+    }
+  return fmi2OK;
+}
+
+/* A state is known by its GUID: that of another model has another meaning. */
+static fmi2Status copied(model *to, const model *from)
+{
+  if (to == NULL || from == NULL || strcmp(from->guid, GUID) != 0)
+    return fmi2Error;
+  memcpy(to, from, sizeof *to);
   return fmi2OK;
 }
 
 EXPORT fmi2Status fmi2GetFMUstate(fmi2Component c, void **state)
 {
+  if (c == NULL || state == NULL)
+    return fmi2Error;
   if (*state == NULL)
     *state = malloc(sizeof(model));
-  if (*state == NULL)
-    return fmi2Error;
-  memcpy(*state, c, sizeof(model));
-  return fmi2OK;
+  return copied(*state, c);
 }
 
-EXPORT fmi2Status fmi2SetFMUstate(fmi2Component c, void *state)
-{
-  memcpy(c, state, sizeof(model));
-  return fmi2OK;
-}
+EXPORT fmi2Status fmi2SetFMUstate(fmi2Component c, void *state) { return copied(c, state); }
 
 EXPORT fmi2Status fmi2FreeFMUstate(fmi2Component c, void **state)
 {
-  (void)c;
+  if (c == NULL || state == NULL)
+    return fmi2Error;
   free(*state);
   *state = NULL;
   return fmi2OK;
@@ -152,15 +186,15 @@ EXPORT fmi2Status fmi2FreeFMUstate(fmi2Component c, void **state)
 
 EXPORT fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, void *state, size_t *size)
 {
-  (void)c, (void)state;
+  if (c == NULL || state == NULL || size == NULL)
+    return fmi2Error;
   *size = sizeof(model);
   return fmi2OK;
 }
 
 EXPORT fmi2Status fmi2SerializeFMUstate(fmi2Component c, void *state, fmi2Byte bytes[], size_t size)
 {
-  (void)c;
-  if (size < sizeof(model))
+  if (c == NULL || state == NULL || bytes == NULL || size < sizeof(model))
     return fmi2Error;
   memcpy(bytes, state, sizeof(model));
   return fmi2OK;
@@ -168,15 +202,15 @@ EXPORT fmi2Status fmi2SerializeFMUstate(fmi2Component c, void *state, fmi2Byte b
 
 EXPORT fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, void **state)
 {
-  (void)c;
-  if (size != sizeof(model))
+  model read;
+  if (c == NULL || bytes == NULL || state == NULL || size != sizeof read)
+    return fmi2Error;
+  memcpy(&read, bytes, sizeof read);
+  if (strncmp(read.guid, GUID, sizeof read.guid) != 0 || read.phase < INSTANTIATED || read.phase > TERMINATED)
     return fmi2Error;
   if (*state == NULL)
     *state = malloc(sizeof(model));
-  if (*state == NULL)
-    return fmi2Error;
-  memcpy(*state, bytes, sizeof(model));
-  return fmi2OK;
+  return copied(*state, &read);
 }
 
 /* What FMI asks every FMU to have, and this one has nothing of. */
@@ -231,6 +265,8 @@ EXPORT fmi2Status fmi2GetStatus(fmi2Component c, int kind, fmi2Status *value)
 
 EXPORT fmi2Status fmi2GetRealStatus(fmi2Component c, int kind, double *value)
 {
+  if (c == NULL || value == NULL)
+    return fmi2Error;
   if (kind != 2) /* the last time that was reached */
     return fmi2Discard;
   *value = ((model *)c)->time;

@@ -68,12 +68,15 @@ def _source(plant: PlantSource, guid: str, step: float) -> str:
     """All of its C in one file."""
     outputs = sum(one.role == "output" for one in plant.variables)
     begun = ", ".join(_number(one.value) for one in plant.variables)
-    struct = "double v[VARIABLES];\n  double x[STATES];\n  double time;\n  bool running;"
+    struct = "double v[VARIABLES], x[STATES], time;\n  int phase, ready;\n  char guid[sizeof GUID];"
+    limits = {name: ", ".join(_number(getattr(one, name)) for one in plant.variables) for name in ("low", "high")}
     head = (
         "#include <math.h>\n#include <stdbool.h>\n#include <stddef.h>\n#include <stdint.h>\n\n"
         f'#define GUID "{guid}"\n#define VARIABLES {len(plant.variables)}\n#define OUTPUTS {outputs}\n'
         f"#define STATES {plant.states}\n#define STEP {step!r}\n\ntypedef struct {{\n  {struct}\n}} model;\n\n"
         f"static const double begun[VARIABLES] = {{{begun}}};\n"
+        f"static const double low[VARIABLES] = {{{limits['low']}}};\n"
+        f"static const double high[VARIABLES] = {{{limits['high']}}};\n"
     )
     glue = (importlib.resources.files("diffabs.export") / "fmi2.c").read_text(encoding="utf-8")
     return f"{head}\n{plant.text}\n{glue}"
@@ -129,7 +132,11 @@ def _variable(parent: Any, one: Variable, reference: int) -> None:
         "name": one.name, "valueReference": str(reference), **CAUSES[one.role],
     })  # fmt: skip
     start = {} if one.role == "output" else {"start": repr(one.value).replace("inf", "INF")}
-    xml.SubElement(scalar, "Real", {**start, **({} if one.unit in ("", "1") else {"unit": printable(one.unit)})})
+    limits = {"min": one.low, "max": one.high} if one.role == "parameter" else {}
+    shown = {name: repr(limit) for name, limit in limits.items() if abs(limit) < sys.float_info.max}
+    xml.SubElement(
+        scalar, "Real", {**shown, **start, **({} if one.unit in ("", "1") else {"unit": printable(one.unit)})}
+    )
 
 
 def _unknowns(structure: Any, variables: Sequence[Variable]) -> None:

@@ -2,6 +2,8 @@
 
 The text is that of the functions which the simulation calls, traced, as for a controller (`lowered`)."""
 
+import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -10,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import parameters, prepared, strong
+from diffabs.core.pytree import Spec, parameters, prepared, strong
 from diffabs.export.c_words import Words
 from diffabs.export.device import NotExported
 from diffabs.export.labels import Labelled
@@ -25,12 +27,14 @@ CONTROL = "control"
 
 class Variable(NamedTuple):
     """A number that is seen from outside: what is shown ("output"), the control ("input"), or a parameter, with its
-    value before anything is set; a unit."""
+    value before anything is set; its unit, and the least and the greatest value that it may be set to."""
 
     name: str
     role: str
     value: float
     unit: str
+    low: float = -sys.float_info.max
+    high: float = sys.float_info.max
 
 
 class PlantSource(NamedTuple):
@@ -70,8 +74,20 @@ def _variables(loop: Loop) -> tuple[Variable, ...]:
             units = [unit.strip() for unit in spec.unit.split(",")]
             for k, at in enumerate(np.ndindex(numbers.shape)):
                 unit = units[min(k, len(units) - 1)]
-                found.append(Variable(".".join([where, path, *map(str, at)]), "parameter", float(numbers[at]), unit))
+                name = ".".join([where, path, *map(str, at)])
+                found.append(Variable(name, "parameter", float(numbers[at]), unit, *_limits(spec)))
     return tuple(found)
+
+
+def _limits(spec: Spec) -> tuple[float, float]:
+    """The least and the greatest number of a range; below an open end the nearest one, above 0 the least normal one."""
+    low, high = spec.low, spec.high
+    if spec.open_low:
+        low = sys.float_info.min if low == 0 else math.nextafter(low, math.inf)
+    if spec.open_high:
+        high = -sys.float_info.min if high == 0 else math.nextafter(high, -math.inf)
+    most = math.inf if spec.infinite else sys.float_info.max
+    return max(low, -most), min(high, most)
 
 
 class _Written:
