@@ -1,10 +1,14 @@
 """`diffabs verify`: proves what is true, in fractions, and nothing that is false or no claim at all."""
 
+import contextlib
 import copy
+import inspect
 import json
 import os
 import subprocess
 import sys
+import time
+from fractions import Fraction
 
 import checker
 import numpy as np
@@ -12,7 +16,7 @@ import pytest
 from commands import assert_one_error_line, run
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-from diffabs.cli import console
+from diffabs.cli import console, design
 from diffabs.design import verify
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof.certificate import Certificate, Claim
@@ -212,3 +216,85 @@ def test_it_needs_no_solver_and_the_checker_nothing_of_the_package(tmp_path):
             f"m = runpy.run_path({verify.__file__!r}); assert not m['verify']({str(path)!r})[0].reason"  # fmt: skip
     done = subprocess.run([sys.executable, "-c", alone], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+# As long as it may take
+
+
+def large(n, exponent=2.0, vertices=1):
+    """A decay of n states, of numbers over so many decades to both sides: A is about -1000, P about 1e10."""
+    rng = np.random.default_rng(n)
+
+    def drawn():
+        return rng.uniform(0.1, 1.0, (n, n)) * 10.0 ** rng.uniform(-exponent, exponent, (n, n))
+
+    p = np.tril(1e-3 * drawn(), -1)
+    p = p + p.T + 10.0 ** (exponent + 8) * np.eye(n)
+    a = [(drawn() * (1 - np.eye(n)) - 1e3 * np.eye(n)).tolist() for _ in range(vertices)]
+    system = {**UNSTABLE, "A": a, "B": [[[0.0]] * n] * vertices}
+    return document(system=system, gain=[[0.0] * n], P=p.tolist(), rate=0.0)
+
+
+def test_many_states_are_decided(tmp_path):
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps(large(32)))
+    begun = time.monotonic()
+    (verdict,) = verify.verify(path)
+    assert not verdict.reason
+    assert time.monotonic() - begun < 5
+
+
+@pytest.mark.parametrize("given", [(64, 250.0), (64, 2.0, 40)], ids=["digits", "vertices"])
+def test_what_takes_too_long_is_refused(given, tmp_path):
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps(large(*given)))
+    begun = time.monotonic()
+    result = run("verify", path, "--seconds", "0.5", status=2)
+    assert time.monotonic() - begun < 5
+    assert "is not decided within 0.5 s, so nothing is proved" in result.stderr
+    assert_one_error_line(result)
+
+
+def test_the_command_takes_as_long_as_the_library():
+    (option,) = [one.default for name, one in inspect.signature(design.verify).parameters.items() if name == "seconds"]
+    assert option == verify.LONGEST
+
+
+def test_no_time_is_no_answer(tmp_path):
+    assert "--seconds = 0 is outside (0, inf) s" in run("verify", tmp_path / "c.json", "--seconds", 0, status=2).stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [(64,), (24, 280.0), (64, 280.0), (64, 2.0, 40)])
+def test_an_answer_or_a_refusal_within_ten_seconds(given, tmp_path):
+    path = tmp_path / "c.json"
+    path.write_text(json.dumps(large(*given)))
+    begun = time.monotonic()
+    with contextlib.suppress(ValueError):
+        verify.verify(path)
+    assert time.monotonic() - begun < 10
+
+
+def test_a_trace_beyond_all_doubles_is_one_line(tmp_path):
+    path = tmp_path / "c.json"
+    huge = (np.eye(2) * 1.7e308).tolist()
+    system = {**UNSTABLE, "A": [(-np.eye(2)).tolist()], "B": [[[0.0], [0.0]]]}
+    path.write_text(json.dumps(document("cost", system, [[0.0, 0.0]], P=huge, Q=np.eye(2).tolist(), R=[[1.0]])))
+    with pytest.raises(ValueError, match="beyond the largest double"):
+        verify.verify(path)
+
+
+def test_elimination_agrees_with_the_eigenvalues():
+    """Positive, semidefinite, indefinite and singular matrices of whole numbers, exact in doubles."""
+    rng, seen = np.random.default_rng(4), set()
+    for _ in range(300):
+        n, rank = rng.integers(1, 6), rng.integers(1, 6)
+        factor = rng.integers(-2, 3, (n, rank))
+        m = factor @ factor.T - rng.choice([0, 0, 1]) * np.diag(rng.integers(0, 2, n))
+        least = np.linalg.eigvalsh(m)[0]
+        exact = [[Fraction(int(x), 3) for x in row] for row in m]
+        for semi in (False, True):
+            wanted = least > -1e-9 if semi else least > 1e-9
+            assert verify.positive(exact, semi) is bool(wanted), m
+            seen.add((semi, bool(wanted)))
+    assert len(seen) == 4

@@ -69,6 +69,9 @@ def certify(
 
 def verify(
     file: Annotated[pathlib.Path, typer.Argument(metavar="FILE.json", help="What design or certify wrote.")],
+    seconds: Annotated[
+        float, typer.Option(help="Refuse a file that is not decided after so many seconds of computing.")
+    ] = 6.0,
     as_json: console.Json = False,
 ) -> None:
     """Prove a saved certificate again, in fractions, by code that shares nothing with what made it. Exit status 0
@@ -76,8 +79,10 @@ def verify(
     from diffabs.design.verify import verify as verified
 
     with console.guarded():
+        if not 0 < seconds < math.inf:
+            console.fail(f"--seconds = {seconds:g} is outside (0, inf) s")
         try:
-            verdicts = console.waited(lambda: verified(file), f"verifying {file}")
+            verdicts = console.waited(lambda: verified(file, seconds), f"verifying {file}")
         except ValueError as error:
             console.fail(f"{file}: {' '.join(str(error).split())}")
         proved = bool(verdicts) and not any(verdict.reason for verdict in verdicts)

@@ -9,18 +9,25 @@ what a claim must contain, in which range, is part of what is checked. In discre
     cost        the same without a rate, and with -Q - K'RK         damping, l2, input, scheduled: as in `exact`
 """
 
+import contextvars
 import itertools
 import json
 import math
+import operator
 import os
 import pathlib
 import stat
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from typing import Any, NamedTuple
 
 Matrix = list[list[Fraction]]
 LARGEST_FILE, LARGEST_ORDER, LARGEST_SET = 2**24, 64, 2**12  # bytes; states or inputs; vertices, cells, points
+LONGEST = 6.0  # s, so that the command answers within 10
+_deadline: contextvars.ContextVar[tuple[float, float]] = contextvars.ContextVar(
+    "deadline", default=(math.inf, math.inf)
+)
 SHAPES = {  # an axis a letter: n states, m inputs, V vertices, N nodes; "?" need not be there
     "decay": {"P": "nn", "rate?": "", "factor?": ""},
     "cost": {"P": "nn", "Q": "nn", "R": "mm", "x0?": "n"},
@@ -68,12 +75,14 @@ class Stored(NamedTuple):
     claims: list[tuple[str, dict[str, Any]]]
 
 
-def verify(path: str | os.PathLike[str]) -> list[Verdict]:
+def verify(path: str | os.PathLike[str], seconds: float = LONGEST) -> list[Verdict]:
     """A verdict for each claim of a file.
 
+    path: of the file; seconds: after which an undecided file is refused
     Raises ValueError, in one line that names the field, for what is no certificate: not readable, not of the format, a
-    claim that does not fit its system or is outside of its range.
+    claim that does not fit its system or is outside of its range; and for one that is not decided in time.
     """
+    given = _deadline.set((time.monotonic() + seconds, seconds))
     try:
         stored = _stored(_parsed(pathlib.Path(path)))
         return [Verdict(kind, _says(kind, d, stored.discrete), _reason(kind, d, stored)) for kind, d in stored.claims]
@@ -81,6 +90,20 @@ def verify(path: str | os.PathLike[str]) -> list[Verdict]:
         raise ValueError(f"cannot be read: {error.strerror or error}") from None
     except RecursionError:
         raise ValueError("is nested too deeply") from None
+    except OverflowError:
+        raise ValueError("has numbers whose sum is beyond the largest double") from None
+    finally:
+        _deadline.reset(given)
+
+
+def _check_time() -> None:
+    """Raises ValueError where the time for this file is over."""
+    end, seconds = _deadline.get()
+    if time.monotonic() > end:
+        raise ValueError(
+            f"is not decided within {seconds:g} s, so nothing is proved: fewer states, vertices or claims, numbers of"
+            " fewer digits, or more time are needed"
+        )
 
 
 # The file
@@ -196,6 +219,7 @@ def _tensor(value: Any, letters: str, sizes: dict[str, int], where: str) -> Any:
         return Fraction(value)
     if not isinstance(value, list) or not 0 < len(value) <= LARGEST_SET:
         raise ValueError(f"{where} must be a list of 1 to {LARGEST_SET}")
+    _check_time()
     if len(value) != sizes.setdefault(letters[0], len(value)):
         raise ValueError(f"{where} has {len(value)} entries; {sizes[letters[0]]} are needed")
     return [_tensor(each, letters[1:], sizes, f"{where}[{i}]") for i, each in enumerate(value)]
@@ -205,12 +229,23 @@ def _tensor(value: Any, letters: str, sizes: dict[str, int], where: str) -> Any:
 
 
 def mul(*factors: Matrix) -> Matrix:
-    """A B ..."""
+    """A B ..., each product in integers over a common denominator."""
     a, *rest = factors
     for b in rest:
-        columns = turned(b)
-        a = [[sum((x * y for x, y in zip(row, c, strict=True) if x and y), Fraction(0)) for c in columns] for row in a]
+        (rows, below), (columns, under) = _integers(a), _integers(turned(b))
+        a = [[_quotient(map(operator.mul, row, column), below * under) for column in columns] for row in rows]
     return a
+
+
+def _integers(m: Matrix) -> tuple[list[list[int]], int]:
+    """M times the common denominator of its entries, and that."""
+    below = math.lcm(*(x.denominator for row in m for x in row))
+    return [[x.numerator * (below // x.denominator) for x in row] for row in m], below
+
+
+def _quotient(terms: Iterable[int], below: int) -> Fraction:
+    _check_time()
+    return Fraction(sum(terms), below)
 
 
 def turned(a: Matrix) -> Matrix:
@@ -240,16 +275,27 @@ def block(a: Matrix, b: Matrix, d: Matrix) -> Matrix:
 
 
 def positive(m: Matrix, semi: bool = False) -> bool:
-    """Whether M is symmetric and its pivots positive; of a semidefinite matrix, a zero pivot's row is zero."""
+    """Whether M is symmetric and its pivots positive; of a semidefinite matrix, a zero pivot's row is zero.
+
+    Elimination in integers (Bareiss, 1968): `rows` are those of the upper triangle, every entry a minor of M times the
+    common denominator, so divisions leave no rest, and no number grows beyond a minor."""
     if m != turned(m):
         return False
-    while m:
-        (pivot, *row), *rest = m
+    whole, last = _integers(m)[0], 1
+    rows = [row[i:] for i, row in enumerate(whole)]
+    while rows:
+        (pivot, *row), *rows = rows
         if pivot < 0 or (pivot == 0 and (any(row) or not semi)):
             return False
-        scale = [x / pivot if x else Fraction(0) for x in row] if pivot else row
-        m = [[x - first * s if first and s else x for x, s in zip(r, scale, strict=True)] for first, *r in rest]
+        if pivot:
+            rows = [_eliminated(pivot, a, row[i:], r, last) for i, (a, r) in enumerate(zip(row, rows, strict=True))]
+            last = pivot
     return True
+
+
+def _eliminated(pivot: int, first: int, above: list[int], row: list[int], last: int) -> list[int]:
+    _check_time()
+    return [(pivot * x - first * y) // last for x, y in zip(row, above, strict=True)]
 
 
 def _reason(kind: str, d: Mapping[str, Any], stored: Stored) -> str:
