@@ -6,6 +6,8 @@ import numpy as np
 import parts
 import pytest
 
+import diffabs as d
+from diffabs import actuators, controllers, objectives, plants, references, stops
 from diffabs.core.messages import Segment
 from diffabs.core.protocols import Shown
 from diffabs.objectives import PeakVoltage
@@ -33,3 +35,31 @@ def test_a_voltage_that_rises_to_a_limit_does_not_leave_it():
     """u = 20 + 8 t to 24, where the step ends and the voltage falls: its slope there says nothing about the step."""
     objective, segment = PeakVoltage(), step(lambda t: jnp.where(t < 0.5, 20.0 + 8.0 * t, 26.0 - 4.0 * t), 0.5, True)
     np.testing.assert_allclose(objective.update(objective.start(segment.start), segment), 24.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("lag", "end"), [(1e-3, 10.5), pytest.param(0.0, 5.0, marks=pytest.mark.slow)])
+def test_a_peak_on_an_event_of_the_grid_moves_with_the_event(lag, end):
+    """The slip rises until the brake is released, on an instant of the grid. The step to that event has no length, but
+    its end moves with the delay, and so do the peak and the torque's variation. Against differences from both sides."""
+    inner = controllers.PID(kp=20.0, ki=200.0, torque_min=0.2, torque_max=6.0)
+    loop = d.Loop(
+        plant=plants.MirroredRig(),
+        initial=d.BrakeStart(speed=11.0, slip=0.03),
+        stop=stops.SpeedReached(speed=end),
+        reference=references.FixedSlip(slip=0.15),
+        feedforward=controllers.HoldingInput(),
+        controller=controllers.Sampled(controller=inner, period=2e-3, delay=1e-3),
+        **({"actuator": actuators.Lag(time_constant=lag)} if lag else {}),
+    )
+    measured = {"slip": objectives.MaxSlip(), "variation": objectives.Variation()}
+
+    @jax.jit
+    def values(delay):
+        late = d.replace(loop, {"controller.delay": delay})
+        found = d.measure(late, d.FixedStep(2e-4, 2.0), measured).metrics
+        return jnp.stack([found[name] for name in measured])
+
+    slopes, here = np.asarray(jax.jit(jax.jacfwd(values))(1e-3)), np.asarray(values(1e-3))
+    left, right = ((np.asarray(values(1e-3 + width)) - here) / width for width in (-2e-6, 2e-6))
+    np.testing.assert_allclose(left, right, rtol=2e-2)  # there is a derivative
+    np.testing.assert_allclose(slopes, (left + right) / 2, rtol=2e-3)

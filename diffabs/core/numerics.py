@@ -8,6 +8,8 @@ import jax.numpy as jnp
 
 from diffabs.core.pytree import Scalar
 
+EQUAL = 1024.0  # precisions: two values of a signal at instants that are one to rounding
+
 
 def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
     """x limited to [low, high]. The slope in x is 1 at a limit and 0 beyond it, where that in the limit is 1.
@@ -21,6 +23,13 @@ def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
 def larger(x: Scalar, y: Scalar) -> Any:
     """max(x, y). Equal, the slope is that in x: `jnp.maximum` shares it between both, by a division in its tangent."""
     return jnp.where(jnp.greater_equal(x, y), x, y)
+
+
+def later_of_larger(x: Scalar, y: Scalar) -> Any:
+    """max(x, y) of two values one after the other. Where they are equal to rounding, the slope is that of the later
+    one, y: the end of a step without a length moves with the event there, its beginning does not."""
+    rounding = EQUAL * jnp.finfo(jnp.result_type(x, y)).eps * jnp.abs(x)
+    return jnp.where(jnp.greater(x, y + rounding), x, y)
 
 
 def smaller(x: Scalar, y: Scalar) -> Any:

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.numerics import clamp, larger, sign
+from diffabs.core.numerics import clamp, larger, later_of_larger, sign
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, pytree
 from diffabs.objectives.tracking import FinalError, SettlingTime, held, integral, nothing, unchanged
@@ -65,7 +65,7 @@ def _greatest(name: str) -> tuple[Any, Any, Any, Any]:
         """The greatest so far."""
         del self
         angle = segment.output(lambda output: getattr(output, name))
-        return larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()))
+        return later_of_larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()))
 
     return start, nothing, update, held
 
@@ -102,8 +102,8 @@ def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
     def update(self: Any, memory: Memory, segment: Segment) -> Scalar:
         """The greater of what was, and of the greatest of the step."""
         del self
-        ends = larger(size(segment.start), size(segment.end))
-        return larger(memory.held, segment.sample(size).greatest_of_parabola() if segment.smooth else ends)
+        ends = later_of_larger(size(segment.start), size(segment.end))
+        return later_of_larger(memory.held, segment.sample(size).greatest_of_parabola() if segment.smooth else ends)
 
     return start, nothing, update, held
 

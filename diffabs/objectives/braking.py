@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from diffabs.core.numerics import larger, smaller
+from diffabs.core.numerics import larger
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.objectives.tracking import FinalError, from_zero, held, held_from_zero, integral, nothing, unchanged
@@ -102,9 +102,11 @@ class Variation:
         total, last = memory.held
         u = segment.sample(lambda sample: sample.control)
         top, bottom = u.greatest(), -u.times(-1.0).greatest()
-        low, high = smaller(u.start, u.end), larger(u.start, u.end)
-        inside = (high - low) + 2.0 * ((top - high) + (low - bottom))
-        return Varied(total + jnp.abs(u.start - last) + inside, u.end)
+        # A step without a length, to an event, has no rise yet: which way it moves with the event its rate says.
+        up = jnp.where(u.start == u.end, segment.sample_rates()[0].control > 0, u.end > u.start)
+        low, high = jnp.where(up, u.start, u.end), jnp.where(up, u.end, u.start)
+        beyond = jnp.where(top > high, top - high, 0.0) + jnp.where(bottom < low, low - bottom, 0.0)
+        return Varied(total + jnp.abs(u.start - last) + (high - low) + 2.0 * beyond, u.end)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """What was found."""

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.cubic import Cubic
-from diffabs.core.numerics import larger, sign, smaller
+from diffabs.core.numerics import later_of_larger, sign, smaller
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, pytree
 
@@ -131,7 +131,7 @@ class MaxSlip:
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """The greatest of the step, from its cubic."""
         slip = segment.output(lambda output: output.slip).greatest()
-        return larger(memory.held, smaller(slip, 1.0))
+        return later_of_larger(memory.held, smaller(slip, 1.0))
 
 
 @pytree
@@ -154,7 +154,7 @@ class Overshoot:
         """The greatest of the step, from its cubic."""
         side, greatest = memory.held
         value = segment.output().times(side).greatest()
-        return Sided(side, larger(greatest, smaller(value, highest(segment.end.output))))
+        return Sided(side, later_of_larger(greatest, smaller(value, highest(segment.end.output))))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Overshoot."""
