@@ -253,6 +253,26 @@ def test_a_comment_ends_where_it_should(text, tmp_path):
     assert not re.search(r"[{}$]", written)
 
 
+@needs_cc
+def test_names_that_c_does_not_have_get_others(tmp_path):
+    """Fields whose letters are not of ASCII, two of which would be called the same."""
+
+    @d.core.pytree.pytree
+    class Greek:
+        start, flow = d.core.protocols.no_memory, d.core.protocols.no_flow
+        α: float = d.core.pytree.param(default=3.0, unit="1")
+        β: float = d.core.pytree.param(default=0.5, unit="1")
+
+        def output(self, t, memory, signal):
+            return self.α * signal.measured.slip + self.β
+
+    found = device(rig(Greek()))
+    program = compiled(c_source(found, "unit"), "unit", tmp_path)
+    said = subprocess.run([program], input="0.5\n", capture_output=True, text=True, check=True).stdout
+    assert float(said) == 2.0
+    assert Block(structured_text(found, "Unit"))(slip=0.5) == 2.0
+
+
 def test_numbers_are_called_as_in_the_source():
     """No number has a name that says nothing."""
     text = c_source(device(LOOPS["PID, filtered derivative"]), "unit")

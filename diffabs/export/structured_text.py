@@ -280,7 +280,7 @@ def _scientific(x: float) -> str:
 def _fresh(path: str, taken: set[str]) -> str:
     """A name that the language has, that no other is, whatever the case; which is then taken."""
     name = re.sub(r"[\W_]+", "_", path, flags=re.ASCII).strip("_")
-    name = f"x_{name}" if name.lower() in RESERVED or not name[:1].isalpha() else name
+    name = f"x_{name}".strip("_") if name.lower() in RESERVED or not name[:1].isalpha() else name
     number, fresh = 2, name
     while fresh.lower() in taken:
         number, fresh = number + 1, f"{name}_{number}"

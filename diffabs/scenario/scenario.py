@@ -1,5 +1,6 @@
 """A scenario: a TOML file, or the name of a packaged one, that says what is run.
 
+    title, description    one printable line; printable lines
     [plant] [road] [initial] [sensor] [reference] [feedforward] [controller] [actuator] [stop]    a part each: `type`
     [solver]       type (fixed, adaptive), step [s], duration [s], every (trajectories keep every so many steps), rtol
                    (of adaptive steps), kinks (of fixed ones), seed (of noisy sensors)
