@@ -4,7 +4,8 @@ Of each past step, whatever its length, the delay keeps the times of both ends a
 them, from values and rates there. So a smooth command comes out to the order of the method. Where one step's end and
 the next one's beginning are not the same, in value or in rate, the command has jumped or bent: a step of the run ends
 where that comes out, and the moment of it carries the derivatives of the moment at which it went in, and of `time`.
-(To a delay of exactly one step the jump is known only when it comes out: that has no derivative in `time`.)
+To a delay of exactly one step the jump is known when it comes out. Where a derivative by `time` is asked for, the next
+step begins with that event (`_InEvents`).
 
 In Runge-Kutta stages the delayed command must be smooth, also beyond such an end. So a step uses the pieces between
 two ends alone, from a window of those that come out next, which is moved on after every step."""
@@ -123,7 +124,7 @@ class Delay:
         return memory._replace(held=m._replace(ring=m.ring.put(free, row), newest=newest, count=count))
 
     def tick(self, clock: Clock, memory: Memory, signal: Scalar) -> Memory:
-        """The window from here. What breaks at this very instant has come out."""
+        """The window from here. After a delay of one step, what breaks at this very instant has come out."""
         del signal
         m: DelayMemory = memory.held
         size, over = m.ring.size, self._place(clock.t, m)
@@ -132,8 +133,16 @@ class Delay:
         window = jnp.where(count < size, rows, jnp.nan)  # else a piece that is still to come out is overwritten
         known, none = jnp.minimum(count, WINDOW), jnp.zeros_like(count)
         new = self._aimed(DelayMemory(m.ring, window, known, none, none, none, first, count, m.newest))
-        out = (new.last + 1 < known) & (new.until + self.time <= clock.t)
-        return memory._replace(held=self._aimed(new._replace(place=jnp.where(out, new.last + 1, none))))
+        return memory._replace(held=self._at_once(new, clock.t))
+
+    def _at_once(self, m: DelayMemory, t: Scalar) -> DelayMemory:
+        """What breaks at time t or before has come out."""
+        out = (m.last + 1 < m.known) & (m.until + self.time <= t)
+        return self._aimed(m._replace(place=jnp.where(out, m.last + 1, m.place)))
+
+    def differentiated(self, names: set[str]) -> "Delay":
+        """Return the same delay for derivatives by these of its parameters."""
+        return _InEvents(time=self.time, capacity=self.capacity) if "time" in names else self
 
     def _place(self, t: Scalar, m: DelayMemory) -> Any:
         """Which piece of the window comes out at time t, up to the next break."""
@@ -163,6 +172,16 @@ class Delay:
             f"time is {outside}",
             lambda: f"time = {float(self.time):g} s is {outside}",
         )
+
+
+@pytree
+class _InEvents(Delay):
+    """A delay whose command breaks in an event, also after a delay of one step: at the beginning of the next one. The
+    moment then has a derivative, and the sample kept at that instant is the command before."""
+
+    def _at_once(self, m: DelayMemory, t: Scalar) -> DelayMemory:
+        late = jnp.where(m.last + 1 < m.known, t + _rounding(t) - (m.until + self.time), 0.0)
+        return m._replace(until=m.until + jnp.maximum(jax.lax.stop_gradient(late), 0.0))
 
 
 def _row(piece: Piece) -> Any:

@@ -63,7 +63,7 @@ class Sampled:
         m: SampledMemory = memory.held
         now, number = clock.ticks(self.period)
         inner, output, _ = self.guarded(clock._replace(h=self.period, k=number), m.inner, m.next, signal)
-        waits = jnp.greater(self.delay, 0)
+        waits = self._waits()
         applied = jnp.where(waits, jnp.where(m.waits > 0.5, m.next, m.applied), output)
         new = SampledMemory(inner, applied, output, self._until(clock.t), jnp.where(waits, 1.0, 0.0))
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m))
@@ -93,12 +93,22 @@ class Sampled:
         inner, output = jax.tree.map(lambda old, new: jnp.where(held, old, new), (memory, last), new)
         return inner, output, held
 
+    def _waits(self) -> Any:
+        """Whether an output is computed for a while, so that an event applies it."""
+        return jnp.greater(self.delay, 0)
+
+    def differentiated(self, names: set[str]) -> "Sampled":
+        """Return the same controller for derivatives by these of its parameters."""
+        if "delay" not in names:
+            return self
+        return _AlwaysWaits(controller=self.controller, period=self.period, delay=self.delay)
+
     def _until(self, t: Scalar) -> Any:
-        """When what is sampled now is applied: a rounding before the next sample at the latest, or the moment of a
-        whole period would have no derivative."""
+        """When what is sampled now is applied. A rounding early: an event exactly on an instant of the grid would end
+        no step, and the greatest value of a run there would have the derivative of the instant, which does not move."""
         rounding = CLOSE * jnp.finfo(jnp.result_type(t, self.period)).eps * (t + self.period)
-        over = jnp.maximum(self.delay - (self.period - rounding), 0.0)
-        return t + self.delay - jax.lax.stop_gradient(over)
+        early = jnp.maximum(jnp.minimum(rounding, self.delay), self.delay - (self.period - rounding))
+        return t + self.delay - jax.lax.stop_gradient(early)
 
     def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: Any) -> tuple[Any]:
         """The time until the output changes."""
@@ -132,6 +142,16 @@ class Sampled:
 def usable(signal: Any) -> Any:
     """Return a signal with 0 for NaN: a memory that begins on it is finite."""
     return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), 0.0, x), signal)
+
+
+@pytree
+class _AlwaysWaits(Sampled):
+    """A controller whose output is applied in an event after any delay. Without a delay, too, it then has a derivative
+    in it, that from the right; the sample kept at such an instant is the output before. Values do without, because an
+    event in every period makes a run some times as long."""
+
+    def _waits(self) -> Any:
+        return jnp.asarray(True)
 
 
 def unsampled(controller: Any) -> Any:

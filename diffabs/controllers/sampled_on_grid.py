@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.controllers.pid import PID
-from diffabs.controllers.sampled import Sampled, usable, within_period
+from diffabs.controllers.sampled import CLOSE, Sampled, usable, within_period
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import Scalar, param, part, pytree
@@ -61,9 +61,15 @@ class SampledOnGrid:
         m: GridMemory = memory.held
         now, number = clock.ticks(self.sampling_period)
         inner, output, _ = self.guarded(clock._replace(h=self.sampling_period, k=number), m.inner, m.next, signal)
-        new = GridMemory(inner, output, m.next, clock.t + self.delay, m.applied)
+        close = CLOSE * jnp.finfo(jnp.result_type(clock.t, clock.h)).eps * (clock.t + self.sampling_period)
+        over = jax.lax.stop_gradient(jnp.maximum(self.delay - (self.sampling_period - 2 * close), 0.0))
+        new = GridMemory(inner, output, m.next, clock.t + self.delay - over, m.applied)
         m = jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m)
-        waits = clamp((m.until - clock.t) / clock.h, 0.0, 1.0)
+        left = m.until - clock.t
+        # An output that changes on the grid belongs to the step after it, so that one step alone has the derivative.
+        within = (left >= -close) & (left < clock.h - close)
+        fixed = jax.lax.stop_gradient(left)
+        waits = clamp(fixed / clock.h, 0.0, 1.0) + jnp.where(within, (left - fixed) / clock.h, 0.0)
         applied = waits * m.last + (1 - waits) * m.next
         return Memory(held=m._replace(applied=jnp.where(clock.ticks()[0], applied, m.applied)))
 

@@ -1,9 +1,10 @@
-"""An error in place of second derivatives that would be wrong.
+"""An error in place of derivatives that would be wrong: of a parameter that has none, and second ones.
 
 A rule for derivatives that freezes what depends on the parameters has right first derivatives and wrong second ones.
 Such a rule passes its tangents through `first_order`, on both sides: forward mode meets the one on its results, reverse
 mode the one on its arguments."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -20,6 +21,23 @@ def first_order(tangents: Any, why: str) -> Any:
         return x if getattr(x, "dtype", None) == jax.dtypes.float0 else _operation.bind(x, why=why)
 
     return jax.tree.map(each, tangents)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def without_derivative(path: str, x: Any) -> Any:
+    """Return x, the value of the parameter at this path. Whoever differentiates it gets a ValueError that names it."""
+    del path
+    return x
+
+
+@without_derivative.defjvp
+def _named(path: str, at: Any, moves: Any) -> tuple[Any, Any]:
+    # JAX asks for this rule only where x has a tangent: one that is known to be zero does not come here.
+    del at, moves
+    raise ValueError(
+        f"{path} has no derivative: a run does not depend smoothly on it. Differentiate by other parameters, or hold"
+        " this one with jax.lax.stop_gradient"
+    )
 
 
 def _refused(at: Any, moves: Any, *, why: str) -> Any:

@@ -280,6 +280,20 @@ def refined(part: Any, times: int) -> Any:
     return _rebuilt(part, "refined", times)
 
 
+def differentiated(part: Any, paths: Iterable[str], prefix: str = "") -> Any:
+    """The same parts, where derivatives by the parameters at these paths are asked for: a part that has a method
+    `differentiated(names)` is replaced by what it returns for those of its own."""
+    if isinstance(part, tuple):
+        return tuple(differentiated(item, paths, f"{prefix}{i}.") for i, item in enumerate(part))
+    if not dataclasses.is_dataclass(part):
+        return part
+    fields = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
+    inner = {name: differentiated(getattr(part, name), paths, f"{prefix}{name}.") for name in fields}
+    part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
+    own = {path.removeprefix(prefix) for path in paths if path.startswith(prefix)}
+    return part.differentiated(own) if hasattr(part, "differentiated") else part
+
+
 def _rebuilt(part: Any, method: str, *args: Any) -> Any:
     """The same parts, each that has this method replaced by what it returns; the innermost first."""
     if isinstance(part, tuple):

@@ -9,6 +9,13 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core.first_order import first_order
+from diffabs.core.pytree import parameters
+
+
+def asked(tangents: Any) -> frozenset[str]:
+    """Return the paths of a part's parameters by which it is differentiated, from its tangents in a rule with
+    `symbolic_zeros`."""
+    return frozenset(path for path, _, move in parameters(tangents) if type(move) is not SymbolicZero)
 
 
 def pushed(function: Callable[..., Any], primals: Any, tangents: Any, once: str = "") -> tuple[Any, Any]:

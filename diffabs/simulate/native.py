@@ -10,12 +10,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 
 from diffabs.core.compiling import traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import strong
-from diffabs.core.tracing import moving, pushed
+from diffabs.core.pytree import differentiated, strong
+from diffabs.core.tracing import asked, moving, pushed
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
@@ -26,7 +27,7 @@ from diffabs.simulate.methods import AtPace
 from diffabs.simulate.outcome import judge
 from diffabs.simulate.pursuit import Pursuing, Pursuit
 from diffabs.simulate.refill import ROUND, Enough, by_lane
-from diffabs.simulate.run import arguments
+from diffabs.simulate.run import arguments, without_derivatives
 from diffabs.simulate.solution import Run, Solver
 
 MOST = 1 << 17  # lanes that are started together: the carries of more would fill the memory
@@ -47,6 +48,7 @@ def run_native(
     `measure` objects to."""
     loop, objectives, method = arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
+    values = {**values, **without_derivatives(loop, values)}
     count = len(accepted)
     enough = jax.tree.map(jnp.asarray, enough)
     own = None if enough is None else jax.vmap(enough.own)(jnp.arange(count))
@@ -71,8 +73,12 @@ def _made(given: Any) -> Run:
 def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
     """By steps that end on kinks, as derivatives have them elsewhere (`run`)."""
 
+    moves = tangents[0]
+    paths = asked(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
+
     def run(given: Any) -> Run:
         loop, values, objectives, method, *rest = given
+        loop = differentiated(loop, paths)
         method = Pursuing(method.noted()) if isinstance(method, AtPace) else method.located()
         return _run(loop, values, objectives, method, *rest)
 

@@ -17,7 +17,7 @@ from diffabs.core.tracing import separated
 from diffabs.simulate.condition import Condition
 from diffabs.simulate.drivers import BLOCK, Carry
 from diffabs.simulate.outcome import judge, prepare
-from diffabs.simulate.run import arguments
+from diffabs.simulate.run import arguments, without_derivatives
 from diffabs.simulate.solution import Run, Solver
 
 WIDTH = 1024  # lanes whose state stays in a processor's cache
@@ -51,6 +51,7 @@ def run_refilled(
     Raises ValueError for what `measure` objects to."""
     loop, objectives, method = arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
+    values = {**values, **without_derivatives(loop, values)}
     return _run(loop, values, objectives, method, keys, accepted, enough, width=WIDTH)
 
 

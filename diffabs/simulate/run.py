@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core import kinds
-from diffabs.core.compiling import SAME, compile_once
+from diffabs.core.compiling import SAME, compile_once, traced
+from diffabs.core.first_order import without_derivative
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import arrayed, strong
-from diffabs.core.tracing import pushed
+from diffabs.core.pytree import arrayed, differentiated, parameters, replace, strong
+from diffabs.core.tracing import asked, pushed
 from diffabs.core.validity import misshapen
 from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
 from diffabs.simulate.methods import AtPace, method_of
@@ -92,7 +93,16 @@ def arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -
     """Loop, objectives, and what chooses the steps, of one data type. Raises ValueError."""
     refuse(loop, solver, objectives)
     loop, objectives = strong((arrayed(loop), {name: arrayed(part) for name, part in objectives.items()}))
+    if traced(loop):
+        loop = replace(loop, without_derivatives(loop, {path: value for path, _, value in parameters(loop)}))
     return loop, objectives, method_of(solver, jax.tree.leaves(loop)[0].dtype)
+
+
+def without_derivatives(loop: Loop, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those of the values, by path of the loop, on which a run does not depend smoothly. Whoever
+    differentiates by them gets a ValueError."""
+    coarse = {path for path, spec, _ in parameters(loop) if not spec.tunable}
+    return {path: without_derivative(path, value) for path, value in values.items() if path in coarse}
 
 
 def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
@@ -133,7 +143,12 @@ def _simulated(places: Places, run: Any) -> Run:
 
 def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
     loop, _, method, _ = primals[0]
-    return pushed(lambda run: _reversible(*run, places=places), primals, tangents, once=_only_once(loop, method))
+    paths = asked(tangents[0][0])
+
+    def reversible(run: Any) -> Run:
+        return _reversible(differentiated(run[0], paths), *run[1:], places=places)
+
+    return pushed(reversible, primals, tangents, once=_only_once(loop, method))
 
 
 def _only_once(loop: Loop, method: Any) -> str:
