@@ -4,7 +4,7 @@
 
 A pointer moves a slider 25 times a second. The time of each move runs, in the browser and by its clock, from the
 slider's event to the frame after which a curve of that value, or of a later one, was painted: server, simulation,
-network and drawing included. Needs diffabs[explore], Playwright and Chromium."""
+network and drawing included. Needs the extra `explore`, Playwright and Chromium."""
 
 import argparse
 import pathlib

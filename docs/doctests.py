@@ -1,5 +1,5 @@
-"""An extension of Griffe: an example in a docstring, `>>> ...` up to the next empty line, is code on the page, and a
-part has a table of its parameters."""
+"""An extension of Griffe: an example in a docstring, `>>> ...` up to the next empty line, is code on the page; a class
+has its signature, a part a table of its parameters; and lines `name: what it is` are a list."""
 
 import importlib.util
 import pathlib
@@ -21,6 +21,22 @@ def fenced(text: str) -> str:
     return EXAMPLE.sub(lambda found: f"```pycon\n{found[0].rstrip()}\n```\n", text)
 
 
+def listed(text: str, names: set[str]) -> str:
+    """Return a docstring whose lines `name: what it is`, of a parameter or field, are a list. Without that, the parser
+    of docstrings takes such a line for the head of a section and drops the name."""
+    found: list[str] = []
+    within = False
+    for line in text.splitlines():
+        head, colon, rest = line.partition(": ")
+        if colon and not line.startswith(" ") and set(head.split(", ")) <= names:
+            found += ([] if within else [""]) + [f"- {', '.join(f'`{name}`' for name in head.split(', '))}: {rest}"]
+            within = True
+        else:
+            within = within and line.startswith(" ")
+            found.append(line)
+    return "\n".join(found)
+
+
 class Doctests(griffe.Extension):
     """Changes the docstrings of what is documented."""
 
@@ -28,5 +44,13 @@ class Doctests(griffe.Extension):
         """Of each object, when its members are known."""
         del given
         if obj.docstring:
-            tabled = parameters.table(obj.source) if obj.is_class else ""
-            obj.docstring.value = fenced(obj.docstring.value) + (f"\n\n{tabled}" if tabled else "")
+            text = listed(fenced(obj.docstring.value), _names(obj))
+            parts = [parameters.signature(obj.source), text, parameters.table(obj.source)] if obj.is_class else [text]
+            obj.docstring.value = "\n\n".join(part for part in parts if part)
+
+
+def _names(obj: Any) -> set[str]:
+    """Of a function's parameters, or of a class's fields."""
+    if obj.is_function:
+        return {one.name for one in obj.parameters}
+    return {name for name, one in obj.members.items() if one.is_attribute} if obj.is_class else set()

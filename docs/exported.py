@@ -25,6 +25,7 @@ def exported(package: str) -> dict[str, str]:
 
 
 def on_page_markdown(markdown: str, **given: Any) -> str:
-    """Return the page with the marks replaced."""
+    """Return the page with the marks replaced. Names are those that users import: `diffabs.controllers.PID` has an
+    anchor."""
     del given
-    return MARK.sub(lambda mark: "\n\n".join(f"::: {path}" for path in exported(mark[1]).values()), markdown)
+    return MARK.sub(lambda mark: "\n\n".join(f"::: {mark[1]}.{name}" for name in exported(mark[1])), markdown)

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 KNOWN = {"math": math, "np": SimpleNamespace(inf=math.inf)}  # what bounds are computed with
 LONGEST = 24  # characters of a default
+WIDTH = 90  # characters of a line
+FIELDS = ("param", "part", "static", "entry", "dataclasses.field")  # what makes a field with a default
 
 
 class Parameter(NamedTuple):
@@ -57,6 +59,33 @@ def _interval(said: dict[str, ast.expr]) -> str:
 
 def _number(node: ast.expr) -> float:
     return float(eval(ast.unparse(node), {"__builtins__": {}}, KNOWN))
+
+
+def signature(source: str) -> str:
+    """Return how a class is called, from its fields, as a block of Python in Markdown; nothing for one without fields."""
+    (tree, *_) = ast.parse(textwrap.dedent(source)).body or [None]
+    if not isinstance(tree, ast.ClassDef) or not any(_makes_fields(one) for one in tree.decorator_list):
+        return ""
+    lines = [line for line in tree.body if isinstance(line, ast.AnnAssign)]
+    fields = [f"{ast.unparse(line.target)}{_after(line.value)}" for line in lines]
+    named = ["*"] if any(ast.unparse(one).startswith("pytree") for one in tree.decorator_list) else []
+    call = f"{tree.name}({', '.join(named + fields)})"
+    if len(call) > WIDTH:
+        call = f"{tree.name}(\n    " + ",\n    ".join(named + fields) + ",\n)"
+    return f"```python\n{call}\n```" if fields else ""
+
+
+def _makes_fields(decorator: ast.expr) -> bool:
+    return ast.unparse(decorator).partition("(")[0] in ("pytree", "dataclass", "dataclasses.dataclass")
+
+
+def _after(value: ast.expr | None) -> str:
+    """What follows the name of a field: its default, if it has one."""
+    if isinstance(value, ast.Call) and ast.unparse(value.func) in FIELDS:
+        said = {one.arg: one.value for one in value.keywords}
+        default = said.get("default") or said.get("default_factory")
+        return f"={_default({'default': default})}" if default else ""
+    return f"={ast.unparse(value)}" if value else ""
 
 
 def table(source: str) -> str:

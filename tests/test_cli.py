@@ -233,7 +233,7 @@ def test_plot_without_matplotlib(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     result = run("simulate", "slip-lmi", "--plot", tmp_path / "a.png", status=2)
     assert_one_error_line(result)
-    assert 'pip install "diffabs[plot]"' in result.stderr
+    assert 'pip install ".[plot]" in a clone' in result.stderr
 
 
 def test_real_figure(tmp_path, simulated):

@@ -321,7 +321,7 @@ def test_without_the_extra(small, csv, monkeypatch):
     monkeypatch.setitem(sys.modules, "optax", None)
     result = run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, status=2)
     assert_one_error_line(result)
-    assert 'pip install "diffabs[tune]"' in result.stderr
+    assert 'pip install ".[tune]" in a clone' in result.stderr
 
 
 def test_a_trajectory_is_as_long_as_the_data_and_fits_into_memory(small, csv):

@@ -247,7 +247,7 @@ def test_without_the_design_extra_there_is_no_certificate(small, invented, monke
         result = run("tune", small, "--json")
     document = json.loads(result.stdout)
     assert document["certificate"]["quadratically_stable"] is None
-    assert 'pip install "diffabs[design]"' in document["certificate"]["reason"]
+    assert 'pip install ".[design]" in a clone' in document["certificate"]["reason"]
     assert result.stderr == f"no certificate: {document['certificate']['reason']}\n"
 
 
@@ -486,4 +486,4 @@ def test_without_the_extra(small, monkeypatch, module):
     monkeypatch.setitem(sys.modules, module, None)
     result = run("tune", small, status=2)
     assert_one_error_line(result)
-    assert f'{module} needed: pip install "diffabs[tune]"' in result.stderr
+    assert f'{module} needed: pip install ".[tune]" in a clone' in result.stderr

@@ -95,10 +95,28 @@ def test_a_part_becomes_a_table():
     assert parameters.table("class A:\n    unit = 'm'\n") == "Unit of the value: m."
 
 
+def test_a_class_shows_how_it_is_called():
+    pid = importlib.import_module("diffabs.controllers").PID
+    lines = parameters.signature(inspect.getsource(pid)).splitlines()
+    assert lines[1:3] == ["PID(", "    *,"]
+    assert [line.strip(" ,").partition("=")[0] for line in lines[3:-2]] == [f.name for f in dataclasses.fields(pid)]
+    assert "rtol=1e-05" in parameters.signature(inspect.getsource(importlib.import_module("diffabs").Adaptive))
+    assert parameters.signature("class A:\n    x: int = 1\n") == ""
+
+
+def test_a_line_about_a_parameter_keeps_its_name():
+    """A line `name: ...` that Google's style would read as the head of a section."""
+    doctests = loaded("doctests")
+    text = "What it is.\n\nrtol: the error\n    of a step\nstep, h: a length\nNote: no field."
+    assert doctests.listed(text, {"rtol", "step", "h"}).splitlines() == [
+        "What it is.", "", "", "- `rtol`: the error", "    of a step", "- `step`, `h`: a length", "Note: no field.",
+    ]  # fmt: skip
+
+
 def test_a_mark_becomes_the_names():
     text = exported.on_page_markdown("before\n\n<!-- exported: diffabs.stops -->\n", page=None)
-    assert text.startswith("before\n\n::: diffabs.stops.stops.")
-    assert "::: diffabs.stops.stops.Standstill" in text
+    assert text.startswith("before\n\n::: diffabs.stops.")
+    assert "::: diffabs.stops.Standstill" in text
     with pytest.raises(ValueError, match="exports nothing"):
         exported.exported("diffabs.cli")
 

@@ -514,7 +514,7 @@ def test_the_framework_is_only_loaded_by_the_command():
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(console.EXTRAS, "explore", ("no_such_framework",))
     found = run("explore", "slip-cured", status=2)
-    assert found.stderr == 'error: no_such_framework needed: pip install "diffabs[explore]"\n'
+    assert found.stderr == 'error: no_such_framework needed: pip install ".[explore]" in a clone\n'
 
 
 def test_a_scenario_that_is_wrong_is_said_before_anything_listens(monkeypatch, file):

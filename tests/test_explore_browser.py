@@ -1,6 +1,6 @@
 """The explorer in headless Chromium: drag, see the curve change, tune, save, run; and its server from outside.
 
-Needs the extra `diffabs[explore]`; the tests with a browser also Playwright and Chromium ($CHROMIUM, or the
+Needs the extra `explore`; the tests with a browser also Playwright and Chromium ($CHROMIUM, or the
 system's)."""
 
 import contextlib
@@ -28,10 +28,10 @@ FLAGS += ["--disable-component-update", "--disable-sync"]
 PATIENCE = 120_000  # ms: programs are compiled on the way, on a machine that has other work
 
 there = {name: importlib.util.find_spec(name) is not None for name in ("nicegui", "playwright")}
-needs_extra = pytest.mark.skipif(not there["nicegui"], reason="needs the extra diffabs[explore]")
+needs_extra = pytest.mark.skipif(not there["nicegui"], reason="needs the extra `explore`")
 needs_browser = pytest.mark.skipif(
     not (there["nicegui"] and there["playwright"] and CHROMIUM),
-    reason="needs the extra diffabs[explore], Playwright and Chromium",
+    reason="needs the extra `explore`, Playwright and Chromium",
 )
 pytestmark = pytest.mark.slow
 

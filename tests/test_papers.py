@@ -346,9 +346,9 @@ def test_a_figure_that_fails_leaves_nothing_behind(tmp_path):
 
 def test_without_a_solver_the_design_is_left_out(monkeypatch):
     def missing():
-        raise ModuleNotFoundError('robust design needs cvxpy: pip install "diffabs[design]"', name="cvxpy")
+        raise ModuleNotFoundError('robust design needs cvxpy: pip install ".[design]" in a clone', name="cvxpy")
 
     monkeypatch.setattr(lmi_design, "Designed", missing)
     rows, figures, more = slip_lmi._designed({}, None)
     assert (rows, figures, more["design"]) == ([], {}, None)
-    assert 'pip install "diffabs[design]"' in more["notes"][0]
+    assert 'pip install ".[design]" in a clone' in more["notes"][0]

@@ -259,5 +259,5 @@ def test_box_of_too_many_vertices(monkeypatch):
 
 def test_without_scipy(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "scipy.optimize", None)
-    with pytest.raises(ModuleNotFoundError, match=r'a polytope needs SciPy: pip install "diffabs\[design\]"'):
+    with pytest.raises(ModuleNotFoundError, match=r'a polytope needs SciPy: pip install "\.\[design\]"'):
         polytope(SlipModel(), PAPER)

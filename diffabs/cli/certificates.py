@@ -1,6 +1,6 @@
 """What the commands that prove something share: a scenario as linear systems, a gain on them, a certificate as JSON.
 
-All of it needs the extra `diffabs[design]`, so what needs that is imported when a command runs."""
+All of it needs the extra `design`, so what needs that is imported when a command runs."""
 
 import contextlib
 import dataclasses

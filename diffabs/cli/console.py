@@ -253,11 +253,11 @@ def need_extra(extra: str) -> None:
     """Raises typer.Exit if a module of an optional extra is not installed."""
     missing = [name for name in EXTRAS[extra] if importlib.util.find_spec(name) is None]
     if missing:
-        fail(f'{" and ".join(missing)} needed: pip install "diffabs[{extra}]"')
+        fail(f'{" and ".join(missing)} needed: pip install ".[{extra}]" in a clone')
 
 
 def need_matplotlib() -> None:
     """Raises typer.Exit where no figure can be drawn."""
     os.environ.setdefault("MPLBACKEND", "agg")
     if importlib.util.find_spec("matplotlib") is None:
-        fail('figures need matplotlib: pip install "diffabs[plot]"')
+        fail('figures need matplotlib: pip install ".[plot]" in a clone')

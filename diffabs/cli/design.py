@@ -1,6 +1,6 @@
 """The commands `design` and `certify`: a robust gain for a scenario, and what can be proved about one.
 
-Both need the extra `diffabs[design]`, so what needs it is imported when a command runs."""
+Both need the extra `design`, so what needs it is imported when a command runs."""
 
 import math
 import pathlib

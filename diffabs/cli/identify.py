@@ -1,6 +1,6 @@
 """The command `identify`: parameters of a scenario from a measured run.
 
-It needs the extra `diffabs[tune]`; what needs that is imported when it runs."""
+It needs the extra `tune`; what needs that is imported when it runs."""
 
 import dataclasses
 import math

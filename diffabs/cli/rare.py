@@ -1,6 +1,6 @@
 """The command `rare`: the probability of a failure that a sweep would hardly meet.
 
-It needs the extra `diffabs[sweep]`, which is imported when it runs."""
+It needs the extra `sweep`, which is imported when it runs."""
 
 import dataclasses
 import math

@@ -1,4 +1,4 @@
-"""The command `report`: results as one HTML file. It needs the extra `diffabs[report]`."""
+"""The command `report`: results as one HTML file. It needs the extra `report`."""
 
 import pathlib
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""The command `reproduce`: a paper's whole result. It draws, and needs the extra `diffabs[plot]`."""
+"""The command `reproduce`: a paper's whole result. It draws, and needs the extra `plot`."""
 
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any

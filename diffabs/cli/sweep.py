@@ -1,6 +1,6 @@
 """The command `sweep`: a Monte-Carlo study into a folder, with statistics.
 
-It needs the extra `diffabs[sweep]`, and for Dask `diffabs[cluster]`; what needs them is imported when it runs."""
+It needs the extra `sweep`, and for Dask `cluster`; what needs them is imported when it runs."""
 
 import contextlib
 import dataclasses

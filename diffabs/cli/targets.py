@@ -24,7 +24,7 @@ def check_mat(mat: pathlib.Path | None) -> None:
     if mat and mat.suffix != ".mat":
         fail(f"--mat {mat}: the name must end in .mat")
     if mat and importlib.util.find_spec("scipy") is None:
-        fail('MAT files need scipy: pip install "diffabs[tune]"')
+        fail('MAT files need scipy: pip install ".[tune]" in a clone')
 
 
 def check_scenario_file(out: pathlib.Path | None) -> None:

@@ -1,6 +1,6 @@
 """The command `tune`: the free parameters of [tune] by gradients, and what can be proved of the result.
 
-It needs the extra `diffabs[tune]`, and for a proof `diffabs[design]`; what needs them is imported when it runs."""
+It needs the extra `tune`, and for a proof `design`; what needs them is imported when it runs."""
 
 import contextlib
 import dataclasses

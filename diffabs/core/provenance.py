@@ -10,6 +10,7 @@ import pathlib
 import platform
 import shlex
 import subprocess
+import sys
 from collections.abc import Sequence
 
 import jax
@@ -17,8 +18,9 @@ import jax
 
 def versions(*packages: str) -> dict[str, str]:
     """Return the versions of diffabs, JAX, these packages, and Python, by name."""
-    found = {name: importlib.metadata.version(name) for name in ("diffabs", "jax", *packages)}
-    return {**found, "python": platform.python_version()}
+    found = {name: importlib.metadata.version(name) for name in ("jax", *packages)}
+    own = sys.modules[__name__.partition(".")[0]].__version__  # the distribution has another name than the package
+    return {"diffabs": own, **found, "python": platform.python_version()}
 
 
 def origin(*packages: str) -> dict[str, str]:

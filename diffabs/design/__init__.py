@@ -1,6 +1,6 @@
 """Robust design and its proofs: `design`, `certify`, and what they are about.
 
-Needs the extra `diffabs[design]` (cvxpy, Clarabel, SciPy), which is loaded when the first program is solved. Riccati
+Needs the extra `design` (cvxpy, Clarabel, SciPy), which is loaded when the first program is solved. Riccati
 and Lyapunov equations are pure JAX and need nothing.
 """
 

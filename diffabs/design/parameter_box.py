@@ -111,7 +111,7 @@ def _scipy() -> None:
     try:
         import scipy.optimize  # noqa: F401  # pyright: ignore[reportUnusedImport]
     except ModuleNotFoundError:
-        raise ModuleNotFoundError('a polytope needs SciPy: pip install "diffabs[design]"') from None
+        raise ModuleNotFoundError('a polytope needs SciPy: pip install ".[design]" in a clone') from None
 
 
 def bounds(model: Any, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:

@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 
 class Canvas:

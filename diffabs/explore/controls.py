@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
 from typing import Any
 
-from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.explore.curves import Fan
 from diffabs.explore.knobs import STEPS, Knob, unit_words

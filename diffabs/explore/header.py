@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 if TYPE_CHECKING:
     from diffabs.explore.page import Page

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.explore import charts
 from diffabs.explore.canvas import Canvas

@@ -4,7 +4,7 @@ import pathlib
 import shlex
 from typing import Any
 
-from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.core.values import ScenarioError
 from diffabs.explore import saving

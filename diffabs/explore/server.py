@@ -12,7 +12,7 @@ import webbrowser
 from collections.abc import Callable
 from typing import Any
 
-import uvicorn  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+import uvicorn  # pyright: ignore[reportMissingImports]  # the extra `explore`
 from fastapi import FastAPI  # pyright: ignore[reportMissingImports]
 from nicegui import ui  # pyright: ignore[reportMissingImports]
 

@@ -3,7 +3,7 @@
 import html
 from typing import TYPE_CHECKING, Any
 
-from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra diffabs[explore]
+from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.core.values import ScenarioError
 from diffabs.explore import curves, tuning

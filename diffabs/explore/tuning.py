@@ -96,7 +96,7 @@ def goal(
 def tuned(chosen: Scenario, posed: Posed, told: Callable[[int, float], None], stopping: Callable[[], bool]) -> Found:
     """Return what `diffabs tune` finds for a scenario's [tune]. `told` hears iteration and loss.
 
-    Raises ValueError for a start that cannot be left, ModuleNotFoundError without the extra `diffabs[tune]`."""
+    Raises ValueError for a start that cannot be left, ModuleNotFoundError without the extra `tune`."""
     from diffabs.tune import Method, Stopping, tune
 
     task = chosen.tune

@@ -83,7 +83,7 @@ def compiler() -> Compiler:
     tried = [_tried(tuple(command)) for command in commands]
     works = [one for one in tried if isinstance(one, Compiler)]
     if not works:
-        raise NoCompiler("; ".join(map(str, tried)) or 'no C++ compiler; pip install "diffabs[kernel]" brings one')
+        raise NoCompiler("; ".join(map(str, tried)) or 'no C++ compiler; pip install ".[kernel]" in a clone brings one')
     return works[0]
 
 

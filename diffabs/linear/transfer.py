@@ -122,5 +122,7 @@ def _control() -> Any:
     try:
         import control
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError('python-control needed: pip install "diffabs[control]"', name="control") from error
+        raise ModuleNotFoundError(
+            'python-control needed: pip install ".[control]" in a clone', name="control"
+        ) from error
     return control

@@ -1,4 +1,4 @@
-"""Figures of runs, sweeps and tunings. The only importer of matplotlib (`pip install "diffabs[plot]"`)."""
+"""Figures of runs, sweeps and tunings. The only importer of matplotlib (the extra `plot`)."""
 
 from diffabs.plot.runs import angle_lines as angle_lines
 from diffabs.plot.runs import balance as balance

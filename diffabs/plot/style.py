@@ -1,5 +1,5 @@
-"""The look of all figures: sheets, axes and their words. The only importer of matplotlib (`pip install
-"diffabs[plot]"`); it keeps no global state.
+"""The look of all figures: sheets, axes and their words. The only importer of matplotlib (the extra
+`plot`); it keeps no global state.
 
 Speeds are drawn in km/h, everything else in SI units. Colours are those of M. Okabe and K. Ito, Color Universal Design
 (2008), which colour-blind readers can tell apart; curves that lie close differ in their dashes as well.
@@ -23,7 +23,7 @@ try:
     from matplotlib.text import Text
     from matplotlib.ticker import Formatter, LogLocator, NullFormatter
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError('figures need matplotlib: pip install "diffabs[plot]"', name=error.name) from error
+    raise ModuleNotFoundError('figures need matplotlib: pip install ".[plot]" in a clone', name=error.name) from error
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 DASHES = ("-", "--", "-.", ":", "-", "--", "-.")

@@ -1,4 +1,4 @@
-"""Probabilities of rare failures: subset simulation, importance sampling, design points. Needs `diffabs[sweep]`."""
+"""Probabilities of rare failures: subset simulation, importance sampling, design points. Needs the extra `sweep`."""
 
 from diffabs.reliability.failure import failure_probability as failure_probability
 from diffabs.reliability.importance_sampling import Estimate as Estimate

@@ -1,4 +1,4 @@
-"""A result as one HTML file that needs nothing else: for colleagues, and for paper. Needs the extra `diffabs[report]`.
+"""A result as one HTML file that needs nothing else: for colleagues, and for paper. Needs the extra `report`.
 
 documents   what commands wrote, found in a folder or a file
 page        what a section of a report consists of

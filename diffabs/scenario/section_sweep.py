@@ -19,7 +19,7 @@
     overshoot = 0.5                                           # more is a failure; so is not to stop, or to lock
 
 The distributions are those of `diffabs.sweep.distributions`. Reading needs no extra, but for
-files; running needs `diffabs[sweep]`."""
+files; running needs the extra `sweep`."""
 
 import dataclasses
 import pathlib
@@ -154,7 +154,7 @@ def _with_numbers(given: Mapping[str, Any], where: str, folder: pathlib.Path) ->
     try:
         from diffabs.sweep import sample_files
     except ImportError:
-        raise ScenarioError(f'{where}: reading a file needs pip install "diffabs[sweep]"') from None
+        raise ScenarioError(f'{where}: reading a file needs pip install ".[sweep]" in a clone') from None
     try:
         values = sample_files.read(folder / file, column)
     except ValueError as error:

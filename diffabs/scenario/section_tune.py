@@ -20,7 +20,7 @@
     [tune.limits]
     overshoot = 0.008                                        # at most, on every lane
 
-Paths are those of `parameter_paths`. Only reading is done without the extra `diffabs[tune]`."""
+Paths are those of `parameter_paths`. Only reading is done without the extra `tune`."""
 
 import dataclasses
 import math

@@ -118,6 +118,6 @@ class Run(NamedTuple):
         return frames.to_xarray(self, plant)
 
     def plot(self, plant: Any = None, *, title: str = "") -> Any:
-        """The run as a figure of matplotlib (extra `diffabs[plot]`); `plant` says the unit of the control. Raises
+        """The run as a figure of matplotlib (extra `plot`); `plant` says the unit of the control. Raises
         ValueError for a run without a trajectory."""
         return frames.to_figure(self, plant, title)

@@ -19,7 +19,7 @@ import numpy as np
 
 SOLVERS = ("CLARABEL", "MOSEK", "CVXOPT")  # in this order, of those installed; SCS is wrong by 1e-3 and never asked
 OPTIONS = {"CLARABEL": {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}}
-HINT = 'pip install "diffabs[design]"'
+HINT = 'pip install ".[design]" in a clone'
 LOCK = threading.Lock()  # a compiled program is shared, and holds its parameters
 
 
