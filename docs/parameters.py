@@ -62,7 +62,7 @@ def _number(node: ast.expr) -> float:
 
 
 def signature(source: str) -> str:
-    """Return how a class is called, from its fields, as a block of Python in Markdown; nothing for one without fields."""
+    """Return how a class is called, from its fields, as a block of Python in Markdown; nothing if it has no fields."""
     (tree, *_) = ast.parse(textwrap.dedent(source)).body or [None]
     if not isinstance(tree, ast.ClassDef) or not any(_makes_fields(one) for one in tree.decorator_list):
         return ""
