@@ -629,7 +629,7 @@ MUTATIONS = [
     Mutation(
         "events at the end of the step in which they are noticed",
         "simulate/landing.py",
-        "jnp.where(earlier, before, jnp.where(enough, x + apart, guess)), enough & ~earlier",
+        "jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier",
         "x, True",
         "test_blocks.py::test_latch_finds_the_vertex",
     ),

@@ -11,8 +11,16 @@ import pytest
 from marks import cases
 
 import diffabs as d
-from diffabs.actuators import Delay
-from diffabs.controllers import PID, Clamping, ConstantTorque, Sampled, StateFeedback
+from diffabs.actuators import Delay, Lag
+from diffabs.controllers import (
+    PID,
+    Clamping,
+    ConstantTorque,
+    HoldingInput,
+    Sampled,
+    ScheduledFeedback,
+    StateFeedback,
+)
 from diffabs.core.kinks import Program
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import quotient, searchsorted
@@ -228,6 +236,31 @@ def test_a_derivative_through_a_kink_is_that_of_the_closed_form(name):
     if name == "two in a step":
         np.testing.assert_allclose(final(place), wanted[0], rtol=1e-8)
         np.testing.assert_allclose(jax.grad(final)(place), wanted[1], rtol=1e-8)
+
+
+def test_a_comparison_close_to_the_beginning_of_a_run_is_landed_on():
+    """At rest all comparisons of a run are near their zeros. A probe for one of them would lie before the first step,
+    where another one changes: then the backward pass would be of no number, where the run and its tangents are."""
+    loop = braking(
+        plant=MirroredRig(),
+        controller=ScheduledFeedback(
+            speeds=(1.4, 14.0), integral_gains=(-300.0, -3e3), gains=(-6.0, -60.0), torque_min=0.0, torque_max=9.03
+        ),
+        feedforward=HoldingInput(),
+        actuator=Lag(time_constant=1e-3),
+        initial=d.BrakeStart(speed=2.5),
+    )
+    solver = d.FixedStep(step=1e-3, duration=0.004, kinks=True)
+
+    def iae(gains: Any) -> Any:
+        return d.measure(d.replace(loop, {"controller.gains": gains}), solver, {"iae": IAE()}).metrics["iae"]
+
+    gains = jnp.array([-6.0, -60.0])
+    moves = 1e-3 * np.diag(gains)
+    ahead, behind = jax.jit(jax.vmap(iae))(gains + np.concatenate([moves, -moves])).reshape(2, 2)
+    found = jax.jit(jax.jacrev(iae))(gains)
+    np.testing.assert_allclose(found, (ahead - behind) / np.diag(2 * moves), rtol=1e-6)
+    np.testing.assert_allclose(found, jax.jit(jax.jacfwd(iae))(gains), rtol=1e-12)
 
 
 def test_a_run_that_slides_along_a_kink_is_a_run():

@@ -112,14 +112,16 @@ def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Se
     first = jnp.where(jnp.isfinite(search.at_near), jnp.maximum(search.near + share * width, least), least)
     inside = falls & (newton > search.near) & (newton < search.far) & (search.tries % BISECT != 0)
     guess = jnp.where(inside, newton, jnp.where(fresh, first, search.near + 0.5 * width))
-    apart = jnp.where(sought.end < 0, 1.0, -1.0) * h * jnp.finfo(h.dtype).eps ** APART
+    apart = h * jnp.finfo(h.dtype).eps ** APART
+    # Before the beginning of the step its regime does not hold, and the margin says nothing.
+    probe = jnp.where(sought.end < 0, x + apart, jnp.where(x > apart, x - apart, 0.5 * x))
     found = near | at_once
     search = search._replace(place=x, margin=jnp.where(found, sought.end, 0.0), found=found, at_once=at_once)
     # Beyond the zero another margin that falls does so before it.
     earlier = enough & ~at_once & tells.another & ~changes & tells.falls & (search.tries < TRIES)
     search = select(earlier, _bracket(search, x, tells.other), search)
     before = jnp.where(x > 4 * NEAR * h, x - 2 * NEAR * h, 0.5 * x)  # often both fall at once
-    return search, jnp.where(earlier, before, jnp.where(enough, x + apart, guess)), enough & ~earlier
+    return search, jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier
 
 
 def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> tuple[Search, Any]:
@@ -128,8 +130,10 @@ def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> tuple[Search,
     place, the probe, and an end of the first try: that on the same side, or where that says nothing the other, if the
     margin is smooth up to there."""
     x = jax.lax.stop_gradient(x)
-    g, start = jax.lax.stop_gradient(tells.sought[1:])
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
+    told = jnp.isfinite(tells.sought.end)  # not if another comparison changes at the probe, and this one does not
+    probe = tells.sought._replace(end=jnp.where(told, tells.sought.end, margin))
+    g, start = jax.lax.stop_gradient(probe[1:])
     ends = (search.full, search.at_full), (0.0 * x, start)
     side, other = select(margin < 0, ends, ends[::-1])
     near = _tells(side, place, x)
@@ -138,7 +142,7 @@ def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> tuple[Search,
     changes = ratio(at_end - g, end - x) - fall
     far = near | (_tells(third, place, x) & (jnp.abs(changes) <= PART * jnp.abs(fall)))
     bend = jnp.where(far, ratio(changes, end - place), 0.0)
-    at_place = fall + (place - x) * bend
+    at_place = jnp.where(told, fall + (place - x) * bend, 0.0)
     length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)
     slope = at_place + 2.0 * (length - place) * bend
     last, at_last = select(near & _tells(other, place, x), other, third)
@@ -148,7 +152,7 @@ def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> tuple[Search,
     far = jnp.abs(length - place) > jnp.abs(x - place)
     length = jnp.where(far, jnp.maximum(jnp.minimum(length, search.far), search.near), length)
     known = search.found & (slope < 0) & ~far
-    moved = length + jnp.where(far, 0.0, _moves(search, x, tells.sought.end, length, slope))
+    moved = length + jnp.where(far, 0.0, _moves(search, x, probe.end, length, slope))
     steep = _falls_at_once(search, at_place, start)
     known &= ~search.at_once | steep
     at_once = jnp.where(steep, moved - jax.lax.stop_gradient(jnp.minimum(moved, 0.0)), 0.0)
