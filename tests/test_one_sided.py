@@ -1,5 +1,7 @@
 """Derivatives by delays and clocks: right, from the side that there is, or an error that names the parameter."""
 
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -132,3 +134,54 @@ def test_a_clock_leaves_the_derivatives_of_other_parameters():
     slopes = jax.grad(distance)(jax.tree.map(jnp.asarray, loop.controller))
     assert slopes.period == 0
     assert slopes.controller.kp != 0
+
+
+def both_sides(function, x):
+    return [float((function(x + h) - function(x)) / h) for h in (-1e-6, 1e-6)]
+
+
+@pytest.mark.parametrize(("name", "side"), [("gain", 0), ("limit", 1)])
+def test_a_gain_at_the_limit_has_one_side(name, side):
+    limit = "torque_max" if hasattr(controllers.SlidingMode(), "torque_max") else "high"
+
+    def control(x):
+        mode = d.replace(controllers.SlidingMode(gain=90.0, **{limit: 90.0}), {limit if name == "limit" else name: x})
+        signal = types.SimpleNamespace(target=0.2, measured=(0.0,), feedforward=0.0)
+        return mode.output(0.0, None, signal)
+
+    slopes = both_sides(control, 90.0)
+    assert abs(slopes[0] - slopes[1]) > 0.9
+    np.testing.assert_allclose(jax.grad(control)(90.0), slopes[side], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("which", "side"), [(0, 0), (1, 1)])
+def test_a_torque_at_the_limit_of_the_actuator_has_one_side(which, side):
+    def control(x):
+        both = [90.0, 90.0]
+        both[which] = x
+        return actuators.Limits(high=both[1]).output(0.0, None, jnp.asarray(both[0]))
+
+    slopes = both_sides(control, 90.0)
+    assert abs(slopes[0] - slopes[1]) > 0.9
+    np.testing.assert_allclose(jax.grad(control)(90.0), slopes[side], rtol=1e-6)
+
+
+def test_a_relay_on_its_target_is_released():
+    def applied(slip):
+        signal = types.SimpleNamespace(target=0.2, measured=(slip,), feedforward=0.0)
+        return float(controllers.Relay().start(signal).held)
+
+    assert [applied(0.2 + one) for one in (-1e-9, 0.0, 1e-9)] == [1.0, 0.0, 0.0]
+
+
+def test_points_with_one_side_are_named():
+    from diffabs.tune.one_sided import one_sided, warn
+
+    relay = controllers.Relay(torque_max=9.0)
+    loop = braking(controller=relay, actuator=actuators.Limits(high=9.0))
+    paths = {path for path, _ in one_sided(loop)}
+    assert {"controller.torque_max", "actuator.high"} <= paths
+    with pytest.warns(UserWarning, match="start: the derivative by controller.torque_max is that of one side"):
+        warn(loop, ["controller.torque_max"], "start")
+    assert {path for path, _ in one_sided(DELAYS[0].values[0])} == {"controller.delay"}
+    assert not list(one_sided(braking(controller=PID)))

@@ -13,6 +13,7 @@ from diffabs.objectives import usual
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.engine import EngineError
 from diffabs.simulate.solution import Solver
+from diffabs.tune import one_sided
 from diffabs.tune.augmented_lagrangian import Search
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.problem import Mode, Problem, automatic, built
@@ -61,6 +62,8 @@ def tune(
     >>> print(f"{found.values['controller.torque']:.1f} N m, {found.objective[0]:.2f} to {found.objective[1]:.2f} s")
     85.6 N m, 1.14 to 0.18 s
 
+    Warns where a derivative by a free parameter is that of one side (`docs/gradients.md`), at the start or the result.
+
     Raises:
         ValueError: a path, range, metric or batch that does not fit; a lane that must not be run whatever is tuned.
         EngineError: what stands against the engine "kernel".
@@ -79,10 +82,13 @@ def tune(
         mode=method.mode,
         engine=engine,
     )
+    one_sided.warn(built(subject), free, "start")
     try:
-        return Search(problem, method, progress, stopping).result()
+        found = Search(problem, method, progress, stopping).result()
     except NoCompiler as error:
         raise EngineError.of(error) from None
+    one_sided.warn(found.loop, free, "result")
+    return found
 
 
 def posed(
