@@ -48,11 +48,11 @@ LMI = braking(
 )
 EST = braking(
     plant=plants.QuarterCar(road=roads.MagicFormula(), inertia=1.0539),
-    controller=controllers.PID(ki=5000.0, kd=5.67),
+    controller=controllers.PID(ki=5000.0, kd=5.67, low=0.0, high=90.0),
     reference=references.FixedSlip(),
 )
 EST_PARAMETERS = ("controller.kp", "controller.ki", "controller.kd", "controller.cutoff", "reference.slip")
-EST_PARAMETERS += ("controller.torque_max", "plant.inertia", "plant.road.D")
+EST_PARAMETERS += ("controller.high", "plant.inertia", "plant.road.D")
 # loop, masses [kg], duration [s], parameters: those of the controller first, since tuning moves them.
 CASES = {
     "lmi": (

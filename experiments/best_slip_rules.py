@@ -108,19 +108,19 @@ def loop(fixed: Fixed, sensors: str, reference: Any, controller: PID) -> Loop:
     noise = Noise(deceleration=fixed.noise, period=fixed.period)
     seen = Series(blocks=(noise, IntegratedAccelerometer(floor=fixed.floor))) if sensors == ERRORS else Direct()
     parts = {"sensor": seen, "reference": reference, "stop": Standstill(speed=fixed.stop)}
-    controller = dataclasses.replace(controller, torque_max=fixed.torque)
+    controller = dataclasses.replace(controller, high=fixed.torque)
     return braking(plant=QuarterCar(inertia=INERTIA, road=road), controller=controller, **parts)
 
 
 def start(ranges: Ranges, fixed: Fixed, sensors: str, rule: str) -> Loop:
     """What is tuned, before."""
-    pi = PID(ki=ranges.ki, antiwindup=BackCalculation(tracking_time=ranges.tracking_time))
+    pi = PID(ki=ranges.ki, antiwindup=BackCalculation(tracking_time=ranges.tracking_time), low=0.0, high=90.0)
     return loop(fixed, sensors, references(ranges)[rule], pi)
 
 
 def untuned(ranges: Ranges, fixed: Fixed, sensors: str) -> Iterator[tuple[str, Loop]]:
     """The paper's rule, and others with the paper's gains."""
-    paper = PID(ki=5000.0)
+    paper = PID(ki=5000.0, low=0.0, high=90.0)
     yield PAPER, loop(fixed, sensors, PeakLatch(), paper)
     yield "robust latch, the paper's gains", loop(fixed, sensors, PeakRobust(arming=ranges.arming), paper)
     yield "fixed slip 0.2, the paper's gains", loop(fixed, sensors, FixedSlip(), paper)

@@ -112,7 +112,7 @@ def loops(car: QuarterCar, config: Config) -> dict[str, Loop]:
     found = {"no ABS": braking(plant=car, reference=FixedSlip(), controller=ConstantTorque(torque=90.0), stop=stop)}
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
         for name, (ki, kd) in slip_estimator.GAINS.items():
-            controller = PID(kp=3893.0, ki=ki, kd=kd)
+            controller = PID(kp=3893.0, ki=ki, kd=kd, low=0.0, high=90.0)
             found[f"{method} {name}"] = braking(plant=car, reference=reference, controller=controller, stop=stop)
     return found
 

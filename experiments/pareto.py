@@ -53,7 +53,7 @@ def car(config: Config) -> Loop:
     return braking(
         plant=QuarterCar(inertia=1.0539, road=MagicFormula()),
         reference=FixedSlip(slip=0.1),
-        controller=PID(kp=3893.0, ki=5000.0, antiwindup=BackCalculation(tracking_time=0.05)),
+        controller=PID(kp=3893.0, ki=5000.0, antiwindup=BackCalculation(tracking_time=0.05), low=0.0, high=90.0),
         stop=Standstill(speed=config.stop),
     )
 
@@ -94,7 +94,9 @@ def scattered(config: Config) -> tuple[np.ndarray, np.ndarray]:
 
 def published(config: Config) -> tuple[float, float]:
     """The paper's conventional PI, target 0.2 and no anti-windup."""
-    one = replace(dataclasses.replace(car(config), controller=PID(ki=5000.0)), {"reference.slip": 0.2})
+    one = replace(
+        dataclasses.replace(car(config), controller=PID(ki=5000.0, low=0.0, high=90.0)), {"reference.slip": 0.2}
+    )
     metrics = measure(one, FixedStep(step=config.step, duration=config.duration), MEASURED).metrics
     return float(metrics["effort"]), float(metrics["stop_distance"])
 

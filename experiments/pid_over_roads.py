@@ -144,7 +144,7 @@ def family(config: Config, count: int, seed: int) -> Family:
 def loops(config: Config) -> dict[str, Loop]:
     """The paper's gains on the car of the family, conventional and proposed."""
     road = Patches(roads=(MagicFormula(), MagicFormula()), edges=np.array([10.0]), width=config.width)
-    car, pi = QuarterCar(inertia=1.0539, road=road), PID(ki=5000.0)
+    car, pi = QuarterCar(inertia=1.0539, road=road), PID(ki=5000.0, low=0.0, high=90.0)
     stop = Standstill(speed=config.stop)
     references = {"conventional": FixedSlip(), "proposed": PeakRobust(arming=config.arming)}
     return {name: braking(plant=car, reference=r, controller=pi, stop=stop) for name, r in references.items()}

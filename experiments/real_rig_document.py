@@ -55,11 +55,11 @@ LAWS = {
     "StateFeedback": ["g = 1", *FEEDBACK],
     "PID": [
         "error = target_k - slip_k; x_0 = d_0 = 0",
-        "raw = ff + kp error + ki x_k + kd cutoff (error - d_k), u_k = min(max(raw, torque_min), torque_max)",
+        "raw = ff + kp error + ki x_k + kd cutoff (error - d_k), u_k = min(max(raw, low), high)",
         "x_(k+1) = x_k + h [error + (u_k - raw)/(ki tracking_time)], d_(k+1) = d_k + h cutoff (error - d_k)",
     ],
     "SlidingMode": [
-        "u_k = min(max(ff + gain min(max((target_k - slip_k)/boundary, -1), 1), torque_min), torque_max)",
+        "u_k = min(max(ff + gain min(max((target_k - slip_k)/boundary, -1), 1), low), high)",
     ],
 }
 HELD = "u = u_k from t_k + delay to t_(k+1) + delay, 0 before the first"

@@ -67,6 +67,8 @@ def runs(one: Loop, points: dict[str, np.ndarray], config: Judging, seed: int) -
     found: Any = jax.tree.map(lambda *parts: np.concatenate(parts)[: lanes.size], *blocks)
     worst = {"overshoot": LOST, "deviation": LOST, "locked": LONGEST, "settling": LONGEST}
     metrics = {name: np.where(found.diverged, worst.get(name, np.nan), found.metrics[name]) for name in MEASURED}
+    never = np.isinf(metrics["settling"])  # a run that never settles counts with its length: quantiles stay finite
+    metrics["settling"] = np.where(never, found.ending.sample.t, metrics["settling"])
     return metrics | {"stopped": found.stopped & ~found.diverged}
 
 

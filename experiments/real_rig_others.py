@@ -172,7 +172,11 @@ def contenders(
 
 def proportional_integral(config: Others) -> tuple[PID, Free]:
     """The PI that is searched for: where it starts, and what is free."""
-    pi = PID(kp=config.pi[0], ki=config.pi[1], antiwindup=BackCalculation(tracking_time=config.tracking_time))
+    pi = PID(
+        kp=config.pi[0],
+        ki=config.pi[1],
+        antiwindup=BackCalculation(tracking_time=config.tracking_time),
+    )
     return pi, {
         f"controller.controller.{name}": ends for name, ends in zip(("kp", "ki"), config.pi_ranges, strict=True)
     }

@@ -53,7 +53,7 @@ def car() -> QuarterCar:
 
 def gains(config: Config) -> dict[str, PID]:
     """P and PI."""
-    return {"P": PID(kp=config.kp), "PI": PID(kp=config.kp, ki=config.ki)}
+    return {"P": PID(kp=config.kp, low=0.0, high=90.0), "PI": PID(kp=config.kp, ki=config.ki, low=0.0, high=90.0)}
 
 
 def loop(config: Config, controller: PID, period: float, delay: float, reference: Any = None) -> Loop:

@@ -107,7 +107,7 @@ def car(config: Config) -> tuple[Loop, Batch]:
     loop = braking(
         plant=QuarterCar(inertia=1.0539, road=MagicFormula()),
         reference=PeakRobust(slip=0.2, arming=1.0),
-        controller=PID(kp=1500.0, ki=3000.0, kd=5.0, antiwindup=BackCalculation(tracking_time=0.2)),
+        controller=PID(kp=1500.0, ki=3000.0, kd=5.0, antiwindup=BackCalculation(tracking_time=0.2), low=0.0, high=90.0),
         stop=Standstill(speed=config.car_stop),
     )
     ranges = {

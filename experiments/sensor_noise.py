@@ -62,7 +62,7 @@ OBJECTIVES = {"distance": StopDistance()}
 def noisy_loop(config: Config, car: QuarterCar, noise: float, reference: Any, ki: float = 0.0) -> Loop:
     """The closed loop with a noisy accelerometer."""
     stop, sensor = Standstill(speed=config.stop), Noise(deceleration=noise, period=config.step)
-    return braking(plant=car, sensor=sensor, reference=reference, controller=PID(ki=ki), stop=stop)
+    return braking(plant=car, sensor=sensor, reference=reference, controller=PID(ki=ki, low=0.0, high=90.0), stop=stop)
 
 
 def noisy(config: Config, loops: list[Loop], duration: float) -> tuple[Any, Any]:
@@ -130,7 +130,11 @@ def biased(config: Config) -> list[dict[str, Any]]:
     rows = []
     for method, reference, ki in (("conventional P", FixedSlip(), 0.0), ("proposed P", PeakLatch(), 0.0)):
         loops = [
-            braking(sensor=IntegratedAccelerometer(bias=b, floor=f), reference=reference, controller=PID(ki=ki))
+            braking(
+                sensor=IntegratedAccelerometer(bias=b, floor=f),
+                reference=reference,
+                controller=PID(ki=ki, low=0.0, high=90.0),
+            )
             for f, b in cases
         ]
         run = run_batch(*stacked(loops), solver, OBJECTIVES, together=True, accepted=True)

@@ -46,21 +46,31 @@ ASPHALT = {
 REST = Standstill(speed=0.5)
 SPLINE = {"plant": plants.QuarterCar(road=roads.SPLINE_B), "initial": d.BrakeStart(), "stop": REST}
 LOOPS = {
-    "fixed slip, P": braking(**ASPHALT, controller=controllers.PID(), reference=references.FixedSlip(slip=0.12)),
+    "fixed slip, P": braking(
+        **ASPHALT, controller=controllers.PID(low=0.0, high=90.0), reference=references.FixedSlip(slip=0.12)
+    ),
     "fixed slip, PI, clamping": braking(
         **ASPHALT,
-        controller=controllers.PID(kp=2000.0, ki=8000.0, torque_max=150.0, antiwindup=controllers.Clamping()),
+        controller=controllers.PID(kp=2000.0, ki=8000.0, high=150.0, antiwindup=controllers.Clamping(), low=0.0),
         reference=references.FixedSlip(slip=0.12),
     ),
-    "latch, P": braking(**ASPHALT | {"stop": REST}, controller=controllers.PID(), reference=references.PeakLatch()),
+    "latch, P": braking(
+        **ASPHALT | {"stop": REST}, controller=controllers.PID(low=0.0, high=90.0), reference=references.PeakLatch()
+    ),
     "relay": braking(  # ends well inside a half-wave: its settling time has a derivative
         **ASPHALT | {"stop": SpeedReached(speed=1.3)},
         controller=controllers.Relay(torque_max=150.0),
         reference=references.FixedSlip(slip=0.12),
     ),
-    "robust, PI": braking(**ASPHALT, controller=controllers.PID(ki=2000.0), reference=references.PeakRobust(slip=0.3)),
-    "spline, latch, P": braking(**SPLINE, controller=controllers.PID(), reference=references.PeakLatch()),
-    "spline, latch, PI": braking(**SPLINE, controller=controllers.PID(ki=2000.0), reference=references.PeakLatch()),
+    "robust, PI": braking(
+        **ASPHALT, controller=controllers.PID(ki=2000.0, low=0.0, high=90.0), reference=references.PeakRobust(slip=0.3)
+    ),
+    "spline, latch, P": braking(
+        **SPLINE, controller=controllers.PID(low=0.0, high=90.0), reference=references.PeakLatch()
+    ),
+    "spline, latch, PI": braking(
+        **SPLINE, controller=controllers.PID(ki=2000.0, low=0.0, high=90.0), reference=references.PeakLatch()
+    ),
 }
 
 
@@ -190,7 +200,7 @@ class Brake:
         if self.relay:
             return m
         raw, c = self.raw(z, m), self.controller
-        for name, limit, way in (("low", c.torque_min, 1), ("high", c.torque_max, -1)):
+        for name, limit, way in (("low", c.low, 1), ("high", c.high, -1)):
             if way * (raw - limit) < -1e-9:
                 return dataclasses.replace(m, torque=name)
             if abs(raw - limit) <= 1e-9:
@@ -213,7 +223,7 @@ class Brake:
         if self.relay:
             return m.torque
         raw, c = self.raw(z, m), self.controller
-        return "low" if raw <= c.torque_min else "high" if raw >= c.torque_max else "inside"
+        return "low" if raw <= c.low else "high" if raw >= c.high else "inside"
 
     def guards(self, m: Mode) -> Iterator[tuple[str, Callable[..., float], int]]:
         """Names, functions and directions of what ends a piece."""
@@ -257,7 +267,7 @@ class Brake:
             side = 1 if m.torque == "high" else -1
             yield "switch", lambda t, z: self.slip(z) - m.target - side * c.band, side
             return
-        for name, limit, way in (("low", c.torque_min, 1), ("high", c.torque_max, -1)):
+        for name, limit, way in (("low", c.low, 1), ("high", c.high, -1)):
             if m.torque in (name, "inside"):
                 leaving = way if m.torque == name else -way
                 yield name, lambda t, z, limit=limit: self.raw(z, m) - limit, leaving

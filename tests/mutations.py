@@ -146,8 +146,8 @@ MUTATIONS = [
     Mutation(
         "a sliding mode that asks for twice as much",
         "controllers/switching.py",
-        "self.gain * inside, self.torque_min",
-        "2 * self.gain * inside, self.torque_min",
+        "self.gain * inside, self.low",
+        "2 * self.gain * inside, self.low",
         "test_real_rig.py::test_each_committed_controller_runs_elsewhere[estimated-sliding-mode-cma-es]",
     ),
     Mutation(

@@ -63,13 +63,17 @@ BALANCES: dict[str, Any] = {
     "arm, as printed": plants.PrintedArm(),
 }
 
-_PID = controllers.PID(kp=150.0, ki=800.0, kd=1.5, torque_min=-5.0)
+_PID = controllers.PID(kp=150.0, ki=800.0, kd=1.5, low=-5.0, high=90.0)
 
 CONTROLLERS: dict[str, Any] = {
     "pid": _PID,
-    "pid, default": controllers.PID(),
-    "pid, clamping": controllers.PID(kp=900.0, ki=5000.0, kd=5.67, antiwindup=controllers.Clamping()),
-    "pid, back-calculation": controllers.PID(kp=900.0, ki=5000.0, antiwindup=controllers.BackCalculation()),
+    "pid, default": controllers.PID(low=0.0, high=90.0),
+    "pid, clamping": controllers.PID(
+        kp=900.0, ki=5000.0, kd=5.67, antiwindup=controllers.Clamping(), low=0.0, high=90.0
+    ),
+    "pid, back-calculation": controllers.PID(
+        kp=900.0, ki=5000.0, antiwindup=controllers.BackCalculation(), low=0.0, high=90.0
+    ),
     "state feedback": controllers.StateFeedback(),
     "state feedback, limited": controllers.StateFeedback(
         gain=np.array([-900.0, -150.0]),
@@ -86,7 +90,7 @@ CONTROLLERS: dict[str, Any] = {
     "proportional feedback": controllers.ProportionalFeedback(gain=np.array([-900.0, -150.0]), torque_max=40.0),
     "constant torque": controllers.ConstantTorque(),
     "relay": controllers.Relay(torque_min=2.0),
-    "sliding mode": controllers.SlidingMode(gain=60.0, boundary=0.1, torque_max=70.0),
+    "sliding mode": controllers.SlidingMode(gain=60.0, boundary=0.1, high=70.0, low=0.0),
     "sampled pid": controllers.Sampled(controller=_PID, period=2e-3, delay=5e-4),
     "balance feedback": controllers.BalanceFeedback(),
     "observer feedback": controllers.ObserverFeedback(
@@ -121,7 +125,7 @@ ACTUATORS: dict[str, Any] = {
     "rate limit": actuators.RateLimit(),
     "delay": actuators.Delay(time=2.3e-3, capacity=8),
     "series": blocks.Series(
-        blocks=(actuators.Delay(time=1.6e-3, capacity=8), actuators.Lag(), actuators.Limits(low=-5.0))
+        blocks=(actuators.Delay(time=1.6e-3, capacity=8), actuators.Lag(), actuators.Limits(low=-5.0, high=90.0))
     ),
 }
 
@@ -173,6 +177,7 @@ PARTS: dict[str, dict[str, Any]] = {
         **objectives.BRAKING,
         "itae": objectives.ITAE(),
         "quadratic": objectives.QuadraticCost(q=np.array([3.0, 2.0]), r=0.5),
+        "share at a limit": objectives.ShareAtLimit(high=12.0),
         "effort": objectives.Effort(),
         "torque rate": objectives.TorqueRate(),
         "variation": objectives.Variation(),
@@ -341,6 +346,7 @@ VALUES = {  # of the objectives on those runs, by hand
     "locked_time": T * np.log(0.8 / 0.79),
     "quadratic": 3 * (0.8 * T) ** 2 * (0.5 - 2 * T * (1 - E) + T / 2 * (1 - E**2))
     + (2 + 0.5 * 25) * 0.64 * T / 2 * (1 - E**2),
+    "share at a limit": 69.5e-3 / 0.5,  # 5 e >= 2 until T log(2) = 0.0693: 69 steps, and half of the next
     "effort": 100 * 0.5 + 100 * 0.8 * T * (1 - E) + 25 * 0.64 * T / 2 * (1 - E**2),
     "variation": 4.0 * (1 - E),
     "balance: settling_time": T * np.log(0.6 / 0.01),

@@ -79,8 +79,8 @@ class Draw:
             kp=self.near(kp),
             ki=self.near(3.0 * kp, 0.8),
             kd=self.near(2e-3 * kp),
-            torque_min=self.within(1.0, 4.0),
-            torque_max=self.near(most),
+            low=self.within(1.0, 4.0),
+            high=self.near(most),
             antiwindup=antiwindup or controllers.NoAntiWindup(),
         )
 
@@ -159,7 +159,7 @@ def robust_noise(r: Draw) -> d.Loop:
     return braking(
         **r.car(roads.MagicFormula()),
         controller=controllers.SlidingMode(
-            gain=r.near(120.0), boundary=r.near(0.06), torque_min=r.within(1.0, 4.0), torque_max=r.near(90.0)
+            gain=r.near(120.0), boundary=r.near(0.06), low=r.within(1.0, 4.0), high=r.near(90.0)
         ),
         feedforward=controllers.ConstantInput(value=r.near(12.0)),
         reference=references.PeakRobust(
@@ -327,7 +327,7 @@ def sliding(r: Draw) -> d.Loop:
     return braking(
         **r.car(r.patches(roads.DRY_COBBLESTONE, roads.DRY_ASPHALT)),
         controller=controllers.SlidingMode(
-            gain=r.near(120.0), boundary=r.near(0.05), torque_min=r.within(1.0, 4.0), torque_max=r.near(100.0)
+            gain=r.near(120.0), boundary=r.near(0.05), low=r.within(1.0, 4.0), high=r.near(100.0)
         ),
         reference=references.FilteredSlip(slip=r.near(0.2), time_constant=r.near(0.05)),
         sensor=sensors.WheelSpeed(time_constant=r.near(0.003)),

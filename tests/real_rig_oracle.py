@@ -116,7 +116,8 @@ class Controller:
 
     def within(self, raw: float) -> float:
         """Within the torque's limits."""
-        return min(max(raw, self.of("torque_min")), self.of("torque_max"))
+        names = ("low", "high") if self.kind in ("PID", "SlidingMode") else ("torque_min", "torque_max")
+        return min(max(raw, self.of(names[0])), self.of(names[1]))
 
     def drained(self, lost: float, gain: float) -> float:
         """What the anti-windup adds to the integral's rate."""

@@ -92,7 +92,10 @@ def test_seeking_ends_at_the_peak_of_a_road():
     """From either side, under a controller, on a road whose peak is known."""
     car = plants.QuarterCar(road=roads.MagicFormula())
     best = float(d.roads.peak(car.road).slip)
-    stop, pi = d.stops.Standstill(speed=2.0), controllers.PID(ki=5e4, antiwindup=controllers.BackCalculation())
+    stop, pi = (
+        d.stops.Standstill(speed=2.0),
+        controllers.PID(ki=5e4, antiwindup=controllers.BackCalculation(), low=0.0, high=90.0),
+    )
     found = []
     for slip in (0.05, 0.3):
         seeking = references.ExtremumSeeking(slip=slip, gain=20.0)

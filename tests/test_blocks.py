@@ -126,7 +126,7 @@ def close(actual, desired, rtol=1e-12, atol=1e-14):
 
 def test_pid_by_hand():
     """10 + 100 * 0.05 + 2000 * 0.01 + 3 * 55 * (0.05 - 0.02) = 39.95."""
-    pid = PID(kp=100.0, ki=2000.0, kd=3.0, cutoff=55.0)
+    pid = PID(kp=100.0, ki=2000.0, kd=3.0, cutoff=55.0, low=0.0, high=90.0)
     memory = Memory(PIDMemory(0.01, 0.02))
     close(pid.output(0.0, memory, tracking(0.05, 10.0)), 39.95)
     close(pid.flow(0.0, memory, tracking(0.05)), (0.05, 55.0 * 0.03))
@@ -135,7 +135,7 @@ def test_pid_by_hand():
 
 def test_pi_and_filtered_derivative_to_a_step():
     """u = kp e + ki e t + kd wc e exp(-wc t)."""
-    pid = PID(kp=10.0, ki=40.0, kd=0.5, cutoff=30.0)
+    pid = PID(kp=10.0, ki=40.0, kd=0.5, cutoff=30.0, low=0.0, high=90.0)
     t = H * np.arange(50)
     u = run(pid, lambda t: tracking(0.1 + 0.0 * t), 50)
     close(u, 1.0 + 4.0 * t + 0.5 * 30.0 * 0.1 * np.exp(-30.0 * t), rtol=1e-8)
@@ -315,7 +315,7 @@ def test_the_integral_of_an_error_whose_setpoint_moves(solver, rtol):
 
 
 def test_sliding_mode():
-    mode = SlidingMode(gain=40.0, boundary=0.1, torque_min=-100.0)
+    mode = SlidingMode(gain=40.0, boundary=0.1, low=-100.0, high=90.0)
     close([mode.output(0.0, Memory(), tracking(e, 5.0)) for e in (0.05, -0.02, 0.3, -0.3)], [25.0, -3.0, 45.0, -35.0])
 
 
@@ -323,7 +323,7 @@ def test_sliding_mode():
 def test_sampled_is_a_zero_order_hold(delay):
     """Against the textbook loop: u_k held from t_k + delay on, integral by forward Euler."""
     period, steps, fine = 4, 23, 2  # in steps; `fine` resolves the mean
-    pid = PID(kp=30.0, ki=500.0, torque_min=-200.0, torque_max=200.0)
+    pid = PID(kp=30.0, ki=500.0, low=-200.0, high=200.0)
 
     def error(t):
         return 0.1 * jnp.cos(300.0 * t)

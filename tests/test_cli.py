@@ -75,7 +75,7 @@ def whole(tmp_path_factory, runs):
 def test_json_has_what_scripts_rely_on(whole):
     folder, document = whole
     old = {"scenario", "metrics", "stopped", "diverged", "solver", "versions", "files"}
-    assert set(document) == old | {"title", "parts", "parameters"}
+    assert set(document) == old | {"title", "parts", "parameters", "at_limit", "warnings"}
     assert document["scenario"] == "slip-lmi"
     assert list(document["metrics"]) == list(BRAKING)
     assert document["stopped"] is True
@@ -359,7 +359,7 @@ def test_quiet_says_results_and_warnings_only(monkeypatch):
     monkeypatch.setattr(console, "PATIENCE", 0.0)
     loud, quiet = (run("simulate", "slip-lmi", *SHORT, *noise, *more) for more in ((), ("-q",)))
     assert "checking the scenario" in loud.stderr
-    assert [line.partition(":")[0] for line in quiet.stderr.splitlines()] == ["warning"]
+    assert {line.partition(":")[0] for line in quiet.stderr.splitlines()} == {"warning"}
     assert quiet.stdout == loud.stdout
     assert "checking the scenario" in run("simulate", "slip-lmi", *SHORT).stderr  # the next one is loud again
 

@@ -246,7 +246,7 @@ def test_what_bends_comes_out_bent(kinks):
     """A command cut off at 5 by a limit before the delay, in series: the mean of its square to the order of the method
     where kinks are located."""
     read, late = Says(read=lambda t: 400.0 * t), 3.3e-3
-    series = Series(blocks=(Limits(high=5.0), Delay(time=late, capacity=32)))
+    series = Series(blocks=(Limits(low=0.0, high=5.0), Delay(time=late, capacity=32)))
     u, mean = played(read, series, 30, kinks=kinks)
     came = np.maximum(H * np.arange(31) - late, 0.0)
     close(u, np.minimum(400.0 * came, 5.0), rtol=0, atol=1e-6 if kinks else 0.1)

@@ -57,7 +57,7 @@ def ours(bias):
         plant=plants.QuarterCar(inertia=J, road=roads.MagicFormula(B=B, C=C, D=D, E=E)),
         sensor=sensors.IntegratedAccelerometer(bias=bias),
         reference=references.PeakLatch(),
-        controller=controllers.PID(kp=KP, ki=0.0),
+        controller=controllers.PID(kp=KP, ki=0.0, low=0.0, high=90.0),
     )
     run = d.measure(loop, d.FixedStep(STEP, DURATION), {"stop_distance": objectives.StopDistance()})
     return float(run.ending.sample.output.distance), bool(run.stopped)

@@ -92,7 +92,7 @@ def test_the_oracle_is_the_other_one_where_nothing_jumps(name):
     c = loop.controller
 
     def torque(t, slip, memory):
-        return 600.0 if loop is STUCK else np.clip(c.kp * (0.12 - slip), c.torque_min, c.torque_max)
+        return 600.0 if loop is STUCK else np.clip(c.kp * (0.12 - slip), c.low, c.high)
 
     other = oracles.brake(loop.plant, torque, speed=22.0, stop=loop.stop.speed)
     mine, record = event_oracle.Brake(loop, loop.plant.inertia).run()

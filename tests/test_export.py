@@ -59,15 +59,15 @@ def observer():
 
 LOOPS = {
     "state feedback": rig(StateFeedback(gain=(-300.0, -48.0))),
-    "PID, filtered derivative": rig(PID(kp=60.0, ki=400.0, kd=0.3, torque_max=9.03)),
-    "conditional integration": rig(PID(kp=30.0, ki=900.0, torque_max=9.03, antiwindup=Clamping())),
-    "back-calculation": rig(PID(kp=30.0, ki=900.0, torque_max=9.03, antiwindup=BackCalculation())),
+    "PID, filtered derivative": rig(PID(kp=60.0, ki=400.0, kd=0.3, high=9.03, low=0.0)),
+    "conditional integration": rig(PID(kp=30.0, ki=900.0, high=9.03, antiwindup=Clamping(), low=0.0)),
+    "back-calculation": rig(PID(kp=30.0, ki=900.0, high=9.03, antiwindup=BackCalculation(), low=0.0)),
     "schedule": rig(ScheduledFeedback(speeds=(2.0, 6.0, 14.0), integral_gains=(-90.0, -200.0, -300.0),
                                       gains=(-9.0, -40.0, -58.0), torque_min=0.0, torque_max=9.03)),
     "proportional to the speed": rig(ProportionalFeedback(gain=(-300.0, -48.0), torque_min=0.0, torque_max=9.03)),
     "filtered target": rig(StateFeedback(gain=(-300.0, -48.0)), reference=FilteredSlip()),
     "holding torque": rig(StateFeedback(gain=(-300.0, -48.0)), feedforward=HoldingInput()),
-    "holding command, table of friction": rig(SlidingMode(gain=0.2), feedforward=HoldingInput(),
+    "holding command, table of friction": rig(SlidingMode(gain=0.2, low=0.0, high=90.0), feedforward=HoldingInput(),
         plant=LabRig(road=Tabulated())),
     "observer": balancing(controller=Sampled(controller=observer(), period=0.01)),
 }  # fmt: skip
@@ -306,7 +306,7 @@ def test_a_whole_run_is_what_the_exported_controller_does(tmp_path):
 
 @needs_cc
 def test_the_target_can_come_from_outside(tmp_path):
-    loop = rig(PID(kp=60.0, ki=400.0), reference=PeakLatch())
+    loop = rig(PID(kp=60.0, ki=400.0, low=0.0, high=90.0), reference=PeakLatch())
     with pytest.raises(NotExported, match="PeakLatch follows what is measured"):
         device(loop)
     found = device(loop, given_target=True)
@@ -320,7 +320,9 @@ def test_the_target_can_come_from_outside(tmp_path):
 
 
 def test_difference_equations_are_the_controllers():
-    found = equations(rig(PID(kp=60.0, ki=400.0, kd=0.3, cutoff=55.0, torque_max=np.inf), feedforward=HoldingInput()))
+    found = equations(
+        rig(PID(kp=60.0, ki=400.0, kd=0.3, cutoff=55.0, high=np.inf, low=0.0), feedforward=HoldingInput())
+    )
     assert found["inputs"] == ["target", "slip", "feedforward"]
     T, wc, kd = 1e-3, 55.0, 0.3
     np.testing.assert_allclose(found["F"], [[1.0, 0.0], [0.0, 1 - T * wc]], rtol=1e-12)
@@ -407,7 +409,7 @@ def test_the_controller_of_the_scenario_is_exported(tmp_path):
     for name, value in gains.items():
         assert re.search(rf"\bcontroller\.controller\.{name} = {value:g}\b", head)
     limits = load("slip-estimator", integrated=False).loop.controller
-    low, high = float(limits.torque_min), float(limits.torque_max)
+    low, high = float(limits.low), float(limits.high)
     slips = 0.2 - 0.003 * np.cos(np.arange(40.0))
     lines = "".join(f"{slip!r} 0.2\n" for slip in slips.tolist())
     program = compiled(text, "pid", tmp_path)
@@ -424,7 +426,7 @@ def test_the_controller_of_the_scenario_is_exported(tmp_path):
 
 
 def test_a_computer_without_events_is_exported_as_one_with():
-    inner = PID(kp=60.0, ki=400.0)
+    inner = PID(kp=60.0, ki=400.0, low=0.0, high=90.0)
     texts = [
         c_source(device(dataclasses.replace(rig(inner), controller=one)), "unit")
         for one in (Sampled(controller=inner, period=2e-3), SampledOnGrid(controller=inner, sampling_period=2e-3))

@@ -82,7 +82,7 @@ def test_a_loop_closed_outside_is_the_loop(tmp_path):
     """The plant as FMU, the controller as Structured Text: together what was simulated, to 1e-6."""
     loop = braking(
         plant=MirroredRig(),
-        controller=Sampled(controller=PID(kp=60.0, ki=400.0, kd=0.3, torque_max=9.03), period=PERIOD),
+        controller=Sampled(controller=PID(kp=60.0, ki=400.0, kd=0.3, high=9.03, low=0.0), period=PERIOD),
         reference=FixedSlip(slip=0.2),
         feedforward=ConstantInput(value=2.7),
     )

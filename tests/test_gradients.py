@@ -67,7 +67,7 @@ LOOPS = {
     ),
     "latch": braking(
         **CAR | {"stop": Standstill(speed=5.5)},
-        controller=controllers.PID(ki=5000.0, kd=5.67, torque_max=200.0),
+        controller=controllers.PID(ki=5000.0, kd=5.67, high=200.0, low=0.0),
         reference=references.PeakLatch(),
     ),
     "lock": braking(
@@ -85,7 +85,7 @@ LOOPS = {
     "computer": braking(
         **CAR | {"plant": plants.QuarterCar(road=PATCHES)},
         controller=controllers.Sampled(
-            controller=controllers.PID(kp=900.0, ki=2000.0, torque_max=120.0, antiwindup=controllers.Clamping()),
+            controller=controllers.PID(kp=900.0, ki=2000.0, high=120.0, antiwindup=controllers.Clamping(), low=0.0),
             period=5e-3,
             delay=1.3e-3,
         ),
@@ -93,7 +93,7 @@ LOOPS = {
     ),
     "noisy": braking(
         **CAR,
-        controller=controllers.SlidingMode(gain=160.0, boundary=0.05, torque_max=150.0),
+        controller=controllers.SlidingMode(gain=160.0, boundary=0.05, high=150.0, low=0.0),
         reference=references.PeakRobust(time_constant=0.004, threshold=0.02),
         sensor=blocks.Series(
             blocks=(
@@ -135,12 +135,12 @@ LOOPS = {
     ),
     "extremum seeking": braking(
         **CAR | {"plant": plants.QuarterCar(road=ALONG)},
-        controller=controllers.PID(kp=600.0, torque_max=150.0),
+        controller=controllers.PID(kp=600.0, high=150.0, low=0.0),
         reference=references.ExtremumSeeking(gain=2.0, time_constant=0.05),
     ),
     "by deceleration": braking(
         **CAR | {"plant": plants.QuarterCar(road=ALONG)},
-        controller=controllers.PID(kp=600.0, torque_max=150.0),
+        controller=controllers.PID(kp=600.0, high=150.0, low=0.0),
         reference=references.SlipByDeceleration(
             decelerations=np.array([1.0, 6.0, 12.0]), slips=np.array([0.1, 0.12, 0.16])
         ),
@@ -174,7 +174,7 @@ LOOPS = {
     ),
     "delay": braking(
         **CAR,
-        controller=controllers.PID(kp=300.0, kd=1.0, torque_max=250.0),
+        controller=controllers.PID(kp=300.0, kd=1.0, high=250.0, low=0.0),
         reference=references.PeakLiteral(slip=0.15),
         actuator=actuators.Delay(time=0.0123, capacity=64),
     ),
@@ -287,7 +287,7 @@ def test_sensitivity_of_the_conventional_brake():
         "controller.kp": 0.33163,
         "reference.slip": 3.873,
         "plant.inertia": 0.98866,
-        "controller.torque_max": -0.93409,
+        "controller.high": -0.93409,
         "plant.road.D": -43.27,
     }
     np.testing.assert_allclose(_sensitivity(FULL, list(expected)), list(expected.values()), rtol=5e-4, atol=0)
@@ -300,8 +300,10 @@ def test_sensitivity_of_the_conventional_brake():
 )
 def test_gradient_through_the_latch_agrees_with_a_wide_difference(ki, published):
     """A narrow difference would agree with a wrong derivative: both miss how the latched slip moves between samples."""
-    loop = dataclasses.replace(FULL, reference=references.PeakLatch(), controller=controllers.PID(ki=ki))
-    paths = ["plant.inertia", "controller.torque_max"]
+    loop = dataclasses.replace(
+        FULL, reference=references.PeakLatch(), controller=controllers.PID(ki=ki, low=0.0, high=90.0)
+    )
+    paths = ["plant.inertia", "controller.high"]
     ours = _sensitivity(loop, paths)
     np.testing.assert_allclose(ours, _sensitivity(loop, paths, difference=1e-2), rtol=1e-3, atol=0)
     if published:
@@ -311,7 +313,7 @@ def test_gradient_through_the_latch_agrees_with_a_wide_difference(ki, published)
 @pytest.mark.slow
 def test_a_maximum_on_a_knot_of_the_road_has_the_slip_of_the_knot():
     """Where the spline of the paper has its greatest friction, its curvature jumps; whatever the inertia."""
-    loop = dataclasses.replace(FULL, reference=references.PeakLatch(), controller=controllers.PID())
+    loop = dataclasses.replace(FULL, reference=references.PeakLatch(), controller=controllers.PID(low=0.0, high=90.0))
     loop = dataclasses.replace(
         loop, plant=plants.QuarterCar(road=roads.SPLINE_B), initial=d.BrakeStart(speed=100 / 3.6)
     )

@@ -314,7 +314,9 @@ class TestTraces:
 
     def test_a_step_that_is_not_stable_is_named(self):
         data = Traces(t=T, columns={"speed": T})
-        loop = dataclasses.replace(LOOP, controller=controllers.PID(kp=3893.0), stop=stops.Standstill(speed=0.05))
+        loop = dataclasses.replace(
+            LOOP, controller=controllers.PID(kp=3893.0, low=0.0, high=90.0), stop=stops.Standstill(speed=0.05)
+        )
         with pytest.raises(ValueError, match=r"solver.step = 0.001 s is not stable at the start; at most 0.00019 s is"):
             identify(loop, data, FREE, solver=SOLVER)
 
@@ -322,7 +324,7 @@ class TestTraces:
 ROWS = {
     "locked": LOOP,
     "weak": replace(LOOP, {"controller.torque": 60.0}),
-    "sliding": dataclasses.replace(LOOP, controller=controllers.PID(kp=500.0)),
+    "sliding": dataclasses.replace(LOOP, controller=controllers.PID(kp=500.0, low=0.0, high=90.0)),
 }
 
 

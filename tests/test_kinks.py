@@ -328,7 +328,7 @@ def integrating(late: float) -> tuple[Loop, float]:
     integral = error.integ() - error.integ()(leaves)
     square = ((kp * error + ki * integral) ** 2).integ()
     loop = clockwork(lambda x, a: 1.0 + 0.0 * x, jnp.asarray(0.0))
-    pid = PID(kp=kp, ki=ki, torque_max=most, antiwindup=Clamping())
+    pid = PID(kp=kp, ki=ki, high=most, antiwindup=Clamping(), low=0.0)
     parts = {"controller": pid, "reference": Setpoint(value=setpoint)}
     parts |= {"actuator": Delay(time=late, capacity=128)} if late else {}
     return Loop(**{**vars(loop), **parts}), most**2 * leaves + square(END - late) - square(leaves)

@@ -251,7 +251,7 @@ def one_period(loop, z, period):
     "controller",
     [
         StateFeedback(gain=np.array([-400.0, -30.0])),
-        PID(kp=30.0, ki=400.0, kd=0.3, torque_min=-np.inf, torque_max=np.inf),
+        PID(kp=30.0, ki=400.0, kd=0.3, low=-np.inf, high=np.inf),
     ],
     ids=["state feedback", "pid"],
 )
@@ -283,10 +283,13 @@ def modes(matrix):
 
 CONTROLLERS = {
     "state feedback": (StateFeedback(), ["integral of slip error", "slip error"]),
-    "p": (PID(kp=300.0, torque_max=np.inf), ["slip error"]),
-    "pi": (PID(kp=300.0, ki=900.0), ["integral of slip error", "slip error"]),
-    "pd": (PID(kp=300.0, kd=4.0), ["slip error", "filtered slip error"]),
-    "pid": (PID(kp=300.0, ki=900.0, kd=4.0), ["integral of slip error", "slip error", "filtered slip error"]),
+    "p": (PID(kp=300.0, high=np.inf, low=0.0), ["slip error"]),
+    "pi": (PID(kp=300.0, ki=900.0, low=0.0, high=90.0), ["integral of slip error", "slip error"]),
+    "pd": (PID(kp=300.0, kd=4.0, low=0.0, high=90.0), ["slip error", "filtered slip error"]),
+    "pid": (
+        PID(kp=300.0, ki=900.0, kd=4.0, low=0.0, high=90.0),
+        ["integral of slip error", "slip error", "filtered slip error"],
+    ),
 }
 
 
@@ -300,7 +303,7 @@ def test_reduction_has_the_modes_of_the_loop(plant, name, actuator):
     controller, states = CONTROLLERS[name]
     plant = {"rig": MirroredRig(), "car": QuarterCar(road=Burckhardt(c4=0.0))}[plant]
     if isinstance(plant, QuarterCar):
-        controller = replace(controller, {"torque_max": np.inf})
+        controller = replace(controller, {"high": np.inf})
     parts = {"reference": FixedSlip(slip=0.2), "feedforward": HoldingInput(), "controller": controller}
     loop = braking(plant=plant, initial=BrakeStart(speed=9.0, slip=0.2), actuator=actuator, **parts)
     reduced = state_feedback(loop)
@@ -331,8 +334,8 @@ def test_what_is_neglected():
     lag = Lag(time_constant=0.02)
     loop = braking(
         plant=MirroredRig(),
-        controller=PID(kp=30.0, ki=9.0, antiwindup=BackCalculation()),
-        actuator=Series(blocks=(Delay(time=0.004), lag, Limits(), Direct())),
+        controller=PID(kp=30.0, ki=9.0, antiwindup=BackCalculation(), low=0.0, high=90.0),
+        actuator=Series(blocks=(Delay(time=0.004), lag, Limits(low=0.0, high=90.0), Direct())),
         sensor=WheelSpeed(),
         reference=FilteredSlip(),
     )
@@ -366,7 +369,7 @@ def test_what_is_neglected():
     ("change", "message"),
     [
         ({"controller": Relay()}, "controller relay is not linear: it cannot be brought to state feedback"),
-        ({"controller": SlidingMode()}, "controller sliding mode is not linear"),
+        ({"controller": SlidingMode(low=0.0, high=90.0)}, "controller sliding mode is not linear"),
         ({"controller": Sampled(controller=ConstantTorque())}, "controller constant torque is not linear"),
         ({"controller": Sampled(controller=Sampled())}, "controller sampled is not linear"),
         ({"actuator": Series(blocks=(Lag(), Lag()))}, "room for one lag, not for several"),

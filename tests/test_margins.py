@@ -160,12 +160,12 @@ def test_ends_of_the_axis():
 
 LOOPS = {
     "state feedback": {},
-    "PID": {"controller": PID(kp=60.0, ki=400.0, kd=0.3, torque_min=-np.inf, torque_max=np.inf)},
+    "PID": {"controller": PID(kp=60.0, ki=400.0, kd=0.3, low=-np.inf, high=np.inf)},
     "lag": {"actuator": Lag(time_constant=4e-3)},
     "sampled": {"controller": Sampled(controller=StateFeedback(), period=2e-3)},
     "sampled, half a period late": {"controller": Sampled(controller=StateFeedback(), period=2e-3, delay=1e-3)},
     "sampled PID, lag": {
-        "controller": Sampled(controller=PID(kp=60.0, ki=400.0, kd=0.3, torque_max=np.inf), period=2e-3, delay=2e-3),
+        "controller": Sampled(controller=PID(kp=60.0, ki=400.0, kd=0.3, high=np.inf, low=0.0), period=2e-3, delay=2e-3),
         "actuator": RateLimit(time_constant=4e-3),
     },
 }
@@ -251,7 +251,7 @@ def test_noise_is_a_disturbance_and_limits_do_not_act():
     w = np.geomspace(1, 1e3, 9)
     noisy = rig(sensor=Noise(slip=0.01), controller=StateFeedback(torque_min=0.0, torque_max=9.03))
     np.testing.assert_allclose(open_loop(noisy).transfer().response(w), plain.response(w), rtol=1e-12)
-    integrating = rig(controller=PID(ki=300.0, torque_min=0.0, torque_max=9.03))
+    integrating = rig(controller=PID(ki=300.0, low=0.0, high=9.03))
     held = dataclasses.replace(integrating, feedforward=load("slip-estimator").loop.feedforward)
     np.testing.assert_allclose(
         open_loop(held).transfer().response(w), open_loop(integrating).transfer().response(w), rtol=1e-9
@@ -263,7 +263,7 @@ def test_noise_is_a_disturbance_and_limits_do_not_act():
     [
         ({"controller": ConstantTorque()}, "its command does not follow"),
         ({"controller": Relay()}, "acts at instants"),
-        ({"controller": PID(kp=1.0, torque_max=0.5)}, "does not follow what is measured at the setpoint"),
+        ({"controller": PID(kp=1.0, high=0.5, low=0.0)}, "does not follow what is measured at the setpoint"),
     ],
     ids=["constant", "relay", "at its limit"],
 )

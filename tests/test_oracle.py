@@ -49,7 +49,7 @@ def _case(seed):
         return loop, lambda t, s, m: hold + k1 * m[0] + k2 * (s - 0.2), lambda t, s, m: [s - 0.2], 1
     if kind == "pid":
         kp, ki, kd, wc, top = scale, 2 * scale, 0.002 * scale, 55.0, 1.5 * hold
-        controller = controllers.PID(kp=kp, ki=ki, kd=kd, cutoff=wc, torque_max=top)
+        controller = controllers.PID(kp=kp, ki=ki, kd=kd, cutoff=wc, high=top, low=0.0)
 
         def torque(t, s, m):
             e = 0.2 - s

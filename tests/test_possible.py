@@ -84,8 +84,8 @@ def test_a_brake_never_speeds_the_car_up_without_a_flag():
     """A lag from well resolved to far beyond the step, around a brake with limits: the car is no faster at the end than
     at the start, or the run has diverged."""
     loop = braking(
-        controller=controllers.PID(kp=3893.0),
-        actuator=blocks.Series(blocks=(actuators.Lag(), actuators.Limits(high=400.0))),
+        controller=controllers.PID(kp=3893.0, low=0.0, high=90.0),
+        actuator=blocks.Series(blocks=(actuators.Lag(), actuators.Limits(low=0.0, high=400.0))),
     )
     rng = np.random.default_rng(4)
     values = {

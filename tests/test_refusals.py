@@ -56,7 +56,9 @@ BAD = {  # a loop, values by lane of which the first is fine, and what is said o
         ["controller.delay exceeds the period", "controller.period is not a multiple of solver.step = 0.001 s"],
     ),
     "filter": (
-        dataclasses.replace(RIG, controller=controllers.Sampled(controller=controllers.PID(kd=1.0))),
+        dataclasses.replace(
+            RIG, controller=controllers.Sampled(controller=controllers.PID(kd=1.0, low=0.0, high=90.0))
+        ),
         {"controller.controller.cutoff": [1999.0, 2001.0, 1e5]},
         ["controller.controller.cutoff is too fast for the period"],
     ),
@@ -356,6 +358,12 @@ def test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows(cutoff, gro
     assert (abs(d) > 1) == grows
     line = f"controller.controller.cutoff = {cutoff:g} rad/s is outside (0, 2000) rad/s: sampled every 0.001 s"
     for computer in (controllers.Sampled, controllers.SampledOnGrid):
-        said = list(problems(dataclasses.replace(RIG, controller=computer(controller=controllers.PID(cutoff=cutoff)))))
+        said = list(
+            problems(
+                dataclasses.replace(
+                    RIG, controller=computer(controller=controllers.PID(cutoff=cutoff, low=0.0, high=90.0))
+                )
+            )
+        )
         assert len(said) == grows
         assert all(one.startswith(line) for one in said)

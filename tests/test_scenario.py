@@ -57,7 +57,7 @@ def test_slip_lmi_is_the_papers_example():
 def test_slip_estimator_is_the_papers_example():
     s = load("slip-estimator")
     c = s.loop.controller
-    assert (c.kp, c.ki, c.kd, c.cutoff, c.torque_min, c.torque_max) == (3893, 5000, 5.67, 55, 0, 90)
+    assert (c.kp, c.ki, c.kd, c.cutoff, c.low, c.high) == (3893, 5000, 5.67, 55, 0, 90)
     assert type(s.loop.reference).__name__ == "PeakLatch"
     assert (s.loop.plant.mass, s.loop.plant.radius, s.loop.plant.inertia) == (15, 0.2, 1.04456)
     np.testing.assert_array_equal(s.loop.plant.road.mu, roads.SPLINE_B.mu)

@@ -92,7 +92,7 @@ def test_a_gain_that_the_step_cannot_follow_is_not_entered():
         plant=plants.QuarterCar(),
         initial=d.BrakeStart(speed=8.0, slip=0.02),
         stop=SpeedReached(speed=6.0),
-        controller=controllers.PID(kp=2000.0, torque_max=1e6),
+        controller=controllers.PID(kp=2000.0, high=1e6, low=0.0),
         reference=references.FixedSlip(slip=0.1),
     )
     step = 2e-3

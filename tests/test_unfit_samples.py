@@ -62,7 +62,7 @@ def trajectory(loop):
 @pytest.mark.parametrize("which", [0, 1], ids=["sampled", "sampled on the grid"])
 def test_a_lost_sample_holds_memory_and_command(which):
     """Against the difference equations of the PID, which skip the samples that are lost."""
-    slips, commands = trajectory(rig(computers(PID(kp=60.0, ki=400.0, kd=0.3, torque_max=9.03))[which]))
+    slips, commands = trajectory(rig(computers(PID(kp=60.0, ki=400.0, kd=0.3, high=9.03, low=0.0))[which]))
     integral, filtered, wanted = 0.0, 0.0, []
     for k, slip in enumerate(slips):
         if k in range(LOST.start, LOST.stop):
@@ -78,7 +78,7 @@ def test_a_lost_sample_holds_memory_and_command(which):
 
 
 def test_what_the_controller_does_not_read_is_not_missed():
-    inner = PID(kp=60.0, ki=400.0, torque_max=9.03)
+    inner = PID(kp=60.0, ki=400.0, high=9.03, low=0.0)
     _, whole = trajectory(rig(computers(inner)[0], first=1.0, last=2.0))
     _, other = trajectory(rig(computers(inner)[0], other=1.0))
     np.testing.assert_array_equal(other, whole)

@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from diffabs.core.numerics import clamp, quotient
 from diffabs.core.protocols import Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
@@ -10,10 +12,10 @@ from diffabs.core.rules import Rule, ordered
 
 @pytree
 class Limits:
-    """control = clamp(command, low, high)."""
+    """control = clamp(command, low, high), without limits by default."""
 
-    low: Scalar = param(default=0.0, unit="control")
-    high: Scalar = param(default=90.0, unit="control")
+    low: Scalar = param(default=-np.inf, unit="control", infinite=True)
+    high: Scalar = param(default=np.inf, unit="control", infinite=True)
 
     start = no_memory
     flow = no_flow
@@ -22,6 +24,10 @@ class Limits:
         """Control: a brake's torque [N m]."""
         del t, memory
         return clamp(signal, self.low, self.high)
+
+    def limits(self) -> tuple[Scalar, Scalar]:
+        """Between which the control stays."""
+        return self.low, self.high
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""

@@ -3,6 +3,7 @@
 import pathlib
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from diffabs.cli import console, show, show_samples
@@ -12,6 +13,7 @@ from diffabs.core.values import ScenarioError, unknown
 if TYPE_CHECKING:
     from diffabs.sweep import Results
 
+FEWEST = 4  # samples of which anything is said
 SAME = ("space", "seed", "samples")  # of two studies whose samples are the same
 
 
@@ -55,14 +57,18 @@ def _metrics(a: "Results", b: "Results", wanted: list[str] | None) -> list[str]:
 
 
 def _compared(a: "Results", b: "Results", metrics: list[str]) -> dict[str, Any]:
-    """Paired statistics of second minus first, over samples that diverged or were refused in neither."""
+    """Paired statistics of second minus first, over samples that diverged or were refused in neither. A sample that
+    never settles in one of them is left out of that metric, and counted."""
     from diffabs.sweep.statistics.estimates import Moments
     from diffabs.sweep.statistics.paired import paired
 
     lost = a.column("diverged") | b.column("diverged") | ~a.accepted | ~b.accepted
     rows = {}
     for name in metrics:
-        before, after = a.column(name)[~lost], b.column(name)[~lost]
+        both = ~lost & np.isfinite(a.column(name)) & np.isfinite(b.column(name))
+        before, after = a.column(name)[both], b.column(name)[both]
+        if both.sum() < FEWEST:
+            continue
         found = paired(after, before)
         rows[name] = {
             "first": Moments.of(before).mean().value,
@@ -72,5 +78,6 @@ def _compared(a: "Results", b: "Results", metrics: list[str]) -> dict[str, Any]:
             "share in which the second is less": found.less.table(),
             "equal": found.ties,
             "variance reduction": found.reduction,
+            "never": int((~lost & ~both).sum()),
         }
     return {"samples": len(lost), "left out": int(lost.sum()), "metrics": rows}

@@ -13,6 +13,7 @@ import importlib
 import itertools
 import math
 import pathlib
+from collections.abc import Iterator
 from typing import Annotated, Any, NoReturn
 
 import jax
@@ -41,6 +42,7 @@ from diffabs.cli import (
 from diffabs.cli.checking import checked, said
 from diffabs.core import interrupt, provenance
 from diffabs.core.pytree import parameters
+from diffabs.objectives import at_limits
 from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.matlab import write_mat
@@ -59,6 +61,8 @@ app = typer.Typer(
     help="Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers.",
 )
 
+AT_LIMIT = "at a limit"  # among the objectives of a run; no metric of a scenario has a space in its name
+MOSTLY = 0.5  # of the time, from which a run at a limit is worth a warning
 MOST_ROWS = 20_000  # of a trajectory
 YOUNG = 50_000  # objects between two looks for garbage; 700 by default, and tracing makes many that stay
 
@@ -128,7 +132,7 @@ def simulate(
             mat_file = files.enter_context(targets.new_file(mat, "--mat"))
             picture = files.enter_context(targets.new_file(plot, "--plot"))
             chosen, key = _source(scenario, from_sweep, sample, changes, seed)
-            run = console.waited(lambda: _run(chosen, key, keep=kept), f"simulating {chosen.name}")
+            run, limited = console.waited(lambda: _run(chosen, key, keep=kept), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
                 show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
             if mat_file:
@@ -137,7 +141,9 @@ def simulate(
             if picture:
                 console.waited(lambda: _draw(chosen, run, picture), "drawing")
             found = console.waited(lambda: checked(chosen, key), "shortening the step") if check else None
-        result = _result(chosen, run, {"csv": csv, "mat": mat, "plot": plot}) | ({"accuracy": found} if found else {})
+        result = _result(chosen, run, limited, {"csv": csv, "mat": mat, "plot": plot}) | (
+            {"accuracy": found} if found else {}
+        )
         show.as_json(result) if as_json else show.run(result, chosen)
         if found and not as_json:
             show.accuracy(found)
@@ -161,19 +167,27 @@ def _judge(chosen: Scenario, result: dict[str, Any]) -> None:
     if result["diverged"]:
         why = "a number became infinite or impossible, or something switched in every step: there are no metrics"
         console.fail(f"{chosen.name} diverged: {why}", 1)
-    if warning := _warning(chosen, result):
+    for warning in result["warnings"]:
         console.say(f"warning: {warning}")
 
 
-def _warning(chosen: Scenario, result: dict[str, Any]) -> str:
-    """What a reader of the metrics must know about how the run ended."""
-    stop = chosen.loop.stop
-    if result["stopped"] == stop.success:
-        return ""
-    otherwise = getattr(stop, "otherwise", "")
-    if result["stopped"]:
-        return otherwise or "STOPPED EARLY: the run reached its stop"
-    return f"NOT STOPPED within solver.duration = {chosen.solver.duration:g} s{otherwise and f'; {otherwise}'}"
+def _warnings(chosen: Scenario, run: Run, limited: float) -> Iterator[str]:
+    """Yield what a reader of the metrics must know: how the run ended, what it never reached, and a control that is
+    limited most of the time."""
+    stop, stopped = chosen.loop.stop, bool(run.stopped)
+    if bool(run.diverged):
+        return
+    if stopped != stop.success:
+        otherwise = getattr(stop, "otherwise", "")
+        late = f"NOT STOPPED within solver.duration = {chosen.solver.duration:g} s{otherwise and f'; {otherwise}'}"
+        yield (otherwise or "STOPPED EARLY: the run reached its stop") if stopped else late
+    for name in chosen.objectives:
+        if math.isinf(run.metrics[name]):
+            yield f"{name} is infinite: the run ends before it gets there"
+    if limited > MOSTLY:
+        limits, unit = at_limits(chosen.loop), chosen.loop.plant.control_unit
+        ends = f"{float(limits.low):g} to {float(limits.high):g} {unit}"
+        yield f"the control is at a limit ({ends}) for {100 * limited:.0f} % of the run: gains hardly matter there"
 
 
 def _check_source(scenario: Any, from_sweep: Any, sample: int | None, changes: Any, seed: int | None) -> None:
@@ -196,14 +210,20 @@ def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
             console.fail(f"--{one} and --{other} are the same file, {wanted[one]}")
 
 
-def _run(chosen: Scenario, key: Any, keep: bool) -> Run:
-    """The run, on the host."""
+def _run(chosen: Scenario, key: Any, keep: bool) -> tuple[Run, float]:
+    """Return the run, on the host, and for which share of it the control was at a limit."""
+    measured = {**chosen.objectives, AT_LIMIT: at_limits(chosen.loop)}
+    run = jax.device_get(_made(chosen, measured, key, keep=keep))
+    return run._replace(metrics={name: run.metrics[name] for name in chosen.objectives}), float(run.metrics[AT_LIMIT])
+
+
+def _made(chosen: Scenario, measured: dict[str, Any], key: Any, *, keep: bool) -> Run:
     if not keep:
-        return jax.device_get(measure(chosen.loop, chosen.solver, chosen.objectives, key=key))
+        return measure(chosen.loop, chosen.solver, measured, key=key)
     steps = chosen.solver.steps
     every = min(max(chosen.solver.every, math.ceil(steps / MOST_ROWS)), steps)
     solver = dataclasses.replace(chosen.solver, every=every)
-    return jax.device_get(rollout(chosen.loop, solver, chosen.objectives, key=key))
+    return rollout(chosen.loop, solver, measured, key=key)
 
 
 def _draw(chosen: Scenario, run: Run, picture: pathlib.Path) -> None:
@@ -212,12 +232,14 @@ def _draw(chosen: Scenario, run: Run, picture: pathlib.Path) -> None:
     draw(run, title=chosen.title or chosen.name, unit=plant.control_unit).savefig(picture)
 
 
-def _result(chosen: Scenario, run: Run, files: dict[str, pathlib.Path | None]) -> dict[str, Any]:
+def _result(chosen: Scenario, run: Run, limited: float, files: dict[str, pathlib.Path | None]) -> dict[str, Any]:
     return {
         "scenario": chosen.name,
         "metrics": {name: float(run.metrics[name]) for name in chosen.objectives},
         "stopped": bool(run.stopped),
         "diverged": bool(run.diverged),
+        "at_limit": limited,
+        "warnings": list(_warnings(chosen, run, limited)),
         "title": chosen.title,
         "parts": model.parts(chosen),
         "parameters": model.numbers(chosen),

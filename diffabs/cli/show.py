@@ -52,7 +52,9 @@ def run(result: dict[str, Any], chosen: Scenario) -> None:
     """Metrics with their units, and what was written."""
     table = Table("metric", "value", "unit")
     for name, value in result["metrics"].items():
-        table.add_row(name, number(value), unit_of(chosen.objectives[name], chosen.loop.plant))
+        table.add_row(
+            name, "never" if value == math.inf else number(value), unit_of(chosen.objectives[name], chosen.loop.plant)
+        )
     titled(chosen.title or chosen.name, table)
     files(result)
 

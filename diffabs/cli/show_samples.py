@@ -18,6 +18,9 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
     percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
     titled(f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", failures)
     titled("statistics of the lanes that did not diverge", _statistics(result["metrics"], chosen))
+    for name, row in result["never"].items():
+        where = f"{row['count']} runs, the first sample {row['samples'][0]}"
+        say(f"warning: {name} is infinite (never) in {where}: they are in no statistic of it")
     paths = list(next(iter(result["sensitivity"].values()), {}))
     if paths:
         kind = list(next(iter(result["sensitivity"].values()))[paths[0]])[-1]

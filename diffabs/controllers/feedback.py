@@ -45,6 +45,10 @@ class StateFeedback:
         raw = signal.feedforward + self.gain[0] * memory.flow + self.gain[1] * error
         return raw, clamp(raw, self.torque_min, self.torque_max)
 
+    def limits(self) -> tuple[Scalar, Scalar]:
+        """Between which the control stays."""
+        return self.torque_min, self.torque_max
+
     def problems(self) -> Iterator[str]:
         """A gain of the wrong length."""
         if np.shape(self.gain) != (2,):

@@ -31,7 +31,7 @@ class ScheduledFeedback:
     torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
     antiwindup: Any = part(default=NoAntiWindup)
 
-    start = StateFeedback.start
+    start, limits = StateFeedback.start, StateFeedback.limits
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Any:
         """x1' = slip - target, unless the anti-windup says otherwise."""
@@ -77,7 +77,8 @@ class ProportionalFeedback:
     torque_max: Scalar = param(default=np.inf, unit="control", infinite=True)
     antiwindup: Any = part(default=NoAntiWindup)
 
-    start, problems, rules = StateFeedback.start, StateFeedback.problems, StateFeedback.rules
+    start, limits = StateFeedback.start, StateFeedback.limits
+    problems, rules = StateFeedback.problems, StateFeedback.rules
     flow, output = ScheduledFeedback.flow, ScheduledFeedback.output
 
     def _here(self, signal: Tracking) -> StateFeedback:

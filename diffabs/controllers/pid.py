@@ -1,6 +1,6 @@
-"""PID control of the first signal, a brake's slip, with filtered derivative and limits.
+"""PID control of the first signal that a plant shows, with filtered derivative and limits.
 
-    u = clamp(ff + kp e + kI I + kD wc (e - d), u_min, u_max),   I' = e,   d' = wc (e - d),   e = target - slip
+    u = clamp(ff + kp e + kI I + kD wc (e - d), low, high),   I' = e,   d' = wc (e - d),   e = target - signal
 
 Aoki and Nakamura, eq. (13): C(s) = kp + kI/s + kD s wc/(s + wc). Their u is the negative of this one, which brakes when
 positive. P, PI and PD are this with gains of zero.
@@ -8,6 +8,8 @@ positive. P, PI and PD are this with gains of zero.
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.core.numerics import clamp
@@ -25,14 +27,14 @@ class PIDMemory(NamedTuple):
 
 @pytree
 class PID:
-    """u = clamp(ff + kp e + kI I + kD wc (e - d), torque_min, torque_max)."""
+    """u = clamp(ff + kp e + kI I + kD wc (e - d), low, high), without limits by default."""
 
     kp: Scalar = param(default=3893.0, unit="control/signal", low=0.0)
     ki: Scalar = param(default=0.0, unit="control/signal/s", low=0.0)
     kd: Scalar = param(default=0.0, unit="control s/signal", low=0.0)
     cutoff: Scalar = param(default=55.0, unit="rad/s", above=0.0)
-    torque_min: Scalar = param(default=0.0, unit="control", infinite=True)
-    torque_max: Scalar = param(default=90.0, unit="control", infinite=True)
+    low: Scalar = param(default=-np.inf, unit="control", infinite=True)
+    high: Scalar = param(default=np.inf, unit="control", infinite=True)
     antiwindup: Any = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:
@@ -48,15 +50,19 @@ class PID:
         return PIDMemory(integral, self.cutoff * (error - memory.flow.filtered))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Control: a brake's torque [N m]."""
+        """Control, in the plant's unit."""
         return self._torque(memory, signal)[1]
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
         error = signal.target - signal.measured[0]
         derivative = self.cutoff * (error - memory.flow.filtered)
         raw = signal.feedforward + self.kp * error + self.ki * memory.flow.integral + self.kd * derivative
-        return raw, clamp(raw, self.torque_min, self.torque_max)
+        return raw, clamp(raw, self.low, self.high)
+
+    def limits(self) -> tuple[Scalar, Scalar]:
+        """Between which the control stays."""
+        return self.low, self.high
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""
-        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}")
+        yield ordered(("low", self.low), ("high", self.high), "{control}")

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, Tracking, no_flow, no_memory
@@ -67,22 +68,30 @@ class Relay:
 
 @pytree
 class SlidingMode:
-    """u = clamp(ff + gain sat((target - slip)/boundary), torque_min, torque_max), sat(z) = clamp(z, -1, 1).
+    """u = clamp(ff + gain sat((target - signal)/boundary), low, high), sat(z) = clamp(z, -1, 1).
 
-    First-order sliding mode with a boundary layer. Slotine and Li, Applied Nonlinear Control, sec. 7.2.
+    First-order sliding mode with a boundary layer, without limits by default. Slotine and Li, Applied Nonlinear
+    Control, sec. 7.2.
     """
 
     gain: Scalar = param(default=90.0, unit="control", low=0.0)
     boundary: Scalar = param(default=0.02, unit="signal", above=0.0)
-    torque_min: Scalar = param(default=0.0, unit="control")
-    torque_max: Scalar = param(default=90.0, unit="control")
+    low: Scalar = param(default=-np.inf, unit="control", infinite=True)
+    high: Scalar = param(default=np.inf, unit="control", infinite=True)
 
     start = no_memory
     flow = no_flow
-    rules = Relay.rules
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
         """Control: a brake's torque [N m]."""
         del t, memory
         inside = clamp((signal.target - signal.measured[0]) / self.boundary, -1.0, 1.0)
-        return clamp(signal.feedforward + self.gain * inside, self.torque_min, self.torque_max)
+        return clamp(signal.feedforward + self.gain * inside, self.low, self.high)
+
+    def limits(self) -> tuple[Scalar, Scalar]:
+        """Between which the control stays."""
+        return self.low, self.high
+
+    def rules(self) -> Iterator[Rule]:
+        """Limits that do not exclude each other."""
+        yield ordered(("low", self.low), ("high", self.high), "{control}")

@@ -140,8 +140,11 @@ class Segment(NamedTuple):
 
     def error(self) -> Cubic:
         """The cubic of the first signal - setpoint, which a reference may move within a step."""
-        ends = Shown.of(self.start), Shown.of(self.end)
-        return self._cubic(lambda shown: shown.output[0] - shown.setpoint, ends, self.shown_rates())
+        return self.shown(lambda shown: shown.output[0] - shown.setpoint)
+
+    def shown(self, read: Callable[[Shown], Scalar]) -> Cubic:
+        """The cubic of read(shown): of what the plant shows and the setpoint of its first signal."""
+        return self._cubic(read, (Shown.of(self.start), Shown.of(self.end)), self.shown_rates())
 
     def sample(self, read: Callable[[Sample], Scalar]) -> Cubic:
         """The cubic of read(sample): of anything seen. It costs the rates of all signals."""

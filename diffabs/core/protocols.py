@@ -34,6 +34,7 @@ What a part may offer beyond its contract, as a method or an attribute of its cl
                    period                               of its clock [s]; without it, it ticks on the whole grid
                    every_step = True                    it ticks in every step of the integration
                    record(memory, passage)              told of every step, when it is over: `core.blocks.Passage`
+                   limits()                             of a controller or actuator: between which the control stays
                    offers(hook)                         of a block made of blocks: whether one has tick, or margins
     plant          usual_parts(), usual_objectives()    the loop around it, and its metrics, where a scenario says none
                    audit(initial)                       an objective whose value exceeds 1 where a run cannot have been
@@ -185,7 +186,8 @@ class Stop(Protocol):
 
 class Objective(Protocol):
     """What is measured on a run, streamed: a sweep stores no trajectories. A run whose value is outside of `physical`,
-    or no number, has `diverged`."""
+    or no number, has `diverged`. An objective may have an attribute `unreached`, an infinite value: the answer of a run
+    that does not get to what is measured."""
 
     @property
     def unit(self) -> str:

@@ -62,6 +62,10 @@ def unknown(what: str, name: Any, there: Iterable[str]) -> ScenarioError:
     return ScenarioError(f"{what}; {hint} {', '.join(there) or 'nothing'}")
 
 
+# Older names of a controller's limits, which scenarios may still use where its own are `low` and `high`.
+FORMER = {"torque_min": "low", "torque_max": "high"}
+
+
 def wrong(path: str, value: Any, needed: str) -> ScenarioError:
     """Return the error for a value of the wrong kind."""
     kinds = ((bool, "a boolean"), (str, "text"), ((int, float), "a number"), (list, "a list"), (dict, "a table"))

@@ -21,7 +21,7 @@ WIDTH = 2.0  # how many times more, and less, than its value a number without a 
 NEARBY = 1.25  # beyond the range of a scenario a slider goes on to so many times its value
 SPEEDS = ("speed", "reference_speed")  # of a vehicle, in km/h
 FILTERS = ("time_constant", "cutoff")
-LIMITS = ("torque_min", "torque_max", "reference_speed", "period")  # of a controller, hardly dragged
+LIMITS = ("torque_min", "torque_max", "low", "high", "reference_speed", "period")  # of a controller, hardly dragged
 MOST_FIRST = 14
 
 

@@ -24,13 +24,16 @@ from diffabs.objectives.tracking import MaxSlip as MaxSlip
 from diffabs.objectives.tracking import Overshoot as Overshoot
 from diffabs.objectives.tracking import QuadraticCost as QuadraticCost
 from diffabs.objectives.tracking import SettlingTime as SettlingTime
+from diffabs.objectives.tracking import ShareAtLimit as ShareAtLimit
+from diffabs.objectives.tracking import at_limits as at_limits
 
+# The papers of the brakes take the band of +-0.01 in slip, whatever the target is.
 BRAKING = {
     "stop_time": StopTime(),
     "stop_distance": StopDistance(),
     "max_slip": MaxSlip(),
     "overshoot": Overshoot(),
-    "settling_time": SettlingTime(),
+    "settling_time": SettlingTime(share=0.0, band=0.01),
     "iae": IAE(),
     "final_slip_error": FinalError(),
     "locked_time": LockedTime(),

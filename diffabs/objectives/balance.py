@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, larger, later_of_larger, sign
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, pytree
-from diffabs.objectives.tracking import FinalError, SettlingTime, held, integral, nothing, unchanged
+from diffabs.objectives.tracking import FinalError, held, integral, nothing, unchanged
 
 RATES = ("theta_rate", "psi_rate", "phi_rate")
 ANGLES = ("theta", "psi", "phi")
@@ -158,26 +158,34 @@ class SoftLoss:
 
 @pytree
 class RestTime:
-    """Since when every angle has stayed within `band` of upright [s]; the end of the run if the last did not."""
+    """Since when every angle has stayed within `band` of upright [s]; infinite for a run that ends outside of it."""
 
     unit = "s"
     physical = (0.0, math.inf)
+    unreached = math.inf  # the value of a run that does not come to rest
 
     band: Scalar = param(default=0.01, unit="rad", above=0.0)
 
-    start, flow, value = SettlingTime.start, nothing, held
+    flow = nothing
+
+    def start(self, sample: Sample) -> Memory:
+        """At rest from the start."""
+        return Memory(held=0.0 * sample.t)
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
-        """The last of the angles' entries into the band, roots of the cubics of the step; its end where it ends
-        outside."""
-        entered, inside = memory.held, True
+        """The last of the angles' entries into the band, roots of the cubics of the step."""
+        entered = memory.held
         for name in ANGLES:
             angle = segment.output(lambda output, name=name: getattr(output, name))
             beyond = angle.times(sign(jax.lax.stop_gradient(angle.start))).minus(self.band)
             entry = segment.start.t + segment.h * beyond.root()
             entered = larger(entered, jnp.where(beyond.start > 0, entry, 0.0))
-            inside &= jnp.abs(angle.end) <= self.band
-        return jnp.where(inside, entered, segment.end.t)
+        return entered
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """The last entry; infinite if an angle of the last sample is outside."""
+        angles = jnp.stack([jnp.abs(getattr(ending.sample.output, name)) for name in ANGLES])
+        return jnp.where(jnp.all(angles <= self.band), memory.held, self.unreached)
 
 
 @pytree

@@ -15,7 +15,8 @@ import numpy as np
 from diffabs.core.cubic import Cubic
 from diffabs.core.numerics import later_of_larger, sign, smaller
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
-from diffabs.core.pytree import Scalar, Vector, param, pytree
+from diffabs.core.pytree import Scalar, Vector, param, parts, pytree
+from diffabs.core.rules import Rule, ordered
 
 LEAST = 0.01  # of the first signal, of which an overshoot is a fraction
 
@@ -166,32 +167,110 @@ class Overshoot:
         return jnp.where(excess > 0, excess, 0.0)
 
 
+class Settling(NamedTuple):
+    """The first value of the signal, and the last entry into the band [s]."""
+
+    first: Scalar
+    entered: Scalar
+
+
 @pytree
 class SettlingTime:
-    """Time [s] after which |y - setpoint| stays within `band`; the end of the run if it never does.
+    """Time [s] after which |y - setpoint| stays within a band; infinite for a run that ends outside of it.
 
-    The entry is the root of the cubic of a step. A visit outside that begins and ends within one step is not seen. The
-    time jumps where a lobe just touches the band.
+    The band is `share` of the step from the first value to the setpoint (2 % by default), or `band` where that is more.
+    A run that starts on its setpoint has no step: it settles only if `band` is given. The entry is the root of the
+    cubic of a step. A visit outside that begins and ends within one step is not seen. The time jumps where a lobe just
+    touches the band.
     """
 
     unit = "s"
     physical = (0.0, math.inf)
+    unreached = math.inf  # the value of a run that does not settle
 
-    band: Scalar = param(default=0.01, unit="signal", above=0.0)
+    share: Scalar = param(default=0.02, unit="1", low=0.0, below=1.0)
+    band: Scalar = param(default=0.0, unit="signal", low=0.0)
 
-    flow, value = nothing, held
+    flow = nothing
 
     def start(self, sample: Sample) -> Memory:
         """Settled from the start."""
-        return Memory(held=0.0 * sample.t)
+        return Memory(held=Settling(sample.output[0], 0.0 * sample.t))
+
+    def update(self, memory: Memory, segment: Segment) -> Settling:
+        """Note the last entry into the band."""
+        first, entered = memory.held
+        side = sign(jax.lax.stop_gradient(segment.error().start))
+        excess = segment.shown(lambda shown: side * (shown.output[0] - shown.setpoint) - self._width(shown, first))
+        entry = segment.start.t + segment.h * excess.root()
+        return Settling(first, jnp.where(excess.start > 0, entry, entered))
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """The last entry; infinite if the last sample is outside."""
+        last = ending.sample
+        outside = jnp.abs(error(last)) > self._width(last, memory.held.first)
+        return jnp.where(outside, self.unreached, memory.held.entered)
+
+    def _width(self, seen: Any, first: Scalar) -> Any:
+        """Half the width of the band; `seen` has a setpoint."""
+        return larger(self.share * jnp.abs(seen.setpoint - first), self.band)
+
+    def problems(self) -> Iterator[str]:
+        """A band without width."""
+        if np.all(np.asarray(self.share) == 0) and np.all(np.asarray(self.band) == 0):
+            yield "share and band are both 0; a settling time needs a band of some width"
+
+
+@pytree
+class ShareAtLimit:
+    """Share of the run's time [1] for which the command stands at `low` or `high`, or beyond. A step with one end there
+    counts by half. `at_limits` gives one with the limits of a loop."""
+
+    unit = "1"
+    physical = (0.0, 1.0)
+
+    low: Scalar = param(default=-math.inf, unit="control", infinite=True)
+    high: Scalar = param(default=math.inf, unit="control", infinite=True)
+
+    start, flow = held_from_zero, nothing
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
-        """Note the last entry; while outside, the present time."""
-        e = segment.error()
-        outside = e.times(sign(jax.lax.stop_gradient(e.start))).minus(self.band)
-        beyond = jnp.abs(e.end) > self.band
-        entered = segment.start.t + segment.h * outside.root()
-        return jnp.where(beyond, segment.end.t, jnp.where(outside.start > 0, entered, memory.held))
+        """Add the step, or half of it."""
+        ends = [(x.command <= self.low) | (x.command >= self.high) for x in (segment.start, segment.end)]
+        return memory.held + segment.h * sum(jnp.where(end, 0.5, 0.0) for end in ends)
+
+    def value(self, memory: Memory, ending: Ending) -> Scalar:
+        """The share; 0 for a run without length."""
+        t = ending.sample.t
+        return jnp.where(t > 0, memory.held / jnp.where(t > 0, t, 1.0), 0.0)
+
+    def rules(self) -> Iterator[Rule]:
+        """Limits that do not exclude each other."""
+        yield ordered(("low", self.low), ("high", self.high), "{control}")
+
+
+def at_limits(loop: Any) -> ShareAtLimit:
+    """Return the objective that measures for which share of a run the control of a loop is limited.
+
+    loop: whose controller and actuator say their limits with a method `limits()`; the tightest count. A relay's two
+        torques are levels, not limits.
+
+    >>> import diffabs as d
+    >>> from diffabs.objectives import at_limits
+    >>> loop = d.braking()
+    >>> run = d.measure(loop, d.FixedStep(1e-3, 4.0), {"at a limit": at_limits(loop)})
+    >>> print(f"{run.metrics['at a limit']:.2f}")
+    0.00
+    """
+    low, high = -math.inf, math.inf
+    pending = [loop.controller, loop.actuator]
+    while pending:
+        one = pending.pop()
+        pending.extend(parts(one))
+        if hasattr(one, "limits"):
+            below, above = one.limits()
+            low, high = larger(low, below), smaller(high, above)
+    return ShareAtLimit(low=low, high=high)
 
 
 @pytree

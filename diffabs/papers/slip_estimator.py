@@ -92,7 +92,9 @@ def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
     locked = rollout(loop(car, FixedSlip(), ConstantTorque(torque=90.0)), solver, BRAKING)
     runs = {"no ABS": jax.tree.map(np.asarray, locked)}
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
-        lanes = stacked([loop(car, reference, PID(kp=3893.0, ki=ki, kd=kd)) for ki, kd in GAINS.values()])
+        lanes = stacked(
+            [loop(car, reference, PID(kp=3893.0, ki=ki, kd=kd, low=0.0, high=90.0)) for ki, kd in GAINS.values()]
+        )
         done = run_batch(*lanes, solver, BRAKING, trajectories=True, accepted=True)
         runs |= {f"{method} {name}": record.lane(done, i) for i, name in enumerate(GAINS)}
     return runs
@@ -100,7 +102,7 @@ def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
 
 def run_literal() -> list[Run]:
     """The estimator as printed, under P control, at two sampling periods."""
-    printed = loop(CARS["spline B"], PeakLiteral(), PID(kp=3893.0))
+    printed = loop(CARS["spline B"], PeakLiteral(), PID(kp=3893.0, low=0.0, high=90.0))
     return [jax.tree.map(np.asarray, rollout(printed, solver, BRAKING)) for solver in LITERAL]
 
 

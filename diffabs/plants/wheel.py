@@ -48,9 +48,15 @@ def forward(speed: Scalar) -> Any:
 
 
 def usual_parts(self: Any) -> dict[str, Any]:
-    """Return what surrounds a brake where nothing is said: a PID that holds a fixed slip until standstill."""
+    """Return what surrounds a brake where nothing is said: a PID of 0 to 90 N m that holds a fixed slip until
+    standstill."""
     del self
-    return {"initial": BrakeStart(), "reference": FixedSlip(), "controller": PID(), "stop": Standstill()}
+    return {
+        "initial": BrakeStart(),
+        "reference": FixedSlip(),
+        "controller": PID(low=0.0, high=90.0),
+        "stop": Standstill(),
+    }
 
 
 def usual_objectives(self: Any) -> dict[str, Any]:

@@ -36,8 +36,18 @@ class View:
         self.rows = self.good & (found.column("sample") % period == 0)  # those in the statistics: A of (A, B, AB)
         least = ROUNDING * np.finfo(found.study["dtype"]).eps
         columns = ((name, found.column(name)[self.rows]) for name in found.metrics if self.rows.any())
-        self.varying = [name for name, x in columns if np.ptp(x) > least * max(1.0, np.abs(x).max())]
+        finite = ((name, x[np.isfinite(x)]) for name, x in columns)
+        self.varying = [name for name, x in finite if x.size and np.ptp(x) > least * max(1.0, np.abs(x).max())]
         self.leading = next((name for name in [*self.bounds, *self.varying] if name in self.varying), "")
+
+    def known(self, name: str, rows: np.ndarray) -> np.ndarray:
+        """Those of the rows in which a metric is finite: a run that never settles has no place in a figure."""
+        return rows & np.isfinite(self.found.column(name)) if name else rows
+
+    def never(self, name: str) -> str:
+        """How many runs a figure of this metric leaves out; empty for none."""
+        count = np.sum(self.rows & ~self.known(name, self.rows))
+        return f" ({count} never: left out)" if count else ""
 
     def named(self, name: str) -> str:
         """A column's name with its unit."""

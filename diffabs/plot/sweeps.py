@@ -40,7 +40,7 @@ def distributions(found: Results, units: Mapping[str, str] = {}) -> Figure | Non
     view = View(found, units)
     figure, axes = _panels(view.varying, view.title("distributions of", view.rows))
     for ax, name in zip(axes, view.varying, strict=True):
-        values = found.column(name)[view.rows]
+        values = found.column(name)[view.known(name, view.rows)]
         low, middle, high = np.quantile(values, (0.05, 0.5, 0.95))
         far = FAR * (high - low) or np.inf
         ends = max(values.min(), low - far), min(values.max(), high + far)
@@ -51,7 +51,8 @@ def distributions(found: Results, units: Mapping[str, str] = {}) -> Figure | Non
             ax.axvline(end, color="black", linestyle="--", linewidth=1.1, label=text)
         ax.set_xlim(_limits(ax, *ends, view.bounds.get(name)))
         beyond = len(values) - counts.sum()
-        label(ax, view.named(name), f"runs ({beyond} more outside)" if beyond else "runs", legend=False)
+        outside = f" ({beyond} more outside)" if beyond else ""
+        label(ax, view.named(name), f"runs{outside}{view.never(name)}", legend=False)
         ax.legend(**ABOVE)
     return figure
 
@@ -63,10 +64,10 @@ def exceedance(found: Results, units: Mapping[str, str] = {}, confidence: float 
     band = f"{100 * confidence:g} % band" + ("" if view.design == "random" else " (as if independent)")
     figure, axes = _panels(view.varying, view.title("how often a value is exceeded in", view.rows))
     for ax, name in zip(axes, view.varying, strict=True):
-        values = np.sort(found.column(name)[view.rows])
+        values = np.sort(found.column(name)[view.known(name, view.rows)])
         n, limits = len(values), _limits(ax, values[0], values[-1], view.bounds.get(name))
         x, counts = _exceeding(values, *limits)
-        ax.plot(x, counts / n, color=COLOURS[0], label="runs")
+        ax.plot(x, counts / n, color=COLOURS[0], label=f"runs{view.never(name)}")
         if view.design not in ("grid", "corners"):
             known = [Count(int(k), n).probability(confidence=confidence) for k in counts]
             ends = [one.low for one in known], [one.high for one in known]
@@ -84,7 +85,8 @@ def worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -> Fig
     metric is the first that has a bound of failure and varies, or else the first that varies. With one variable, the
     metric over it. None where nothing varies."""
     view = View(found, units)
-    good, metric = view.good, view.leading
+    metric = view.leading
+    good = view.known(metric, view.good)
     paths = view.influential(good, found.column(metric)[good], numbers_first=True) if metric else []
     if not (ones := [view.variable(path, good) for path in paths]):
         return None
@@ -141,7 +143,8 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
         return None
     rows, result = every, failed
     if view.leading and min(np.sum(failed), np.sum(~failed)) < FEW:
-        rows, result = view.good, found.column(view.leading)[view.good]
+        rows = view.known(view.leading, view.good)
+        result = found.column(view.leading)[rows]
     if not (ones := [view.variable(path, every) for path in view.influential(rows, result)]):
         return None
     places, edges = zip(*(cells(one, len(ones)) for one in ones), strict=True)

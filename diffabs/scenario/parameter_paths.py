@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.pytree import Spec, parameters
-from diffabs.core.values import ScenarioError, inside, number, shown, unknown, wrong
+from diffabs.core.values import FORMER, ScenarioError, inside, number, shown, unknown, wrong
 from diffabs.scenario.registry import DEEPEST, KMH, in_kmh
 
 Ends = tuple[Any, Any]  # low and high, tuples where the parameter is a list
@@ -145,15 +145,24 @@ def entries(
     say of a name that is not. Raises ScenarioError."""
     known = {canonical(path): (path, spec, shape, 1.0) for path, (spec, shape) in there.items()}
     known |= {f"{k}_kmh": (path, in_kmh(spec), n, KMH) for k, (path, spec, n, _) in known.items() if spec.unit == "m/s"}
+    known |= {former: item for key, item in known.items() if (former := _former(key)) not in (None, *known)}
     seen = set()
     for key, given in flat(table, section).items():
         if key not in known:
             raise unknown(f"{_where(section, key)} is {otherwise}", key, known)
         path, spec, shape, scale = known[key]
         if path in seen:
-            raise ScenarioError(f"{_where(section, canonical(path))} is given twice, in m/s and in km/h")
+            how = "in m/s and in km/h" if spec.unit in ("m/s", "km/h") else "by its former name, too"
+            raise ScenarioError(f"{_where(section, canonical(path))} is given twice, {how}")
         seen.add(path)
         yield Entry(path, _where(section, key), given, spec, shape, scale)
+
+
+def _former(path: str) -> str | None:
+    """Return the path of a controller's limit under its older name; None for every other parameter."""
+    section, _, name = path.rpartition(".")
+    older = {new: old for old, new in FORMER.items()}
+    return f"{section}.{older[name]}" if section.startswith("controller") and name in older else None
 
 
 def parameters_of(loop: Any) -> dict[str, tuple[Spec, tuple[int, ...]]]:

@@ -20,7 +20,7 @@ from diffabs.core import blocks, protocols
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import Spec
 from diffabs.core.units import Units, in_loop, units_of
-from diffabs.core.values import ScenarioError, dotted, inside, kebab, number, shown, unknown, whole, wrong
+from diffabs.core.values import FORMER, ScenarioError, dotted, inside, kebab, number, shown, unknown, whole, wrong
 from diffabs.scenario import outside
 from diffabs.scenario.defaults import braking
 
@@ -184,12 +184,15 @@ def filled(template: Any, table: dict[str, Any], family: str, path: str, units: 
     values = {}
     for key, given in table.items():
         where = joined(path, key)
+        if family == "controller" and key not in fields and FORMER.get(key) in fields:
+            key = FORMER[key]
         if key not in fields and key not in edge:
             whose = f"a field of {name_of(family, template)}" if path else "a section"
             raise unknown(f"{where} is not {whose}", key, fields if path else (*fields, *OTHERS))
         field = fields[key] if key in fields else edge[key]
         if field.name in values:
-            raise ScenarioError(f"{joined(path, field.name)} is given twice, in m/s and in km/h")
+            how = "in m/s and in km/h" if field.metadata["spec"].unit == "m/s" else "by its former name, too"
+            raise ScenarioError(f"{joined(path, field.name)} is given twice, {how}")
         if key in edge:
             values[field.name] = inside(given, in_kmh(field.metadata["spec"]), where) / KMH
         else:

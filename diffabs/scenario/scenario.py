@@ -27,8 +27,8 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.units import units_of
 from diffabs.core.validity import cautions, problems
+from diffabs.core.values import FORMER, plain, printable, printed_line, printed_lines, shown, unknown, wrong
 from diffabs.core.values import ScenarioError as ScenarioError
-from diffabs.core.values import plain, printable, printed_line, printed_lines, shown, unknown, wrong
 from diffabs.objectives import BRAKING, usual
 from diffabs.scenario import parameter_paths, section_design, section_solver, section_sweep, section_tune, toml
 from diffabs.scenario.compatibility import misfits
@@ -217,6 +217,8 @@ def _override(table: dict[str, Any], override: str) -> None:
     if isinstance(place, str):
         other = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
         node.pop(other, None)
+        if keys[0] == "controller":  # an override replaces the same limit under its other name
+            node.pop({**FORMER, **{new: old for old, new in FORMER.items()}}.get(place), None)
     try:
         node[place] = toml.value(text.strip())
     except ScenarioError as error:

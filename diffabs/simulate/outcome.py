@@ -52,4 +52,6 @@ def _impossible(name: str, objective: Objective, value: Any) -> Any:
     low, high = getattr(objective, "physical", (-math.inf, math.inf))
     if math.isinf(low) and math.isinf(high):
         return jnp.asarray(False)
-    return ~((value >= low - ROUNDING) & (value <= high + ROUNDING) & jnp.isfinite(value))
+    inside = (value >= low - ROUNDING) & (value <= high + ROUNDING) & jnp.isfinite(value)
+    unreached = getattr(objective, "unreached", None)  # an infinite value is the answer of a run that never gets there
+    return ~inside if unreached is None else ~(inside | (value == unreached))

@@ -95,6 +95,8 @@ def _run(study: Study, loop: Any, key: Any) -> tuple[Run, Any]:
 
 
 def _changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> dict[str, Any]:
+    known = np.isfinite(values) & np.isfinite(half)  # a run that never settles has an infinite settling time
+    values, half, samples = values[known], half[known], samples[known]
     if not len(values):
         return {}
     typical = np.maximum(np.abs(values), np.median(np.abs(values)))

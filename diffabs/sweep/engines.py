@@ -67,7 +67,7 @@ def done(study: Study, seal: Seal, columns: Columns) -> Done:
         int(np.sum(columns["diverged"] & accepted(columns["refused"]))),
         int(np.sum(~accepted(columns["refused"]))),
     )
-    return Done(seal.chunk, encoded(columns, seal), *counts)
+    return Done(seal.chunk, encoded(columns, seal, study.units()), *counts)
 
 
 def accepted(refused: Any) -> np.ndarray:

@@ -76,6 +76,7 @@ class Results:
         rows = []
         for name in self.metrics:
             good = self.column(name)[run & ~lost]
+            good = good[np.isfinite(good)]  # a run that never settles has an infinite settling time
             spread = (good.mean(), good.min(), good.max()) if len(good) else ("", "", "")
             rows.append((name, *spread, self.units.get(name, "")))
         whole = "" if self.complete else f" of {self.study['samples']}, not complete"

@@ -50,11 +50,14 @@ def digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, separators=(",", ":")).encode()).hexdigest()
 
 
-def encoded(columns: Mapping[str, np.ndarray], seal: Seal) -> bytes:
-    """A chunk as the bytes of its Parquet file: the same columns of the same sweep give the same bytes."""
-    table = pa.table({name: _array(column) for name, column in columns.items()})
+def encoded(columns: Mapping[str, np.ndarray], seal: Seal, units: Mapping[str, str] | None = None) -> bytes:
+    """A chunk as the bytes of its Parquet file: the same columns of the same sweep give the same bytes. A column whose
+    unit is known has it in its field's metadata, under `unit`."""
+    arrays = {name: _array(column) for name, column in columns.items()}
+    told = {name: {"unit": unit} for name, unit in (units or {}).items()}
+    schema = pa.schema([pa.field(n, array.type, metadata=told.get(n)) for n, array in arrays.items()], seal.metadata())
     buffer = io.BytesIO()
-    pq.write_table(table.replace_schema_metadata(seal.metadata()), buffer, compression="zstd")
+    pq.write_table(pa.table(list(arrays.values()), schema), buffer, compression="zstd")
     return buffer.getvalue()
 
 

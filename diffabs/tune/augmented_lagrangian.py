@@ -124,6 +124,8 @@ class Search:
 
     def _unusable(self) -> str:
         worst = int(self.before.diverged)
+        if not worst and np.isinf(self.before.objective):
+            return "the objective is infinite there: a run never settles; start from one that does, or take iae"
         return (
             f"{worst} of {self.problem.batch.size} lanes diverge there"
             if worst

@@ -51,6 +51,7 @@ def summary(found: Results, confidence: float = 0.95) -> dict[str, Any]:
         "confidence": confidence,
         "intervals": note,
         "failures": dict(_failures(found, view, confidence)),
+        "never": {name: never for name in found.metrics if (never := view.never(name))["count"]},
         "metrics": {name: _metric(view, name, confidence) for name in found.metrics},
         "sensitivity": _sensitivity(found, view, confidence),
         "worst": {name: _worst(found, view, name) for name in found.metrics},
@@ -85,7 +86,12 @@ class _View:
     def blocks(self, name: str) -> list[np.ndarray]:
         """One column for each replicate."""
         values = np.where(self.good, self.found.column(name), np.nan)
-        return [block[~np.isnan(block)] for block in np.split(values, self.replicates)]
+        return [block[np.isfinite(block)] for block in np.split(values, self.replicates)]
+
+    def never(self, name: str) -> dict[str, Any]:
+        """How many runs have an infinite value: they never got to what is measured. They are in no other number."""
+        rows = self.good & self.rows & np.isinf(self.found.column(name))
+        return {"count": int(rows.sum()), "samples": self.found.column("sample")[rows][:WORST].tolist()}
 
 
 def _failures(found: Results, view: _View, confidence: float) -> Iterator[tuple[str, Any]]:
@@ -107,6 +113,7 @@ def _failures(found: Results, view: _View, confidence: float) -> Iterator[tuple[
 
 def _metric(view: _View, name: str, confidence: float) -> dict[str, Any]:
     values = view.column(name)
+    values = values[np.isfinite(values)]
     if len(values) < FEWEST:
         return {}
     found = summarised(values, confidence, LEVELS, TAIL)
@@ -135,7 +142,11 @@ def _sensitivity(found: Results, view: _View, confidence: float) -> dict[str, An
     x = np.stack([found.column(path)[rows] for path in variables], axis=1)
     result = {}
     for name, values in metrics.items():
-        both = correlations(x, values[rows], confidence=confidence, binormal=False)
+        y = values[rows]
+        known = np.isfinite(y)
+        if known.sum() < FEWEST:
+            continue
+        both = correlations(x[known], y[known], confidence=confidence, binormal=False)
         result[name] = {
             path: {"pearson": _plain(p.table(), True), "spearman": _plain(s.table(), True)}
             for path, p, s in zip(variables, *both, strict=True)
@@ -144,9 +155,10 @@ def _sensitivity(found: Results, view: _View, confidence: float) -> dict[str, An
 
 
 def _indices(values: np.ndarray, view: _View, names: list[str], confidence: float) -> dict[str, Any]:
-    """Rows of which a lane diverged are left out whole."""
+    """Rows of which a lane diverged, or has an infinite value, are left out whole."""
     whole = len(values) // view.period * view.period
-    table, good = values[:whole].reshape(-1, view.period), view.good[:whole].reshape(-1, view.period).all(axis=1)
+    table, good = values[:whole].reshape(-1, view.period), view.good[:whole] & np.isfinite(values[:whole])
+    good = good.reshape(-1, view.period).all(axis=1)
     if good.sum() < FEWEST:
         return {}
     a, b, *ab = table[good].T
@@ -158,7 +170,8 @@ def _indices(values: np.ndarray, view: _View, names: list[str], confidence: floa
 
 
 def _worst(found: Results, view: _View, name: str) -> list[dict[str, Any]]:
-    values, samples = found.column(name)[view.good], found.column("sample")[view.good]
+    known = view.good & np.isfinite(found.column(name))
+    values, samples = found.column(name)[known], found.column("sample")[known]
     tail = Tail.of(values, samples, WORST)
     return [{"sample": int(i), "value": float(v)} for i, v in zip(tail.indices, tail.values, strict=True)]
 
