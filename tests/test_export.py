@@ -176,7 +176,7 @@ int main(void)
     printf("%.17g", unit_step(&s, &p, &in[k]));
     printf(" %d\\n", s.held);
     p.kp = 80.0;
-    p.torque_max = 4.0;
+    p.high = 4.0;
   }
   return 0;
 }
@@ -188,7 +188,7 @@ def limited():
     first = 2.7 + 60.0 * 0.1
     integral = 1e-3 * 0.1
     then = [min(2.7 + 80.0 * 0.1 + 400.0 * integral, 4.0), max(2.7 - 80.0 * 0.1 + 400.0 * 2 * integral, 0.0)]
-    pid = PID(kp=60.0, ki=400.0, torque_min=0.0, torque_max=9.03)
+    pid = PID(kp=60.0, ki=400.0, low=0.0, high=9.03)
     return rig(pid), [first, first, *then], [0, 1, 0, 0]
 
 
@@ -212,7 +212,7 @@ def test_parameters_can_be_changed_and_a_lost_sample_is_told_in_structured_text(
     block, found = Block(text), []
     for slip in (0.1, np.nan, 0.1, 0.3):
         found.append((block(slip=slip), int(block.values["HELD"])))
-        block.values |= {"KP": 80.0, "TORQUE_MAX": 4.0}
+        block.values |= {"KP": 80.0, "HIGH": 4.0}
     np.testing.assert_allclose([command for command, _ in found], wanted, rtol=1e-12)
     assert [flag for _, flag in found] == held
     assert "kp : LREAL := 60.0; (* [N m] in [0, inf) *)" in text

@@ -41,7 +41,7 @@ def test_a_voltage_that_rises_to_a_limit_does_not_leave_it():
 def test_a_peak_on_an_event_of_the_grid_moves_with_the_event(lag, end):
     """The slip rises until the brake is released, on an instant of the grid. The step to that event has no length, but
     its end moves with the delay, and so do the peak and the torque's variation. Against differences from both sides."""
-    inner = controllers.PID(kp=20.0, ki=200.0, torque_min=0.2, torque_max=6.0)
+    inner = controllers.PID(kp=20.0, ki=200.0, low=0.2, high=6.0)
     loop = d.Loop(
         plant=plants.MirroredRig(),
         initial=d.BrakeStart(speed=11.0, slip=0.03),

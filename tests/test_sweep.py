@@ -11,6 +11,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from commands import assert_one_error_line, left_in, run
 from marks import cases
@@ -268,6 +269,12 @@ def test_pandas_polars_and_xarray_in_one_call_each(made):
     assert np.array_equal(frame["plant.mass"], mass)
     assert np.array_equal(table["plant.mass"].to_numpy(), mass)
     assert dict(data.sizes) == {"sample": 150}
+    fields = pq.read_schema(min((made.folder / "chunks").glob("*.parquet")))
+    assert {name: fields.field(name).metadata for name in ("plant.mass", "iae", "sample")} == {
+        "plant.mass": {b"unit": b"kg"},
+        "iae": {b"unit": b"s"},
+        "sample": None,
+    }
     assert np.array_equal(data["plant.mass"], mass)
     assert float(data["iae"].sel(sample=149)) == made.column("iae")[149]
     if "plant.road" in made.variables:

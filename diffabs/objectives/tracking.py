@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.cubic import Cubic
-from diffabs.core.numerics import later_of_larger, sign, smaller
+from diffabs.core.numerics import larger, later_of_larger, sign, smaller
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, parts, pytree
 from diffabs.core.rules import Rule, ordered
