@@ -405,8 +405,8 @@ MUTATIONS = [
     Mutation(
         "a setpoint does not move within a step",
         "core/messages.py",
-        "ends, self.shown_rates())",
-        "ends, [rate._replace(setpoint=0.0 * rate.setpoint) for rate in self.shown_rates()])",
+        "Shown.of(self.end)), self.shown_rates())",
+        "Shown.of(self.end)), [rate._replace(setpoint=0.0 * rate.setpoint) for rate in self.shown_rates()])",
         "test_blocks.py::test_the_integral_of_an_error_whose_setpoint_moves",
     ),
     Mutation(
