@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 from real_rig_box import ESTIMATED, KMH, KNOWN, NOMINAL, Box, Fixed, batch, columns, corners, drawn
-from real_rig_floor import GRAVITY, MIRRORED, Deviation, floor
+from real_rig_floor import GRAVITY, HELD, MIRRORED, Deviation, floor
 
 from diffabs import Batch, FixedStep, Loop, run_batch
 from diffabs.objectives import IAE, LockedTime, Overshoot, SettlingTime, StopDistance
@@ -25,6 +25,9 @@ MEASURED = {
 LONGEST = 5.0  # s, of a run
 LOST = 100.0  # overshoot of a run that diverged
 ENOUGH = 1.5  # times the floor is what was asked for
+# Required of a controller: in REQUIRED of the points the deviation to both sides exceeds that of the speed's error by at
+# most NEAR, twice the deviation of the measured slip's noise (0.005 of 0.2), and no wheel locks, and every run stops.
+NEAR, REQUIRED = 0.05, 0.95
 PEAK = float(np.max(np.asarray(RIG.friction(np.linspace(0.1, 0.3, 2001)))))  # before the rise towards a locked wheel
 
 SPOTS: dict[str, dict[str, float]] = {
@@ -119,6 +122,8 @@ def on_samples(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, s
     found, least = runs(one, points, config, config.seed), floor(points, speed, fixed)
     widest = 4 * max(map(abs, (*box.first, *box.last)))  # the floor of the box, of a known speed
     overshoot, lost = found["overshoot"], found["distance"] / shortest(points, fixed) - 1
+    off = found["deviation"] - floor(points, speed, fixed, two_sided=True)
+    fine = (found["locked"] == 0) & found["stopped"]
     low = least > 0.01
     said = {
         "overshoot > 1 %": chance(overshoot > 0.01, config.confidence),
@@ -131,7 +136,11 @@ def on_samples(one: Loop, box: Box, fixed: Fixed, speed: str, config: Judging, s
         ),
         "overshoot [%]": quantiles(100 * overshoot),
         "above the floor [%]": quantiles(100 * (overshoot - least)),
+        "deviation above the floor [%]": quantiles(100 * off),
+        "deviation near the floor": chance(off <= NEAR, config.confidence),
+        "meets the requirement": bool(fine.all() and np.mean(off <= NEAR) >= REQUIRED),
         "settling [s]": quantiles(found["settling"]),
+        "settled within 0.25 s": chance(found["settling"] <= HELD, config.confidence),
         "distance lost [%]": quantiles(100 * lost),
         "samples": samples,
     }
