@@ -37,14 +37,17 @@ def cost_figure(found: Mapping[str, Mapping[str, Log]], nominals: Mapping[str, f
 
 
 def road_figure(attacks: Mapping[str, Attack], worst: Mapping[str, np.ndarray], seed: int) -> Any:
-    """The road and the noise that were found for each controller beside random ones, and the slips on both."""
+    """The road and the noise that were found for each controller beside random ones, and the slips on both: all runs of
+    a controller have the mass and the start that were found."""
     figure, axes = plot.sheet(len(attacks), 3, title="The road that was found, and a random one", size=(4.4, 2.7))
     for row, (name, attack) in enumerate(attacks.items()):
         usual = drawn(attack.bounds, 1, np.random.default_rng(seed))
-        for i, (label, z) in enumerate({"found": worst[name], "random": usual}.items()):
-            style = {"color": plot.COLOURS[1 - i], "ls": plot.DASHES[i], "label": label}
-            _drawn(axes[3 * row : 3 * row + 3], attack, z, style)
         start = parameters(attack.bounds, worst[name])
+        same = {path: start[path] for path in ("plant.mass", "initial.speed")}
+        random = parameters(attack.bounds, usual) | same
+        for i, (label, values) in enumerate({"found": start, "random": random}.items()):
+            style = {"color": plot.COLOURS[1 - i], "ls": plot.DASHES[i], "label": label}
+            _drawn(axes[3 * row : 3 * row + 3], attack, {path: np.asarray(x)[0] for path, x in values.items()}, style)
         from_speed = f"{name}: {start['plant.mass'][0]:.2f} kg, {KMH * start['initial.speed'][0]:.0f} km/h"
         plot.label(axes[3 * row], "distance [m]", "factor of the friction", from_speed)
         plot.label(axes[3 * row + 1], "time in its 64 ms [ms]", "error of the slip", legend=False)
@@ -52,8 +55,7 @@ def road_figure(attacks: Mapping[str, Attack], worst: Mapping[str, np.ndarray], 
     return figure
 
 
-def _drawn(axes: Any, attack: Attack, z: np.ndarray, style: dict[str, Any]) -> None:
-    values = {path: np.asarray(value)[0] for path, value in parameters(attack.bounds, z).items()}
+def _drawn(axes: Any, attack: Attack, values: dict[str, Any], style: dict[str, Any]) -> None:
     one: Any = replace(attack.loop, values)
     run = rollout(one, attack.solver())
     sample, running = run.trajectory.sample, np.asarray(run.trajectory.running)  # pyright: ignore[reportOptionalMemberAccess]

@@ -150,6 +150,8 @@ def figure(config: Config, results: dict[str, dict[str, Metrics]], shortest: np.
             one = those[name]
             above = np.sort(100 * (one["stop_distance"] / shortest - 1)[good(one)])
             share = 100 * np.arange(1, len(above) + 1) / len(shortest)
+            if not np.any(above <= config.farthest):  # a legend entry without a curve says why there is none
+                name = f"{name}: none within {config.farthest:g} %"
             ax.plot(above, share, plot.DASHES[j], color=plot.COLOURS[j], label=name)
         ax.set_xlim(0.0, config.farthest)
         ax.set_ylim(0.0, 100.0)

@@ -5,9 +5,11 @@ tests/test_real_rig.py does that, in NumPy, from the file alone."""
 from typing import Any
 
 import numpy as np
+from real_rig_box import ESTIMATED, KNOWN, Fixed
+from real_rig_loops import loop
 
-from diffabs import Loop
-from diffabs.core.pytree import parameters
+from diffabs import Loop, controllers, references
+from diffabs.core.pytree import parameters, replace
 
 PLANT = {
     "state": "omega1, omega2 [rad/s] of the braked wheel and the body wheel, torque [N m]; (1 - slip0) v0/r1, v0/r2, 0 "
@@ -88,3 +90,15 @@ def document(one: Loop) -> dict[str, Any]:
             for path, spec, value in parameters(one)
         },
     }
+
+
+def loop_of(document: dict[str, Any]) -> Loop:
+    """Return the loop of a document, as it is judged: with its noises and the quantisation of the wheel's speed."""
+    kinds, values = document["kinds"], {path: one["value"] for path, one in document["parameters"].items()}
+    windup = {}
+    if any(path.startswith("controller.controller.antiwindup") for path in values):
+        windup = {"antiwindup": controllers.BackCalculation()}
+    controller = getattr(controllers, kinds["controller"])(**windup)
+    speed = ESTIMATED if kinds["speed"] == "SpeedEstimator" else KNOWN
+    one = loop(Fixed(), controller, speed, getattr(references, kinds["reference"])())
+    return replace(one, {path: np.array(value) for path, value in values.items()})

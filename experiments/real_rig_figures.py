@@ -50,7 +50,8 @@ SEEDS = 2
 
 
 def degradation(one: Loop, speed: str, config: Judging, count: int) -> Maps:
-    """Overshoot [%] over pairs of parameters around the nominal point, the worst of a few noises (count, count)."""
+    """Overshoot [%] over pairs of parameters around the nominal point, the worst of SEEDS noises, drawn for each point
+    (count, count)."""
     found = {}
     for pair in PAIRS[speed]:
         x, y = np.linspace(*pair.x_range, count), np.linspace(*pair.y_range, count)
@@ -80,7 +81,12 @@ def map_figure(maps: Maps, speed: str, box: Box) -> Any:
     from matplotlib.colors import BoundaryNorm
     from matplotlib.patches import Rectangle
 
-    figure, axes = plot.sheet(1, len(maps), title=f"Overshoot [%] beyond the box, speed {speed}", size=(4.8, 3.8))
+    figure, axes = plot.sheet(
+        1,
+        len(maps),
+        title=f"Overshoot [%] beyond the box, speed {speed}: the worse of {SEEDS} noises at each point",
+        size=(4.8, 3.8),
+    )
     for ax, pair in zip(axes, PAIRS[speed], strict=True):
         one = maps[f"{pair.x}, {pair.y}"]
         values = np.clip(np.array(one["overshoot [%]"]), 0.0, 100.0)

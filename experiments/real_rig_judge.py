@@ -25,8 +25,8 @@ MEASURED = {
 LONGEST = 5.0  # s, of a run
 LOST = 100.0  # overshoot of a run that diverged
 ENOUGH = 1.5  # times the floor is what was asked for
-# Required of a controller: in REQUIRED of the points the deviation to both sides exceeds that of the speed's error by at
-# most NEAR, twice the deviation of the measured slip's noise (0.005 of 0.2), and no wheel locks, and every run stops.
+# Required of a controller: no wheel locks, every run stops, and in REQUIRED of the points the deviation to both sides
+# exceeds that of the speed's error by at most NEAR, which is twice the noise of the measured slip (0.005 of 0.2).
 NEAR, REQUIRED = 0.05, 0.95
 PEAK = float(np.max(np.asarray(RIG.friction(np.linspace(0.1, 0.3, 2001)))))  # before the rise towards a locked wheel
 

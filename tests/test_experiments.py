@@ -7,9 +7,11 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from diffabs import FixedStep
 from diffabs.core.pytree import replace
+from diffabs.plants import QuarterCar
 from diffabs.scenario.scenario import load
 
 pytest.importorskip("matplotlib")
@@ -276,3 +278,53 @@ def test_a_design_is_judged_as_its_own_loop_would_be():
     designs = {"gain": np.stack([gain, 0.0 * gain]), "mass": np.array([30.0, 30.0])}
     judge = module.runs(closed, 50.0, start, solver)
     assert judge(designs, np.array([0.03, 0.2])).tolist() == [[True, False], [False, False]]
+
+
+def latched_stop(own, height, place, edge, width):
+    """Distance [m] of the paper's car under its PI, whose target is 0.2 up to the slip of the first peak and then that
+    slip, by SciPy."""
+    mass, inertia, radius, torque, kp, ki = 15.0, 1.0539, QuarterCar().radius, 90.0, 3893.0, 5000.0
+    at = np.linspace(0.01, 0.3, 29_001)
+
+    def curve(s, b=own.B):
+        return own.D * np.sin(own.C * np.arctan(b * s - own.E * (b * s - np.arctan(b * s))))
+
+    peak = at[np.argmax(curve(at))]
+
+    def friction(s, x):
+        y = np.clip((x - edge) / width + 0.5, 0.0, 1.0)
+        share = y * y * (3 - 2 * y)
+        return (1 - share) * curve(s) + share * height * curve(s, own.B / place)
+
+    def rates(t, state, target):
+        v, w, x, total = state
+        s = 1 - w / v
+        mu, error = friction(s, x), target - s
+        u = np.clip(kp * error + ki * total, 0.0, torque)
+        return [-9.81 * mu, radius * (radius * mass * 9.81 * mu - u) / inertia, v, error]
+
+    def at_peak(t, state, target):
+        return 1 - state[1] / state[0] - peak
+
+    def slow(t, state, target):
+        return state[0] - 2.0
+
+    at_peak.terminal = slow.terminal = True
+    how = {"method": "LSODA", "rtol": 1e-8, "atol": 1e-10, "max_step": 0.02}
+    first = solve_ivp(rates, (0, 40), [100 / 3.6, 100 / 3.6, 0.0, 0.0], args=(0.2,), events=at_peak, **how)
+    last = solve_ivp(rates, (first.t[-1], 80), first.y[:, -1], args=(peak,), events=slow, **how).y[:, -1]
+    return last[2] + last[0] ** 2 / (2 * 9.81 * friction(1 - last[1] / last[0], last[2]))
+
+
+def test_the_latch_holds_the_first_slip_on_the_second_surface(monkeypatch):
+    """So it is too long where the second peak lies at another slip, and hardly where both are at one slip."""
+    monkeypatch.syspath_prepend(FOLDER)
+    module = experiment("changing_road")
+    config = module.Config(heights=(0.5,), places=(1.0, 2.0), edges=(0.5,))
+    values = module.roads(config)
+    found = module.excess(config, module.RULES["proposed, latch"], values)
+    lanes = {path: x for path, x in values.items() if "." in path}
+    edge = float(values["plant.road.edges"][0, 0])
+    theirs = [latched_stop(module.OWN, 0.5, place, edge, config.width) for place in config.places]
+    np.testing.assert_allclose(found, theirs / module.bound(lanes, 90.0, config.width).distance - 1, rtol=0, atol=1e-3)
+    assert found[0] < 0.02 < 0.08 < found[1]

@@ -263,10 +263,8 @@ def _reach(v: np.ndarray, x: np.ndarray) -> tuple[float, int]:
         return np.inf, len(x)
     if d == 1:
         return float(max(x.max() / v.max(), x.min() / v.min())), len(x)
-    if _few(v):
-        from scipy.spatial import ConvexHull
-
-        facets = ConvexHull(v).equations
+    if (hull := _facets(v)) is not None:
+        facets = hull.equations
         slopes = facets[:, :-1] / -facets[:, -1:]
         return max(float((part @ slopes.T).max()) for part in np.split(x, range(CHUNK, len(x), CHUNK))), len(x)
     from scipy.optimize import linprog
@@ -282,12 +280,18 @@ def _extreme(v: np.ndarray) -> list[int]:
         return [0]
     if v.shape[1] == 1:
         return sorted({int(v.argmin()), int(v.argmax())})
-    if _few(v):
-        from scipy.spatial import ConvexHull
-
-        return sorted(ConvexHull(v).vertices.tolist())
+    if (hull := _facets(v)) is not None:
+        return sorted(hull.vertices.tolist())
     return sorted(np.unique(v.round(12), axis=0, return_index=True)[1].tolist())
 
 
-def _few(v: np.ndarray) -> bool:
-    return v.shape[1] <= FACETS[0] and len(v) <= FACETS[1]
+def _facets(v: np.ndarray) -> Any:
+    """The hull of v (V, d) with its facets; None where they are too many, or merge by rounding (64 points in 6-d)."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    if v.shape[1] > FACETS[0] or len(v) > FACETS[1]:
+        return None
+    try:
+        return ConvexHull(v)
+    except QhullError:
+        return None
