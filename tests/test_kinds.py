@@ -174,3 +174,8 @@ def test_arrays_of_double_precision_where_single_is_the_default():
         assert not told
         found = iae(d.replace(RIG, {"plant.mass": double}))
     assert found.dtype == jnp.float64 or any("truncated to dtype float32" in str(line.message) for line in told)
+
+
+def test_a_number_is_no_objective():
+    with pytest.raises(ValueError, match=r"objectives\.x = 1\.0 is no objective: it needs start, flow, update, value$"):
+        d.rollout(d.braking(), d.FixedStep(1e-3, 1.0), {"x": 1.0})

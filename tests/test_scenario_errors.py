@@ -87,6 +87,10 @@ BAD = [
     ("sensor={type='series',blocks=['lag']}", "sensor.blocks.0.type", '"lag" is unknown'),
     ("controller={type='state-feedback',gain=[1]}", "controller.gain has shape (1,); it needs (2,)"),
     ("controller={type='pid',low=100,high=90}", "controller.low = 100 N m exceeds high = 90 N m"),
+    (
+        "controller={type='sampled',controller='pid',kp=3}",
+        "controller.kp is not a field of sampled; did you mean controller.controller.kp?",
+    ),
     ("objective.settling_time.band=0", "objective.settling_time.share and band are both 0"),
     ("objective.settling_tim.band=1", "objective.settling_tim.type is missing", "did you mean settling-time?"),
     ("objective.cost={type='quadratic-cost',q=[1]}", "objective.cost.q has shape (1,); it needs (2,)"),

@@ -188,6 +188,8 @@ def filled(template: Any, table: dict[str, Any], family: str, path: str, units: 
             key = FORMER[key]
         if key not in fields and key not in edge:
             whose = f"a field of {name_of(family, template)}" if path else "a section"
+            if path and (inner := _inside(template, key)):
+                raise ScenarioError(f"{where} is not {whose}; did you mean {path}.{inner}?")
             raise unknown(f"{where} is not {whose}", key, fields if path else (*fields, *OTHERS))
         field = fields[key] if key in fields else edge[key]
         if field.name in values:
@@ -198,6 +200,20 @@ def filled(template: Any, table: dict[str, Any], family: str, path: str, units: 
         else:
             values[field.name] = _value(given, field, getattr(template, key), (family, where), units)
     return dataclasses.replace(template, **values) if values else template
+
+
+def _inside(part: Any, key: str) -> str:
+    """Return the path of a field of this name in a part inside this one; empty without one."""
+    pending = [("", part)]
+    while pending:
+        path, one = pending.pop(0)
+        for field in dataclasses.fields(one):
+            if path and field.name == key:
+                return f"{path}.{key}"
+            value = getattr(one, field.name)
+            if "part" in field.metadata and dataclasses.is_dataclass(value):
+                pending.append((f"{path}.{field.name}".removeprefix("."), value))
+    return ""
 
 
 def loop_of(sections: dict[str, Any]) -> Loop:

@@ -25,6 +25,7 @@ from diffabs.simulate.outcome import judge, prepare
 from diffabs.simulate.replay import note, repeat, repeat_and_watch, room
 from diffabs.simulate.solution import Adaptive, Run, Solver, Trajectory
 
+MEASURES = ("start", "flow", "update", "value")  # methods of an objective
 MOST_STEPS = 2**31 - 8  # that a counter in 32 bits holds, landing included
 
 
@@ -108,7 +109,11 @@ def without_derivatives(loop: Loop, values: Mapping[str, Any]) -> dict[str, Any]
 def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
     """Raise ValueError for what is no run, whatever its numbers are."""
     lines = [*_wrong_solver(solver), *misshapen(loop)]
-    lines += [line for name, part in objectives.items() for line in misshapen(part, f"objectives.{name}.")]
+    for name, part in objectives.items():
+        if all(callable(getattr(part, method, None)) for method in MEASURES):
+            lines += misshapen(part, f"objectives.{name}.")
+        else:
+            lines.append(f"objectives.{name} = {kinds.shown(part)} is no objective: it needs {', '.join(MEASURES)}")
     if lines:
         raise ValueError("; ".join(lines))
 
