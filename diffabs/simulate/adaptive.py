@@ -45,6 +45,9 @@ from diffabs.simulate.tsit5 import off_in_the_middle, tsit5_pair
 
 MOST, EACH = 100_000, 16  # tries of a run, and for each instant of its grid: more of them lead nowhere
 CALM = 0.1  # of the length that the error allows: a step so long that ends on no comparison is none in such a row
+# For derivatives: the first step after an event or a comparison that changes, as a part of the longest stable one, and
+# how much longer each of the next may be. An event excites the fastest modes of the derivative far more than the run's.
+EASED, EASIER = 1 / 16, 1.6
 TURNS = 16  # steps in a row that end on comparisons; then steps are blunt
 OVER = 1.5  # times the way to where a comparison is predicted to change: a step that keeps to its regime
 COUNTED = ("tries", "condition")  # what is still looked at when a run is over
@@ -68,7 +71,9 @@ def init_carry(loop: Loop, objectives: Objectives, pace: Pace, key: Any) -> Carr
     lengths = (natural, length, ends, limit, scale, length)
     point = point._replace(state=lend(state, logs))
     return typed(
-        Carry(point, zero, none, *lengths, search, zero, zero, past, zero, jnp.asarray(False), zero, condition),
+        Carry(
+            point, zero, none, *lengths, search, zero, zero, past, zero, 1.0 + none, jnp.asarray(False), zero, condition
+        ),
         pace.h.dtype,
     )
 
@@ -109,7 +114,12 @@ def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict
     trying, new = ~verdict.taken, carry.condition == Condition.RUNNING
     natural = _natural(carry, here, verdict, pace)
     left = (pace.strike(loop, carry.k) - carry.k) * pace.h - carry.since
-    length, ends = planned(jnp.minimum(natural, carry.limit), point.ahead, left, pace)
+    eased = carry.eased
+    if pace.notes:
+        quiet = carry.condition == Condition.RUNNING
+        eased = jnp.where(verdict.taken, jnp.where(quiet, jnp.minimum(EASIER * eased, 1.0), EASED), eased)
+    longest = jnp.minimum(natural, eased * carry.limit)
+    length, ends = planned(longest, point.ahead, left, pace)
     late = trying & (here.late > 0) & verdict.fine
     length = jnp.where(late, jnp.maximum(carry.length - here.late, pace.least), length)
     condition = jnp.where(verdict.taken, after_step(loop, carry, here.point.margins, verdict), carry.condition)
@@ -129,7 +139,7 @@ def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict
         begins = (tired | (verdict.taken & (turns > TURNS))) & ~blunt
         blunt = (blunt | begins) & ~(calm & same)
         looking &= ~(begins & tired)
-        length = jnp.where(begins & tired, jnp.minimum(natural, carry.limit), length)
+        length = jnp.where(begins & tired, longest, length)
         condition = jnp.where(begins & tired, Condition.RUNNING, condition).astype(condition.dtype)
     lost = (~verdict.fine & (carry.length <= pace.least)) | (carry.tries > MOST + EACH * pace.steps)
     last = Span(*(carry.point.t, carry.point.state, carry.point.rate[0]), *_end(here.point))
@@ -144,6 +154,7 @@ def _after(loop: Loop, pace: Pace, carry: Carry, here: Arrival, verdict: Verdict
         tries=carry.tries + 1,
         past=select(verdict.taken, last, carry.past) if pace.keeps else (),
         turns=turns,
+        eased=eased,
         blunt=blunt,
         fired=packed(verdict.fired),
         condition=jnp.where(lost, Condition.DIVERGED, condition).astype(carry.condition.dtype),

@@ -22,7 +22,7 @@ from diffabs.simulate.solution import Adaptive, Solver, Trajectory
 from diffabs.simulate.tries import Carry
 
 ROUNDING = 32  # times the precision of a number: the least error that is asked of a step
-PART = 0.01  # of the error that a step may have, where a derivative is asked for
+PART = 0.03  # of the error that a step may have, where a derivative is asked for
 ROUND = 16  # tries between two looks at what is stable
 
 

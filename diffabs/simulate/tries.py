@@ -57,6 +57,7 @@ class Carry(NamedTuple):
     renewed: Any  # how many of these there were when the longest stable step was last looked at
     past: Any  # the last step, as a `Span`; () where nobody asks
     turns: Any  # steps in a row that ended where a comparison changes
+    eased: Any  # the part of the longest stable step that a step may have, after an event
     blunt: Any  # whether the comparisons in a step say at each stage what the numbers say, where steps keep to a regime
     fired: Any  # a bit for each event at the end of the last try
     condition: Any
