@@ -11,6 +11,7 @@ from oracles import brake
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, references, sensors, stops
+from diffabs.cli.checking import loose
 from diffabs.core import blocks
 from diffabs.objectives import IAE, MaxSlip, StopDistance, StopTime
 from diffabs.scenario.defaults import braking
@@ -160,3 +161,17 @@ def test_a_run_that_diverges_at_a_shorter_step_is_not_alike():
 
 def test_share_of_nothing():
     np.testing.assert_array_equal(acc.share(np.array([0.0, 1.0, -1.0]), np.array([0.0, 0.0, 4.0])), [0, np.inf, 0.25])
+
+
+def test_a_run_says_what_its_solver_does_not_hold():
+    """A metric that a smaller `rtol` moves by more than 100 rtol is told; one that is about 0 is not."""
+    solver, asked = d.Adaptive(1e-5), []
+
+    def again(other):
+        asked.append(other)
+        return d.Run({"a": 2.0, "b": 2.0, "c": 1e-9}, True, False, False, None, None)  # pyright: ignore[reportArgumentType]
+
+    (line,) = loose({"a": 2.0 + 2.1e-3, "b": 2.0 + 1.9e-3, "c": 2e-9}, solver, again)
+    assert line.startswith("solver.rtol = 6.3e-07 changes a by 0.1 %: the run chatters")
+    assert asked == [dataclasses.replace(solver, rtol=1e-5 / 16)]
+    assert not loose({"a": 2.0, "b": 2.0, "c": 1e-9}, solver, again)

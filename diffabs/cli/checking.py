@@ -1,7 +1,9 @@
 """How accurate the metrics of a scenario's run are, as values of JSON: against steps of a half and a quarter, and in
 single precision."""
 
+import dataclasses
 import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -12,10 +14,12 @@ from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.accuracy import accuracy, needs_key, reasons
 from diffabs.simulate.refusals import MOST_STEPS
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import described, finer
+from diffabs.simulate.solution import Adaptive, Run, Solver, described, finer
 
 SMALL = 1e-6  # of a value: below, nobody asks for its order
 FINEST = 4  # the shortest step is this part of the scenario's
+CLOSER = 16  # times smaller: the error of a step with which a run with adaptive steps is compared
+LOOSE, LEAST = 100, 0.01  # times `rtol`, of a metric or of this, where that is more: a greater change is told
 
 
 def checked(chosen: Scenario, key: Any) -> dict[str, Any]:
@@ -53,6 +57,20 @@ def checked(chosen: Scenario, key: Any) -> dict[str, Any]:
         "ended alike": bool(found.alike),
         "metrics": metrics,
     }
+
+
+def loose(metrics: Mapping[str, Any], solver: Adaptive, again: Callable[[Solver], Run]) -> list[str]:
+    """Return what to tell of a run with adaptive steps: the metrics that a smaller error of a step changes by much more
+    than that error. Such a run chatters, or amplifies its errors. `again` makes it with another solver."""
+    closer = dataclasses.replace(solver, rtol=solver.rtol / CLOSER)
+    shares = {
+        name: abs(metrics[name] - value) / max(abs(value), LEAST) for name, value in again(closer).metrics.items()
+    }
+    found = [f"{name} by {100 * share:.2g} %" for name, share in shares.items() if share > LOOSE * solver.rtol]
+    if not found:
+        return []
+    why = "the run chatters or amplifies its errors; choose a smaller solver.rtol, or see --check"
+    return [f"solver.rtol = {closer.rtol:.2g} changes {', '.join(found)}: {why}"]
 
 
 def said(found: dict[str, Any]) -> list[str]:

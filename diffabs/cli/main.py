@@ -39,7 +39,7 @@ from diffabs.cli import (
     tune,
     usage,
 )
-from diffabs.cli.checking import checked, said
+from diffabs.cli.checking import checked, loose, said
 from diffabs.core import interrupt, provenance
 from diffabs.core.pytree import parameters
 from diffabs.objectives import at_limits
@@ -47,7 +47,7 @@ from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.matlab import write_mat
 from diffabs.simulate.run import measure, rollout
-from diffabs.simulate.solution import Run, described
+from diffabs.simulate.solution import Adaptive, Run, described
 
 if COLLECTS:
     gc.enable()
@@ -141,13 +141,14 @@ def simulate(
             if picture:
                 console.waited(lambda: _draw(chosen, run, picture), "drawing")
             found = console.waited(lambda: checked(chosen, key), "shortening the step") if check else None
+            lines = said(found) if found else _loose(chosen, run, key, kept)
         result = _result(chosen, run, limited, {"csv": csv, "mat": mat, "plot": plot}) | (
             {"accuracy": found} if found else {}
         )
         show.as_json(result) if as_json else show.run(result, chosen)
         if found and not as_json:
             show.accuracy(found)
-        for line in said(found) if found else ():
+        for line in lines:
             console.say(f"warning: {line}")
         _judge(chosen, result)
 
@@ -224,6 +225,14 @@ def _made(chosen: Scenario, measured: dict[str, Any], key: Any, *, keep: bool) -
     every = min(max(chosen.solver.every, math.ceil(steps / MOST_ROWS)), steps)
     solver = dataclasses.replace(chosen.solver, every=every)
     return rollout(chosen.loop, solver, measured, key=key)
+
+
+def _loose(chosen: Scenario, run: Run, key: Any, keep: bool) -> list[str]:
+    """What a run does not know as well as its solver suggests; `_run` makes it once more, by the same program."""
+    solver = chosen.solver
+    if not isinstance(solver, Adaptive) or run.diverged:
+        return []
+    return loose(run.metrics, solver, lambda other: _run(dataclasses.replace(chosen, solver=other), key, keep)[0])
 
 
 def _draw(chosen: Scenario, run: Run, picture: pathlib.Path) -> None:
