@@ -429,3 +429,10 @@ def test_what_a_document_lacks_is_named(tmp_path):
     (tmp_path / "x.json").write_text('{"gain": [1.0], "states": ["a"], "over": {}, "poles": []}')
     with pytest.raises(ReportError, match=r"no whole document of design: KeyError 'lower_bound'"):
         report(documents(tmp_path))
+
+
+def test_a_number_that_no_float_can_be_is_one_line(tmp_path):
+    path = tmp_path / "summary.json"
+    path.write_text(f'{{"samples": {10**400}}}')
+    with pytest.raises(ReportError, match=r"summary\.json: a whole number of 401 digits is too large$"):
+        documents(path)

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import pathlib
+import sys
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -70,7 +71,9 @@ def _place(path: pathlib.Path) -> tuple[int, str]:
 def _of(path: pathlib.Path, named: bool = False) -> Iterator[Document]:
     """The documents of a file; where a person has named it there must be one."""
     try:
-        content = json.loads(files.content(path, LARGEST))
+        content = json.loads(files.content(path, LARGEST), parse_int=_whole)
+    except OverflowError as error:
+        raise ReportError(f"{path}: {error}") from None
     except (ValueError, RecursionError):
         if named:
             raise ReportError(f"{path}: is no JSON document that {READ}") from None
@@ -79,6 +82,14 @@ def _of(path: pathlib.Path, named: bool = False) -> Iterator[Document]:
     if named and not found:
         raise ReportError(f"{path}: is no document that {READ}")
     yield from found
+
+
+def _whole(text: str) -> int:
+    """Return a whole number of JSON. Raises OverflowError for one that no float can be."""
+    value = int(text)
+    if abs(value) > sys.float_info.max:
+        raise OverflowError(f"a whole number of {len(text.lstrip('-'))} digits is too large")
+    return value
 
 
 def _inside(content: Any, path: pathlib.Path) -> Iterator[Document]:
