@@ -121,6 +121,14 @@ def test_a_mark_becomes_the_names():
         exported.exported("diffabs.cli")
 
 
+def test_a_formula_becomes_mathml_without_any_script():
+    pytest.importorskip("latex2mathml", reason="latex2mathml is in the group `docs`")
+    text = loaded("formulas").on_page_markdown("Let\n\n$$\n\\dot v = -g\n$$\n\nbe; a price of $5.")
+    assert text.startswith("Let\n\n<math")
+    assert text.endswith("</math>\n\nbe; a price of $5.")
+    assert "<mover><mi>v</mi>" in text
+
+
 def test_every_page_is_in_the_navigation():
     said = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     listed = set(re.findall(r"^ +- ([\w/-]+\.md)$", said, re.MULTILINE))

@@ -1,0 +1,42 @@
+"""Draw the figures of the pages that teach, by the commands and the code that the pages show.
+
+python docs/draw_pages.py        writes docs/figures/<page>.png"""
+
+import contextlib
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import tempfile
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+FIGURES = ROOT / "docs" / "figures"
+NOISE = "--set solver.step=1e-3 --set sensor=noise --set sensor.slip=0.005"
+SWEEP = f"sweep slip-lmi --samples 1000 {NOISE} --figures --out noisy"
+# page: (folder in which it begins, command, the file that it draws)
+COMMANDS = {
+    "margins": (".", "margins slip-cured --plot loop.png", "loop.png"),
+    "plant-in-15-minutes": ("examples/dc-servo", "simulate servo.toml --parts dc_servo --plot run.png", "run.png"),
+    "sweeps": (".", SWEEP, "noisy/figures/distributions.png"),
+}
+
+
+def main() -> None:
+    """Draw all of them, each in a folder that goes away."""
+    sys.path.insert(0, str(ROOT / "tests"))
+    os.environ["MPLBACKEND"] = "Agg"
+    import pages
+
+    for page, (source, command, picture) in COMMANDS.items():
+        with tempfile.TemporaryDirectory() as folder:
+            shutil.copytree(ROOT / source, folder, dirs_exist_ok=True) if source != "." else None
+            subprocess.run([sys.executable, "-m", "diffabs", *command.split(), "--quiet"], cwd=folder, check=True)
+            shutil.copy(pathlib.Path(folder) / picture, FIGURES / f"{page}.png")
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        pages.printed((ROOT / "docs" / "quick-start.md").read_text(encoding="utf-8"), "quick-start.md")
+        shutil.copy("run.png", FIGURES / "quick-start.png")
+
+
+if __name__ == "__main__":
+    main()
