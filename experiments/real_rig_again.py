@@ -40,6 +40,12 @@ def loops(config: Config, speed: str) -> dict[str, Loop]:
     return {name: loop_of(json.loads(path.read_text())) for name, path in those.items()}
 
 
+def near_corner(config: Config, speed: str, corner: dict[str, float]) -> dict[str, Any]:
+    """Return points of the box, each coordinate within a fifth of its range from a corner's."""
+    points = drawn(config.box, speed, config.judging.fewer, config.judging.seed + 4)
+    return {name: corner[name] + 0.2 * (x - corner[name]) for name, x in points.items()}
+
+
 def judged(config: Config, speed: str, name: str, one: Loop) -> dict[str, Any]:
     """Return what corners and points of the box say of a loop, and of a tuned estimator that never begins anew."""
     tuned = name.startswith("tuned")
@@ -51,6 +57,8 @@ def judged(config: Config, speed: str, name: str, one: Loop) -> dict[str, Any]:
     if name == "tuned-cvar" and speed == ESTIMATED:
         points = drawn(config.box, speed, samples, config.judging.seed)
         never = runs(replace(one, {"sensor.blocks.4.rest": RAREST}), points, config.judging, config.judging.seed)
+        near = runs(one, near_corner(config, speed, found["corners"]["at"]), config.judging, config.judging.seed + 4)
+        found["near the worst corner, overshoot [%]"] = 100 * float(near["overshoot"].max())
         found["without rest, does not stop"] = chance(~never["stopped"], config.judging.confidence)
     return found
 
@@ -65,6 +73,7 @@ def row(one: dict[str, Any]) -> dict[str, Any]:
         "above it, median, 95 %": f"{off['median']:.1f}, {off['95 %']:.1f}",
         "overshoot: worst corner, worst point": f"{one['corners']['overshoot [%]']:.1f}, "
         f"{box['overshoot [%]']['greatest']:.1f}",
+        "near the worst corner": one.get("near the worst corner, overshoot [%]", ""),
         "locks, not stopped": f"{box['locks']['count']}, {box['does not stop']['count']}",
         "not stopped without rest": one.get("without rest, does not stop", {}).get("count", ""),
         "settled within 0.25 s": f"{box['settled within 0.25 s']['percent']:.1f}",
