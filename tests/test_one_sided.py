@@ -17,7 +17,7 @@ MEASURED = {
     "iae": objectives.IAE(),
     "variation": objectives.Variation(),
 }
-PID = controllers.PID(kp=20.0, ki=200.0, torque_min=0.2, torque_max=6.0)
+PID = controllers.PID(kp=20.0, ki=200.0, low=0.2, high=6.0)
 
 
 def braking(**parts):
@@ -140,12 +140,10 @@ def both_sides(function, x):
     return [float((function(x + h) - function(x)) / h) for h in (-1e-6, 1e-6)]
 
 
-@pytest.mark.parametrize(("name", "side"), [("gain", 0), ("limit", 1)])
+@pytest.mark.parametrize(("name", "side"), [("gain", 0), ("high", 1)])
 def test_a_gain_at_the_limit_has_one_side(name, side):
-    limit = "torque_max" if hasattr(controllers.SlidingMode(), "torque_max") else "high"
-
     def control(x):
-        mode = d.replace(controllers.SlidingMode(gain=90.0, **{limit: 90.0}), {limit if name == "limit" else name: x})
+        mode = d.replace(controllers.SlidingMode(gain=90.0, high=90.0), {name: x})
         signal = types.SimpleNamespace(target=0.2, measured=(0.0,), feedforward=0.0)
         return mode.output(0.0, None, signal)
 
@@ -184,4 +182,9 @@ def test_points_with_one_side_are_named():
     with pytest.warns(UserWarning, match="start: the derivative by controller.torque_max is that of one side"):
         warn(loop, ["controller.torque_max"], "start")
     assert {path for path, _ in one_sided(DELAYS[0].values[0])} == {"controller.delay"}
-    assert not list(one_sided(braking(controller=PID)))
+    for usual in (PID, controllers.SlidingMode(), controllers.PID()):
+        assert not list(one_sided(braking(controller=usual, actuator=actuators.Limits())))
+    assert {path for path, _ in one_sided(braking(controller=controllers.SlidingMode(gain=9.0, high=9.0)))} == {
+        "controller.gain",
+        "controller.high",
+    }

@@ -20,7 +20,7 @@ def one_sided(loop: Loop) -> Iterator[tuple[str, str]]:
             if _same(sampled.delay, value):
                 yield "controller.delay", f"it is {name}"
     for name, sign, limit in (("torque_max", 1, "high"), ("torque_min", -1, "low")):
-        name = name if hasattr(inner, name) else limit
+        name = name if hasattr(inner, name) else limit  # a relay names its two torques otherwise
         if hasattr(inner, "boundary") and _same(sign * inner.gain, getattr(inner, name)):
             yield from ((f"{prefix}{one}", f"gain and {name} are equal in size") for one in ("gain", name))
         for path, actuator in _actuators(loop.actuator):
