@@ -164,14 +164,14 @@ def test_share_of_nothing():
 
 
 def test_a_run_says_what_its_solver_does_not_hold():
-    """A metric that a smaller `rtol` moves by more than 100 rtol is told; one that is about 0 is not."""
-    solver, asked = d.Adaptive(1e-5), []
+    """A metric that a smaller `rtol` moves by more than 100 rtol is told; one that is about 0, or infinite, is not."""
+    solver, asked, never = d.Adaptive(1e-5), [], float("inf")
 
     def again(other):
         asked.append(other)
-        return d.Run({"a": 2.0, "b": 2.0, "c": 1e-9}, True, False, False, None, None)  # pyright: ignore[reportArgumentType]
+        return d.Run({"a": 2.0, "b": 2.0, "c": 1e-9, "t": never}, True, False, False, None, None)  # pyright: ignore[reportArgumentType]
 
-    (line,) = loose({"a": 2.0 + 2.1e-3, "b": 2.0 + 1.9e-3, "c": 2e-9}, solver, again)
+    (line,) = loose({"a": 2.0 + 2.1e-3, "b": 2.0 + 1.9e-3, "c": 2e-9, "t": never}, solver, again)
     assert line.startswith("solver.rtol = 6.3e-07 changes a by 0.1 %: the run chatters")
     assert asked == [dataclasses.replace(solver, rtol=1e-5 / 16)]
-    assert not loose({"a": 2.0, "b": 2.0, "c": 1e-9}, solver, again)
+    assert not loose({"a": 2.0, "b": 2.0, "c": 1e-9, "t": never}, solver, again)

@@ -63,9 +63,9 @@ def loose(metrics: Mapping[str, Any], solver: Adaptive, again: Callable[[Solver]
     """Return what to tell of a run with adaptive steps: the metrics that a smaller error of a step changes by much more
     than that error. Such a run chatters, or amplifies its errors. `again` makes it with another solver."""
     closer = dataclasses.replace(solver, rtol=solver.rtol / CLOSER)
-    shares = {
-        name: abs(metrics[name] - value) / max(abs(value), LEAST) for name, value in again(closer).metrics.items()
-    }
+    others = again(closer).metrics.items()
+    changed = [(name, value) for name, value in others if metrics[name] != value]  # both may be infinite
+    shares = {name: abs(metrics[name] - value) / max(abs(value), LEAST) for name, value in changed}
     found = [f"{name} by {100 * share:.2g} %" for name, share in shares.items() if share > LOOSE * solver.rtol]
     if not found:
         return []
