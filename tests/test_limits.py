@@ -10,6 +10,7 @@ import pytest
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, references, stops
+from diffabs.cli.show import at_bounds
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import param, pytree
 from diffabs.core.values import ScenarioError
@@ -121,3 +122,12 @@ def test_runs_that_never_settle_are_counted_in_a_sweep(tmp_path):
     assert document["never"]["settling_time"]["count"] > 0
     assert set(document["never"]) == {"settling_time"}
     assert document["metrics"]["iae"]["mean"]["value"] > 0
+
+
+def test_a_tuning_says_on_which_bounds_it_stands():
+    free = {
+        "controller.gain": {"after": [-9999.9, -40.0], "low": [-1e4, -60.0], "high": [-100.0, -20.0]},
+        "reference.slip": {"after": 0.35, "low": 0.05, "high": 0.35},
+        "controller.kp": {"after": 7.0, "low": 0.0, "high": math.inf},
+    }
+    assert list(at_bounds(free)) == ["controller.gain.0 (lower, -10000)", "reference.slip (upper, 0.35)"]

@@ -3,9 +3,10 @@
 import json
 import math
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
@@ -20,6 +21,7 @@ from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.solution import Trajectory
 
+NEAR = 1e-3  # of its range, from a bound, on which a tuned number then stands
 PIPE_WIDTH = 140  # columns of a table that goes to a file
 PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
 
@@ -174,6 +176,8 @@ def tuned(result: dict[str, Any], chosen: Scenario) -> None:
     how.add_row("gradient mode", result["mode"])
     how.add_row("greatest component of the last gradient", f"{result['gradient_norm']:.2g}")
     how.add_row("it ended because", result["reason"])
+    if bounds := list(at_bounds(result["free"])):
+        how.add_row("it stands on bounds", ", ".join(bounds))
     titled("", how)
     files(result)
 
@@ -228,3 +232,14 @@ def _console() -> Console:
     if not console.is_terminal:
         console.width = PIPE_WIDTH
     return console
+
+
+def at_bounds(free: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the tuned numbers that ended within a thousandth of their range of one of its ends, with that end."""
+    for path, row in free.items():
+        after, low, high = np.broadcast_arrays(*(np.asarray(row[key], float) for key in ("after", "low", "high")))
+        for at in np.ndindex(after.shape):
+            name = ".".join([path, *map(str, at)])
+            for end, what in ((low[at], "lower"), (high[at], "upper")):
+                if abs(after[at] - end) <= NEAR * (high[at] - low[at]) < math.inf:
+                    yield f"{name} ({what}, {end:g})"
