@@ -19,7 +19,7 @@ import numpy as np
 from real_rig_box import ESTIMATED, KNOWN, Box, Fixed
 from real_rig_document import document
 from real_rig_figures import degradation, descents, distributions, map_figure, traces
-from real_rig_judge import Judging, in_corners, on_samples, weak_spots
+from real_rig_judge import Judging, in_corners, on_samples, seconds, weak_spots
 from real_rig_loops import loop, quantised
 from real_rig_others import Others, Score, cma_es, contenders, designs, proportional_integral
 from real_rig_proof import Proving, proofs
@@ -124,7 +124,7 @@ def row(one: dict[str, Any]) -> dict[str, Any]:
         "within 1.5 floors [%]": f"{box['within 1.5 floors of the box']['percent']:.2f}",
         "overshoot median, 95 %": f"{box['overshoot [%]']['median']:.1f}, {box['overshoot [%]']['95 %']:.1f}",
         "above floor 95 %": f"{box['above the floor [%]']['95 %']:.1f}",
-        "settled median, 95 % [s]": f"{box['settling [s]']['median']:.3f}, {box['settling [s]']['95 %']:.3f}",
+        "settled median, 95 % [s]": f"{seconds(box['settling [s]']['median'])}, {seconds(box['settling [s]']['95 %'])}",
         "lost median [%]": f"{box['distance lost [%]']['median']:.2f}",
         "longer than with the true speed, median, 95 % [%]": f"{truth['median']:.2f}, {truth['95 %']:.2f}",
         "certificate": proof["said"] + ("" if rate is None else f", {rate:.2g} /s"),

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 from real_rig_box import ESTIMATED, KNOWN, Box, Fixed
 from real_rig_document import loop_of
-from real_rig_judge import Judging, chance, drawn, in_corners, on_samples, runs
+from real_rig_judge import Judging, chance, drawn, in_corners, on_samples, runs, seconds
 from real_rig_proof import Proving, proofs
 
 from diffabs import Loop, replace
@@ -77,7 +77,7 @@ def row(one: dict[str, Any]) -> dict[str, Any]:
         "locks, not stopped": f"{box['locks']['count']}, {box['does not stop']['count']}",
         "not stopped without rest": one.get("without rest, does not stop", {}).get("count", ""),
         "settled within 0.25 s": f"{box['settled within 0.25 s']['percent']:.1f}",
-        "settled, median, 95 %": f"{settling['median']:.3f}, {settling['95 %']:.3f}",
+        "settled, median, 95 %": f"{seconds(settling['median'])}, {seconds(settling['95 %'])}",
         "certificate": proof["said"] + ("" if rate is None else f", {rate:.3g} /s"),
         "pole": f"{proof.get('largest frozen |pole| of a machine', float('nan')):.5f}",
         "samples": box["samples"],

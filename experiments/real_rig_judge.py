@@ -154,6 +154,11 @@ def quantiles(values: np.ndarray) -> dict[str, float]:
     return {name: float(np.quantile(finite, level)) for name, level in named.items()}
 
 
+def seconds(time: float) -> str:
+    """Return a settling time as text; one that is longer than a run is that of runs which never settle."""
+    return f"{time:.3f}" if time <= LONGEST else "never"
+
+
 def against_truth(one: Loop, points: Any, found: Any, config: Judging) -> dict[str, float]:
     """Stopping distance, in per cent longer than under the same controller that sees the true speed with the same noise
     of the wheel."""
