@@ -6,6 +6,7 @@ of all seeds go on side by side, as lanes of one batch. Every point that is run 
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import cma
@@ -22,7 +23,7 @@ class Searching:
     budget: int = 5000  # runs of one search, 40 for each number of the adversary's
     seeds: tuple[int, ...] = (1, 2, 3, 4, 5)
     screened: int = 64  # random points that gradients and CMA-ES begin with
-    starts: int = 4  # of gradients, at a time
+    starts: int = 4  # at a time, of gradients and of CMA-ES
     first: float = 1.0  # step of an ascent, a root mean square
     tried: tuple[float, ...] = (4.0, 1.0, 0.25, 0.06)  # times the last step
     shares: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05)  # of the way to the farthest point along the gradient
@@ -33,7 +34,7 @@ class Searching:
 
     def priced(self, attack: Attack) -> float:
         """Return how many runs a gradient costs, each in batches of those sizes in which it is asked for."""
-        generation = len(self.seeds) * (4 + int(3 * np.log(attack.bounds.size)))  # of CMA-ES, its own default
+        generation = len(self.seeds) * self.starts * (4 + int(3 * np.log(attack.bounds.size)))  # of CMA-ES, its default
         return attack.priced(len(self.seeds) * self.starts, 1 << (generation - 1).bit_length())
 
 
@@ -104,23 +105,30 @@ def _screened(attack: Attack, config: Searching, log: Log) -> np.ndarray:
     return np.take_along_axis(z, np.argsort(-found, axis=1)[:, :, None], axis=1)
 
 
-def cma_es(attack: Attack, config: Searching, price: float) -> Log:
-    """Search by CMA-ES, which sees f(feasible(z))."""
+def cma_es(attack: Attack, config: Searching, price: float, starts: int | None = None) -> Log:
+    """Search by CMA-ES, which sees f(feasible(z)), from the worst of the screened points, as many at a time as
+    gradients unless told otherwise. A start that has come to its own end makes room for the next."""
     del price
-    log, size = _log(config, attack.bounds), attack.bounds.size
-    first = _screened(attack, config, log)[:, 0]
-    options = {"verbose": -9, "verb_log": 0, "maxfevals": np.inf}
-    searches = [
-        cma.CMAEvolutionStrategy(z, config.spread, {**options, "seed": seed})
-        for z, seed in zip(first, config.seeds, strict=True)
-    ]
+    log, size, starts = _log(config, attack.bounds), attack.bounds.size, starts or config.starts
+    queue = _screened(attack, config, log)
+    seeds, waiting, _ = queue.shape
+    taken = np.full(seeds, starts)
+
+    def begun(seed: int, start: int) -> Any:
+        options = {"verbose": -9, "verb_log": 0, "maxfevals": np.inf, "seed": config.seeds[seed] + 1000 * start}
+        return cma.CMAEvolutionStrategy(queue[seed, start % waiting], config.spread, options)
+
+    searches = [[begun(seed, start) for start in range(starts)] for seed in range(seeds)]
     while log.spent < config.budget:
-        asked = np.array([search.ask() for search in searches]).reshape(len(searches), -1, size)
-        z = feasible(attack.bounds, asked.reshape(-1, size)).reshape(asked.shape)
+        asked = np.array([[search.ask() for search in row] for row in searches])  # (seeds, starts, population, size)
+        z = feasible(attack.bounds, asked.reshape(-1, size)).reshape(seeds, -1, size)
         found = _asked(attack, z)
         log.add(found.shape[1], z, found)
-        for search, points, values in zip(searches, asked, found, strict=True):
-            search.tell(list(points), list(-values))
+        for (i, j), values in zip(np.ndindex(seeds, starts), found.reshape(seeds * starts, -1), strict=True):
+            searches[i][j].tell(list(asked[i, j]), list(-values))
+            if searches[i][j].stop():
+                searches[i][j] = begun(i, taken[i])
+                taken[i] += 1
     return log
 
 
@@ -157,6 +165,7 @@ def gradients(attack: Attack, config: Searching, price: float) -> Log:
 SEARCHES: dict[str, Callable[..., Log]] = {
     "gradients": gradients,
     "CMA-ES": cma_es,
+    "CMA-ES, one start": partial(cma_es, starts=1),
     "random": random_points,
     "corners": at_corners,
 }

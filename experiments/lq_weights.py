@@ -1,17 +1,12 @@
 """Is it worth while to differentiate? Gains, and LQ weights through the Riccati equation and through the LMI.
 
-L-BFGS on the gradient is compared with two derivative-free searches from well-kept libraries, Nelder-Mead and CMA-ES,
-from the same start (`searches.py` says how they are counted), on problems of 2 to 48 parameters (`search_problems.py`
-says which).
+What derivatives are worth is what the same search takes on derivatives and on forward differences: SciPy's L-BFGS-B.
+Beside it stand `diffabs.tune`, Nelder-Mead, and CMA-ES at the best of several first steps, chosen afterwards for each
+accuracy. `searches.py` says how they are counted, `search_problems.py` which problems of 2 to 48 parameters there are.
 
 What counts is rollouts of the batch until the objective is within a hundredth, a ten thousandth and a millionth of the
-way from the start to the best that any of the three ever found; and rollouts to where each derivative-free search
-itself ended, to a millionth of its way. Where that is its budget and not its own end it proves little: a search still
-on its way would have gone on to where gradients are slow as well. Two prices of a gradient: over a rollout that
-measures all of a braking report, as `tune` does by default, and over one that measures nothing but the objective.
-
-Chosen after results were seen: the tables (of the schedule most gains do not matter, and its filter ends at the end of
-its range), L-BFGS's memory of 100 steps instead of 10, and budgets that the time allowed.
+way from the start to the best that any search found. A gradient counts at its price over a rollout that measures
+nothing but the objective.
 
     python experiments/lq_weights.py [PROBLEM ...]      (needs the package cma, of the dependency group test)
 
@@ -22,6 +17,8 @@ import dataclasses
 import json
 import pathlib
 import sys
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -38,6 +35,10 @@ from diffabs.tune.problem import Problem
 from diffabs.tune.tuning import posed
 from diffabs.tune.weights import LQWeights
 
+TUNE, GRADIENTS, DIFFERENCES = "tune", "L-BFGS-B", "L-BFGS-B, differences"
+NELDER_MEAD, CMA_ES = "Nelder-Mead", "CMA-ES"
+WITH = (TUNE, GRADIENTS)  # derivatives
+
 
 def bare(problem: Problem) -> Problem:
     """Measuring nothing but the objective."""
@@ -50,27 +51,36 @@ def allowed(config: Config, parameters: int) -> int:
 
 
 def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
-    """One problem, three searches."""
+    """One problem, all searches. Traces of `TUNE` and `GRADIENTS` count gradients, the others rollouts."""
     pose = problems(config)[name]
-    problem = pose(posed)
+    problem = bare(pose(posed))
     large = int(problem.space.size > 2)
-    prices = [searches.prices(p, config.repeats) for p in (problem, bare(problem))]
-    mode = min(prices[0], key=lambda mode: prices[0][mode])
-    stopping = Stopping(gradient=1e-9, change=1e-11, iterations=config.iterations[large])
-    found = pose(tune, method=Method(mode=mode, memory=config.memory, stopping=stopping))
-    print(f"{name}: L-BFGS {found.objective[1]:.9g}, {found.evaluations} gradients; {found.reason.value}", flush=True)
+    prices = searches.prices(problem, config.repeats)
+    mode = min(prices, key=lambda mode: prices[mode])
+    most = config.iterations[large]
+    stopping = Stopping(gradient=1e-9, change=1e-11, iterations=most)
+    found = pose(tune, method=Method(mode=mode, memory=searches.MEMORY, stopping=stopping))
+    print(f"{name}: tune {found.objective[1]:.9g}, {found.evaluations} gradients; {found.reason.value}", flush=True)
     budget = allowed(config, problem.space.size)
-    traces = {"L-BFGS": [(float(p.evaluations), p.objective) for p in found.history]}
-    traces["Nelder-Mead"] = searches.nelder_mead(bare(problem), budget)
-    print(f"{name}: Nelder-Mead {traces['Nelder-Mead'][-1]}", flush=True)
-    traces["CMA-ES"] = searches.cma_es(bare(problem), budget, config.seed)
+    asked: dict[str, Callable[[], searches.Trace]] = {
+        GRADIENTS: lambda: searches.gradients(problem, mode, most),
+        DIFFERENCES: lambda: searches.differences(problem, budget),
+        NELDER_MEAD: lambda: searches.nelder_mead(problem, budget),
+        **{
+            f"{CMA_ES}, first step {first:g}": partial(searches.cma_es, problem, budget, config.seed, first)
+            for first in config.first_steps
+        },
+    }
+    traces = {TUNE: [(float(p.evaluations), p.objective) for p in found.history]}
+    for who, search in asked.items():
+        traces[who] = search()
+        print(f"{name}: {who} {traces[who][-1]}", flush=True)
     return {
         "problem": name,
         "parameters": problem.space.size,
         "lanes": problem.batch.size,
-        "prices": [{m.value: p for m, p in price.items()} for price in prices],
-        "price": prices[0][mode],
-        "price, bare": min(prices[1].values()),
+        "prices": {m.value: p for m, p in prices.items()},
+        "price": prices[mode],
         "start": found.objective[0],
         "found": {who: trace[-1][1] for who, trace in traces.items()},
         "spent": {who: trace[-1][0] for who, trace in traces.items()},
@@ -80,35 +90,34 @@ def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
 
 
 def lines(config: Config, kept: dict[str, Any]) -> list[dict[str, Any]]:
-    """The rows of one problem: each accuracy, and the ends of both derivative-free searches."""
-    start, traces, best = kept["start"], kept["traces"], min(kept["found"].values())
-    theirs = [who for who in traces if who != "L-BFGS"]
-    asked = [(f"{near:g}", best + near * (start - best), theirs) for near in config.near]
-    budget = allowed(config, kept["parameters"])
-    ends = {who: "budget" if kept["spent"][who] >= budget else "end" for who in theirs}
-    asked += [(f"{who}'s {ends[who]}", searches.own(traces[who], start)[0], [who]) for who in theirs]
-    return [line(kept, *one) for one in asked]
+    """The rows of one problem, one for each accuracy."""
+    start, best = kept["start"], min(kept["found"].values())
+    return [line(kept, f"{near:g}", best + near * (start - best)) for near in config.near]
 
 
-def line(kept: dict[str, Any], accuracy: str, target: float, theirs: list[str]) -> dict[str, Any]:
-    """Rollouts to a target; None where it was not reached. Where no derivative-free search reached it, they count as
-    what the longer one spent, and the ratio is a lower bound."""
-    counts = {who: searches.needed(kept["traces"][who], target) for who in kept["traces"]}
-    other = min(counts[who] for who in theirs)
-    other = other if np.isfinite(other) else max(kept["spent"][who] for who in theirs)
-    ours = {name: 1 + counts["L-BFGS"] * kept[name] for name in ("price", "price, bare")}
-    shown = {who: n if np.isfinite(n) and (who in theirs or who == "L-BFGS") else None for who, n in counts.items()}
+def line(kept: dict[str, Any], accuracy: str, target: float) -> dict[str, Any]:
+    """Rollouts to a target; None where it was not reached. A ratio is None where derivatives did not reach it, and a
+    lower bound where the search without them did not, and counts as what it spent."""
+    counts = {who: searches.needed(trace, target) for who, trace in kept["traces"].items()}
+    rollouts = {who: n * kept["price"] if who in WITH else n for who, n in counts.items()}
+    tuned = [who for who in counts if who.startswith(CMA_ES)]
+    best = min(tuned, key=lambda who: (rollouts[who], kept["found"][who]))
+
+    def fewer(other: str) -> float | None:
+        theirs = rollouts[other] if np.isfinite(rollouts[other]) else kept["spent"][other]
+        return theirs / rollouts[GRADIENTS] if np.isfinite(rollouts[GRADIENTS]) else None
+
+    shown = {who: rollouts[who] for who in (TUNE, GRADIENTS, DIFFERENCES, NELDER_MEAD)} | {CMA_ES: rollouts[best]}
     return {
         "problem": kept["problem"],
         "parameters": kept["parameters"],
         "accuracy": accuracy,
-        "gradients": shown.pop("L-BFGS"),
         "price": kept["price"],
-        "rollouts": ours["price"] if np.isfinite(ours["price"]) else None,
-        **shown,
-        "times fewer": other / ours["price"],
-        "price, bare": kept["price, bare"],
-        "times fewer, bare": other / ours["price, bare"],
+        "gradients": int(counts[GRADIENTS]) if np.isfinite(counts[GRADIENTS]) else None,
+        **{who: round(n) if np.isfinite(n) else None for who, n in shown.items()},
+        "best of CMA-ES": best.removeprefix(f"{CMA_ES}, "),
+        "differences / gradients": fewer(DIFFERENCES),
+        "CMA-ES / gradients": fewer(best),
     }
 
 
@@ -149,10 +158,10 @@ def figures(kept: list[dict[str, Any]]) -> dict[str, Any]:
         best = min(row["found"].values())
         for i, (name, trace) in enumerate(row["traces"].items()):
             n, value = np.array(trace).T
-            n = 1 + n * row["price"] if name == "L-BFGS" else n
+            n = n * row["price"] if name in WITH else n
             gap = np.maximum((value - best) / (row["start"] - best), 1e-9)
-            named = "L-BFGS, gradients at their price" if name == "L-BFGS" else name
-            ax.loglog(n, gap, plot.DASHES[i], color=plot.COLOURS[i], label=named, drawstyle="steps-post")
+            style = {"ls": plot.DASHES[i % len(plot.DASHES)], "color": plot.COLOURS[i % len(plot.COLOURS)]}
+            ax.loglog(n, gap, label=name, drawstyle="steps-post", **style)
         title = f"{row['problem']}: {row['parameters']} parameters"
         plot.label(ax, "rollouts of the batch", "distance to the best", title)
     for ax in axes[len(kept) :]:

@@ -70,7 +70,7 @@ class Config:
     # up to so many parameters: evaluations of a derivative-free search
     budgets: tuple[tuple[int, int], ...] = ((2, 400), (8, 2000), (15, 4000), (24, 12000), (48, 30000))
     iterations: tuple[int, int] = (30, 400)  # of L-BFGS, for 2 parameters and for more
-    memory: int = 100  # of L-BFGS
+    first_steps: tuple[float, ...] = (0.1, 0.2, 0.5)  # of CMA-ES, in units of z
     repeats: int = 11  # of every timing
     seed: int = 3
     out: str = "out/experiments/lq_weights"

@@ -1,17 +1,21 @@
-"""A search by gradients and two without them on one problem, counted in rollouts of its batch.
+"""Searches with and without derivatives on one problem, counted in rollouts of its batch.
 
-    Nelder-Mead   SciPy's, with coefficients adapted to the dimension where there are more than two parameters
-    CMA-ES        the reference implementation (cma), its own population size, first step 0.5 in units of z
-    L-BFGS        `diffabs.tune`; a gradient counts at its price, and the one value it asks for at the start as one
+    tune                    `diffabs.tune`, L-BFGS with a line search for kinks
+    L-BFGS-B                SciPy's, on derivatives
+    L-BFGS-B, differences   the same on forward differences: 1 + p rollouts for p parameters
+    Nelder-Mead             SciPy's, with coefficients adapted to the dimension from three parameters on
+    CMA-ES                  the reference implementation (cma), its own population size, several first steps
 
-The price of a gradient is the median of ratios of times, gradient over value, measured alternately; forward mode or
-reverse mode, whichever is cheaper. All three start from the same point. A point counts as found if its run did not
-diverge and its integration step is stable; derivative-free searches are asked about the step only where a value would
-be their least and z has moved by NEAR since they were asked last, because the answer takes longer than a short run."""
+The price of a gradient is the median of ratios of processor times, gradient over value, measured alternately; in
+forward mode or reverse mode, whichever is cheaper. Both measure nothing but the objective. All searches start from the
+same point. A point counts as found if its run did not diverge and its integration step is stable. Searches without
+derivatives are asked about the step only where a value would be their least and z has moved by NEAR since they were
+asked last, because the answer takes longer than a short run."""
 
 import dataclasses
 import statistics
 import time
+from collections.abc import Callable
 from typing import Any
 
 import cma
@@ -25,7 +29,8 @@ from diffabs.tune.problem import Mode, Multipliers, Problem
 FORWARD = 6  # parameters beyond which forward mode is not timed: benchmarks/bench_gradient.py found it slower there
 REJECTED = 1e6  # the value of a run that failed, as the libraries want it
 NEAR = 0.05  # greatest component of a move in z after which the step is as stable as before
-OWN = 1e-6  # of the way from the start to its least value: there a search has reached its own optimum
+MEMORY = 100  # steps that L-BFGS-B remembers, as many as `tune` does here
+DIFFERENCE = 1e-7  # in z: forward differences
 
 Trace = list[tuple[float, float]]  # (rollouts so far, least value)
 
@@ -47,16 +52,16 @@ def prices(problem: Problem, repeats: int) -> dict[Mode, float]:
 
 
 def _time(call: Any, *arguments: Any) -> float:
-    begun = time.perf_counter()
+    begun = time.process_time()
     jax.block_until_ready(call(*arguments))
-    return time.perf_counter() - begun
+    return time.process_time() - begun
 
 
 class Counted:
-    """The objective as a plain function of z, which keeps what it has seen."""
+    """The objective as a plain function of z, which keeps the least value so far."""
 
     def __init__(self, problem: Problem):
-        """Compiled once."""
+        """Compiled once for each number of points that are asked for together."""
         self._seen, self._steady = problem.valuer(), problem.steady()
         self._asked: np.ndarray | None = None
         self.count, self.least = 0, np.inf
@@ -64,18 +69,28 @@ class Counted:
 
     def __call__(self, z: Any) -> float:
         """At one point."""
-        z = np.asarray(z, float)
-        seen = jax.device_get(self._seen(jnp.asarray(z)[None]))
-        value = float(seen.objective[0])
+        return self.each(np.asarray(z, float)[None])[0]
+
+    def each(self, points: np.ndarray) -> list[float]:
+        """At several points, one after the other as far as it is counted."""
+        seen = jax.device_get(self._seen(jnp.asarray(points)))
+        return [self._counted(*one) for one in zip(points, seen.objective, seen.diverged, strict=True)]
+
+    def slope(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        """The value at z, and its forward differences."""
+        value, *ahead = self.each(z + DIFFERENCE * np.concatenate([np.zeros((1, z.size)), np.eye(z.size)]))
+        return value, (np.array(ahead) - value) / DIFFERENCE
+
+    def _counted(self, z: np.ndarray, value: Any, diverged: Any) -> float:
         self.count += 1
-        if not np.isfinite(value) or seen.diverged[0]:
+        if not np.isfinite(value) or diverged:
             return REJECTED
         if value < self.least:
             if not self._stable(z):
                 return REJECTED
-            self.least = value
-            self.trace.append((self.count, value))
-        return value
+            self.least = float(value)
+            self.trace.append((self.count, self.least))
+        return float(value)
 
     def _stable(self, z: np.ndarray) -> bool:
         if self._asked is None or np.max(np.abs(z - self._asked)) > NEAR:
@@ -93,23 +108,58 @@ def nelder_mead(problem: Problem, budget: int) -> Trace:
     return [*f.trace, (f.count, f.least)]
 
 
-def cma_es(problem: Problem, budget: int, seed: int) -> Trace:
-    """To its own end or the budget, a population at a time."""
+def cma_es(problem: Problem, budget: int, seed: int, first: float) -> Trace:
+    """To its own end or the budget, a population at a time; `first` is its first step, in units of z."""
     f, start = Counted(problem), problem.space.place(problem.subject)
     options = {"maxfevals": budget, "verbose": -9, "seed": seed, "verb_log": 0, "tolfun": 1e-12}
-    search = cma.CMAEvolutionStrategy(start, 0.5, options)
+    search = cma.CMAEvolutionStrategy(start, first, options)
     while not search.stop():
         asked = search.ask()
-        search.tell(asked, [f(z) for z in asked])
+        search.tell(asked, f.each(np.array(asked)))
     return [*f.trace, (f.count, f.least)]
+
+
+def differences(problem: Problem, budget: int) -> Trace:
+    """SciPy's L-BFGS-B on forward differences, to its own end or the budget of rollouts."""
+    f = Counted(problem)
+    _scipy_lbfgs(problem, f.slope, budget // (1 + problem.space.size))
+    return [*f.trace, (f.count, f.least)]
+
+
+def gradients(problem: Problem, mode: Mode, most: int) -> Trace:
+    """SciPy's L-BFGS-B on derivatives, to its own end or so many of them; counted in gradients."""
+    evaluate, steady = dataclasses.replace(problem, mode=mode).evaluator(1.0), problem.steady()
+    none, trace, spent = Multipliers(np.zeros((1, 0)), np.ones(1)), [], 0
+
+    def slope(z: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal spent
+        spent += 1
+        found = jax.device_get(evaluate(jnp.asarray(z)[None], none))
+        value, gradient = float(found.loss[0]), np.asarray(found.gradient[0])
+        fine = np.isfinite(value) and np.isfinite(gradient).all() and not found.seen.diverged[0]
+        if not fine or not steady(z[None])[0]:
+            return REJECTED, np.zeros_like(z)
+        if not trace or value < trace[-1][1]:
+            trace.append((float(spent), value))
+        return value, gradient
+
+    _scipy_lbfgs(problem, slope, most)
+    return [*trace, (float(spent), trace[-1][1])]
+
+
+def _scipy_lbfgs(problem: Problem, slope: Callable[[np.ndarray], tuple[float, np.ndarray]], most: int) -> None:
+    """Its tolerances are absolute, so it is given the objective in units of that at the start."""
+    start = problem.space.place(problem.subject)
+    size = abs(slope(start)[0])
+
+    def scaled(z: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = slope(z)
+        return value / size, gradient / size
+
+    options = {"maxfun": most - 1, "maxiter": most, "ftol": 1e-15, "gtol": 1e-10, "maxcor": MEMORY}
+    minimize(scaled, start, jac=True, method="L-BFGS-B", options=options)
 
 
 def needed(trace: Trace, target: float) -> float:
     """Rollouts until the target was reached; infinity if it was not."""
     return next((float(n) for n, value in trace if value <= target), np.inf)
-
-
-def own(trace: Trace, start: float) -> tuple[float, float]:
-    """Where a search ended, to within a millionth of its way, and the rollouts until there."""
-    target = trace[-1][1] + OWN * (start - trace[-1][1])
-    return target, needed(trace, target)

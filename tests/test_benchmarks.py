@@ -1,8 +1,10 @@
 """What the benchmarks compute: the problem of the peers, its references, whether a ratio became worse, the figure."""
 
 import importlib
+import itertools
 import json
 import pathlib
+import re
 import sys
 
 import jax.numpy as jnp
@@ -101,6 +103,20 @@ def test_times_are_taken_in_turn_and_ratios_within_a_round():
     assert record.in_turn(takers, 2) == {"a": [1.0, 3.0], "b": [2.0, 4.0]}
     assert order == ["a", "b", "a", "b"]
     assert record.ratio([2.0, 30.0, 4.0], [1.0, 10.0, 4.0]) == 2.0
+
+
+def test_every_peer_has_a_ladder_without_a_gap():
+    """At most half a decade from one setting to the next, the same for every peer that is given the same thing."""
+    ladders = {}
+    for path in sorted((FOLDER / "peers").glob("*_*.py")):
+        named = re.findall(r"^LADDER = (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+        if named:
+            ladders[path.stem] = named[0]
+    assert {"c_adaptive", "kernel_adaptive", "diffrax_event"} <= set(ladders)
+    assert set(ladders.values()) == {"TOLERANCES", "STEPS"}, ladders
+    ladder = module("peers.ladder")
+    for settings in (ladder.TOLERANCES, ladder.STEPS):
+        assert all(1 < a / b < 3.4 for a, b in itertools.pairwise(settings))
 
 
 @pytest.mark.slow

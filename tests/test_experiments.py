@@ -164,36 +164,57 @@ def test_tuned_over_roads_no_wheel_locks_longer(tmp_path):
 def test_gradients_need_fewer_rollouts_than_searches_without(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
     module = experiment("lq_weights")
-    config = module.Config(budgets=((2, 120),), rig_step=1e-3, repeats=1, out=str(tmp_path))
+    config = module.Config(budgets=((2, 120),), rig_step=1e-3, repeats=1, first_steps=(0.2, 0.5), out=str(tmp_path))
     rows = {row["accuracy"]: row for row in module.main(config, ("gain",))["table"]}
-    found = json.loads((tmp_path / "gain.json").read_text())["found"]
-    assert found["L-BFGS"] <= found["Nelder-Mead"] * (1 + 1e-4)
+    kept = json.loads((tmp_path / "gain.json").read_text())
+    assert kept["found"]["tune"] <= kept["found"]["Nelder-Mead"] * (1 + 1e-4)
+    assert len([who for who in kept["found"] if who.startswith("CMA-ES")]) == 2
     assert rows["0.0001"]["gradients"] < 15
+    assert rows["0.0001"]["L-BFGS-B, differences"] < 45
     assert rows["0.0001"]["Nelder-Mead"] > 30
-    assert next(row for name, row in rows.items() if name.startswith("Nelder-Mead"))["gradients"] < 20
+
+
+def test_a_table_of_gains_can_be_tuned(tmp_path, monkeypatch):
+    """By gradients in reverse mode, from its start on."""
+    monkeypatch.syspath_prepend(FOLDER)
+    module = experiment("lq_weights")
+    few = {"table_masses": (5.75,), "table_speeds": (9.0, 50.0, 3), "first": 0.1, "iterations": (2, 2)}
+    config = module.Config(budgets=((48, 100),), repeats=1, first_steps=(0.2,), out=str(tmp_path), **few)
+    for name in ("table 6", "table 24"):
+        module.main(config, (name,))
+        kept = json.loads((tmp_path / f"{name.replace(' ', '_')}.json").read_text())
+        assert kept["found"]["tune"] < kept["start"]
+        assert kept["found"]["L-BFGS-B"] < kept["start"]
 
 
 def test_what_searches_spent_is_counted(monkeypatch):
     """By hand: a bound where no search without gradients arrives, and none where the gradients do not."""
     monkeypatch.syspath_prepend(FOLDER)
     module = experiment("lq_weights")
-    traces = {"L-BFGS": [[1, 9.0], [5, 1.0]], "Nelder-Mead": [[1, 9.0], [60, 2.0]], "CMA-ES": [[1, 9.0], [33, 1.5]]}
+    traces = {
+        "tune": [[1, 9.0], [6, 1.0]],
+        "L-BFGS-B": [[1, 9.0], [5, 1.0]],
+        "L-BFGS-B, differences": [[1, 9.0], [40, 1.0]],
+        "Nelder-Mead": [[1, 9.0], [60, 2.0]],
+        "CMA-ES, first step 0.2": [[1, 9.0], [44, 2.0], [90, 1.4]],
+        "CMA-ES, first step 0.5": [[1, 9.0], [33, 1.5]],
+    }
     kept = {
         "problem": "p",
         "parameters": 3,
         "price": 2.0,
-        "price, bare": 4.0,
         "traces": traces,
-        "spent": {"L-BFGS": 5, "Nelder-Mead": 110, "CMA-ES": 220},
+        "found": {who: trace[-1][1] for who, trace in traces.items()},
+        "spent": {who: 200 for who in traces},
     }
-    both = ["Nelder-Mead", "CMA-ES"]
-    row = module.line(kept, "2", 2.0, both)
-    assert (row["gradients"], row["rollouts"], row["Nelder-Mead"], row["CMA-ES"]) == (5, 11, 60, 33)
-    assert (row["times fewer"], row["times fewer, bare"]) == (33 / 11, 33 / 21)
-    row = module.line(kept, "1", 1.0, both)
-    assert (row["Nelder-Mead"], row["CMA-ES"], row["times fewer"]) == (None, None, 220 / 11)
-    row = module.line(kept, "0", 0.5, both)
-    assert (row["gradients"], row["rollouts"], row["times fewer"]) == (None, None, 0.0)
+    row = module.line(kept, "2", 2.0)
+    assert (row["gradients"], row["tune"], row["L-BFGS-B"], row["L-BFGS-B, differences"]) == (5, 12, 10, 40)
+    assert (row["Nelder-Mead"], row["CMA-ES"], row["best of CMA-ES"]) == (60, 33, "first step 0.5")
+    assert (row["differences / gradients"], row["CMA-ES / gradients"]) == (4.0, 3.3)
+    row = module.line(kept, "1", 1.0)
+    assert (row["Nelder-Mead"], row["CMA-ES"], row["CMA-ES / gradients"]) == (None, None, 20.0)
+    row = module.line(kept, "0", 0.5)
+    assert (row["gradients"], row["tune"], row["differences / gradients"]) == (None, None, None)
 
 
 def test_weights_tuned_by_gradients_recover_more_starts_and_are_proved(tmp_path):

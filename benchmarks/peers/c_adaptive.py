@@ -1,9 +1,10 @@
 """lanes.c, adaptive, with OpenMP over blocks of lanes."""
 
 from peers import c
+from peers.ladder import TOLERANCES
 
 TITLE, PACKAGES, MANY = "C, adaptive RK4 (gcc -O3, OpenMP)", (), None
-LADDER = (1e-5, 5e-6, 3e-6, 1e-6, 3e-7, 1e-7)
+LADDER = TOLERANCES
 
 
 def prepared(masses, speeds, tolerance, dtype, threads):

@@ -8,10 +8,11 @@ import optimistix
 
 from peers import on_devices
 from peers.jax_scan import rates
+from peers.ladder import TOLERANCES
 from peers.problem import DURATION, R1, R2, STOP, holding
 
 TITLE, PACKAGES, MANY = "diffrax, Tsit5 with Event", ("diffrax", "jax", "jaxlib", "equinox", "optimistix"), None
-LADDER = (1e-5, 1e-6, 3e-7, 1e-7, 3e-8, 1e-8, 3e-9)
+LADDER = TOLERANCES
 BLOCK, SAVED, WINDOW = 64, 241, 0.12  # [s], in which every lane has its greatest slip
 MOST_STEPS = 100_000
 

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 
 from peers import on_devices
+from peers.ladder import STEPS
 from peers.problem import DURATION, J1, K1, K2, R1, R2, SLIP, STOP, W1, W2, W3, W4, A, G, P, U, holding
 
 TITLE, PACKAGES, MANY = "JAX, fixed RK4 scan by hand", ("jax", "jaxlib"), None
-LADDER = (2e-3, 1e-3, 5e-4, 3e-4, 2e-4, 1e-4)
+LADDER = STEPS
 
 
 def rates(y, mass, hold):

@@ -9,10 +9,11 @@ from jaxonomy.simulation import Simulator
 
 from peers import on_devices
 from peers.jax_scan import rates
+from peers.ladder import TOLERANCES
 from peers.problem import DURATION, K1, K2, R1, R2, SLIP, STOP, U, holding
 
 TITLE, PACKAGES, MANY = "jaxonomy, Dopri5 with zero crossings", ("jaxonomy", "jax", "jaxlib"), 256
-LADDER = (1e-5, 1e-6, 3e-7, 1e-7, 3e-8, 1e-8, 3e-9)
+LADDER = TOLERANCES
 MAJOR_STEPS = 400
 
 

@@ -1,9 +1,10 @@
 """diffabs with steps as long as their error allows, by a kernel."""
 
 from peers import ours
+from peers.ladder import TOLERANCES
 
 TITLE, PACKAGES, MANY = "diffabs, Adaptive, kernel", ours.PACKAGES, ours.MANY
-LADDER = (1e-4, 3e-5, 2e-5, 1e-5, 5e-6, 3e-6, 1e-6, 3e-7)
+LADDER = TOLERANCES
 
 
 def prepared(masses, speeds, tolerance, dtype, threads):

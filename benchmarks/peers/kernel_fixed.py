@@ -1,9 +1,10 @@
 """diffabs with equal steps, by a kernel."""
 
 from peers import ours
+from peers.ladder import STEPS
 
 TITLE, PACKAGES, MANY = "diffabs, FixedStep, kernel", ours.PACKAGES, ours.MANY
-LADDER = (2e-3, 1e-3, 5e-4, 3e-4, 2e-4, 1e-4)
+LADDER = STEPS
 
 
 def prepared(masses, speeds, step, dtype, threads):

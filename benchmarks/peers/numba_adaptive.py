@@ -5,10 +5,11 @@ import math
 import numba
 import numpy as np
 
+from peers.ladder import TOLERANCES
 from peers.problem import J1, K1, K2, R1, R2, SLIP, STOP, W1, W2, W3, W4, A, G, P, U, holding
 
 TITLE, PACKAGES, MANY = "Numba, adaptive RK4 (prange)", ("numba", "llvmlite", "numpy"), None
-LADDER = (1e-5, 5e-6, 3e-6, 1e-6, 3e-7, 1e-7)
+LADDER = TOLERANCES
 FIRST, LONGEST, LEAST = 1e-4, 7e-3, 2e-5  # s
 LOW = 1e-6  # slip, below which friction is taken as there; and s
 

@@ -5,10 +5,11 @@ from math import exp, log
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from peers.ladder import TOLERANCES
 from peers.problem import J1, K1, K2, R1, R2, SLIP, STOP, W1, W2, W3, W4, A, G, P, U, holding
 
 TITLE, PACKAGES, MANY = "SciPy solve_ivp RK45 in a loop", ("scipy", "numpy"), 16
-LADDER = (1e-5, 1e-6, 3e-7, 1e-7, 3e-8, 1e-8)
+LADDER = TOLERANCES
 WINDOW = np.linspace(0.0, 0.12, 481)  # [s], in which every lane has its greatest slip
 
 

@@ -5,11 +5,12 @@ import numpy as np
 import torch
 import torchdiffeq
 
+from peers.ladder import TOLERANCES
 from peers.problem import J1, K1, K2, R1, R2, SLIP, STOP, W1, W2, W3, W4, A, G, P, U, holding
 from peers.scipy_loop import highest
 
 TITLE, PACKAGES, MANY = "torchdiffeq, odeint_event in a loop", ("torchdiffeq", "torch"), 2
-LADDER = (1e-5, 1e-6, 3e-7, 1e-7, 3e-8, 1e-8)
+LADDER = TOLERANCES
 WINDOW, SAVED = 0.12, 241
 
 
