@@ -214,6 +214,20 @@ def rig_proportional(r: Draw) -> d.Loop:
     )
 
 
+def rig_clamped(r: Draw) -> d.Loop:
+    return braking(
+        **r.rig(),
+        controller=controllers.StateFeedback(
+            gain=np.array([-r.near(3000.0), -r.near(90.0)]),
+            torque_min=r.within(0.1, 0.4),
+            torque_max=r.near(5.0),
+            antiwindup=controllers.Clamping(),
+        ),
+        feedforward=controllers.HoldingInput(),
+        reference=references.LimitedSlip(slip=r.near(0.15), rate=r.near(2.0), time_constant=r.near(0.02), period=2e-3),
+    )
+
+
 def rig_on_grid(r: Draw, speed: Any) -> d.Loop:
     return braking(
         **r.rig(),
@@ -440,6 +454,7 @@ STRUCTURES = {
     "rig, filtered": Structure(rig),
     "rig, scheduled, delay": Structure(rig_scheduled),
     "rig, proportional, rate limit": Structure(rig_proportional),
+    "rig, limited, clamped": Structure(rig_clamped),
     "rig, speed that drifts": Structure(rig_drifting),
     "rig, estimated speed": Structure(rig_estimated),
     "extremum seeking": Structure(seeking),

@@ -25,6 +25,12 @@ def test_gradients_are_those_of_wide_differences(name):
     assert compared > 0.5 * sum(found.gradient.size for found in founds)
 
 
+@pytest.mark.slow
+def test_gradients_of_adaptive_runs_are_those_of_wide_differences():
+    wrong = offenders(studied("rig, limited, clamped", range(3), seed=1, told=False, rtol=1e-6))
+    assert not wrong, "\n".join(line(row) for row in wrong)
+
+
 @pytest.mark.parametrize("name", random_loops.STRUCTURES)
 def test_random_loops_are_allowed(name):
     for number in range(20):
