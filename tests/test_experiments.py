@@ -349,3 +349,10 @@ def test_the_latch_holds_the_first_slip_on_the_second_surface(monkeypatch):
     theirs = [latched_stop(module.OWN, 0.5, place, edge, config.width) for place in config.places]
     np.testing.assert_allclose(found, theirs / module.bound(lanes, 90.0, config.width).distance - 1, rtol=0, atol=1e-3)
     assert found[0] < 0.02 < 0.08 < found[1]
+
+
+def test_a_wheels_speed_tells_the_road(tmp_path):
+    module = experiment("wheel_speed_identification")
+    result = module.main(module.Config(seeds=2, out=str(tmp_path)))
+    np.testing.assert_allclose(result["noise"], 0.05, rtol=0.05)  # what is left by the fits is the noise that was added
+    assert list(tmp_path.glob("*.png"))
