@@ -151,7 +151,9 @@ class Brake:
     def torque(self, z: Any, m: Mode) -> float:
         if m.torque == "inside":
             return self.raw(z, m)
-        return self.controller.torque_max if m.torque == "high" else self.controller.torque_min
+        c = self.controller
+        low, high = (c.torque_min, c.torque_max) if self.relay else (c.low, c.high)
+        return high if m.torque == "high" else low
 
     def rates(self, t: float, z: Any, m: Mode) -> list[float]:
         del t

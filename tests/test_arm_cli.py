@@ -48,7 +48,8 @@ def test_the_papers_start_falls_and_that_is_said(falling):
     assert document["metrics"]["peak_voltage"] == 48.0
     assert document["metrics"]["peak_torque"] <= 30 * (48 + 30 * 10) / 3
     assert [line for line in result.stderr.splitlines() if line.startswith("warning: ")] == [
-        "warning: FELL: the frame reached the stop's angle"
+        "warning: FELL: the frame reached the stop's angle",
+        "warning: settling_time is infinite: the run ends before it gets there",
     ]
 
 
@@ -62,7 +63,8 @@ def test_every_column_has_its_unit(falling):
     first, last = (dict(zip(header, map(float, row), strict=True)) for row in (rows[0], rows[-1]))
     assert (first["theta [rad]"], first["phi [rad]"], first["psi [rad]"]) == (0.5, 0.2, 0.0)
     assert last["theta [rad]"] == pytest.approx(math.pi / 2, abs=1e-9)
-    assert (last["t [s]"]) == pytest.approx(falling[1]["metrics"]["settling_time"], rel=1e-11)
+    assert (last["t [s]"]) == pytest.approx(0.649256, abs=1e-5)
+    assert falling[1]["metrics"]["settling_time"] is None  # never
 
 
 def test_the_hanging_arm_stays_up():
@@ -81,7 +83,7 @@ def test_a_rider_whom_the_spring_cannot_hold_is_a_warning():
     result = run("simulate", "arm-hanging", *SHORT, "--set", "plant.stiffness=294")
     assert "warning: plant.stiffness = 294 N m/rad does not hold the rider" in result.stderr
     assert "m3 g hg = 294.3 N m/rad" in result.stderr
-    assert "warning" not in run("simulate", "arm-hanging", *SHORT, "--set", "plant.stiffness=295").stderr
+    assert "plant.stiffness" not in run("simulate", "arm-hanging", *SHORT, "--set", "plant.stiffness=295").stderr
 
 
 BAD = [

@@ -155,7 +155,7 @@ def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
 
 
 def _of_controller(controller: Any) -> Iterator[str]:
-    low, high = float(controller.torque_min), float(controller.torque_max)
+    low, high = map(float, controller.limits())
     if np.isfinite([low, high]).any():
         yield f"The controller's torque limits of {low:g} and {high:g} {{control}}."
         if not isinstance(controller.antiwindup, NoAntiWindup):
