@@ -147,6 +147,17 @@ def test_a_peer_that_is_not_there_says_so_and_the_others_go_on(tmp_path, monkeyp
     assert "run_s" not in rows["nobody"]
 
 
+@pytest.mark.slow
+def test_the_price_of_a_gradient_is_measured(tmp_path, monkeypatch):
+    bench, out = module("bench_gradient"), tmp_path / "gradient.json"
+    small = ["--quick", "--rounds", "1", "--loops", "lmi", "--lanes", "4", "--step", "2e-3", "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", ["bench_gradient.py", *small])
+    bench.main()
+    rows = json.loads(out.read_text())["loops"]["lmi"]["rows"]
+    assert rows["reverse"]["ratio"] > 0
+    assert rows["forward 1"]["ratio"] > 0
+
+
 RECORD = {"loops": {"lmi": {"rows": {"forward 1": {"ratio": 2.0}, "reverse": {"ratio": 6.0}}}}}
 
 
