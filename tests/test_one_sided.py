@@ -52,7 +52,7 @@ DELAYS = [
     pytest.param(
         braking(controller=controllers.Sampled(controller=PID, period=PERIOD)),
         "controller.delay",
-        [(0.0, (1,)), (3e-4, (-1, 1)), (2 * STEP, (-1, 1))],
+        [(0.0, (1,)), (3e-4, (-1, 1)), (2 * STEP, (-1, 1)), (PERIOD, (-1,))],
         id="computer",
     ),
     pytest.param(
