@@ -87,7 +87,10 @@ class Program:
         solver = slow = FixedStep(step, duration, kinks=True)  # as derivatives have it
         if rtol is not None:
             solver, slow = (Adaptive(error, duration, step) for error in (rtol, SURE))
-        self.objectives = list(self.structure.objectives)
+        self.measured = dict(self.structure.objectives)
+        if rtol is not None and "delay" in name:
+            del self.measured["variation"]  # has no derivative there
+        self.objectives = list(self.measured)
 
         def one(solver: Any, loop: Any, measures: Any, x: Any) -> tuple[Any, Any]:
             loop, measures = _moved(loop, measures, self.places, x)
@@ -113,7 +116,7 @@ class Program:
     def study(self, number: int, seed: int, widths: Sequence[float] = WIDTHS, slopes: bool = True) -> Found:
         """Gradients and differences of a loop, or differences alone."""
         loop = strong(refined(random_loops.drawn(self.name, number, seed), self.times))
-        measures = strong(dict(self.structure.objectives))
+        measures = strong(self.measured)
         self.places = random_loops.numbers(loop, measures)
         x = np.array([_at(loop, measures, path)[place] for path, places in self.places.items() for place in places])
         size = np.where(np.abs(x) > 1e-6, np.abs(x), 1e-2)

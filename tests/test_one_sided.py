@@ -188,3 +188,30 @@ def test_points_with_one_side_are_named():
         "controller.gain",
         "controller.high",
     }
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
+def test_the_variation_behind_a_delay_has_no_derivative_with_adaptive_steps(derivative):
+    loop = DELAYS[2].values[0]
+
+    def measured(time):
+        return d.measure(d.replace(loop, {"actuator.time": time}), d.Adaptive(1e-4, 0.01, STEP), MEASURED).metrics
+
+    with pytest.raises(ValueError, match="variation: Variation has no derivative behind a pure delay with adaptive"):
+        derivative(lambda time: measured(time)["variation"])(1e-3)
+
+
+@pytest.mark.slow
+def test_a_pure_delay_has_the_derivative_of_differences_with_adaptive_steps():
+    loop = DELAYS[2].values[0]
+    measured = {name: one for name, one in MEASURED.items() if name != "variation"}
+
+    @jax.jit
+    def run(time):
+        metrics = d.measure(d.replace(loop, {"actuator.time": time}), d.Adaptive(1e-7, 0.1, STEP), measured).metrics
+        return jnp.stack(list(metrics.values()))
+
+    slope = jax.jit(jax.jacfwd(run))
+    for x in (7e-4, 1e-3):
+        found, differences = beside(run, slope, x, (-1, 1))
+        np.testing.assert_allclose(found, differences, rtol=1e-3, atol=1e-5, err_msg=f"{x}")

@@ -180,6 +180,8 @@ class _InEvents(Delay):
     moment then has a derivative, and the sample kept at that instant is the command before."""
 
     def _at_once(self, m: DelayMemory, t: Scalar) -> DelayMemory:
+        # A break that is over has come out: a repeated run may see one that, to rounding, it did not see before.
+        m = Delay._at_once(self, m, t - 4 * _rounding(t))
         late = jnp.where(m.last + 1 < m.known, t + _rounding(t) - (m.until + self.time), 0.0)
         return m._replace(until=m.until + jnp.maximum(jax.lax.stop_gradient(late), 0.0))
 

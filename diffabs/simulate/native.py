@@ -27,7 +27,7 @@ from diffabs.simulate.methods import AtPace
 from diffabs.simulate.outcome import judge
 from diffabs.simulate.pursuit import Pursuing, Pursuit
 from diffabs.simulate.refill import ROUND, Enough, by_lane
-from diffabs.simulate.run import arguments, without_derivatives
+from diffabs.simulate.run import arguments, refuse_derivative, without_derivatives
 from diffabs.simulate.solution import Run, Solver
 
 MOST = 1 << 17  # lanes that are started together: the carries of more would fill the memory
@@ -73,7 +73,8 @@ def _made(given: Any) -> Run:
 def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
     """By steps that end on kinks, as derivatives have them elsewhere (`run`)."""
 
-    moves = tangents[0]
+    moves, (given_loop, _, measured, method, *_) = tangents[0], primals[0]
+    refuse_derivative(given_loop, measured, method)
     paths = asked(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
 
     def run(given: Any) -> Run:

@@ -19,6 +19,7 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, differentiated, parameters, replace, strong
 from diffabs.core.tracing import asked, pushed
 from diffabs.core.validity import misshapen
+from diffabs.objectives import Variation
 from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
 from diffabs.simulate.methods import AtPace, method_of
 from diffabs.simulate.outcome import judge, prepare
@@ -147,13 +148,26 @@ def _simulated(places: Places, run: Any) -> Run:
 
 
 def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
-    loop, _, method, _ = primals[0]
+    loop, objectives, method, _ = primals[0]
+    refuse_derivative(loop, objectives, method)
     paths = asked(tangents[0][0])
 
     def reversible(run: Any) -> Run:
         return _reversible(differentiated(run[0], paths), *run[1:], places=places)
 
     return pushed(reversible, primals, tangents, once=_only_once(loop, method))
+
+
+def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: Any) -> None:
+    """Raise ValueError for a run whose derivatives would be wrong."""
+    if isinstance(method, AtPace) and loop.recorders:
+        # A repeated run sees bends of the delayed command, to rounding, elsewhere than the run that it repeats.
+        names = [name for name, one in objectives.items() if isinstance(one, Variation)]
+        if names:
+            raise ValueError(
+                f"{', '.join(names)}: Variation has no derivative behind a pure delay with adaptive steps. Leave it"
+                " out, or use d.FixedStep"
+            )
 
 
 def _only_once(loop: Loop, method: Any) -> str:
