@@ -8,6 +8,7 @@ import pytest
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, stops
+from diffabs.core.blocks import Series
 from diffabs.core.messages import Segment
 from diffabs.core.protocols import Shown
 from diffabs.objectives import PeakVoltage
@@ -63,3 +64,28 @@ def test_a_peak_on_an_event_of_the_grid_moves_with_the_event(lag, end):
     left, right = ((np.asarray(values(1e-3 + width)) - here) / width for width in (-2e-6, 2e-6))
     np.testing.assert_allclose(left, right, rtol=2e-2)  # there is a derivative
     np.testing.assert_allclose(slopes, (left + right) / 2, rtol=2e-3)
+
+
+@pytest.mark.slow
+def test_a_peak_on_a_corner_of_a_limit_has_the_derivative_of_accurate_runs():
+    """The motor's torque is greatest where its current leaves the limit, behind a lag. Against differences of adaptive
+    runs at three widths."""
+    loop = d.Loop(
+        plant=plants.ArmBalance(gear=1.1, rotor_inertia=0.3, current_max=40.0),
+        initial=plants.BalanceStart(theta=0.02, psi=0.015, phi=0.01, theta_rate=0.02, psi_rate=0.03, phi_rate=0.01),
+        reference=references.Upright(),
+        controller=controllers.BalanceFeedback(),
+        actuator=Series(blocks=(actuators.VoltageLimit(voltage_max=90.0), actuators.Lag(time_constant=0.002))),
+        stop=stops.Fallen(),
+    )
+    paths = {"plant.arm_mass": float(loop.plant.arm_mass), "initial.theta": 0.02}
+
+    def peak(z, solver):
+        values = {path: value * jnp.exp(z[i]) for i, (path, value) in enumerate(paths.items())}
+        return d.measure(d.replace(loop, values), solver, {"x": objectives.PeakTorque()}).metrics["x"]
+
+    slope = np.asarray(jax.jit(jax.jacfwd(lambda z: peak(z, d.FixedStep(5e-4, 0.3))))(jnp.zeros(2)))
+    accurate = jax.jit(jax.vmap(lambda z: peak(z, d.Adaptive(1e-9, 0.3, 5e-4))))
+    for width in (3e-3, 1e-3, 3e-4):
+        up, down = np.asarray(accurate(width * jnp.concatenate([jnp.eye(2), -jnp.eye(2)]))).reshape(2, 2)
+        np.testing.assert_allclose(slope, (up - down) / (2 * width), rtol=1e-2, atol=1e-2 * np.max(np.abs(slope)))

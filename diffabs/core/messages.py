@@ -131,7 +131,7 @@ class Segment(NamedTuple):
     step: Scalar
     shown_rates: Callable[[], tuple[Shown, Shown]]
     sample_rates: Callable[[], tuple[Sample, Sample]]
-    smooth: bool = False
+    smooth: Any = False
 
     def output(self, read: Callable[[Any], Scalar] = lambda output: output[0]) -> Cubic:
         """The cubic of read(output): by default of the first signal that the plant shows."""

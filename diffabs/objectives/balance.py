@@ -103,7 +103,9 @@ def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
         """The greater of what was, and of the greatest of the step."""
         del self
         ends = later_of_larger(size(segment.start), size(segment.end))
-        return later_of_larger(memory.held, segment.sample(size).greatest_of_parabola() if segment.smooth else ends)
+        if segment.smooth is not False:
+            ends = jnp.where(segment.smooth, segment.sample(size).greatest_of_parabola(), ends)
+        return later_of_larger(memory.held, ends)
 
     return start, nothing, update, held
 

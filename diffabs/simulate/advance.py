@@ -160,7 +160,8 @@ def _segment(system: Dynamics, point: Point, end: Any, sample: Sample, one: Try)
     def each(of: Any) -> Any:
         return cache(lambda: tuple(system.moving(of, end, within) for end in ends))
 
-    return Segment(point.sample, sample, one.h, one.step, each(Shown.of), each(lambda sample: sample))
+    smooth = ~one.blunt if system.kinks else False  # a step that ends on every comparison reaches no limit within
+    return Segment(point.sample, sample, one.h, one.step, each(Shown.of), each(lambda sample: sample), smooth)
 
 
 def _passed(system: Dynamics, point: Point, end: Any, one: Try) -> dict[str, Passage]:
