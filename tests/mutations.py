@@ -1610,8 +1610,8 @@ MUTATIONS = [
     Mutation(
         "balance: a voltage is seen at the ends of a step alone",
         "objectives/balance.py",
-        "if segment.smooth else ends",
-        "if False else ends",
+        "if segment.smooth is not False:",
+        "if False:",
         "test_peaks.py::test_a_voltage_rises_and_falls_within_a_long_step[True-24.0]",
     ),
     Mutation(

@@ -67,9 +67,8 @@ def test_a_peak_on_an_event_of_the_grid_moves_with_the_event(lag, end):
 
 
 @pytest.mark.slow
-def test_a_peak_on_a_corner_of_a_limit_has_the_derivative_of_accurate_runs():
-    """The motor's torque is greatest where its current leaves the limit, behind a lag. Against differences of adaptive
-    runs at three widths."""
+def test_a_peak_of_the_torque_has_the_derivative_of_accurate_runs():
+    """Between the ends of fixed steps, behind a lag. Against differences of adaptive runs at three widths."""
     loop = d.Loop(
         plant=plants.ArmBalance(gear=1.1, rotor_inertia=0.3, current_max=40.0),
         initial=plants.BalanceStart(theta=0.02, psi=0.015, phi=0.01, theta_rate=0.02, psi_rate=0.03, phi_rate=0.01),
@@ -78,7 +77,7 @@ def test_a_peak_on_a_corner_of_a_limit_has_the_derivative_of_accurate_runs():
         actuator=Series(blocks=(actuators.VoltageLimit(voltage_max=90.0), actuators.Lag(time_constant=0.002))),
         stop=stops.Fallen(),
     )
-    paths = {"plant.arm_mass": float(loop.plant.arm_mass), "initial.theta": 0.02}
+    paths = {"plant.arm_mass": 20.0, "plant.gear": 1.1}
 
     def peak(z, solver):
         values = {path: value * jnp.exp(z[i]) for i, (path, value) in enumerate(paths.items())}
@@ -88,4 +87,4 @@ def test_a_peak_on_a_corner_of_a_limit_has_the_derivative_of_accurate_runs():
     accurate = jax.jit(jax.vmap(lambda z: peak(z, d.Adaptive(1e-9, 0.3, 5e-4))))
     for width in (3e-3, 1e-3, 3e-4):
         up, down = np.asarray(accurate(width * jnp.concatenate([jnp.eye(2), -jnp.eye(2)]))).reshape(2, 2)
-        np.testing.assert_allclose(slope, (up - down) / (2 * width), rtol=1e-2, atol=1e-2 * np.max(np.abs(slope)))
+        np.testing.assert_allclose(slope, (up - down) / (2 * width), rtol=1e-3)

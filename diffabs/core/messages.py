@@ -123,7 +123,8 @@ class Segment(NamedTuple):
     after the jumps there, the last before them), its length [s], and the step of the grid [s]. What `output`,
     `error` and `sample` return is the cubic of something seen, from values and rates at both ends: its extrema, roots
     and integrals are those of the run to the order of the method. `smooth`: no limit is reached within, either, because
-    the step would end there; else the cubic of a signal that has limits may leave them."""
+    the step would end there; else the cubic of a signal that has limits may leave them. `inner`: the rates at the end
+    are those within the step, also where it ends on a limit; else those beyond it."""
 
     start: Sample
     end: Sample
@@ -132,6 +133,7 @@ class Segment(NamedTuple):
     shown_rates: Callable[[], tuple[Shown, Shown]]
     sample_rates: Callable[[], tuple[Sample, Sample]]
     smooth: Any = False
+    inner: bool = False
 
     def output(self, read: Callable[[Any], Scalar] = lambda output: output[0]) -> Cubic:
         """The cubic of read(output): by default of the first signal that the plant shows."""

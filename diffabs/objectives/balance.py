@@ -104,7 +104,9 @@ def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
         del self
         ends = later_of_larger(size(segment.start), size(segment.end))
         if segment.smooth is not False:
-            ends = jnp.where(segment.smooth, segment.sample(size).greatest_of_parabola(), ends)
+            cubic = segment.sample(size)
+            top = cubic.greatest() if segment.inner else cubic.greatest_of_parabola()
+            ends = jnp.where(segment.smooth, top, ends)
         return later_of_larger(memory.held, ends)
 
     return start, nothing, update, held

@@ -161,7 +161,8 @@ def _segment(system: Dynamics, point: Point, end: Any, sample: Sample, one: Try)
         return cache(lambda: tuple(system.moving(of, end, within) for end in ends))
 
     smooth = ~one.blunt if system.kinks else False  # a step that ends on every comparison reaches no limit within
-    return Segment(point.sample, sample, one.h, one.step, each(Shown.of), each(lambda sample: sample), smooth)
+    rates = each(Shown.of), each(lambda sample: sample)
+    return Segment(point.sample, sample, one.h, one.step, *rates, smooth, inner=True)
 
 
 def _passed(system: Dynamics, point: Point, end: Any, one: Try) -> dict[str, Passage]:
