@@ -68,8 +68,8 @@ class Crossings(NamedTuple):
 
 def init_search(h: Any) -> Search:
     """Return a search for nothing."""
-    none, zero = 0.0 * h, jnp.asarray(0)
-    return Search(zero, h, none, none, none, h, none, zero, h, none, *2 * (jnp.asarray(False),), none)
+    none, zero, no = 0.0 * h, jnp.asarray(0), jnp.asarray(False)
+    return Search(zero, h, none, none, none, h, none, zero, h, none, no, no, none)
 
 
 def falls_through(before: list[Any], after: list[Any]) -> list[Any]:
