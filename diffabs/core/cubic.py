@@ -78,7 +78,7 @@ class Cubic(NamedTuple):
         bend = jnp.sqrt(jnp.where(inside & (square > 0), square, 1.0)) - c2
         x = clamp(_quotient(c1, bend), 0.0, 1.0)
         x = _refined(x, self.slope, jnp.where(inside, 2.0 * c2 + 6.0 * c3 * x, 0.0))
-        ends = later_of_larger(self.start, self.end)
+        ends = self._greater_end()
         top = self(x)
         return jnp.where(inside & (top > ends), top, ends)
 
@@ -89,7 +89,15 @@ class Cubic(NamedTuple):
         inside = (self.start_slope > 0) & (2.0 * rise < self.start_slope)
         bend = jnp.where(inside, self.start_slope - rise, 1.0)
         top = self.start + 0.25 * self.start_slope * self.start_slope / bend
-        return jnp.where(inside, top, later_of_larger(self.start, self.end))
+        return jnp.where(inside, top, self._greater_end())
+
+    @property
+    def falls(self) -> Any:
+        """Whether p falls from the start on."""
+        return jax.lax.stop_gradient(self.start_slope) < 0
+
+    def _greater_end(self) -> Any:
+        return later_of_larger(self.start, self.end, self.falls)
 
     def _coefficients(self) -> tuple[Any, Any, Any]:
         rise = self.end - self.start

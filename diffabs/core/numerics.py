@@ -25,11 +25,13 @@ def larger(x: Scalar, y: Scalar) -> Any:
     return jnp.where(jnp.greater_equal(x, y), x, y)
 
 
-def later_of_larger(x: Scalar, y: Scalar) -> Any:
+def later_of_larger(x: Scalar, y: Scalar, falls: Any = False) -> Any:
     """max(x, y) of two values one after the other. Where they are equal to rounding, the slope is that of the later
-    one, y: the end of a step without a length moves with the event there, its beginning does not."""
+    one, y: the end of a step without a length moves with the event there, its beginning does not. If the signal `falls`
+    from x on, it is that of x: a peak at an event that is a rounding before the grid does not stand on the grid."""
     rounding = EQUAL * jnp.finfo(jnp.result_type(x, y)).eps * jnp.abs(x)
-    return jnp.where(jnp.greater(x, y + rounding), x, y)
+    more = jnp.where(falls, rounding, -rounding)
+    return jnp.where(jnp.greater_equal(y, x + more), y, x)
 
 
 def smaller(x: Scalar, y: Scalar) -> Any:

@@ -65,7 +65,8 @@ def _greatest(name: str) -> tuple[Any, Any, Any, Any]:
         """The greatest so far."""
         del self
         angle = segment.output(lambda output: getattr(output, name))
-        return later_of_larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()))
+        falls = jnp.where(angle.start >= 0, angle.falls, angle.times(-1.0).falls)
+        return later_of_larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()), falls)
 
     return start, nothing, update, held
 
@@ -102,12 +103,12 @@ def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
     def update(self: Any, memory: Memory, segment: Segment) -> Scalar:
         """The greater of what was, and of the greatest of the step."""
         del self
-        ends = later_of_larger(size(segment.start), size(segment.end))
+        ends, falls = later_of_larger(size(segment.start), size(segment.end)), False
         if segment.smooth is not False:
             cubic = segment.sample(size)
             top = cubic.greatest() if segment.inner else cubic.greatest_of_parabola()
-            ends = jnp.where(segment.smooth, top, ends)
-        return later_of_larger(memory.held, ends)
+            ends, falls = jnp.where(segment.smooth, top, ends), segment.smooth & cubic.falls
+        return later_of_larger(memory.held, ends, falls)
 
     return start, nothing, update, held
 

@@ -131,8 +131,8 @@ class MaxSlip:
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """The greatest of the step, from its cubic."""
-        slip = segment.output(lambda output: output.slip).greatest()
-        return later_of_larger(memory.held, smaller(slip, 1.0))
+        slip = segment.output(lambda output: output.slip)
+        return later_of_larger(memory.held, smaller(slip.greatest(), 1.0), slip.falls)
 
 
 @pytree
@@ -154,8 +154,9 @@ class Overshoot:
     def update(self, memory: Memory, segment: Segment) -> Sided:
         """The greatest of the step, from its cubic."""
         side, greatest = memory.held
-        value = segment.output().times(side).greatest()
-        return Sided(side, later_of_larger(greatest, smaller(value, highest(segment.end.output))))
+        signal = segment.output().times(side)
+        value = smaller(signal.greatest(), highest(segment.end.output))
+        return Sided(side, later_of_larger(greatest, value, signal.falls))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Overshoot."""
