@@ -3,6 +3,7 @@
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from diffabs.core.numerics import larger
@@ -77,10 +78,11 @@ class Effort:
 
 
 class Varied(NamedTuple):
-    """What is found so far, and the last torque."""
+    """What is found so far, the last torque, and the sign of its last change."""
 
     total: Scalar
     last: Scalar
+    way: Scalar
 
 
 @pytree
@@ -95,18 +97,22 @@ class Variation:
 
     def start(self, sample: Sample) -> Memory:
         """From the first torque."""
-        return Memory(held=Varied(0.0 * sample.control, sample.control))
+        return Memory(held=Varied(0.0 * sample.control, sample.control, 0.0 * sample.control))
 
     def update(self, memory: Memory, segment: Segment) -> Varied:
         """Add the jump before the step, and what the torque does in it: there and back, where it has an extremum."""
-        total, last = memory.held
+        total, last, way = memory.held
         u = segment.sample(lambda sample: sample.control)
         top, bottom = u.greatest(), -u.times(-1.0).greatest()
         # A step without a length, to an event, has no rise yet: which way it moves with the event its rate says.
         up = jnp.where(u.start == u.end, segment.sample_rates()[0].control > 0, u.end > u.start)
         low, high = jnp.where(up, u.start, u.end), jnp.where(up, u.end, u.start)
         beyond = jnp.where(top > high, top - high, 0.0) + jnp.where(bottom < low, low - bottom, 0.0)
-        return Varied(total + jnp.abs(u.start - last) + (high - low) + 2.0 * beyond, u.end)
+        # No jump may be one that a derivative is about to open: part of the change before it, which goes the same way.
+        jump, rise = jax.lax.stop_gradient((u.start - last, u.end - u.start))
+        way = jnp.where(jump != 0, jnp.sign(jump), way)
+        total += way * (u.start - last) + (high - low) + 2.0 * beyond
+        return Varied(total, u.end, jnp.where(rise != 0, jnp.sign(rise), way))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """What was found."""
@@ -126,7 +132,7 @@ class TorqueRate:
 
     def update(self, memory: Memory, segment: Segment) -> Varied:
         """The jump before the step, and the rates at its ends."""
-        greatest, last = memory.held
+        greatest, last, way = memory.held
         jump = jnp.abs(segment.start.control - last) / segment.step
         rates = (jnp.abs(rate.control) for rate in segment.sample_rates())
-        return Varied(larger(larger(greatest, jump), larger(*rates)), segment.end.control)
+        return Varied(larger(larger(greatest, jump), larger(*rates)), segment.end.control, way)
