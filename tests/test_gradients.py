@@ -218,7 +218,8 @@ def flat(name):
     @jax.jit
     def measured(x):
         run = d.measure(replace(loop, dict(zip(paths, unravel(x), strict=True))), solver, measures, key=KEY)
-        return jnp.stack([run.metrics[one] for one in measures])
+        end = run.ending.sample.t  # in place of what is never reached, which has no derivative
+        return jnp.stack([jnp.where(jnp.isinf(x), end, x) for x in (run.metrics[one] for one in measures)])
 
     return names, values, measured, jax.jit(jax.jacfwd(measured)), list(measures)
 
