@@ -9,6 +9,7 @@ import pytest
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, stops
 from diffabs.core.blocks import Series
+from diffabs.core.cubic import Cubic
 from diffabs.core.messages import Segment
 from diffabs.core.protocols import Shown
 from diffabs.objectives import PeakVoltage
@@ -88,3 +89,13 @@ def test_a_peak_of_the_torque_has_the_derivative_of_accurate_runs():
     for width in (3e-3, 1e-3, 3e-4):
         up, down = np.asarray(accurate(width * jnp.concatenate([jnp.eye(2), -jnp.eye(2)]))).reshape(2, 2)
         np.testing.assert_allclose(slope, (up - down) / (2 * width), rtol=1e-3)
+
+
+def test_a_cubic_without_a_root_ends_at_its_end_and_does_not_move():
+    """A signal outside its band at both ends enters it no earlier than at the end, where its set point may jump."""
+
+    def place(start):
+        return Cubic(start, 0.5, -0.3, -0.1).root()
+
+    assert jax.jvp(place, (1.0,), (1.0,)) == (1.0, 0.0)
+    assert jax.jvp(place, (-1.0,), (1.0,))[0] < 1.0

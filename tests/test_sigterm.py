@@ -71,7 +71,7 @@ def work():
     with files.unfinished(pathlib.Path(sys.argv[1]) / "half.tmp") as path:
         path.mkdir()
         (path / "data").write_text("half")
-        print("begun", flush=True)
+        print("begun", flush=True, file=sys.__stdout__)  # stdout itself is not of a command's work
         time.sleep(100)
 
 interrupt.begin()

@@ -54,8 +54,8 @@ class Cubic(NamedTuple):
         return x * x * (self.start / 2.0 + x * (c1 / 3.0 + x * (c2 / 4.0 + x * c3 / 5.0)))
 
     def root(self) -> Any:
-        """The place at which p changes its sign, where its ends have different ones; else any place in [0, 1]. Its
-        derivative is the implicit function theorem's."""
+        """The place at which p changes its sign, where its ends have different ones; else the end, 1. Its derivative is
+        the implicit function theorem's."""
         still = jax.lax.stop_gradient(self)
         spread = still.start - still.end
         x = clamp(still.start / jnp.where(spread == 0, 1.0, spread), 0.0, 1.0)
@@ -67,7 +67,9 @@ class Cubic(NamedTuple):
             newton = x - _quotient(value, still.slope(x))
             x = jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
         x = clamp(x - _quotient(self(x), still.slope(x)), 0.0, 1.0)
-        return _refined(x, self, still.slope(jax.lax.stop_gradient(x)))
+        x = _refined(x, self, still.slope(jax.lax.stop_gradient(x)))
+        changes = ((still.start < 0) != (still.end < 0)) | (still.start == 0)
+        return jnp.where(changes, x, 1.0)
 
     def greatest(self) -> Any:
         """The greatest value of p in [0, 1]. The derivative is that of p at the place of the extremum, which moves by a
