@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 import types
+import warnings
 
 import jax
 import numpy as np
@@ -67,6 +68,28 @@ def quick():
         patch.setattr(refusals, "stable_step", lambda loop: np.inf)
         patch.setitem(sys.modules, "diffabs.plot.tuning", types.SimpleNamespace(tuning=drawn))
         yield
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_warning_of_the_library_is_a_line(capsys):
+    console.waited(lambda: warnings.warn("of two\nlines", stacklevel=1), "warning")
+    assert capsys.readouterr().err == "warning: of two lines\n"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_a_start_with_a_one_sided_derivative_is_said_in_a_line(file):
+    """A relay that starts on its target: the run jumps there."""
+    relay = 'controller={type="relay",torque_max=9.0}'
+    changes = ("initial.slip=0.15", "reference.slip=0.15", relay, "tune.free={reference.slip=[0.1,0.2]}")
+    words = [word for change in changes for word in ("--set", change)]
+    found = run("tune", file(SMALL), *words, "--set", "tune.limits.overshoot=9.0")
+    (line,) = [line for line in found.stderr.splitlines() if "one side" in line]
+    assert line.startswith(
+        "warning: start: the relay starts on its target, where its first state jumps (in 2 of 2 runs)"
+    )
+    assert "the derivative by reference.slip is" in line
+    assert ".py" not in found.stderr
 
 
 @pytest.fixture

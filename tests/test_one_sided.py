@@ -1,6 +1,7 @@
 """Derivatives by delays and clocks: right, from the side that there is, or an error that names the parameter."""
 
 import types
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,11 @@ import pytest
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, stops
+from diffabs.core.pytree import get, param, parameters, pytree
+from diffabs.tune import one_sided
 
 STEP, PERIOD, WIDTH = 5e-4, 2e-3, 2e-7
+SOLVER = d.FixedStep(STEP, 0.01)
 MEASURED = {
     "distance": objectives.StopDistance(),
     "peak": objectives.MaxSlip(),
@@ -20,13 +24,12 @@ MEASURED = {
 PID = controllers.PID(kp=20.0, ki=200.0, low=0.2, high=6.0)
 
 
-def braking(**parts):
+def braking(slip=0.03, **parts):
     return d.Loop(
         plant=plants.MirroredRig(),
-        initial=d.BrakeStart(speed=11.0, slip=0.03),
+        initial=d.BrakeStart(speed=11.0, slip=slip),
         stop=stops.SpeedReached(speed=10.0),
-        feedforward=controllers.HoldingInput(),
-        **{"reference": references.FixedSlip(slip=0.15), **parts},
+        **{"reference": references.FixedSlip(slip=0.15), "feedforward": controllers.HoldingInput(), **parts},
     )
 
 
@@ -170,22 +173,96 @@ def test_a_relay_on_its_target_is_released():
     assert [applied(0.2 + one) for one in (-1e-9, 0.0, 1e-9)] == [1.0, 0.0, 0.0]
 
 
-def test_points_with_one_side_are_named():
-    from diffabs.tune.one_sided import one_sided, warn
+RELAY, SLIDING = controllers.Relay(torque_max=9.0), controllers.SlidingMode(gain=9.0, high=9.0)
+POINTS = {  # loop; which free parameters are named; a part of what is said
+    "torque": (
+        braking(controller=RELAY, actuator=actuators.Limits(high=9.0)),
+        {"controller.torque_max", "actuator.high"},
+        "controller.torque_max and actuator.high are equal",
+    ),
+    "gain": (
+        braking(controller=SLIDING, feedforward=controllers.NoFeedforward()),
+        {"controller.gain", "controller.high"},
+        "controller.gain reaches controller.high and no further",
+    ),
+    "gain, constant": (
+        braking(
+            controller=controllers.SlidingMode(gain=9.0, low=-6.5), feedforward=controllers.ConstantInput(value=2.5)
+        ),
+        {"controller.gain", "controller.low", "feedforward.value"},
+        "controller.gain reaches controller.low and no further",
+    ),
+    "relay": (
+        braking(slip=0.15, controller=controllers.Relay()),
+        {"initial.slip", "reference.slip"},
+        "the relay starts on its target, where its first state jumps",
+    ),
+    "sampled relay": (
+        braking(slip=0.15, controller=controllers.Sampled(controller=controllers.Relay(), delay=3e-4)),
+        {"initial.slip", "reference.slip"},
+        "the relay starts on its target, where its first state jumps",
+    ),
+    "delay": (DELAYS[0].values[0], {"controller.delay"}, "controller.delay is zero"),
+    "delay, period": (
+        braking(controller=controllers.Sampled(controller=PID, period=PERIOD, delay=PERIOD)),
+        {"controller.delay"},
+        "controller.delay and controller.period are equal",
+    ),
+    "delay, steps": (
+        braking(controller=controllers.SampledOnGrid(controller=PID, delay=STEP)),
+        {"controller.delay"},
+        "controller.delay is a whole number of steps",
+    ),
+    "pure delay": (
+        braking(controller=PID, actuator=actuators.Delay(time=STEP)),
+        {"actuator.time"},
+        "actuator.time and the step are equal",
+    ),
+    "PID": (braking(controller=PID, actuator=actuators.Limits()), set(), ""),
+    "relay, off its target": (braking(controller=controllers.Relay(), actuator=actuators.Limits()), set(), ""),
+    "usual sliding mode": (braking(controller=controllers.SlidingMode(), actuator=actuators.Limits()), set(), ""),
+    "usual PID": (braking(controller=controllers.PID(), actuator=actuators.Limits()), set(), ""),
+    "held gain": (braking(controller=SLIDING), set(), ""),  # what holds the wheel is added: always at the limit
+}
 
-    relay = controllers.Relay(torque_max=9.0)
-    loop = braking(controller=relay, actuator=actuators.Limits(high=9.0))
-    paths = {path for path, _ in one_sided(loop)}
-    assert {"controller.torque_max", "actuator.high"} <= paths
-    with pytest.warns(UserWarning, match="start: the derivative by controller.torque_max is that of one side"):
-        warn(loop, ["controller.torque_max"], "start")
-    assert {path for path, _ in one_sided(DELAYS[0].values[0])} == {"controller.delay"}
-    for usual in (PID, controllers.SlidingMode(), controllers.PID()):
-        assert not list(one_sided(braking(controller=usual, actuator=actuators.Limits())))
-    assert {path for path, _ in one_sided(braking(controller=controllers.SlidingMode(gain=9.0, high=9.0)))} == {
-        "controller.gain",
-        "controller.high",
-    }
+
+def warned(subject, free, batch=None):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        one_sided.warn(subject, {path: get(subject, path) for path in free}, batch or d.Batch(), SOLVER, "start")
+    return [str(warning.message) for warning in told]
+
+
+@pytest.mark.parametrize(("loop", "paths", "said"), POINTS.values(), ids=POINTS)
+def test_points_with_one_side_are_named(loop, paths, said):
+    free = [path for path, spec, value in parameters(loop) if spec.tunable and np.isfinite(value).all()]
+    told = warned(loop, free)
+    assert len(told) == bool(paths)
+    for line in told:
+        assert line.startswith(f"start: {said}, so the derivative by ")
+        assert set(line.partition(" by ")[2].partition(" is that of one side; ")[0].split(" and ")) == paths
+        assert "a search may end there without a minimum: start it from other values" in line
+    assert warned(loop, [path for path in free if path not in paths]) == []
+
+
+def test_points_with_one_side_are_named_in_any_run_and_subject():
+    """One run of a batch may stand on the point, and what is free need not be a parameter of the loop."""
+    loop = braking(controller=controllers.Relay())
+    batch = d.Batch({"initial.slip": np.array([0.1, 0.15, 0.2])})
+    (told,) = warned(loop, ["reference.slip", "controller.band"], batch)
+    assert told.startswith("start: the relay starts on its target, where its first state jumps (in 1 of 3 runs), so ")
+    assert "by reference.slip is that" in told
+
+    @pytree
+    class Twice:
+        half: float = param(default=4.5, unit="N m")
+
+        def closed(self):
+            controller = controllers.SlidingMode(gain=2 * self.half, high=9.0)
+            return braking(controller=controller, feedforward=controllers.NoFeedforward())
+
+    (told,) = warned(Twice(), ["half"])
+    assert "by half is that" in told
 
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])

@@ -9,6 +9,7 @@ import sys
 import textwrap
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, NoReturn, TypeVar
 
@@ -193,7 +194,8 @@ def waited(
 
     def run() -> None:
         try:
-            with contextlib.redirect_stdout(sys.stderr):  # a part from outside may print: stdout is for the result
+            # a part from outside may print: stdout is for the result
+            with contextlib.redirect_stdout(sys.stderr), warnings_in_lines():
                 result.append(work())
         except BaseException as error:
             errors.append(error)
@@ -211,6 +213,14 @@ def waited(
     if errors:
         raise errors[0]
     return result[0]
+
+
+@contextlib.contextmanager
+def warnings_in_lines() -> Iterator[None]:
+    """Say what the library warns of in a line, without the file that warns."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_: say(f"warning: {' '.join(str(message).split())}")
+        yield
 
 
 def _pressed_while(thread: threading.Thread) -> bool:

@@ -36,7 +36,8 @@ def explore(
         there = _listening(port)
         told = {"ready": lambda url: console.say(f"{url} (on this machine only; Ctrl-C ends it)"), "browser": browser}
         if not interrupt.pressed():  # while the framework was imported
-            server.serve(scenario, _tools(), pathlib.Path.cwd(), there, thread=console.WORKER, **told)
+            with console.warnings_in_lines():
+                server.serve(scenario, _tools(), pathlib.Path.cwd(), there, thread=console.WORKER, **told)
             interrupt.pressed()
         raise KeyboardInterrupt  # nothing else ends it
 

@@ -1,55 +1,89 @@
 """Points at which a derivative by a parameter is that of one side alone (`docs/gradients.md` says of which)."""
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from diffabs.actuators import Delay
+from diffabs.controllers import ConstantInput, NoFeedforward, Relay, SampledOnGrid, SlidingMode
 from diffabs.core.loop import Loop
+from diffabs.core.pytree import arrayed, replace
+from diffabs.simulate.batch import Batch
+from diffabs.simulate.solution import FixedStep, Solver
+from diffabs.tune.problem import built
+
+ROUNDING = 64.0  # precisions: numbers that are equal
+ADVICE = "a search may end there without a minimum: start it from other values, or hold one of these parameters"
 
 
-def one_sided(loop: Loop) -> Iterator[tuple[str, str]]:
-    """Yield the path of each parameter at whose value a derivative is one-sided, and why."""
+def pairs(loop: Loop, solver: Solver) -> Iterator[tuple[str, Any, Any]]:
+    """Yield, for each point of `loop` with a one-sided derivative, its name and the two numbers that are equal there.
+
+    The name depends on the parts of the loop alone, so both numbers may be traced."""
     sampled: Any = loop.controller
     inner: Any = getattr(sampled, "controller", sampled)
     prefix = "controller." if inner is sampled else "controller.controller."
     if inner is not sampled and hasattr(sampled, "delay"):
-        period = getattr(sampled, "period", getattr(sampled, "sampling_period", None))
-        for value, name in ((0.0, "zero"), (period, "the period")):
-            if _same(sampled.delay, value):
-                yield "controller.delay", f"it is {name}"
-    for name, sign, limit in (("torque_max", 1, "high"), ("torque_min", -1, "low")):
-        name = name if hasattr(inner, name) else limit  # a relay names its two torques otherwise
-        if hasattr(inner, "boundary") and _same(sign * inner.gain, getattr(inner, name)):
-            yield from ((f"{prefix}{one}", f"gain and {name} are equal in size") for one in ("gain", name))
+        period = next(name for name in ("period", "sampling_period") if hasattr(sampled, name))
+        yield "controller.delay is zero", sampled.delay, 0.0
+        yield f"controller.delay and controller.{period} are equal", sampled.delay, getattr(sampled, period)
+    if isinstance(sampled, SampledOnGrid):
+        steps = jnp.round(sampled.delay / solver.step)
+        yield "controller.delay is a whole number of steps", sampled.delay, steps * solver.step
+    for path, one in _actuators(loop.actuator):
+        if isinstance(one, Delay) and isinstance(solver, FixedStep):
+            yield f"{path}.time and the step are equal", one.time, solver.step
+    for sign, torque, limit in ((1, "torque_max", "high"), (-1, "torque_min", "low")):
+        name = torque if hasattr(inner, torque) else limit
+        if isinstance(inner, SlidingMode) and isinstance(loop.feedforward, NoFeedforward | ConstantInput):
+            constant = getattr(loop.feedforward, "value", 0.0)
+            text = f"{prefix}gain reaches {prefix}{name} and no further"
+            yield text, sign * inner.gain + constant, getattr(inner, name)
         for path, actuator in _actuators(loop.actuator):
-            if (
-                hasattr(inner, name)
-                and hasattr(actuator, limit)
-                and _same(getattr(inner, name), getattr(actuator, limit))
-            ):
+            if hasattr(inner, name) and hasattr(actuator, limit):
                 text = f"{prefix}{name} and {path}.{limit} are equal"
-                yield from ((one, text) for one in (f"{prefix}{name}", f"{path}.{limit}"))
+                yield text, getattr(inner, name), getattr(actuator, limit)
+    if isinstance(inner, Relay):
+        signals = loop.signals(0.0, loop.start())
+        yield "the relay starts on its target, where its first state jumps", signals.measured[0], signals.sample.target
 
 
-def warn(loop: Loop, free: Iterable[str], where: str) -> None:
-    """Warn of the free parameters at which a derivative is one-sided."""
-    free = set(free)
-    for path, why in one_sided(loop):
-        if path in free:
-            warnings.warn(f"{where}: the derivative by {path} is that of one side, since {why}", stacklevel=3)
+def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, where: str) -> None:
+    """Warn of the parameters of `subject` by whose `values`, by path, a derivative of some run is one-sided."""
+
+    def compared(values: Mapping[str, Any]) -> Any:
+        """Both numbers of each pair in each run, (2, runs, pairs)."""
+        loop = arrayed(built(replace(subject, values)))
+        both = batch.each(loop, lambda loop, _: [jnp.stack(two) for _, *two in pairs(loop, solver)])
+        return jnp.moveaxis(jnp.stack(both, axis=1), 2, 0)
+
+    names = [name for name, *_ in pairs(built(subject), solver)]
+    if not names:
+        return
+    values = {path: jnp.asarray(value, float) for path, value in values.items()}
+    x, y = np.asarray(compared(values))
+    small = ROUNDING * np.finfo(x.dtype).eps
+    equal = np.isfinite(x) & np.isclose(x, y, rtol=small, atol=0.0)
+    if not equal.any():
+        return
+    slopes = jax.jacfwd(lambda values: jnp.subtract(*compared(values)))(values)
+    moves = {path: abs(np.asarray(slope)) > small for path, slope in slopes.items()}  # and not the rounding of zero
+    for i, name in enumerate(names):
+        moving = [path for path, ones in moves.items() if ones[:, i][equal[:, i]].any()]
+        if moving:
+            runs = f" (in {equal[:, i].sum()} of {len(equal)} runs)" if len(equal) > 1 else ""
+            side = f"the derivative by {' and '.join(moving)} is that of one side"
+            warnings.warn(f"{where}: {name}{runs}, so {side}; {ADVICE}", stacklevel=3)
 
 
 def _actuators(actuator: Any) -> Iterator[tuple[str, Any]]:
-    """An actuator, or those of a series, by path."""
+    """Yield an actuator, or those of a series, by path."""
     series = getattr(actuator, "blocks", None)
     if isinstance(series, tuple):
         yield from ((f"actuator.blocks.{i}", one) for i, one in enumerate(series))
     else:
         yield "actuator", actuator
-
-
-def _same(x: Any, y: Any) -> bool:
-    """Whether two numbers are equal to rounding, and finite."""
-    return y is not None and bool(np.all(np.isfinite(y)) and np.allclose(x, y, rtol=1e-12, atol=0.0))

@@ -7,6 +7,7 @@ import numpy as np
 
 from diffabs.core.bijectors import Range, space
 from diffabs.core.protocols import Objective
+from diffabs.core.pytree import get
 from diffabs.core.validity import check
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.objectives import usual
@@ -62,7 +63,8 @@ def tune(
     >>> print(f"{found.values['controller.torque']:.1f} N m, {found.objective[0]:.2f} to {found.objective[1]:.2f} s")
     85.6 N m, 1.14 to 0.18 s
 
-    Warns where a derivative by a free parameter is that of one side (`docs/gradients.md`), at the start or the result.
+    Warns where a derivative by a free parameter is that of one side (`docs/gradients.md`), in a run of the start or the
+    result: a search may end there without a minimum.
 
     Raises:
         ValueError: a path, range, metric or batch that does not fit; a lane that must not be run whatever is tuned.
@@ -82,12 +84,12 @@ def tune(
         mode=method.mode,
         engine=engine,
     )
-    one_sided.warn(built(subject), free, "start")
+    one_sided.warn(subject, {path: get(subject, path) for path in free}, problem.batch, solver, "start")
     try:
         found = Search(problem, method, progress, stopping).result()
     except NoCompiler as error:
         raise EngineError.of(error) from None
-    one_sided.warn(found.loop, free, "result")
+    one_sided.warn(subject, found.values, problem.batch, solver, "result")
     return found
 
 
