@@ -160,6 +160,16 @@ def test_a_map_of_starts_is_that_of_xla():
     np.testing.assert_allclose(maps[0].time, maps[1].time, rtol=1e-12)
 
 
+class TestSweep:
+    def test_a_library_that_cannot_be_written_is_said(self, monkeypatch, tmp_path):
+        """As on a full disk: it is compiled after everything was traced."""
+        (tmp_path / "file").touch()
+        monkeypatch.setenv(binaries.CACHE, str(tmp_path / "file" / "kernel"))
+        study = dataclasses.replace(STUDY, engine="kernel", objectives={"iae": IAE()})
+        with pytest.raises(ValueError, match=r"^engine = 'kernel' is not possible: no kernel in .*: Not a directory$"):
+            sweep.sweep(study, tmp_path / "out")
+
+
 class TestRare:
     @pytest.mark.slow
     @pytest.mark.parametrize("gradients", [pytest.param(False, marks=pytest.mark.slow), True])

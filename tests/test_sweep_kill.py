@@ -291,7 +291,7 @@ def test_a_disk_that_is_really_full(longer, tmp_path):
     assert (0 < int(count) < 100, status, unfinished) == (True, "1", "0")
     assert longer.digest in digest
     lines = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert lines == ["error: [Errno 28] No space left on device; finished chunks stay, --resume goes on"]
+    assert lines == [f"error: {out}: No space left on device; finished chunks stay, --resume goes on"]
     assert "Traceback" not in done.stderr
 
 

@@ -24,6 +24,7 @@ from diffabs.core.values import ScenarioError, unknown
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads
+from diffabs.simulate.engine import EngineError
 from diffabs.simulate.refusals import first_line
 
 if TYPE_CHECKING:
@@ -126,11 +127,12 @@ def warn_of_strays(found: "Results") -> None:
 
 @contextlib.contextmanager
 def _continued(out: pathlib.Path, resume: bool) -> Iterator[None]:
-    """A full disk and Ctrl-C say how to go on."""
+    """A full disk, a kernel that cannot be compiled any more, and Ctrl-C say how to go on."""
     try:
         yield
-    except OSError as error:
-        console.fail(f"{' '.join(str(error).split())}; finished chunks stay, --resume goes on", console.FAILED)
+    except (OSError, EngineError) as error:
+        where = f"{out}: {error.strerror}" if isinstance(error, OSError) and not error.filename else str(error)
+        console.fail(f"{' '.join(where.split())}; finished chunks stay, --resume goes on", console.FAILED)
     except KeyboardInterrupt:
         if not any((out / "chunks").glob("*.parquet")):
             raise

@@ -5,6 +5,7 @@ its own. A program sharded over the devices (`shard_map`) is another one for eac
 always the same, so a lane's result does not depend on D. Without alternatives of parts a block is a whole chunk; with
 them a chunk is sorted into blocks of an eighth, the last of each structure filled up with copies."""
 
+import contextlib
 import dataclasses
 import functools
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +16,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.batch import Batch, run_batch
+from diffabs.simulate.engine import EngineError
 from diffabs.simulate.refusals import refusals
 from diffabs.sweep.study import FLAGS, Study, noise_key, numbers, precision
 
@@ -87,7 +90,7 @@ class Runner:
     def _alone(self, loop: Any, program: Any, block: _Block, device: Any) -> Columns:
         with jax.default_device(device):
             asked = refusals(loop, block.values, self.study.solver)
-        with precision(self.study.dtype):
+        with precision(self.study.dtype), _compiling():
             given = self._arguments(block, asked.accepted)
             found = jax.device_get(program(*jax.device_put(given, device)))
         return found | {"refused": asked.texts.astype(object)}
@@ -98,7 +101,7 @@ class Runner:
 
     def _compiled(self, names: tuple[str, ...], block: _Block) -> None:
         """Have the program of some parts traced, and its kernel compiled."""
-        with precision(self.study.dtype):
+        with precision(self.study.dtype), _compiling():
             self._program(names).lower(*self._arguments(block, np.ones(self.size, bool)))
 
     def _variant(self, names: tuple[str, ...]) -> Any:
@@ -112,6 +115,15 @@ class Runner:
             study = dataclasses.replace(self.study, objectives=objectives)
             self._programs[names] = jax.jit(partial(_block, study, loop))
         return self._programs[names]
+
+
+@contextlib.contextmanager
+def _compiling() -> Iterator[None]:
+    """Raises EngineError where a kernel turns out not to be possible once it is compiled: a full disk, say."""
+    try:
+        yield
+    except NoCompiler as error:
+        raise EngineError.of(error) from None
 
 
 @functools.lru_cache(maxsize=4)
