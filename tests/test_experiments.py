@@ -261,6 +261,37 @@ def test_a_stronger_motor_raises_the_bound_as_the_root_of_its_power(monkeypatch)
     assert 6 < float(found[0].gear) < 390
 
 
+@pytest.mark.parametrize(
+    ("only", "known", "estimated"),
+    [  # whether it is met, near the floor [%], worst corner [%], proof; as docs/real-rig.md says of more points
+        ("published", ("no", 0, 143, "unstable"), ("no", 0, 150, "unstable")),
+        ("tuned-cvar", ("yes", 99.9, 20, "proved"), ("no", 55, 96, "proved")),
+    ],
+)
+def test_the_committed_controllers_are_judged_and_proved_again(tmp_path, monkeypatch, only, known, estimated):
+    monkeypatch.syspath_prepend(FOLDER)
+    module = experiment("real_rig_again")
+    judging = module.Judging(samples=256, fewer=256, block=256, corner_seeds=1)
+    found = module.main(module.Config(judging=judging, only=only, out=str(tmp_path)))
+    for speed, (meets, near, corner, said) in (("known", known), ("estimated", estimated)):
+        ((name, one),) = found[speed].items()
+        row = module.row(one)
+        assert name.startswith(only)
+        assert (row["meets"], one["proof"]["said"]) == (meets, said)
+        assert float(row["deviation near the floor"]) == pytest.approx(near, abs=10)  # 3 standard deviations of 55 %
+        assert one["corners"]["corners"] == {"known": 512, "estimated": 256}[speed]
+        assert one["corners"]["overshoot [%]"] == pytest.approx(corner, rel=0.1)
+        assert row["locks, not stopped"] == "0, 0"
+    if only == "tuned-cvar":
+        assert one["near the worst corner, overshoot [%]"] > 50
+        corner = one["corners"]["at"]
+        box, near = module.Box(), module.near_corner(module.Config(judging=judging), "estimated", corner)
+        for path, (low, high) in box.ranges("estimated").items():
+            assert np.all(np.abs(near[path] - corner[path]) <= 0.2 * (high - low))
+            assert np.all((near[path] >= low) & (near[path] <= high))
+    assert list(tmp_path.glob("*.json"))
+
+
 @pytest.mark.parametrize(("resistance", "watts"), [(3.0, 192.0), (1.0, 576.0), (0.3, 1800.0), (0.1, 2520.0)])
 def test_the_power_of_a_motor_knows_the_limit_of_its_current(monkeypatch, resistance, watts):
     """The greatest I (U - R I) over currents within 60 A, on a grid."""

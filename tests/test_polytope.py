@@ -1,9 +1,12 @@
 """Boxes of parameters to polytopes: every system of the box is a convex combination of the vertices."""
 
+import itertools
+
 import jax
 import numpy as np
 import pytest
 from scipy.optimize import linprog
+from scipy.spatial import ConvexHull, QhullError
 
 from diffabs.actuators import Lag
 from diffabs.core.pytree import param, pytree, replace
@@ -115,6 +118,44 @@ def test_corners_are_spread():
     assert len(p.corners) == p.vertices == 4
     np.testing.assert_allclose(np.ptp(p.A), 1.2, rtol=1e-6)
     assert furthest(model, UNIT, p) < 1e-12
+
+
+BENT = np.random.default_rng(0).normal(size=(6, 6, 6))
+
+
+@pytree
+class Cube:
+    """(A, B) are the six parameters, bent by 1e-14, and A[0, 1] bulges by 0.1 between the ends of the first."""
+
+    a: float = param(default=0.5, unit="1")
+    b: float = param(default=0.5, unit="1")
+    c: float = param(default=0.5, unit="1")
+    d: float = param(default=0.5, unit="1")
+    e: float = param(default=0.5, unit="1")
+    f: float = param(default=0.5, unit="1")
+
+    states, period = ("x", "y"), None
+
+    def matrices(self):
+        x = jax.numpy.stack([self.a, self.b, self.c, self.d, self.e, self.f])
+        y = x + 1e-14 * jax.numpy.einsum("kij,i,j->k", BENT, x, x)
+        y = y.at[1].add(0.4 * x[0] * (1 - x[0]))
+        return StateSpace(y[:4].reshape(2, 2), y[4:].reshape(2, 1))
+
+
+def test_corners_whose_facets_merge_by_rounding_are_judged_by_linear_programs():
+    """The facets of a cube in six dimensions are flat to rounding: Qhull gives up on its 64 corners."""
+    over = dict.fromkeys("abcdef", (0.0, 1.0))
+    ends = np.array(list(itertools.product((0.0, 1.0), repeat=6)))
+    with pytest.raises(QhullError):
+        ConvexHull(ends + 1e-14 * np.einsum("kij,ni,nj->nk", BENT, ends, ends))
+    p = polytope(Cube(), over, grid=3)
+    assert p.vertices == 64
+    assert (
+        p.coverage.checked < 1000
+    )  # systems, by a linear program each: of facets all are looked at, tens of thousands
+    np.testing.assert_allclose(p.coverage.spread, 1.2, rtol=1e-6)
+    assert furthest(Cube(), over, p) < 1e-9
 
 
 def test_bulge_between_grid_points():
