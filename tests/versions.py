@@ -13,7 +13,8 @@ import sys
 
 ROOT = pathlib.Path(__file__).parent.parent
 TESTS = ("pytree", "linearize", "integrate", "rollout", "gradients", "batch", "checkpoints", "riccati", "blocks",
-         "tsit5", "adaptive", "kept", "kernel", "kernel_native", "kernel_tangents", "tune", "sweep")  # fmt: skip
+         "tsit5", "adaptive", "kernel", "kernel_start",
+         "kernel_native", "kernel_tangents", "tune", "sweep")  # fmt: skip
 
 
 def environment(folder: pathlib.Path, python: str, jax: str) -> pathlib.Path:

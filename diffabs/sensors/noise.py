@@ -161,7 +161,8 @@ class Bias:
 class Quantisation:
     """measured = q round(true/q) for each channel; q = 0 leaves the channel alone.
 
-    The derivative is the true one almost everywhere: 0 in the signal, round(true/q) in q. It says nothing of the jumps.
+    The derivative in the signal is that of a staircase, 0: it says nothing of the jumps. A run does not depend smoothly
+    on q: differentiating it by q raises a ValueError.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0, tunable=False)
