@@ -22,6 +22,16 @@ COMMANDS = {
 }
 
 
+# pages whose code saves a figure, and under which name
+PAGES = {
+    "quick-start": "run.png",
+    "identify": "fit.png",
+    "journeys/own-plant": "run.png",
+    "journeys/own-reference": "run.png",
+    "journeys/own-actuator": "run.png",
+}
+
+
 def main() -> None:
     """Draw all of them, each in a folder that goes away."""
     sys.path.insert(0, str(ROOT / "tests"))
@@ -33,9 +43,10 @@ def main() -> None:
             shutil.copytree(ROOT / source, folder, dirs_exist_ok=True) if source != "." else None
             subprocess.run([sys.executable, "-m", "diffabs", *command.split(), "--quiet"], cwd=folder, check=True)
             shutil.copy(pathlib.Path(folder) / picture, FIGURES / f"{page}.png")
-    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
-        pages.printed((ROOT / "docs" / "quick-start.md").read_text(encoding="utf-8"), "quick-start.md")
-        shutil.copy("run.png", FIGURES / "quick-start.png")
+    for page, picture in PAGES.items():
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            pages.printed((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8"), f"{page}.md")
+            shutil.copy(picture, FIGURES / f"{pathlib.Path(page).name}.png")
 
 
 if __name__ == "__main__":

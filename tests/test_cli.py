@@ -377,11 +377,12 @@ def test_show_prints_a_scenario_to_start_from(tmp_path):
     assert first["title"] == second["title"] == "slip-lmi with plant.mass=6.2, " + ", ".join(SHORT[1::2])
 
 
-def test_completion_offers_commands_and_scenarios():
+def test_completion_offers_commands_scenarios_fields_and_families():
     code = """
 import contextlib, os, sys
 from diffabs.cli.main import main
-for words in ("diffabs id", "diffabs simulate slip-"):
+for words in ("diffabs id", "diffabs simulate slip-", "diffabs simulate slip-lmi --set plant.ma",
+              "diffabs simulate --set plant.ma", "diffabs list ro"):
     os.environ |= {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
     sys.argv = ["diffabs"]
     with contextlib.suppress(SystemExit):
@@ -390,8 +391,11 @@ for words in ("diffabs id", "diffabs simulate slip-"):
 """
     env = os.environ | {"_DIFFABS_COMPLETE": "complete_bash"}
     done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
-    command, scenario = (said.split() for said in done.stdout.split("END")[:2])
+    command, scenario, field, none, family = (said.split() for said in done.stdout.split("END")[:5])
     assert command == ["identify"]
+    assert field == ["plant.mass="]
+    assert none == []
+    assert family == ["roads"]
     assert set(scenario) == {"slip-cured", "slip-estimator", "slip-lmi", "slip-real"}
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import commands
 import jax
@@ -113,8 +114,11 @@ class TestBeforeARun:
             if fine:
                 assert d.check(lane, SOLVER) is lane
             else:
-                with pytest.raises(ValueError, match=next(iter(values)).split(".")[0]):
+                with pytest.raises(ValueError, match=next(iter(values)).split(".")[0]) as checked:
                     d.check(lane, SOLVER)
+                for run in (d.measure, d.rollout):
+                    with pytest.raises(ValueError, match=re.escape(str(checked.value))):
+                        run(lane, SOLVER, {})
 
     def test_numbers_of_a_tuple_are_asked_like_those_of_an_array(self, any_step):
         """Inside the compiled call a gain given as a tuple is a tuple of traced numbers."""
@@ -171,6 +175,12 @@ class TestBeforeARun:
         assert (many < 3 * modes).all()
 
 
+    def test_an_impossible_objective_is_refused(self):
+        late = {"settled": objectives.SettlingTime(share=-0.1)}
+        with pytest.raises(ValueError, match=r"objectives\.settled\.share = -0\.1 is outside"):
+            d.measure(RIG, SOLVER, late)
+
+
 class TestAfterARun:
     @pytest.mark.parametrize("step", [1e-4, 1e-3])
     def test_an_unstable_step_is_seen_although_every_number_is_finite(self, step):
@@ -184,13 +194,14 @@ class TestAfterARun:
         assert not np.asarray(many.stopped).any()
         assert all(np.isnan(x).all() for x in many.metrics.values())
 
-    def test_a_start_beyond_the_stop_is_no_run(self):
+    def test_a_traced_start_beyond_the_stop_is_no_run(self):
+        braked = jax.jit(lambda start: d.measure(replace(RIG, {"initial.speed": start}), SOLVER, BRAKING))
         for start in (1.0, 5 / 3.6):
-            found = d.measure(replace(RIG, {"initial.speed": start}), SOLVER, BRAKING)
+            found = braked(start)
             assert found.diverged
             assert np.isnan(found.metrics["stop_time"])
-        fallen = replace(d.balancing(), {"initial.theta": 2.0})
-        assert d.measure(fallen, SOLVER, BALANCE).diverged
+        balanced = jax.jit(lambda start: d.measure(replace(d.balancing(), {"initial.theta": start}), SOLVER, BALANCE))
+        assert balanced(2.0).diverged
 
     def test_a_metric_outside_its_range_is_a_run_that_diverged(self):
         for part in (*BRAKING.values(), *BALANCE.values()):

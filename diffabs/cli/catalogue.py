@@ -13,20 +13,28 @@ from diffabs.scenario.scenario import dump, header, names
 PLURALS = {f"{name}s": name for name in ("plant", "road", "controller", "reference", "actuator", "sensor")}
 PLURALS |= {"feedforward": "feedforward", "antiwindup": "antiwindup", "initial": "initial"}
 PLURALS |= {"stops": "stop", "objectives": "objective"}
+FAMILIES = (*PLURALS, "scenarios")
+
+
+def families_like(incomplete: str) -> list[str]:
+    """Completions of a family's name."""
+    return [name for name in FAMILIES if name.startswith(incomplete)]
 
 
 def list_parts(
     family: Annotated[
-        str | None, typer.Argument(metavar="[FAMILY]", help=f"{', '.join(PLURALS)} or scenarios.")
+        str | None,
+        typer.Argument(metavar="[FAMILY]", help=f"{', '.join(PLURALS)} or scenarios.", autocompletion=families_like),
     ] = None,
     as_json: console.Json = False,
 ) -> None:
-    """Every part with its parameters, defaults, units and ranges; every packaged scenario."""
+    """List all parts and packaged scenarios.
+
+    A part is listed with its parameters, their defaults, units and ranges."""
     with console.guarded():
-        there = (*PLURALS, "scenarios")
-        if family is not None and family not in there:
-            raise values.unknown(f"there is no family {values.shown(family)}", family, there)
-        result = {name: _listed(name) for name in there if family in (None, name)}
+        if family is not None and family not in FAMILIES:
+            raise values.unknown(f"there is no family {values.shown(family)}", family, FAMILIES)
+        result = {name: _listed(name) for name in FAMILIES if family in (None, name)}
         if as_json:
             return show.as_json(result)
         for name, members in result.items():
@@ -41,7 +49,9 @@ def show_scenario(
         pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write to this file; default: stdout.")
     ] = None,
 ) -> None:
-    """A scenario as TOML with every field, to start one's own from."""
+    """Print a scenario as TOML with every field.
+
+    One's own can start from it."""
     with console.guarded():
         targets.check_scenario_file(out)
         text = dump(console.loaded(scenario, changes, integrated=False))

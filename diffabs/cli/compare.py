@@ -23,7 +23,9 @@ def compare(
     metric: Annotated[list[str] | None, typer.Option(help="Only this metric; may be repeated.")] = None,
     as_json: console.Json = False,
 ) -> None:
-    """What the second sweep does better or worse than the first, on common random numbers."""
+    """Compare two sweeps on common random numbers.
+
+    It says what the second does better or worse than the first."""
     with console.guarded():
         console.need_extra("sweep")
         from diffabs.sweep import Results

@@ -9,6 +9,7 @@ import sys
 import textwrap
 import threading
 import time
+import tomllib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, NoReturn, TypeVar
@@ -21,7 +22,7 @@ from diffabs.core import files, interrupt, provenance, stopwatch
 from diffabs.core.values import ScenarioError
 from diffabs.scenario import outside
 from diffabs.scenario.model import model
-from diffabs.scenario.scenario import Scenario, load, names
+from diffabs.scenario.scenario import Scenario, dump, load, names
 
 T = TypeVar("T")
 
@@ -46,11 +47,35 @@ def scenarios_like(incomplete: str) -> list[str]:
     return [name for name in names() if name.startswith(incomplete)]
 
 
+def fields_like(context: typer.Context, incomplete: str) -> list[str]:
+    """Completions of --set: the fields of the scenario on the line, as `show` writes them."""
+    words = [context.params.get("scenario"), *context.args]  # an option without its value leaves words unread
+    try:
+        tables = tomllib.loads(dump(load(next(filter(None, words)))))
+    except (StopIteration, OSError, ValueError):
+        return []
+    return [f"{path}=" for path in _paths(tables) if path.startswith(incomplete)]
+
+
+def _paths(tables: dict[str, Any], above: str = "") -> Iterator[str]:
+    for name, value in tables.items():
+        if isinstance(value, dict):
+            yield from _paths(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}"
+
+
 ScenarioName = Annotated[
     str, typer.Argument(help="A TOML file, or the name of a packaged scenario.", autocompletion=scenarios_like)
 ]
 Changes = Annotated[
-    list[str] | None, typer.Option("--set", metavar="SECTION.FIELD=VALUE", help="Override a field; may be repeated.")
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="SECTION.FIELD=VALUE",
+        help="Override a field; may be repeated.",
+        autocompletion=fields_like,
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="One JSON document on stdout, nothing else there.")]
 

@@ -24,7 +24,9 @@ def design(
     as_json: console.Json = False,
     out: Out = None,
 ) -> None:
-    """Find the state feedback with the least guaranteed cost over the ranges of [design], and prove it."""
+    """Find the gain with the least guaranteed cost.
+
+    It is a state feedback for all systems within the ranges of [design], and its cost is proved."""
     with console.guarded(), certificates.reported():
         with targets.new_file(out, "--out") as file:
             task = _task(scenario, changes or (), weighed=True)
@@ -53,7 +55,9 @@ def certify(
     as_json: console.Json = False,
     out: Out = None,
 ) -> None:
-    """Prove, or disprove, that a gain is stable over the ranges of [design], however fast the parameters vary."""
+    """Prove that a gain is stable over the ranges of [design].
+
+    The proof, or what stands against it, holds however fast the parameters vary."""
     with console.guarded(), certificates.reported():
         with targets.new_file(out, "--out") as file:
             task = _task(scenario, changes or (), gain)
@@ -74,8 +78,9 @@ def verify(
     ] = 6.0,
     as_json: console.Json = False,
 ) -> None:
-    """Prove a saved certificate again, in fractions, by code that shares nothing with what made it. Exit status 0
-    proved, 1 not proved, 2 no certificate."""
+    """Prove a saved certificate again, in exact fractions.
+
+    The code shares nothing with what made the certificate. Exit status 0 proved, 1 not proved, 2 no certificate."""
     from diffabs.design.verify import verify as verified
 
     with console.guarded():

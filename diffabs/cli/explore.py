@@ -27,7 +27,9 @@ def explore(
     ] = None,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in the browser.")] = True,
 ) -> None:
-    """Drag parameters in the browser: curves, a fan, poles and a certificate follow; tune, and save."""
+    """Drag parameters in the browser.
+
+    Curves, a fan of runs, poles and a certificate follow. The page tunes, and saves."""
     with console.guarded():
         console.need_extra("explore")
         console.loaded(scenario, None)  # what is wrong is said here, not in a page

@@ -54,12 +54,13 @@ def export(
     ] = None,
     period: Annotated[
         float | None,
-        typer.Option(metavar="SECONDS", help="Sample the scenario's controller, which runs in continuous time, so."),
+        typer.Option(metavar="SECONDS", help="Sample the scenario's continuous controller with this period."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="With --to table: one JSON document on stdout.")] = False,
 ) -> None:
-    """The sampled controller, with filter, limits, anti-windup, schedule and target, as code for a computer; or the
-    plant for other simulators."""
+    """Write the sampled controller as code, or the plant as FMU.
+
+    The code has the controller's filter, limits, anti-windup, schedule and target."""
     with console.guarded():
         from diffabs.export import NotExported
 

@@ -55,7 +55,9 @@ def identify(
         pathlib.Path | None, typer.Option(metavar="FILE.toml", help="Write the scenario with what was found.")
     ] = None,
 ) -> None:
-    """Find parameters of a scenario from a measured run, and say how well it determines them."""
+    """Find parameters of a scenario from a measured run.
+
+    It says how well the run determines them."""
     with console.guarded(), certificates.reported():
         console.need_extra("tune")
         targets.check_scenario_file(out)

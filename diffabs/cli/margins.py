@@ -53,7 +53,9 @@ def margins(
     ] = None,
     as_json: console.Json = False,
 ) -> None:
-    """Gain, phase, delay and modulus margin of the linearised loop, and their worst over [design.over]."""
+    """Compute stability margins of the linearised loop.
+
+    Gain, phase, delay and modulus margin, here and at their worst over [design.over]."""
     with console.guarded():
         targets.check_picture(plot)
         with targets.new_file(plot, "--plot") as picture:

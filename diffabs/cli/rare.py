@@ -36,7 +36,9 @@ def rare(
     engine: engines.Engine = "xla",
     as_json: console.Json = False,
 ) -> None:
-    """The probability that a metric reaches a bound while [sweep.over] varies, down to 1e-7 and less."""
+    """Compute the probability that a metric reaches a bound.
+
+    The scenario varies as [sweep.over] says. Probabilities of 1e-7 and less can be had."""
     with console.guarded():
         console.need_extra("sweep")
         engines.check(engine)

@@ -24,7 +24,9 @@ def report(
         typer.Option("--out", "-o", metavar="FILE.html", help="Default: report.html in the folder."),
     ] = None,
 ) -> None:
-    """Make one HTML file of a result: question, answer, figures, tables, certificate, model, provenance."""
+    """Make one HTML file of a result.
+
+    It has question, answer, figures, tables, certificate, model and provenance."""
     with console.guarded():
         console.need_extra("report")
         target = out or (source / NAME if source.is_dir() else source.with_suffix(".html"))

@@ -19,7 +19,9 @@ def reproduce(
     ),
     as_json: console.Json = False,
 ) -> None:
-    """A paper's whole result: figures, summary.json, and in short what agrees with it and what is refuted."""
+    """Reproduce a paper's results.
+
+    It makes all figures and summary.json, and says in short what agrees with the paper and what is refuted."""
     with console.guarded():
         console.need_matplotlib()
         console.need_extra("report")

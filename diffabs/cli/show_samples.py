@@ -12,12 +12,14 @@ from diffabs.scenario.scenario import Scenario
 
 def swept(result: dict[str, Any], chosen: Scenario) -> None:
     """Failures, statistics with intervals, what moves what, the worst samples."""
-    failures = Table("failure", "lanes", "probability", "low", "high")
-    for name, row in result["failures"].items():
-        failures.add_row(name, str(row["count"]), *_estimate(row))
     percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
-    titled(f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", failures)
-    titled("statistics of the lanes that did not diverge", _statistics(result["metrics"], chosen))
+    titled(f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", _failures(result["failures"]))
+    constant = [name for name, row in result["metrics"].items() if row and row["least"] == row["greatest"]]
+    moving = {name: row for name, row in result["metrics"].items() if name not in constant}
+    titled("statistics of the lanes that did not diverge; summary.json has all intervals", _statistics(moving, chosen))
+    for name in constant:
+        unit = unit_of(chosen.objectives[name], chosen.loop.plant)
+        say(f"{name} is {brief(result['metrics'][name]['mean']['value'])} {unit} in every lane")
     for name, row in result["never"].items():
         where = f"{row['count']} runs, the first sample {row['samples'][0]}"
         say(f"warning: {name} is infinite (never) in {where}: they are in no statistic of it")
@@ -26,6 +28,8 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
         kind = list(next(iter(result["sensitivity"].values()))[paths[0]])[-1]
         moves = Table("metric", *paths)
         for name, row in result["sensitivity"].items():
+            if name in constant:
+                continue
             moves.add_row(
                 name, *("" if row[p][kind]["value"] is None else f"{row[p][kind]['value']:.3f}" for p in paths)
             )
@@ -50,15 +54,28 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
     say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
 
 
+def _failures(found: dict[str, Any]) -> Table:
+    """A row for each failure that was seen, and one for all that were not."""
+    table = Table("failure", "lanes", "probability", "low", "high")
+    for name, row in found.items():
+        if row["count"]:
+            table.add_row(name, str(row["count"]), *_estimate(row))
+    unseen = [name for name, row in found.items() if not row["count"]]
+    if unseen:
+        table.add_row(", ".join(unseen), "0", *_estimate(found[unseen[0]]))
+    return table
+
+
 def _statistics(metrics: dict[str, Any], chosen: Scenario) -> Table:
-    kinds = list(next((row for row in metrics.values() if row), {}))
-    kinds = [kind for kind in kinds if kind not in ("least", "greatest")]
-    table = Table("metric", "unit", "", "value", "low", "high")
+    """A row for each metric; of the intervals only the mean's."""
+    kinds = [
+        kind for kind in next((row for row in metrics.values() if row), {}) if kind not in ("mean", "least", "greatest")
+    ]
+    table = Table("metric", "unit", "mean", "low", "high", *kinds)
     for name, row in metrics.items():
-        for i, kind in enumerate(kinds):
-            first = (name, unit_of(chosen.objectives[name], chosen.loop.plant)) if i == 0 else ("", "")
-            table.add_row(*first, kind, *_estimate(row[kind]))
-        table.add_section()
+        unit = unit_of(chosen.objectives[name], chosen.loop.plant)
+        cells = [*_estimate(row["mean"]), *(_estimate(row[kind])[0] for kind in kinds)] if row else []
+        table.add_row(name, unit, *cells)
     return table
 
 

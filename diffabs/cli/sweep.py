@@ -57,7 +57,9 @@ def sweep(
     figures: Annotated[bool, typer.Option("--figures", help=f"Draw into DIR/{FIGURES}.")] = False,
     as_json: console.Json = False,
 ) -> None:
-    """Run a scenario for many values of what [sweep.over] varies, and show statistics with confidence intervals."""
+    """Run a scenario for many values, and show statistics.
+
+    Values are drawn as [sweep.over] says. Statistics have confidence intervals."""
     with console.guarded():
         _check_options(engine, on, scheduler, workers, devices, figures)
         _check_samples(samples)

@@ -42,7 +42,9 @@ def tune(
         pathlib.Path | None, typer.Option(metavar="FILE.png", help="Draw how the tuning went, and its worst lane.")
     ] = None,
 ) -> None:
-    """Tune the free parameters of [tune] by gradients, over all its runs at once."""
+    """Tune the free parameters of [tune] by gradients.
+
+    It tunes over all runs of [tune] at once."""
     with console.guarded(), certificates.reported():
         console.need_extra("tune")
         engines.check(engine)

@@ -79,10 +79,14 @@ def signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
             ax.plot(t, sample.setpoint, ":", color="black", label="setpoint")
         alone = len(names) == 1
         words = f"{spaced(names[0])} " if alone else ""
-        label(ax, "time [s]", f"{words}[{of_signal}]", legend=ax is axes[0] or not alone)
-    _control(axes[len(groups)], seen, unit)
-    for ax in axes[len(groups) + 1 :]:
+        label(ax, "", f"{words}[{of_signal}]", legend=ax is axes[0] or not alone)
+    count = len(groups) + 1
+    _control(axes[count - 1], seen, unit)
+    for ax in axes[count:]:
         ax.set_visible(False)
+    for ax in axes[max(0, count - 2) : count]:  # the lowest of each column; a hidden one keeps no labels for it
+        ax.set_xlabel("time [s]", fontsize=11)
+        ax.tick_params(labelbottom=True)
     return figure
 
 

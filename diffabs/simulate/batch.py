@@ -16,7 +16,7 @@ from diffabs.simulate.engine import by_engine, check_process
 from diffabs.simulate.placement import divided
 from diffabs.simulate.refill import Enough, run_refilled
 from diffabs.simulate.refusals import first_line, refusals
-from diffabs.simulate.run import measure, refuse, rollout
+from diffabs.simulate.run import refuse, run_any
 from diffabs.simulate.solution import Run, Solver
 
 TOGETHER = "lanes run together, for trajectories or for derivatives in either mode"
@@ -192,21 +192,21 @@ def _made(
     def by_xla() -> Run:
         if not as_one:
             return run_refilled(*given, enough)
-        run = rollout if trajectories else measure
-        return _flagged(_together(loop, batch, solver, objectives, run), accepted)
+        return _flagged(_together(loop, batch, solver, objectives, trajectories), accepted)
 
     why_not = TOGETHER if trajectories or together or (as_one and engine == "auto") else ""
     return by_engine(engine, by_kernel, by_xla, why_not)
 
 
-def _together(loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], run: Any) -> Run:
+def _together(loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], trajectories: bool) -> Run:
     """In groups of similar length, but trajectories have all the same instants."""
+    every = solver.every if trajectories else 0
 
     def found(lanes: Any, duration: float) -> Run:
         like = dataclasses.replace(solver, duration=duration)
-        return batch.each(loop, lambda one, key: run(one, like, objectives, key=key), lanes)
+        return batch.each(loop, lambda one, key: run_any(one, like, objectives, key, every), lanes)
 
-    if run is rollout or batch.durations is None:
+    if trajectories or batch.durations is None:
         return found(None, solver.duration)
     groups = batch.groups(solver.duration)
     order = np.argsort(np.concatenate([lanes for lanes, _ in groups]))

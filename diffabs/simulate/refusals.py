@@ -66,6 +66,11 @@ def check(part: T, solver: Solver | None = None) -> T:
     return part
 
 
+def impossible(loop: Loop, solver: Solver) -> list[str]:
+    """A line for each value of a loop that no run may have, alone or with the solver; the step may be unstable."""
+    return list(broken(rules(loop))) or list(together(loop, solver))
+
+
 def together(loop: Loop, solver: Solver) -> Iterator[str]:
     """What does not go together: start and stop, parts and step; a line each."""
     begun = _begun(loop)
@@ -136,7 +141,7 @@ def first_line(loop: Loop, values: Mapping[str, Any], solver: Solver) -> str | N
     """The first refused lane and why, in a line with its numbers; None if all lanes are accepted. Without values the
     loop is the lane."""
     if not values:
-        lines = [*broken(rules(loop)), *together(loop, solver)] or list(unstable(loop, solver))
+        lines = impossible(loop, solver) or list(unstable(loop, solver))
         return "; ".join(lines) or None
     found = refusals(loop, values, solver)
     if not found.number:

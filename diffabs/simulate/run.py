@@ -18,11 +18,12 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, differentiated, parameters, replace, strong
 from diffabs.core.tracing import asked, pushed
-from diffabs.core.validity import misshapen
+from diffabs.core.validity import broken, misshapen, rules
 from diffabs.objectives import Variation
 from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
 from diffabs.simulate.methods import AtPace, method_of
 from diffabs.simulate.outcome import judge, prepare
+from diffabs.simulate.refusals import impossible
 from diffabs.simulate.replay import note, repeat, repeat_and_watch, room
 from diffabs.simulate.solution import Adaptive, Run, Solver, Trajectory
 
@@ -45,10 +46,14 @@ def rollout(loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | No
 
     Pure and jit-compiled, once per structure of the loop: new values and another duration do not compile again. A
     trajectory or a derivative does where it becomes longer than the room that it has, up to an eighth more than asked.
-    Raises ValueError for a step, duration or stride that is not positive, a step longer than the duration, and
-    parameters that are no real numbers of 32 bits or more, or have another shape than they need.
+    Raises ValueError for a step, duration or stride that is not positive, a step longer than the duration, parameters
+    that are no real numbers of 32 bits or more, or have another shape than they need, and for concrete parameters that
+    no run may have: out of range, against a rule of their part, a start beyond the stop, a clock off the grid. It does
+    not ask whether the step is stable, as `check` does. Traced parameters that are impossible make a run that diverged.
     """
-    return _call(loop, solver, objectives or {}, key, solver.every)
+    objectives = objectives or {}
+    refuse_values(loop, solver, objectives)
+    return run_any(loop, solver, objectives, key, solver.every)
 
 
 def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Any = None) -> Run:
@@ -62,10 +67,13 @@ def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, 
     >>> print(f"{run.metrics['distance']:.2f} m")
     43.85 m
     """
-    return _call(loop, solver, objectives, key, 0)
+    refuse_values(loop, solver, objectives)
+    return run_any(loop, solver, objectives, key, 0)
 
 
-def _call(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
+def run_any(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
+    """Return a run, with a trajectory of one in `every` instants, or without for 0. The values of the parameters may be
+    impossible; then it has diverged."""
     loop, objectives, method = arguments(loop, solver, objectives)
     steps, every = solver.steps, int(every)
     count = -(-steps // every) if every else 0
@@ -115,6 +123,17 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
             lines += misshapen(part, f"objectives.{name}.")
         else:
             lines.append(f"objectives.{name} = {kinds.shown(part)} is no objective: it needs {', '.join(MEASURES)}")
+    if lines:
+        raise ValueError("; ".join(lines))
+
+
+def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
+    """Raise ValueError for what is no run, or has concrete parameters that no run may have."""
+    refuse(loop, solver, objectives)
+    if traced(loop, dict(objectives)):
+        return
+    lines = impossible(loop, solver)
+    lines += [line for name, part in objectives.items() for line in broken(rules(part, f"objectives.{name}."))]
     if lines:
         raise ValueError("; ".join(lines))
 
