@@ -1812,7 +1812,7 @@ MUTATIONS = [
         "simulate/stepper.py",
         "zero + Condition.RUNNING, zero + Condition.DIVERGED",
         "zero + Condition.RUNNING, zero + Condition.STOPPED",
-        "test_refusals.py::TestAfterARun::test_a_start_beyond_the_stop_is_no_run",
+        "test_refusals.py::TestAfterARun::test_a_traced_start_beyond_the_stop_is_no_run",
     ),
     Mutation(
         "no audit of a brake",
