@@ -187,7 +187,7 @@ KERNEL = [
     (
         "kernel: a compiler is not tried",
         "kernel/compilers.py",
-        "            _try(command)\n",
+        "            _check_loads(command)\n",
         "",
         f"{OBJECTION}::test_of_a_compiler_that_does_not_work[false]",
     ),

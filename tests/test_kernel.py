@@ -288,7 +288,7 @@ class TestLibrary:
         compilers.compiler()  # has been tried, which is noted
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
         path = compilers.library(self.TEXT % 1)
-        monkeypatch.setattr(compilers, "_run", None)
+        monkeypatch.setattr(compilers, "_compile", None)
         assert compilers.library(self.TEXT % 1) == path
         assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
@@ -297,7 +297,9 @@ class TestLibrary:
         """Also one whose file is a library, but another one: no damaged file is ever loaded."""
         compilers.compiler()
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
-        monkeypatch.setattr(compilers, "_run", lambda words, source, result, s: result.write_bytes(source.read_bytes()))
+        monkeypatch.setattr(
+            compilers, "_compile", lambda words, source, result, s: result.write_bytes(source.read_bytes())
+        )
         path, other = compilers.library("one library"), compilers.library("another")
         whole = path.read_bytes()
         damaged = {
@@ -338,7 +340,7 @@ class TestLibrary:
     def test_that_was_not_used_for_longest_goes(self, tmp_path, monkeypatch):
         compilers.compiler()
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
-        monkeypatch.setattr(compilers, "_run", lambda words, source, result, s: result.write_bytes(bytes(10)))
+        monkeypatch.setattr(compilers, "_compile", lambda words, source, result, s: result.write_bytes(bytes(10)))
         first, second, third = (compilers.library(text) for text in ("first", "second", "third"))
         for i, path in enumerate((first, second, third)):
             os.utime(path, (i, i))
@@ -354,7 +356,7 @@ class TestLibrary:
     def test_is_another_for_other_flags_and_processors(self, changed, tmp_path, monkeypatch):
         compilers.compiler()
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
-        monkeypatch.setattr(compilers, "_run", lambda words, source, result, s: result.write_bytes(b""))
+        monkeypatch.setattr(compilers, "_compile", lambda words, source, result, s: result.write_bytes(b""))
         path, made = compilers.library("one"), compilers.compiler()
         monkeypatch.setattr(compilers, "compiler", lambda: made)
         monkeypatch.setattr(compilers, changed, ("-O1",) if changed == "FLAGS" else lambda: "another")

@@ -174,7 +174,6 @@ class TestBeforeARun:
         assert (modes <= many).all()
         assert (many < 3 * modes).all()
 
-
     def test_an_impossible_objective_is_refused(self):
         late = {"settled": objectives.SettlingTime(share=-0.1)}
         with pytest.raises(ValueError, match=r"objectives\.settled\.share = -0\.1 is outside"):

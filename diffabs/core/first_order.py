@@ -1,8 +1,8 @@
-"""An error in place of derivatives that would be wrong: of a parameter that has none, and second ones.
+"""An error where a derivative would be wrong: by a parameter that has none, and second ones of a frozen rule.
 
 A rule for derivatives that freezes what depends on the parameters has right first derivatives and wrong second ones.
-Such a rule passes its tangents through `first_order`, on both sides: forward mode meets the one on its results, reverse
-mode the one on its arguments."""
+Such a rule wraps both the tangents that it gets and the tangents that it returns in `first_order`. A second pass in
+forward mode meets the wrapper of the result, a pass in reverse mode that of the argument."""
 
 from functools import partial
 from typing import Any

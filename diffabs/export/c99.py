@@ -15,8 +15,8 @@ from diffabs.kernel.program import live
 
 def c_source(found: Device, name: str, notes: Sequence[str] = ()) -> str:
     """Return a device as C99: `NAME_state`, `NAME_input`, `NAME_parameters` with `NAME_defaults`, `NAME_start`,
-    `NAME_step`, and a main for tests under `#ifdef NAME_MAIN` that reads a line of inputs for each sample and writes
-    the command.
+    `NAME_step`, and the type `NAME_real` of their numbers. Under `#ifdef NAME_MAIN`, with the name in capitals, a main
+    for tests reads a line of inputs for each sample and writes the command.
 
     name: an identifier; notes: lines of the comment at its head
     Raises:
@@ -46,7 +46,7 @@ class _Text:
         return f"{where}->{self.fields[where][path]}" if where else path
 
     def parts(self) -> Iterator[str]:
-        """The lines of the text."""
+        """Yield the text, block after block."""
         yield from self._head()
         yield f"typedef {'float' if self.device.dtype == np.float32 else 'double'} {self.real};\n"
         yield from self._structs()
@@ -63,8 +63,8 @@ class _Text:
         yield from self._main()
 
     def _head(self) -> Iterator[str]:
-        delay = f", output it {self.device.delay:g} s after that" if self.device.delay else ""
-        yield f"/* {self.name}: the controller, to be called every {self.device.period:g} s{delay}."
+        delay = f", output it {float(self.device.delay)!r} s after that" if self.device.delay else ""
+        yield f"/* {self.name}: the controller, to be called every {float(self.device.period)!r} s{delay}."
         for line in [*self.notes, *map(str, self.device.numbers)]:
             yield f"   {commented(line)}"
         yield (
@@ -74,7 +74,8 @@ class _Text:
             "   Nothing is allocated and nothing changes that is global; two states are two controllers. */"
         )
         yield "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>\n"
-        yield "#ifdef __FAST_MATH__\n#error compile without -ffast-math: a NaN must be seen\n#endif\n"
+        yield "#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__ > 0)"
+        yield "#error compile without -ffast-math and -ffinite-math-only: a NaN must be seen\n#endif\n"
 
     def _structs(self) -> Iterator[str]:
         """Inputs, parameters and memory."""
@@ -103,7 +104,7 @@ class _Text:
         yield "};\n"
 
     def _body(self, stored: dict[str, Node], more: Sequence[Node]) -> Iterator[str]:
-        """The operations that these need, and the memory's new values."""
+        """Yield the statements that compute `stored` and `more`, and store them in the memory."""
         nodes = live([*stored.values(), *more])
         moving = self.program.moving if more else {}
         used = {node.id for node in nodes} | {node.id for node in live(list(moving.values()))}

@@ -1,8 +1,9 @@
-"""Compiled libraries in the user's cache folder: what is loaded is what was compiled.
+"""Compiled libraries in the user's cache folder, whose damage is found before they are loaded.
 
 The name of a file has two digests: one of everything that the library is made of, one of the file's content. A file
 whose content is not what its name says (empty, cut off, changed, or another library) is removed and compiled again."""
 
+import contextlib
 import errno
 import hashlib
 import logging
@@ -19,12 +20,17 @@ log = logging.getLogger("diffabs")
 
 
 def cache_folder() -> pathlib.Path:
-    """Return the folder in which libraries are kept: $DIFFABS_KERNEL_CACHE, or the user's for caches."""
+    """Return the folder in which libraries are kept: $DIFFABS_KERNEL_CACHE, or the user's for caches. Raises OSError
+    for a user without a home folder."""
     if said := os.environ.get(CACHE):
         return pathlib.Path(said)
-    if sys.platform == "darwin":
-        return pathlib.Path.home() / "Library" / "Caches" / "diffabs" / "kernel"
-    return pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "diffabs" / "kernel"
+    try:
+        caches = pathlib.Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+    except RuntimeError:
+        raise OSError(errno.ENOENT, f"the user has no home folder; name a folder in {CACHE}") from None
+    if sys.platform != "darwin" and (said := os.environ.get("XDG_CACHE_HOME")):
+        caches = pathlib.Path(said)
+    return caches / "diffabs" / "kernel"
 
 
 def own_folder() -> pathlib.Path:
@@ -38,16 +44,21 @@ def own_folder() -> pathlib.Path:
 
 
 def find(made_of: str, suffix: str) -> pathlib.Path | None:
-    """Return the file of a library, or None. A damaged one is removed, with one line in the log. Raises OSError, as
-    `own_folder`.
+    """Return the file of a library, or None where there is none. A damaged file is removed, with one line in the log.
+    Raises OSError for a file that cannot be read, and as `own_folder`.
 
     Args:
-        made_of: the digest of everything that decides the library
-        suffix: of its file name
+        made_of: digest of everything that decides the library
+        suffix: end of the file's name
     """
     for path in sorted(own_folder().glob(f"{made_of}-*{suffix}")):
-        if _named(made_of, files.content(path), suffix) == path.name:
-            os.utime(path)  # it was used
+        try:
+            content = files.content(path)
+        except FileNotFoundError:  # another process has removed it
+            continue
+        if _file_name(made_of, content, suffix) == path.name:
+            with contextlib.suppress(OSError):  # a folder that is only read
+                os.utime(path)  # the file was used
             return path
         log.warning("%s is damaged; it is compiled again", path)
         path.unlink(missing_ok=True)
@@ -58,8 +69,8 @@ def write(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
     """Write a library and return its file, which is whole at every instant at which it is there. Raises OSError."""
     folder = own_folder()
     files.make_room(folder, f"*{suffix}", ROOM)
-    return files.write_synced(folder / _named(made_of, content, suffix), content)
+    return files.write_synced(folder / _file_name(made_of, content, suffix), content)
 
 
-def _named(made_of: str, content: bytes, suffix: str) -> str:
+def _file_name(made_of: str, content: bytes, suffix: str) -> str:
     return f"{made_of}-{hashlib.sha256(content).hexdigest()[:CONTENT]}{suffix}"

@@ -10,6 +10,7 @@ import importlib.util
 import os
 import pathlib
 import platform
+import shlex
 import shutil
 import signal
 import subprocess
@@ -23,11 +24,10 @@ from diffabs.core import stopwatch
 from diffabs.kernel.binaries import cache_folder, find, own_folder, write
 
 NATIVE = pathlib.Path(__file__).parent / "native"
-COMPILER = "DIFFABS_KERNEL_COMPILER"  # the command, if set; an empty one is none
+COMPILER = "DIFFABS_KERNEL_COMPILER"  # the compiler's command; set but empty, no compiler is used
 CANDIDATES = (["c++"], ["clang++"], ["g++"])
-# No flag may change what is finite, nor what a comparison with NaN says: nothing of -ffast-math but what concerns the
-# errno of C's functions, and traps, which nobody looks at. Not at linking, either: that would set how the whole process
-# treats the smallest numbers.
+# No flag may change NaN or infinity: of -ffast-math only no-math-errno and no-trapping-math. It must not be given at
+# linking either, where it changes how the whole process treats subnormal numbers.
 FLAGS = (
     *("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
     *("-fno-exceptions", "-fno-rtti", "-fPIC", "-shared", "-pthread", "-w"),
@@ -37,7 +37,7 @@ LONGEST_TRY_S = 30  # and to say its version, or to make a library of one line
 
 
 class NoCompiler(Exception):
-    """Nothing here makes a library of C++; why."""
+    """No C++ compiler here makes a library. The message says why."""
 
 
 class Compiler(NamedTuple):
@@ -56,7 +56,7 @@ def _tried(command: tuple[str, ...]) -> Compiler | str:
         made = Compiler(command, version.stdout.partition("\n")[0].strip())
         note = cache_folder() / f".{_digest('works', made)[:32]}"
         if not note.is_file():
-            _try(command)
+            _check_loads(command)
             with contextlib.suppress(OSError):
                 (own_folder() / note.name).touch()
     except (OSError, NoCompiler) as error:
@@ -64,11 +64,12 @@ def _tried(command: tuple[str, ...]) -> Compiler | str:
     return made
 
 
-def _try(command: tuple[str, ...]) -> None:
+def _check_loads(command: tuple[str, ...]) -> None:
+    """Make a library of one line and load it. Raises NoCompiler or OSError."""
     with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
         source, library = pathlib.Path(folder) / "one.cpp", pathlib.Path(folder) / "one.so"
         source.write_text('#include "functions.h"\nextern "C" double one(double x) { return k_exp(all(x))[0]; }\n')
-        _run(command, source, library, LONGEST_TRY_S)
+        _compile(command, source, library, LONGEST_TRY_S)
         ctypes.CDLL(str(library))
 
 
@@ -77,14 +78,16 @@ def compiler() -> Compiler:
     said = os.environ.get(COMPILER)
     if said is not None and not said.strip():
         raise NoCompiler(f"{COMPILER} is empty")
-    commands = [said.split()] if said else [command for command in CANDIDATES if shutil.which(command[0])]
+    commands = [shlex.split(said)] if said else [command for command in CANDIDATES if shutil.which(command[0])]
     if not said and importlib.util.find_spec("ziglang"):
         commands.append([sys.executable, "-m", "ziglang", "cc", "-x", "c++"])
-    tried = [_tried(tuple(command)) for command in commands]
-    works = [one for one in tried if isinstance(one, Compiler)]
-    if not works:
-        raise NoCompiler("; ".join(map(str, tried)) or 'no C++ compiler; pip install ".[kernel]" in a clone brings one')
-    return works[0]
+    reasons = []
+    for command in commands:
+        tried = _tried(tuple(command))
+        if isinstance(tried, Compiler):
+            return tried
+        reasons.append(tried)
+    raise NoCompiler("; ".join(reasons) or 'no C++ compiler; pip install ".[kernel]" in a clone brings one')
 
 
 def library(text: str) -> pathlib.Path:
@@ -99,7 +102,7 @@ def library(text: str) -> pathlib.Path:
             source, result = pathlib.Path(own) / "kernel.cpp", pathlib.Path(own) / "kernel.so"
             source.write_text(text)
             with stopwatch.compiling():
-                _run(made.command, source, result, LONGEST_S)
+                _compile(made.command, source, result, LONGEST_S)
             return write(digest, ".so", result.read_bytes())
     except OSError as error:
         raise NoCompiler(f"no kernel in {cache_folder()}: {error.strerror or error}") from None
@@ -110,7 +113,7 @@ def described() -> dict[str, str]:
     return {"compiler": compiler().version, "flags": " ".join(FLAGS), "processor": _processor()}
 
 
-def _run(command: tuple[str, ...], source: pathlib.Path, result: pathlib.Path, longest: float) -> None:
+def _compile(command: tuple[str, ...], source: pathlib.Path, result: pathlib.Path, longest: float) -> None:
     include = [f"-I{NATIVE}", f"-I{jax.ffi.include_dir()}"]
     done = _output([*command, *FLAGS, *include, "-o", str(result), str(source), "-lm"], longest)
     if done.returncode or not result.is_file():
@@ -120,7 +123,8 @@ def _run(command: tuple[str, ...], source: pathlib.Path, result: pathlib.Path, l
 
 
 def _output(words: list[str], longest: float) -> subprocess.CompletedProcess[str]:
-    """Run a command for at most so many seconds. Raises NoCompiler for one that takes longer, OSError for none."""
+    """Run a command for at most so many seconds. Raises NoCompiler for one that takes longer, OSError where the
+    command does not exist."""
     told = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(words, **told, start_new_session=True) as process:
         try:

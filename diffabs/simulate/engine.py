@@ -12,7 +12,7 @@ from diffabs.simulate.solution import Run
 
 ENGINES = ("auto", "xla", "kernel")
 log = logging.getLogger("diffabs")
-_threads_in = 0  # the process that had XLA's threads when it, or a child of it, was forked
+_threads_in = 0  # id of the first process that forked while XLA's threads ran; 0 if there is none
 
 
 def _before_fork() -> None:
@@ -37,15 +37,16 @@ class EngineError(ValueError):
 
     @classmethod
     def of(cls, line: Any) -> "EngineError":
-        """Return the error that says so of a kernel."""
+        """Return the error that a kernel is not possible, with this reason."""
         return cls(f"engine = 'kernel' is not possible: {line}")
 
 
 def by_engine(engine: str, native: Callable[[], Run], otherwise: Callable[[], Run], why_not: str = "") -> Run:
-    """Return `native()`, or `otherwise()` as the engine says: "kernel" means what it says, "auto" the first if that can
-    be, and tells the log once why it cannot. Raises ValueError for another name, or for what stands against "kernel".
+    """Return the run of an engine: "kernel" by `native()`, "xla" by `otherwise()`. "auto" takes the kernel where one is
+    possible, and else tells the log once why not. Raises ValueError for another name, and EngineError where a kernel
+    that is asked for is not possible.
 
-    why_not: what is known already to stand against it"""
+    why_not: a reason against a kernel that is known already"""
     if engine not in ENGINES:
         raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(ENGINES)}")
     if engine == "xla":
@@ -75,5 +76,5 @@ def described(engine: str) -> dict[str, str]:
 
 @functools.cache
 def tell(why_not: str) -> None:
-    """Say in the log why XLA does what was left to be decided, once."""
+    """Log why "auto" takes XLA, once for each reason."""
     log.warning("runs are made by XLA, not by a kernel: %s", why_not)
