@@ -1616,9 +1616,9 @@ MUTATIONS = [
     ),
     Mutation(
         "balance: a voltage leaves its limit in the middle of a step",
-        "core/cubic.py",
-        "inside = (self.start_slope > 0) & (2.0 * rise < self.start_slope)",
-        "inside = self.start_slope > 0",
+        "core/messages.py",
+        "end_slope=jnp.where(end, cubic.end_slope, last)",
+        "end_slope=cubic.end_slope",
         "test_peaks.py::test_a_voltage_that_rises_to_a_limit_does_not_leave_it",
     ),
     Mutation(

@@ -7,7 +7,7 @@ import parts
 import pytest
 
 import diffabs as d
-from diffabs import actuators, controllers, objectives, plants, references, stops
+from diffabs import actuators, controllers, objectives, plants, references, sensors, stops
 from diffabs.core.blocks import Series
 from diffabs.core.cubic import Cubic
 from diffabs.core.messages import Segment
@@ -33,10 +33,37 @@ def test_a_voltage_rises_and_falls_within_a_long_step(smooth, peak):
     np.testing.assert_allclose(objective.update(objective.start(segment.start), segment), peak, rtol=1e-12)
 
 
-def test_a_voltage_that_rises_to_a_limit_does_not_leave_it():
+@pytest.mark.parametrize(("objective", "value"), [(PeakVoltage(), 24.0), (objectives.Variation(), 4.0)])
+def test_a_voltage_that_rises_to_a_limit_does_not_leave_it(objective, value):
     """u = 20 + 8 t to 24, where the step ends and the voltage falls: its slope there says nothing about the step."""
-    objective, segment = PeakVoltage(), step(lambda t: jnp.where(t < 0.5, 20.0 + 8.0 * t, 26.0 - 4.0 * t), 0.5, True)
-    np.testing.assert_allclose(objective.update(objective.start(segment.start), segment), 24.0, rtol=1e-12)
+    segment = step(lambda t: jnp.where(t < 0.5, 20.0 + 8.0 * t, 44.0 - 40.0 * t), 0.5, True)
+    found = objective.update(objective.start(segment.start), segment)
+    np.testing.assert_allclose(getattr(found, "total", found), value, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_variation_of_a_control_with_a_corner_is_that_of_short_steps():
+    """A limit and the nodes of a gain schedule are corners of the control, at which adaptive steps begin and end. The
+    rate beyond a corner makes no extremum before it. Against the sum of |du| over short steps."""
+    loop = d.Loop(
+        plant=plants.MirroredRig(),
+        initial=d.BrakeStart(speed=11.0, slip=0.03),
+        stop=stops.SpeedReached(speed=5.0),
+        sensor=sensors.SpeedScale(factor=0.85),
+        reference=references.FilteredSlip(slip=0.15, time_constant=0.03),
+        feedforward=controllers.HoldingInput(),
+        controller=controllers.ScheduledFeedback(
+            speeds=np.array([3.0, 7.0, 13.0]),
+            integral_gains=np.array([-900.0, -1100.0, -1300.0]),
+            gains=np.array([-40.0, -60.0, -80.0]),
+            torque_min=0.3,
+            torque_max=4.0,
+            antiwindup=controllers.BackCalculation(tracking_time=0.03),
+        ),
+    )
+    control = d.rollout(loop, d.FixedStep(2e-4, 2.0, kinks=True)).trajectory.sample.control
+    found = d.measure(loop, d.Adaptive(1e-6, 2.0), {"variation": objectives.Variation()})
+    np.testing.assert_allclose(found.metrics["variation"], np.sum(np.abs(np.diff(control))), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("lag", "end"), [(1e-3, 10.5), pytest.param(0.0, 5.0, marks=pytest.mark.slow)])

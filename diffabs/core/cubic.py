@@ -84,15 +84,6 @@ class Cubic(NamedTuple):
         top = self(x)
         return jnp.where(inside & (top > ends), top, ends)
 
-    def greatest_of_parabola(self) -> Any:
-        """The greatest value in [0, 1] of the parabola through both ends with the slope at the start: to O(h^3), and of
-        what may have a kink at the end, behind which its slope is another."""
-        rise = self.end - self.start
-        inside = (self.start_slope > 0) & (2.0 * rise < self.start_slope)
-        bend = jnp.where(inside, self.start_slope - rise, 1.0)
-        top = self.start + 0.25 * self.start_slope * self.start_slope / bend
-        return jnp.where(inside, top, self._greater_end())
-
     @property
     def falls(self) -> Any:
         """Whether p falls from the start on."""

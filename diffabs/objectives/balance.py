@@ -106,8 +106,7 @@ def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
         ends, falls = later_of_larger(size(segment.start), size(segment.end)), False
         if segment.smooth is not False:
             cubic = segment.sample(size)
-            top = cubic.greatest() if segment.inner else cubic.greatest_of_parabola()
-            ends, falls = jnp.where(segment.smooth, top, ends), segment.smooth & cubic.falls
+            ends, falls = jnp.where(segment.smooth, cubic.greatest(), ends), segment.smooth & cubic.falls
         return later_of_larger(memory.held, ends, falls)
 
     return start, nothing, update, held

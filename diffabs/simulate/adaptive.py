@@ -24,7 +24,7 @@ from diffabs.simulate.advance import Kink, after_changes, at_end, start
 from diffabs.simulate.checkpoint import anyone, apart
 from diffabs.simulate.condition import Condition, after_step
 from diffabs.simulate.dynamics import FREE, Ahead, Dynamics, Objectives, Tally, dynamics, parted
-from diffabs.simulate.foresight import kinks
+from diffabs.simulate.foresight import kinks, within_step
 from diffabs.simulate.landing import (
     BEYOND,
     TRIES,
@@ -183,6 +183,7 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, lands: Any, pace
     found = system.ahead(end, state, tallied, at)
     seen, moving, recording, _, words, _, comparisons = found
     sample, recorded = seen.signals.sample, (seen.signals.recorded, recording)
+    changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
     segment = Segment(
         point.sample,
         sample,
@@ -191,11 +192,11 @@ def arrive(system: Dynamics, carry: Carry, end: Any, anew: Any, lands: Any, pace
         lambda: (Shown.of(point.moving), Shown.of(moving)),
         lambda: (point.moving, moving),
         smooth=True,
+        within=within_step(comparisons, changed, h),
     )
     tally = {name: Memory(z[1][name], o.update(tallied[name], segment)) for name, o in system.objectives.items()}
     if loop.changes and not loop.ticks:
         tally = select(anew, point.tally, tally)
-    changed = tuple(a ^ b for a, b in zip(words, point.words, strict=True))
     ahead, late = kinks(comparisons, carry.natural, pace.least, changed, h)
     ahead = jnp.where(carry.blunt, 1.0, OVER) * ahead if pace.notes else ahead
     new = Point(end, rests, tally, sample, moving, recorded, seen[:2], seen.margins, words, ahead)

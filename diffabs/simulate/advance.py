@@ -162,7 +162,7 @@ def _segment(system: Dynamics, point: Point, end: Any, sample: Sample, one: Try)
 
     smooth = ~one.blunt if system.kinks else False  # a step that ends on every comparison reaches no limit within
     rates = each(Shown.of), each(lambda sample: sample)
-    return Segment(point.sample, sample, one.h, one.step, *rates, smooth, inner=True)
+    return Segment(point.sample, sample, one.h, one.step, *rates, smooth, (True, True))
 
 
 def _passed(system: Dynamics, point: Point, end: Any, one: Try) -> dict[str, Passage]:

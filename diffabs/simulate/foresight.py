@@ -50,6 +50,18 @@ def kinks(margins: Sequence[Margin], natural: Any, shortest: Any, changed: Words
     return Kinks(-next, jnp.where(first > low, first, 0.0))
 
 
+def within_step(margins: Sequence[Margin], changed: Words, length: Any) -> tuple[Any, Any]:
+    """Return whether the rates at the start of a step, and those at its end, are those within it: no comparison has
+    changed there."""
+    start = end = jnp.asarray(True)
+    for one in margins:
+        was = bit(changed, one.numbers)
+        for on, since in zip(*(jnp.ravel(jnp.asarray(x)) for x in (was, one.value / one.rate)), strict=True):
+            early = since >= (1 - START) * length
+            start, end = start & ~(on & early), end & ~(on & ~early)
+    return start, end
+
+
 def bit(words: Words, numbers: Any) -> Any:
     """Return the bits of these numbers."""
     numbers = jnp.asarray(numbers)

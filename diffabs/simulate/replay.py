@@ -216,6 +216,7 @@ def _step(
         lambda: (Shown.of(begin.moving), Shown.of(end.moving)),
         lambda: (begin.moving, end.moving),
         smooth=True,
+        within=(True, ~one.blunt),
     )
     tally = {name: Memory(tally[name].flow, o.update(tally[name], segment)) for name, o in objectives.items()}
     ends = (t, state.flow(), end.seen.rate) if pace.keeps else ()
