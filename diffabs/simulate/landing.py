@@ -1,14 +1,14 @@
-"""Where in a step a margin falls through zero: the lengths that are tried, and the one that ends on the zero.
+"""Locate the zero of a margin in a step: the lengths of the tries, and the length of the step that ends on the zero.
 
-seek    tries shrink a bracket, by secant, Newton's step on a parabola, or halving, until one ends near the zero
-probe   one more, on the same side: how the margin falls there
-land    place - margin(place)/fall: the last try's length. Its derivative is that of the event's moment, by the
+seek    tries shrink a bracket, by secant, Newton's step on a parabola, or halving, until a try ends near the zero
+probe   a try beside it, on the same side, shows how the margin falls there
+land    the final step has the length place - margin(place)/fall. Its derivative is that of the event's moment, by the
         implicit function theorem: the margin at the end of a try carries it
 refine  for derivatives: one more try of this length. A Newton step from it is right to the second derivative, as the
         one before was to the first: each doubles the order (A. Griewank, A. Walther, Evaluating Derivatives, 15.3)
 
-Margins are those of comparisons, then those of the stop and of the blocks' events; of the first only the end of a try
-tells them."""
+The margins of comparisons have the first numbers; those of the stop and of the blocks' events follow. A comparison's
+margin is known only at the end of a try."""
 
 from typing import Any, NamedTuple
 
@@ -18,34 +18,31 @@ import jax.numpy as jnp
 from diffabs.core.numerics import ratio
 
 NEAR = 1e-4  # steps: a Newton step from here misses the zero by some 1e-8 steps
-APART = 0.2  # power of the precision: the probe's distance, in steps
-BEYOND = 0.5  # power of the precision: how far behind the zero of a comparison a step ends, in steps
+APART = 0.2  # exponent: the probe is eps**APART steps away
+BEYOND = 0.5  # exponent: a step ends eps**BEYOND steps past the zero of a comparison
 TRIES = 24  # the most for an event, whose margin may have a corner or jump
 BISECT = 4  # every so many tries halve the bracket
 GRAZES = 1e-2  # of the margin's mean rate in the step: a margin that falls more slowly at the beginning only touches
-SMOOTH = 1e-4  # of the slope: the most by which both ends of a step together know it better; more is a kink between
-PART = 0.5  # of the fall: the most by which it may change where the margin is smooth, or has other signs on either side
+SMOOTH = 1e-4  # of the slope: the greatest correction by a cubic through both ends of a step; a larger one is a kink
+PART = 0.5  # of the fall: the greatest change of it within a step in which the margin is taken to be smooth
 
 
 class Search(NamedTuple):
-    """Where an event is looked for: the number of its margin; the length that was tried first [s]; the bracket; the
-    margin at these (infinite where nobody knows it); how many times it was tried. Near the zero: the length, the
-    margin there, whether there is a zero, and whether that is where the step begins. Where the step ends that lands:
-    how the margin falls [1/s], 0 where its moment has no derivative."""
+    """Where an event is looked for. A margin is infinite where it is not known."""
 
-    which: Any
-    full: Any
-    at_full: Any
-    near: Any
+    which: Any  # the number of its margin
+    full: Any  # the length that was tried first [s]
+    at_full: Any  # the margin there
+    near: Any  # the bracket's shorter length [s]
     at_near: Any
-    far: Any
+    far: Any  # the bracket's longer length [s]
     at_far: Any
-    tries: Any
-    place: Any
-    margin: Any
-    found: Any
-    at_once: Any
-    fall: Any
+    tries: Any  # how many there were
+    place: Any  # the length of the try that ended near the zero [s]
+    margin: Any  # the margin there; 0 if no zero was found
+    found: Any  # whether there is a zero
+    at_once: Any  # whether the zero is where the step begins
+    fall: Any  # the margin's slope at the end of the final step [1/s]; 0 where the moment has no derivative
 
 
 class Crossed(NamedTuple):
@@ -90,8 +87,8 @@ def earliest(which: Any, first: int, before: list[Any], after: list[Any]) -> Cro
 
 
 def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Search, Any, Any]:
-    """Return the search for the earliest event after the try of length x, what to try next, and whether x is near
-    enough, so that this is the probe.
+    """Return the search for the earliest event after the try of length x, the length to try next, and whether that is
+    the probe. It is the probe once x is near enough to the zero.
 
     new: whether nothing was looked for until now"""
     x = jax.lax.stop_gradient(x)
@@ -108,7 +105,7 @@ def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Se
 
     width, newton = search.far - search.near, x - correction
     share = ratio(search.at_near, search.at_near - search.at_far, 0.5)
-    least = jnp.minimum(NEAR * h, 0.5 * width)  # where the margin has begun to fall
+    least = jnp.minimum(NEAR * h, 0.5 * width)  # the first guess is no shorter: there the margin has begun to fall
     first = jnp.where(jnp.isfinite(search.at_near), jnp.maximum(search.near + share * width, least), least)
     inside = falls & (newton > search.near) & (newton < search.far) & (search.tries % BISECT != 0)
     guess = jnp.where(inside, newton, jnp.where(fresh, first, search.near + 0.5 * width))
@@ -125,10 +122,10 @@ def seek(search: Search, x: Any, new: Any, tells: Crossings, h: Any) -> tuple[Se
 
 
 def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> tuple[Search, Any]:
-    """Return the search, which then knows the fall, and the length that ends on the zero, after the probe of length x;
-    or so much `beyond` that the margin has changed its sign for certain. The fall is that of the parabola through the
-    place, the probe, and an end of the first try: that on the same side, or where that says nothing the other, if the
-    margin is smooth up to there."""
+    """Return the search with its fall, and the length that ends on the zero, after the probe of length x. `beyond` is
+    added to the length, so that the margin has surely changed its sign. The fall is that of the parabola through the
+    place, the probe, and an end of the first try. This is the end on the same side; the other one where the first says
+    nothing and the margin is smooth up to there."""
     x = jax.lax.stop_gradient(x)
     place, margin = jax.lax.stop_gradient((search.place, search.margin))
     told = jnp.isfinite(tells.sought.end)  # not if another comparison changes at the probe, and this one does not
@@ -160,16 +157,16 @@ def land(search: Search, x: Any, tells: Crossings, beyond: Any) -> tuple[Search,
 
 
 def refine(search: Search, x: Any, tells: Crossings) -> Any:
-    """Return the same length x, with the second derivatives of the event's moment as well: by a Newton step from the
-    margin at the end of a try of length x."""
+    """Return x. Its value stays; a Newton step from the margin at the end of a try of length x makes its second
+    derivatives those of the event's moment."""
     left = jnp.where((search.fall < 0) & jnp.isfinite(tells.sought.end), tells.sought.end, 0.0)
     return x - (left - jax.lax.stop_gradient(left)) / jnp.where(search.fall < 0, search.fall, -1.0)
 
 
 def aimed(search: Search, x: Any, length: Any) -> tuple[Any, Any]:
-    """Return the length of a step that is to land, after the probe of length x, and whether it is none: where it would
-    end so far from where the zero seemed to be, or the margin so little seems to fall there, that it is to be looked
-    for again, in the middle of the bracket. So it is with a margin that hardly falls, and then all at once."""
+    """Return the length to try after the probe of length x, and whether to search again, in the middle of the bracket.
+    The search goes on if the final step would end farther from `place` than the probe did, or if the margin does not
+    fall there: a margin may hardly fall, and then all at once."""
     probe, off = jnp.abs(x - search.place), jnp.abs(length - search.place)
     missed = ((off > probe) | ((off == 0) & (search.margin != 0))) & (search.far - search.near > probe)
     again = jax.lax.stop_gradient(missed & ~search.at_once & (search.tries < TRIES))
@@ -177,8 +174,8 @@ def aimed(search: Search, x: Any, length: Any) -> tuple[Any, Any]:
 
 
 def _moves(search: Search, x: Any, g: Any, zero: Any, fall: Any) -> Any:
-    """0, with the derivatives of the zero. The margin's are those of the place and of the probe x, continued to the
-    zero: they, too, change in the ten-thousandth of a step between."""
+    """A number with value 0 and the derivatives of the event's length. They follow from those of the margin at the
+    place and at the probe x, continued to the zero: they, too, change in the ten-thousandth of a step between."""
     known = search.found & (fall < 0)
     share = ratio(zero - search.place, x - search.place)
     ends = (jnp.where(known, end, 0.0) for end in (search.margin, g))
