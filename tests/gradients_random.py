@@ -122,16 +122,16 @@ class Program:
         size = np.where(np.abs(x) > 1e-6, np.abs(x), 1e-2)
         moves = [sign * width * np.diag(size) for width in widths for sign in (1, -1)]
         lanes, late = self.values(loop, measures, x + np.concatenate([np.zeros((1, len(x))), *moves]))
-        lanes = np.asarray(lanes)
+        lanes = _compared(lanes)
         sides = lanes[1:].reshape(len(widths), 2, len(x), len(self.objectives)).swapaxes(2, 3)
         names = [path + "".join(f"[{i}]" for i in place) for path, all in self.places.items() for place in all]
         ended = not late[0] or self.structure.objectives is random_loops.BALANCE
-        plain, none = np.asarray(self.plain(loop, measures, x)[0]), np.zeros((len(lanes[0]), len(x)))
+        plain, none = _compared(self.plain(loop, measures, x)[0]), np.zeros((len(lanes[0]), len(x)))
         found = Found(self.name, number, self.objectives, names, lanes[0], none, sides, bool(ended), plain, plain)
         if not slopes:
             return found
         gradient, beside = self.slopes(loop, measures, x)
-        return found._replace(gradient=np.asarray(gradient) * size, beside=np.asarray(beside))
+        return found._replace(gradient=np.asarray(gradient) * size, beside=_compared(beside))
 
     def revalued(self, found: Found, seed: int) -> Found:
         """The study of a loop, with the objectives that a derivative changes."""
@@ -145,6 +145,12 @@ class Program:
         off[[name in BY_GRID for name in self.objectives]] = 0.0
         moved = (off > bound) | (np.abs(found.beside - found.value) > SAME * least)
         return found._replace(moved=tuple(np.array(found.objectives)[moved]))
+
+
+def _compared(values: Any) -> np.ndarray:
+    """Values, with no number where they are infinite: a time that is never reached has no differences."""
+    values = np.asarray(values)
+    return np.where(np.isinf(values), np.nan, values)
 
 
 def looked_closer(found: Found, closer: Sequence[Found]) -> Found:
