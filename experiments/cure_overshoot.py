@@ -199,7 +199,7 @@ def judged(config: Config, one: Loop, system: Polytope, batch: Batch) -> tuple[d
     worst = {name: float(np.max(values)) for name, values in runs.metrics.items()}
     row = {
         "overshoot [%]": 100 * worst["overshoot"],
-        "settling [s]": worst["settling_time"],
+        "settling [s]": record.reached(worst["settling_time"]),
         "locked [s]": worst["locked_time"],
         "max slip": worst["max_slip"],
         "IAE [s]": worst["iae"],

@@ -102,7 +102,7 @@ def table(found: dict[str, Design], runs: dict[str, Run]) -> list[dict[str, Any]
                 "decay proved [1/s]": proof.decay_rate,
                 "proved exactly": proof.verified_exactly,
                 "overshoot [%]": 100 * float(metrics["overshoot"]),
-                "settling time [s]": float(metrics["settling_time"]),
+                "settling time [s]": record.reached(metrics["settling_time"]),
             }
         )
     return rows

@@ -112,7 +112,9 @@ def test_noise_with_its_own_clock_is_the_same_at_every_step():
 @pytest.mark.parametrize("period", cases([2.5e-4, 1.5e-3], 2.5e-4))
 def test_other_noise_is_not_compared(period):
     key, solver = jax.random.key(4), d.FixedStep(1e-3, 2.0)
-    found = acc.accuracy(noisy(period), solver, OBJECTIVES, key=key)
+    with pytest.raises(ValueError, match="period"):  # a clock off the grid
+        acc.accuracy(noisy(period), solver, OBJECTIVES, key=key)
+    found = jax.jit(lambda period: acc.accuracy(noisy(period), solver, OBJECTIVES, key=key))(period)
     assert not found.comparable
     assert all(np.isnan(float(one.error)) and not one.converges for one in found.estimates.values())
     assert "other noise" in acc.reasons(noisy(period), solver, key)[0]

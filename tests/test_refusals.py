@@ -294,7 +294,10 @@ class TestWhoeverRuns:
         for name in swept.metrics:
             x = swept.column(name)
             assert np.isnan(x[below]).all()
-            np.testing.assert_allclose(found["metrics"][name]["mean"]["value"], x[~below].mean(), rtol=1e-12)
+            reached = x[~below][np.isfinite(x[~below])]
+            assert found["never"].get(name, {"count": 0})["count"] == (~below).sum() - len(reached)
+            if len(reached):
+                np.testing.assert_allclose(found["metrics"][name]["mean"]["value"], reached.mean(), rtol=1e-12)
         assert found["refused"]["count"] == below.sum()
         assert found["refused"]["samples"][0] == np.flatnonzero(below)[0]
         assert sum(found["refused"]["reasons"].values()) == below.sum()

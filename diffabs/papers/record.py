@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -36,6 +37,11 @@ def printed(name: str, quantity: str, unit: str, ours: Any, published: float, di
     """A line of a table whose published number has so many decimals; `matches` if ours rounds to it."""
     line = row(name, quantity, unit, ours, published=published)
     return {**line, "matches": round(line["ours"], digits) == round(published, digits)}
+
+
+def reached(time: Any) -> float | str:
+    """Return a time [s] as a summary has it: "never" where it is infinite."""
+    return "never" if math.isinf(float(time)) else float(time)
 
 
 def solver(step: FixedStep, **more: Any) -> dict[str, Any]:

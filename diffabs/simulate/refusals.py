@@ -66,9 +66,10 @@ def check(part: T, solver: Solver | None = None) -> T:
     return part
 
 
-def impossible(loop: Loop, solver: Solver) -> list[str]:
-    """A line for each value of a loop that no run may have, alone or with the solver; the step may be unstable."""
-    return list(broken(rules(loop))) or list(together(loop, solver))
+def impossible(loop: Loop, step: float) -> list[str]:
+    """A line for each value of a loop that no run may have, alone or on a grid of this step [s]."""
+    begun = _begun(loop)
+    return list(broken(rules(loop))) or ([] if begun.holds else [begun.says()]) or list(broken(grid_rules(loop, step)))
 
 
 def together(loop: Loop, solver: Solver) -> Iterator[str]:
@@ -141,7 +142,7 @@ def first_line(loop: Loop, values: Mapping[str, Any], solver: Solver) -> str | N
     """The first refused lane and why, in a line with its numbers; None if all lanes are accepted. Without values the
     loop is the lane."""
     if not values:
-        lines = impossible(loop, solver) or list(unstable(loop, solver))
+        lines = [*broken(rules(loop)), *together(loop, solver)] or list(unstable(loop, solver))
         return "; ".join(lines) or None
     found = refusals(loop, values, solver)
     if not found.number:

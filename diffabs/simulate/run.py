@@ -132,7 +132,7 @@ def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     refuse(loop, solver, objectives)
     if traced(loop, dict(objectives)):
         return
-    lines = impossible(loop, solver)
+    lines = impossible(loop, solver.step)
     lines += [line for name, part in objectives.items() for line in broken(rules(part, f"objectives.{name}."))]
     if lines:
         raise ValueError("; ".join(lines))
