@@ -15,20 +15,20 @@ from diffabs.core.protocols import Shown
 from diffabs.objectives import PeakVoltage
 
 
-def step(voltage, h, smooth):
-    """A step of length h of a balance under voltage(t)."""
+def step(h, smooth, within=(True, True), **signals):
+    """A step of length h of a balance with these signals of time."""
 
     def at(t):
-        return parts.balancing_at(t)._replace(control=voltage(t))
+        return parts.balancing_at(t)._replace(**{name: signal(t) for name, signal in signals.items()})
 
     (a, da), (b, db) = (jax.jvp(at, (t,), (jnp.ones_like(t),)) for t in jnp.array([0.0, h]))
-    return Segment(a, b, h, h, lambda: (Shown.of(da), Shown.of(db)), lambda: (da, db), smooth)
+    return Segment(a, b, h, h, lambda: (Shown.of(da), Shown.of(db)), lambda: (da, db), smooth, within)
 
 
 @pytest.mark.parametrize(("smooth", "peak"), [(True, 24.0), (False, 19.2)])
 def test_a_voltage_rises_and_falls_within_a_long_step(smooth, peak):
     """u = 24 - 30 (t - 0.4)^2 over a step of 1 s. If the step would not end on a limit, only its ends are seen."""
-    segment = step(lambda t: 24.0 - 30.0 * (t - 0.4) ** 2, 1.0, smooth)
+    segment = step(1.0, smooth, control=lambda t: 24.0 - 30.0 * (t - 0.4) ** 2)
     objective = PeakVoltage()
     np.testing.assert_allclose(objective.update(objective.start(segment.start), segment), peak, rtol=1e-12)
 
@@ -36,9 +36,33 @@ def test_a_voltage_rises_and_falls_within_a_long_step(smooth, peak):
 @pytest.mark.parametrize(("objective", "value"), [(PeakVoltage(), 24.0), (objectives.Variation(), 4.0)])
 def test_a_voltage_that_rises_to_a_limit_does_not_leave_it(objective, value):
     """u = 20 + 8 t to 24, where the step ends and the voltage falls: its slope there says nothing about the step."""
-    segment = step(lambda t: jnp.where(t < 0.5, 20.0 + 8.0 * t, 44.0 - 40.0 * t), 0.5, True)
+
+    def voltage(t):
+        return jnp.where(t < 0.5, 20.0 + 8.0 * t, 44.0 - 40.0 * t)
+
+    segment = step(0.5, True, (True, False), control=voltage)
     found = objective.update(objective.start(segment.start), segment)
     np.testing.assert_allclose(getattr(found, "total", found), value, rtol=1e-12)
+
+
+@pytest.mark.parametrize("corner", [0.0, 0.5])
+def test_the_error_of_a_setpoint_with_a_corner_at_an_end_is_that_within_the_step(corner):
+    """The setpoint rises by 2 t within the step, and falls before or after it. Integral of |theta - setpoint|."""
+    within = corner == 0.0
+
+    def setpoint(t):
+        return jnp.where((t > 0.0) if within else (t < 0.5), 2.0 * t, -6.0 * (t - corner) + 2.0 * corner)
+
+    def theta(t):
+        return 3.0 * t - 0.2
+
+    def output(t):
+        return parts.balancing_at(t).output._replace(theta=theta(t))
+
+    segment = step(0.5, True, (not within, within), output=output, setpoint=setpoint)
+    objective = objectives.IAE()
+    found = objective.update(objective.start(segment.start), segment)
+    np.testing.assert_allclose(found, 0.2**2 / 2 + 0.3**2 / 2, rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -125,7 +125,7 @@ class Segment(NamedTuple):
     and integrals are those of the run to the order of the method. `smooth`: no limit is reached within, either, because
     the step would end there; else the cubic of a signal that has limits may leave them. `within`: whether the
     rates at the start, and those at the end, are those within the step, also where a limit is reached there. Where one
-    is not, what `sample` returns is the parabola through both ends with the other rate; without either, the line."""
+    is not, the cubic is the parabola through both ends with the other rate; without either, the line."""
 
     start: Sample
     end: Sample
@@ -134,7 +134,7 @@ class Segment(NamedTuple):
     shown_rates: Callable[[], tuple[Shown, Shown]]
     sample_rates: Callable[[], tuple[Sample, Sample]]
     smooth: Any = False
-    within: tuple[Any, Any] = (True, False)
+    within: tuple[Any, Any] = (True, True)
 
     def output(self, read: Callable[[Any], Scalar] = lambda output: output[0]) -> Cubic:
         """The cubic of read(output): by default of the first signal that the plant shows."""
@@ -151,19 +151,19 @@ class Segment(NamedTuple):
 
     def sample(self, read: Callable[[Sample], Scalar]) -> Cubic:
         """The cubic of read(sample): of anything seen. It costs the rates of all signals."""
-        cubic = self._cubic(read, (self.start, self.end), self.sample_rates())
-        if all(one is True for one in self.within):
-            return cubic
-        rise, (start, end) = cubic.end - cubic.start, self.within
-        first = jnp.where(end, 2.0 * rise - cubic.end_slope, rise)
-        last = jnp.where(start, 2.0 * rise - cubic.start_slope, rise)
-        return cubic._replace(
-            start_slope=jnp.where(start, cubic.start_slope, first), end_slope=jnp.where(end, cubic.end_slope, last)
-        )
+        return self._cubic(read, (self.start, self.end), self.sample_rates())
 
     def _cubic(self, read: Callable[[Any], Scalar], ends: tuple[Any, Any], rates: tuple[Any, Any]) -> Cubic:
         (a, da), (b, db) = (jax.jvp(read, (end,), (rate,)) for end, rate in zip(ends, rates, strict=True))
-        return Cubic(a, b, self.h * da, self.h * db)
+        first, last, rise, (start, end) = self.h * da, self.h * db, b - a, self.within
+        if start is True and end is True:
+            return Cubic(a, b, first, last)
+        return Cubic(
+            a,
+            b,
+            jnp.where(start, first, jnp.where(end, 2.0 * rise - last, rise)),
+            jnp.where(end, last, jnp.where(start, 2.0 * rise - first, rise)),
+        )
 
 
 def still(sample: Sample, h: Scalar) -> Segment:
