@@ -1617,8 +1617,8 @@ MUTATIONS = [
     Mutation(
         "balance: a voltage leaves its limit in the middle of a step",
         "core/messages.py",
-        "end_slope=jnp.where(end, cubic.end_slope, last)",
-        "end_slope=cubic.end_slope",
+        "jnp.where(end, last, jnp.where(start, 2.0 * rise - first, rise))",
+        "last",
         "test_peaks.py::test_a_voltage_that_rises_to_a_limit_does_not_leave_it",
     ),
     Mutation(
