@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow coverage versions lint docs bench bench-peers bench-check bench-figure mutations fuzz clean
+.PHONY: demo test test-slow coverage versions lint docs bench bench-peers bench-check bench-figure mutants fuzz clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -60,8 +60,8 @@ bench-figure: $(VENV)/.bench
 	$(BIN)/python benchmarks/bench_peers.py --dtype float64
 	$(BIN)/python benchmarks/draw_work_precision.py --out docs/figures/work-precision.png
 
-mutations: $(VENV)/.test
-	$(BIN)/python tests/mutations.py
+mutants: $(VENV)/.test
+	$(BIN)/python tests/mutants.py
 
 # the oldest and newest Python and JAX: VERSIONS="python3.11=0.10 ..."
 VERSIONS ?= python3.11=0.10 python3.12=0.11 python3.13=0.12

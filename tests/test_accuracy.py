@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from marks import cases
+from mutants import killed_by
 from oracles import brake
 
 import diffabs as d
@@ -36,6 +37,9 @@ def truth(low=-np.inf, high=np.inf):
     return brake(RIG.plant, torque, speed=10.0, stop=4.0, slip=0.15, memory=1, rates=rates)
 
 
+@killed_by(
+    "simulate/accuracy.py", "error = jnp.abs(d1) + jnp.abs(d2) / (1 - jnp.minimum(q, SLOW))", "error = jnp.abs(d1)"
+)
 def test_the_error_of_a_smooth_loop_is_that_of_fourth_order():
     """Sixteen fifteenths of what the half step changes; and the half step's own error is a fifteenth."""
     found, exact = acc.accuracy(RIG, d.FixedStep(4e-3, 2.0), OBJECTIVES), truth()
@@ -82,6 +86,7 @@ def test_events_and_delays_are_estimated_to_their_size(make, step):
         assert float(one.error) <= 30 * error + 1e-5 * abs(float(one.value)), (name, error, one)
 
 
+@killed_by("actuators/delay.py", "capacity=times * self.capacity", "capacity=self.capacity")
 @pytest.mark.slow
 def test_a_delay_keeps_its_time_at_a_shorter_step():
     """A ring of 16 steps of 1 ms holds 13.1 ms, one of 16 steps of 0.25 ms does not."""
@@ -108,6 +113,7 @@ def test_noise_with_its_own_clock_is_the_same_at_every_step():
     assert abs(other["iae"] / found.estimates["iae"].value - 1) > 1e-2  # what another realisation would do
 
 
+@killed_by("simulate/accuracy.py", "    if key is None:", "    if True:", case="0.00025")
 @pytest.mark.slow
 @pytest.mark.parametrize("period", cases([2.5e-4, 1.5e-3], 2.5e-4))
 def test_other_noise_is_not_compared(period):

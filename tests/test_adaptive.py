@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import random_loops
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, references, roads, stops
@@ -89,6 +90,9 @@ def test_random_loops_of_any_parts_are_right_to_1e_4(name):
     close(run, d.measure(refined(loop, FINE), fixed, measured, key=key), 1e-4, 1e-3)
 
 
+@killed_by(
+    "simulate/lengths.py", "jnp.minimum(loop.next_tick(k, self.h), self.steps)", "jnp.minimum(k + 1, self.steps)"
+)
 @pytest.mark.slow
 def test_a_computer_strikes_on_its_own_clock_and_not_on_the_grid():
     chosen = load("slip-cured", ["sensor=noise", "sensor.slip=0.002"])
@@ -101,6 +105,11 @@ def test_a_computer_strikes_on_its_own_clock_and_not_on_the_grid():
     close(fine, d.measure(chosen.loop, d.FixedStep(1e-4, 3.0), chosen.objectives, key=key), 1e-4, 1e-3)
 
 
+@killed_by(
+    "simulate/methods.py",
+    "        inside = (t < now.t) & (carry.past.until > carry.past.t)",
+    "        inside = (t < now.t) & (carry.past.until < carry.past.t)",
+)
 @pytest.mark.slow
 def test_a_trajectory_is_kept_on_the_grid_and_changes_nothing():
     chosen = rig()
@@ -148,6 +157,7 @@ def test_a_computer_in_single_precision_keeps_its_time():
     close(run, exact, 2e-4)
 
 
+@killed_by("simulate/methods.py", "ROUNDING = 32 ", "ROUNDING = 0 ")
 @pytest.mark.slow
 def test_single_precision_asks_for_no_smaller_error_than_it_has():
     chosen = rig()
@@ -171,6 +181,12 @@ def on_limits(solver):
     return metrics
 
 
+@killed_by(
+    "simulate/adaptive.py",
+    "exact = fine & (((here.error <= 1) & (here.late <= 0)) | short)",
+    "exact = fine & ((here.error <= 1) | short)",
+)
+@killed_by("simulate/adaptive.py", "system.kinks if pace.notes else 0", "0")
 @pytest.mark.slow
 def test_derivatives_on_limits_agree_with_differences_of_three_widths():
     slopes = jax.jit(jax.jacfwd(on_limits(d.Adaptive(1e-5, 2.5))))(jnp.zeros(2))
@@ -260,6 +276,7 @@ def test_reverse_mode_is_forward_mode(name):
     np.testing.assert_allclose(reverse(5.7), forward(5.7), rtol=1e-6)
 
 
+@killed_by("simulate/replay.py", "    t = one.t + shift\n", "    shift *= 0.0\n    t = one.t + shift\n")
 @pytest.mark.slow
 def test_a_derivative_through_a_relay_and_a_latch_is_that_of_fixed_steps():
     structure, loop = random_loops.STRUCTURES["relay, latch, lag"], random_loops.drawn("relay, latch, lag", 3, 0)
@@ -275,6 +292,11 @@ def test_a_derivative_through_a_relay_and_a_latch_is_that_of_fixed_steps():
     np.testing.assert_allclose(slope(d.Adaptive(1e-6, structure.duration)), fixed, rtol=2e-3)
 
 
+@killed_by(
+    "simulate/adaptive.py",
+    "    return point.t, point.state.flow(), point.rate[0]",
+    "    return point.t, point.state.flow(), jax.tree.map(lambda x: 0.0 * x, point.rate[0])",
+)
 @pytest.mark.slow
 def test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps():
     chosen = load("slip-lmi", ["controller={type='sampled',controller='pid',period=0.005}"])
@@ -283,6 +305,12 @@ def test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps(
     np.testing.assert_allclose(seen, reference, atol=1e-6)
 
 
+@killed_by(
+    "simulate/replay.py",
+    "(t, state.flow(), end.seen.rate) if pace.keeps",
+    "(t, state.flow(), begin.seen.rate) if pace.keeps",
+    case="limits",
+)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "more",
@@ -361,6 +389,7 @@ def test_steps_that_find_themselves_are_never_unstable():
     d.check(loop, d.Adaptive(1e-5, 4.0, 1e-2))
 
 
+@killed_by("simulate/foresight.py", "next = jnp.where((since < -least) & (since > next), since, next)", "del least")
 def test_lines_say_when_comparisons_change_and_when_they_did():
     numbers = [0, 1, 33, np.array([2, 3])]
     values = [jnp.asarray(3.0), jnp.asarray(-2.0), jnp.asarray(1.0), jnp.array([0.5, 4.0])]
@@ -375,6 +404,16 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
     assert none.late == 0
 
 
+@killed_by(
+    "simulate/lengths.py",
+    "sample.output[0], *jax.tree.leaves(off))",
+    "sample.output[0], *(0.0 * x for x in jax.tree.leaves(off)))",
+)
+@killed_by(
+    "simulate/lengths.py",
+    "moved = state.with_flow(jax.tree.map(lambda x, d: x - d, state.flow(), off))",
+    "moved = state",
+)
 def test_the_error_of_a_step_is_that_of_the_worst_state():
     loop = prepared(strong(arrayed(load("slip-lmi", ["actuator=lag", "actuator.time_constant=0.01"]).loop)))
     state = loop.start()
@@ -397,6 +436,7 @@ def test_the_error_of_a_step_is_that_of_the_worst_state():
     assert slip > 0.01 * float(scale[0])
 
 
+@killed_by("simulate/lengths.py", "(moves) / size", "(moves * 0.0 + size[0]) / size", case="arm-hanging")
 @pytest.mark.parametrize("name", ["slip-lmi", "arm-hanging"])
 def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
     loop = prepared(strong(arrayed(load(name).loop)))

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+from mutants import killed_by
 from oracles import arm_rates
 from scipy.integrate import solve_ivp
 
@@ -121,6 +122,12 @@ def lagrangian(p, q, rates):
     return kinetic - masses @ places[:, 1] * p.gravity - 0.5 * p.stiffness * q[2] ** 2
 
 
+@killed_by(
+    "plants/arm_balance.py",
+    "r2 = torque - c2 * sin2 * v1**2 + arm",
+    "r2 = torque - c2 * sin2 * v1**2 - arm",
+    case="upright",
+)
 @pytest.mark.parametrize("plant", [ARM, HANGING, GEARED], ids=["upright", "hanging", "geared"])
 def test_the_closed_form_is_lagranges_equation(plant):
     """M q'' = force + dL/dq - (d2L/dq'dq) q', M = d2L/dq'2. Both round at 1e-16 times the condition of M, about 20."""
@@ -140,6 +147,7 @@ def test_the_closed_form_is_lagranges_equation(plant):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * float(np.max(np.abs(expected))))
 
 
+@killed_by("plants/arm_balance.py", "c2 * sin2 * v2 * (2 * v1 + v2)", "c2 * sin2 * v2 * (v1 + v2)", case="hanging")
 @pytest.mark.parametrize("plant", [ARM, HANGING, GEARED], ids=["upright", "hanging", "geared"])
 def test_what_the_motor_puts_in_and_the_damper_takes_out_is_the_energys_change(plant):
     """Here as tau psi' - d phi'^2, with the torque of eq. (11) by hand, relative to the largest term."""
@@ -160,6 +168,11 @@ def test_what_the_motor_puts_in_and_the_damper_takes_out_is_the_energys_change(p
     np.testing.assert_allclose(plant.power(x, volts), terms, rtol=1e-13, atol=1e-9)
 
 
+@killed_by(
+    "plants/arm_balance.py",
+    "current = clamp(current, -self.current_max, self.current_max)",
+    "current = clamp(current, -np.inf, np.inf)",
+)
 def test_torque_ends_at_the_current_limit():
     motor = dataclasses.replace(GEARED, current_max=7.0)
     most, rate = 100 * 0.3 * 7.0, 0.5
@@ -190,6 +203,11 @@ def gravity_matrix(plant):
     return mass @ a[3:, :3]
 
 
+@killed_by(
+    "plants/printed_arm.py",
+    "m.gravity * b2 * (theta - psi), m.gravity * b3 * (theta - phi)",
+    "m.gravity * b2 * (theta + psi), m.gravity * b3 * (theta + phi)",
+)
 def test_printed_gravity_is_no_machines():
     right, printed = gravity_matrix(FREE), gravity_matrix(PrintedArm(machine=FREE))
     np.testing.assert_allclose(right, right.T, rtol=0, atol=1e-11 * np.max(right))

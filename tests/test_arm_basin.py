@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from balancing import DIRECTION, EFFORT, GAIN, HANGING, MULTIPLES, SHORT, SLOW, SOLVER, START, WEIGHTS, closed, model
+from mutants import killed_by
 from oracles import arm_rates, arm_stays_up
 
 from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
@@ -54,6 +55,9 @@ def test_a_region_is_what_its_runs_do():
     assert not np.array_equal(found.outcomes.recovered[:5], found.outcomes.recovered[:5][::-1])
 
 
+@killed_by(
+    "design/attraction.py", "inside.of(lanes).contain(x) & ~run.stopped & ~run.diverged", "~run.stopped & ~run.diverged"
+)
 @pytest.mark.slow
 def test_what_is_not_known_in_time_is_undecided_and_nothing_else():
     """The slow LQR after 3 s: neither on the ground nor where it surely returns. In the end 32.8 % return, not 23.0."""
@@ -96,6 +100,9 @@ def test_starts_beside_the_border_end_as_scipy_says(gain):
     assert outcomes(loop, columns, COARSE).recovered.tolist() == expected
 
 
+@killed_by(
+    "design/attraction.py", "(np.arange(self.number) + 0.5) / self.number", "np.arange(self.number) / (self.number - 1)"
+)
 def test_a_share_is_one_by_area():
     """Cells, so that the border counts half: of theta > phi the half, of which a grid with its edges makes 0.45."""
     cells = Cells(-0.1, 0.1, 10)
@@ -173,6 +180,7 @@ CASES = {
 }
 
 
+@killed_by("design/capture.py", "_growth(systems, p, inverse, level) < decay", "np.ones(len(p), bool)")
 @pytest.mark.parametrize("case", CASES)
 def test_in_the_ellipsoid_its_function_falls(case):
     """At 4,000 states in and on it, in separately written equations with the limit; on it the motor is linear. It is
@@ -191,6 +199,7 @@ def test_in_the_ellipsoid_its_function_falls(case):
     assert np.sqrt(np.linalg.inv(s)[0, 0]) > 1.7e-3
 
 
+@killed_by("design/capture.py", "1 / reach.max(axis=1)", "np.full(len(p), 1e9)")
 def test_no_ellipsoid_where_the_loop_does_not_return():
     """A rider of 72 kg falls, slowly; NaN is no gain; an unlimited motor and a current limit change what is linear."""
     masses = np.array([70.0, 72.0])
@@ -208,6 +217,11 @@ def test_no_ellipsoid_where_the_loop_does_not_return():
     assert np.sqrt(row @ np.linalg.solve(strong, row)) > 1.0
 
 
+@killed_by(
+    "plants/arm_balance.py",
+    "rider = self.gravity * b3 * extent(unit[0] + unit[2]) ** 3 / 6",
+    "rider = 0.0 * extent(unit[0] + unit[2])",
+)
 @pytest.mark.slow
 def test_what_is_left_of_the_equations_is_within_its_bound():
     """Of random machines at random states of a box; and the bound is not idle: some are at more than a tenth of it."""
@@ -256,6 +270,7 @@ def test_float32_and_float64_agree_on_the_region():
     assert 0.2 < double.share < 0.8
 
 
+@killed_by("stops/stops.py", "return self.angle**2 - output.theta**2", "return self.angle**2 - output.psi**2")
 @pytest.mark.slow
 def test_the_slope_of_the_time_of_a_fall_is_a_difference():
     """In the lean that it starts with: the last step ends on the ground, wherever that is between two instants."""
@@ -282,6 +297,11 @@ def robust():
     return design(gridded(BalanceModel(plant=HANGING), OVER), Spec(Q=np.diag(WEIGHTS), R=EFFORT))
 
 
+@killed_by(
+    "design/parameter_grid.py",
+    "np.linspace(low[path], high[path], points)",
+    "np.linspace(low[path], high[path], points, endpoint=False)",
+)
 def test_the_vertices_are_the_systems_on_the_grid():
     """Ends included; the last parameter runs first, as in the corners."""
     over = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (1000.0, 1000.0), "plant.damping": (70.0, 130.0)}

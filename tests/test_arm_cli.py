@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from mutants import killed_by
 
 from diffabs import FixedStep, stops
 from diffabs.cli import console
@@ -138,6 +139,7 @@ def test_certify_disproves_the_gain_for_one_rider():
     assert "quadratic stability is disproved" in result.stderr
 
 
+@killed_by("sweep/engines.py", "return np.asarray(stopped) != success", "return ~np.asarray(stopped)")
 def test_a_stop_that_is_a_fall_is_not_missed():
     stopped = np.array([True, False])
     np.testing.assert_array_equal(missed(stopped, stops.Fallen.success), [True, False])

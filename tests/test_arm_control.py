@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from balancing import EFFORT, HANGING, MULTIPLES, START, WEIGHTS, closed, model
+from mutants import killed_by
 from scipy.integrate import solve_ivp
 
 from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
@@ -36,6 +37,7 @@ def by_eigenvectors(a, b, start, limit):
     return abs(w @ b[:, 0]) * limit / (poles[place].real * abs(w @ start))
 
 
+@killed_by("linear/recoverable.py", "return 2 * limit / jnp.sqrt", "return limit / jnp.sqrt")
 def test_the_bound_is_that_of_the_unstable_mode():
     a, b = (np.asarray(x) for x in model(HANGING))
     expected = by_eigenvectors(a, b, START, 48.0)
@@ -99,6 +101,7 @@ def observer():
     return lqg(HANGING, WEIGHTS, EFFORT, voltage_max=48.0)
 
 
+@killed_by("linear/gaussian.py", "dare(A.T, C.T, W, V)", "dare(A.T, C.T, 0.5 * W, V)")
 def test_kalman_is_scipys():
     random = np.random.default_rng(6)
     a, c, root = random.normal(size=(6, 6)), random.normal(size=(2, 6)), random.normal(size=(6, 6))
@@ -123,6 +126,9 @@ def corrected(observer, last, x, k=1):
     return observer.tick(Clock(0.01 * k, 0.01, k, None), Memory(held=last), seen(x)).held
 
 
+@killed_by(
+    "linear/gaussian.py", "jnp.linalg.solve(spread, C @ found.P).T", "jnp.linalg.solve(spread, C @ found.P @ A.T).T"
+)
 def test_regulator_and_filter_are_those_of_the_weights():
     """SciPy's, of unknown accelerations that are constant over a period of 20 ms; other weights than the defaults."""
     a, b = (np.asarray(x) for x in model(HANGING))
@@ -161,6 +167,11 @@ def test_poles_of_the_loop_are_those_of_regulator_and_filter(observer):
     np.testing.assert_allclose(np.sum(poles), np.sum(np.r_[regulated, filtered]), rtol=1e-12, atol=0)
 
 
+@killed_by(
+    "controllers/balance.py",
+    "voltage = clamp(estimate.voltage, -self.voltage_max, self.voltage_max)",
+    "voltage = estimate.voltage",
+)
 def test_an_observer_knows_the_limit_of_its_voltage(observer):
     """From the last estimate under 48 V, however much was asked for."""
     inner, last = observer.controller, np.linspace(-0.1, 0.2, 6)
@@ -170,6 +181,11 @@ def test_an_observer_knows_the_limit_of_its_voltage(observer):
     assert float(found.voltage) == pytest.approx(float(inner.gain @ predicted), rel=1e-12)
 
 
+@killed_by(
+    "controllers/balance.py",
+    "jnp.where(number > 0, predicted + self.correction @ error, self.start(signal).held.state)",
+    "predicted + self.correction @ error",
+)
 def test_an_observer_starts_at_what_is_measured(observer):
     """Without a prediction at its first sample, whatever voltage it would have asked for."""
     x = jnp.linspace(0.1, 0.6, 6)

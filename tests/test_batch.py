@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from marks import cases
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, plants
@@ -103,6 +104,7 @@ class TestLanes:
         run = d.run_batch(LOOP, Batch(VALUES, keys), SOLVER, MEASURED, accepted=True, enough=never)
         same(jax.device_get(run), expected)
 
+    @killed_by("core/compiling.py", "isinstance(jax.device_put(0), Tracer) or any(", "any(")
     @pytest.mark.slow
     def test_are_those_of_single_runs_together(self, keys, expected):
         lanes = Batch(VALUES, keys)
@@ -121,6 +123,12 @@ class TestLanes:
             same(jax.tree.map(lambda x, i=i: x[i], found), one)
         assert found.metrics["iae"][SHORT] == found.metrics["iae"][6]
 
+    @killed_by(
+        "simulate/batch.py",
+        "return jax.vmap(jax.random.key)(jnp.asarray(self.keys))",
+        "return jax.vmap(jax.random.key)(0 * jnp.asarray(self.keys))",
+        case="refilled",
+    )
     @pytest.mark.slow
     def test_may_differ_in_their_noise_alone(self, driven):
         """Keys, or the numbers that they are made of."""
@@ -134,6 +142,13 @@ class TestLanes:
         found = driven(QUIET, Batch(), SOLVER, MEASURED)
         same(found, jax.tree.map(lambda x: x[None], jax.device_get(d.measure(QUIET, SOLVER, MEASURED))))
 
+    @killed_by("simulate/batch.py", "    if accepted is True:\n        return run", "    return run", case="together")
+    @killed_by(
+        "simulate/refill.py",
+        "jnp.where(run & (number < count), carry.condition",
+        "jnp.where(number < count, carry.condition",
+        case="refilled",
+    )
     def test_that_are_not_accepted(self, driven, keys, expected):
         """They are flagged, the others are what they were."""
         out = np.isin(np.arange(len(SPEEDS)), [0, NEVER, 9])
@@ -151,6 +166,7 @@ class TestLanes:
             Batch({"initial.speed": SPEEDS}).check(LOOP, SOLVER)
         assert d.run_batch(QUIET, Batch(), d.FixedStep(0.3, 0.6), MEASURED).diverged.tolist() == [True]
 
+    @killed_by("simulate/batch.py", "jnp.concatenate(x)[order]", "jnp.concatenate(x)")
     @pytest.mark.slow
     def test_in_order_when_those_of_similar_length_run_together(self, keys, expected):
         times = np.maximum(expected.ending.sample.t + 0.02, 0.13)
@@ -170,6 +186,9 @@ class TestLanes:
         assert refill._run._cache_size() == before
 
 
+@killed_by(
+    "simulate/refill.py", "free = ~belt.carry.running | _seen_enough(enough, built, belt)", "free = ~belt.carry.running"
+)
 @pytest.mark.parametrize("width", cases(WIDTHS, 4))
 def test_a_lane_of_which_enough_is_seen_is_taken_off(keys, expected, width, monkeypatch):
     """At the next look; it has not stopped, and the others are what they were."""
@@ -202,6 +221,12 @@ def iae_of_one(gain, speed):
     return d.measure(loop, SOLVER, {"iae": MEASURED["iae"]}).metrics["iae"]
 
 
+@killed_by(
+    "simulate/batch.py",
+    "columns = {path: jnp.asarray(column, float) for",
+    "columns = {path: jax.lax.stop_gradient(jnp.asarray(column, float)) for",
+    case="jacfwd",
+)
 @pytest.mark.parametrize(
     ("mode", "single"),
     [
@@ -252,6 +277,7 @@ class TestStacked:
         weights = lanes.each(first, lambda loop, key: loop.plant.mass * loop.controller.gain[0])
         np.testing.assert_array_equal(weights, [-2e4, -3e4])
 
+    @killed_by("simulate/batch.py", "(jax.tree.structure(loop), *map", "(0, *map")
     def test_of_one_structure(self):
         other = replace(QUIET, {"stop": Standstill(speed=5.0)})  # of equal shapes
         assert by_structure([QUIET, other, replace(QUIET, {"plant.mass": 6.0})]) == [[0, 2], [1]]
@@ -305,6 +331,7 @@ def placed(values, keys, kind):
     return {path: jax.device_put(x, place) for path, x in values.items()}, jax.device_put(keys, place)
 
 
+@killed_by("simulate/placement.py", "    if not meshes:", "    if True:")
 def test_lanes_on_an_explicit_mesh_are_run_on_an_auto_one():
     """Gathers say nothing of where they lie there; results come back."""
     (speeds,), numbers = (given := placed({"speed": SPEEDS[:4]}, np.arange(4), AxisType.Explicit))[0].values(), given[1]

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -54,6 +55,9 @@ def fed(block, signal_at, end, steps=4000):
     return Memory(jax.lax.scan(step, start, jnp.arange(steps, dtype=float))[0])
 
 
+@killed_by(
+    "references/extremum_seeking.py", "slip * deceleration - m.covariance", "slip * signal.deceleration - m.covariance"
+)
 def test_seeking_finds_the_slope_whatever_moves_the_slip():
     """On a line a = a0 + p slip the covariance is p times the variance, so the estimate is p m/b where the resolution
     does not matter; a swing A sin(w t) has the variance (A^2/2) (wT)^2/(1 + (wT)^2) about the mean that lags, in the
@@ -68,6 +72,9 @@ def test_seeking_finds_the_slope_whatever_moves_the_slip():
     np.testing.assert_allclose(m.variance, swing**2 / 2 * share * (1 - np.exp(-6.0)), rtol=0.02)
 
 
+@killed_by(
+    "references/extremum_seeking.py", "self.gain * e * clamp(room / jnp.log1p(self.band), 0.0, 1.0)", "self.gain * e"
+)
 def test_seeking_climbs_at_its_gain_and_stays_within_its_limits():
     """A deceleration in proportion to the slip has the elasticity 1: ln s grows at the gain, until the band."""
     block = references.ExtremumSeeking(
@@ -87,6 +94,7 @@ def test_seeking_climbs_at_its_gain_and_stays_within_its_limits():
     np.testing.assert_allclose(block.output(np.pi / 60.0, down, None), 1.1 * block.setpoint(down), rtol=1e-12)
 
 
+@killed_by("references/extremum_seeking.py", "return self.gain * e", "return -self.gain * e")
 @pytest.mark.slow
 def test_seeking_ends_at_the_peak_of_a_road():
     """From either side, under a controller, on a road whose peak is known."""
@@ -105,6 +113,11 @@ def test_seeking_ends_at_the_peak_of_a_road():
     np.testing.assert_allclose(found, best, rtol=0.15)
 
 
+@killed_by(
+    "references/by_deceleration.py",
+    "return (signal.deceleration - memory.flow) / self.time_constant",
+    "return 1e3 * (signal.deceleration - memory.flow)",
+)
 def test_a_slip_by_deceleration_is_interpolated_behind_its_filter():
     """np.interp, of the step response of the filter."""
     nodes, slips = np.array([1.0, 2.0, 5.0]), np.array([0.05, 0.2, 0.1])

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 from scipy.optimize import brentq
 
 import diffabs as d
@@ -133,6 +134,11 @@ def test_pid_by_hand():
     close([pid.output(0.0, memory, tracking(error)) for error in (1.0, -1.0)], [90.0, 0.0])
 
 
+@killed_by(
+    "controllers/pid.py",
+    "return PIDMemory(integral, self.cutoff * (error - memory.flow.filtered))",
+    "return PIDMemory(integral, 0.0 * error)",
+)
 def test_pi_and_filtered_derivative_to_a_step():
     """u = kp e + ki e t + kd wc e exp(-wc t)."""
     pid = PID(kp=10.0, ki=40.0, kd=0.5, cutoff=30.0, low=0.0, high=90.0)
@@ -141,6 +147,11 @@ def test_pi_and_filtered_derivative_to_a_step():
     close(u, 1.0 + 4.0 * t + 0.5 * 30.0 * 0.1 * np.exp(-30.0 * t), rtol=1e-8)
 
 
+@killed_by(
+    "controllers/antiwindup.py",
+    "ratio(limited - raw, gain * self.tracking_time)",
+    "ratio(raw - limited, gain * self.tracking_time)",
+)
 @pytest.mark.parametrize(
     ("strategy", "rates"),
     [
@@ -184,6 +195,7 @@ def test_scheduled_feedback_interpolates_its_gains():
         close(k.flow(0.0, Memory(0.3), signal), fixed.flow(0.0, Memory(0.3), signal))
 
 
+@killed_by("core/numerics.py", "jnp.where(x >= nodes[1:], 1.0,", "jnp.where(x >= nodes[1:], 0.0,")
 def test_scheduled_feedback_interpolates_between_many_nodes():
     """Against NumPy: before the first node, at nodes, between, beyond the last; rounding only."""
     nodes, values = np.array([2.0, 3.0, 5.0, 9.0]), np.array([-1.0, -5.0, -2.0, -7.0])
@@ -194,6 +206,7 @@ def test_scheduled_feedback_interpolates_between_many_nodes():
         close(k.output(0.0, Memory(0.3), signal), -0.1 * np.interp(speed, nodes, values))
 
 
+@killed_by("controllers/gain_schedule.py", "(signal.measured.speed / self.reference_speed)", "1.0")
 def test_proportional_feedback_is_state_feedback_with_a_gain_that_goes_with_the_speed():
     k = ProportionalFeedback(gain=np.array([-30.0, -5.0]), reference_speed=4.0, torque_max=9.0)
     for speed, part in ((4.0, 1.0), (1.0, 0.25), (8.0, 2.0)):  # all beyond 9 N m with an integral of -3
@@ -217,6 +230,10 @@ def test_scheduled_feedback_refuses(change, message):
         check(ScheduledFeedback(**change))
 
 
+@killed_by("controllers/switching.py", "return (self.band + jnp.where", "return (0.0 * self.band + jnp.where")
+@killed_by(
+    "simulate/landing.py", "length = place - margin / jnp.where(at_place < 0, at_place, -jnp.inf)", "length = place"
+)
 def test_relay_switches_on_the_far_side_of_its_band():
     """Slip 0.2 + 0.03 sin(w t), band 0.02: released where the sine is 2/3 and rises, applied where it is -2/3 and
     falls; 10 periods in 523 steps, which no period divides. It starts on its target, released."""
@@ -232,6 +249,7 @@ def test_relay_switches_on_the_far_side_of_its_band():
     close(mean, 1.0 + 8.0 * on / (20 * np.pi), rtol=1e-9)
 
 
+@killed_by("simulate/landing.py", "enough & ~at_once & tells.another", "enough & ~at_once & False")
 def test_two_events_in_one_step():
     """The deceleration has its maximum 0.3 into step 5, at a slip of 0.15; the relay, whose target is that from then
     on, releases at 0.16; with the target before it, it would at 0.21, 0.8 into the step. The slip bends so that a
@@ -251,6 +269,11 @@ def test_two_events_in_one_step():
     close(torque_mean, 5.3 + brentq(lambda x: float(rise(x)) - 0.01, 0.0, 1.0), rtol=1e-9)
 
 
+@killed_by(
+    "simulate/stepper.py",
+    "jnp.where(lost, Condition.DIVERGED, condition)",
+    "jnp.where(lost, Condition.TIMED_OUT, condition)",
+)
 def test_what_switches_in_every_step_is_no_run():
     """A relay on the rig with hardly a band: it would switch some ten times in each step of 1 ms."""
     loop = d.Loop(
@@ -265,6 +288,8 @@ def test_what_switches_in_every_step_is_no_run():
     assert np.isnan(run.metrics["iae"])
 
 
+@killed_by("objectives/tracking.py", "cubic.start * cubic.end < 0", "cubic.start * cubic.end < -1e9")
+@killed_by("core/cubic.py", "return jnp.where(inside & (top > ends), top, ends)", "return ends")
 @pytest.mark.parametrize("h", [1e-3, 5e-4])
 def test_the_integral_of_an_error_that_changes_sign(h):
     """Of 0.03 |sin(w t)| over five and a quarter periods that no step divides, and with the weight t; and its peak."""
@@ -283,6 +308,16 @@ def test_the_integral_of_an_error_that_changes_sign(h):
     close(found["itae"], np.trapezoid(t * 0.03 * np.abs(np.sin(w * t)), t), rtol=3e-6 * (h / 1e-3) ** 4)
 
 
+@killed_by(
+    "core/messages.py",
+    "Shown.of(self.start), Shown.of(self.end)",
+    "Shown.of(self.start), Shown.of(self.end)._replace(setpoint=self.start.setpoint)",
+)
+@killed_by(
+    "core/messages.py",
+    "Shown.of(self.end)), self.shown_rates())",
+    "Shown.of(self.end)), [rate._replace(setpoint=0.0 * rate.setpoint) for rate in self.shown_rates()])",
+)
 @pytest.mark.parametrize(
     ("solver", "rtol"),
     [
@@ -319,6 +354,7 @@ def test_sliding_mode():
     close([mode.output(0.0, Memory(), tracking(e, 5.0)) for e in (0.05, -0.02, 0.3, -0.3)], [25.0, -3.0, 45.0, -35.0])
 
 
+@killed_by("controllers/sampled.py", "t + self.delay - jax", "t - jax")
 @pytest.mark.parametrize("delay", [0.0, 1.5, 2.0, 4.0])
 def test_sampled_is_a_zero_order_hold(delay):
     """Against the textbook loop: u_k held from t_k + delay on, integral by forward Euler."""
@@ -357,6 +393,9 @@ def parabola(t, top=5.3e-3, a=9.0, bend=4e4):
     return seen(0.15 + 20.0 * (t - top) + 300.0 * (t - top) ** 2, deceleration=a - bend * (t - top) ** 2)
 
 
+@killed_by(
+    "simulate/landing.py", "jnp.where(earlier, before, jnp.where(enough, probe, guess)), enough & ~earlier", "x, True"
+)
 @pytest.mark.parametrize("top", [5.3e-3, 5.7e-3, 6e-3])
 def test_latch_finds_the_vertex(top):
     """Exactly, and at its moment; also on an instant of the grid."""
@@ -375,6 +414,7 @@ def two_maxima(t):
     return seen(0.1 + t, deceleration=values[i] + (values[i + 1] - values[i]) * x * x * (3 - 2 * x))
 
 
+@killed_by("references/peak_slip.py", "zero + LEAST, slip", "zero, slip")
 def test_latch_waits_for_the_brake():
     """A wheel that rolls shows a deceleration of some 1e-5 m/s^2 in single precision, up and down; then the brake."""
 
@@ -416,6 +456,7 @@ def test_latch_does_not_move_for_rounding():
     close(target, [0.2] * 3 + [0.1022] * 5, rtol=1e-9)
 
 
+@killed_by("core/loop.py", "((a >= 0) & ((b < 0) | (c < 0)))", "((a >= 0) & (c < 0))")
 @pytest.mark.slow
 def test_noise_of_a_sampled_accelerometer_latches_where_it_jumps_down():
     """a = 3 + 50 t + noise that is held for 2 steps: a jump down from more than ever is a maximum, wherever it goes to,
@@ -442,6 +483,7 @@ def test_literal_follows_the_slip_while_friction_rises():
     close(target, [0.2, *slip[1:6], *[slip[5]] * 6])
 
 
+@killed_by("references/peak_slip.py", "(m.latched < 0.5) & (m.greatest > self.arming)", "(m.latched < 0.5)")
 @pytest.mark.parametrize(("threshold", "arming", "latches"), [(0.05, 3.0, True), (0.05, 9.1, False), (0.5, 3.0, False)])
 def test_robust_latch(threshold, arming, latches):
     """A low-pass turns A - B t^2 into A - B T^2 - B (t - T)^2, slip likewise. With top 9.3 ms, T = 0.2 ms, the level
@@ -483,6 +525,7 @@ def test_two_lags_in_series():
 # Sensors
 
 
+@killed_by("core/messages.py", "self.on_grid & (self.k % n == 0)", "self.on_grid & (self.k % n == 1)")
 def test_noise():
     """10^4 draws: their mean within 4/sqrt(10^4) and their deviation within 4/sqrt(2 10^4) of the deviation."""
     noise = Noise(slip=0.1, speed=2.0, wheel_speed=0.5, deceleration=3.0, period=2 * H)
@@ -517,6 +560,7 @@ def test_wheel_speed_lags_a_ramp():
     close(y.slip, (20.0 - y.wheel_speed) / 30.0)
 
 
+@killed_by("sensors/speed.py", "return self.bias - signal.deceleration", "return -signal.deceleration")
 def test_integrated_accelerometer():
     """v = v0 - a t + bias t; slip (v - w)/v."""
     t = H * np.arange(30)
@@ -527,6 +571,7 @@ def test_integrated_accelerometer():
     close(y.deceleration, 7.5)
 
 
+@killed_by("sensors/speed.py", "slip=(v - signal.wheel_speed) / jnp.maximum(v, self.floor), speed=v)", "speed=v)")
 def test_a_speed_seen_low_hides_slip():
     """At 20 m/s with the rim at 16: seen as 19, slip 3/19 instead of 0.2; a wheel that rolls seems to be driven. The
     floor stands in for the speed below it, the accelerometer and the distance are as they are."""

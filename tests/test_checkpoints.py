@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, plants
@@ -54,12 +55,16 @@ def memory(steps):
     return analysis.temp_size_in_bytes
 
 
+@killed_by("simulate/checkpoint.py", "SLOTS = 1800", "SLOTS = 10**9")
 @pytest.mark.slow
 def test_memory_of_reverse_mode_hardly_grows_with_the_number_of_steps():
     sizes = [memory(steps) for steps in (1000, 4000, 16000)]
     assert max(sizes) < 2 * min(sizes), sizes
 
 
+@killed_by(
+    "simulate/checkpoint.py", "return math.ceil(count / inner), inner", "return count // inner, inner", case="1801"
+)
 @pytest.mark.parametrize("count", [1, 2, 7, 900, 1800, 1801, 1804, 4004, 16004, 10**6])
 def test_nested_scans_make_enough_steps_and_keep_few_carries(count):
     groups, steps = levels(count)
@@ -91,6 +96,11 @@ def test_groups_after_the_end_are_skipped_and_have_no_derivative():
         np.testing.assert_allclose(slope, made * 1.01 ** (made - 1), rtol=1e-12)
 
 
+@killed_by(
+    "simulate/rk4.py",
+    "pushed(lambda *step: _scan(f, *step), primals",
+    "pushed(lambda *step: _scan(f, *step[:4], jax.lax.stop_gradient(step[4])), primals",
+)
 @pytest.mark.slow
 def test_reverse_forward_and_differences_agree_in_nested_scans(monkeypatch):
     monkeypatch.setattr(checkpoint, "SLOTS", 16)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from mutants import killed_by
 
 from diffabs.cli import console
 from diffabs.core.pytree import Scalar, param, pytree
@@ -171,6 +172,11 @@ def infeasible(monkeypatch):
     monkeypatch.setattr(synthesis, "design", none)
 
 
+@killed_by(
+    "cli/design.py",
+    "                    show.as_json(certificates.document(task, reason=str(error)))\n",
+    "                    pass\n",
+)
 def test_no_gain_could_not_be_done(tmp_path, infeasible):
     (tmp_path / "c.json").write_text("old")
     result = run("design", "slip-lmi", "--json", "--out", tmp_path / "c.json", status=1)
@@ -236,6 +242,7 @@ def test_what_is_known_besides_of_the_published_gain():
     assert rows["proved stable for a speed falling by no more than"] == "7.918"
 
 
+@killed_by("design/frozen.py", "int((rates > 0).sum())", "len(grid)")
 def test_frozen_loops_are_counted_at_their_poles():
     """x'' = u, u = -a x - x' with a between -1 and 3: stable for a > 0, 4 of 17 points and the one at 0 are not."""
     found = frozen([0.0, 0.0], Spring(), {"stiffness": (-1.0, 3.0)})
@@ -264,6 +271,7 @@ def test_where_two_vertices_refute_at_once(tmp_path):
     assert checked(tmp_path / "c.json").returncode == 0
 
 
+@killed_by("cli/certificates.py", "fastest=True", "fastest=False")
 def test_fastest_decay_and_least_cost_of_a_gain():
     document = json.loads(run("certify", "slip-lmi", "--gain=-11753,-158.17", "--json").stdout)
     assert document["trace_cost"] == pytest.approx(1847633.09, rel=1e-5)
@@ -278,6 +286,10 @@ def test_unstable_gain_says_so():
     ).stderr  # fmt: skip
 
 
+@killed_by(
+    "cli/design.py", "        if reason:\n            console.fail", "        if False:\n            console.fail"
+)
+@killed_by("cli/certificates.py", '"damping": (spec.damping > 0,', '"damping": (False,')
 @pytest.mark.parametrize(
     ("change", "said"),
     [("design.decay=500", "decay = 500 1/s is disproved"), ("design.damping=0.95", "damping = 0.95 is undecided")],
@@ -296,6 +308,7 @@ def test_specifications_that_are_proved():
     assert document["decay_rate"] > 50
 
 
+@killed_by("cli/certificates.py", '[] if stable else [f"quad', '[] if stable is not False else [f"quad')
 def test_undecided_is_not_proved(tmp_path, monkeypatch):
     monkeypatch.setattr(analysis, "certify", lambda gain, polytope, *_, **__: Certificate(polytope, gain, ()))
     result = run("certify", "slip-lmi", "--json", "--out", tmp_path / "c.json", status=1)
@@ -315,6 +328,11 @@ def test_sampled_loop_behind_a_delay():
     assert "note: the linear model is not the loop's own linearisation" in result.stderr
 
 
+@killed_by(
+    "cli/certificates.py",
+    "    if not isinstance(controller, ProportionalFeedback) or not isinstance(reduced.model, SlipModel):",
+    "    if True:",
+)
 @pytest.mark.slow
 def test_a_gain_that_follows_the_speed_is_proved_as_one():
     """Fixed at its value for 50 km/h, the same gain is not stable at 5 km/h under 1 kHz; in proportion it is."""
@@ -346,6 +364,7 @@ BAD = [
 ]
 
 
+@killed_by("cli/certificates.py", "    if len(values) != len(states):", "    if False:")
 @pytest.mark.parametrize(("args", "needed"), BAD, ids=[" ".join(args) for args, _ in BAD])
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, no_polytope, args, needed):
     monkeypatch.chdir(tmp_path)
@@ -374,6 +393,11 @@ def test_failure_of_the_linear_algebra_is_not_bad_input(monkeypatch):
     assert_one_error_line(run("certify", "slip-lmi", status=1))
 
 
+@killed_by(
+    "cli/certificates.py",
+    '    except ModuleNotFoundError as error:\n        console.fail(" ".join(str(error).split()))\n',
+    "",
+)
 @pytest.mark.parametrize("command", ["design", "certify"])
 def test_without_the_extra(command, monkeypatch, no_polytope):
     monkeypatch.setitem(sys.modules, "cvxpy", None)
@@ -383,6 +407,11 @@ def test_without_the_extra(command, monkeypatch, no_polytope):
     assert 'pip install ".[design]" in a clone' in result.stderr
 
 
+@killed_by(
+    "sweep/distributions.py",
+    "from numpy.typing import ArrayLike\n",
+    "from numpy.typing import ArrayLike\nfrom scipy.special import ndtr as _\n",
+)
 def test_other_commands_do_without_the_extra():
     code = """
 import sys

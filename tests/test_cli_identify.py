@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from mutants import killed_by
 from sweeping import rig
 
 import diffabs.identify.identification as library
@@ -111,6 +112,7 @@ BAD_FILES = [
 ]
 
 
+@killed_by("scenario/measurements.py", "np.flatnonzero(np.diff(t) <= 0)", "np.flatnonzero(np.diff(t) < -1e9)")
 @pytest.mark.parametrize(("lines", "needed"), BAD_FILES, ids=[needed[:40] for _, needed in BAD_FILES])
 def test_a_bad_file_is_one_line(csv, lines, needed):
     path = csv(*lines) if lines else csv("")
@@ -171,6 +173,7 @@ def test_the_arguments_reach_the_fit(small, csv, invented):
     assert asked["solver"].duration == pytest.approx(0.302)
 
 
+@killed_by("cli/identify.py", "max(_rms(residuals[name]), LEAST * spread[name])", "spread[name]")
 def test_noise_that_is_not_known_is_taken_from_the_residuals(small, csv, invented):
     document = json.loads(run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, "--json").stdout)
     first, *others = (asked["data"].sigma for asked in invented)

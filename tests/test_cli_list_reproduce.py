@@ -9,6 +9,7 @@ import types
 
 import pytest
 from commands import assert_one_error_line, left_in, run, umask
+from mutants import killed_by
 
 from diffabs.cli import catalogue, console, report
 from diffabs.papers.digest import Digest
@@ -86,6 +87,7 @@ def papers(monkeypatch):
     return found, interrupted
 
 
+@killed_by("cli/reproduce.py", 'if name == "all" else None', "if False else None")
 def test_reproduce_everything(papers, tmp_path):
     result = run("reproduce", "--out", tmp_path / "new" / "out")
     out = tmp_path / "new" / "out"

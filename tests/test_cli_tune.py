@@ -17,6 +17,7 @@ import pytest
 from commands import assert_one_error_line, left_in, run, umask
 from invented import HISTORY
 from invented import tuned as invention
+from mutants import killed_by
 from sweeping import rig, tune_section
 
 import diffabs.tune as library
@@ -166,6 +167,7 @@ def test_json_has_what_scripts_rely_on(tuned):
     assert said == "no proof\n"
 
 
+@killed_by("cli/tune.py", 'after = chosen.with_loop(found.loop, "tuned")', "after = chosen")
 def test_what_is_written_loads_and_simulates_to_what_was_reported(tuned):
     folder, document, _ = tuned
     before, after = load(folder / "small.toml"), load(folder / "out.toml")
@@ -321,6 +323,7 @@ def test_packaged_scenarios_can_be_tuned(name, invented):
 # What could not be done
 
 
+@killed_by("cli/tune_document.py", '"met": beyond <= 0', '"met": True')
 def test_a_constraint_that_is_not_met_could_not_be_done(small, invented, tmp_path):
     (tmp_path / "old.toml").write_text("old")
     out = ("--out", tmp_path / "old.toml", "--plot", tmp_path / "a.png")
@@ -338,6 +341,7 @@ def test_a_constraint_that_is_not_met_could_not_be_done(small, invented, tmp_pat
     assert (tmp_path / "old.toml").read_text() == "old"
 
 
+@killed_by("cli/tune_document.py", '"met": beyond <= 0', '"met": beyond <= 1e-3 * abs(bound)')
 @pytest.mark.parametrize(("bound", "met"), [("0.2", True), ("0.19999999999999998", False), ("0.1999001", False)])
 def test_met_is_met_without_a_tolerance(small, invented, bound, met):
     """0.2 was reached. The float below it is not met, and the table says by how much."""
@@ -382,6 +386,7 @@ def test_what_the_packaged_cure_says_is_met_is_met(tmp_path, changes):
     assert (-poles.real / np.abs(poles)).min() >= after.tune.damping
 
 
+@killed_by("cli/tune.py", "    except StartError as error:", "    except KeyError as error:")
 def test_no_start_that_can_be_used_could_not_be_done(small, monkeypatch):
     def none(*_, **__):
         raise StartError(f"{Reason.START.value}: 2 of 2 lanes diverge there")

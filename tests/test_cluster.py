@@ -19,6 +19,7 @@ import psutil
 import pytest
 from commands import assert_one_error_line, left_in, run
 from distributed import Client, LocalCluster
+from mutants import killed_by
 from sweeping import PATIENCE, SCENARIO, chunks, command, described, environment, free_port, started, until
 
 from diffabs.sweep import SweepError, cluster, sweep
@@ -257,6 +258,7 @@ def test_the_command_is_killed_or_interrupted(scenario, tmp_path, how):
     assert document["digest"] == other["digest"]
 
 
+@killed_by("sweep/cluster.py", "if stopping() and not client.nthreads():", "if False:")
 @pytest.mark.parametrize(
     ("threads", "stopped", "somebody"), [({}, True, False), ({}, False, True), ({"a": 1}, True, True)]
 )
@@ -281,6 +283,7 @@ def listening():
     return {(c.laddr.ip, c.laddr.port) for c in inside if c.status == psutil.CONN_LISTEN}
 
 
+@killed_by("sweep/cluster.py", 'worker_dashboard_address=f"{LOOPBACK}:0"', 'worker_dashboard_address=":0"')
 def test_nobody_else_reaches_scheduler_workers_and_their_pages():
     before = listening()
     with Dask(workers=1)._client() as client:
@@ -340,6 +343,7 @@ def test_a_scheduler_that_cannot_be_reached(scenario, tmp_path, impatient, where
     assert f"the scheduler at {where} cannot be reached: " in result.stderr
 
 
+@killed_by("sweep/cluster.py", "if where is self.scheduler:", "if False:")
 @pytest.mark.slow
 def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tmp_path, impatient):
     """No thread of a client that would block the next one, and no folder that only `resume` would take."""
@@ -350,6 +354,7 @@ def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tm
     assert sweep(study, tmp_path, on=Dask(inside)).digest == alone.digest
 
 
+@killed_by("sweep/cluster.py", "await asyncio.wait_for(call(), TIMEOUT + 1)", "await call()")
 def test_what_listens_but_is_no_scheduler(study, tmp_path, impatient):
     """It never says a word; so that nobody waits for ever if we did, it is gone after a while."""
     with socket.create_server(("127.0.0.1", 0)) as mute:
@@ -387,6 +392,7 @@ def without(folder, name):
     return folder
 
 
+@killed_by("sweep/cluster.py", "for line in differences(there, here):", "for line in ():")
 @pytest.mark.slow
 def test_a_worker_with_other_versions(scenario, tmp_path):
     """Of the package and of JAX; and one that has no diffabs at all."""

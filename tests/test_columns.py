@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import assert_one_error_line, run
+from mutants import killed_by
 from sweeping import SCENARIO
 
 from diffabs.scenario import section_sweep
@@ -28,6 +29,7 @@ def scenario(file, tmp_path):
     return file(MEASURED)
 
 
+@killed_by("sweep/distributions.py", "return tuple(x / scale for x in value)", "return tuple(value)")
 def test_a_file_is_its_numbers(scenario):
     """In the unit of the path, from the folder of the scenario; the dump holds the numbers themselves."""
     chosen = load(scenario)
@@ -65,6 +67,7 @@ def written(folder, text):
     (folder / "day" / "masses.csv").write_text(text)
 
 
+@killed_by("sweep/sample_files.py", "isinstance(value, bool) else np.nan", "isinstance(value, bool) else 0.0")
 @pytest.mark.parametrize(
     ("change", "needed"),
     [

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
+from mutants import killed_by
 from parts import BLOCKS, PARTS, PLANTS, ROADS, differences, jacobian, leaves, struct, value
 
 from diffabs.core import protocols
@@ -36,6 +37,11 @@ def signatures(family):
 # Every part
 
 
+@killed_by(
+    "roads/__init__.py",
+    "from diffabs.roads.tabulated import Tabulated as Tabulated\n",
+    "from diffabs.roads.tabulated import PiecewiseCubic as PiecewiseCubic, Tabulated as Tabulated\n",
+)
 def test_every_exported_part_has_an_instance():
     """The list above the tests is the test's reach: a part missing from it would be tested by nothing."""
     exported = {c for module in parts.FAMILIES for c in vars(module).values() if dataclasses.is_dataclass(c)}
@@ -101,6 +107,12 @@ def test_replace_changes_one_parameter(family, part):
             np.testing.assert_allclose(get(new, other), get(part, other), rtol=0, atol=0)
 
 
+@killed_by(
+    "core/pytree.py",
+    "return structure.unflatten([as_array(x, dtype) for x in leaves])",
+    "return tree",
+    case="plant: quarter car",
+)
 @pytest.mark.parametrize(("family", "part"), EVERY)
 def test_new_values_do_not_compile_again(family, part):
     """Whether they come as Python floats, NumPy arrays or JAX scalars; and jit gives back what it was given."""
@@ -123,6 +135,8 @@ def road_slopes(road, slip, speed, distance):
     return jax.vmap(mu, (None, 0, 0, 0))(road, slip, speed, distance)
 
 
+@killed_by("core/numerics.py", "return s * curve(s * x)", "return curve(s * x)", case="SNOW")
+@killed_by("core/numerics.py", "jnp.log(jnp.where(fine, square, 1.0))", "jnp.log(square)", case="RIG")
 @pytest.mark.parametrize("name", ROADS)
 def test_road(name):
     """mu(0) = 0, odd, bounded, C1 at 0, and finite with its derivatives where curves are in danger of not being."""
@@ -187,6 +201,12 @@ def test_plant_keeps_the_structure_of_its_state(name, dtype):
     assert struct(jax.eval_shape(lambda p, y, s: p.holding(y, s), plant, y, control)) == control
 
 
+@killed_by(
+    "plants/mirrored_rig.py",
+    "wheel = quotient(push * self.wheel_radius - control, self.wheel_inertia)",
+    'wheel = (__import__("jax").lax.stop_gradient(push) * self.wheel_radius - control) / self.wheel_inertia',
+    case="mirrored rig",
+)
 @pytest.mark.parametrize("name", PLANTS)
 def test_plant_jacobian(name):
     """In parameters, state and control, at seeded states, against differences; speeds of 20, rates of 100."""
@@ -302,6 +322,7 @@ def test_objective(name):
     np.testing.assert_allclose(exact, differenced, rtol=1e-5, atol=1e-8)
 
 
+@killed_by("objectives/tracking.py", "jnp.abs(whole))", "whole)", case="iae")
 @pytest.mark.parametrize("name", ["iae", "itae", "final_slip_error", "settling_time", "quadratic"])
 def test_errors_count_on_either_side(name):
     found = jax.jit(partial(parts.objective_run, sample_at=parts.mirrored_at))(strong(PARTS["objective"][name]))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from marks import cases
+from mutants import killed_by
 from test_blocks import Mean, Script, close, seen
 
 import diffabs as d
@@ -125,6 +126,7 @@ def played(controller, actuator, steps, h=H, **solver):
 # A smooth command
 
 
+@killed_by("core/log.py", "if self.lent else rows", "if False else rows", case="1.0")
 @pytest.mark.parametrize("back", [1.0, 2.0, 2.7, 5.5])
 def test_a_ramp_comes_later(back):
     """Exact at the instants and in the mean, from the very first moment."""
@@ -174,6 +176,7 @@ def test_converges_to_the_method_of_steps(kinks):
     assert np.log2(errors[0] / errors[-1]) / 3 > 2.7, errors
 
 
+@killed_by("actuators/delay.py", "jnp.where(at[0] <= 1.0, moves[0], 0.0)", "0.0 * moves[0]", case="jacfwd-0.0317")
 @pytest.mark.parametrize("late", [0.0317, pytest.param(0.03, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 def test_derivatives_of_the_method_of_steps(late, derivative):
@@ -195,6 +198,7 @@ def test_derivatives_of_the_method_of_steps(late, derivative):
 # A command that jumps
 
 
+@killed_by("actuators/delay.py", "(m.window[i, -1] > 0.5)", "(m.window[i, -1] > 2.0)", case="0.0073-0.0026-False")
 @pytest.mark.parametrize("kinks", cases([False, True], False))
 @pytest.mark.parametrize(("first", "late"), [(7.3e-3, 2.6e-3), (7.3e-3, 2.7e-3), (7e-3, 2e-3), (7.3e-3, 1e-3)])
 def test_a_jump_comes_out_at_its_moment(first, late, kinks):
@@ -215,6 +219,12 @@ def slope_of_jump(derivative):
     return jax.jit(derivative(mean))
 
 
+@killed_by(
+    "actuators/delay.py",
+    "_piece(m.window, last + 1).start,",
+    "jax.lax.stop_gradient(_piece(m.window, last + 1).start),",
+    case="0.0073-0.0026-jacfwd",
+)
 @pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("first", "late"), [(7.3e-3, 2.6e-3), (7.3e-3, 2.7e-3), (7.25e-3, 0.75e-3 + H)])
@@ -224,6 +234,12 @@ def test_the_moment_of_a_jump_is_differentiable(first, late, derivative):
     close(slope_of_jump(derivative)(np.array([first, late])) * 14 * H, [-3.0, -5.0], rtol=1e-7)
 
 
+@killed_by(
+    "actuators/delay.py",
+    "jnp.where(newest, 1.0, -1.0) * _rounding(until + self.time)",
+    "_rounding(until + self.time)",
+    case="0.002",
+)
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [2e-3, pytest.param(2.4e-3, marks=pytest.mark.slow)])
 def test_what_a_computer_says_comes_out_later(late):
@@ -240,6 +256,14 @@ def test_what_a_computer_says_comes_out_later(late):
     close(jax.grad(mean)(late) * 15e-3, -levels[lengths > 1e-9][-1], rtol=1e-7)
 
 
+@killed_by("actuators/delay.py", "return jnp.any(jnp.stack(jumps))", "return jumps[0]", case="True")
+@killed_by("simulate/dynamics.py", "(seen[:2], seen.signals.recorded)", "seen[:2]", case="True")
+@killed_by(
+    "core/blocks.py",
+    "            signal = block.output(t, m, signal)\n        return found\n\n    def record",
+    "        return found\n\n    def record",
+    case="True",
+)
 @pytest.mark.slow
 @pytest.mark.parametrize("kinks", cases([None, True], None))
 def test_what_bends_comes_out_bent(kinks):
@@ -318,6 +342,11 @@ def stepped(delay, command, slope, lengths, jumps=()):
     return np.array(found), tries
 
 
+@killed_by(
+    "actuators/delay.py",
+    "_piece(m.window, last).end)",
+    "_piece(m.window, last).end + jnp.where(m.known == m.count, 0.0, 1.0))",
+)
 def test_steps_of_any_length():
     """A cubic command that jumps by 3 at 0.1 s. Steps between 20 us and 5 ms; the delay is 3.7 ms, so that longer ones
     are cut. Exact everywhere; on a break, before and after."""
@@ -350,6 +379,7 @@ def test_steps_of_any_length():
 # Where there is no room
 
 
+@killed_by("actuators/delay.py", "window = jnp.where(count < size, rows, jnp.nan)", "window = rows", case="0.0009-True")
 @pytest.mark.parametrize(("every", "diverges"), [(4.1e-3, False), (0.9e-3, True)])
 def test_a_delay_that_has_no_room_has_no_value(every, diverges):
     """30 steps of delay in a ring of 32: commands that jump each fourth step fit, those that jump in each do not."""
@@ -371,6 +401,11 @@ def test_a_lag_behind_a_delay():
     close(run.metrics["rate"], 50.0 / lag, rtol=1e-12)
 
 
+@killed_by(
+    "actuators/delay.py",
+    "return _count([m.window[i, 1] for i in range(WINDOW)], t - self.time, m.place, m.last)",
+    "return jnp.clip(jnp.sum(t - self.time >= m.window[:, 1]).astype(m.last.dtype), m.place, m.last)",
+)
 def test_nobody_looks_for_the_ends_of_smooth_pieces():
     """A step spans two of them, and compares, but what it compares does not count as a kink."""
     there = strong(loop(Says(read=lambda t: jnp.sin(40.0 * t)), Delay(time=3.3e-3, capacity=16)))

@@ -8,6 +8,7 @@ import sys
 import cvxpy as cp
 import numpy as np
 import pytest
+from mutants import killed_by
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are, solve_discrete_lyapunov
 
 from diffabs.design import DesignError, InputLimit, L2Gain, Polytope, Schedule, Spec, certify, design, synthesis
@@ -91,6 +92,11 @@ def test_where_unscaled_solvers_return_a_destabilising_gain():
     np.testing.assert_allclose(found.gain[0], [-11747.5, -187.25], rtol=1e-3)
 
 
+@killed_by(
+    "design/sdp/inequalities.py",
+    "[q_root @ x @ even, np.eye(n)], [f @ even, None, np.eye(m)]]",
+    "[0 * q_root @ x @ even, np.eye(n)], [f @ even, None, np.eye(m)]]",
+)
 def test_one_vertex_is_the_closed_form_over_ten_decades():
     random = np.random.default_rng(1)
     for q1, q2, r in 10.0 ** random.uniform(-5, 5, (24, 3)):
@@ -101,6 +107,7 @@ def test_one_vertex_is_the_closed_form_over_ten_decades():
         np.testing.assert_allclose(found.lower_bound, trace, rtol=1e-9)
 
 
+@killed_by("design/sdp/program.py", "self.weight = weight / np.trace(weight)", "self.weight = np.eye(n) / n")
 def test_four_vertices_agree_with_the_program_by_hand():
     random = np.random.default_rng(2)
     for q1, q2, r in 10.0 ** np.stack([random.uniform(0, 6, 8), random.uniform(0, 4, 8), random.uniform(-1, 1, 8)], 1):
@@ -148,6 +155,7 @@ def test_printed_pairing_leaves_vertices_uncovered():
 # proofs about a gain
 
 
+@killed_by("design/analysis.py", "w = t @ w @ t.T / sizes[:, None, None]", "w = w / sizes[:, None, None]")
 def test_published_gain_has_no_common_lyapunov_matrix():
     proof = certify((-11753.0, -48.0), RIG)
     assert proof.quadratically_stable is False
@@ -158,6 +166,12 @@ def test_published_gain_has_no_common_lyapunov_matrix():
     assert np.linalg.eigvals(RIG.closed(proof.gain)).real.max() < 0
 
 
+@killed_by(
+    "design/sdp/scaling.py",
+    "whole = self.inverse.T @ p @ self.inverse",
+    "whole = self.T.T @ p @ self.T",
+    case="-76.7-True",
+)
 @pytest.mark.parametrize(("k2", "stable"), [(-76.6, False), (-76.7, True), (-158.17, True), (48.0, False)])
 def test_verdicts(k2, stable):
     proof = certify((-11753.0, k2), RIG)
@@ -255,6 +269,7 @@ def frequency_response(closed, b, c, d, gain, count=20001):
     return np.linalg.norm((c + d @ gain) @ resolvent @ b, ord=2, axis=(1, 2)).max()
 
 
+@killed_by("design/bounds.py", "z = l2.output + l2.feedthrough @ self.k", "z = l2.output")
 def test_l2_gain_of_one_system_is_the_peak_of_its_frequency_response():
     gain, c, d = np.array([[-1000.0, -30.0]]), np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [0.003]])
     peak = frequency_response(ONE.closed(gain)[0], ONE.B[0], c, d, gain)
@@ -283,6 +298,7 @@ def switched(system, gain, count=40, seed=0, steps=400, h=5e-4):
     return np.stack(states, 1)
 
 
+@killed_by("design/sdp/program.py", "limit.limit * (1 - TIGHTER)", "3 * limit.limit")
 def test_guarantees_hold_while_the_system_switches():
     limit, q, r = 9.03 - 2.8, np.diag([1e6, 1e4]), 1.0
     spec = Spec(Q=q, R=r, decay=3.0, input=InputLimit(limit, [START]))
@@ -303,6 +319,12 @@ def test_guarantees_hold_while_the_system_switches():
     assert (spent <= START @ p["cost"] @ START * 1.001).all()
 
 
+@killed_by("design/sdp/inequalities.py", "return drift - he(flow) - 2 * rate * x", "return drift - he(flow) - rate * x")
+@killed_by(
+    "design/sdp/inequalities.py",
+    "-symmetric([[he(flow)], [-skew, he(flow)]])",
+    "-symmetric([[he(flow)], [0 * skew, he(flow)]])",
+)
 def test_pole_regions():
     found = design(RIG, Spec(Q=(K1**2, 1.0), R=1.0, decay=90.0, damping=0.95))
     poles = np.linalg.eigvals(RIG.closed(found.gain))
@@ -371,6 +393,9 @@ def test_discrete_design_and_proofs():
     assert too_fast.verified_exactly
 
 
+@killed_by(
+    "design/bounds.py", "return math.exp(-2 * rate) * p - c.T @ p @ c", "return math.exp(-2 * rate) * p - c @ p @ c.T"
+)
 def test_discrete_analysis_of_one_system():
     system, gain = sampled(ONE), np.array([[-1000.0, -30.0]])
     closed = system.closed(gain)[0]
@@ -405,6 +430,7 @@ def form(proof, speed):
     return np.array([[np.interp(speed, nodes, p[:, i, j]) for j in range(2)] for i in range(2)])
 
 
+@killed_by("design/scheduled.py", "common = drift * (end - start)", "common = 0 * drift * (end - start)")
 @pytest.mark.slow
 def test_published_gain_is_proved_for_a_speed_that_cannot_jump():
     proof = certify((-11753.0, -48.0), chain(), Spec(rates=RATES, decay=5.0))
@@ -424,6 +450,7 @@ def test_published_gain_is_proved_for_a_speed_that_cannot_jump():
         before = after
 
 
+@killed_by("design/sdp/program.py", "slope = rate / width / frame.tau", "slope = 0.0 * rate / width / frame.tau")
 def test_scheduled_gain():
     system = chain(6)
     found = design(system, Spec(Q=(K1**2, 1.0), R=1.0, rates=RATES))
@@ -525,6 +552,12 @@ def tampered(change):
     return solve
 
 
+@killed_by(
+    "design/synthesis.py",
+    "    missing = wanted - {claim.kind for claim in proof.claims}\n",
+    '    return ""\n    missing = wanted - {claim.kind for claim in proof.claims}\n',
+    case="larger Z",
+)
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -558,6 +591,7 @@ def test_gap_and_violation():
     assert answer._replace(y=np.array([0.4])).violation(blocks) > 0.02
 
 
+@killed_by("design/sdp/solver.py", " + float(np.abs(c - found) @ np.abs(self.y))", "")
 def test_a_gap_counts_what_the_multipliers_leave():
     """Multipliers that do not balance the objective prove nothing: the optimum of the toy program is 1/2."""
     unknowns = lmi.Unknowns(y=(1, 1))

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 
 import pytest
+from mutants import killed_by
 
 ROOT = pathlib.Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -77,6 +78,7 @@ def parts():
     }
 
 
+@killed_by("../docs/parameters.py", 'left = "(" if "above" in bound or low', 'left = "(" if low')
 def test_the_reference_shows_unit_and_range_of_every_parameter():
     """Its tables are read from the text of the classes, and the classes say the same."""
     assert len(parts()) > 60
@@ -88,6 +90,7 @@ def test_the_reference_shows_unit_and_range_of_every_parameter():
         assert all(unit for unit, _ in said.values()), path
 
 
+@killed_by("../docs/parameters.py", 'named = {"unit": "Unit of the value", ', "named = {")
 def test_a_part_becomes_a_table():
     text = parameters.table(inspect.getsource(importlib.import_module("diffabs.controllers").PID))
     assert "| `kp` | `3893.0` | control/signal | [0, inf) |" in text.splitlines()

@@ -9,6 +9,7 @@ import pathlib
 import re
 
 import pytest
+from mutants import killed_by
 
 import diffabs
 
@@ -102,6 +103,7 @@ def is_a_place(place):
     return (HOME / place).is_dir() or any((HOME / place).parent.glob(f"{pathlib.Path(place).name}.*"))
 
 
+@killed_by("tune/constraints.py", "`design.interior.differentiable`", "`design.sensitivity`")
 def test_what_is_named_is_there():
     """In the text of the package and on the pages: dotted names, and places such as `simulate/batch`."""
     for path in [*HOME.rglob("*.py"), *(HOME.parent / "docs").rglob("*.md")]:

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, references, roads, sensors
@@ -63,6 +64,7 @@ def ours(bias):
     return float(run.ending.sample.output.distance), bool(run.stopped)
 
 
+@killed_by("references/peak_slip.py", "return jnp.abs(signal.deceleration)", "return signal.deceleration", case="0.1")
 @pytest.mark.parametrize("bias", [-0.2, -0.05, 0.0, 0.1, 0.2])
 def test_a_biased_accelerometer_misleads_the_latch_as_the_paper_has_it(bias):
     """Forward biases of 0.1 m/s^2 and more: |a| falls through zero before the wheel has slipped, the latch takes that

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 from commands import left_in, run
+from mutants import killed_by
 
 from diffabs.cli import console
 from diffabs.core.pytree import get, parameters, replace
@@ -89,6 +90,7 @@ def test_every_packaged_scenario_opens_with_what_one_drags(name):
         assert knob.spec.holds(knob.high)
 
 
+@killed_by("explore/knobs.py", "part = place / STEPS\n", "part = min(1.0, place / STEPS + 1e-3)\n")
 @pytest.mark.parametrize("name", ["slip-cured", "arm-hanging"])
 def test_places_of_a_slider_are_values(name):
     found = Session(name)
@@ -100,12 +102,21 @@ def test_places_of_a_slider_are_values(name):
             assert knob.place_of(knob.value_at(place)) == pytest.approx(place, abs=0.51)
 
 
+@killed_by("explore/knobs.py", ">= DECADE * min(abs(low), abs(high))", "< 0")
 def test_a_slider_over_decades_is_even_in_the_logarithm(session):
     knob = session.knobs["controller.gain.0"]  # from -1e5 to -300
     middle = -np.sqrt(knob.low * knob.high)
     assert knob.value_at(STEPS / 2) == pytest.approx(middle, rel=1e-4)
 
 
+@killed_by(
+    "explore/knobs.py",
+    "return inside(given, self.spec, self.name) / self.scale",
+    "return float(given) / self.scale",
+    case="plant.mass--3-plant.mass = -3 is outside (0, inf) kg",
+)
+@killed_by("explore/session.py", "            self.withdraw()\n", "")
+@killed_by("explore/session.py", "        if lines := objections(chosen):\n", "        if (lines := []):\n")
 @pytest.mark.parametrize(
     ("key", "given", "said"),
     [
@@ -137,6 +148,7 @@ def test_a_spread_that_is_none_is_refused(session, given):
     assert session.spread == Spread()
 
 
+@killed_by("explore/session.py", "return lines or list(unstable(chosen.loop, chosen.solver))", "return lines")
 def test_a_step_that_is_not_stable_is_refused(file, monkeypatch):
     from diffabs.simulate import refusals
 
@@ -148,6 +160,7 @@ def test_a_step_that_is_not_stable_is_refused(file, monkeypatch):
     assert found.value("plant.mass") == 5.5
 
 
+@killed_by("explore/session.py", "new[() if knob.place is None else knob.place] = value", "new[...] = value")
 def test_what_is_turned_is_in_the_scenario_and_nowhere_else(file):
     one, other = (Session(str(file(SHORT))) for _ in range(2))
     one.turn("plant.mass", "5.5")
@@ -162,6 +175,7 @@ def test_what_is_turned_is_in_the_scenario_and_nowhere_else(file):
     assert dump(one.scenario()) == dump(other.scenario())
 
 
+@killed_by("explore/session.py", "                self._put(key, value)", "                pass")
 def test_another_road_leaves_what_was_turned(session):
     session.turn("plant.mass", "5.5")
     session.turn("plant.road.scale", "0.5")
@@ -183,6 +197,13 @@ def test_a_part_that_does_not_fit_changes_nothing(session):
     assert session.parts["controller"] == AS_GIVEN
 
 
+@killed_by("explore/friction.py", "had or float(road.scale) != 1.0", "True", case="slip-lmi")
+@killed_by(
+    "explore/friction.py",
+    "sweep=dataclasses.replace(sweep, over=keys(sweep.over), correlation=correlation)",
+    "sweep=sweep",
+    case="slip-lmi",
+)
 @pytest.mark.parametrize("name", ["slip-lmi", "slip-cured", "arm-hanging"])
 def test_a_friction_factor_comes_and_goes_without_a_trace(name):
     given = load(name)
@@ -198,6 +219,7 @@ def test_a_friction_factor_comes_and_goes_without_a_trace(name):
         assert get(again.loop, "plant.road.road.w4") == get(given.loop, "plant.road.w4")
 
 
+@killed_by("explore/session.py", "        now = self.scenario()\n", "        now = self._base\n", case="turned0")
 @pytest.mark.parametrize("turned", [{"plant.mass": 5.61}, {"plant.mass": 5.61, "plant.road.scale": 0.77}, {}])
 def test_the_command_line_runs_what_was_saved_to_the_same_numbers(session, tmp_path, turned):
     for key, value in turned.items():
@@ -209,6 +231,7 @@ def test_the_command_line_runs_what_was_saved_to_the_same_numbers(session, tmp_p
     assert ("scaled" in path.read_text()) == ("plant.road.scale" in turned)
 
 
+@killed_by("explore/saving.py", "if name != pathlib.PurePath(name).name or", "if")
 @pytest.mark.parametrize(
     "name", ["mine", "../mine.toml", "/tmp/mine.toml", ".mine.toml", ".toml", "", "a/b.toml", "a\\b.toml", "a\nb.toml"]
 )
@@ -220,6 +243,7 @@ def test_a_name_that_leads_elsewhere_is_refused(session, tmp_path, name):
     assert left_in(tmp_path) <= {"in", "mine.toml"}  # the scenario itself
 
 
+@killed_by("explore/saving.py", "if replacing and path.is_file():", "if path.is_file():")
 def test_a_file_is_only_replaced_when_that_is_said(session, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
@@ -233,6 +257,12 @@ def test_a_file_is_only_replaced_when_that_is_said(session, tmp_path):
     assert left_in(folder) == {"mine.toml"}
 
 
+@killed_by("explore/curves.py", "here * (1 + sign * part)", "here * (1 + sign * part / 2)")
+@killed_by(
+    "explore/curves.py",
+    "np.nanquantile(values, QUANTILES, axis=0)",
+    "np.nanquantile(values, QUANTILES, axis=0, method='lower')",
+)
 def test_a_fan_has_the_quantiles_of_its_runs(session, monkeypatch):
     monkeypatch.setattr(curves, "MEMBERS", 5)
     chosen, spread = session.scenario(), Spread(mass=0.1, road=0.3)
@@ -251,6 +281,7 @@ def test_a_fan_has_the_quantiles_of_its_runs(session, monkeypatch):
         assert np.ptp(values[path]) > part * here
 
 
+@killed_by("explore/curves.py", "KMH * line.values", "line.values")
 @pytest.mark.slow
 def test_a_draft_is_the_run_to_what_can_be_seen(session):
     exact, draft = (curves.curves(session.scenario(), by) for by in (None, curves.Adaptive(rtol=1e-3, step=2.5e-3)))
@@ -262,6 +293,11 @@ def test_a_draft_is_the_run_to_what_can_be_seen(session):
     assert exact.end.startswith("ends after 0.")
 
 
+@killed_by(
+    "linear/stability_margins.py",
+    "return np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0))\n\n\ndef grid",
+    "return np.linalg.eigvals(system.A)\n\n\ndef grid",
+)
 def test_poles_of_a_closed_loop_are_those_of_its_polynomial():
     def of(a, b, c, **more):
         return Transfer(*(np.array(x, float) for x in (a, b, c, [[0.0]])))._replace(**more)
@@ -272,6 +308,9 @@ def test_poles_of_a_closed_loop_are_those_of_its_polynomial():
     np.testing.assert_allclose(np.sort_complex(closed_poles(late)), np.sort_complex(np.roots([1, -1, 0.3])), rtol=1e-12)
 
 
+@killed_by(
+    "scenario/section_design.py", 'self._with_speed(loop) if self.over and hasattr(loop.plant, "frozen") else', ""
+)
 def test_margins_are_those_of_the_library(session):
     chosen = session.scenario()
     found, oracle = stability.stability(chosen, stability.around(chosen)), margins(open_loop(chosen.loop))
@@ -283,6 +322,8 @@ def test_margins_are_those_of_the_library(session):
     assert np.all(found.poles.real < 0)
 
 
+@killed_by("explore/stability.py", "if known and known.of == of:", "if known:")
+@killed_by("explore/stability.py", "if known and known.of == of:", "if False:")
 def test_corners_are_looked_at_again_only_where_they_move(session):
     first = stability.around(session.scenario())
     session.turn("plant.mass", "5.5")  # has a range in [design.over]
@@ -300,6 +341,11 @@ def test_corners_are_looked_at_again_only_where_they_move(session):
     assert found.worst == whole.worst
 
 
+@killed_by(
+    "explore/session.py",
+    "        self.adopt(self._accepted)\n",
+    "        self._values = dict(list(self._values.items())[:-1])\n",
+)
 def test_what_is_not_accepted_is_withdrawn_with_all_that_came_after(session):
     session.turn("plant.mass", "5.5")
     session.put("initial.speed", "5")  # below the stop's
@@ -320,6 +366,7 @@ def test_a_loop_without_a_linear_model_says_so():
         stability.stability(friction.with_factor(load("lab-rig")), None)
 
 
+@killed_by("explore/tuning.py", "given = chosen.tune.free.get(path)", "given = None")
 def test_a_tuning_begins_from_what_is_shown(file):
     session = Session(str(file(SHORT.replace("[-100.0, -15.0]", "[-100.0, -45.0]"))))
     assert session.knobs["controller.gain.1"].high > -45  # a slider goes further than the scenario tunes
@@ -387,6 +434,7 @@ def test_a_transient_ends_when_the_signal_has_settled_to_its_target():
     assert charts.until(1.23456789) == {"dataZoom": [{"startValue": 0, "endValue": 1.2346}]}
 
 
+@killed_by("explore/charts.py", "third - quarter, high - third", "third - quarter, high - low")
 def test_charts_are_plain_json_whatever_a_run_was():
     lines = (Line("slip", np.array([0.1, np.nan, np.inf])), Line("target", np.array([0.0, 1e-30, 123456.789])))
     torque = Panel("N m", (Line("control", np.array([0.0, 9.03, np.nan])), Line("command", np.array([0.0, 1e9, 5.0]))))
@@ -402,6 +450,9 @@ def test_charts_are_plain_json_whatever_a_run_was():
     json.dumps([charts.frame(found), change, charts.pole_frame(), charts.poles(None)], allow_nan=False)
 
 
+@killed_by("explore/guard.py", "len(host) == 1 and host[0] in self.hosts", "len(host) == 1")
+@killed_by("explore/guard.py", "return here and own and", "return here and")
+@killed_by("explore/guard.py", '_loopback(scope.get("client"))', "True")
 @pytest.mark.parametrize(
     ("allowed", "host", "origin", "client"),
     [
@@ -425,6 +476,13 @@ def test_only_the_own_page_on_this_machine_is_answered(allowed, host, origin, cl
     assert Guard(None, 8342, TOKEN).allowed(scope) == allowed
 
 
+@killed_by("explore/guard.py", "(self.allowed(scope) and self.known(scope))", "self.allowed(scope)")
+@killed_by(
+    "explore/guard.py",
+    "len(given) == 1 and secrets.compare_digest(given[0].encode(), self.token.encode())",
+    "len(given) == 1",
+)
+@killed_by("explore/guard.py", "Path=/; HttpOnly;", "Path=/;")
 @pytest.mark.parametrize(
     ("path", "query", "cookie", "status"),
     [
@@ -474,6 +532,7 @@ async def answered(kind, path, query, cookie):
     return sent
 
 
+@killed_by("explore/server.py", "path.touch(mode=0o600,", "path.touch(mode=0o644,")
 def test_a_browser_is_led_to_the_token_by_a_file_of_its_user(tmp_path):
     pytest.importorskip("nicegui")
     from diffabs.explore.server import leading_to
@@ -483,6 +542,11 @@ def test_a_browser_is_led_to_the_token_by_a_file_of_its_user(tmp_path):
     assert f'url=http://127.0.0.1:8342/?token={TOKEN}"' in path.read_text()
 
 
+@killed_by(
+    "explore/work.py",
+    "            self._job = job\n",
+    "            self._job = (lambda a, b: lambda: (a(), b()))(self._job, job) if self._job else job\n",
+)
 def test_a_worker_does_the_newest_and_drops_what_waited():
     gate, done, ended, errors = threading.Event(), [], threading.Event(), []
     worker = Latest("test of a worker", errors.append)
@@ -502,6 +566,7 @@ def test_a_worker_does_the_newest_and_drops_what_waited():
     assert [type(error) for error in errors] in ([ZeroDivisionError], [])
 
 
+@killed_by("cli/explore.py", "PORT = 8342\n", "PORT = 8342\nfrom diffabs.tune import Method as Method\n")
 def test_the_framework_is_only_loaded_by_the_command():
     code = (
         "import sys, diffabs, diffabs.explore, diffabs.cli.main, diffabs.explore.session as s; s.Session('slip-cured');"

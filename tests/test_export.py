@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line
 from commands import run as command
+from mutants import killed_by
 from structured_text import Block
 
 import diffabs as d
@@ -143,6 +144,25 @@ def commands_of_c(found, text, name, seen, folder):
     return np.array(said.split(), float)
 
 
+@killed_by(
+    "export/c_words.py",
+    'CHOSEN = {"lower": "<", "higher": ">"}',
+    'CHOSEN = {"lower": ">", "higher": "<"}',
+    case="PID, filtered derivative-float64",
+)
+@killed_by(
+    "export/c_words.py",
+    'return f"{which} ? {yes} : {no}"',
+    'return f"{which} ? {no} : {yes}"',
+    case="conditional integration-float64",
+)
+@killed_by("export/c99.py", "i < {self.device.moves}", "i < 1", case="filtered target-float64")
+@killed_by(
+    "export/device.py",
+    "return inner, state.samples + 1, command",
+    "return inner, state.samples, command",
+    case="observer-float64",
+)
 @needs_cc
 @pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize("name", LOOPS)
@@ -289,6 +309,11 @@ def test_a_compiler_that_assumes_that_there_is_no_nan_is_refused(tmp_path):
     assert "compile without -ffast-math" in result.stderr
 
 
+@killed_by(
+    "export/c_words.py",
+    'np.format_float_positional(x, trim="0")',
+    'np.format_float_positional(x, precision=7, trim="0")',
+)
 @needs_cc
 def test_a_whole_run_is_what_the_exported_controller_does(tmp_path):
     """slip-cured, sample by sample: what it measured goes in, what it commanded comes out."""
@@ -304,6 +329,7 @@ def test_a_whole_run_is_what_the_exported_controller_does(tmp_path):
     np.testing.assert_allclose(result, np.asarray(run.trajectory.sample.command)[:count], rtol=1e-12, atol=1e-12)
 
 
+@killed_by("export/device.py", "if offers(reference) or moves:", "if False:")
 @needs_cc
 def test_the_target_can_come_from_outside(tmp_path):
     loop = rig(PID(kp=60.0, ki=400.0, low=0.0, high=90.0), reference=PeakLatch())
@@ -351,6 +377,7 @@ def test_an_operation_without_translation_is_named():
         c_source(device(rig(Sorted())), "unit")
 
 
+@killed_by("export/difference_equations.py", "ROUNDING = 1e-12", "ROUNDING = 0.0")
 @needs_cc
 def test_the_command_writes_a_file_that_compiles(tmp_path):
     path = tmp_path / "controller.c"
@@ -443,6 +470,11 @@ def test_inputs_are_what_the_plant_shows():
     assert isinstance(LOOPS["observer"].plant, ArmBalance)
 
 
+@killed_by(
+    "export/c99.py",
+    'yield from self.words.operations(nodes, "  ")\n        if moving:\n            yield from self._moves(moving)\n',
+    'if moving:\n            yield from self._moves(moving)\n        yield from self.words.operations(nodes, "  ")\n',
+)
 @needs_cc
 def test_a_target_that_moves_is_returned_as_it_was(tmp_path):
     """A controller that commands the target itself: what is returned is memory that moves in the same call."""
@@ -460,6 +492,7 @@ def test_a_target_that_moves_is_returned_as_it_was(tmp_path):
     np.testing.assert_allclose([*map(float, said.split())], 0.2 - 0.1 * np.exp(-np.arange(3) / 10), rtol=1e-6)
 
 
+@killed_by("export/lowered.py", "if not more:\n                break", "if kept:\n                break")
 @needs_cc
 def test_memory_behind_memory_is_kept(tmp_path):
     """The command is the double integral of the error: it needs the first integral only a sample later."""
@@ -493,6 +526,19 @@ def commands_of_text(text, seen):
     return np.array([block(**dict(zip(names, row, strict=True))) for row in zip(*columns, strict=True)], float)
 
 
+@killed_by(
+    "export/structured_text.py",
+    "return f\"SEL({', '.join(args)})\"",
+    'return f"SEL({args[0]}, {args[2]}, {args[1]})"',
+    case="conditional integration-float64",
+)
+@killed_by(
+    "export/structured_text.py",
+    "{'<' if op == 'lower' else '>'}",
+    "{'>' if op == 'lower' else '<'}",
+    case="PID, filtered derivative-float64",
+)
+@killed_by("export/structured_text.py", "self.device.moves - 1", "self.device.moves", case="filtered target-float64")
 @pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize("name", LOOPS)
 def test_structured_text_commands_what_the_parts_do(name, dtype):
@@ -510,6 +556,7 @@ def test_structured_text_commands_what_the_parts_do(name, dtype):
     np.testing.assert_allclose(result[early], wanted[early], rtol=tight, atol=tight * np.max(np.abs(wanted)))
 
 
+@killed_by("export/structured_text.py", '.replace("e", "E")', "")
 def test_a_whole_run_is_what_the_function_block_does():
     chosen = load("slip-cured", ["initial.speed_kmh=40"])
     every = round(float(chosen.loop.controller.period) / chosen.solver.step)
@@ -522,6 +569,7 @@ def test_a_whole_run_is_what_the_function_block_does():
     np.testing.assert_allclose(result, np.asarray(run.trajectory.sample.command)[:count], rtol=1e-12, atol=1e-12)
 
 
+@killed_by("export/structured_text.py", "IF reset OR NOT started", "IF NOT started")
 def test_a_block_begins_anew_when_it_is_told_to():
     block = Block(structured_text(device(LOOPS["PID, filtered derivative"]), "Unit"))
     first = [block(slip=slip) for slip in (0.1, 0.15, 0.3)]
@@ -529,6 +577,11 @@ def test_a_block_begins_anew_when_it_is_told_to():
     assert [block(slip=slip, reset=False) for slip in (0.1, 0.15, 0.3)] != first
 
 
+@killed_by(
+    "export/structured_text.py",
+    "yield from self._operations(live([*stored.values(), *more]), indent)",
+    "yield from (*self._moves(indent), *self._operations(live([*stored.values(), *more]), indent))",
+)
 def test_what_a_sample_stores_does_not_change_while_the_target_moves():
     """A controller that remembers the very number that the target's own movement computes anew."""
 
@@ -570,6 +623,8 @@ class Kinds:
         return jnp.where(odd, entry, -entry) + jnp.minimum(shaped, speed) + jnp.arctan2(slip, speed) + slip**1.5
 
 
+@killed_by("export/structured_text.py", "_TRUNC_{after}", "_TO_{after}")
+@killed_by("export/structured_text.py", '(">", "-") if op == "floor"', '(">", "+") if op == "floor"')
 def test_structured_text_knows_every_kind_of_operation():
     loop = rig(Kinds())
     seen = measured(loop, seed=3)
@@ -578,6 +633,7 @@ def test_structured_text_knows_every_kind_of_operation():
     np.testing.assert_allclose(result, wanted, rtol=1e-12, atol=1e-13)
 
 
+@killed_by("export/structured_text.py", "or name.lower() in RESERVED:", "or False:", case="step")
 @pytest.mark.parametrize("name", ["2fast", "a b", "a__b", "Function_Block", "step"])
 def test_a_name_that_structured_text_does_not_have_is_refused(name):
     with pytest.raises(NotExported, match="no name that Structured Text has"):

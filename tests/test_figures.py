@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mutants import killed_by
 
 from diffabs import plot
 from diffabs.controllers import HoldingInput, StateFeedback
@@ -28,6 +29,7 @@ def boxes(axis):
     return np.array([text.get_window_extent().get_points() for text in seen])
 
 
+@killed_by("plot/style.py", "one.set_minor_formatter(NullFormatter())", "pass", case="(0.2, 0.9)")
 @pytest.mark.parametrize(
     "ends", [(0.2, 0.9), (0.05, 4.0), (3e-7, 2e-6), (1e-5, 1e-3), (1e-9, 1e3), (2e4, 3e7)], ids=lambda ends: f"{ends}"
 )
@@ -44,6 +46,7 @@ def test_labels_of_a_logarithmic_axis_do_not_touch(ends):
         assert (found[order][1:, 0, i] > found[order][:-1, 1, i]).all()
 
 
+@killed_by("plot/style.py", "few = low > 0 and", "few = low > 0 or")
 def test_a_long_axis_has_powers_and_a_short_one_numbers():
     _, (ax,) = plot.sheet()
     plot.logarithmic(ax, "x")
@@ -57,6 +60,7 @@ def test_a_long_axis_has_powers_and_a_short_one_numbers():
     assert said(2e-7) == "2\N{MULTIPLICATION SIGN}10⁻⁷"
 
 
+@killed_by("plot/frequency.py", "(1 / (1 + main), COLOURS[1]", "(main / (1 + main), COLOURS[1]")
 def test_the_curves_of_a_loop_are_its_response():
     loop = braking(plant=MirroredRig(), reference=FixedSlip(), feedforward=HoldingInput(), controller=StateFeedback())
     opened, others = open_loop(loop), band(loop, {"plant.mass": (5.0, 6.5)}, samples=2)

@@ -14,6 +14,7 @@ from commands import assert_one_error_line, left_in
 from commands import run as command
 from fmi import Fmu
 from marks import cases
+from mutants import killed_by
 from structured_text import Block
 
 import diffabs as d
@@ -60,6 +61,13 @@ PLANTS = {
 }
 
 
+@killed_by("export/plant_c.py", "plant.project(rk4_step(", "(lambda x: x)(rk4_step(", case="a wheel that locks")
+@killed_by(
+    "export/plant_c.py",
+    'yield from (f"  m->{array}[{k}] = n{k};" for k in results)',
+    'yield from (f"  m->{array}[{k}] = n{(k + 1) % len(results)};" for k in results)',
+    case="balance",
+)
 @pytest.mark.parametrize("name", cases(PLANTS, "laboratory rig", "balance", "quarter car"))
 def test_an_fmu_runs_as_the_simulation_does(name, tmp_path):
     """To rounding, and so to 1e-6: the control of a whole run goes in, what was shown comes out."""
@@ -96,6 +104,12 @@ def test_a_loop_closed_outside_is_the_loop(tmp_path):
     assert found[-1, 0] == pytest.approx(0.2, abs=0.02)
 
 
+@killed_by(
+    "export/plant_c.py",
+    'm->v[{self.places[path]}]" if where',
+    'begun[{self.places[path]}]" if where == "v" and path != CONTROL else f"m->v[{self.places[path]}]" if where',
+)
+@killed_by("export/fmi2.c", "(m->phase == RUNNING && at[i] != OUTPUTS)", "0")
 def test_parameters_are_the_importers(tmp_path):
     changed = d.core.pytree.replace(PLANTS["mirrored rig"], {"plant.mass": 6.2, "initial.slip": 0.1})
     one = imported(PLANTS["mirrored rig"], tmp_path)
@@ -110,6 +124,7 @@ def test_parameters_are_the_importers(tmp_path):
     assert one.set("slip", 0.3) == 3  # an output
 
 
+@killed_by("export/fmi2.c", "{ return copied(c, state); }", "{ return copied(c, c); }")
 def test_a_state_can_be_kept_and_taken_again(tmp_path):
     one = imported(PLANTS["mirrored rig"], tmp_path).begin()
     followed(one, 20, lambda k: 2.0, ("slip",))
@@ -119,6 +134,7 @@ def test_a_state_can_be_kept_and_taken_again(tmp_path):
     np.testing.assert_array_equal(followed(one, 20, lambda k: 3.0, ("slip", "speed", "distance")), first)
 
 
+@killed_by("export/fmi2.c", ": ceil(whole);", ": 1.0;")
 def test_steps_of_any_length_are_taken_by_whole_ones(tmp_path):
     """A step of the importer that is no multiple is divided into equal ones, none longer than that of the plant."""
     one = imported(PLANTS["mirrored rig"], tmp_path).begin()
@@ -131,12 +147,16 @@ def test_steps_of_any_length_are_taken_by_whole_ones(tmp_path):
     assert one.step(1.0, math.nan) == 3
 
 
+@killed_by("export/fmi2.c", "|| strcmp(guid, GUID) != 0", "")
 def test_who_asks_for_another_is_given_none(tmp_path):
     path = tmp_path / "plant.fmu"
     path.write_bytes(fmu(PLANTS["mirrored rig"], "plant", step=STEP))
     assert Fmu(path, tmp_path / "a", guid="{no}").instance.value is None
 
 
+@killed_by("export/mockup.py", "enumerate(variables, 1)", "enumerate(variables)")
+@killed_by("export/mockup.py", '{"unit": printable(one.unit)}', "{}")
+@killed_by("export/mockup.py", "zipfile.ZipInfo(path, LONG_AGO)", "path")
 def test_the_description_says_what_is_what(tmp_path):
     one = imported(PLANTS["mirrored rig"], tmp_path)
     assert one.description.get("fmiVersion") == "2.0"

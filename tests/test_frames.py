@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import run as command
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import objectives
@@ -41,6 +42,7 @@ def run():
     return d.rollout(rig(), SOLVER, objectives.BRAKING)
 
 
+@killed_by("core/summary.py", "NOTHING = 1e-14", "NOTHING = 0.0")
 @pytest.mark.parametrize(
     ("value", "text"),
     [
@@ -63,6 +65,7 @@ def test_a_cell_of_a_list_is_its_beginning():
     assert cell(True) == "True"
 
 
+@killed_by("core/summary.py", "<strong>{html.escape(self.title)}</strong>", "<strong>{self.title}</strong>")
 def test_a_summary_is_text_and_html():
     found = Summary("a <title>", ("name", "value"), (("x", 1 / 3), ("longer", 8e-17)), "note")
     assert str(found).splitlines() == [
@@ -74,6 +77,7 @@ def test_a_summary_is_text_and_html():
     assert "<td>0</td>" in html
 
 
+@killed_by("simulate/frames.py", '"reached its stop {end}" if run.stopped', '"reached its stop {end}" if True')
 def test_a_run_says_what_it_is(run):
     lines = repr(run).splitlines()
     end = float(run.ending.sample.t)
@@ -108,6 +112,8 @@ def test_many_runs_are_counted_and_a_traced_one_can_be_shown():
     assert frame["stopped"].tolist() == [True] * 3
 
 
+@killed_by("simulate/frames.py", "[:count]) for name, (unit, values)", ") for name, (unit, values)")
+@killed_by("simulate/frames.py", "plant.control_unit if plant is not None else RELATIVE", "RELATIVE")
 def test_frames_have_units_and_end_where_the_run_does(run):
     count = int(np.sum(run.trajectory.running)) + 1
     frame, plant = run.pandas(rig().plant), rig().plant
@@ -142,6 +148,7 @@ def test_a_run_draws_the_figure_of_its_plant(run, tmp_path):
     figure.savefig(tmp_path / "run.png")
 
 
+@killed_by("tune/result.py", '("objective", *self.objective)', '("objective", *self.objective[::-1])')
 @pytest.mark.slow
 def test_a_tuning_has_a_table():
     free, over = {"controller.gain": ((-1e4, -300.0), (-200.0, -10.0))}, grid({"plant.mass": [5.3, 6.2]})
@@ -156,6 +163,7 @@ def test_a_tuning_has_a_table():
     assert "<table>" in found._repr_html_()
 
 
+@killed_by("identify/fit.py", "deviations.get(name))", "0.0)")
 @pytest.mark.slow
 def test_an_identification_has_a_table(run):
     frame = run.pandas()
@@ -177,6 +185,7 @@ def swept(tmp_path_factory):
     return sweep(study, tmp_path_factory.mktemp("sweeps") / "study")
 
 
+@killed_by("sweep/study.py", "if path in declared}", "if False}")
 @pytest.mark.slow
 def test_the_frame_of_a_sweep_has_units_and_says_what_failed(swept, monkeypatch):
     bound = float(np.median(swept.column("iae")))
@@ -198,6 +207,7 @@ def test_the_frame_of_a_sweep_has_units_and_says_what_failed(swept, monkeypatch)
     assert "<table>" in swept._repr_html_()
 
 
+@killed_by("sweep/results.py", "{name: failed & run for", "{name: failed for")
 def test_what_was_missed_or_refused_is_told_apart(swept, monkeypatch):
     stopped, refused = np.ones(20, bool), np.full(20, "")
     stopped[3], refused[5] = False, "a step that is too long"

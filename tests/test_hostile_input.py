@@ -4,6 +4,7 @@ import os
 
 import pytest
 from commands import assert_one_error_line, left_in, run
+from mutants import killed_by
 
 from diffabs.design.proof.certificate import Certificate
 
@@ -34,6 +35,7 @@ def strange(path, kind):
 KINDS = ["a folder", "a pipe", "a loop"]
 
 
+@killed_by("core/files.py", "if not stat.S_ISREG(os.fstat(handle).st_mode):", "if False:")
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_no_file_is_not_read(tmp_path, kind):
     scenario = strange(tmp_path / "x.toml", kind)

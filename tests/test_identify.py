@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 from scipy.optimize import curve_fit
 
 import diffabs as d
@@ -72,6 +73,12 @@ class TestFit:
         np.testing.assert_allclose([found.cost, told[-1][1]], cost, rtol=1e-9, atol=0)
         assert told[-1][0] >= after
 
+    @killed_by(
+        "identify/uncertainty.py",
+        "degrees, known = len(data) - len(names), data * size / scale",
+        "degrees, known = len(data) - len(names), data * size",
+        case="False",
+    )
     @pytest.mark.parametrize("absolute", [True, False])
     def test_a_line_has_the_closed_form_and_its_covariance(self, absolute):
         found = fit(Decay(), ["a", "c"], line_residuals, data=LINE, sigma=SIGMA, absolute=absolute)
@@ -85,6 +92,11 @@ class TestFit:
         np.testing.assert_allclose(found.uncertainty.deviations["c"], np.sqrt(covariance[1, 1]), rtol=1e-6, atol=0)
         np.testing.assert_allclose(np.diag(found.uncertainty.correlation), 1.0, rtol=1e-12, atol=0)
 
+    @killed_by(
+        "identify/fit.py",
+        "over = np.divide(1.0, slope, out=np.zeros_like(slope), where=slope != 0)",
+        "over = np.ones_like(slope)",
+    )
     @pytest.mark.parametrize("sigma", [SIGMA, None])
     def test_a_curve_and_its_covariance_are_those_of_scipy(self, sigma):
         found = fit(Decay(), ["a", "k", "c"], decay_residuals, data=DATA, sigma=sigma)
@@ -100,6 +112,9 @@ class TestFit:
         assert found.reason in (Reason.GRADIENT, Reason.CHANGE)
         assert found.start == {"a": 1.0, "k": 0.5, "c": pytest.approx(0.1)}
 
+    @killed_by(
+        "identify/uncertainty.py", "np.concatenate([known, prior * size])", "np.concatenate([known, 0 * prior * size])"
+    )
     def test_a_gaussian_prior_has_the_closed_form(self):
         prior = gaussian({"c": (0.2, 0.05)})
         found = fit(Decay(), ["a", "c"], line_residuals, data=LINE, sigma=SIGMA, prior=prior)
@@ -155,6 +170,7 @@ class TestFit:
         )
         assert 1.5 < found.values["a"] <= 3.0
 
+    @killed_by("identify/residuals.py", "return seen if seen.finite() else None", "return seen")
     def test_the_best_start_wins_and_the_others_are_kept(self):
         def well(part):
             return jnp.where(part.a > 10, jnp.nan, (part.a**2 - 4) * (part.a + 3))[None]
@@ -259,6 +275,9 @@ class TestTraces:
         np.testing.assert_allclose(np.std(left["speed"]), 0.1, rtol=0.15, atol=0)
         np.testing.assert_allclose(np.std(left["wheel_speed"]), 0.05, rtol=0.15, atol=0)
 
+    @killed_by(
+        "identify/traces.py", "part = clamp(ratio(t - times[i], times[i + 1] - times[i]), 0.0, 1.0)", "part = 0.0 * t"
+    )
     @pytest.mark.slow
     def test_the_loop_is_compared_between_its_instants_and_stays_where_it_ended(self):
         t = np.array([0.0, 0.0103, 0.1999, 0.3, 0.41, 0.59])

@@ -5,6 +5,7 @@ import math
 import jax
 import numpy as np
 import pytest
+from mutants import killed_by
 
 from diffabs.core.numerics import axpy
 from diffabs.simulate.rk4 import rk4_step
@@ -25,6 +26,8 @@ def forced(t, x):
     return -2 * t * x
 
 
+@killed_by("simulate/rk4.py", "(0.5, 2.0), (0.5, 2.0)", "(0.5, 1.0), (0.5, 3.0)")
+@killed_by("simulate/rk4.py", "rate = f(t + place * h,", "rate = f(t,")
 @pytest.mark.parametrize(
     ("derivative", "x0", "end", "error"),
     [

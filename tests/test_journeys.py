@@ -10,6 +10,7 @@ import pages
 import pytest
 import typer
 from marks import cases
+from mutants import killed_by
 
 from diffabs.cli.main import app
 from diffabs.scenario.scenario import load
@@ -41,6 +42,14 @@ def test_there_are_these_journeys_of_at_most_40_lines():
     assert {page: count for page, count in lines.items() if count > 40} == {}
 
 
+@killed_by("simulate/frames.py", '.set_index("t")', "", case="journeys/pandas.md")
+@killed_by(
+    "linear/transfer.py",
+    "period=float(found.dt) if found.dt else None",
+    "period=None",
+    case="journeys/python-control.md",
+)
+@killed_by("simulate/frames.py", "good.min(), good.max()", "good.max(), good.min()", case="journeys/lanes.md")
 @pytest.mark.parametrize("page", cases(EXECUTED, *SLOW))
 def test_its_code_prints_what_the_page_says(page, tmp_path, monkeypatch):
     if page in needs and shutil.which(needs[page]) is None:
@@ -52,6 +61,7 @@ def test_its_code_prints_what_the_page_says(page, tmp_path, monkeypatch):
         assert out == (block.said or "")
 
 
+@killed_by("../tests/pages.py", "for block in blocks(text):", "for block in blocks(text)[:1]:")
 def test_what_a_page_says_it_prints_is_seen_and_written():
     page = "a\n\n```python\nprint(1)\n```\n\n```text\n2\n```\n\n```python\nprint(3 )\n```\n"
     assert [block.said for block in pages.blocks(page)] == ["2\n", None]

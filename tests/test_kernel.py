@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from commands import run
 from kernels import FOLDER, applied, both, same
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, plants, scenario, sensors
@@ -76,6 +77,8 @@ def runs():
 
 
 class TestRuns:
+    @killed_by("kernel/native/drive.h", "lane[p] >= 0 && !get(on[q], p - q*LANES)", "lane[p] >= 0 && !get(on[q], 0)")
+    @killed_by("kernel/native/drive.h", "if (fresh) begin(b, s, q);", "")
     def test_are_those_of_xla(self, runs):
         """Lanes that begin beyond their stop, diverge and run out of time among them; noise to the last digits."""
         found, expected = runs
@@ -138,6 +141,8 @@ class TestObjections:
     def test_there_is_none(self):
         assert native.objection(LOOP, VALUES, SOLVER, MEASURED) is None
 
+    @killed_by("kernel/compilers.py", "if said is not None and not said.strip():", "if False:")
+    @killed_by("simulate/engine.py", "    tell(why_not)\n", "")
     def test_without_a_compiler(self, monkeypatch, caplog):
         monkeypatch.setenv(compilers.COMPILER, "")
         tell.cache_clear()
@@ -152,16 +157,21 @@ class TestObjections:
         assert [record.getMessage() for record in caplog.records] == [f"runs are made by XLA, not by a kernel: {line}"]
         assert runs[0].stopped.tolist() == runs[1].stopped.tolist()
 
+    @killed_by("kernel/compilers.py", "            _check_loads(command)\n", "", case="false")
     @pytest.mark.parametrize("command", ["false", "/no/such/compiler"])
     def test_of_a_compiler_that_does_not_work(self, command, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, command)
         with pytest.raises(compilers.NoCompiler, match=command):
             compilers.compiler()
 
+    @killed_by("simulate/engine.py", "if engine not in ENGINES:", "if False:")
     def test_of_another_name(self):
         with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
             d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="gpu")
 
+    @killed_by(
+        "simulate/batch.py", "why_not = TOGETHER if trajectories or together or", "why_not = TOGETHER if False and"
+    )
     @pytest.mark.parametrize("more", [{"together": True}, {"trajectories": True}])
     def test_of_lanes_that_run_together(self, more):
         with pytest.raises(ValueError, match="together, for trajectories or for derivatives"):
@@ -176,6 +186,12 @@ class TestObjections:
         with pytest.raises(ValueError, match="a kernel has no reverse mode: forward mode"):
             jax.grad(iae)(-4000.0)
 
+    @killed_by("kernel/nested.py", "or not _says_any(eqn)", "")
+    @killed_by("kernel/primitives.py", "if name not in RULES:", 'if name not in RULES and name != "while":')
+    @killed_by("kernel/nested.py", 'if p["length"] > LONGEST:', "if False:")
+    @killed_by("kernel/indexing.py", "if count > LONGEST:", "if False:")
+    @killed_by("kernel/indexing.py", "if len(column) > LONGEST:", "if False:")
+    @killed_by("kernel/draws.py", 'if str(aval.dtype) != "key<fry>":', "if False:")
     @pytest.mark.parametrize(
         ("function", "line"),
         [
@@ -192,6 +208,7 @@ class TestObjections:
         with pytest.raises(Unsupported, match=line.replace("(", r"\(")):
             applied({"f": function}, np.ones(3))
 
+    @killed_by("kernel/nested.py", "if len(groups) != 3 or", "if False and")
     @pytest.mark.parametrize("structure", [None, (1, 1, 1), {}])
     def test_of_a_scan_whose_inputs_are_told_otherwise(self, structure):
         """As JAX 0.11 began to do: a still later one may do so again."""
@@ -202,6 +219,7 @@ class TestObjections:
         with pytest.raises(Unsupported, match="scan: its parameter ft_in is not known"):
             translate(Graph(), new, [], [known(Graph(), 1.0)])
 
+    @killed_by("kernel/primitives.py", "sorted(set(eqn.params) - RULES[name].known)", "[]")
     def test_of_a_parameter_that_is_not_known(self):
         """A later JAX may say something with it."""
         jaxpr = jax.make_jaxpr(lambda x: jnp.exp(x))(1.0).jaxpr
@@ -214,6 +232,7 @@ class TestObjections:
 class TestSweep:
     SETTINGS = ("sweep.samples=40", "sweep.chunk=16", "solver.step=2e-3", "solver.duration=0.4", "stop.speed_kmh=40.0")
 
+    @killed_by("sweep/study.py", 'if self.engine != "xla":', "if False:")
     @pytest.mark.slow
     def test_is_that_of_xla_and_says_what_made_it(self, tmp_path):
         """Another engine does not go on with it."""
@@ -231,6 +250,7 @@ class TestSweep:
         with pytest.raises(SweepError, match="engine"):
             sweep(study, tmp_path / "kernel", resume=True)
 
+    @killed_by("sweep/run.py", 'if study.engine != "xla" and', "if False and")
     def test_is_refused_before_anything_is_written(self, tmp_path, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, "")
         native._run.clear_cache()
@@ -239,6 +259,8 @@ class TestSweep:
             sweep(dataclasses.replace(study, engine="kernel"), tmp_path / "out")
         assert not (tmp_path / "out").exists()
 
+    @killed_by("cli/sweep.py", 'if engine == "xla":', "if True:", case="kernel-")
+    @killed_by("cli/sweep.py", 'if line and engine == "kernel":', "if line:", case="auto-note: runs are made by XLA: ")
     @pytest.mark.slow
     @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA: "), ("kernel", "")])
     def test_by_the_command(self, engine, line, tmp_path, monkeypatch):
@@ -252,6 +274,7 @@ class TestSweep:
 
 
 class TestGraph:
+    @killed_by("kernel/operations.py", '"add", "mul", "and"', '"add", "sub", "mul", "and"')
     def test_equal_operations_are_one(self):
         graph = Graph()
         x, y = (graph.input(float, Level.STEP, i) for i in range(2))
@@ -267,6 +290,7 @@ class TestGraph:
         assert graph.op("mul", x, graph.const(1.0)) is x
         assert graph.op("mul", x, graph.const(0.0)) is not graph.const(0.0)  # x may be infinite
 
+    @killed_by("kernel/graph.py", 'if inverse.op == "const" and not', "if False and not")
     def test_a_divisor_of_before_the_step_is_inverted_there(self):
         graph = Graph()
         x, fixed, tiny = graph.input(float, Level.STEP, 0), graph.input(float, Level.UNIFORM, 1), graph.const(1e-310)
@@ -352,6 +376,7 @@ class TestLibrary:
         fifth = compilers.library("fifth")
         assert set(tmp_path.glob("*.so")) == {first, fourth, fifth}
 
+    @killed_by("kernel/compilers.py", "repr((made, FLAGS, _processor()))", "repr(made)")
     @pytest.mark.parametrize("changed", ["FLAGS", "_processor"])
     def test_is_another_for_other_flags_and_processors(self, changed, tmp_path, monkeypatch):
         compilers.compiler()
@@ -362,12 +387,18 @@ class TestLibrary:
         monkeypatch.setattr(compilers, changed, ("-O1",) if changed == "FLAGS" else lambda: "another")
         assert compilers.library("one") != path
 
+    @killed_by(
+        "kernel/compilers.py",
+        '    except OSError as error:\n        raise NoCompiler(f"no kernel',
+        '    except subprocess.TimeoutExpired as error:\n        raise NoCompiler(f"no kernel',
+    )
     def test_in_a_folder_that_cannot_be_made(self, tmp_path, monkeypatch):
         (tmp_path / "file").write_text("")
         monkeypatch.setenv(binaries.CACHE, str(tmp_path / "file" / "kernel"))
         with pytest.raises(compilers.NoCompiler, match=r"no kernel in .*file.kernel: Not a directory"):
             compilers.library(self.TEXT % 3)
 
+    @killed_by("kernel/launch.py", "except (OSError, AttributeError) as error:", "except AttributeError as error:")
     def test_that_is_none_cannot_be_loaded(self, tmp_path, monkeypatch):
         (tmp_path / "none.so").write_text("nothing")
         with pytest.raises(compilers.NoCompiler, match=r"invalid ELF header|file too short|not a mach-o"):

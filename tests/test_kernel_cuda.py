@@ -17,6 +17,7 @@ import test_kernel_parts as cases
 import test_kernel_tangents
 from cuda_on_processor import Processor
 from kernels import FOLDER, applied, both, same
+from mutants import killed_by
 from test_kernel import AT_ONCE, DIVERGING, KEYS, LOOP, MEASURED, NEVER, SOLVER, VALUES
 
 import diffabs as d
@@ -49,6 +50,9 @@ def processor(monkeypatch):
 class TestText:
     """By stand-ins for CUDA's own names."""
 
+    @killed_by("kernel/native/threads.h", "j = (i64)atomicAdd((u64*)next, (u64)1);", "j = count;")
+    @killed_by("kernel/native/threads.h", "arrays.carry);\n    begin(b, s, 0);\n  }", "arrays.carry);\n  }")
+    @killed_by("kernel/native/threads.h", "*next = threads;", "*next = threads + 1;")
     @pytest.mark.slow
     def test_runs_are_those_of_xla(self, processor):
         """Lanes that begin beyond their stop, diverge and run out of time among them; noise to the last digits."""
@@ -66,6 +70,13 @@ class TestText:
         assert found.metrics["iae"].dtype == np.float32
         same(found, expected, rtol=2e-4, atol=1e-6)
 
+    @killed_by(
+        "kernel/native/lane.h",
+        "T most(T a, T b) { return a == a ? higher(a, b) : a; }",
+        "T most(T a, T b) { return higher(a, b); }",
+    )
+    @killed_by("kernel/native/lane.h", "x < high ? (V)x : greatest", "true ? (V)x : greatest")
+    @killed_by("kernel/native/lane.h", "both.from = x;", "both.to = (V)x;")
     def test_rules_are_those_of_jax(self, processor):
         """Every rule in one kernel, NaN and infinite arguments among them."""
         test_kernel_native.test_rules_are_those_of_jax()
@@ -151,6 +162,7 @@ class TestMachineCode:
         assert not [*tmp_path.iterdir()]
 
 
+@killed_by("kernel/nvrtc.py", "repr((FLAGS, version(), architecture))", "repr((version(), architecture))")
 def test_machine_code_is_made_once(tmp_path, monkeypatch):
     """For the same text, flags and architecture."""
     made = []
@@ -173,6 +185,7 @@ class TestObjections:
         with pytest.raises(NoCompiler, match="no CUDA compiler; the package nvidia-cuda-nvrtc"):
             nvrtc._library.__wrapped__()
 
+    @killed_by("kernel/gpu.py", 'if not capability.replace(".", "").isdigit():', "if False:")
     def test_of_a_gpu_of_another_make(self, monkeypatch):
         monkeypatch.setattr(gpu.jax, "devices", lambda platform=None: [Home("gpu", "gfx942")])
         gpu._cuda.cache_clear()
@@ -231,6 +244,9 @@ class TestDriver:
         on.start(code, arrays, 4096, count, Context(77))
         return on, code, arrays
 
+    @killed_by("kernel/gpu.py", "ctypes.c_int64(blocks * cuda.THREADS)", "ctypes.c_int64(blocks)")
+    @killed_by("kernel/gpu.py", "cuda.THREADS, context.stream, arrays", "cuda.THREADS, 0, arrays")
+    @killed_by("kernel/gpu.py", "min(one.blocks, -(-count // cuda.THREADS))", "-(-count // cuda.THREADS)")
     def test_is_told_of_arrays_threads_and_lanes(self, monkeypatch, tmp_path):
         """No more blocks than there are lanes for, nor than the device holds; one thread first; XLA's stream."""
         for count, blocks in ((1000, 8), (10**6, 3 * 132)):
@@ -249,6 +265,9 @@ class TestDriver:
         assert driver.asked.count("cuModuleLoadData") == 1
         assert len(driver.launches) == 4
 
+    @killed_by(
+        "kernel/gpu.py", '    finally:\n        _do("cuCtxPop', '    except ZeroDivisionError:\n        _do("cuCtxPop'
+    )
     def test_objects(self, monkeypatch, tmp_path):
         driver = Driver(failing="cuModuleLoadData")
         with pytest.raises(RuntimeError, match=r"cuModuleLoadData: CUDA_ERROR_OUT_OF_MEMORY \(2\)"):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import run
 from kernels import FOLDER
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, reliability, roads, scenario, stops, sweep, tune
@@ -74,6 +75,7 @@ class TestTune:
         np.testing.assert_allclose(found.values["controller.torque"], expected.values["controller.torque"], rtol=1e-6)
         assert found.mode is Mode.FORWARD
 
+    @killed_by("tune/problem.py", 'engine="kernel", mode=Mode.FORWARD)', 'engine="kernel")')
     @pytest.mark.slow
     def test_without_lanes_of_its_own_and_of_many_parameters(self):
         """One lane; and forward mode where XLA would have taken reverse mode."""
@@ -90,15 +92,19 @@ class TestTune:
         found, expected = (jax.device_get(problem.evaluator(1.0)(z, none)) for problem in problems)
         np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-7, atol=1e-12)
 
+    @killed_by("tune/problem.py", "REVERSE if mode is Mode.REVERSE else None", "None")
     def test_in_reverse_mode_is_refused(self):
         method = tune.Method(mode=Mode.REVERSE)
         with pytest.raises(EngineError, match="engine = 'kernel' is not possible: a kernel has no reverse mode"):
             tune.tune(LOOP, **TUNED, method=method, engine="kernel")
 
+    @killed_by("tune/problem.py", "if engine not in ENGINES:", "if False:")
     def test_of_another_name(self):
         with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
             tune.tune(LOOP, **TUNED, engine="gpu")
 
+    @killed_by("tune/problem.py", "line := line or found.objection()", "line := line")
+    @killed_by("tune/problem.py", "together=together, engine=self.engine)", "together=True)")
     @pytest.mark.slow
     def test_without_a_compiler(self, no_compiler, caplog):
         with pytest.raises(EngineError, match=NONE):
@@ -109,6 +115,7 @@ class TestTune:
         assert len(caplog.records) == 1
         assert NONE in caplog.records[0].getMessage()
 
+    @killed_by("kernel/primitives.py", "error.method = error.method or _asked_by(eqn)", "pass")
     def test_of_what_has_no_rule_names_the_part(self):
         line = tune.posed(DELAYED, **TUNED, engine="kernel").objection()
         why = "dynamic_slice: of 1296 entries that differ between lanes (in Delay.tick)"
@@ -126,11 +133,14 @@ class TestTune:
         assert f"note: runs are made by XLA: engine = 'kernel' is not possible: {NONE}" in done.stderr
         assert json.loads(done.stdout)["engine"] == {"name": "xla"}
 
+    @killed_by("cli/engine.py", "if engine not in ENGINES:", "if False:")
     @pytest.mark.parametrize("command", [("tune", "slip-lmi"), ("rare", "slip-lmi", "overshoot")])
     def test_another_engine_is_refused_by_the_command(self, command):
         assert "--engine gpu is unknown" in run(*command, "--engine", "gpu", status=2).stderr
 
 
+@killed_by("tune/worst.py", "accepted=True, engine=engine)", "accepted=True)")
+@killed_by("tune/worst.py", "    problem = problem.by(engine)\n", "")
 @pytest.mark.slow
 def test_the_worst_case_is_that_of_xla(monkeypatch):
     """Screened without derivatives and ascended with them, both by a kernel."""
@@ -147,6 +157,7 @@ def test_the_worst_case_is_that_of_xla(monkeypatch):
     assert {bool(made.tangents) for made in launches} == {False, True}
 
 
+@killed_by("simulate/native.py", "ROUND // BLOCK", "1")
 @pytest.mark.slow
 def test_a_map_of_starts_is_that_of_xla():
     """Runs that end inside of an ellipsoid, that fall, and that do neither; known at the same instant."""
@@ -171,6 +182,7 @@ class TestSweep:
 
 
 class TestRare:
+    @killed_by("reliability/failure.py", 'forward if study.engine == "kernel" else slopes', "slopes", case="True")
     @pytest.mark.slow
     @pytest.mark.parametrize("gradients", [pytest.param(False, marks=pytest.mark.slow), True])
     def test_is_that_of_xla(self, gradients):
@@ -182,6 +194,7 @@ class TestRare:
         assert found.evaluations == expected.evaluations
         assert found.gradients == expected.gradients
 
+    @killed_by("reliability/failure.py", ", engine=study.engine)", ")")
     @pytest.mark.slow
     def test_objection(self, no_compiler):
         assert reliability.failure.objection(STUDY, "stop_time") == NONE

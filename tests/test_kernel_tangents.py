@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from kernels import FOLDER
 from marks import cases
+from mutants import killed_by
 from test_kernel_parts import CASES, VARIED, with_part
 
 import diffabs as d
@@ -89,12 +90,39 @@ SECOND = ("of what is the same for all", "three tangents", "eleven tangents", "f
 
 
 class TestLaunch:
+    @killed_by(
+        "kernel/linear.py",
+        'self.graph.op("div", self.graph.const(1, node.dtype), value(args[1]))',
+        "value(args[1])",
+        case="of both",
+    )
+    @killed_by("kernel/linear.py", 'self.graph.op("mul", x.number, y.number)', "x.number", case="three tangents")
+    @killed_by("kernel/tangents.py", "copy_of(new[x.id], k) for", "copy_of(new[x.id], 0) for", case="three tangents")
+    @killed_by(
+        "kernel/binding.py",
+        "jnp.pad(x, wide), first, first + each,",
+        "jnp.pad(x, wide), 0, each,",
+        case="eleven tangents",
+    )
+    @killed_by(
+        "kernel/binding.py",
+        "x = jnp.moveaxis(x, 0, at)\n    return",
+        "x = jnp.moveaxis(x[::-1], 0, at)\n    return",
+        case="three tangents",
+    )
+    @killed_by(
+        "kernel/binding.py",
+        "jnp.moveaxis(x, axis, 0)\n    if shared:",
+        "0 * x + jnp.moveaxis(x, axis, 0)[:1]\n    if shared:",
+        case="for several gains",
+    )
     @pytest.mark.parametrize("way", cases(WAYS, *SECOND))
     def test_derivatives_are_those_of_xla(self, way):
         found, expected = (jax.device_get(WAYS[way](lambda g, r, e=e: chain(g, r, e))) for e in ("kernel", "xla"))
         assert np.abs(expected[..., :3]).max() > 0
         np.testing.assert_allclose(found, expected, rtol=2e-13, atol=1e-13)
 
+    @killed_by("kernel/tangents.py", "if reached == do[Level.STEP]:", "if True:")
     def test_only_what_moves_is_carried(self, monkeypatch):
         """The fourth number moves with nothing, and what comes from no tangent is no operation."""
         seen = []
@@ -104,6 +132,7 @@ class TestLaunch:
         assert seen[-1][Level.STEP] == (1, 2, 3)
         assert seen[-1][Level.LANE] == ()
 
+    @killed_by("kernel/tangents.py", "if wanted is not None:", "if False:")
     def test_only_what_is_asked_for_is_carried(self, monkeypatch):
         """The third number leads to nothing but itself, and has no tangent; the second has those that it has anyway."""
         seen = []
@@ -116,6 +145,9 @@ class TestLaunch:
         np.testing.assert_allclose(found[1], known[1], rtol=2e-13)
         assert not np.any(found[2])
 
+    @killed_by(
+        "kernel/elimination.py", "all(x not in self.vertices and self.levels[x] < Level.STEP for x in once)", "True"
+    )
     def test_what_is_not_chosen_does_not_matter(self):
         """A try may lead to what is no number, and is then not taken: neither are its tangents."""
 
@@ -131,6 +163,7 @@ class TestLaunch:
         known = jnp.outer((1 + 0.1 * RATES) ** STEPS * RATES, jnp.ones(3))
         np.testing.assert_allclose(jax.jacfwd(run)(jnp.arange(3.0)), known, rtol=1e-13)
 
+    @killed_by("kernel/binding.py", "MOST = 8 ", "MOST = 1 ", case="8-1")
     @pytest.mark.parametrize(("many", "launches"), [(8, 1), (9, 2)])
     def test_tangents_are_one_launch(self, many, launches, monkeypatch):
         made = []
@@ -139,6 +172,7 @@ class TestLaunch:
         jax.jacfwd(lambda x: chain(jnp.sum(x), RATES))(jnp.ones(many))
         assert len(made) == launches
 
+    @killed_by("kernel/binding.py", "pe.custom_partial_eval_rules[operation] = _unknown", "")
     @pytest.mark.parametrize(
         "reverse",
         [
@@ -152,6 +186,7 @@ class TestLaunch:
         with pytest.raises(ValueError, match="a kernel has no reverse mode: forward mode"):
             reverse(lambda g: jnp.sum(chain(g, RATES)))
 
+    @killed_by("kernel/binding.py", "    if begins is not None:\n        raise", "    if False:\n        raise")
     def test_second_derivatives_are_refused(self):
         with pytest.raises(ValueError, match="a kernel has no second derivatives"):
             jax.jacfwd(jax.jacfwd(lambda g: chain(g, RATES)))(2.0)
@@ -252,6 +287,7 @@ def test_a_part(family, name):
     compare((loop, d.FixedStep(1e-3, 0.06, kinks=False), usual(loop.plant), path), ROUNDED.get(name, EXACT))
 
 
+@killed_by("simulate/native.py", "else method.located()", "else method")
 @pytest.mark.slow
 def test_steps_end_on_kinks_where_those_of_xla_do():
     """Of a torque that comes to its limits: without, the derivatives would be others."""
@@ -269,6 +305,7 @@ def test_steps_end_on_kinks_where_those_of_xla_do():
     assert np.abs(blunt - known).max() > 1e-5 * np.abs(known).max()
 
 
+@killed_by("simulate/pursuit.py", "anyone(note.moved)", "anyone(note.fired != 0)", case="slip-lmi-adaptive")
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grid", "kinks", "adaptive"])
 @pytest.mark.parametrize("name", scenario.names())

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, roads, stops
@@ -83,6 +84,7 @@ def test_a_list_is_an_array():
     assert listed == tupled == iae(d.replace(RIG, {"controller.gain": np.array([-9e3, -40.0])}))
 
 
+@killed_by("core/validity.py", "kinds.shape(value) != spec.shape", "False")
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [

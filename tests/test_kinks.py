@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from marks import cases
+from mutants import killed_by
 
 import diffabs as d
 from diffabs.actuators import Delay, Lag
@@ -76,6 +77,10 @@ def same(out: Any) -> Any:
     return out
 
 
+@killed_by(
+    "core/kinks.py", "key = (y, x, not strict) if turned else (x, y, strict)", "key = (x, y, strict)", case="a contrary"
+)
+@killed_by("core/kinks.py", "asks = name if moves and real", "asks = name if real", case="of what is fixed")
 @pytest.mark.parametrize("name", KINKED)
 def test_a_program_is_the_function(name):
     f, count = KINKED[name]
@@ -99,6 +104,7 @@ def test_a_regime_goes_on_beyond_its_kinks(name, at, beyond, value, slope):
     np.testing.assert_allclose([found, move], [value, slope], rtol=1e-15)
 
 
+@killed_by("core/regime.py", "against = margin < -_rounding(x)", "against = margin < -jnp.inf", case="gt")
 @pytest.mark.parametrize("name", [name for name, (_, count) in KINKED.items() if count])
 def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
     f, _ = KINKED[name]
@@ -123,6 +129,7 @@ def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
         assert answers.words == held(one, 2.2).words
 
 
+@killed_by("core/regime.py", "most.eps**ROUNDING *", "0.0 *")
 def test_numbers_that_are_equal_to_rounding_say_nothing():
     one = program(lambda x, p: jnp.where(x > p, 1.0, 0.0))
     regime = held(one, 0.1)
@@ -130,6 +137,7 @@ def test_numbers_that_are_equal_to_rounding_say_nothing():
         assert any(one.look(same, 0.6 + excess, 0.6, regime)[1].crossed) == sees
 
 
+@killed_by("core/regime.py", "against |= gives & (margin == 0) & (says() != taken)", "pass")
 def test_a_product_that_has_become_0_is_held_by_nobody():
     """(x - min(x, p)) x > 0 above p, and 0 > 0 below, which contradicts nobody: it gives way all the same."""
     one = program(lambda x, p: jnp.where((x - jnp.minimum(x, p)) * x > 0, 1.0, 0.0))
@@ -219,6 +227,18 @@ def clockwork(rate: Any, place: Any) -> Loop:
     )
 
 
+@killed_by(
+    "core/regime.py",
+    "next = below + jnp.where(high < -_rounding(x), 1, 0) - jnp.where(low < -_rounding(x), 1, 0)",
+    "next = below",
+    case="a table",
+)
+@killed_by(
+    "simulate/methods.py",
+    "dataclasses.replace(self, kinks=self.kinks is not False,",
+    "dataclasses.replace(self, kinks=False,",
+    case="a jump",
+)
 @pytest.mark.parametrize("name", cases(CLOSED, "two in a step"))
 def test_a_derivative_through_a_kink_is_that_of_the_closed_form(name):
     """However long the step: 10 ms here, and a derivative that misses a jump is 0."""
@@ -263,6 +283,7 @@ def test_a_comparison_close_to_the_beginning_of_a_run_is_landed_on():
     np.testing.assert_allclose(found, jax.jit(jax.jacfwd(iae))(gains), rtol=1e-12)
 
 
+@killed_by("simulate/stepper.py", "tired & (search.which < kinks)", "tired & False")
 def test_a_run_that_slides_along_a_kink_is_a_run():
     """x' = -sign(x - a) + 0.3: nobody can follow each switch; it stays within a step of the place, and says so."""
 
@@ -278,6 +299,7 @@ def test_a_run_that_slides_along_a_kink_is_a_run():
     np.testing.assert_allclose(run.metrics["y"], [0.2, 0.4], atol=0.02)
 
 
+@killed_by("simulate/stepper.py", "fine &= carry.blunt | _plausible(carry, here) if kinks else True", "pass")
 def test_where_a_step_is_too_long_a_regime_is_not_believed():
     """Below its crawl speed a wheel is stiffer than any step, and a curve of friction beyond its kinks has no bound."""
     loop = braking(
@@ -334,6 +356,12 @@ def integrating(late: float) -> tuple[Loop, float]:
     return Loop(**{**vars(loop), **parts}), most**2 * leaves + square(END - late) - square(leaves)
 
 
+@killed_by(
+    "controllers/antiwindup.py",
+    "(raw - limited) * gain * error > 0",
+    "jnp.not_equal(raw, limited) & ((raw - limited) * gain * error > 0)",
+)
+@killed_by("simulate/methods.py", "loop.jumps if self.kinks is None", "False if self.kinks is None")
 @pytest.mark.parametrize("late", [0.0, 0.0337])
 def test_where_a_rate_jumps_a_value_is_right_too(late):
     """An integral that waits for a limit starts at once when the limit is left: in the middle of a step of 10 ms, which

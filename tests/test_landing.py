@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from marks import cases
+from mutants import killed_by
 from test_blocks import Mean, close
 from test_delay import H, Integrator, Proportional, Says, loop
 
@@ -49,6 +50,11 @@ class Slips:
         return Memory(held=jnp.where(fired[0], 5.0, memory.held))
 
 
+@killed_by(
+    "simulate/adaptive.py", "jnp.where(again, Condition.SEEKING, Condition.LANDING)", "jnp.asarray(Condition.LANDING)"
+)
+@killed_by("simulate/landing.py", "((off > probe) | ((off == 0) & (search.margin != 0)))", "(off > probe)")
+@killed_by("simulate/landing.py", "missed & ~search.at_once & (search.tries < TRIES)", "missed & False")
 @pytest.mark.parametrize("solver", [d.FixedStep(H, 0.01, kinks=False), d.Adaptive(1e-5, 0.01, H)])
 def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
     """Where it is still flat, a parabola through three tries may take it for near its zero, and its fall there leads
@@ -64,6 +70,8 @@ def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
         close(mean(level) * 0.01, 2.0 * moment + 5.0 * (0.01 - moment), rtol=2e-5)
 
 
+@killed_by("controllers/sampled.py", "output, self._until(clock.t), jnp", "output, clock.t + self.delay, jnp")
+@killed_by("simulate/landing.py", "jnp.where(steep, moved -", "jnp.where(steep & False, moved -", case="0.002")
 @pytest.mark.parametrize("late", cases([2e-3, 4e-3, 2.3e-3, 5e-3], 2e-3, 4e-3, 5e-3))
 @pytest.mark.parametrize("solver", [d.FixedStep(H, 0.03), pytest.param(d.Adaptive(1e-5, 0.03, H), id="adaptive")])
 def test_the_moment_of_an_event_on_the_grid_is_differentiable(late, solver):
@@ -82,6 +90,9 @@ def test_the_moment_of_an_event_on_the_grid_is_differentiable(late, solver):
     close(slope * 0.03, -levels[-1], rtol=1e-7)
 
 
+@killed_by(
+    "simulate/landing.py", "share = ratio(zero - search.place, x - search.place)", "share = 0.0 * zero", case="jacfwd"
+)
 @pytest.mark.parametrize("derivative", cases([jax.jacfwd, jax.jacrev], jax.jacrev))
 def test_derivatives_of_a_moment_are_those_at_the_zero(derivative):
     """x' = -k x comes down to a level, at steps of 0.4/k: against differences of the runs themselves. The last try

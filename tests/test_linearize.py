@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
+from mutants import killed_by
 from scipy.signal import cont2discrete
 
 from diffabs.actuators import Delay, Lag, Limits, RateLimit
@@ -70,6 +71,7 @@ def test_rig_is_equation_21(mass, slip, speed):
     assert a.dtype == b.dtype == jnp.float64
 
 
+@killed_by("linear/linearization.py", "jax.jvp(chart, (x,), (flow(x, u),))[1]", "by_x @ flow(x, u)")
 def test_quarter_car_by_hand():
     """slip' = ((1 - s) v' - r omega')/v at a frozen v, and mu' of Burckhardt's curve, by hand."""
     r, m, j, s, v, road = 0.2, 15.0, 1.04456, 0.1, 12.0, WET_ASPHALT
@@ -330,6 +332,7 @@ def test_reduction_has_the_modes_of_the_loop(plant, name, actuator):
         assert np.min(np.abs(true - mode)) < 1e-9 * max(1, abs(mode))
 
 
+@killed_by("design/state_feedback.py", "in_words(line, units) for line", "line.replace('{control}', 'N m') for line")
 def test_what_is_neglected():
     lag = Lag(time_constant=0.02)
     loop = braking(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from commands import run as command
 from marks import cases
+from mutants import killed_by
 from scipy.optimize import brentq
 from scipy.signal import cont2discrete
 
@@ -51,6 +52,14 @@ def random_loop(seed, sampled):
             return system
 
 
+@killed_by(
+    "linear/stability_margins.py",
+    "phases = np.angle(-_response",
+    "phases = np.angle(-1j * _response",
+    case="continuous",
+)
+@killed_by("linear/stability_margins.py", "-1 / values[real]", "-values[real]", case="sampled")
+@killed_by("linear/stability_margins.py", "while high - low > 1e-9 * high:", "while False:", case="continuous")
 @pytest.mark.parametrize(
     ("sampled", "seeds"),
     [
@@ -134,6 +143,10 @@ def test_a_delay_in_continuous_time_against_the_closed_form():
     assert not margins(loop._replace(delay=0.99 * math.pi / (2 * k) + 0.02)).stable
 
 
+@killed_by(
+    "linear/stability_margins.py", "times = 1 + math.floor((system.delay - first) * w / (2 * math.pi))", "times = 1"
+)
+@killed_by("linear/stability_margins.py", "2 * times if falling else -2 * times", "2 * times")
 def test_a_delay_can_bring_back_what_it_took():
     """x'' + x = -k x'(t - d) loses stability and regains it as d grows; the counts are those with a Pade approximat."""
     k = 0.3
@@ -147,6 +160,7 @@ def test_a_delay_can_bring_back_what_it_took():
     assert stable(loop._replace(delay=6.0))
 
 
+@killed_by("linear/stability_margins.py", "[end for end in ends if _real(system, end)]", "[]")
 def test_ends_of_the_axis():
     """A first-order loop that needs its gain, L = k/(s - 1), may lose a factor k; sampled, it turns over at z = -1."""
     one = np.ones((1, 1))
@@ -171,6 +185,12 @@ LOOPS = {
 }
 
 
+@killed_by(
+    "linear/opened_loop.py",
+    "delay += float(sampled.delay) if sampled else 0.0",
+    "pass",
+    case="sampled, half a period late",
+)
 @pytest.mark.parametrize("name", cases(LOOPS, "sampled", "lag", "state feedback", "PID", "sampled, half a period late"))
 def test_closed_is_the_loop_of_the_certificates(name):
     """Its poles are those of A + B K, which the linear slip model has from elsewhere."""
@@ -184,6 +204,7 @@ def test_closed_is_the_loop_of_the_certificates(name):
     np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-9)
 
 
+@killed_by("linear/opened_loop.py", "there.at[0].set(around.setpoint) if around.frozen else there", "there")
 @pytest.mark.slow
 def test_the_brake_lab_rig_and_a_filtered_sensor_come_to_rest():
     lab = rig(plant=LabRig(), initial=BrakeStart(speed=14.0), controller=StateFeedback(gain=(-60.0, -4.0)))
@@ -198,6 +219,11 @@ def test_the_brake_lab_rig_and_a_filtered_sensor_come_to_rest():
     np.testing.assert_allclose(filtered.response(w), direct.response(w) / (1 + 3e-3j * w[:, None, None]), rtol=1e-9)
 
 
+@killed_by(
+    "linear/opened_loop.py",
+    "delay = float(sum(block.time for block in blocks if isinstance(block, Delay)))",
+    "delay = 0.0",
+)
 def test_a_pure_delay_turns_the_phase_and_nothing_else():
     w = np.geomspace(1, 2000, 40)
     plain = open_loop(rig(actuator=Lag(time_constant=1e-3))).transfer()
@@ -207,6 +233,7 @@ def test_a_pure_delay_turns_the_phase_and_nothing_else():
     assert other.delay == pytest.approx(one.delay - 1e-3, rel=1e-9)
 
 
+@killed_by("linear/opened_loop.py", "rest = max(delay - whole * self.period, 0.0)", "rest = 0.0")
 @pytest.mark.slow
 def test_a_sampled_loop_behind_a_delay_is_that_of_a_step_response():
     """2.6 periods of delay: the pulse response of L(z) is that of the continuous plant, which has one state."""
@@ -228,6 +255,7 @@ def test_a_sampled_loop_behind_a_delay_is_that_of_a_step_response():
     np.testing.assert_allclose([0.0, *((whole.C @ x).item() for x in states)], wanted, rtol=1e-9, atol=1e-12)
 
 
+@killed_by("linear/stability_margins.py", "loop.period is None or not math.isfinite(guess)", "True")
 def test_the_delay_margin_of_a_sampled_loop_is_where_it_turns_unstable():
     loop = rig(controller=Sampled(controller=StateFeedback(gain=(-3000.0, -48.0)), period=4e-3))
     opened = open_loop(loop)
@@ -245,6 +273,8 @@ def closed_poles(system):
     return np.linalg.eigvals(system.A - system.B @ system.C)
 
 
+@killed_by("linear/opened_loop.py", "OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)", "OFFSETS = (0.0,)")
+@killed_by("core/tracing.py", "not _zero(step) and not needed", "not needed")
 @pytest.mark.slow
 def test_noise_is_a_disturbance_and_limits_do_not_act():
     plain = open_loop(rig()).transfer()
@@ -272,6 +302,7 @@ def test_what_has_no_linear_loop_says_why(parts, words):
         open_loop(rig(**parts))
 
 
+@killed_by("linear/transfer.py", "for _ in range(round(shifts)):", "for _ in range(0):")
 def test_python_control_there_and_back():
     system = random_loop(3, True)._replace(delay=0.0)
     back = from_control(to_control(system))
@@ -291,6 +322,7 @@ def test_python_control_there_and_back():
         margins(Transfer(np.eye(2) * -1, np.eye(2), np.eye(2), np.zeros((2, 2))))
 
 
+@killed_by("linear/robustness.py", "return {name: max(self.systems", "return {name: min(self.systems")
 def test_a_band_is_of_the_corners_and_of_samples_between():
     loop, over = rig(), {"plant.mass": (5.3, 6.2), "initial.speed": (2.0, 10.0)}
     found = band(loop, over, samples=5)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in
 from commands import run as command
+from mutants import killed_by
 
 io = pytest.importorskip("scipy.io")
 
@@ -17,6 +18,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@killed_by("simulate/matlab.py", "values[:rows]", "values")
 def test_a_mat_file_has_what_the_csv_has(folder):
     found = io.loadmat(folder / "run.mat", simplify_cells=True)
     header, *rows = (folder / "run.csv").read_text().splitlines()
@@ -30,6 +32,7 @@ def test_a_mat_file_has_what_the_csv_has(folder):
     assert found["scenario"] == "slip-lmi"
 
 
+@killed_by("simulate/matlab.py", ', oned_as="column"', "")
 def test_a_mat_file_has_metrics_and_parameters(folder):
     found = io.loadmat(folder / "run.mat", simplify_cells=True)
     assert found["parameters"]["plant_mass"] == 5.3
@@ -41,6 +44,7 @@ def test_a_mat_file_has_metrics_and_parameters(folder):
     assert (folder / "run.mat").read_bytes()[:19] == b"MATLAB 5.0 MAT-file"
 
 
+@killed_by("cli/main.py", "if places[one] == places[other]:", "if False:")
 @pytest.mark.parametrize(
     ("words", "said"),
     [

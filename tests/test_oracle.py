@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from marks import cases
+from mutants import killed_by
 from oracles import brake
 
 import diffabs as d
@@ -69,6 +70,9 @@ def _fields(loop):
     return {"plant": loop.plant, "initial": loop.initial, "stop": loop.stop}
 
 
+@killed_by(
+    "plants/mirrored_rig.py", "slip_ratio(v, w, self.crawl_speed)", "slip_ratio(w, v, self.crawl_speed)", case="2"
+)
 @pytest.mark.parametrize("seed", cases(range(12), 2, 3, 4, 6, 7, 8, 9, 10, 11))
 def test_random_scenario_agrees_with_scipy(seed):
     loop, torque, rates, memory = _case(seed)
@@ -82,6 +86,7 @@ def test_random_scenario_agrees_with_scipy(seed):
         np.testing.assert_allclose(run.metrics[name], value, rtol=rtol, atol=1e-9, err_msg=name)
 
 
+@killed_by("plants/lab_rig.py", "stuck = jnp.where(held, smaller(asked, capacity), capacity)", "stuck = capacity")
 def test_lab_rig_locks_and_stops_like_scipy():
     plant = plants.LabRig()
     loop = braking(

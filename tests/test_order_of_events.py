@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 from marks import cases
+from mutants import killed_by
 from scipy.integrate import solve_ivp
 
 import diffabs as d
@@ -131,6 +132,9 @@ STEPS = (1e-3, 5e-4, 2.5e-4)
 BOUNDS = {"relay": (1e-6, 2.0), "delay": (2e-9, 1.5), "rate limit": (1e-5, 1.4)}  # error at 1 ms, order
 
 
+@killed_by(
+    "actuators/delay.py", "(h * rate for rate in passage.rates)", "(0.0 * rate for rate in passage.rates)", case="delay"
+)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", cases(BOUNDS, "rate limit"))
 def test_converges_to_scipy(name):

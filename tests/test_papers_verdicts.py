@@ -11,6 +11,8 @@ from scipy.interpolate import PchipInterpolator
 
 pytest.importorskip("matplotlib")
 
+from mutants import killed_by
+
 from diffabs import FixedStep, roads
 from diffabs.design.parameter_box import polytope
 from diffabs.linear.slip_model import SlipModel
@@ -33,6 +35,11 @@ def runs():
     return slip_estimator.run(CAR, FixedStep(step=1e-4, duration=3.6, every=1))
 
 
+@killed_by(
+    "papers/estimator_claims.py",
+    'np.sum(np.abs(np.diff(seen(run)["torque"])))',
+    'np.sum(np.maximum(np.diff(seen(run)["torque"]), 0))',
+)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "variation", "jerk"),
@@ -224,6 +231,7 @@ def test_a_cost_that_is_small_for_any_mass(rig):
         assert np.isfinite(lmi_claims.cost(A, B, gain, weights)) == stable
 
 
+@killed_by("papers/lmi_claims.py", "-(Q + K.T @ K)", "-Q")
 def test_the_nearest_explanation_of_the_gain(rig):
     """The optimum at 5 km/h alone with the published k1 has k2 = -50.3, and more for any weight on the slip error, any
     cross weight and any greater speed; -48 is that of 4.54 km/h. So the design saw the slow end of its range only: at
@@ -275,6 +283,7 @@ def test_equations_4_and_6_lack_gravity():
         np.testing.assert_allclose(missing, -(9.81 - 1) * 70 * 0.7 * np.cos(q[0]), rtol=1e-11)
 
 
+@killed_by("papers/arm_equations.py", "eighth - m2 * lg * sin2", "eighth - m2 * l * lg * sin2")
 def test_what_the_printed_equations_of_motion_miss_of_their_own_lagrangian():
     """Eq. (8) lacks l in one term; (9) and (10) have the other sign in the centrifugal term and in gravity."""
     b2, b3, c2, c3, g = 10.0, 30.0, 7.0, 21.0, 9.81

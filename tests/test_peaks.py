@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import parts
 import pytest
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, sensors, stops
@@ -25,6 +26,7 @@ def step(h, smooth, within=(True, True), **signals):
     return Segment(a, b, h, h, lambda: (Shown.of(da), Shown.of(db)), lambda: (da, db), smooth, within)
 
 
+@killed_by("objectives/balance.py", "if segment.smooth is not False:", "if False:", case="True-24.0")
 @pytest.mark.parametrize(("smooth", "peak"), [(True, 24.0), (False, 19.2)])
 def test_a_voltage_rises_and_falls_within_a_long_step(smooth, peak):
     """u = 24 - 30 (t - 0.4)^2 over a step of 1 s. If the step would not end on a limit, only its ends are seen."""
@@ -33,6 +35,7 @@ def test_a_voltage_rises_and_falls_within_a_long_step(smooth, peak):
     np.testing.assert_allclose(objective.update(objective.start(segment.start), segment), peak, rtol=1e-12)
 
 
+@killed_by("core/messages.py", "jnp.where(end, last, jnp.where(start, 2.0 * rise - first, rise))", "last")
 @pytest.mark.parametrize(("objective", "value"), [(PeakVoltage(), 24.0), (objectives.Variation(), 4.0)])
 def test_a_voltage_that_rises_to_a_limit_does_not_leave_it(objective, value):
     """u = 20 + 8 t to 24, where the step ends and the voltage falls: its slope there says nothing about the step."""

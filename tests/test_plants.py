@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 from parts import PLANTS
 
 from diffabs import check
@@ -124,6 +125,11 @@ def test_lab_rig_static_load():
     assert torque == 0
 
 
+@killed_by(
+    "plants/lab_rig.py",
+    "normal = jnp.where(free, quotient(self.weight_torque + torque, jnp",
+    "normal = jnp.where(free, quotient(self.weight_torque, jnp",
+)
 def test_lab_rig_derivative():
     rate = LabRig().derivative(0.0, LabRigState(100.0, 140.0, 3.0, 0.0), 0.6)
     expected = (25.7927789186, -129.512606509, -1.34442, 0.099 * 140.0)
@@ -146,6 +152,7 @@ def test_the_brake_of_the_lab_rig_does_not_drive(command):
     np.testing.assert_allclose(rate.brake, 20.37 * (max(15.24 * command - 14.0, 0.0) - 0.5), rtol=1e-12)
 
 
+@killed_by("plants/lab_rig.py", "yield stays_below(friction, limit,", "yield stays_below(friction, 1e9 * limit,")
 def test_a_lever_that_locks_itself_is_refused():
     """tan 65.61 deg = 2.205: at that friction no finite normal force balances the lever."""
     assert check(LabRig(road=Burckhardt(c1=2.2, c3=0.0))).road.c1 == 2.2
@@ -156,6 +163,7 @@ def test_a_lever_that_locks_itself_is_refused():
         check(LabRig(road=Burckhardt(c1=1e300)))
 
 
+@killed_by("core/validity.py", "found |= bool(within)", "found |= False")
 def test_a_lever_on_a_broken_road_is_not_asked_for():
     """Rules between parts are for parts that are sound: this spline has fewer frictions than slips."""
     broken = Tabulated(slip=np.array([0.0, 0.1, 0.2, 1.0]), mu=np.array([0.0, 0.5, 0.6]))
@@ -163,6 +171,11 @@ def test_a_lever_on_a_broken_road_is_not_asked_for():
         check(LabRig(road=broken))
 
 
+@killed_by(
+    "plants/lab_rig.py",
+    "jnp.where(free, arm, 1.0)), jnp.inf)",
+    "jnp.where(free, arm, 1.0)), quotient(self.weight_torque + torque, arm))",
+)
 def test_a_lever_that_locks_itself_further_on_is_no_run():
     """A patch that `check` does not see. The normal force is infinite there: no number is left to be averaged."""
     road = Patches(roads=(RIG, Burckhardt(c1=5.0, c3=0.0)), edges=(2.0,))
@@ -172,6 +185,7 @@ def test_a_lever_that_locks_itself_further_on_is_no_run():
     assert np.isfinite(rig.derivative(0.0, ahead._replace(distance=1.0), 0.9).drum)
 
 
+@killed_by("plants/lab_rig.py", "held = arm > self.wheel_radius * mu", "held = arm > -jnp.inf")
 def test_a_lab_wheel_that_no_torque_holds_turns_again():
     """Friction between 1.34 and tan phi: the road's torque grows faster than the brake's, whatever the brake does."""
     rig = LabRig(road=Burckhardt(c1=1.6, c3=0.0, c4=0.0))
@@ -195,6 +209,7 @@ def test_stuck_lab_wheel_carries_what_the_road_asks():
     np.testing.assert_allclose(normal, (19.6181 + torque) / arm, rtol=1e-12, atol=0)
 
 
+@killed_by("plants/lab_rig.py", "wheel = jnp.where(rests, 0.0, wheel)", "wheel = jnp.where(rests, wheel, wheel)")
 def test_a_stuck_lab_wheel_stays_at_rest():
     """Exactly, on a thousand roads: a rate of 1e-16, the rounding of a torque that balances another, would turn it,
     and a wheel that turns feels all of the brake."""
@@ -216,6 +231,12 @@ def states(plant, count=60):
     return start._replace(distance=place), speed, rim, (speed - rim) / np.maximum(speed, rim)
 
 
+@killed_by(
+    "plants/wheel.py",
+    "return quotient(speed - wheel_speed,",
+    "return quotient(wheel_speed - speed,",
+    case="quarter car",
+)
 @pytest.mark.parametrize("name", PLANTS)
 def test_energy_only_goes_into_friction(name):
     """With the brake released, dE/dt = -Fn mu (v - w) - bearing friction <= 0."""
@@ -251,6 +272,12 @@ def held_slip_rate(plant, speed, target):
     return jax.jvp(lambda x: plant.output(x).slip, (state,), (plant.derivative(0.0, state, control),))[1]
 
 
+@killed_by(
+    "plants/quarter_car.py",
+    "self.mass * self.radius + (1 - target) * self.inertia / self.radius",
+    "self.mass * self.radius",
+    case="25.0-0.2-quarter car",
+)
 @pytest.mark.parametrize("name", PLANTS)
 @pytest.mark.parametrize(("speed", "target"), [(25.0, 0.2), (3.0, 0.08), (12.0, 0.9)])
 def test_holding_holds_the_slip(name, speed, target):
@@ -259,6 +286,12 @@ def test_holding_holds_the_slip(name, speed, target):
     np.testing.assert_allclose(held_slip_rate(PLANTS[name], speed, target), 0.0, rtol=0, atol=1e-12 * scale)
 
 
+@killed_by(
+    "plants/wheel.py",
+    "return jnp.where(jnp.greater(speed, 0), rate, larger(rate, 0.0))",
+    "return rate",
+    case="mirrored rig",
+)
 @pytest.mark.parametrize("name", PLANTS)
 def test_a_stopped_wheel_stays_stopped_until_released(name):
     """It sticks while the brake can carry the road's torque, here up to a hair, and turns again below."""

@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 from matplotlib.text import Text
+from mutants import killed_by
 from scipy.stats import beta
 from sweeping import manifest
 
@@ -97,6 +98,7 @@ def test_a_bound_far_from_the_data_does_not_press_them_together(made):
     assert "bound 30" in lines(far)
 
 
+@killed_by("plot/sweeps.py", "ax.plot(x, counts / n,", "ax.plot(x, 1 - counts / n,")
 def test_exceedance_is_one_minus_the_empirical_distribution(found):
     figure = plots.exceedance(found, UNITS, confidence=0.9)
     ax, values = panels(figure)["overshoot"], OVERSHOOT[~DIVERGED]
@@ -111,6 +113,7 @@ def test_exceedance_is_one_minus_the_empirical_distribution(found):
     assert lines(ax)["bound 0.3"][0, 0] == 0.3
 
 
+@killed_by("plot/sweeps.py", "Count(int(k), n)", "Count(int(n - k), n)")
 def test_the_band_is_that_of_clopper_and_pearson(found):
     ax, n = panels(plots.exceedance(found, confidence=0.9))["overshoot"], N - 3
     x, share = lines(ax)["runs"]
@@ -140,6 +143,7 @@ def test_of_a_saltelli_design_the_rows_a_are_drawn(made):
     assert counts.sum() == N / 4
 
 
+@killed_by("plot/sweeps.py", 'found.column("sample")[good]\n', "np.arange(np.sum(good))\n")
 def test_the_worst_are_marked_and_named(found):
     figure = plots.worst(found, UNITS, count=6)
     ax = figure.axes[0]
@@ -249,6 +253,7 @@ def mesh(ax):
     return (corners[0, :, 0], corners[:, 0, 1]), np.ma.filled(drawn.get_array().astype(float), np.nan).T
 
 
+@killed_by("plot/sweeps.py", "lanes == 0, table).T, **colours", "lanes == 0, table), **colours")
 def test_the_map_has_the_share_of_failed_runs(found):
     figure = plots.failure_map(found, UNITS)
     ax = figure.axes[0]
@@ -261,6 +266,7 @@ def test_the_map_has_the_share_of_failed_runs(found):
     assert figure.get_suptitle() == f"rig: {failed.sum()} failed of 1,200 runs (3 diverged)"
 
 
+@killed_by("sweep/results.py", '"diverged": self.column("diverged"),', '"diverged": ~run,')
 @pytest.mark.parametrize("kind", ["diverged", "stopped", "locked", "bound"])
 def test_each_kind_of_failure_is_in_the_map(made, kind):
     bad = A > 0.7
@@ -290,6 +296,7 @@ def test_cells_without_a_run_are_empty_and_levels_have_cells_of_their_own(made):
     assert table[4, 1] == table[5, 0] == 1
 
 
+@killed_by("plot/sweeps.py", "np.maximum.at(table, cell, values)", "table[:] = values.max()")
 def test_a_map_where_nothing_failed_is_over_what_moves_the_metric(found, made):
     metrics = {"overshoot": OVERSHOOT, "effort": 5 + A}
     sweep = made({"a": A, "b": B, "c": C}, metrics, failures={"overshoot": 9.0})

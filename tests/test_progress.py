@@ -7,6 +7,7 @@ import time
 import jax
 import jax.numpy as jnp
 import pytest
+from mutants import killed_by
 
 from diffabs.cli import console, progress
 from diffabs.cli.progress import Far, Pace
@@ -23,6 +24,7 @@ def clock(monkeypatch):
     return now, watch
 
 
+@killed_by("core/stopwatch.py", "while self._spans and", "while False and")
 def test_spans_that_overlap_count_once():
     watch = stopwatch.Stopwatch()
     for start, end in ((1.0, 2.0), (4.0, 5.0), (4.5, 6.0), (3.5, 7.0), (9.0, 10.0)):
@@ -32,6 +34,7 @@ def test_spans_that_overlap_count_once():
     assert watch.seconds(since=20.0) == 0.0
 
 
+@killed_by("core/stopwatch.py", "if event.startswith(TOLD):", "if False:")
 def test_what_jax_compiles_is_counted():
     stopwatch.listen()
     stopwatch.listen()  # once is enough
@@ -52,6 +55,7 @@ def test_what_jax_compiles_is_counted():
     assert 0.049 <= stopwatch.compiled(begun) - before <= most
 
 
+@killed_by("cli/progress.py", "spent = now - start - stopwatch.compiled(start)", "spent = now - start")
 def test_what_is_left_does_not_count_compiling(clock):
     """30 s, of which 20 were compiling, for a tenth of the work: the rest takes 90 s, not 270."""
     now, watch = clock
@@ -64,6 +68,7 @@ def test_what_is_left_does_not_count_compiling(clock):
     assert pace.said(Far("")) == " 30 s, 20 s of it compiling"
 
 
+@killed_by("cli/progress.py", "self.first = self.first or (now, far.done)", "self.first = self.first or (now, 0.0)")
 def test_what_was_there_before_is_no_pace(clock):
     """A sweep that goes on: 50 of 100 were there; 10 more took 10 s."""
     now, _ = clock
@@ -82,6 +87,7 @@ def test_a_time_in_words(seconds, words):
     assert progress.spoken(seconds) == words
 
 
+@killed_by("cli/progress.py", "if told != (told := words):", "if True:")
 def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
     """Where nothing can be drawn over, in lines; those that only differ in time are not told again."""
     monkeypatch.setattr(console, "PATIENCE", 1.0)
@@ -99,6 +105,7 @@ def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
     assert re.fullmatch(r"working ... somewhere; \d+ s(, \d+ s of it compiling)?\n", said), said
 
 
+@killed_by("cli/console.py", '"of it compiling": round(compiling, 1)', '"of it compiling": 0.0')
 def test_documents_say_how_long_they_took():
     console.begin(["list", "roads"])
     with stopwatch.compiling():
@@ -108,6 +115,7 @@ def test_documents_say_how_long_they_took():
     assert 0.1 <= made["of it compiling"] <= made["seconds"] <= 300.0
 
 
+@killed_by("cli/progress.py", "    if len(words) > room:\n", "    if False:\n")
 @pytest.mark.parametrize(
     ("width", "line"),
     [

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 
 import diffabs
 from diffabs.core.arrays import as_array
@@ -90,6 +91,7 @@ def test_check_names_every_offender_with_value_range_and_unit():
     ]
 
 
+@killed_by("core/pytree.py", " & ((abs(x) < math.inf) | self.infinite)", "")
 def test_check_returns_the_part_and_allows_declared_infinities():
     pair = Pair()
     assert check(pair) is pair
@@ -191,6 +193,11 @@ def test_prepared_is_differentiable():
     np.testing.assert_allclose(jax.jit(jax.grad(mu))(0.96331), 1.0, rtol=1e-12, atol=0)
 
 
+@killed_by(
+    "core/pytree.py",
+    "    _register(new, [f.name for f in fields if f.name not in meta], meta)\n",
+    "    jax.tree_util.register_dataclass(new, [f.name for f in fields if f.name not in meta], meta)\n",
+)
 def test_structures_of_different_classes_differ():
     """Else jit may run for one class what it compiled for another: `jax.tree_util.register_dataclass` of JAX 0.10
     compares neither classes nor names of fields."""
@@ -212,6 +219,7 @@ def test_leaves_have_the_names_of_the_fields():
     assert keys[:2] == [".springs[0].stiffness", ".springs[0].damping"]
 
 
+@killed_by("core/arrays.py", "_number(float(x), math.copysign(1.0, x), ", "_number(float(x), 1.0, ")
 def test_an_array_is_made_once_of_each_number():
     """Of each type, and of 0 and -0, which are equal; within jit none is kept."""
     first, second = (strong([0.0, -0.0, 1.5]) for _ in range(2))

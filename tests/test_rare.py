@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mutants import killed_by
 from scipy.integrate import quad
 from scipy.stats import chi2, norm
 from scipy.stats import t as student_t
@@ -88,6 +89,8 @@ class TestKnown:
     """Within a factor of 1.5: of the seeds 0 to 199 all but one in d = 2 and 10, where importance sampling follows, and
     91 % where subset simulation stays alone, as in d = 100, so at least 6 of 10 with a probability of 0.999."""
 
+    @killed_by("reliability/subset_simulation.py", "math.sqrt(1 - s**2) * z + s", "z + s")
+    @killed_by("reliability/subset_simulation.py", "accepted = new >= value", "accepted = new >= -np.inf")
     @pytest.mark.parametrize("beta", [3.0, 4.75342, 5.19934])
     @pytest.mark.parametrize(("d", "least"), [(2, 10), (10, 10), (100, 6)])
     def test_a_half_space(self, d, least, beta):
@@ -156,6 +159,11 @@ class TestSubset:
         assert [level.threshold for level in found.levels] == [1.0]
         assert found.probability == pytest.approx(norm.sf(2.5), rel=0.4)  # 62 of 10000: three standard deviations
 
+    @killed_by(
+        "reliability/subset_simulation.py",
+        "return _estimate(levels, last.family).interval[1] * min(1.0, RULE / starts)",
+        "return min(1.0, RULE / starts)",
+    )
     def test_a_plateau_ends_with_a_bound(self):
         flat, cut = (subset_simulation(lambda z, x=x: np.minimum(linear(2)(z), x), 2, 4.0) for x in (-9.0, 3.0))
         for found, levels in [(flat, 1), (cut, 4)]:
@@ -230,6 +238,7 @@ class TestSubset:
         assert len(np.unique(found.failing, axis=0)) == 100
         assert np.all(np.diff(np.sum(found.failing**2, axis=1)) >= 0)
 
+    @killed_by("reliability/subset_simulation.py", "(1 + max(0.0, excess))", "1.0")
     def test_covariance_of_chains(self):
         rng = np.random.default_rng(0)
         frozen = np.tile(rng.random(400) < 0.2, (10, 1))
@@ -282,6 +291,7 @@ class TestImportance:
         error = np.std(weight[:, None] * z**2, axis=0) / np.sqrt(len(z))
         assert np.all(np.abs(second - 1) <= 4 * error)
 
+    @killed_by("reliability/importance_sampling.py", "np.exp(mixture.log_weight(z)), 0.0)", "1e-6, 0.0)")
     def test_failures_foretell_the_variance(self):
         found = runs(linear(10), 10, B6, 20)
         foretold = np.array([each.importance.foretold for each in found])
@@ -302,6 +312,7 @@ class TestImportance:
         assert moment < np.log(100)
         assert Mixture(one, np.ones(1), np.ones(1)).log_weight(z).max() > np.log(1e6)
 
+    @killed_by("reliability/importance_sampling.py", "return below <= APART", "return True or below <= APART")
     def test_one_that_is_far_too_low_is_not_believed(self):
         subset = Estimate(1e-6, 0.2, (0.6e-6, 1.6e-6))
         for factor, believed in [(1.0, True), (0.7, True), (0.3, False), (3.0, True)]:
@@ -326,6 +337,11 @@ def of_both_sides(z):
 
 
 class TestGradient:
+    @killed_by(
+        "reliability/importance_sampling.py",
+        "np.sum(slope * z, axis=1) + threshold - score",
+        "np.sum(slope * z, axis=1) - score",
+    )
     def test_design_points_of_a_half_space_and_of_two(self):
         rng = np.random.default_rng(0)
         starts = 6 * rng.standard_normal((8, 100))

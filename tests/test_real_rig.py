@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import real_rig_oracle as oracle
 import scipy.linalg
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, objectives, references, scenario, sensors
@@ -62,6 +63,13 @@ def quiet(rig, speed, case):
     return d.replace(one, {path: float(value[0]) for path, value in box.columns(at).items()})
 
 
+@killed_by("controllers/sampled_on_grid.py", "waits * m.last + (1 - waits) * m.next", "m.next", case="all wrong-known")
+@killed_by(
+    "sensors/speed.py",
+    "error = self.last + (self.first - self.last) * jnp.exp(-t / self.time_constant)",
+    "error = self.last + 0.0 * t",
+    case="all wrong-known",
+)
 @pytest.mark.parametrize("speed", ["known", "estimated"])
 @pytest.mark.parametrize("case", CASES)
 def test_a_document_runs_elsewhere(rig, speed, case):
@@ -99,6 +107,12 @@ def of_document(rig, document):
 CONTROLLERS = [pytest.param(path, id=path.stem, marks=() if path.stem in EXAMPLES else SLOW) for path in COMMITTED]
 
 
+@killed_by(
+    "controllers/switching.py",
+    "self.gain * inside, self.low",
+    "2 * self.gain * inside, self.low",
+    case="estimated-sliding-mode-cma-es",
+)
 @pytest.mark.parametrize("path", CONTROLLERS)
 def test_each_committed_controller_runs_elsewhere(rig, path):
     """The documents of docs/controllers, on a rig that is not the nominal one."""
@@ -183,6 +197,7 @@ def let_go(rig, rest):
     return one, d.rollout(one, d.FixedStep(1e-3, 4.0, kinks=False), key=jax.random.key(0))
 
 
+@killed_by("sensors/speed_estimator.py", "(slip < self.gate) | (braked >= self.rest)", "(slip < 2.0)")
 def test_a_brake_that_was_let_go_by_mistake_bites_again(rig):
     """The wheel that seems to slip does not push, so it is believed in the end; the same in NumPy. Where nobody looks
     at that, the car rolls for ever."""
@@ -199,6 +214,7 @@ def test_a_brake_that_was_let_go_by_mistake_bites_again(rig):
     np.testing.assert_array_less(5 / 3.6, np.asarray(lost.trajectory.sample.output.speed))
 
 
+@killed_by("controllers/sampled_on_grid.py", "fixed / clock.h, 0.0", "fixed / clock.h + 0.5, 0.0")
 @pytest.mark.slow
 def test_the_grid_agrees_with_located_events(rig):
     """Where the computing delay is located by events, and by the mean over the step in which the command changes."""
@@ -241,6 +257,9 @@ def fed(block, outputs, key=None):
     return jax.lax.scan(step, block.start(first), (jnp.arange(len(outputs[0])), outputs))[1]
 
 
+@killed_by(
+    "sensors/noise.py", "wheel_speed=signal.wheel_speed - signal.speed * noise", "wheel_speed=signal.wheel_speed"
+)
 def test_noise_of_the_wheel_is_the_slip_s_at_any_speed():
     n = 4000
     v = jnp.linspace(20.0, 2.0, n)
@@ -255,6 +274,7 @@ def test_noise_of_the_wheel_is_the_slip_s_at_any_speed():
     assert float(sensors.WheelNoise(slip=0.01).start(true).held[0]) == 0  # before the first instant
 
 
+@killed_by("sensors/noise.py", "played % noise.size", "played")
 def test_a_played_noise_is_the_sequence_that_is_given():
     """Three entries of 2 ms, which repeat, of the slip at any speed."""
     n, noise = 20, np.array([0.01, -0.02, 0.005])
@@ -265,6 +285,7 @@ def test_a_played_noise_is_the_sequence_that_is_given():
     np.testing.assert_allclose((v - seen.wheel_speed) / v, seen.slip, rtol=1e-12)
 
 
+@killed_by("sensors/speed_estimator.py", "clamp(1 - slip / self.gate, 0.0, 1.0)", "1.0 + 0.0 * slip")
 def test_an_estimator_is_not_led_astray_by_a_wheel_that_locks():
     """It rolls for 20 ms, locks for 0.3 s, and rolls again, at 8 m/s^2; the accelerometer is off by 0.1 m/s^2."""
     t = 1e-3 * jnp.arange(500)
@@ -281,6 +302,11 @@ def test_an_estimator_is_not_led_astray_by_a_wheel_that_locks():
     np.testing.assert_allclose(gated.slip, 1 - w / gated.speed, rtol=0, atol=1e-12)
 
 
+@killed_by(
+    "sensors/speed_estimator.py",
+    "larger(signal.deceleration, m.braked * jnp.exp(-self.period / self.hold))",
+    "signal.deceleration",
+)
 def test_a_wheel_that_does_not_push_is_believed_after_a_while():
     """Where it seems to slip and nothing decelerates, the filter begins anew, hold ln(g/rest) after it began."""
     hold, rest, k = 0.02, 1.5, np.arange(120)
@@ -297,6 +323,7 @@ def test_a_wheel_that_does_not_push_is_believed_after_a_while():
         np.testing.assert_allclose(seen.speed, 10.0 - 1e-3 * (np.cumsum(a) - a[0]), rtol=1e-12)
 
 
+@killed_by("sensors/speed_estimator.py", "(1 - gain) * variance", "variance")
 def test_the_estimator_averages_the_first_samples():
     """P starts at R, so without growth the gains are 1/2, 1/3, ...: of a wheel that rolls, and is never slower than the
     estimate, the estimate is the mean so far."""
@@ -307,6 +334,11 @@ def test_the_estimator_averages_the_first_samples():
     np.testing.assert_allclose(seen.speed, mean, rtol=1e-5)  # R goes with the estimate
 
 
+@killed_by(
+    "references/limited.py",
+    "h = self.period * self.reference_speed / jnp.maximum(signal.speed, self.floor)",
+    "h = self.period",
+)
 def test_a_limited_target_asks_for_the_same_torque_at_every_speed():
     """Its rise, times the speed, is at most rate v0; and then it settles with T v/v0."""
     target = references.LimitedSlip(rate=3.0, time_constant=0.02, reference_speed=10.0)

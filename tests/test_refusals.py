@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 from sweeping import described
 
 import diffabs as d
@@ -99,6 +100,18 @@ def any_step(monkeypatch):
 
 
 class TestBeforeARun:
+    @killed_by(
+        "simulate/refusals.py",
+        "    yield _begun(loop)\n    yield from grid_rules(loop, step)",
+        "    yield _begun(loop)",
+        case="ring",
+    )
+    @killed_by(
+        "core/validity.py",
+        '    yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "rules")',
+        "    yield from ()",
+        case="limits",
+    )
     @pytest.mark.parametrize("name", BAD)
     def test_a_lane_is_refused_where_its_loop_alone_would_be(self, any_step, name):
         """In single precision as well: the check is in double, like that of one loop."""
@@ -137,6 +150,7 @@ class TestBeforeARun:
             with pytest.raises(ValueError, match=message):
                 d.check(RIG, solver)
 
+    @killed_by("simulate/stable_step.py", "bound = jnp.max(jnp.exp(log)", "bound = 0.5 * jnp.max(jnp.exp(log)")
     def test_the_step_is_judged_as_by_the_eigenvalues(self):
         """Whatever a lane is decided by: the first bound, the squared one, or its eigenvalues; the last are NumPy's."""
         rng = np.random.default_rng(0)
@@ -156,6 +170,11 @@ class TestBeforeARun:
         assert stable_step.stable(RIG, alike, 1e-4).all()
         assert not stable_step.stable(RIG, alike, 2e-2).any()
 
+    @killed_by(
+        "simulate/stable_step.py",
+        "bound = jnp.max(jnp.minimum(rows, columns))",
+        "bound = 0.5 * jnp.max(jnp.minimum(rows, columns))",
+    )
     def test_the_bound_of_many_lanes_is_that_of_few(self, monkeypatch):
         """Of many it is worked out number by number; and no mode is faster."""
         values = {"sensor.time_constant": np.array([1e-4, 3e-4, 1e-3]), "plant.mass": np.array([4.0, 5.0, 8.0])}
@@ -181,6 +200,7 @@ class TestBeforeARun:
 
 
 class TestAfterARun:
+    @killed_by("simulate/outcome.py", 'audit = getattr(loop.plant, "audit", None)', "audit = None")
     @pytest.mark.parametrize("step", [1e-4, 1e-3])
     def test_an_unstable_step_is_seen_although_every_number_is_finite(self, step):
         """At 1e-6 s the run ends after three steps at -1e13 m: it has not stopped, and there is no mean to enter."""
@@ -193,6 +213,11 @@ class TestAfterARun:
         assert not np.asarray(many.stopped).any()
         assert all(np.isnan(x).all() for x in many.metrics.values())
 
+    @killed_by(
+        "simulate/stepper.py",
+        "zero + Condition.RUNNING, zero + Condition.DIVERGED",
+        "zero + Condition.RUNNING, zero + Condition.STOPPED",
+    )
     def test_a_traced_start_beyond_the_stop_is_no_run(self):
         braked = jax.jit(lambda start: d.measure(replace(RIG, {"initial.speed": start}), SOLVER, BRAKING))
         for start in (1.0, 5 / 3.6):
@@ -202,6 +227,7 @@ class TestAfterARun:
         balanced = jax.jit(lambda start: d.measure(replace(d.balancing(), {"initial.theta": start}), SOLVER, BALANCE))
         assert balanced(2.0).diverged
 
+    @killed_by("simulate/outcome.py", "(value >= low - ROUNDING)", "(value >= -jnp.inf)")
     def test_a_metric_outside_its_range_is_a_run_that_diverged(self):
         for part in (*BRAKING.values(), *BALANCE.values()):
             assert type(part).physical[0] <= 0
@@ -235,6 +261,7 @@ def sample(speed, wheel, distance, control=0.0, deceleration=0.0):
     return Sample(0.0, y, 0.2, 0.2, 0.0, control, control)
 
 
+@killed_by("plants/audit.py", "_driving(-before.control, -sample.control)", "0.0")
 @pytest.mark.parametrize(
     ("before", "after", "fine"),
     [
@@ -279,6 +306,7 @@ def swept(tmp_path_factory):
 
 
 class TestWhoeverRuns:
+    @killed_by("sweep/statistics/summary.py", "asked = view.rows & view.accepted", "asked = view.rows")
     @pytest.mark.slow
     def test_a_refused_lane_is_a_row_with_a_reason_and_in_no_number(self, swept):
         below = swept.column("initial.speed") <= 25 / 3.6
@@ -305,6 +333,7 @@ class TestWhoeverRuns:
         assert found["failures"]["not stopped"]["value"] < 0.5
         assert found["failures"]["any"]["high"] < 1 / 2
 
+    @killed_by("simulate/refill.py", "carry.condition, Condition.DIVERGED)", "carry.condition, Condition.TIMED_OUT)")
     @pytest.mark.slow
     def test_a_batch_does_not_run_them(self, any_step):
         values = {"initial.speed": np.array([8.0, 1.0, 9.0])}
@@ -318,6 +347,7 @@ class TestWhoeverRuns:
         found = outcomes(arm, starts, d.FixedStep(1e-3, 0.05), band=0.1)
         assert (found.recovered.tolist(), found.diverged.tolist()) == ([True, False], [False, True])
 
+    @killed_by("reliability/failure.py", "    if len(bad):", "    if False:")
     def test_a_probability_is_of_the_whole_space_or_none(self, any_step):
         study = described(SMALL)
         with pytest.raises(ValueError, match=r"\d+ of 40 points cannot be run: initial.speed is not above"):
@@ -362,6 +392,8 @@ def test_the_sweep_of_the_report(tmp_path):
     assert not (set(document["metrics"]) - set(BRAKING))
 
 
+@killed_by("controllers/sampled.py", "array(cutoff) * array(period) < 2", "array(cutoff) * array(period) < 200")
+@killed_by("controllers/sampled_on_grid.py", "within_period(self.controller,", "within_period(None,")
 @pytest.mark.parametrize(("cutoff", "grows"), [(1990.0, False), (2010.0, True)])
 def test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows(cutoff, grows):
     """The oracle is the computer's own recursion, d + T wc (e - d), written out for e = 0."""

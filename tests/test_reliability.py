@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from mutants import killed_by
 from scipy.stats import norm
 
 import diffabs as d
@@ -41,6 +42,7 @@ def test_scores_are_runs():
         assert value == pytest.approx(float(alone), rel=1e-12)
 
 
+@killed_by("reliability/failure.py", "(above - below) / (2 * STEP)", "(above - below) / (above - below)")
 @pytest.mark.slow
 @pytest.mark.parametrize("metric", ["stop_distance", pytest.param("max_slip", marks=pytest.mark.slow)])
 def test_slopes_are_differences_of_runs(metric):
@@ -60,6 +62,7 @@ def test_slopes_are_differences_of_runs(metric):
         np.testing.assert_allclose(slope[:, j], difference, rtol=1e-5, atol=1e-9, err_msg=f"z_{j}")
 
 
+@killed_by("reliability/failure.py", "if gradients else None", "if False else None")
 @pytest.mark.slow
 def test_gradients_lead_to_the_design_point_of_a_slippery_road():
     """Where the distance reaches the bound nearest to the mean: at w4 = 0.4 - 0.01 * 4, whatever the mass."""

@@ -19,6 +19,8 @@ from terminal import Terminal, assert_fits, assert_orderly
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
+from mutants import killed_by
+
 from diffabs import tune
 from diffabs.cli import report as reporting
 from diffabs.core.pictures import AXES, with_text, without_text
@@ -92,6 +94,9 @@ def leaves(value):
     return {repr(value)} if isinstance(value, int | float) and not isinstance(value, bool) else set()
 
 
+@killed_by("report/writing.py", 'return f"sha256-{', 'return "unsafe-inline" or f"sha256-{', case="sweep")
+@killed_by("report/page.py", 'f"data:{kind};base64,{text}"', "path.as_uri()", case="sweep")
+@killed_by("report/page.py", '(content.get("made") or {}).get("command")', "None", case="tune")
 @pytest.mark.parametrize("kind", cases(SOURCES, *LONG))
 def test_a_report_stands_for_itself(results, kind):
     found = page(results, kind)
@@ -124,6 +129,8 @@ SAID = {
 OWN = {"sweep": {"least", "greatest"}, "rare": {"spread"}, "tune": {"missed"}}  # that only the document has
 
 
+@killed_by("report/page.py", "repr(value))]", "number(value))]", case="tune")
+@killed_by("report/findings.py", "value - NORMAL * deviation", "value", case="identify")
 @pytest.mark.parametrize("kind", cases(SAID, *LONG))
 def test_numbers_are_those_of_the_document(results, kind):
     """All of what matters is there with all its digits, and nothing that is nowhere in the document."""
@@ -158,6 +165,7 @@ def test_numbers_are_those_of_the_document(results, kind):
     assert set(found.numbers) <= known
 
 
+@killed_by("report/proofs.py", "sum(not one.reason for one in proved)", "len(proved)")
 def test_a_certificate_says_what_is_proved(results):
     found = page(results, "design")
     content = json.loads((results / "design.json").read_text())
@@ -174,6 +182,7 @@ def test_a_certificate_says_what_is_proved(results):
         wrong.unlink()
 
 
+@killed_by("report/page.py", 'False: "disproved"', 'False: "proved"')
 def test_a_disproved_gain_is_said_to_be(tmp_path):
     out = command("certify", "slip-lmi", "--gain=-11753,48", "--json", status=1).stdout
     (tmp_path / "bad.json").write_text(out)
@@ -191,6 +200,7 @@ def named(value, names):
     return HOSTILE if value in names else value
 
 
+@killed_by("report/writing.py", "autoescape=True", "autoescape=False", case="tune")
 @pytest.mark.parametrize("kind", cases(["tune", "identify", "rare", "design"], *LONG))
 def test_hostile_names_are_text(results, tmp_path, kind):
     content = json.loads((results / f"{kind}.json").read_text())
@@ -232,6 +242,8 @@ def drawn(path):
     return t, counts, edges
 
 
+@killed_by("plot/shown.py", "line.get_xdata(), line.get_ydata())", "line.get_ydata(), line.get_xdata())")
+@killed_by("plot/shown.py", "np.linspace(0, len(there) - 1,", "np.linspace(0, min(MOST, len(there)) - 1,")
 def test_a_picture_has_the_numbers_that_it_shows(tmp_path):
     t, counts, edges = drawn(tmp_path / "a.png")
     found = image(tmp_path / "a.png")
@@ -253,6 +265,7 @@ def test_a_picture_has_the_numbers_that_it_shows(tmp_path):
     assert 0 <= left["box"][1] < left["box"][3] < 1
 
 
+@killed_by("plot/shown.py", "1 - place.y1, place.x1, 1 - place.y0", "place.y0, place.x1, place.y1")
 def test_axes_lie_where_the_picture_has_them(tmp_path):
     """The left spine is the first long dark line of pixels."""
     from PIL import Image
@@ -269,6 +282,7 @@ def test_axes_lie_where_the_picture_has_them(tmp_path):
     assert abs(rows[-1] + 0.5 - y1) <= 2
 
 
+@killed_by("core/pictures.py", "return picture[:start] + picture[end:],", "return picture,")
 def test_numbers_of_a_picture_leave_no_trace_in_its_bytes(tmp_path):
     drawn(tmp_path / "a.png")
     whole = (tmp_path / "a.png").read_bytes()
@@ -279,6 +293,7 @@ def test_numbers_of_a_picture_leave_no_trace_in_its_bytes(tmp_path):
     assert without_text(whole[:50], AXES) == (whole[:50], "")
 
 
+@killed_by("report/page.py", 'all(map(_is_series, one["series"])) and', 'one["series"] is not None and')
 @pytest.mark.parametrize(
     "text",
     ["", "{", "3", "[3]", '[{"series":[]}]', "[" * 5000, HOSTILE,
@@ -305,6 +320,9 @@ def test_a_sweep_s_histogram_is_that_of_its_runs(results):
         assert sum(bars["y"]) + (int(beyond[1]) if beyond else 0) == 128
 
 
+@killed_by(
+    "report/page.py", "kind = IMAGES.get(path.suffix.lower())", 'kind = IMAGES.get(path.suffix.lower(), "image/png")'
+)
 def test_figures_outside_of_the_folder_are_not_shown(results, tmp_path):
     """Names in a document are not trusted; and what is no picture is none."""
     content = json.loads((results / "tune.json").read_text())
@@ -320,6 +338,7 @@ def test_figures_outside_of_the_folder_are_not_shown(results, tmp_path):
     assert base64.b64decode(data.partition(",")[2]) == b"\x89PNG drawn"
 
 
+@killed_by("report/documents.py", "_home(kind, content, path))", "path)")
 @pytest.mark.slow
 def test_a_folder_of_results_is_one_file(results):
     """What `sweep --json` has printed beside the sweep's folder is the same result, and comes once."""
@@ -342,6 +361,7 @@ def test_the_command_says_where_it_is(results, tmp_path):
     assert left_in(tmp_path) == {"mine.html"}
 
 
+@killed_by("cli/sweep.py", "report.write([out], out / report.NAME)", "pass")
 @pytest.mark.slow
 def test_a_sweep_with_figures_writes_its_report(results):
     text = (results / "sweep" / "report.html").read_text(encoding="utf-8")
@@ -372,6 +392,7 @@ def test_what_is_no_result_is_refused_in_one_line(tmp_path, content, words):
     assert not (folder / "report.html").exists()
 
 
+@killed_by("report/documents.py", "if named and not found:", "if False:")
 @pytest.mark.parametrize("text", ["hello", '{"a": 1}', "[1, 2]", '{"papers": {}, "out": "x"}'])
 def test_a_file_of_others_is_refused_in_one_line(tmp_path, text):
     (tmp_path / "x.json").write_text(text)
@@ -381,6 +402,7 @@ def test_a_file_of_others_is_refused_in_one_line(tmp_path, text):
     assert left_in(tmp_path) == {"x.json"}
 
 
+@killed_by("cli/report.py", "and not (target.is_file() and ours(target))", "and False")
 def test_files_of_others_stay(results, tmp_path):
     out = tmp_path / "report.html"
     out.write_text("<html>a thesis</html>")
@@ -413,6 +435,7 @@ def test_a_terminal_of_80_columns(results, tmp_path):
     assert left_in(tmp_path) == {"report.html"}
 
 
+@killed_by("report/charts.py", "round(HEIGHT - BOTTOM - (y - low)", "round(TOP + (y - low)")
 def test_a_chart_has_its_points_where_they_are():
     """Of a straight line, the places are on one; a value that is no number has none."""
     text = lines([(0, 1.0), (1, 2.0), (2, math.nan), (3, 4.0)], "x < 1", "y")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 from marks import cases
+from mutants import killed_by
 
 from diffabs.linear.gaussian import kalman
 from diffabs.linear.lyapunov import discrete_lyapunov, lyapunov
@@ -47,6 +48,18 @@ def relative(a, b):
     return np.linalg.norm(a - b) / np.linalg.norm(b)
 
 
+@killed_by(
+    "linear/riccati_batched.py",
+    "a, q = A - times(B, transpose(S)), Q - times(S, transpose(S))",
+    "a, q = A, Q",
+    case="2",
+)
+@killed_by(
+    "linear/riccati_batched.py",
+    "return whole[:n, :n], -whole[:n, n:], whole[n:, :n]",
+    "return whole[:n, :n], whole[:n, n:], -whole[n:, :n]",
+    case="2",
+)
 @pytest.mark.parametrize("n", cases(range(1, 11), 2, 3, 4, 5, 6, 7, 8, 9, 10))
 def test_care_is_scipys(n):
     for seed in range(6):
@@ -67,6 +80,12 @@ def test_dare_is_scipys(n):
         assert relative(found.P, sl.solve_discrete_are(a, b, q, r, s=s)) < 1e-10
 
 
+@killed_by(
+    "linear/regulator.py",
+    "return Regulator(-jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned)",
+    "return Regulator(jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned)",
+    case="q1-140.291806958",
+)
 @pytest.mark.parametrize("speed", [FAST, SLOW])
 @pytest.mark.parametrize("q", [(11753.0**2, 1.0), (1.38e8, 1.0), (1e6, 1e4), (1.0, 1.0), (1e-5, 1e5)])
 def test_the_rig_is_its_closed_form(speed, q):
@@ -214,6 +233,7 @@ def test_derivative_where_an_input_costs_nothing():
     np.testing.assert_allclose(slope, (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-6 * np.abs(slope).max())
 
 
+@killed_by("linear/riccati.py", "if B.dtype != jnp.float64:", "if False:", case="care")
 @pytest.mark.parametrize("solve", [care, dare, lqr, dlqr])
 def test_single_precision_is_refused(solve):
     """Where every P would be NaN, because none is proven to 1e-7."""
@@ -244,6 +264,7 @@ def scalar(solver, weights):
     return lambda *data: jnp.sum(weights * solver(*data).P)
 
 
+@killed_by("linear/riccati.py", "closed = A - B @ jnp.linalg.solve(R, B.T @ P + S.T)", "closed = A", case="care")
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", [care, dare])
 def test_gradients_are_differences(solver):
@@ -327,6 +348,7 @@ def test_repeated_poles_and_unseen_unstable_modes():
         assert np.linalg.eigvals(closed).real.max() < -0.9
 
 
+@killed_by("linear/riccati_batched.py", "return jnp.where((error <= limit) & (moved <= limit), P, jnp.nan)", "return P")
 def test_nearly_unstabilisable_is_right_or_reported():
     reported = 0
     for coupling in 10.0 ** -np.arange(0.0, 15.0):

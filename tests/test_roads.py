@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 from parts import ROADS, differences, jacobian
 from scipy.interpolate import BSpline, PchipInterpolator
 from scipy.optimize import brentq
@@ -101,6 +102,7 @@ def test_burckhardt_peak(name):
     np.testing.assert_allclose(mu, c1 - c3 / c2 - c3 * s, rtol=1e-12, atol=0)
 
 
+@killed_by("roads/optimum.py", "s0 - ratio(slope(s0), curvature)", "s0")
 def test_gradient_of_burckhardt_peak():
     """d/dc1 = 1/(c1 c2), d/dc2 = (1/c2 - s)/c2, d/dc3 = -1/(c2 c3); of mu at its peak: the partial derivatives."""
     c1, c2, c3 = TABLE["WET_ASPHALT"]
@@ -154,6 +156,8 @@ FLAT = (np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0]), np.array([0.0, 0.5, 0.5, 0.8, 
 STEEP_ENDS = (np.array([0.0, 0.3, 0.35, 0.4, 0.45, 1.0]), np.array([0.0, 0.05, 0.01, 0.8, 0.2, 0.3]))
 
 
+@killed_by("roads/tabulated.py", "w0 * m[1:] + w1 * m[:-1]", "w1 * m[1:] + w0 * m[:-1]")
+@killed_by("roads/tabulated.py", "jnp.where(steep, 3 * m0, d)", "d")
 @pytest.mark.parametrize(
     ("slip", "mu"),
     [knots(seed, monotone) for seed in range(8) for monotone in (True, False)]
@@ -168,6 +172,8 @@ def test_tabulated_is_pchip(slip, mu):
     np.testing.assert_allclose(curve(road, slip), mu, rtol=1e-15, atol=1e-15)
 
 
+@killed_by("roads/along.py", "4 + 3 * t * t * (t - 2)", "4 + 3 * t * t * (t - 1)")
+@killed_by("roads/along.py", "c[-1] * ends", "0.0 * ends")
 @pytest.mark.slow
 def test_a_factor_along_the_road_is_a_b_spline():
     """SciPy's, the first and the last factor going on; within the factors, and no steeper than they are."""
@@ -246,6 +252,7 @@ def test_patches_on_either_side_and_between():
     np.testing.assert_allclose(mu, [a, a, quarter, (a + b) / 2, b, b, (b + c) / 2, c, c], rtol=1e-14, atol=0)
 
 
+@killed_by("roads/patches.py", "y * y * (3 - 2 * y)", "y")
 def test_patches_are_c1():
     """Slope zero at both ends of the ramp, 3/2 (after - before)/width in its middle."""
     road = Patches(width=2.0)

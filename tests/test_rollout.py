@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, plants, references, roads
@@ -54,6 +55,7 @@ def test_standstill_of_a_locked_wheel_in_closed_form(step):
     np.testing.assert_allclose(run.metrics["locked_time"], (10 - 0.05) / DECELERATION, rtol=1e-12)
 
 
+@killed_by("simulate/stepper.py", "| (to_grid & ~changes))", "| to_grid)")
 def test_speed_reached_lands_between_samples():
     loop = dataclasses.replace(SLIDING, stop=SpeedReached(speed=3.0))
     run = d.rollout(loop, d.FixedStep(0.01, 2.0), {"effort": Effort(), "variation": Variation()})
@@ -64,6 +66,11 @@ def test_speed_reached_lands_between_samples():
     assert run.metrics["variation"] == 0
 
 
+@killed_by(
+    "objectives/braking.py",
+    "rates = (jnp.abs(rate.control) for rate in segment.sample_rates())",
+    "rates = (segment.step * jnp.abs(rate.control) for rate in segment.sample_rates())",
+)
 def test_the_torque_rate_of_a_lag_is_that_of_its_exponential():
     """u = U (1 - exp(-t/T)) from rest: U/T at once, and less from then on."""
     lag, h = 0.05, 1e-3
@@ -79,6 +86,12 @@ def test_the_peak_of_a_falling_slip_is_its_first_value():
     assert run.metrics["max_slip"] == 0.6
 
 
+@killed_by(
+    "simulate/outcome.py",
+    "(carry.condition == Condition.TIMED_OUT) & ~diverged",
+    "(carry.condition == Condition.LANDING) & ~diverged",
+)
+@killed_by("simulate/stepper.py", "(on_grid & (carry.k + 1 >= steps))", "(on_grid & False)")
 def test_a_run_that_does_not_stop_is_charged_the_rest():
     run = d.measure(SLIDING, d.FixedStep(1e-3, 0.5), BRAKING)
     assert run.timed_out
@@ -188,6 +201,12 @@ def test_trajectories_of_other_durations_and_strides_are_of_one_program():
     assert _run._cache_size() == before + 1  # of the whole trajectory's length
 
 
+@killed_by(
+    "simulate/drivers.py",
+    "jax.lax.while_loop(lambda carry: anyone(carry.running), block",
+    "jax.lax.while_loop(lambda carry: ~anyone(~carry.running), block",
+)
+@killed_by("simulate/checkpoint.py", "jnp.any(running, axis=0)", "jnp.all(running, axis=0)")
 @pytest.mark.slow
 def test_a_batch_ends_with_its_last_lane():
     """Behind `vmap` the condition of the loop is one for all lanes; each lane ends as it would alone, also if another
@@ -204,6 +223,7 @@ def test_a_batch_ends_with_its_last_lane():
             np.testing.assert_allclose(many.ending.sample.t[0, i], run(speed, duration).ending.sample.t, rtol=1e-12)
 
 
+@killed_by("simulate/outcome.py", "jnp.where(diverged, jnp.nan, value)", "value")
 def test_a_diverging_lane_is_flagged_and_leaves_the_others_alone():
     solver = d.FixedStep(1e-3, 0.5)
 
@@ -263,6 +283,7 @@ PASSIVE = {
 }
 
 
+@killed_by("plants/wheel.py", "return jnp.where(jnp.greater(speed, 0), speed, 0.0)", "return speed", case="car")
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", ["car", *(pytest.param(name, marks=pytest.mark.slow) for name in ("rig", "lab"))])
 def test_energy_never_increases_down_to_standstill(plant):

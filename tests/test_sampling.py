@@ -8,6 +8,7 @@ import tomllib
 import jax
 import numpy as np
 import pytest
+from mutants import killed_by
 from scipy import stats
 from scipy.special import ndtri
 from scipy.stats import qmc
@@ -70,6 +71,11 @@ def quantile(case, p, q):
     return np.where(p < q, theirs.ppf(p), above)
 
 
+@killed_by(
+    "sweep/distributions.py",
+    "p * width * rise), self.high - np.sqrt(q * width * fall)",
+    "p * width * fall), self.high - np.sqrt(q * width * rise)",
+)
 @pytest.mark.parametrize("case", CONTINUOUS)
 def test_quantiles_are_scipys(case):
     """To rounding: of quantities of size 1 next to where a quantile crosses zero."""
@@ -80,6 +86,7 @@ def test_quantiles_are_scipys(case):
     np.testing.assert_allclose(found.ravel(), quantile(case, u, 1 - u), rtol=1e-12, atol=1e-15)
 
 
+@killed_by("sweep/distributions.py", "return self._at(ndtr(z), ndtr(-np.asarray(z)))", "return self.value(ndtr(z))")
 @pytest.mark.parametrize("case", CONTINUOUS)
 def test_both_tails_of_normal_coordinates_keep_their_digits(case):
     """Twelve digits of Phi(7) are nines, those of Phi(-7) are all there."""
@@ -128,6 +135,7 @@ def test_rounding_does_not_leave_the_support(low):
         assert ((values >= low) & (values <= high)).all()
 
 
+@killed_by("sweep/discrete.py", "np.ones(count) if weights is None", "np.ones(count) if True")
 def test_choices_come_by_weight():
     """u below F(k), so the edges belong to the next choice; the last includes u = 1."""
     ours = Categorical(("dry", "wet", "snow"), (1.0, 1.0, 2.0))
@@ -171,6 +179,13 @@ def test_draws_are_distributed_as_scipy_says(design):
     assert np.abs(independent).max() < 4.5 / math.sqrt(n)
 
 
+@killed_by("sweep/sampling.py", "numbers = start + jax", "numbers = 0 * start + jax", case="random")
+@killed_by(
+    "sweep/sampling.py",
+    "_hypercube(seed, samples, dimension)[start:stop]",
+    "_hypercube(seed, stop - start, dimension)",
+    case="latin",
+)
 @pytest.mark.parametrize("case", DESIGNS)
 def test_chunks_make_the_whole_bit_for_bit(case):
     """Also correlated ones; a chunk of one; chunks across replicates and rows of the design."""
@@ -185,6 +200,7 @@ def test_chunks_make_the_whole_bit_for_bit(case):
         np.testing.assert_array_equal(np.concatenate([part[path] for part in parts]), column)
 
 
+@killed_by("sweep/sampling.py", "_words(_seed(seed)", "_words(_seed(0 * seed)", case="random")
 @pytest.mark.parametrize("case", DESIGNS)
 def test_the_seed_decides(case):
     design, samples = DESIGNS[case]
@@ -222,6 +238,7 @@ def test_random_draws_do_not_depend_on_jaxs_precision_and_compile_once():
     assert sampling._words._cache_size() == compiled
 
 
+@killed_by("sweep/sampling.py", "spawn_key=(stream,)", "spawn_key=(0 * stream,)")
 def test_sobol_replicates_are_scipys():
     """Generated at once, each with a stream of its own; odd multiples of 2^-33, so never 0."""
     found = Sobol(4).unit(9, 0, 1024, 3, 1024)
@@ -298,6 +315,7 @@ def test_corners_are_complete():
     assert found == list(itertools.product((1.0, 2.0), (-3.0, 3.0), (-1.0, 7.5), (4.0, 8.0)))
 
 
+@killed_by("sweep/sampling.py", "np.where(from_b, b, a)", "np.where(from_b, a, b)")
 def test_saltelli_rows_are_a_b_and_mixtures():
     rows, d = 64, 3
     found = Saltelli().unit(6, 0, rows * (d + 2), d, rows * (d + 2)).reshape(rows, d + 2, d)
@@ -322,6 +340,7 @@ def test_saltelli_gives_the_sensitivity_indices_of_ishigami():
     np.testing.assert_allclose(found, [0.3139, 0.4424, 0.0], atol=0.01)
 
 
+@killed_by("sweep/variables.py", "np.linalg.cholesky(np.asarray(self.matrix, float))", "np.asarray(self.matrix, float)")
 def test_correlations_are_recovered():
     """Pearson's of normals is rho, Spearman's of any two 6/pi asin(rho/2); the marginals stay what they are."""
     variables = {
@@ -655,6 +674,7 @@ def test_a_covariance_that_contradicts_the_deviations_is_refused():
         Correlation.from_covariance(("a", "b"), [[0.09, 0.0], [0.0, 0.0]])
 
 
+@killed_by("sweep/distributions.py", "own.high == spec.high and spec.open_high", "False and spec.open_high")
 @pytest.mark.parametrize(
     ("ours", "spec", "line"),
     [

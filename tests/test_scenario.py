@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from mutants import killed_by
 
 from diffabs import controllers, roads
 from diffabs.objectives import BRAKING
@@ -35,6 +36,7 @@ def test_packaged_names():
     assert {"slip-lmi", "slip-estimator", "slip-cured", "lab-rig"} <= set(names())
 
 
+@killed_by("scenario/parameter_paths.py", "return tuple(in_si(end, self.scale) for end in ends)", "return tuple(ends)")
 def test_slip_lmi_is_the_papers_example():
     s = load("slip-lmi")
     assert type(s.loop.plant).__name__ == "MirroredRig"
@@ -64,6 +66,8 @@ def test_slip_estimator_is_the_papers_example():
     assert s.loop.initial.speed == pytest.approx(100 / 3.6, rel=1e-15)
 
 
+@killed_by("scenario/scenario.py", 'for name in ("design", "tune", "sweep")}', 'for name in ("tune", "sweep")}')
+@killed_by("scenario/scenario.py", 'for name in ("design", "tune", "sweep")}', 'for name in ("design", "sweep")}')
 @pytest.mark.parametrize("name", names())
 def test_packaged_scenario_survives_dump_and_load(name, file):
     first = load(name)
@@ -254,6 +258,11 @@ damping = 0.25
 """
 
 
+@killed_by(
+    "scenario/parameter_paths.py",
+    '            pending[:0] = [(f"{path}.{key}", item) for key, item in value.items()]\n            continue',
+    "            found[path] = value\n            continue",
+)
 def test_ranges_are_the_same_however_they_are_written(file):
     dotted = load(
         file(
@@ -370,6 +379,7 @@ WHAT = Goal(
 )
 
 
+@killed_by("scenario/parameter_paths.py", "return tuple(in_si(end, self.scale) for end in ends)", "return tuple(ends)")
 def test_what_is_tuned_is_the_same_however_it_is_written(file):
     dotted = load(
         file(
@@ -474,6 +484,8 @@ def test_another_part_takes_what_is_tuned_with_it(change):
     assert again.free == {"controller.kp": (1000.0, 5000.0)}
 
 
+@killed_by("scenario/scenario.py", "[0, self.seed]", "[self.seed, 0]", case="7")
+@killed_by("scenario/scenario.py", "and 0 <= self.seed < 2**31:", ":", case="1099511627776")
 @pytest.mark.parametrize("seed", [0, 7, 2**31 - 1, 2**40])
 def test_the_key_of_a_run_is_that_of_jax(seed):
     found, wanted = scenario.Scenario("mine", seed=seed).key(), jax.random.key(seed)

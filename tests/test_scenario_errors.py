@@ -1,6 +1,7 @@
 """A scenario that is wrong: one clear line that names field, value, range and unit."""
 
 import pytest
+from mutants import killed_by
 
 from diffabs.scenario.scenario import ScenarioError, load, names
 
@@ -183,6 +184,16 @@ BAD = [
 ]
 
 
+@killed_by(
+    "scenario/parameter_paths.py",
+    "        if not (np.all(low < high) or (not or_else and np.all(low <= high))):",
+    "        if False:",
+)
+@killed_by(
+    "scenario/parameter_paths.py",
+    "        if not (allowed.holds(low) and allowed.holds(high)):",
+    "        if False:",
+)
 @pytest.mark.parametrize("case", BAD, ids=lambda case: case[0][:40].encode("unicode_escape").decode())
 def test_bad_value_is_one_line_that_says_where_what_and_what_is_needed(file, case):
     override, *needed = case

@@ -10,6 +10,7 @@ import shutil
 import numpy as np
 import pytest
 from commands import assert_one_error_line, run
+from mutants import killed_by
 from sweeping import SCENARIO
 
 from diffabs.sweep import Results, SweepError
@@ -63,6 +64,7 @@ def flipped(data, bit):
 # Chunks
 
 
+@killed_by("sweep/seal.py", "if name(seal.chunk, data) != path.name:", "if False:")
 @pytest.mark.parametrize("seed", range(4))
 def test_every_flipped_bit_of_a_chunk_is_seen(copy, seed):
     """A hundred of each seed, anywhere in a file: pages, dictionary, footer, marks."""
@@ -84,6 +86,7 @@ def test_compare_sees_it_too(copy, whole):
         refused(copy, whole, f"{path} is damaged")
 
 
+@killed_by("sweep/results.py", "self._seen.get(chunk) == state", "chunk in self._seen")
 def test_a_file_that_changes_while_it_is_open_is_verified_again(copy):
     found, path = Results(copy), chunk_files(copy)[0]
     before = found.column("iae")
@@ -97,6 +100,9 @@ def numbered(path, chunk):
     return path.with_name(f"part-{chunk:08d}{path.name[13:]}")
 
 
+@killed_by(
+    "sweep/seal.py", "for key, value in seal.metadata().items()", "for key, value in list(seal.metadata().items())[::2]"
+)
 def test_chunks_that_exchanged_their_numbers(copy, whole):
     one, two = chunk_files(copy)[1:3]
     one.rename(copy / "one")
@@ -115,6 +121,9 @@ def test_a_chunk_that_was_copied(copy, whole):
     refused(copy, whole, "is not that chunk: its chunk is '1'")
 
 
+@killed_by(
+    "sweep/seal.py", "for key, value in seal.metadata().items()", "for key, value in list(seal.metadata().items())[1:2]"
+)
 def test_a_chunk_of_another_sweep(copy, whole):
     """Not damaged, so it is not removed either: somebody may have no other copy."""
     mine, other = chunk_files(copy)[1], chunk_files(whole / "other")[1]
@@ -200,6 +209,7 @@ def test_the_digest_of_a_manifest_is_that_of_the_rest(whole, copy):
     assert (copy / "manifest.json").read_bytes() == before
 
 
+@killed_by("sweep/manifest.py", 'if given.get("digest") != digest(manifest):', "if False:")
 def test_a_scenario_that_was_edited_in_the_manifest_is_seen(copy, whole):
     def heavier(there):
         there["source"]["scenario"] = there["source"]["scenario"].replace("0.0995", "0.1")
@@ -214,6 +224,7 @@ def test_a_scenario_that_was_edited_in_the_manifest_is_seen(copy, whole):
         shutil.copy(whole / "out" / "manifest.json", copy)
 
 
+@killed_by("cli/sweep.py", "    check_owner(folder, manifest, number)\n", "")
 def test_the_manifest_of_another_sweep_is_not_believed(copy, whole):
     """Nor by who reads no number of a chunk."""
     shutil.copy(whole / "other" / "manifest.json", copy)

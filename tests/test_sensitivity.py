@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 
 from diffabs.design import Polytope, Spec, analysis, certify, design
 from diffabs.design.interior.decay_rate import certified_decay
@@ -74,6 +75,19 @@ def agrees(system, weights, tolerance):
     np.testing.assert_allclose(by_gain / gain[:, None], gains / np.array(gain)[:, None], rtol=0, atol=tolerance)
 
 
+@killed_by(
+    "design/interior/differentiable.py",
+    "step = -central_path.solved(hessian, by_problem)",
+    "step = central_path.solved(hessian, by_problem)",
+    case="ones",
+)
+@killed_by(
+    "design/interior/central_path.py",
+    '2 * jnp.einsum("ij,abji->ba", total, curved)',
+    '0 * jnp.einsum("ij,abji->ba", total, curved)',
+    case="ones",
+)
+@killed_by("design/interior/differentiable.py", "MU = 1e-8", "MU = 1e-3", case="ones")
 @pytest.mark.parametrize(
     "weights",
     [pytest.param(w, id=name, marks=pytest.mark.slow if name != "middle" else ()) for name, w in PUBLISHED.items()],
@@ -127,6 +141,7 @@ def test_cost_obeys_the_envelope_theorem():
         np.testing.assert_allclose(by_cost[:2], np.diag(x) * (q1, q2), rtol=1e-4)
 
 
+@killed_by("design/interior/central_path.py", "1e-3 * jnp.abs(first) + rounding", "1e-3 * jnp.abs(first) + 1e-30")
 @pytest.mark.slow
 def test_one_vertex_is_the_riccati_equation():
     q1, q2, r, a = 1e6, 1e4, 2.0, ALPHAS[0] / BETA
@@ -206,6 +221,7 @@ def decay(gain, A, B, period=None):
 GAINS = ((-11753.0, -158.17), (-999.7, -111.07), (-0.834, -2.599))
 
 
+@killed_by("design/interior/decay_rate.py", "EXACT = 1e-8", "EXACT = 1e-2", case="gain0-continuous")
 @both_times
 @pytest.mark.parametrize("gain", GAINS)
 def test_decay_is_what_can_be_proved(gain, system):
@@ -215,6 +231,12 @@ def test_decay_is_what_can_be_proved(gain, system):
     assert certify(gain, system, Spec(decay=1.0001 * rate)).decay_rate is None
 
 
+@killed_by(
+    "design/interior/decay_rate.py",
+    "2 * jnp.sum(weights * left)",
+    "2 * jnp.sum(jnp.mean(weights, 0) * left)",
+    case="continuous",
+)
 @both_times
 def test_derivative_of_the_decay_is_a_difference_of_certificates(system, monkeypatch):
     monkeypatch.setattr(analysis, "RAISED", 1e-8)

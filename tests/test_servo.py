@@ -15,6 +15,7 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 from commands import assert_one_error_line, run
+from mutants import killed_by
 
 from diffabs import FixedStep, Loop, measure, replace, rollout
 from diffabs.controllers import PID, Clamping, Sampled
@@ -80,6 +81,10 @@ def by_hand(motor, gains):
     return a, np.array([0, 0, 1 / ell, 0, 0]), np.array([-(kp + kd * wc), 0, 0, ki, -kd * wc])
 
 
+@killed_by(
+    "objectives/tracking.py", "jnp.where(sample.setpoint < 0, -1.0, 1.0)", "jnp.where(sample.setpoint < 0, 1.0, 1.0)"
+)
+@killed_by("objectives/tracking.py", 'getattr(output, "highest", math.inf)', 'getattr(output, "highest", 1.0)')
 def test_the_linear_servo_follows_its_closed_form(servo):
     """exp(A t) with the closed loop written by hand, at every instant; and what is measured, from that curve."""
     loop, gains = linear(servo)
@@ -145,6 +150,7 @@ def test_the_servo_at_its_limits_agrees_with_scipy(servo):
     assert np.ptp(sample.control[:20]) == 0  # at the limit
 
 
+@killed_by("linear/operating_point.py", "kept = plant | (found.K != 0)", "kept = plant | (found.K != found.K)")
 @pytest.mark.slow
 def test_the_linear_model_is_the_one_written_by_hand(servo):
     loop, gains = linear(servo, load=0.03)
@@ -169,6 +175,7 @@ def operating_point_speed(loop, model):
     return dataclasses.replace(model, plant=loop.plant).matrices().A[1, 1]
 
 
+@killed_by("linear/operating_point.py", "if not found.residue < RESIDUE:", "if False:")
 def test_what_has_no_linear_model_says_so(servo):
     loop, _ = linear(servo)
     with pytest.raises(ValueError, match="controller Sampled acts at instants"):
@@ -179,6 +186,7 @@ def test_what_has_no_linear_model_says_so(servo):
         operating_point(replace(loop, {"plant.load": 3.0, "plant.voltage_max": 24.0}))
 
 
+@killed_by("core/units.py", "exponent = int(power or 1) * (-1 if slash else 1)", "exponent = int(power or 1)")
 def test_units_are_those_of_the_loop(servo):
     loop, _ = linear(servo)
     units = {path: spec.unit for path, spec, _ in parameters(loop)}
@@ -198,6 +206,7 @@ def test_units_are_those_of_the_loop(servo):
     assert in_loop("control^2 s/signal", Units("N m/A", "m/s^2")) == "N^2 m s^3/A^2"
 
 
+@killed_by("simulate/stable_step.py", "for one in (loop, arrived)", "for one in (loop,)")
 def test_the_step_is_judged_where_the_controller_is_not_at_its_limit(servo):
     """At the start the PID commands 24 V whatever happens; its own fast mode is only seen on the target."""
     loop, _ = linear(servo, value=1.0)
@@ -208,6 +217,11 @@ def test_the_step_is_judged_where_the_controller_is_not_at_its_limit(servo):
     assert growth.max() == pytest.approx(1.0, abs=2e-3)
 
 
+@killed_by(
+    "scenario/registry.py",
+    'own, units = getattr(plant, "usual_parts", dict), units_of(plant)',
+    "own, units = braking().plant.usual_parts, units_of(plant)",
+)
 def test_what_a_plant_of_ones_own_needs_is_asked_for_by_name(servo, file):
     text = (HERE / "servo.toml").read_text()
     for section, line in (
@@ -230,6 +244,7 @@ def test_a_scenario_never_imports_code():
     assert "dc-motor" not in registry.types("plant")
 
 
+@killed_by("scenario/registry.py", "if name in _packaged(family) or name in found:", "if name in found:")
 @pytest.mark.parametrize(
     ("module", "text", "line"),
     [
@@ -310,6 +325,7 @@ def test_a_part_that_prints_does_not_spoil_the_document(tmp_path, monkeypatch, c
     assert "called" in result.stderr
 
 
+@killed_by("scenario/outside.py", "entry_points(group=GROUP)", 'entry_points(group="other")')
 def test_an_installed_module_is_known_by_its_entry_point(tmp_path, monkeypatch):
     shutil.copy(HERE / "dc_servo.py", tmp_path / "dc_servo_installed.py")
     folder = tmp_path / "dc_servo_installed-0.1.0.dist-info"
@@ -330,6 +346,7 @@ def test_an_installed_module_is_known_by_its_entry_point(tmp_path, monkeypatch):
     assert "entry point servo of diffabs.parts: cannot be imported" in result.stderr
 
 
+@killed_by("cli/usage.py", "know(parts or ())", "know(())")
 def test_simulate_prints_writes_and_draws(tmp_path, monkeypatch):
     from matplotlib.figure import Figure
     from matplotlib.text import Text

@@ -7,6 +7,7 @@ import time
 import psutil
 import pytest
 from commands import left_in
+from mutants import killed_by
 from sweeping import PATIENCE, SCENARIO, chunks, command, started, until
 
 LONG = ("--samples", "640000")
@@ -82,6 +83,7 @@ except KeyboardInterrupt:
 """
 
 
+@killed_by("cli/console.py", "        files.clear()\n", "")
 def test_what_a_thread_was_writing_goes_with_it(tmp_path):
     with started(sys.executable, "-c", LEAVING, str(tmp_path)) as process:
         assert process.stdout.readline() == "begun\n"

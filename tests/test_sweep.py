@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from commands import assert_one_error_line, left_in, run
 from marks import cases
+from mutants import killed_by
 from sweeping import described, rig
 
 import diffabs as d
@@ -110,6 +111,7 @@ def same(found, expected, **tolerance):
 # What is in the table
 
 
+@killed_by("sweep/runner.py", "noise_key(study.seed, sample)", "noise_key(study.seed, 0)")
 def test_each_row_is_its_lane_run_by_itself(posed, made):
     assert made.column("sample").tolist() == list(range(150))
     some = np.arange(0, 150, 4)

@@ -6,6 +6,7 @@ import shlex
 import sys
 
 import pytest
+from mutants import killed_by
 from sweeping import PATIENCE, SCENARIO, chunks, described, free_port, started, until
 
 from diffabs.sweep import sweep
@@ -97,6 +98,7 @@ def test_a_process_that_dies_ends_the_others_and_the_commands_go_on(folder, dige
     assert alone.digest != digest
 
 
+@killed_by("sweep/run.py", "        except Exception:", "        except ZeroDivisionError:")
 def test_a_full_disk_of_one_process_is_said_after_the_other_has_finished(folder):
     broken = SCRIPT.replace("\nprint(", f"{FULL}print(")
     (folder / "many.py").write_text(broken.replace(".digest", ".complete"))

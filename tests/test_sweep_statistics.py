@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from mutants import killed_by
 from scipy import stats
 
 from diffabs.sweep.statistics import estimates, paired, sensitivity
@@ -84,6 +85,7 @@ class TestMoments:
 
 
 class TestCount:
+    @killed_by("sweep/statistics/estimates.py", "stats.beta.ppf(top, k + 1, n - k)", "stats.beta.ppf(top, k, n - k)")
     @pytest.mark.parametrize(("k", "n"), [(0, 10), (10, 10), (3, 10), (1, 1000), (420, 1000)])
     def test_is_clopper_and_pearsons(self, k, n):
         theirs = stats.binomtest(k, n).proportion_ci(0.99)
@@ -97,6 +99,11 @@ class TestCount:
 
 
 class TestQuantile:
+    @killed_by(
+        "sweep/statistics/estimates.py",
+        "stats.binom.isf(1 - top, n, level)) + 1",
+        "stats.binom.isf(1 - top, n, level))",
+    )
     @pytest.mark.parametrize("level", [0.001, 0.05, 0.3, 0.5, 0.9, 0.99])
     @pytest.mark.parametrize("n", [1, 5, 40, 300])
     def test_is_between_the_right_order_statistics(self, level, n):
@@ -131,9 +138,19 @@ class TestCVaR:
             estimates.cvar(self.X, level).value, brute_cvar(self.X, level)[0], rtol=1e-12, atol=0
         )
 
+    @killed_by(
+        "sweep/statistics/estimates.py",
+        "taken = np.clip(share - (reached - weights), 0.0, weights)",
+        "taken = np.clip(np.round(share) - (reached - weights), 0.0, weights)",
+    )
     def test_the_sample_at_the_edge_counts_in_part(self):
         assert estimates.cvar([1.0, 5.0, 2.0, 3.0], 0.625).value == pytest.approx((5 + 0.5 * 3) / 1.5, rel=1e-12)
 
+    @killed_by(
+        "sweep/statistics/estimates.py",
+        "totals = random.binomial(n, total / n, size=replicates)",
+        "totals = np.full(replicates, total)",
+    )
     def test_the_interval_is_that_of_a_plain_studentised_bootstrap(self):
         """Both with 2,000 resamples of their own: an end has a standard error of 0.02 half-widths."""
         random, (value, error) = np.random.default_rng(5), brute_cvar(self.X, 0.8)
@@ -221,6 +238,7 @@ class TestCorrelations:
         theirs = [stats.spearmanr(one, y).statistic for one in x.T]
         np.testing.assert_allclose([one.value for one in found], theirs, rtol=1e-12, atol=0)
 
+    @killed_by("sweep/statistics/sensitivity.py", "math.sqrt(1 + r * r / 2)", "math.sqrt(1.06)")
     def test_spearmans_interval_is_bonetts_published_one(self):
         """The example of ci.spear in his R package statpsych."""
         y = [21, 4, 9, 12, 35, 18, 10, 22, 24, 1, 6, 8, 13, 16, 19]
@@ -296,6 +314,7 @@ class TestSobol:
             hits += [one.low <= index <= one.high for one, index in each]
         np.testing.assert_allclose(hits / 2, 95.0, rtol=0, atol=4.0)
 
+    @killed_by("sweep/statistics/sensitivity.py", "mean = (a.mean() + b.mean()) / 2", "mean = b.mean()")
     def test_the_bootstrap_is_that_of_scipy_with_rows_together(self):
         """First and total index. 2,000 resamples on both sides: an end has a standard error of 0.06 deviations."""
         a, b, ab = outputs(ishigami, 3, 200, np.random.default_rng(15))
@@ -343,6 +362,7 @@ class TestPaired:
     A = np.random.default_rng(19).gamma(4.0, size=150)
     B = A + np.round(np.random.default_rng(20).normal(0.3, 0.5, size=150), 1)
 
+    @killed_by("sweep/statistics/paired.py", "difference = one - other", "difference = other - one")
     def test_is_scipys_each_by_each(self):
         found = paired.paired(self.A, self.B, confidence=0.9)
         theirs = stats.ttest_rel(self.A, self.B).confidence_interval(0.9)

@@ -9,6 +9,7 @@ import optax
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mutants import killed_by
 from scipy.optimize import minimize
 
 from diffabs import controllers, plants, references
@@ -37,6 +38,7 @@ class TestSpace:
             assert low <= value <= high
             np.testing.assert_allclose(m.place(float(m.value(m.place(start)))), m.place(start), rtol=1e-12, atol=1e-12)
 
+    @killed_by("core/bijectors.py", "if far / near >= DECADE:", "if False:")
     def test_a_range_of_decades_is_searched_in_its_logarithm(self):
         assert isinstance(bijection(1e-3, 1e-1, 1e-2), Decades)
         assert isinstance(bijection(-1e4, -10.0, -100.0), Decades)
@@ -94,6 +96,7 @@ class TestSpace:
 class TestAggregates:
     VALUES = np.array(jax.random.normal(jax.random.key(3), (37,))) + 4.0
 
+    @killed_by("tune/risk.py", "weights * -jnp.sort(-values)", "weights * jnp.sort(values)")
     @pytest.mark.parametrize("level", [0.0, 0.5, 0.9, 0.95, 0.99])
     def test_cvar_is_rockafellar_and_uryasevs_minimum(self, level):
         def formula(t):
@@ -172,6 +175,9 @@ class TestDescent:
         (lane,) = descend(lambda z: jnp.abs(z[0] - 1) + 10 * jnp.abs(z[1] + 2 * z[0]) + 0.1 * z[0] ** 2, [3.0, 1.0])
         np.testing.assert_allclose(lane.z, [1.0, -2.0], rtol=0, atol=1e-4)
 
+    @killed_by(
+        "tune/descent.py", "elif float(found.gradient @ lane.update) < WOLFE * slope and not longest:", "elif False:"
+    )
     def test_a_step_that_is_much_too_short_is_not_content_with_little(self):
         """Weak Wolfe conditions, written out here, where the first direction is a thousandth of the way."""
         f = lambda z: 1e-3 * jnp.sum(jnp.sqrt(1 + z**2))  # noqa: E731
@@ -182,6 +188,7 @@ class TestDescent:
         assert f(lane.z) <= f(start) + 1e-4 * before @ step
         assert after @ step >= 0.9 * (before @ step)
 
+    @killed_by("tune/descent.py", "if lane.jumps >= JUMPS:", "if False:")
     def test_where_the_loss_jumps_it_ends_soon(self):
         """A wall at z0 = 0.3, which the slope points across: twelve trials, twice."""
         (lane,) = descend(lambda z: z[0] + z[1] ** 2 + jnp.where(z[0] < 0.3, 1e3, 0.0), [0.7, 1.0])
@@ -196,6 +203,7 @@ class TestDescent:
         slope = jax.grad(lambda x: (x - 0.99) ** 2 - 1e-3 * jnp.sqrt(1 - x))
         assert float(jnp.max(jnp.abs(jax.vmap(slope)(jnp.asarray(lane.z))))) < 1e-5
 
+    @killed_by("tune/descent.py", "return found, fine & self.steady(z)", "return found, fine")
     def test_what_is_not_stable_is_not_entered(self):
         steady = lambda z: z[:, 0] > 0.5  # noqa: E731
         (lane,) = descend(lambda z: jnp.sum(z**2), [2.0, 1.0], steady=steady)
@@ -272,6 +280,7 @@ class Constrained:
 
 
 class TestConstraints:
+    @killed_by("tune/augmented_lagrangian.py", "            m = _raised(m, lanes)\n", "")
     def test_the_multipliers_find_the_constrained_minimum(self):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1], z[0] - 5.0]))
         found = Search(problem, Method(margin=1e-7, rounds=20), None).result()
@@ -280,6 +289,7 @@ class TestConstraints:
         assert found.met
         assert found.violation[1] == 0
 
+    @killed_by("tune/augmented_lagrangian.py", "np.full(count, self.method.margin)", "np.zeros(count)")
     @pytest.mark.parametrize("start", [(2.0, 2.0), (0.1, 0.1), (0.7, 0.7)])
     def test_what_is_met_is_met_without_a_tolerance(self, start):
         """Multipliers come to a bound from outside; the bound stated, not one beside it, holds where they end. With the
@@ -291,6 +301,7 @@ class TestConstraints:
         assert found.values["x"] + found.values["y"] >= 1
         assert found.objective[1] == pytest.approx(2 / 3, rel=5e-3)  # a margin of 1e-3 costs 2e-3 of it
 
+    @killed_by("tune/descent.py", "        if worst <= 0:", "        if False:")
     def test_a_step_that_meets_them_is_returned_where_the_end_does_not(self):
         """Two iterations and no multipliers raised: from inside, the penalty alone ends outside of the bound."""
         problem = Constrained([1.0, 1.0], lambda z: jnp.array([1 - z[0] - z[1]]))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mutants import killed_by
 from scipy.linalg import solve_continuous_are
 from scipy.optimize import minimize
 from scipy.stats import qmc
@@ -148,6 +149,11 @@ class TestStability:
         each = [stable_step(d.replace(RIG, {"plant.mass": m})) for m in masses]
         np.testing.assert_allclose(stable_steps(batch), each, rtol=1e-12)
 
+    @killed_by(
+        "simulate/stable_step.py",
+        "angles = np.abs(np.angle(direction))",
+        "angles = np.full(np.shape(direction), np.pi)",
+    )
     def test_the_limit_of_a_real_and_of_an_imaginary_mode(self):
         from diffabs.simulate.stable_step import _radius
 
@@ -168,6 +174,7 @@ class TestPoles:
         np.testing.assert_allclose(np.sort(rates), np.sort(1 + np.array([-2, -2, -5, -1]) / 1.5), rtol=1e-12)
         np.testing.assert_allclose(np.sort(damping), np.sort([0.6 - 2 / 13**0.5] * 2 + [-0.4] * 2), rtol=1e-9)
 
+    @killed_by("tune/constraints.py", "if self.system.period is not None:", "if False:")
     def test_discrete_poles_are_those_of_continuous_time(self):
         from scipy.linalg import expm
 
@@ -220,6 +227,7 @@ class TestCertifiedDecay:
 
 
 class TestWeights:
+    @killed_by("tune/weights.py", "root = root + jnp.diag(diagonal)", "root = jnp.diag(diagonal)")
     def test_the_gain_is_that_of_the_riccati_equation(self):
         model = SlipModel(speed=20 / 3.6)
         q = np.array([[1e6, 2e3], [2e3, 1e4]])
@@ -262,6 +270,9 @@ class TestSpeedScaled:
         poles = [np.sort_complex(np.linalg.eigvals(m)) for m in (az + bz @ gain, a + b @ turned)]
         np.testing.assert_allclose(*poles, atol=1e-12)
 
+    @killed_by(
+        "design/speed_scaled.py", "jnp.where(torque, 1 + scaled.fall, 1.0) / s", "jnp.where(torque, 1.0, 1.0) / s"
+    )
     def test_a_falling_speed_is_followed_step_by_step(self):
         """Two periods, from v to v+: the physical states, brought to z with the speed of their own instant."""
         v0, speeds = 10.0, (6.0, 5.9, 5.75)
@@ -289,6 +300,7 @@ class TestSpeedScaled:
 BOX = {"plant.mass": (4.0, 8.0), "plant.road.w4": (0.3, 0.5), "actuator.time_constant": (5e-4, 4e-3)}
 
 
+@killed_by("tune/worst.py", "if self.value <= self.corner * (1 + SAME):", "if False:")
 @pytest.mark.parametrize(
     ("corner", "screened", "words"),
     [
@@ -346,6 +358,9 @@ class TestWorstCase:
         assert found.corner <= found.screened <= found.value
         assert found.report().startswith("COUNTEREXAMPLE: max_slip" if not found.met else "No counterexample in")
 
+    @killed_by(
+        "tune/worst.py", "if lane.reason is not Reason.START and -float(lane.seen.objective) > value:", "if False:"
+    )
     @pytest.mark.slow
     def test_the_ascent_finds_what_lies_between_the_points(self):
         """The shortest way of all slips, beside a thousand of them: at no corner."""

@@ -4,6 +4,7 @@ import pytest
 from commands import run
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from mutants import killed_by
 
 from diffabs import plants, plot
 from diffabs.objectives import Effort, TorqueRate, Variation
@@ -25,6 +26,7 @@ def test_a_plant_says_the_unit_of_its_control(plant, unit):
     assert plant.control_unit == unit
 
 
+@killed_by("core/loop.py", "(plant.control_unit, getattr", '("N m", getattr')
 def test_the_csv_file_of_the_lab_rig(tmp_path):
     run("simulate", "lab-rig", *SHORT, "--csv", tmp_path / "run.csv")
     header = (tmp_path / "run.csv").read_text().splitlines()[0].split(",")

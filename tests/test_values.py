@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mutants import killed_by
 
 from diffabs.core import files, provenance, values
 from diffabs.core.exports import lazily
@@ -33,6 +34,11 @@ def test_a_table_becomes_a_dataclass():
     assert values.read_one({"cup": Cup}, {"type": "cup", **given}, "x") == Cup(1.0, 1, "shiny", {"maker": "x"})
 
 
+@killed_by(
+    "core/values.py",
+    '            raise unknown(f"{dotted(path, key)} is not a field',
+    '            continue\n            raise unknown(f"{dotted(path, key)} is not a field',
+)
 @pytest.mark.parametrize(
     ("given", "line"),
     [
@@ -72,6 +78,9 @@ def test_nan_is_in_no_range():
         inside(float("nan"), Spec("1", 0.0, 1.0), "x")
 
 
+@killed_by(
+    "core/values.py", "return value if type(value) in PLAIN else", "return value if isinstance(value, PLAIN) else"
+)
 def test_parts_are_written_whole_and_the_rest_in_short_if_wanted():
     assert plain(Burckhardt(c1=np.float32(0.5), c2=30, c3=0.25)) == {
         "type": "burckhardt", **{"c1": 0.5, "c2": 30.0, "c3": 0.25, "c4": Burckhardt().c4}
@@ -86,6 +95,8 @@ W4 = "{type='normal', mean=0.4, deviation=0.01, low=0.3, high=0.5}"
 DRAWN = f"sweep.over={{'initial.speed_kmh'=[36,72], 'road.w4'={W4}, 'plant.mass'=[5,6]}}"
 
 
+@killed_by("scenario/section_sweep.py", "return distributions.in_si(found, item.scale)", "return found")
+@killed_by("scenario/section_sweep.py", "paths=tuple(known[path] for path in paths)", "paths=tuple(paths)")
 def test_a_sweep_is_read_once_into_si_by_path_of_the_loop():
     chosen = load("slip-lmi", [DRAWN, "sweep.design=sobol", "sweep.correlation={paths=['road.w4'], matrix=[[1]]}"])
     assert list(chosen.sweep.over.items()) == [
@@ -112,6 +123,11 @@ def test_packages_export_what_they_say_and_no_more():
         export("Burkhardt")
 
 
+@killed_by(
+    "core/files.py",
+    "        yield temporary\n        if temporary.exists():\n            temporary.replace(target)",
+    "        try:\n            yield temporary\n        finally:\n            temporary.replace(target)",
+)
 def test_a_file_is_the_old_one_or_the_whole_new_one(tmp_path):
     path = tmp_path / "a.txt"
     mask = os.umask(0o027)
@@ -131,6 +147,11 @@ def test_a_file_is_the_old_one_or_the_whole_new_one(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["a.txt"]
 
 
+@killed_by(
+    "core/files.py",
+    "        new.mkdir()\n        yield new\n",
+    "        new.mkdir()\n        with contextlib.suppress(KeyError):\n            yield new\n",
+)
 def test_a_folder_is_the_old_one_or_the_whole_new_one(tmp_path):
     path = tmp_path / "deep" / "f"
     for content in ("old", "new"):

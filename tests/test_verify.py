@@ -14,6 +14,7 @@ import checker
 import numpy as np
 import pytest
 from commands import assert_one_error_line, run
+from mutants import killed_by
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
 from diffabs.cli import console, design
@@ -153,6 +154,15 @@ FALSE = [
 ]
 
 
+@killed_by(
+    "design/verify.py",
+    '"Q": ("a weight: no diagonal entry below 0", lambda x: min(row[i] for i, row in enumerate(x)) >= 0)',
+    '"Q": ("", lambda x: True)',
+)
+@killed_by("design/verify.py", 'yield f"vertex {i}: what V falls by", positive(falls)', "pass")
+@killed_by(
+    "design/verify.py", '("[0, inf)", lambda x: x >= 0),\n    "factor"', '("[0, inf)", lambda x: True),\n    "factor"'
+)
 @pytest.mark.parametrize(("content", "status", "needed"), FALSE, ids=[needed for *_, needed in FALSE])
 def test_nothing_false_and_no_nonsense_is_proved(tmp_path, content, status, needed):
     (tmp_path / "c.json").write_text(json.dumps(content))
