@@ -61,16 +61,16 @@ bench-figure: $(VENV)/.bench
 	$(BIN)/python benchmarks/draw_work_precision.py --out docs/figures/work-precision.png
 
 mutants: $(VENV)/.test
-	$(BIN)/python tests/mutants.py
+	$(BIN)/python tests/support/mutants.py
 
 # the oldest and newest Python and JAX: VERSIONS="python3.11=0.10 ..."
 VERSIONS ?= python3.11=0.10 python3.12=0.11 python3.13=0.12
 versions:
-	$(PYTHON) tests/versions.py $(VERSIONS)
+	$(PYTHON) tests/support/versions.py $(VERSIONS)
 
 fuzz: $(VENV)/.test
-	$(BIN)/python tests/fuzz_scenarios.py --count 20000 --seed 0
-	$(BIN)/python tests/fuzz_files.py --count 2000 --seed 0
+	$(BIN)/python tests/support/fuzz_scenarios.py --count 20000 --seed 0
+	$(BIN)/python tests/support/fuzz_files.py --count 2000 --seed 0
 
 clean:
 	rm -rf $(VENV) $(VENV)-torch $(VENV)-jaxonomy .jax_cache out

@@ -11,7 +11,7 @@ Every vertex (A, B) of the system has the loop C = A + B K, exactly as stored. W
 
 Other kinds are not proved here. Names of states and corners are labels; nothing is proved about them, and they are not
 shown. Exit status 0 if all claims are proved, 1 if one is not, 2 if the file is no certificate.
-(All kinds, and data rounded outward: tests/checker.py.)"""
+(All kinds, and data rounded outward: tests/support/checker.py.)"""
 
 import json
 import math

@@ -1,6 +1,6 @@
 """A controller of `real_rig.py` as difference equations with every parameter: what another program needs to run it.
 
-tests/test_real_rig.py does that, in NumPy, from the file alone."""
+tests/experiments/test_real_rig.py does that, in NumPy, from the file alone."""
 
 from typing import Any
 

@@ -9,10 +9,11 @@ import importlib.metadata
 import os
 import pathlib
 
+from project import CACHE
+
 QUICK = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
 if importlib.metadata.version("jaxlib").startswith("0.10."):  # later ones end the process that names it
     QUICK.append("--xla_cpu_use_fusion_emitters=false")
-CACHE = str(pathlib.Path(__file__).parent.parent / ".jax_cache")
 
 if os.environ.get("DIFFABS_TEST_XLA") != "default" and "XLA_FLAGS" not in os.environ:  # a worker inherits it
     os.environ["XLA_FLAGS"] = " ".join(QUICK)

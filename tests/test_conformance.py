@@ -1,4 +1,4 @@
-"""What every part must satisfy, run over tests/parts.py."""
+"""What every part must satisfy, run over tests/support/parts.py."""
 
 import dataclasses
 import inspect

@@ -6,8 +6,7 @@ import time
 
 import pytest
 from mutants import Mutant, find_mutants, judge
-
-ROOT = pathlib.Path(__file__).parent.parent
+from project import ROOT
 
 
 def test_each_mutant_finds_its_text():

@@ -1,0 +1,173 @@
+"""Values that somebody wrote become dataclasses, or one line; parts become values; files are whole."""
+
+import dataclasses
+import os
+import subprocess
+from typing import Any
+
+import numpy as np
+import pytest
+from mutants import killed_by
+from project import ROOT
+
+from diffabs.core import files, provenance, values
+from diffabs.core.exports import lazily
+from diffabs.core.pytree import Spec
+from diffabs.core.values import ScenarioError, entry, inside, one_of, plain, ranged, table_of, within
+from diffabs.roads import Burckhardt
+from diffabs.scenario.scenario import dump, load, loads
+from diffabs.sweep.distributions import Normal, Uniform
+from diffabs.sweep.sampling import Sobol
+
+
+@dataclasses.dataclass(frozen=True)
+class Cup:
+    volume: float = entry(ranged(Spec("l", low=0.0, open_low=True)))
+    handles: int = entry(within(0, 2), 1)
+    glaze: str = entry(one_of("matt", "shiny"), "matt")
+    marks: Any = entry(table_of(values.text, "texts"), dict)
+
+
+def test_a_table_becomes_a_dataclass():
+    given = {"volume": 1, "glaze": "shiny", "marks": {"maker": "x"}}
+    assert values.read(Cup, given, "cup") == Cup(1.0, 1, "shiny", {"maker": "x"})
+    assert values.read_one({"cup": Cup}, {"type": "cup", **given}, "x") == Cup(1.0, 1, "shiny", {"maker": "x"})
+
+
+@killed_by(
+    "core/values.py",
+    '            raise unknown(f"{dotted(path, key)} is not a field',
+    '            continue\n            raise unknown(f"{dotted(path, key)} is not a field',
+)
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        (3, "cup = 3 is a number; a table of volume, handles, glaze, marks is needed"),
+        ({}, "cup.volume is missing: cup needs it"),
+        ({"volume": 0}, "cup.volume = 0 is outside (0, inf) l"),
+        ({"volume": "full"}, 'cup.volume = "full" is text; a number in (0, inf) l is needed'),
+        ({"volume": None}, "cup.volume = None is nothing; a number in (0, inf) l is needed"),
+        ({"volume": 1, "handles": 3}, "cup.handles = 3 is outside [0, 2]"),
+        (
+            {"volume": 1, "handle": 1},
+            "cup.handle is not a field of cup; did you mean handles? There is volume",
+        ),
+        ({"volume": 1, "glaze": "shinny"}, 'cup.glaze = "shinny" is unknown; did you mean shiny? There is matt, shiny'),
+        ({"volume": 1, "glaze": 1}, "cup.glaze = 1 is a number; one of matt, shiny is needed"),
+        ({"volume": 1, "marks": {"a\nb": 1}}, r'cup.marks."a\nb" = 1 is a number; text is needed'),
+        ({"volume": 1, "marks": []}, "cup.marks = [] is a list; a table of texts is needed"),
+    ],
+    ids=str,
+)
+def test_what_is_wrong_is_one_line(given, line):
+    with pytest.raises(ScenarioError) as caught:
+        values.read(Cup, given, "cup")
+    assert str(caught.value).startswith(line)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_type_that_is_not_there():
+    with pytest.raises(ScenarioError, match=r"x\.type is missing; there is cup"):
+        values.read_one({"cup": Cup}, {}, "x")
+    with pytest.raises(ScenarioError, match=r'x\.type = "cap" is unknown; did you mean cup'):
+        values.read_one({"cup": Cup}, "cap", "x")
+
+
+def test_nan_is_in_no_range():
+    with pytest.raises(ScenarioError, match=r"x = nan is outside \[0, 1\]"):
+        inside(float("nan"), Spec("1", 0.0, 1.0), "x")
+
+
+@killed_by(
+    "core/values.py", "return value if type(value) in PLAIN else", "return value if isinstance(value, PLAIN) else"
+)
+def test_parts_are_written_whole_and_the_rest_in_short_if_wanted():
+    assert plain(Burckhardt(c1=np.float32(0.5), c2=30, c3=0.25)) == {
+        "type": "burckhardt", **{"c1": 0.5, "c2": 30.0, "c3": 0.25, "c4": Burckhardt().c4}
+    }  # fmt: skip
+    assert plain({"m": (Normal(1.0, 2.0, low=0.0), np.float64(3.0))}, brief=True) == {
+        "m": [{"type": "normal", "mean": 1.0, "deviation": 2.0, "low": 0.0}, 3.0]
+    }
+    assert type(plain(np.float64(3.0))) is float  # the text of a NumPy number is no TOML
+
+
+W4 = "{type='normal', mean=0.4, deviation=0.01, low=0.3, high=0.5}"
+DRAWN = f"sweep.over={{'initial.speed_kmh'=[36,72], 'road.w4'={W4}, 'plant.mass'=[5,6]}}"
+
+
+@killed_by("scenario/section_sweep.py", "return distributions.in_si(found, item.scale)", "return found")
+@killed_by("scenario/section_sweep.py", "paths=tuple(known[path] for path in paths)", "paths=tuple(paths)")
+def test_a_sweep_is_read_once_into_si_by_path_of_the_loop():
+    chosen = load("slip-lmi", [DRAWN, "sweep.design=sobol", "sweep.correlation={paths=['road.w4'], matrix=[[1]]}"])
+    assert list(chosen.sweep.over.items()) == [
+        ("initial.speed", Uniform(10.0, 20.0)),
+        ("plant.road.w4", Normal(0.4, 0.01, 0.3, 0.5)),
+        ("plant.mass", Uniform(5.0, 6.0)),
+    ]
+    assert chosen.sweep.design == Sobol()
+    assert chosen.sweep.correlation.paths == ("plant.road.w4",)
+    again = loads(dump(chosen).encode(), "again", "again").sweep
+    assert list(again.over.items()) == list(chosen.sweep.over.items())  # their order is that of a design's columns
+    assert again.table() == chosen.sweep.table()
+
+
+def test_a_distribution_that_cannot_be_is_refused_when_the_scenario_is_read():
+    with pytest.raises(ScenarioError, match=r"sweep.over.initial.speed_kmh = uniform\(36, 900\) reaches \[36, 900\]"):
+        load("slip-lmi", ["sweep.over.initial.speed_kmh=36,900"])
+
+
+def test_packages_export_what_they_say_and_no_more():
+    export = lazily("diffabs.roads")
+    assert export("Burckhardt") is Burckhardt
+    with pytest.raises(AttributeError, match="has no attribute 'Burkhardt'"):
+        export("Burkhardt")
+
+
+@killed_by(
+    "core/files.py",
+    "        yield temporary\n        if temporary.exists():\n            temporary.replace(target)",
+    "        try:\n            yield temporary\n        finally:\n            temporary.replace(target)",
+)
+def test_a_file_is_the_old_one_or_the_whole_new_one(tmp_path):
+    path = tmp_path / "a.txt"
+    mask = os.umask(0o027)
+    try:
+        files.write(path, b"old")
+    finally:
+        os.umask(mask)
+    assert path.stat().st_mode & 0o777 == 0o640
+    with pytest.raises(KeyError), files.new_file(path) as half:  # noqa: PT012
+        assert half.suffix == ".txt"
+        half.write_text("ne")
+        raise KeyError
+    with files.new_file(path) as unwanted:
+        unwanted.unlink()
+    assert path.read_text() == "old"
+    assert files.write_durably(path, b"new").read_bytes() == b"new"
+    assert [each.name for each in tmp_path.iterdir()] == ["a.txt"]
+
+
+@killed_by(
+    "core/files.py",
+    "        new.mkdir()\n        yield new\n",
+    "        new.mkdir()\n        with contextlib.suppress(KeyError):\n            yield new\n",
+)
+def test_a_folder_is_the_old_one_or_the_whole_new_one(tmp_path):
+    path = tmp_path / "deep" / "f"
+    for content in ("old", "new"):
+        with files.new_folder(path) as new:
+            (new / content).touch()
+    with pytest.raises(KeyError), files.new_folder(path) as new:  # noqa: PT012
+        (new / "half").touch()
+        raise KeyError
+    assert [each.name for each in path.iterdir()] == ["new"]
+    assert [each.name for each in path.parent.iterdir()] == ["f"]
+
+
+def test_a_working_copy_knows_its_commit():
+    root = ROOT
+    if not (root / ".git").exists():
+        pytest.skip("not a working copy")
+    command = ["git", "-C", str(root), "rev-parse", "--short=12", "HEAD"]
+    head = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    assert provenance.commit()["commit"].removesuffix("-dirty") == head

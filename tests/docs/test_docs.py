@@ -1,0 +1,146 @@
+"""The site's reference: every package that exports names has a place there, every name of it comes, and every
+parameter with unit and range."""
+
+import dataclasses
+import importlib
+import importlib.util
+import inspect
+import re
+import shutil
+import subprocess
+
+import pytest
+from mutants import killed_by
+from project import ROOT
+
+DOCS = ROOT / "docs"
+
+
+def loaded(name):
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+exported, parameters = loaded("exported"), loaded("parameters")
+
+INNER = {
+    "cli",
+    "core",
+    "explore",
+    "kernel",
+    "papers",
+    "plot",
+    "report",
+    "scenario",
+    "simulate",
+}  # not for import by their names, or figures
+
+
+def packages():
+    named = {path.parent.name for path in (ROOT / "diffabs").glob("*/__init__.py")} - INNER
+    return {"diffabs", *(f"diffabs.{name}" for name in named)}
+
+
+def pages():
+    return {path: path.read_text(encoding="utf-8") for path in (DOCS / "reference").glob("*.md")}
+
+
+def test_every_package_is_in_the_reference():
+    marks = [mark for text in pages().values() for mark in exported.MARK.findall(text)]
+    assert set(marks) == packages()
+    assert len(marks) == len(set(marks))
+
+
+@pytest.mark.parametrize("package", sorted(packages()))
+def test_every_exported_name_comes_from_where_it_is_defined(package):
+    module = importlib.import_module(package)
+    names = exported.exported(package)
+    own = {name: getattr(value, "__module__", None) or "" for name, value in vars(module).items()}
+    made = {name for name, home in own.items() if not name.startswith("_") and home.startswith(package)}
+    assert made <= names.keys()
+    for name, path in names.items():
+        home, _, last = path.rpartition(".")
+        assert getattr(importlib.import_module(home), last) is getattr(module, name)
+
+
+def parts():
+    """Every exported class with parameters, by where it is defined."""
+    paths = {path for package in packages() for path in exported.exported(package).values()}
+    classes = {
+        path: getattr(importlib.import_module(path.rpartition(".")[0]), path.rpartition(".")[2]) for path in paths
+    }
+    made = {path: one for path, one in classes.items() if inspect.isclass(one) and dataclasses.is_dataclass(one)}
+    return {
+        path: one for path, one in sorted(made.items()) if any("spec" in f.metadata for f in dataclasses.fields(one))
+    }
+
+
+@killed_by("../docs/parameters.py", 'left = "(" if "above" in bound or low', 'left = "(" if low')
+def test_the_reference_shows_unit_and_range_of_every_parameter():
+    """Its tables are read from the text of the classes, and the classes say the same."""
+    assert len(parts()) > 60
+    for path, one in parts().items():
+        said = {p.name: (p.unit, p.interval) for p in parameters.parameters(inspect.getsource(one))}
+        fields = {f.name: f.metadata["spec"] for f in dataclasses.fields(one) if "spec" in f.metadata}
+        plain = {name: dataclasses.replace(spec, unit="1").interval() for name, spec in fields.items()}
+        assert said == {name: (fields[name].unit, plain[name]) for name in fields}, path
+        assert all(unit for unit, _ in said.values()), path
+
+
+@killed_by("../docs/parameters.py", 'named = {"unit": "Unit of the value", ', "named = {")
+def test_a_part_becomes_a_table():
+    text = parameters.table(inspect.getsource(importlib.import_module("diffabs.controllers").PID))
+    assert "| `kp` | `3893.0` | control/signal | [0, inf) |" in text.splitlines()
+    assert parameters.table("def f():\n    return 1\n") == ""
+    assert parameters.table("class A:\n    unit = 'm'\n") == "Unit of the value: m."
+
+
+def test_a_class_shows_how_it_is_called():
+    pid = importlib.import_module("diffabs.controllers").PID
+    lines = parameters.signature(inspect.getsource(pid)).splitlines()
+    assert lines[1:3] == ["PID(", "    *,"]
+    assert [line.strip(" ,").partition("=")[0] for line in lines[3:-2]] == [f.name for f in dataclasses.fields(pid)]
+    assert "rtol=1e-05" in parameters.signature(inspect.getsource(importlib.import_module("diffabs").Adaptive))
+    assert parameters.signature("class A:\n    x: int = 1\n") == ""
+
+
+def test_a_line_about_a_parameter_keeps_its_name():
+    """A line `name: ...` that Google's style would read as the head of a section."""
+    doctests = loaded("doctests")
+    text = "What it is.\n\nrtol: the error\n    of a step\nstep, h: a length\nNote: no field."
+    assert doctests.listed(text, {"rtol", "step", "h"}).splitlines() == [
+        "What it is.", "", "", "- `rtol`: the error", "    of a step", "- `step`, `h`: a length", "Note: no field.",
+    ]  # fmt: skip
+
+
+def test_a_mark_becomes_the_names():
+    text = exported.on_page_markdown("before\n\n<!-- exported: diffabs.stops -->\n", page=None)
+    assert text.startswith("before\n\n::: diffabs.stops.")
+    assert "::: diffabs.stops.Standstill" in text
+    with pytest.raises(ValueError, match="exports nothing"):
+        exported.exported("diffabs.cli")
+
+
+def test_a_formula_becomes_mathml_without_any_script():
+    pytest.importorskip("latex2mathml", reason="latex2mathml is in the group `docs`")
+    text = loaded("formulas").on_page_markdown("Let\n\n$$\n\\dot v = -g\n$$\n\nbe; a price of $5.")
+    assert text.startswith("Let\n\n<math")
+    assert text.endswith("</math>\n\nbe; a price of $5.")
+    assert "<mover><mi>v</mi>" in text
+
+
+def test_every_page_is_in_the_navigation():
+    said = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^ +- ([\w/-]+\.md)$", said, re.MULTILINE))
+    assert listed == {str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")}
+
+
+@pytest.mark.skipif(shutil.which("mkdocs") is None, reason="mkdocs is in the group `docs`")
+def test_the_site_builds_strictly(tmp_path):
+    subprocess.run(["mkdocs", "build", "--strict", "--site-dir", tmp_path], cwd=ROOT, check=True, capture_output=True)
+    assert "margins" in (tmp_path / "reference" / "linear" / "index.html").read_text()
+    assert re.search(
+        r"<td>control/signal/s</td>\s*<td>\[0, inf\)</td>", (tmp_path / "reference/parts/index.html").read_text()
+    )

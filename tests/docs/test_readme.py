@@ -1,0 +1,111 @@
+"""The code of README and docs runs and says what they say of it; their commands exist."""
+
+import importlib.resources
+import pathlib
+import re
+import tempfile
+import textwrap
+
+import numpy as np
+import pytest
+from project import ROOT
+from typer.testing import CliRunner
+
+from diffabs.cli.main import app
+from diffabs.scenario.scenario import load
+
+TEXT, COMMANDS, LIBRARY, SWEEPS = (
+    (ROOT / page).read_text() for page in ("README.md", "docs/commands.md", "docs/library.md", "docs/sweeps.md")
+)
+(START,) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+CODE, DESIGN, TUNE = re.findall(r"```python\n(.*?)```", LIBRARY, re.DOTALL)
+
+
+def test_the_readme_prints_its_table(capsys):
+    exec(compile(START.replace("4096", "3"), "README.md", "exec"), {})
+    rows = capsys.readouterr().out.splitlines()
+    numbers = {
+        row.split()[0]: [float(x) for x in re.findall(r"[-\d.]+(?:e[-+]\d+)?", row.split(maxsplit=1)[1])]
+        for row in rows
+    }
+    assert len(rows) == 8
+    least, greatest, at, slope = numbers["stop_distance"]
+    assert greatest / least == pytest.approx(2, rel=0.1)  # nearly in proportion to 1/grip
+    assert (at, slope) == (0.4, pytest.approx(-12.33 / 0.4, rel=0.1))
+
+
+@pytest.mark.slow
+def test_the_twelve_lines_run():
+    code = CODE.replace("64)", "3)")  # 9 lanes instead of 4,096: the same call
+    names = {}
+    exec(compile(code, "library.md", "exec"), names)
+    assert names["many"]["overshoot"].shape == (9,)
+    assert np.all(np.isfinite(names["slope"]))
+    assert np.all(names["slope"] != 0)
+
+
+@pytest.mark.slow
+def test_4096_masses_and_roads_in_one_call():
+    code = CODE.replace("FixedStep(1e-3, 4.0)", "FixedStep(1e-3, 0.05)").rsplit("slope", 1)[0]
+    names = {}
+    exec(compile(code, "library.md", "exec"), names)
+    overshoot = np.asarray(names["many"]["overshoot"])
+    assert overshoot.shape == (4096,)
+    assert len(np.unique(overshoot)) > 4000
+    one = names["brake"]({"plant.mass": names["masses"][1234], "plant.road.w4": names["grips"][1234]})
+    np.testing.assert_allclose(overshoot[1234], one["overshoot"], rtol=1e-10)
+
+
+def test_the_robust_design_runs():
+    names = {}
+    exec(compile(DESIGN, "library.md", "exec"), names)
+    assert names["found"].certificate.verified_exactly
+    assert names["found"].certificate.decay_rate >= 20.0
+    assert names["published"].quadratically_stable is False
+
+
+@pytest.mark.slow
+def test_the_tuning_runs():
+    names = {}
+    exec(compile(CODE.partition("masses, grips =")[0], "library.md", "exec"), names)
+    exec(compile(TUNE, "library.md", "exec"), names)
+    found = names["found"]
+    assert found.objective[1] < 0.6 * found.objective[0]
+    assert np.max(found.metrics[1]["overshoot"]) < 0.02
+
+
+@pytest.mark.slow
+def test_the_sweep_of_the_page_on_sweeps_runs(tmp_path, monkeypatch):
+    code, _ = re.findall(r"```python\n(.*?)```", SWEEPS, re.DOTALL)  # the other: test_sweep_processes.py
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(compile(code.replace("256", "64").replace("128", "32"), "sweeps.md", "exec"), names)
+    frame = names["frame"]
+    assert len(frame) == 64
+    assert frame["plant.mass"].between(5.3, 6.2).all()
+    assert (frame["stop_distance"].corr(frame["plant.road.w4"])) < -0.9
+    assert len(list((tmp_path / "out" / "sweep" / "chunks").iterdir())) == 2
+
+
+@pytest.mark.parametrize("command", re.findall(r"^    diffabs ((?:list|certify) .*)$", COMMANDS, re.MULTILINE))
+def test_commands_exist(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # one writes a proof
+    assert CliRunner().invoke(app, command.split()).exit_code == 0
+
+
+def test_the_promised_message():
+    result = CliRunner().invoke(app, ["simulate", "slip-lmi", "--set", "plant.mass=-1"])
+    assert result.exit_code == 2
+    assert re.search(r"^    (error: .*)$", COMMANDS, re.MULTILINE)[1] in result.stderr
+
+
+def test_the_section_for_tuning_is_one():
+    block = re.search(r"^    \[tune\]\n(?:    .*\n)+", COMMANDS, re.MULTILINE)
+    packaged = importlib.resources.files("diffabs") / "scenarios" / "slip-cured.toml"
+    head = packaged.read_text().partition("[tune]")[0]
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / "mine.toml"
+        path.write_text(head + textwrap.dedent(block[0]))
+        goal = load(path, integrated=False).tune.check(load("slip-cured", integrated=False).loop)
+    assert set(goal.free) == {"controller.controller.gain", "reference.time_constant"}
+    assert goal.batch(0).size == 9

@@ -1,0 +1,387 @@
+"""Open loops and their margins against python-control, closed forms, poles, and the loops' own linear models."""
+
+import dataclasses
+import json
+import math
+
+import control
+import jax
+import numpy as np
+import pytest
+from commands import run as command
+from marks import cases
+from mutants import killed_by
+from project import ROOT
+from scipy.optimize import brentq
+from scipy.signal import cont2discrete
+
+from diffabs.actuators import Delay, Lag, RateLimit
+from diffabs.controllers import PID, ConstantTorque, HoldingInput, Relay, Sampled, StateFeedback
+from diffabs.core.blocks import Series
+from diffabs.design.state_feedback import state_feedback
+from diffabs.linear import Transfer, band, from_control, margins, open_loop, to_control
+from diffabs.linear.stability_margins import crossings, stable
+from diffabs.plants import BrakeStart, LabRig, MirroredRig
+from diffabs.references import FixedSlip
+from diffabs.scenario.defaults import braking
+from diffabs.scenario.scenario import load
+from diffabs.sensors import Noise, WheelSpeed
+
+
+def rig(**parts):
+    usual = {"initial": BrakeStart(speed=8.0), "reference": FixedSlip(slip=0.2), "feedforward": HoldingInput()}
+    return braking(**{"plant": MirroredRig(), **usual, "controller": StateFeedback(), **parts})
+
+
+def random_loop(seed, sampled):
+    """A stable closed loop of a random system of order 2 to 5 under a gain that leaves it margins."""
+    draw = np.random.default_rng(seed)
+    while True:
+        n = int(draw.integers(2, 6))
+        poles = -np.exp(draw.normal(0, 1.2, n))
+        a = np.diag(poles) + np.triu(draw.normal(0, 1.0, (n, n)), 1)
+        if n >= 3:
+            a[:2, :2] = [[-0.3, 2.0], [-2.0, -0.3]]
+        system = Transfer(a, draw.normal(size=(n, 1)), draw.normal(size=(1, n)), np.zeros((1, 1)))
+        if sampled:
+            period = float(np.exp(draw.normal(-2.5, 0.5)))
+            a, b = cont2discrete((system.A, system.B, system.C, system.D), period)[:2]  # pyright: ignore
+            system = system._replace(A=a, B=b, period=period)
+        system = system._replace(C=system.C * draw.uniform(0.5, 4.0))
+        if stable(system) and len(crossings(system).gain_at):
+            return system
+
+
+@killed_by(
+    "linear/stability_margins.py",
+    "phases = np.angle(-_response",
+    "phases = np.angle(-1j * _response",
+    case="continuous",
+)
+@killed_by("linear/stability_margins.py", "-1 / values[real]", "-values[real]", case="sampled")
+@killed_by("linear/stability_margins.py", "while high - low > 1e-9 * high:", "while False:", case="continuous")
+@pytest.mark.parametrize(
+    ("sampled", "seeds"),
+    [
+        pytest.param(False, range(16), id="continuous"),
+        pytest.param(False, range(16, 40), id="continuous, more", marks=pytest.mark.slow),
+        pytest.param(True, range(40), id="sampled", marks=pytest.mark.slow),
+    ],
+)
+def test_margins_are_those_of_python_control(sampled, seeds):
+    compared = 0
+    for seed in seeds:
+        system = random_loop(seed, sampled)
+        found, crossed = margins(system), crossings(system)
+        gm, pm, sm, wpc, wgc, _ = control.stability_margins(to_control(system), returnall=True, method="poly")
+        there = np.abs(np.abs(system.response(wgc)[:, 0, 0]) - 1)
+        if np.max(there, initial=0.0) > 1e-10:
+            continue  # roots of polynomials in z lose digits: theirs are none of |L| = 1
+        compared += 1
+        np.testing.assert_allclose(np.sort(crossed.gain_at), np.sort(wgc), rtol=1e-8)
+        np.testing.assert_allclose(math.degrees(found.phase), np.min(np.abs(pm)), rtol=1e-8)
+        half = math.pi / system.period if sampled else math.inf
+        inner = (wpc > 1e-6) & (wpc < half * (1 - 1e-6))  # ends of the axis are `test_ends_of_the_axis`
+        ours = (crossed.phase_at > 1e-6) & (crossed.phase_at < half * (1 - 1e-6))
+        at = system.response(wpc)[:, 0, 0]
+        real = np.abs(at.imag) < 1e-10 * np.abs(at)  # and there are some of theirs at which L is not real
+        assert len(wpc[inner & ~real]) or np.sum(ours) == np.sum(inner)
+        for w, factor in zip(wpc[inner & real], gm[inner & real], strict=True):
+            i = np.argmin(np.abs(crossed.phase_at - w))
+            assert crossed.phase_at[i] == pytest.approx(w, rel=1e-8)
+            assert crossed.factors[i] == pytest.approx(factor, rel=1e-8)
+        if len(sm):
+            assert found.modulus <= np.min(sm) * (1 + 1e-12)
+        assert found.modulus == pytest.approx(nearest(system), rel=1e-8)
+    assert compared >= min(15, 0.75 * len(seeds))
+
+
+def nearest(system):
+    """The least distance from -1, by python-control's response on finer and finer grids."""
+    seen, half = to_control(system), math.pi / system.period if system.period else 1e5
+
+    def distance(log_w):
+        w = np.exp(log_w)
+        return np.abs(1 + seen(np.exp(1j * w * system.period) if system.period else 1j * w))
+
+    low, high, best = math.log(1e-4), math.log(half), distance(-math.inf)
+    for _ in range(5):  # each 500 times finer
+        grid = np.linspace(low, high, 2_001)
+        values = distance(grid)
+        i = int(np.argmin(values))
+        best = min(best, values[i])
+        low, high = grid[max(i - 2, 0)], grid[min(i + 2, len(grid) - 1)]
+    return min(best, math.inf if system.period else 1.0)
+
+
+def test_margins_are_where_the_closed_loop_turns_unstable():
+    for seed in range(12):
+        for sampled in (False, True):
+            system, inside = random_loop(seed, sampled), 1e-6
+            found = margins(system)
+            for factor, step in ((found.gain[1], inside), (found.gain[0], -inside)):
+                if math.isfinite(factor) and factor > 0:
+                    assert stable(system._replace(C=system.C * factor * (1 - step)))
+                    assert not stable(system._replace(C=system.C * factor * (1 + step)))
+            if not sampled and math.isfinite(found.delay):
+                assert stable(system._replace(delay=found.delay * (1 - inside)))
+                assert not stable(system._replace(delay=found.delay * (1 + inside)))
+
+
+def test_a_delay_in_continuous_time_against_the_closed_form():
+    """L = k e^(-s d)/s: stable for k d < pi/2; phase pi/2 - k d, gain pi/(2 k d), delay pi/(2 k) - d."""
+    k, d = 3.0, 0.2
+    loop = Transfer(np.zeros((1, 1)), np.ones((1, 1)), np.full((1, 1), k), np.zeros((1, 1)), delay=d)
+    found = margins(loop)
+    assert found.stable
+    assert found.phase == pytest.approx(math.pi / 2 - k * d, rel=1e-12)
+    assert found.gain[1] == pytest.approx(math.pi / (2 * k * d), rel=1e-12)
+    assert found.gain_at[1] == pytest.approx(math.pi / (2 * d), rel=1e-12)
+    assert found.delay == pytest.approx(math.pi / (2 * k) - d, rel=1e-12)
+    w = np.linspace(0.01, 20, 200_001)
+    assert found.sensitivity == pytest.approx(np.max(1 / np.abs(1 + k * np.exp(-1j * w * d) / (1j * w))), rel=1e-8)
+    assert not margins(loop._replace(delay=0.99 * math.pi / (2 * k) + 0.02)).stable
+
+
+@killed_by(
+    "linear/stability_margins.py", "times = 1 + math.floor((system.delay - first) * w / (2 * math.pi))", "times = 1"
+)
+@killed_by("linear/stability_margins.py", "2 * times if falling else -2 * times", "2 * times")
+def test_a_delay_can_bring_back_what_it_took():
+    """x'' + x = -k x'(t - d) loses stability and regains it as d grows; the counts are those with a Pade approximat."""
+    k = 0.3
+    loop = Transfer(
+        np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[0.0], [1.0]]), np.array([[0.0, k]]), np.zeros((1, 1))
+    )
+    for d in np.linspace(0.1, 9.0, 60):
+        closed = control.feedback(to_control(loop._replace(delay=d), pade=9), 1)
+        assert stable(loop._replace(delay=d)) == bool(np.all(closed.poles().real < 0)), d
+    assert not stable(loop._replace(delay=3.0))
+    assert stable(loop._replace(delay=6.0))
+
+
+@killed_by("linear/stability_margins.py", "[end for end in ends if _real(system, end)]", "[]")
+def test_ends_of_the_axis():
+    """A first-order loop that needs its gain, L = k/(s - 1), may lose a factor k; sampled, it turns over at z = -1."""
+    one = np.ones((1, 1))
+    found = margins(Transfer(one, one, 4 * one, 0 * one))
+    assert found.gain == (pytest.approx(0.25, rel=1e-12), math.inf)
+    assert found.gain_at[0] == 0.0
+    found = margins(Transfer(0.5 * one, one, one, 0 * one, period=0.1))  # z = 0.5 - k: -1 at k = 1.5
+    assert found.gain == (0.0, pytest.approx(1.5, rel=1e-12))
+    assert found.gain_at[1] == pytest.approx(math.pi / 0.1)
+
+
+LOOPS = {
+    "state feedback": {},
+    "PID": {"controller": PID(kp=60.0, ki=400.0, kd=0.3, low=-np.inf, high=np.inf)},
+    "lag": {"actuator": Lag(time_constant=4e-3)},
+    "sampled": {"controller": Sampled(controller=StateFeedback(), period=2e-3)},
+    "sampled, half a period late": {"controller": Sampled(controller=StateFeedback(), period=2e-3, delay=1e-3)},
+    "sampled PID, lag": {
+        "controller": Sampled(controller=PID(kp=60.0, ki=400.0, kd=0.3, high=np.inf, low=0.0), period=2e-3, delay=2e-3),
+        "actuator": RateLimit(time_constant=4e-3),
+    },
+}
+
+
+@killed_by(
+    "linear/opened_loop.py",
+    "delay += float(sampled.delay) if sampled else 0.0",
+    "pass",
+    case="sampled, half a period late",
+)
+@pytest.mark.parametrize("name", cases(LOOPS, "sampled", "lag", "state feedback", "PID", "sampled, half a period late"))
+def test_closed_is_the_loop_of_the_certificates(name):
+    """Its poles are those of A + B K, which the linear slip model has from elsewhere."""
+    loop = rig(**LOOPS[name])
+    reduced = state_feedback(loop)
+    model = reduced.model.matrices()
+    wanted = np.linalg.eigvals(np.asarray(model.A) + np.asarray(model.B) @ reduced.gain[None])
+    opened = open_loop(loop).transfer().without_delay()
+    found = np.linalg.eigvals(opened.A - opened.B @ opened.C)
+    wanted, found = (np.sort_complex(p[np.abs(p) > 1e-7]) for p in (wanted, found))
+    np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-9)
+
+
+@killed_by("linear/opened_loop.py", "there.at[0].set(around.setpoint) if around.frozen else there", "there")
+@pytest.mark.slow
+def test_the_brake_lab_rig_and_a_filtered_sensor_come_to_rest():
+    lab = rig(plant=LabRig(), initial=BrakeStart(speed=14.0), controller=StateFeedback(gain=(-60.0, -4.0)))
+    reduced = state_feedback(lab)
+    model = reduced.model.matrices()
+    wanted = np.linalg.eigvals(np.asarray(model.A) + np.asarray(model.B) @ reduced.gain[None])
+    opened = open_loop(lab).transfer()
+    found = np.linalg.eigvals(opened.A - opened.B @ opened.C)
+    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(wanted), rtol=1e-8)
+    direct, filtered = open_loop(rig()).transfer(), open_loop(rig(sensor=WheelSpeed(time_constant=3e-3))).transfer()
+    w = np.geomspace(1, 1e4, 30)
+    np.testing.assert_allclose(filtered.response(w), direct.response(w) / (1 + 3e-3j * w[:, None, None]), rtol=1e-9)
+
+
+@killed_by(
+    "linear/opened_loop.py",
+    "delay = float(sum(block.time for block in blocks if isinstance(block, Delay)))",
+    "delay = 0.0",
+)
+def test_a_pure_delay_turns_the_phase_and_nothing_else():
+    w = np.geomspace(1, 2000, 40)
+    plain = open_loop(rig(actuator=Lag(time_constant=1e-3))).transfer()
+    late = open_loop(rig(actuator=Series(blocks=(Delay(time=1e-3), Lag(time_constant=1e-3))))).transfer()
+    np.testing.assert_allclose(late.response(w)[:, 0, 0], plain.response(w)[:, 0, 0] * np.exp(-1e-3j * w), rtol=1e-12)
+    one, other = margins(plain), margins(late)
+    assert other.delay == pytest.approx(one.delay - 1e-3, rel=1e-9)
+
+
+@killed_by("linear/opened_loop.py", "rest = max(delay - whole * self.period, 0.0)", "rest = 0.0")
+@pytest.mark.slow
+def test_a_sampled_loop_behind_a_delay_is_that_of_a_step_response():
+    """2.6 periods of delay: the pulse response of L(z) is that of the continuous plant, which has one state."""
+    period, delay, gain = 2e-3, 5.2e-3, -20.0
+    controller = Sampled(controller=StateFeedback(gain=(0.0, gain)), period=period)
+    found = open_loop(rig(controller=controller, actuator=Delay(time=delay))).transfer()
+    assert found.delay == pytest.approx(2 * period)
+    plant = open_loop(rig(controller=StateFeedback(gain=(0.0, gain)))).transfer()
+    a, b, c = plant.A[0, 0], plant.B[0, 0], plant.C[0, 0]
+
+    def step(t):
+        return c * b * math.expm1(a * t) / a if t > 0 else 0.0
+
+    wanted = [step(k * period - delay) - step((k - 1) * period - delay) for k in range(60)]
+    whole = found.without_delay()
+    states = [whole.B]
+    for _ in wanted[2:]:
+        states.append(whole.A @ states[-1])
+    np.testing.assert_allclose([0.0, *((whole.C @ x).item() for x in states)], wanted, rtol=1e-9, atol=1e-12)
+
+
+@killed_by("linear/stability_margins.py", "loop.period is None or not math.isfinite(guess)", "True")
+def test_the_delay_margin_of_a_sampled_loop_is_where_it_turns_unstable():
+    loop = rig(controller=Sampled(controller=StateFeedback(gain=(-3000.0, -48.0)), period=4e-3))
+    opened = open_loop(loop)
+    found = margins(opened)
+    worst = brentq(
+        lambda d: max(abs(p) for p in closed_poles(opened.transfer(d))) - 1, 0.5 * found.delay, 1.5 * found.delay
+    )
+    assert found.delay == pytest.approx(worst, rel=1e-8)
+    crossover = margins(opened.transfer())
+    assert found.delay != pytest.approx(crossover.delay, rel=1e-5)  # which forgets that the hold is sampled anew
+
+
+def closed_poles(system):
+    system = system.without_delay()
+    return np.linalg.eigvals(system.A - system.B @ system.C)
+
+
+@killed_by("linear/opened_loop.py", "OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)", "OFFSETS = (0.0,)")
+@killed_by("core/tracing.py", "not _zero(step) and not needed", "not needed")
+@pytest.mark.slow
+def test_noise_is_a_disturbance_and_limits_do_not_act():
+    plain = open_loop(rig()).transfer()
+    w = np.geomspace(1, 1e3, 9)
+    noisy = rig(sensor=Noise(slip=0.01), controller=StateFeedback(torque_min=0.0, torque_max=9.03))
+    np.testing.assert_allclose(open_loop(noisy).transfer().response(w), plain.response(w), rtol=1e-12)
+    integrating = rig(controller=PID(ki=300.0, low=0.0, high=9.03))
+    held = dataclasses.replace(integrating, feedforward=load("slip-estimator").loop.feedforward)
+    np.testing.assert_allclose(
+        open_loop(held).transfer().response(w), open_loop(integrating).transfer().response(w), rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"controller": ConstantTorque()}, "its command does not follow"),
+        ({"controller": Relay()}, "acts at instants"),
+        ({"controller": PID(kp=1.0, high=0.5, low=0.0)}, "does not follow what is measured at the setpoint"),
+    ],
+    ids=["constant", "relay", "at its limit"],
+)
+def test_what_has_no_linear_loop_says_why(parts, words):
+    with pytest.raises(ValueError, match=words):
+        open_loop(rig(**parts))
+
+
+@killed_by("linear/transfer.py", "for _ in range(round(shifts)):", "for _ in range(0):")
+def test_python_control_there_and_back():
+    system = random_loop(3, True)._replace(delay=0.0)
+    back = from_control(to_control(system))
+    assert back.period == system.period
+    w = np.linspace(0.1, 1, 5)
+    np.testing.assert_allclose(back.response(w), system.response(w), rtol=1e-12)
+    late = system._replace(delay=3 * system.period)
+    np.testing.assert_allclose(to_control(late)(np.exp(1j * w * system.period)), late.response(w)[:, 0, 0], rtol=1e-10)
+    with pytest.raises(ValueError, match="pade=ORDER"):
+        to_control(random_loop(3, False)._replace(delay=0.1))
+    assert to_control(random_loop(3, False)._replace(delay=0.1), pade=3).nstates == len(random_loop(3, False).A) + 3
+    with pytest.raises(ValueError, match="whole number of periods"):
+        to_control(system._replace(delay=0.4 * system.period))
+    with pytest.raises(ValueError, match="dt is True"):
+        from_control(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], True))
+    with pytest.raises(ValueError, match="one input and one output"):
+        margins(Transfer(np.eye(2) * -1, np.eye(2), np.eye(2), np.zeros((2, 2))))
+
+
+@killed_by("linear/robustness.py", "return {name: max(self.systems", "return {name: min(self.systems")
+def test_a_band_is_of_the_corners_and_of_samples_between():
+    loop, over = rig(), {"plant.mass": (5.3, 6.2), "initial.speed": (2.0, 10.0)}
+    found = band(loop, over, samples=5)
+    assert found.corners == 4
+    assert len(found.systems) == 9
+    inside = [tuple(one.values.values()) for one in found.systems[4:]]
+    assert all(5.3 < mass < 6.2 and 2.0 < speed < 10.0 for mass, speed in inside)
+    assert len(set(inside)) == 5
+    one = found.systems[2]
+    alone = margins(open_loop(jax.tree.map(lambda x: x, dataclasses.replace(
+        loop, plant=MirroredRig(mass=6.2), initial=BrakeStart(speed=2.0)))))  # fmt: skip
+    assert one.values == {"plant.mass": 6.2, "initial.speed": 2.0}
+    assert one.margins.phase == pytest.approx(alone.phase, rel=1e-12)
+    worst = found.worst()
+    assert worst["phase"].margins.phase == min(one.margins.phase for one in found.systems)
+    assert worst["gain_down"].margins.gain[0] == max(one.margins.gain[0] for one in found.systems)
+    with pytest.raises(ValueError, match="inverted"):
+        band(loop, {"plant.mass": (6.2, 5.3)})
+
+
+def test_the_command_says_margins_and_where_they_are_worst(tmp_path):
+    done = command("margins", "slip-cured", "--json", "--samples", "4", "--plot", str(tmp_path / "loop.png"))
+    result = json.loads(done.stdout)
+    assert result["margins"]["stable"]
+    assert result["corners"] == 4
+    assert len(result["systems"]) == 8
+    slow = {"plant.mass": 6.2, "initial.speed": 5 / 3.6}
+    assert result["worst"]["phase"]["values"] == pytest.approx(slow)
+    here = open_loop(load("slip-cured").loop)
+    assert result["margins"]["phase"] == pytest.approx(margins(here).phase, rel=1e-12)
+    assert (tmp_path / "loop.png").stat().st_size > 10_000
+    assert "mass 6.2 kg, speed 5 km/h" in command("margins", "slip-cured", "--samples", "0").stdout
+    done = command("margins", "slip-cured", "--at", "speed_kmh=6", "--at", "plant.mass=6.2", "--json")
+    result = json.loads(done.stdout)
+    assert result["systems"] == []
+    assert result["margins"]["phase"] == pytest.approx(margins(open_loop(load(
+        "slip-cured", ["plant.mass=6.2", "initial.speed_kmh=6"]).loop)).phase, rel=1e-12)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["slip-cured", "--at", "plant.mas=6"], 2, "did you mean plant.mass"),
+        (["slip-cured", "--at", "speed"], 2, "a number is needed"),
+        (["slip-cured", "--at", "speed=-1"], 2, "--at initial.speed = -1"),
+        (["slip-cured", "--at", "speed=1", "--at", "speed=2"], 2, "given twice"),
+        (["lab-rig"], 1, "does not follow what is measured"),
+        (["slip-lmi", "--set", "controller.gain=30,30"], 1, "not stable"),
+    ],
+)
+def test_the_command_refuses_in_one_line(arguments, status, words):
+    done = command("margins", *arguments, "--samples", "0", status=status)
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error:")]
+    assert len(errors) == 1
+    assert words in errors[0]
+
+
+def test_the_page_runs(capsys):
+    page = ROOT / "docs" / "margins.md"
+    code = page.read_text().partition("```python\n")[2].partition("```")[0]
+    exec(compile(code.replace("samples=100", "samples=2"), "margins.md", "exec"), {})
+    assert capsys.readouterr().out.count("\n") == 3

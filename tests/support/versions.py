@@ -1,0 +1,76 @@
+"""Run tests under other versions of Python and JAX.
+
+    python tests/support/versions.py python3.11=0.10 python3.12=0.11 python3.13=0.12
+
+Each pair gets a virtual environment of its own below --out, with the package, its extras and the tests' group. Without
+--tests those files run that depend most on JAX itself. Prints a line for each pair; exits with 1 if one has failed.
+"""
+
+import argparse
+import pathlib
+import subprocess
+import sys
+
+from project import ROOT
+
+TESTS = (
+    "core/test_pytree",
+    "core/test_blocks",
+    "linear/test_linearize",
+    "linear/test_riccati",
+    "simulate/test_integrate",
+    "simulate/test_rollout",
+    "simulate/test_gradients",
+    "simulate/test_batch",
+    "simulate/test_checkpoints",
+    "simulate/test_tsit5",
+    "simulate/test_adaptive",
+    "kernel/test_kernel",
+    "kernel/test_kernel_start",
+    "kernel/test_kernel_native",
+    "kernel/test_kernel_tangents",
+    "tune/test_tune",
+    "sweep/test_sweep",
+)
+
+
+def environment(folder: pathlib.Path, python: str, jax: str) -> pathlib.Path:
+    """The interpreter of a virtual environment with this JAX. Raises CalledProcessError."""
+    interpreter = folder / "bin" / "python"
+    if not interpreter.exists():
+        subprocess.run([python, "-m", "venv", folder], check=True)
+    pip = [interpreter, "-m", "pip", "install", "--quiet"]
+    subprocess.run([*pip, "--upgrade", "pip>=25.1"], check=True, cwd=ROOT)
+    subprocess.run([*pip, f"jax=={jax}.*", "--editable", ".[plot,design,tune,cluster]"], check=True, cwd=ROOT)
+    subprocess.run([*pip, "--group", "test"], check=True, cwd=ROOT)
+    return interpreter
+
+
+def main() -> int:
+    """Run each pair. Returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pairs", nargs="+", metavar="PYTHON=JAX")
+    parser.add_argument("--tests", nargs="+", metavar="FILE", default=[f"tests/{name}.py" for name in TESTS])
+    parser.add_argument("--out", type=pathlib.Path, default=ROOT / "out" / "versions")
+    options = parser.parse_args()
+    pairs = [tuple(pair.rpartition("=")[::2]) for pair in options.pairs]
+    if not all(python and jax for python, jax in pairs):
+        parser.error("a pair is PYTHON=JAX, as in python3.13=0.12")
+    failed = 0
+    for python, jax in pairs:
+        folder = options.out.absolute() / f"{pathlib.Path(python).name}-jax-{jax}"
+        try:
+            interpreter = environment(folder, python, jax)
+        except (OSError, subprocess.CalledProcessError) as error:
+            print(f"{python} with JAX {jax}: not installed: {error}", flush=True)
+            failed += 1
+            continue
+        tests = ["-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", *options.tests]
+        status = subprocess.run([interpreter, *tests], cwd=ROOT).returncode
+        print(f"{python} with JAX {jax}: {'passed' if status == 0 else 'FAILED'}", flush=True)
+        failed += status != 0
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
