@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow coverage versions lint docs bench bench-peers bench-check bench-figure mutants fuzz clean
+.PHONY: demo test test-slow test-nightly test-weekly coverage versions lint docs bench bench-peers bench-check bench-figure mutants fuzz clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -18,6 +18,10 @@ coverage: $(VENV)/.test
 
 test-slow: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
+
+# two larger tiers; each writes into docs/test-status.md when it ran and what failed
+test-nightly test-weekly: test-%: $(VENV)/.test
+	$(BIN)/python tests/support/tiers.py $*
 
 lint: $(VENV)/.lint $(VENV)/.test
 	$(BIN)/ruff check .

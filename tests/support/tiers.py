@@ -1,0 +1,121 @@
+"""Run a tier of the tests and write into docs/test-status.md when it ran, on which commit, how long, and what failed.
+
+    python tests/support/tiers.py fast | nightly | weekly
+
+fast      tests without the mark `slow`: every change, `make test`
+nightly   slow tests without the mark `weekly`, fast tests of the engine with the compiler flags that users have, and a
+          seventh of the mutants, another one each day
+weekly    all slow tests, all fast tests with these flags, all mutants, and the fuzzers
+
+The exit status is 1 if something failed. A tier that is interrupted writes nothing."""
+
+import datetime
+import os
+import re
+import subprocess
+import sys
+import time
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import NamedTuple
+
+from project import ROOT
+
+PAGE = ROOT / "docs" / "test-status.md"
+OUT = ROOT / "out" / "tiers"
+PYTEST = ("-m", "pytest", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
+ENGINE = ("tests/core", "tests/simulate", "tests/objectives", "tests/controllers", "tests/actuators")
+USERS_FLAGS = MappingProxyType({"DIFFABS_TEST_XLA": "default"})
+SHOWN_FAILURES = 12
+
+
+class Job(NamedTuple):
+    """A part of a tier: its name, the arguments of Python, and what it adds to the environment."""
+
+    name: str
+    arguments: tuple[str, ...]
+    environment: Mapping[str, str] = MappingProxyType({})
+
+
+def jobs_of_tier(tier: str, today: datetime.date) -> list[Job]:
+    """Return the jobs of a tier on a day. Raises KeyError for a tier that does not exist."""
+    mutants, fuzz = "tests/support/mutants.py", "tests/support/fuzz_"
+    return {
+        "fast": [Job("fast tests", (*PYTEST, "-m", "not slow"))],
+        "nightly": [
+            Job("slow tests", (*PYTEST, "-m", "slow and not weekly")),
+            Job("the engine's tests, users' flags", (*PYTEST, "-m", "not slow", *ENGINE), USERS_FLAGS),
+            Job("a seventh of the mutants", (mutants, "--part", f"{today.toordinal() % 7}/7")),
+        ],
+        "weekly": [
+            Job("slow tests", (*PYTEST, "-m", "slow")),
+            Job("fast tests, users' flags", (*PYTEST, "-m", "not slow"), USERS_FLAGS),
+            Job("all mutants", (mutants,)),
+            Job("scenarios of the fuzzer", (f"{fuzz}scenarios.py", "--count", "20000", "--seed", "0")),
+            Job("files of the fuzzer", (f"{fuzz}files.py", "--count", "2000", "--seed", "0")),
+        ],
+    }[tier]
+
+
+def run_job(job: Job) -> tuple[str, list[str]]:
+    """Run a job, print what it prints, and return its outcome in a few words and the names of what failed."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    report = OUT / f"{re.sub(r'[^a-z]+', '-', job.name)}.xml"
+    report.unlink(missing_ok=True)
+    more = (f"--junitxml={report}",) if "pytest" in job.arguments else ()
+    command = [sys.executable, *job.arguments, *more]
+    with subprocess.Popen(
+        command, cwd=ROOT, env={**os.environ, **job.environment}, stdout=subprocess.PIPE, text=True
+    ) as running:
+        assert running.stdout is not None
+        lines = [print(line, end="", flush=True) or line for line in running.stdout]
+    if report.exists():
+        return _read_report(report)
+    failed = [line.strip() for line in lines if re.search(r"SURVIVES|IS OUT OF DATE|^FAILED", line)]
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "nothing printed")
+    return last, failed or ([last] if running.returncode else [])
+
+
+def _read_report(report: os.PathLike[str]) -> tuple[str, list[str]]:
+    cases = list(ElementTree.parse(report).iter("testcase"))
+    failed = [f"{one.get('classname')}::{one.get('name')}" for one in cases if _has(one, "failure", "error")]
+    skipped = sum(_has(one, "skipped") for one in cases)
+    return f"{len(cases) - len(failed) - skipped} passed, {skipped} skipped, {len(failed)} failed", failed
+
+
+def _has(case: ElementTree.Element, *kinds: str) -> bool:
+    return any(case.find(kind) is not None for kind in kinds)
+
+
+def write_status(tier: str, commit: str, minutes: float, rows: list[tuple[Job, float, str, list[str]]]) -> None:
+    """Replace the tier's section of docs/test-status.md."""
+    section = [f"## {tier.capitalize()}", ""]
+    section += [f"{datetime.date.today()}, commit {commit}, {os.cpu_count()} cores: {minutes:.1f} min.", ""]
+    section += ["| job | minutes | outcome |", "|---|---|---|"]
+    section += [f"| {job.name} | {spent:.1f} | {outcome.replace('|', ' ')} |" for job, spent, outcome, _ in rows]
+    failed = [name for *_, names in rows for name in names]
+    if failed:
+        section += ["", "Failed:", "", *(f"- `{name}`" for name in failed[:SHOWN_FAILURES])]
+        section += [f"- and {len(failed) - SHOWN_FAILURES} more"] if len(failed) > SHOWN_FAILURES else []
+    text = PAGE.read_text(encoding="utf-8")
+    old = re.compile(rf"^## {tier.capitalize()}\n.*?(?=^## |\Z)", re.MULTILINE | re.DOTALL)
+    PAGE.write_text(old.sub(lambda _: "\n".join([*section, "", ""]), text).rstrip() + "\n", encoding="utf-8")
+
+
+def main(tier: str) -> int:
+    """Run a tier and write its section."""
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.strip()
+    rows, begun = [], time.monotonic()
+    for job in jobs_of_tier(tier, datetime.date.today()):
+        start = time.monotonic()
+        outcome, failed = run_job(job)
+        rows.append((job, (time.monotonic() - start) / 60, outcome, failed))
+    write_status(tier, commit, (time.monotonic() - begun) / 60, rows)
+    return int(any(failed for *_, failed in rows))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1]))
