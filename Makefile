@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-slow test-nightly test-weekly coverage versions lint docs bench bench-peers bench-check bench-figure mutants fuzz clean
+.PHONY: demo test test-slow test-nightly test-weekly coverage versions lint docs bench bench-peers bench-check bench-figure mutants mutate-changes fuzz clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -67,6 +67,11 @@ bench-figure: $(VENV)/.bench
 mutants: $(VENV)/.test
 	$(BIN)/python tests/support/mutants.py
 
+# small changes of the lines that differ from BASE, and whether the tests notice them
+BASE ?= main
+mutate-changes: $(VENV)/.mutate
+	$(BIN)/python tests/support/mutate_changes.py --base $(BASE)
+
 # the oldest and newest Python and JAX: VERSIONS="python3.11=0.10 ..."
 VERSIONS ?= python3.11=0.10 python3.12=0.11 python3.13=0.12
 versions:
@@ -89,6 +94,6 @@ $(VENV)/.installed: $(VENV)/.python pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable ".[all]"
 	touch $@
 
-$(VENV)/.test $(VENV)/.lint $(VENV)/.docs $(VENV)/.bench: $(VENV)/.%: $(VENV)/.installed
+$(VENV)/.test $(VENV)/.lint $(VENV)/.docs $(VENV)/.bench $(VENV)/.mutate: $(VENV)/.%: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --group $*
 	touch $@
