@@ -355,6 +355,7 @@ def test_wrong_usage_is_one_line(args, needed):
     assert needed.lower() in result.stderr.lower()
 
 
+@pytest.mark.slow
 def test_quiet_says_results_and_warnings_only(monkeypatch):
     noise = ("--set", "sensor=noise", "--set", "solver.seed=3")
     monkeypatch.setattr(console, "PATIENCE", 0.0)

@@ -30,6 +30,7 @@ sweep = {samples = 40, chunk = 40, seed = 5, check = 6, over = {"plant.mass" = [
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
 
+@pytest.mark.slow
 def test_simulate_check_says_how_accurate_each_metric_is(file):
     path = file(RELAY)
     result = json.loads(run("simulate", path, "--check", "--json").stdout)

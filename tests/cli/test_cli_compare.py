@@ -29,6 +29,7 @@ def swept(tmp_path_factory):
     return folder, document
 
 
+@pytest.mark.slow
 def test_the_document_is_about_the_table(swept):
     folder, document = swept
     found = Results(folder / "a")

@@ -258,6 +258,7 @@ def test_a_derivative_through_a_kink_is_that_of_the_closed_form(name):
         np.testing.assert_allclose(jax.grad(final)(place), wanted[1], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_comparison_close_to_the_beginning_of_a_run_is_landed_on():
     """At rest all comparisons of a run are near their zeros. A probe for one of them would lie before the first step,
     where another one changes: then the backward pass would be of no number, where the run and its tangents are."""

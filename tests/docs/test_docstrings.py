@@ -99,8 +99,9 @@ def is_there(dotted):
 
 
 def is_a_place(place):
-    """Whether a module, a package or another file stands there."""
-    return (HOME / place).is_dir() or any((HOME / place).parent.glob(f"{pathlib.Path(place).name}.*"))
+    """Whether a module, a package, a test or another file stands there."""
+    homes = (HOME / place, HOME.parent / "tests" / place)
+    return any(home.is_dir() or any(home.parent.glob(f"{home.name}.*")) for home in homes)
 
 
 @killed_by("tune/constraints.py", "`design.interior.differentiable`", "`design.sensitivity`")

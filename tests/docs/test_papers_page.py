@@ -58,7 +58,7 @@ def test_each_row_has_a_verdict_and_shows_it(paper):
 
 
 def test_every_test_that_is_named_exists():
-    named = set(re.findall(r"`(test_\w+\.py)::(\w+)`", PAGE))
+    named = set(re.findall(r"`(\w+/test_\w+\.py)::(\w+)`", PAGE))
     assert len(named) > 50
     for file, name in named:
         tree = ast.parse((ROOT / "tests" / file).read_text(encoding="utf-8"))
@@ -81,7 +81,7 @@ def test_every_command_that_is_named_exists():
 
 
 def test_every_verdict_computed_for_this_page_is_on_it():
-    tree = ast.parse((ROOT / "tests" / "test_papers_verdicts.py").read_text(encoding="utf-8"))
+    tree = ast.parse((ROOT / "tests" / "papers" / "test_papers_verdicts.py").read_text(encoding="utf-8"))
     there = {node.name for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
     assert {name for name in there if f"test_papers_verdicts.py::{name}`" not in PAGE} == set()
 

@@ -261,6 +261,7 @@ def noisy(loop, fields, sigmas, seed, **more):
 
 
 class TestTraces:
+    @pytest.mark.slow
     def test_known_parameters_are_recovered_within_three_deviations(self):
         truth = replace(LOOP, {"plant.inertia": 1.3, "plant.road.scale": 0.8})
         data = noisy(truth, ("wheel_speed", "speed"), {"wheel_speed": 0.05, "speed": 0.1}, seed=1)

@@ -32,6 +32,7 @@ STUDY = Study(
 )
 
 
+@pytest.mark.slow
 def test_scores_are_runs():
     z = np.array([[0.0, 0.0], [-2.0, 1.0], [3.0, -1.0]])
     found = _scores(STUDY, "stop_distance", z)

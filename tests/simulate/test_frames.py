@@ -207,6 +207,7 @@ def test_the_frame_of_a_sweep_has_units_and_says_what_failed(swept, monkeypatch)
     assert "<table>" in swept._repr_html_()
 
 
+@pytest.mark.slow
 @killed_by("sweep/results.py", "{name: failed & run for", "{name: failed for")
 def test_what_was_missed_or_refused_is_told_apart(swept, monkeypatch):
     stopped, refused = np.ones(20, bool), np.full(20, "")

@@ -124,6 +124,7 @@ def test_a_period_of_a_batch_has_no_derivative(engine, together):
         jax.eval_shape(lambda x: jax.jvp(distances, (x,), (1.0,)), period)
 
 
+@pytest.mark.slow
 def test_a_clock_leaves_the_derivatives_of_other_parameters():
     loop = CLOCKS[0][0]
 
@@ -245,6 +246,7 @@ def test_points_with_one_side_are_named(loop, paths, said):
     assert warned(loop, [path for path in free if path not in paths]) == []
 
 
+@pytest.mark.slow
 def test_points_with_one_side_are_named_in_any_run_and_subject():
     """One run of a batch may stand on the point, and what is free need not be a parameter of the loop."""
     loop = braking(controller=controllers.Relay())

@@ -150,6 +150,7 @@ class TestBeforeARun:
             with pytest.raises(ValueError, match=message):
                 d.check(RIG, solver)
 
+    @pytest.mark.slow
     @killed_by("simulate/stable_step.py", "bound = jnp.max(jnp.exp(log)", "bound = 0.5 * jnp.max(jnp.exp(log)")
     def test_the_step_is_judged_as_by_the_eigenvalues(self):
         """Whatever a lane is decided by: the first bound, the squared one, or its eigenvalues; the last are NumPy's."""

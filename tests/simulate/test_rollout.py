@@ -237,6 +237,7 @@ def test_a_diverging_lane_is_flagged_and_leaves_the_others_alone():
     np.testing.assert_allclose(many.metrics["iae"][0], run(gains[0]).metrics["iae"], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_float32_follows_the_inputs():
     single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), RIG)
     run = d.measure(single, d.FixedStep(1e-3, 2.0), BRAKING)

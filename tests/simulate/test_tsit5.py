@@ -140,6 +140,7 @@ def written_out(f, t, x, rate, h, given):
     return tsit5_pair(lambda t, x: f(t, x, given), t, x, rate, h)[0]
 
 
+@pytest.mark.slow
 @killed_by(
     "simulate/tsit5.py",
     "rounds = (jnp.arange(1, count), jnp.asarray(PLACES, dtype), jnp.asarray(rows, dtype))",

@@ -64,6 +64,7 @@ def flipped(data, bit):
 # Chunks
 
 
+@pytest.mark.slow
 @killed_by("sweep/seal.py", "if name(seal.chunk, data) != path.name:", "if False:")
 @pytest.mark.parametrize("seed", range(4))
 def test_every_flipped_bit_of_a_chunk_is_seen(copy, seed):

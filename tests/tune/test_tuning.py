@@ -338,6 +338,7 @@ class Shortness:
 
 
 class TestWorstCase:
+    @pytest.mark.slow
     def test_it_is_at_least_as_bad_as_a_thousand_samples(self):
         measured = {"max_slip": BRAKING["max_slip"]}
         found = worst_case(
@@ -370,6 +371,7 @@ class TestWorstCase:
         best = float(np.max(d.run_batch(RIG, lanes, SOLVER, measured).metrics["short"]))
         assert found.screened < best <= found.value + 1e-9
 
+    @pytest.mark.slow
     def test_points_without_gradients(self):
         """Any number of points, the first of Sobol's."""
         found = worst_case(RIG, over=BOX, metric="iae", solver=SOLVER, screen=9, starts=0)
