@@ -23,7 +23,7 @@ from rich.table import Table
 
 from diffabs import FixedStep
 from diffabs.core.pytree import replace
-from diffabs.design.attraction import Cells, attraction
+from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.scenario.scenario import load
 
 DTYPES = ("float64", "float32")
@@ -40,7 +40,7 @@ def child(options):
     times = []
     for _ in range(options.rounds + 1):
         begun = time.perf_counter()
-        found = attraction(loop, cells, cells, FixedStep(step=1e-3, duration=60.0))
+        found = region_of_attraction(loop, cells, cells, FixedStep(step=1e-3, duration=60.0))
         times.append(time.perf_counter() - begun)
     first, *rest = times
     seen = {

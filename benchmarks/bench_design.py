@@ -26,7 +26,7 @@ from rich.table import Table
 
 from diffabs.design import Polytope, Spec, certify, design
 from diffabs.design.sdp import solver
-from diffabs.design.sdp.program import Program
+from diffabs.design.sdp.program import DesignProgram
 from diffabs.design.sdp.scaling import design_frames
 
 BETA, ALPHAS, SPEEDS = 133.472842636189, (83.8796606703, 84.6321445666), (140.291806958, 14.0291806958)
@@ -39,9 +39,9 @@ RIG = Polytope(
 def solved(spec):
     """Only the program, in the first frame."""
     frame, _ = next(iter(design_frames(RIG, spec.Q, spec.R)))
-    program = Program(RIG, RIG, spec, frame)
+    program = DesignProgram(RIG, RIG, spec, frame)
     c = program.objective()
-    return float(c @ solver.solve(c, program.blocks(1.0)).y) * program.scale
+    return float(c @ solver.solve_sdp(c, program.blocks(1.0)).y) * program.scale
 
 
 def by_hand(spec):

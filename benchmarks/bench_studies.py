@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from diffabs import FixedStep
-from diffabs.design.attraction import Cells, attraction
+from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.reliability.failure import failure_probability
 from diffabs.scenario import load, section_sweep
 from diffabs.tune.worst import worst_case
@@ -49,7 +49,9 @@ def rare(engine, size):
 def map_(engine, size):
     """The share that is recovered."""
     cells = Cells(-0.1, 0.1, round((size or 10_000) ** 0.5))
-    found = attraction(load("arm-hanging").loop, cells, cells, FixedStep(step=1e-3, duration=60.0), engine=engine)
+    found = region_of_attraction(
+        load("arm-hanging").loop, cells, cells, FixedStep(step=1e-3, duration=60.0), engine=engine
+    )
     return {"found": found.share, "undecided": found.undecided, "runs": cells.number**2}
 
 

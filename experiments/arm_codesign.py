@@ -33,8 +33,8 @@ from scipy.optimize import minimize
 from diffabs import Batch, FixedStep, Loop, plot
 from diffabs.core.pytree import replace
 from diffabs.design import certify
-from diffabs.design.attraction import Reach, largest
-from diffabs.design.parameter_grid import gridded
+from diffabs.design.attraction import Reach, largest_recovered_multiples
+from diffabs.design.parameter_grid import grid_polytope
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import recoverable_bound
 from diffabs.objectives import BALANCE, SoftLoss
@@ -131,7 +131,7 @@ def counted(config: Config, loop: Loop, riders: Any, most: float) -> list[Reach]
     """For each rider the largest multiple that is recovered, of so many up to `most`, by running them."""
     multiples = np.linspace(0.0, most, config.judged_multiples + 1)[1:]
     solver = FixedStep(step=config.judged_step, duration=config.judged_duration)
-    return largest(loop, {"plant.rider_mass": np.asarray(riders)}, DIRECTION, multiples, solver)
+    return largest_recovered_multiples(loop, {"plant.rider_mass": np.asarray(riders)}, DIRECTION, multiples, solver)
 
 
 def worst_of(reaches: list[Reach]) -> float:
@@ -222,7 +222,7 @@ def judged(config: Config, machine: Machine) -> dict[str, Any]:
         value = float(getattr(loop.plant, name))
         box[f"plant.{name}"] = (0.7 * value, 1.3 * value)
     gain = np.asarray(loop.controller.gain)
-    proof = certify(gain, gridded(BalanceModel(plant=loop.plant), box, 3))
+    proof = certify(gain, grid_polytope(BalanceModel(plant=loop.plant), box, 3))
     start = {"initial.theta": START[0] * found.min(), "initial.phi": START[2] * found.min()}
     solver = FixedStep(step=config.judged_step, duration=config.judged_duration)
     heavy = replace(loop, {**start, "plant.rider_mass": riders.max()})

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from diffabs import FixedStep, Loop
-from diffabs.design.attraction import outcomes
+from diffabs.design.attraction import classify_starts
 
 Values = dict[str, np.ndarray]  # by name, with a leading axis of designs
 
@@ -75,6 +75,6 @@ def runs(
         each = np.tile(multiples, len(columns["plant.rider_mass"]))
         lanes |= {"initial.theta": start[0] * each, "initial.phi": start[2] * each}
         one = jax.tree.map(lambda x: x[0], loops)
-        return outcomes(one, lanes, solver).recovered.reshape(-1, len(multiples))
+        return classify_starts(one, lanes, solver).recovered.reshape(-1, len(multiples))
 
     return judge

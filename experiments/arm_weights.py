@@ -20,8 +20,8 @@ import numpy as np
 from diffabs import FixedStep, plot
 from diffabs.core.pytree import replace
 from diffabs.design import certify
-from diffabs.design.attraction import Basin, Cells, attraction, recoverable
-from diffabs.design.parameter_grid import gridded
+from diffabs.design.attraction import Basin, Cells, recoverable_multiple, region_of_attraction
+from diffabs.design.parameter_grid import grid_polytope
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import mode_bounds
 from diffabs.objectives import SoftLoss
@@ -90,7 +90,7 @@ def judged(config: Config, gain: Any) -> tuple[Basin, dict[str, Any]]:
     loop = replace(load("arm-hanging").loop, {"controller.gain": np.asarray(gain)})
     solver = FixedStep(step=config.step, duration=config.duration)
     cells = Cells(-config.box, config.box, config.starts)
-    basin = attraction(loop, cells, cells, solver)
+    basin = region_of_attraction(loop, cells, cells, solver)
     low, high = 1 - config.off, 1 + config.off
     spring, damper = loop.plant.stiffness, loop.plant.damping
     over = {
@@ -98,8 +98,8 @@ def judged(config: Config, gain: Any) -> tuple[Basin, dict[str, Any]]:
         "plant.stiffness": (low * spring, high * spring),
         "plant.damping": (low * damper, high * damper),
     }
-    proof = certify(gain, gridded(BalanceModel(plant=loop.plant), over, config.proof_points))
-    reach = recoverable(loop, PAPER_START, solver)
+    proof = certify(gain, grid_polytope(BalanceModel(plant=loop.plant), over, config.proof_points))
+    reach = recoverable_multiple(loop, PAPER_START, solver)
     return basin, {
         "share of the box": basin.share,
         "undecided": basin.undecided,

@@ -29,8 +29,8 @@ from diffabs.controllers import ConstantInput, HoldingInput, ProportionalFeedbac
 from diffabs.core.pytree import parameters
 from diffabs.design import Certificate, Polytope, Spec, certify, design
 from diffabs.design.parameter_box import polytope
-from diffabs.design.speed_scaled import SpeedScaled, fall
-from diffabs.design.state_feedback import feedback
+from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
+from diffabs.design.state_feedback import feedback_gain
 from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_design, record
@@ -117,7 +117,7 @@ def systems(config: Config) -> dict[str, Polytope]:
     model = SlipModel(slip=config.slip, actuator=Lag(time_constant=config.lag), sampling=Sampling(period=config.period))
     low, high = (speed / KMH for speed in config.proved_speeds)
     scaled = SpeedScaled(model=model, reference_speed=high)
-    falls = (0.0, fall(config.fastest_fall, low, config.period))
+    falls = (0.0, greatest_speed_fall(config.fastest_fall, low, config.period))
     return {
         "fixed": polytope(model, {"plant.mass": config.mass, "speed": (low, high)}),
         "proportional": polytope(scaled, {"model.plant.mass": config.mass, "model.speed": (low, high), "fall": falls}),
@@ -195,7 +195,7 @@ def judged(config: Config, one: Loop, system: Polytope, batch: Batch) -> tuple[d
     """Worst over the lanes, and what is proved of the gain."""
     solver = FixedStep(step=config.step, duration=config.duration)
     runs = jax.device_get(jax.jit(lambda one: run_batch(one, batch, solver, BRAKING))(one))
-    proof = certify(feedback(one, system.states), system, fastest=True)
+    proof = certify(feedback_gain(one, system.states), system, fastest=True)
     worst = {name: float(np.max(values)) for name, values in runs.metrics.items()}
     row = {
         "overshoot [%]": 100 * worst["overshoot"],

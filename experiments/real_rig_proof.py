@@ -30,8 +30,8 @@ from diffabs.actuators import Lag
 from diffabs.controllers import PID, ProportionalFeedback, StateFeedback
 from diffabs.design import Polytope, certify
 from diffabs.design.parameter_box import polytope
-from diffabs.design.parameter_grid import gridded
-from diffabs.design.speed_scaled import SpeedScaled, fall
+from diffabs.design.parameter_grid import grid_polytope
+from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
 from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.roads import RIG
 
@@ -87,7 +87,7 @@ def models(
     }
     if kind == "fixed":
         return model, over
-    falls = {"fall": (0.0, fall(config.fastest, low, fixed.period))}
+    falls = {"fall": (0.0, greatest_speed_fall(config.fastest, low, fixed.period))}
     scaled = SpeedScaled(model=model, reference_speed=50 / KMH)
     return scaled, {f"model.{path}": ends for path, ends in over.items()} | falls
 
@@ -111,7 +111,10 @@ def proofs(config: Proving, box: Box, fixed: Fixed, ones: dict[str, Loop]) -> di
     }
     systems = {
         kind: [
-            (covering(config, box, fixed, kind, cell), gridded(*models(config, box, fixed, kind, cell), config.points))
+            (
+                covering(config, box, fixed, kind, cell),
+                grid_polytope(*models(config, box, fixed, kind, cell), config.points),
+            )
             for cell in cells(config, box)
         ]
         for kind in {kind for _, kind in kinds.values()}

@@ -21,8 +21,8 @@ from diffabs.actuators import Lag
 from diffabs.controllers import StateFeedback
 from diffabs.design import Certificate, certify
 from diffabs.design.parameter_box import polytope
-from diffabs.design.speed_scaled import SpeedScaled, fall
-from diffabs.design.state_feedback import feedback
+from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
+from diffabs.design.state_feedback import feedback_gain
 from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
 from diffabs.papers import lmi_design, record
@@ -115,9 +115,9 @@ def proof(config: Config, one: Loop) -> Certificate:
         system = polytope(model, over, grid=5)
     else:
         wider = SpeedScaled(model=model, reference_speed=over["speed"][1])
-        falls = (0.0, fall(8.6, over["speed"][0], float(controller.period)))  # pyright: ignore[reportAttributeAccessIssue]
+        falls = (0.0, greatest_speed_fall(8.6, over["speed"][0], float(controller.period)))  # pyright: ignore[reportAttributeAccessIssue]
         system = polytope(wider, {**{f"model.{path}": ends for path, ends in over.items()}, "fall": falls}, grid=5)
-    return certify(feedback(one, system.states), system, fastest=True)
+    return certify(feedback_gain(one, system.states), system, fastest=True)
 
 
 def seen(config: Config, one: Loop) -> Run:

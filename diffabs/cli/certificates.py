@@ -28,8 +28,8 @@ from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.design import Certificate, Polytope, Spec
-    from diffabs.design.frozen import Frozen
-    from diffabs.design.state_feedback import Reduced
+    from diffabs.design.frozen import FrozenLoops
+    from diffabs.design.state_feedback import ReducedLoop
 
 # Of the JSON document. Without a certificate most are null.
 FROM_PROOF = ("quadratically_stable", "stable", "verified_exactly", "decay_rate", "damping", "trace_cost",
@@ -46,7 +46,7 @@ class Task(NamedTuple):
     """A scenario brought to linear systems: the gain in question, the set it is about, the specification."""
 
     chosen: Scenario
-    reduced: "Reduced"
+    reduced: "ReducedLoop"
     gain: np.ndarray
     model: Any  # of which the gain is one gain, and whose parameters the box is about
     states: tuple[str, ...]  # of the model
@@ -62,11 +62,11 @@ def task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) ->
         raise ScenarioError("design.Q and design.R are missing: a design minimises the cost that they weigh")
     from diffabs.design import Spec
     from diffabs.design.parameter_box import polytope
-    from diffabs.design.parameter_grid import gridded
+    from diffabs.design.parameter_grid import grid_polytope
     from diffabs.design.sdp import solver
-    from diffabs.design.state_feedback import state_feedback
+    from diffabs.design.state_feedback import reduce_loop
 
-    reduced, wanted = state_feedback(chosen.loop), chosen.design
+    reduced, wanted = reduce_loop(chosen.loop), chosen.design
     states = reduced.model.states
     values = reduced.gain if gain is None else _gain(gain, states)
     spec = Spec(Q=wanted.Q, R=wanted.R, decay=wanted.decay, damping=wanted.damping)
@@ -76,23 +76,23 @@ def task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) ->
         raise ScenarioError(f"design.{error}; the states are {', '.join(states)}") from None
     solver.solvers()  # says what is missing before anything is computed
     reduced, model, over = _followed(chosen.loop, reduced, wanted.box(chosen.loop))
-    systems = gridded(model, over) if isinstance(model, BalanceModel) else polytope(model, over)
+    systems = grid_polytope(model, over) if isinstance(model, BalanceModel) else polytope(model, over)
     return Task(chosen, reduced, values, model, tuple(model.states), over, systems, spec)
 
 
-def _followed(loop: Loop, reduced: "Reduced", box: Box) -> tuple["Reduced", Any, Box]:
+def _followed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["ReducedLoop", Any, Box]:
     """The linear model and its box; where the gain follows the speed, those in which it is one gain, whose proof covers
     every fall of the speed that friction allows."""
     controller = unsampled(loop.controller)
     if not isinstance(controller, ProportionalFeedback) or not isinstance(reduced.model, SlipModel):
         return reduced, reduced.model, box
-    from diffabs.design.speed_scaled import SpeedScaled, fall
+    from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
 
     model = SpeedScaled(model=reduced.model, reference_speed=controller.reference_speed)
     if model.period is None:
         raise ValueError("controller proportional-feedback: only sampled it can be brought to one gain")
     slowest = box.get("speed", (float(reduced.model.speed),))[0]
-    falls = (0.0, fall(_hardest(loop.plant, box, slowest), slowest, float(model.period)))
+    falls = (0.0, greatest_speed_fall(_hardest(loop.plant, box, slowest), slowest, float(model.period)))
     neglected = tuple(line for line in reduced.neglected if "fall of the speed" not in line)
     over = {f"model.{path}": ends for path, ends in box.items()} | {"fall": falls}
     return reduced._replace(neglected=neglected), model, over
@@ -135,7 +135,7 @@ class Besides(NamedTuple):
     speed [m/s^2] up to which a Lyapunov matrix that follows the speed proves it; None if that was not asked or does not
     succeed."""
 
-    frozen: "Frozen"
+    frozen: "FrozenLoops"
     fall: float | None
 
     def document(self) -> dict[str, Any]:
@@ -145,11 +145,11 @@ class Besides(NamedTuple):
 
 def besides(task: Task, proof: "Certificate") -> Besides | None:
     """What is known besides; None where a common Lyapunov matrix says more."""
-    from diffabs.design.frozen import frozen
+    from diffabs.design.frozen import analyse_frozen_loops
 
     if proof.quadratically_stable:
         return None
-    loops = frozen(task.gain, task.model, task.over)
+    loops = analyse_frozen_loops(task.gain, task.model, task.over)
     return Besides(loops, _following(task) if loops.stable == loops.systems else None)
 
 

@@ -81,7 +81,7 @@ def verify(
     """Prove a saved certificate again, in exact fractions.
 
     The code shares nothing with what made the certificate. Exit status 0 proved, 1 not proved, 2 no certificate."""
-    from diffabs.design.verify import verify as verified
+    from diffabs.design.verify import verify_file as verified
 
     with console.guarded():
         if not 0 < seconds < math.inf:

@@ -17,18 +17,18 @@ from typing import Any
 import numpy as np
 
 from diffabs.design import pairs
-from diffabs.design.bounds import ROOM, Bounds, decrease
-from diffabs.design.polytopes import Polytope, Schedule, checked_gain
+from diffabs.design.bounds import BOUND_LOOSENINGS, Bounds, decrease_matrix
+from diffabs.design.polytopes import Polytope, Schedule, as_gain_matrix
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
 from diffabs.design.sdp import solver
-from diffabs.design.sdp.scaling import analysis_frame, frame
+from diffabs.design.sdp.scaling import analysis_frame, lyapunov_frame
 from diffabs.design.sdp.solver import Answer, Unknowns, he
 from diffabs.design.spec import Spec
 
-TRIES = 4  # frames, each better than the one before
-RAISED = 1e-3  # relative: where the search for the fastest decay stops
-SEARCH = 20  # programs of that search, at most
+MAX_FRAMES = 4  # frames, each better than the one before
+DECAY_TOLERANCE = 1e-3  # relative: where the search for the fastest decay stops
+MAX_SEARCH_PROGRAMS = 20  # programs of that search, at most
 
 
 def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *, fastest: bool = False) -> Certificate:
@@ -54,7 +54,7 @@ def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *,
 
         return certify_schedule(gain, system, spec, fastest=fastest)
     spec = spec.checked(system.order, system.inputs)
-    k = checked_gain(gain, (system.inputs, system.order))
+    k = as_gain_matrix(gain, (system.inputs, system.order))
     return Certificate(system, k, tuple(_Analysis(system, k, spec).claims(fastest)))
 
 
@@ -71,7 +71,7 @@ class _Analysis:
         """Each is proved already; what could not be proved is absent."""
         spec, bounds = self.spec, Bounds(self.system, self.k, self.spec, self.frame)
         cost = bounds.cost() if spec.Q is not None and self._slowest_mode() > 0 else None
-        stable = None if cost is None or fastest else self._decaying(np.asarray(cost.data["P"]), spec.decay)
+        stable = None if cost is None or fastest else self._decay_claim(np.asarray(cost.data["P"]), spec.decay)
         stable = stable or self._stability(fastest)
         yield from (claim for claim in (stable, cost) if claim is not None)
         if stable is None or stable.kind == "infeasible":
@@ -85,27 +85,27 @@ class _Analysis:
 
     def _stability(self, fastest: bool) -> Claim | None:
         asked = self.spec.decay
-        for _ in range(TRIES):
+        for _ in range(MAX_FRAMES):
             p, margin, w = self._common(asked)
             if p is None:
                 break
             if margin > 0:
-                found = self._decaying(p, asked)
+                found = self._decay_claim(p, asked)
                 if found is not None:
-                    return self._fastest(found) if fastest else found
+                    return self._fastest_decay_claim(found) if fastest else found
             # whatever the sign of the margin: where there is no P the best is P = 0, whose margin is 0 but for rounding
-            claim = Claim("infeasible", {"W": w, **self._rate(asked)})
+            claim = Claim("infeasible", {"W": w, **self._rate_data(asked)})
             if np.isfinite(w).all() and self._proved(claim):
                 return claim
             try:
-                self.frame = frame(p, self.closed, np.eye(1), discrete=self.discrete)
+                self.frame = lyapunov_frame(p, self.closed, np.eye(1), discrete=self.discrete)
             except np.linalg.LinAlgError:
                 break
-        return self._refuted_by_two(asked)
+        return self._refute_by_pair(asked)
 
-    def _refuted_by_two(self, asked: float) -> Claim | None:
+    def _refute_by_pair(self, asked: float) -> Claim | None:
         """Two vertices without a common P, whose multipliers need no solver."""
-        rate, scaled = self._rate(asked), self.frame.states(self.closed) * self.frame.tau
+        rate, scaled = self._rate_data(asked), self.frame.states(self.closed) * self.frame.tau
         t, factor = self.frame.T, rate.get("factor")
         for w in pairs.witnesses(scaled + rate.get("rate", 0.0) * np.eye(self.system.order), factor):
             w = he(t @ w @ t.T)
@@ -124,13 +124,13 @@ class _Analysis:
         one = np.eye(n)
         decreases = [
             unknowns.affine(
-                lambda v, c=c, s=s: decrease(v["P"], c, rate * step, discrete=self.discrete) / s - v["t"] * one
+                lambda v, c=c, s=s: decrease_matrix(v["P"], c, rate * step, discrete=self.discrete) / s - v["t"] * one
             )
             for c, s in zip(scaled, sizes, strict=True)
         ]
         positive = unknowns.affine(lambda v: v["P"] - v["t"] * one)
         total = unknowns.affine(lambda v: (1 - np.trace(v["P"], axis1=-2, axis2=-1) / n)[:, None, None])
-        answer = solver.solve(unknowns.row(lambda v: -v["t"]), [solver.joined([*decreases, positive]), total])
+        answer = solver.solve_sdp(unknowns.row(lambda v: -v["t"]), [solver.stack_blocks([*decreases, positive]), total])
         if not np.isfinite(answer.y).all():
             return None, math.nan, np.zeros((0, n, n))
         values = unknowns.values(answer.y)
@@ -145,36 +145,36 @@ class _Analysis:
         w = t @ w @ t.T / sizes[:, None, None]
         return he(w) / np.abs(w).max()
 
-    def _decaying(self, p: np.ndarray, asked: float) -> Claim | None:
+    def _decay_claim(self, p: np.ndarray, asked: float) -> Claim | None:
         """The largest rate that this P proves; at least the rate asked for, or nothing."""
-        best = self._rate_of(p)
+        best = self._proved_rate(p)
         if best == -math.inf:
             return None
-        for room in ROOM:
-            rate = best - room * (abs(best) + asked)
-            claim = Claim("decay", {"P": p, **self._rate(max(rate, asked))})
+        for loosening in BOUND_LOOSENINGS:
+            rate = best - loosening * (abs(best) + asked)
+            claim = Claim("decay", {"P": p, **self._rate_data(max(rate, asked))})
             if self._proved(claim):
                 return claim
             if rate <= asked:
                 return None
         return None
 
-    def _fastest(self, claim: Claim) -> Claim:
+    def _fastest_decay_claim(self, claim: Claim) -> Claim:
         """Close in on the fastest rate that a common P proves: each program between the bounds gives a P, whose own
         rate is a lower bound, and multipliers, which are a witness against every rate above an upper bound."""
         p = np.asarray(claim.data["P"])
-        low, high = self._rate_of(p), self._slowest_mode()
-        for _ in range(SEARCH):
-            if high - low <= RAISED * high:
+        low, high = self._proved_rate(p), self._slowest_mode()
+        for _ in range(MAX_SEARCH_PROGRAMS):
+            if high - low <= DECAY_TOLERANCE * high:
                 break
-            self.frame = frame(p, self.closed, np.eye(1), discrete=self.discrete)
+            self.frame = lyapunov_frame(p, self.closed, np.eye(1), discrete=self.discrete)
             better, _, w = self._common((low + high) / 2)
             if better is None:
                 break
-            high = min(high, self._ruled_out(w))
-            if self._rate_of(better) > low:
-                p, low = better, self._rate_of(better)
-        return self._decaying(p, self.spec.decay) or claim
+            high = min(high, self._least_refuted_rate(w))
+            if self._proved_rate(better) > low:
+                p, low = better, self._proved_rate(better)
+        return self._decay_claim(p, self.spec.decay) or claim
 
     def _slowest_mode(self) -> float:
         """The decay rate [1/s] of the slowest mode of any vertex."""
@@ -183,7 +183,7 @@ class _Analysis:
             return -math.log(np.abs(modes).max()) / (self.system.period or 1.0)
         return -float(modes.real.max())
 
-    def _ruled_out(self, w: np.ndarray) -> float:
+    def _least_refuted_rate(self, w: np.ndarray) -> float:
         """The least rate that the multipliers W are a witness against: sum He[C W] + 2 rate sum W >= 0."""
         root = np.linalg.inv(np.linalg.cholesky(w.sum(axis=0)))
         if self.discrete:
@@ -192,7 +192,7 @@ class _Analysis:
             return -math.log(max(least, 1e-300)) / 2 / (self.system.period or 1.0)
         return -float(np.linalg.eigvalsh(root @ he(self.closed @ w).sum(axis=0) @ root.T)[0]) / 2
 
-    def _rate_of(self, p: np.ndarray) -> float:
+    def _proved_rate(self, p: np.ndarray) -> float:
         """The decay rate [1/s] that V = x'Px has at the slowest vertex; -inf where V is not positive definite."""
         try:
             root = np.linalg.cholesky(p).T
@@ -203,11 +203,11 @@ class _Analysis:
             return -math.log(np.linalg.norm(c, ord=2, axis=(1, 2)).max()) / (self.system.period or 1.0)
         return -float(np.linalg.eigvalsh(he(c)).max()) / 2
 
-    def _rate(self, rate: float) -> dict[str, float]:
+    def _rate_data(self, rate: float) -> dict[str, float]:
         """As a claim has it: a rate [1/s], or the factor for one step, rounded to the safe side."""
         if self.discrete:
             return {"factor": min(1.0, math.exp(-rate * (self.system.period or 1.0)) * (1 + 1e-15))}
         return {"rate": rate}
 
     def _proved(self, claim: Claim) -> bool:
-        return exact.verify(claim.kind, self.system, self.k, claim.data)
+        return exact.is_proved(claim.kind, self.system, self.k, claim.data)

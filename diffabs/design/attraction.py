@@ -23,14 +23,17 @@ import numpy as np
 
 from diffabs.controllers.balance import state_of
 from diffabs.core.loop import Loop
-from diffabs.design.capture import capture
+from diffabs.design.capture import capture_ellipsoids
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.solution import Solver
 
-FEWEST = 256  # lanes that a core is given on its own
-FINEST, POINTS = 1e-4, 33  # of a search for the greatest multiple: relative width of its last interval; runs at once
-START = "initial."  # paths of what a loop does not depend on
-INSIDE = 0.98  # of x'Sx, where a run is ended: rounding does not take it out again
+MIN_RUNS_PER_CORE = 256  # lanes that a core is given on its own
+MULTIPLE_TOLERANCE, SEARCH_POINTS = (
+    1e-4,
+    33,
+)  # of a search for the greatest multiple: relative width of its last interval; runs at once
+INITIAL_PREFIX = "initial."  # paths of what a loop does not depend on
+CAPTURE_LEVEL = 0.98  # of x'Sx, where a run is ended: rounding does not take it out again
 
 
 class Outcomes(NamedTuple):
@@ -102,18 +105,18 @@ class _Ellipsoids(NamedTuple):
     def reached(self, own: Any, output: Any) -> Any:
         """Whether a lane is inside, with something to spare, or hopeless."""
         root, hopeless = own
-        return (jnp.sum((root @ state_of(output)) ** 2) <= INSIDE) | hopeless
+        return (jnp.sum((root @ state_of(output)) ** 2) <= CAPTURE_LEVEL) | hopeless
 
-    def of(self, lanes: slice) -> "_Ellipsoids":
+    def of(self, runs: slice) -> "_Ellipsoids":
         """For some lanes only."""
-        return self._replace(system=self.system[lanes])
+        return self._replace(system=self.system[runs])
 
     def contain(self, x: np.ndarray) -> np.ndarray:
         """Whether each state (lanes, 6) is inside; NaN is not."""
         return np.sum(np.einsum("nij,nj->ni", self.roots[self.system], x) ** 2, axis=1) <= 1
 
 
-def outcomes(
+def classify_starts(
     loop: Loop,
     starts: Mapping[str, Any],
     solver: Solver,
@@ -133,11 +136,11 @@ def outcomes(
     """
     starts = {path: np.asarray(column) for path, column in starts.items()}
     count = len(next(iter(starts.values())))
-    inside = _ellipsoids(loop, starts, count) if band is None else _ball(band, count)
-    return _outcomes(loop, starts, solver, inside, band is None, key, engine)
+    inside = _system_ellipsoids(loop, starts, count) if band is None else _ball_as_ellipsoid(band, count)
+    return _classify_starts(loop, starts, solver, inside, band is None, key, engine)
 
 
-def _outcomes(
+def _classify_starts(
     loop: Loop,
     starts: dict[str, np.ndarray],
     solver: Solver,
@@ -149,28 +152,30 @@ def _outcomes(
     """early: a run that comes inside ends there."""
     count = len(inside.system)
     keys = None if key is None else jax.vmap(lambda i: jax.random.fold_in(key, i))(np.arange(count))
-    parts = max(1, min(os.cpu_count() or 1, count // FEWEST)) if engine == "xla" else 1  # a kernel has its threads
+    parts = (
+        max(1, min(os.cpu_count() or 1, count // MIN_RUNS_PER_CORE)) if engine == "xla" else 1
+    )  # a kernel has its threads
 
-    def part(lanes: slice) -> Any:
+    def part(runs: slice) -> Any:
         """Every so many lanes: neighbours take equally long."""
-        mine = {path: column[lanes] for path, column in starts.items()}
-        own = None if keys is None else keys[lanes]
-        enough = inside.of(lanes) if early else None
+        mine = {path: column[runs] for path, column in starts.items()}
+        own = None if keys is None else keys[runs]
+        enough = inside.of(runs) if early else None
         return jax.device_get(run_batch(loop, Batch(mine, own), solver, enough=enough, engine=engine))
 
     found = Outcomes(*np.zeros((4, count), bool), time=np.zeros(count))
     slices = [slice(i, None, parts) for i in range(parts)]
     with concurrent.futures.ThreadPoolExecutor(parts) as pool:
-        for lanes, run in zip(slices, pool.map(part, slices), strict=True):
-            found.fell[lanes], found.diverged[lanes] = run.stopped, run.diverged
-            found.time[lanes] = run.ending.sample.t
+        for runs, run in zip(slices, pool.map(part, slices), strict=True):
+            found.fell[runs], found.diverged[runs] = run.stopped, run.diverged
+            found.time[runs] = run.ending.sample.t
             x = np.stack(list(state_of(run.ending.sample.output)), axis=-1)
-            found.recovered[lanes] = inside.of(lanes).contain(x) & ~run.stopped & ~run.diverged
+            found.recovered[runs] = inside.of(runs).contain(x) & ~run.stopped & ~run.diverged
     found.unstable[:] = inside.hopeless[inside.system] & ~found.fell & ~found.diverged
     return found
 
 
-def attraction(
+def region_of_attraction(
     loop: Loop,
     first: Cells,
     second: Cells,
@@ -185,11 +190,11 @@ def attraction(
     `outcomes`."""
     grid = np.meshgrid(first.centres, second.centres, indexing="ij")
     starts = {path: axis.ravel() for path, axis in zip(paths, grid, strict=True)}
-    found = outcomes(loop, starts, solver, band=band, key=key, engine=engine)
+    found = classify_starts(loop, starts, solver, band=band, key=key, engine=engine)
     return Basin(first, second, Outcomes(*(column.reshape(grid[0].shape) for column in found)))
 
 
-def largest(
+def largest_recovered_multiples(
     loop: Loop,
     rows: Mapping[str, Any],
     direction: Mapping[str, float],
@@ -201,16 +206,16 @@ def largest(
     """For each of the values (rows,) at these paths the greatest of the rising `multiples` of `direction` (values by
     path of the initial state) up to which all are recovered, 0 if none is. One batch."""
     count = len(next(iter(rows.values())))
-    lanes = {path: np.repeat(np.asarray(column), len(multiples), axis=0) for path, column in rows.items()}
-    lanes |= {path: np.tile(value * np.asarray(multiples), count) for path, value in direction.items()}
-    found = outcomes(loop, lanes, solver, engine=engine)
+    runs = {path: np.repeat(np.asarray(column), len(multiples), axis=0) for path, column in rows.items()}
+    runs |= {path: np.tile(value * np.asarray(multiples), count) for path, value in direction.items()}
+    found = classify_starts(loop, runs, solver, engine=engine)
     fine, open_ = (x.reshape(count, -1) for x in (found.recovered, found.undecided))
     good = np.where(fine.all(axis=1), len(multiples), np.argmin(fine, axis=1))
     known = np.concatenate([[0.0], multiples])
     return [Reach(float(known[g]), bool(g < len(multiples) and row[g])) for g, row in zip(good, open_, strict=True)]
 
 
-def recoverable(
+def recoverable_multiple(
     loop: Loop,
     direction: Mapping[str, float],
     solver: Solver,
@@ -224,17 +229,19 @@ def recoverable(
     state) for every c' up to c that is tried; to a relative width of 1e-4. Every refinement is one batch.
 
     Raises ValueError for other paths, and as `outcomes` does."""
-    if others := [path for path in direction if not path.startswith(START)]:
+    if others := [path for path in direction if not path.startswith(INITIAL_PREFIX)]:
         raise ValueError(f"{', '.join(others)}: a direction is one of the initial state")
-    alike = {path: np.full(POINTS, value) for path, value in direction.items()}
-    inside = _ellipsoids(loop, alike, POINTS) if band is None else _ball(band, POINTS)  # wherever the runs start
+    alike = {path: np.full(SEARCH_POINTS, value) for path, value in direction.items()}
+    inside = (
+        _system_ellipsoids(loop, alike, SEARCH_POINTS) if band is None else _ball_as_ellipsoid(band, SEARCH_POINTS)
+    )  # wherever the runs start
     low, high, undecided = 0.0, float(most), False
-    while high - low > FINEST * high:
-        tried = np.linspace(low, high, POINTS + 1)[1:]
+    while high - low > MULTIPLE_TOLERANCE * high:
+        tried = np.linspace(low, high, SEARCH_POINTS + 1)[1:]
         starts = {path: value * tried for path, value in direction.items()}
-        found = _outcomes(loop, starts, solver, inside, band is None, key, engine)
-        good = POINTS if found.recovered.all() else int(np.argmin(found.recovered))
-        if good == POINTS:
+        found = _classify_starts(loop, starts, solver, inside, band is None, key, engine)
+        good = SEARCH_POINTS if found.recovered.all() else int(np.argmin(found.recovered))
+        if good == SEARCH_POINTS:
             return Reach(high, undecided)
         low, high, undecided = (tried[good - 1] if good else low), float(tried[good]), bool(found.undecided[good])
         if high < 1e-9 * most:
@@ -242,19 +249,19 @@ def recoverable(
     return Reach(float(low), undecided)
 
 
-def _ellipsoids(loop: Loop, starts: Mapping[str, np.ndarray], count: int) -> _Ellipsoids:
+def _system_ellipsoids(loop: Loop, starts: Mapping[str, np.ndarray], count: int) -> _Ellipsoids:
     """One for each system among the lanes: where a run starts does not change it."""
-    own = [column.reshape(count, -1) for path, column in starts.items() if not path.startswith(START)]
+    own = [column.reshape(count, -1) for path, column in starts.items() if not path.startswith(INITIAL_PREFIX)]
     first, system = np.zeros(1, int), np.zeros(count, int)
     if own:
         _, first, system = np.unique(np.concatenate(own, axis=1), axis=0, return_index=True, return_inverse=True)
-    shapes, unstable = capture(loop, {path: column[first] for path, column in starts.items()})
+    shapes, unstable = capture_ellipsoids(loop, {path: column[first] for path, column in starts.items()})
     known = np.isfinite(shapes[:, 0, 0])
     roots = np.full_like(shapes, np.inf)
     roots[known] = np.swapaxes(np.linalg.cholesky(shapes[known]), 1, 2)
     return _Ellipsoids(roots, unstable, system.reshape(-1))
 
 
-def _ball(radius: float, count: int) -> _Ellipsoids:
+def _ball_as_ellipsoid(radius: float, count: int) -> _Ellipsoids:
     """|x| <= radius for all."""
     return _Ellipsoids(np.eye(6)[None] / radius, np.zeros(1, bool), np.zeros(count, int))

@@ -10,14 +10,21 @@ from diffabs.design.polytopes import Polytope
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Claim
 from diffabs.design.sdp import solver
-from diffabs.design.sdp.scaling import Frame, analysis_frame, whitening
-from diffabs.design.sdp.solver import Unknowns, grouped, he, symmetric
+from diffabs.design.sdp.scaling import Frame, analysis_frame, whitening_matrix
+from diffabs.design.sdp.solver import Unknowns, group_blocks, he, symmetric_from_blocks
 from diffabs.design.spec import Spec
 
-ROOM = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)  # relative: by how much a bound is loosened until its proof succeeds
+BOUND_LOOSENINGS = (
+    1e-9,
+    1e-8,
+    1e-7,
+    1e-6,
+    1e-5,
+    1e-4,
+)  # relative: by how much a bound is loosened until its proof succeeds
 
 
-def decrease(p: Any, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
+def decrease_matrix(p: Any, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
     """-dV/dt - 2 rate V for V = x'Px and x' = C x, or exp(-2 rate) V - V+ for x+ = C x; P may be a stack."""
     if discrete:
         return math.exp(-2 * rate) * p - c.T @ p @ c
@@ -38,13 +45,13 @@ class Bounds:
         weight = q + self.k.T @ r @ self.k
         at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
         scaled = at.weight(weight)
-        even = whitening(scaled)
+        even = whitening_matrix(scaled)
         trace = at.trace_weight() / np.trace(at.trace_weight())
         return self._found(
             at,
             {"P": self.system.order},
             lambda v: np.einsum("ij,dji->d", trace, v["P"]),
-            lambda v, c, b: [even.T @ (decrease(v["P"], c, 0.0, discrete=self.discrete) - scaled) @ even],
+            lambda v, c, b: [even.T @ (decrease_matrix(v["P"], c, 0.0, discrete=self.discrete) - scaled) @ even],
             lambda p, v, more: {"kind": "cost", "P": more * p, "Q": q, "R": r},
         )
 
@@ -56,7 +63,7 @@ class Bounds:
         def cone(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
             flow = v["P"] @ c / np.linalg.norm(c)
             skew = cot * (flow - np.swapaxes(flow, -1, -2))
-            return [-symmetric([[he(flow)], [-skew, he(flow)]]) - v["t"] * np.eye(2 * len(c))]
+            return [-symmetric_from_blocks([[he(flow)], [-skew, he(flow)]]) - v["t"] * np.eye(2 * len(c))]
 
         return self._found(
             self.frame,
@@ -80,10 +87,10 @@ class Bounds:
         def bounded(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
             e = at.inverse @ b / math.sqrt(at.tau) if given is None else given
             limit = v["g"] * np.eye(e.shape[1])
-            top = decrease(v["P"], c, 0.0, discrete=self.discrete) - at.weight(z.T @ z) - 1e-10 * np.eye(len(c))
+            top = decrease_matrix(v["P"], c, 0.0, discrete=self.discrete) - at.weight(z.T @ z) - 1e-10 * np.eye(len(c))
             if self.discrete:
-                return [symmetric([[top], [-e.T @ v["P"] @ c, limit - e.T @ v["P"] @ e]])]
-            return [symmetric([[top], [-e.T @ v["P"], limit]])]
+                return [symmetric_from_blocks([[top], [-e.T @ v["P"] @ c, limit - e.T @ v["P"] @ e]])]
+            return [symmetric_from_blocks([[top], [-e.T @ v["P"], limit]])]
 
         disturbance = self.system.B if l2.disturbance is None else l2.disturbance
         return self._found(
@@ -112,13 +119,13 @@ class Bounds:
         def held(v: Any) -> list[np.ndarray]:
             p = v["P"]
             inside = [1 - starts_size**-2 * (x @ p @ x)[..., None, None] for x in starts.T]
-            return inside + [symmetric([[p], [row[None] * starts_size, v["g"]]]) for row in rows]
+            return inside + [symmetric_from_blocks([[p], [row[None] * starts_size, v["g"]]]) for row in rows]
 
         return self._found(
             at,
             {"P": self.system.order, "g": (1, 1)},
             lambda v: v["g"],
-            lambda v, c, b: [decrease(v["P"], c, 1e-9, discrete=self.discrete) / np.linalg.norm(c)],
+            lambda v, c, b: [decrease_matrix(v["P"], c, 1e-9, discrete=self.discrete) / np.linalg.norm(c)],
             lambda p, v, more: {
                 "kind": "input",
                 "P": p / starts_size**2 / more,
@@ -142,13 +149,13 @@ class Bounds:
         blocks = unknowns.blocks(lambda v: [v["P"], *(once(v) if once else [])])
         for c, b in zip(at.states(self.closed), self.system.B, strict=True):
             blocks += unknowns.blocks(lambda v, c=c, b=b: everywhere(v, c, b))
-        answer = solver.solve(unknowns.row(objective), grouped(blocks))
+        answer = solver.solve_sdp(unknowns.row(objective), group_blocks(blocks))
         if not np.isfinite(answer.y).all():
             return None
         values = unknowns.values(answer.y)
-        for room in ROOM if "g" not in values or values["g"] > 0 else ():
-            found = claim(at.form(values["P"]), values, 1 + room)
+        for loosening in BOUND_LOOSENINGS if "g" not in values or values["g"] > 0 else ():
+            found = claim(at.form(values["P"]), values, 1 + loosening)
             made = Claim(found.pop("kind"), found)
-            if exact.verify(made.kind, self.system, self.k, made.data):
+            if exact.is_proved(made.kind, self.system, self.k, made.data):
                 return made
         return None

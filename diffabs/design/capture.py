@@ -28,14 +28,14 @@ from diffabs.core.pytree import replace
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.stops import Fallen
 
-SAFE = 0.9  # of the level c that the bound allows
-HALVINGS = 50
-SURE = 1e-6  # 1/s, growth that is not rounding
+SAFE_LEVEL_FRACTION = 0.9  # of the level c that the bound allows
+LEVEL_BISECTIONS = 50
+MIN_GROWTH_RATE = 1e-6  # 1/s, growth that is not rounding
 # Shapes that are tried: part of the slowest decay, and P's right side beside K'K/U^2, by its size and the arm's part.
-DECAYS, SIZES, ARMS = (0.5, 0.9), (1.0, 100.0), (1e-3, 1e-1)
+DECAY_FRACTIONS, RIGHT_SIDE_SIZES, ARM_WEIGHT_FRACTIONS = (0.5, 0.9), (1.0, 100.0), (1e-3, 1e-1)
 
 
-class _Systems(NamedTuple):
+class _ClosedLoops(NamedTuple):
     """Closed loops, stacked: the plant, A (n, 6, 6), K/U (n, 1, 6), rows (n, m, 6) with |row x| <= 1 where linear."""
 
     plant: Any
@@ -44,7 +44,7 @@ class _Systems(NamedTuple):
     limits: np.ndarray
 
 
-class Capture(NamedTuple):
+class CaptureEllipsoids(NamedTuple):
     """S (n, 6, 6), infinite where nothing can be said, so that x'Sx <= 1 holds nowhere; and (n,) whether the loop is
     unstable about upright, so that almost no start comes to rest there."""
 
@@ -52,30 +52,30 @@ class Capture(NamedTuple):
     unstable: np.ndarray
 
 
-def capture(loop: Loop, values: Mapping[str, Any]) -> Capture:
+def capture_ellipsoids(loop: Loop, values: Mapping[str, Any]) -> CaptureEllipsoids:
     """What is sure of loops that differ in the values (n, ...) at these paths.
 
     Raises ValueError for a loop of which this module can never say anything.
     """
-    systems = _systems(loop, values)
-    found = Capture(np.full_like(systems.closed, np.inf), np.zeros(len(systems.closed), bool))
+    systems = _build_closed_loops(loop, values)
+    found = CaptureEllipsoids(np.full_like(systems.closed, np.inf), np.zeros(len(systems.closed), bool))
     known = np.flatnonzero(np.isfinite(systems.closed).all(axis=(1, 2)))
     if len(known):
         slowest = -np.linalg.eigvals(systems.closed[known]).real.max(axis=-1)
-        found.unstable[known] = slowest < -SURE
-        found.shapes[known] = _best(jax.tree.map(lambda x: x[known], systems), slowest)
+        found.unstable[known] = slowest < -MIN_GROWTH_RATE
+        found.shapes[known] = _largest_ellipsoids(jax.tree.map(lambda x: x[known], systems), slowest)
     return found
 
 
-def _best(systems: _Systems, slowest: np.ndarray) -> np.ndarray:
+def _largest_ellipsoids(systems: _ClosedLoops, slowest: np.ndarray) -> np.ndarray:
     """Of the shapes that are tried, the ellipsoid with the greatest volume; none where the slowest decay is not > 0."""
     best = np.full_like(systems.closed, np.inf)
     volume = np.full(len(best), np.inf)
-    for decay in DECAYS:
-        for size in SIZES:
-            for arm in ARMS:
+    for decay in DECAY_FRACTIONS:
+        for size in RIGHT_SIDE_SIZES:
+            for arm in ARM_WEIGHT_FRACTIONS:
                 side = np.diag([1.0, arm, 1.0, 1.0, arm, 1.0]) * size + _square(systems.gain)
-                found = _level(systems, _lyapunov(systems.closed, decay * slowest, side))
+                found = _scale_to_largest_level(systems, _solve_lyapunov(systems.closed, decay * slowest, side))
                 sure = (slowest > 0) & np.isfinite(found[:, 0, 0])
                 log = np.linalg.slogdet(np.where(sure[:, None, None], found, np.eye(6)))[1]
                 better = sure & (log < volume)
@@ -83,9 +83,9 @@ def _best(systems: _Systems, slowest: np.ndarray) -> np.ndarray:
     return best
 
 
-def _systems(loop: Loop, values: Mapping[str, Any]) -> _Systems:
+def _build_closed_loops(loop: Loop, values: Mapping[str, Any]) -> _ClosedLoops:
     """In float64 whatever the loop is in."""
-    _supported(loop)
+    _check_supported(loop)
     with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
         values = {path: np.asarray(column, float) for path, column in values.items()}
         exact = jax.tree.map(lambda x: np.asarray(x, float), loop)
@@ -96,10 +96,12 @@ def _systems(loop: Loop, values: Mapping[str, Any]) -> _Systems:
     most = many.actuator.voltage_max if isinstance(loop.actuator, VoltageLimit) else np.full(len(a), np.inf)
     asked = (gain / most[:, None])[:, None]
     lean = (np.eye(6)[:1] / many.stop.angle[:, None])[:, None]
-    return _Systems(many.plant, a + b @ gain[:, None], asked, np.concatenate([asked, lean, many.plant.limits(gain)], 1))
+    return _ClosedLoops(
+        many.plant, a + b @ gain[:, None], asked, np.concatenate([asked, lean, many.plant.limits(gain)], 1)
+    )
 
 
-def _supported(loop: Loop) -> None:
+def _check_supported(loop: Loop) -> None:
     known = {"controller": BalanceFeedback, "sensor": Direct, "actuator": Direct | VoltageLimit, "stop": Fallen}
     for name, kind in known.items():
         if not isinstance(getattr(loop, name), kind):
@@ -112,7 +114,7 @@ def _square(rows: np.ndarray) -> np.ndarray:
     return np.swapaxes(rows, -1, -2) @ rows
 
 
-def _lyapunov(a: np.ndarray, shift: np.ndarray, side: np.ndarray) -> np.ndarray:
+def _solve_lyapunov(a: np.ndarray, shift: np.ndarray, side: np.ndarray) -> np.ndarray:
     """P of (A + shift I)'P + P (A + shift I) = -side, per system."""
     eye = np.eye(6)
     moved = np.swapaxes(a + shift[:, None, None] * eye, -1, -2)
@@ -121,7 +123,7 @@ def _lyapunov(a: np.ndarray, shift: np.ndarray, side: np.ndarray) -> np.ndarray:
     return (p + np.swapaxes(p, -1, -2)) / 2
 
 
-def _level(systems: _Systems, p: np.ndarray) -> np.ndarray:
+def _scale_to_largest_level(systems: _ClosedLoops, p: np.ndarray) -> np.ndarray:
     """S = P/c with the largest c that the bound allows; infinite where P is no Lyapunov matrix."""
     usable = np.linalg.eigvalsh(p)[:, 0] > 0
     p = np.where(usable[:, None, None], p, np.eye(6))
@@ -131,15 +133,15 @@ def _level(systems: _Systems, p: np.ndarray) -> np.ndarray:
     inverse = _square(root)
     reach = np.einsum("nmi,nij,nmj->nm", systems.limits, inverse, systems.limits)
     low, high = np.zeros(len(p)), 1 / reach.max(axis=1)
-    for tried in [high] + [None] * HALVINGS:
+    for tried in [high] + [None] * LEVEL_BISECTIONS:
         level = (low + high) / 2 if tried is None else tried
         fine = _growth(systems, p, inverse, level) < decay
         low, high = np.where(fine, level, low), np.where(fine, high, level)
     usable &= (decay > 0) & (low > 0)
-    return np.where(usable[:, None, None], p / np.where(usable, SAFE * low, 1.0)[:, None, None], np.inf)
+    return np.where(usable[:, None, None], p / np.where(usable, SAFE_LEVEL_FRACTION * low, 1.0)[:, None, None], np.inf)
 
 
-def _growth(systems: _Systems, p: np.ndarray, inverse: np.ndarray, level: np.ndarray) -> np.ndarray:
+def _growth(systems: _ClosedLoops, p: np.ndarray, inverse: np.ndarray, level: np.ndarray) -> np.ndarray:
     """The sum over k in V' <= -2 V (g - sum), per system."""
 
     def extent(row: Any) -> np.ndarray:

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffabs.core.pytree import replace
-from diffabs.design.parameter_box import bounds, systems
-from diffabs.design.polytopes import checked_gain
+from diffabs.design.parameter_box import check_box_bounds, evaluate_systems
+from diffabs.design.polytopes import as_gain_matrix
 
-POINTS, MOST = 17, 5000  # per parameter, and in all
+MAX_POINTS_PER_AXIS, MAX_BOX_SYSTEMS = 17, 5000  # per parameter, and in all
 
 
-class Frozen(NamedTuple):
+class FrozenLoops(NamedTuple):
     """How many systems of a box were looked at, how many of them a gain stabilises, and the decay rate [1/s] of the
     slowest mode of all, negative where it grows, with the parameters there."""
 
@@ -27,23 +27,23 @@ class Frozen(NamedTuple):
     at: dict[str, float]
 
 
-def frozen(gain: Any, model: Any, over: Mapping[str, Sequence[float]]) -> Frozen:
+def analyse_frozen_loops(gain: Any, model: Any, over: Mapping[str, Sequence[float]]) -> FrozenLoops:
     """The poles of A + B K at the points of a grid over the box {path: (low, high)}, its corners among them.
 
     Raises ValueError as `box.polytope`, and for a gain that does not fit.
     """
-    low, high = bounds(model, over)
+    low, high = check_box_bounds(model, over)
     free = tuple(path for path in over if low[path] < high[path])
-    count = max(2, min(POINTS, int(MOST ** (1 / max(len(free), 1)) + 1e-9)))
+    count = max(2, min(MAX_POINTS_PER_AXIS, int(MAX_BOX_SYSTEMS ** (1 / max(len(free), 1)) + 1e-9)))
     points = itertools.product(*(np.linspace(low[path], high[path], count) for path in free))
     grid = np.array(list(points)).reshape(count ** len(free), len(free))
-    data = systems(replace(model, low), free, grid)
+    data = evaluate_systems(replace(model, low), free, grid)
     a, b = data.matrices
-    modes = np.linalg.eigvals(a + b @ checked_gain(gain, (data.inputs, data.order)))
+    modes = np.linalg.eigvals(a + b @ as_gain_matrix(gain, (data.inputs, data.order)))
     if model.period is None:
         rates = -modes.real.max(axis=1)
     else:
         rates = -np.log(np.maximum(np.abs(modes).max(axis=1), np.finfo(float).tiny)) / float(model.period)
     i = int(np.argmin(rates))
     at = {**low, **dict(zip(free, grid[i].tolist(), strict=True))}
-    return Frozen(len(grid), int((rates > 0).sum()), float(rates[i]), at)
+    return FrozenLoops(len(grid), int((rates > 0).sum()), float(rates[i]), at)

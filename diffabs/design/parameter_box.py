@@ -19,21 +19,23 @@ import numpy as np
 
 from diffabs.core.pytree import parameters, replace
 from diffabs.core.validity import check
-from diffabs.design.polytopes import LARGEST, Coverage, Polytope, Schedule
+from diffabs.design.polytopes import MAX_VERTICES, Coverage, Polytope, Schedule
 
 CHUNK = 1024  # systems computed at once
-SAME = 1e-10  # an entry that varies by less, relative to itself, is constant
-SPAN = 1e-9  # a direction in which the data reach less far than this, relative to the furthest, does not count
-SLACK = 1e-9  # gauges are known to about this
-RANDOM = 2000  # points checked between those of a grid, each time
-ROUNDS = 6  # of checking and growing
-WIDEST = 2.0  # factor by which corners are spread, at most, before a box takes their place
-FLAT = 1e-6  # corners that reach less far than this in some direction are flat
+ENTRY_TOLERANCE = 1e-10  # an entry that varies by less, relative to itself, is constant
+MIN_RELATIVE_EXTENT = (
+    1e-9  # a direction in which the data reach less far than this, relative to the furthest, does not count
+)
+GAUGE_TOLERANCE = 1e-9  # gauges are known to about this
+RANDOM_POINTS = 2000  # points checked between those of a grid, each time
+MAX_COVER_ROUNDS = 6  # of checking and growing
+MAX_CORNER_SPREAD = 2.0  # factor by which corners are spread, at most, before a box takes their place
+RANK_TOLERANCE = 1e-6  # corners that reach less far than this in some direction are flat
 FACETS = (6, 256)  # facets are computed up to this dimension and number of vertices; above, linear programs
 PROBES = 200  # directions whose extreme systems the linear programs check
 
 
-class _Data(NamedTuple):
+class _SystemRows(NamedTuple):
     """Systems as rows A, B flattened."""
 
     rows: np.ndarray
@@ -68,16 +70,18 @@ def polytope(model: Any, over: Mapping[str, Sequence[float]], *, grid: int = 9, 
         ValueError: a path that is no parameter of the model, an interval that is inverted, not finite or outside of the
             parameter's range, a period that varies, more than 2^12 vertices, matrices that are not finite.
     """
-    _scipy()
-    low, high = bounds(model, over)
+    _require_scipy()
+    low, high = check_box_bounds(model, over)
     free = tuple(path for path in over if low[path] < high[path])
-    if 2 ** len(free) > LARGEST:
-        raise ValueError(f"a box of {len(free)} parameters has {2 ** len(free)} corners, more than {LARGEST}; fix some")
+    if 2 ** len(free) > MAX_VERTICES:
+        raise ValueError(
+            f"a box of {len(free)} parameters has {2 ** len(free)} corners, more than {MAX_VERTICES}; fix some"
+        )
     model = replace(model, low)
     box = np.array([[low[path], high[path]] for path in free]).reshape(-1, 2)
     corners = np.array(list(itertools.product(*box))).reshape(2 ** len(free), len(free))
-    data = systems(model, free, corners)
-    rows, kept, coverage = _covered(model, free, box, data, grid, most)
+    data = evaluate_systems(model, free, corners)
+    rows, kept, coverage = _cover_box(model, free, box, data, grid, most)
     labels = tuple({**low, **dict(zip(free, corners[i].tolist(), strict=True))} for i in kept)
     return Polytope(*data._replace(rows=rows).matrices, model.period, tuple(model.states), labels, coverage)
 
@@ -93,7 +97,7 @@ def schedule(
     """
     if along not in over:
         raise ValueError(f"along = '{along}' is not a parameter of the box; there is {', '.join(over) or 'nothing'}")
-    low, high = (bound[along] for bound in bounds(model, over))
+    low, high = (bound[along] for bound in check_box_bounds(model, over))
     if isinstance(nodes, int):
         if nodes < 1:
             raise ValueError(f"nodes = {nodes} cells; it needs at least 1")
@@ -107,14 +111,14 @@ def schedule(
     return Schedule(along, at, tuple(cells))
 
 
-def _scipy() -> None:
+def _require_scipy() -> None:
     try:
         import scipy.optimize  # noqa: F401  # pyright: ignore[reportUnusedImport]
     except ModuleNotFoundError:
         raise ModuleNotFoundError('a polytope needs SciPy: pip install ".[design]" in a clone') from None
 
 
-def bounds(model: Any, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
+def check_box_bounds(model: Any, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
     """The low and the high end of every interval, checked."""
     known = {path: value for path, _, value in parameters(model)}
     for path, ends in over.items():
@@ -139,7 +143,7 @@ def _batch(model: Any, free: tuple[str, ...], points: Any) -> Any:
     return jax.vmap(lambda p: replace(model, dict(zip(free, p, strict=True))).matrices())(points)
 
 
-def systems(model: Any, free: tuple[str, ...], points: np.ndarray) -> _Data:
+def evaluate_systems(model: Any, free: tuple[str, ...], points: np.ndarray) -> _SystemRows:
     """The matrices at points (N, k) of the box, in float64."""
     parts, n, m = [], 0, 0
     with jax.enable_x64(True):
@@ -153,7 +157,7 @@ def systems(model: Any, free: tuple[str, ...], points: np.ndarray) -> _Data:
     if bad.any():
         where = ", ".join(f"{path} = {value:g}" for path, value in zip(free, points[bad][0], strict=True))
         raise ValueError(f"the model's matrices are not finite at {where or 'its parameters'}")
-    return _Data(rows, n, m)
+    return _SystemRows(rows, n, m)
 
 
 def _points(box: np.ndarray, grid: int, most: int, seed: int) -> np.ndarray:
@@ -162,32 +166,32 @@ def _points(box: np.ndarray, grid: int, most: int, seed: int) -> np.ndarray:
     count = max(2, min(grid, int(most ** (1 / k) + 1e-9)))
     axes = [np.linspace(low, high, count) for low, high in box]
     on_grid = itertools.islice(itertools.product(*axes), most)
-    random = np.random.default_rng(seed).uniform(box[:, 0], box[:, 1], (RANDOM, k))
+    random = np.random.default_rng(seed).uniform(box[:, 0], box[:, 1], (RANDOM_POINTS, k))
     return np.concatenate([np.array(list(on_grid)), random])
 
 
-def _covered(
-    model: Any, free: tuple[str, ...], box: np.ndarray, corners: _Data, grid: int, most: int
+def _cover_box(
+    model: Any, free: tuple[str, ...], box: np.ndarray, corners: _SystemRows, grid: int, most: int
 ) -> tuple[np.ndarray, Sequence[int], Coverage]:
     """Vertices as rows, which corners they are, and what was checked."""
     if not free:
         return corners.rows, [0], Coverage(1, 0.0, 1.0)
     seen, hull = corners.rows, None
-    for i in range(ROUNDS):
-        new = systems(model, free, _points(box, (grid - 1) * 2 ** min(i, 1) + 1, most, i)).rows
+    for i in range(MAX_COVER_ROUNDS):
+        new = evaluate_systems(model, free, _points(box, (grid - 1) * 2 ** min(i, 1) + 1, most, i)).rows
         seen, reach = np.concatenate([seen, new]), hull.reach(new)[0] if hull else 1.0
-        if hull and reach <= 1 + SLACK:
+        if hull and reach <= 1 + GAUGE_TOLERANCE:
             break
         # what this look found beyond the last is granted once more, to what lies between its points
         hull = _Hull.around(corners.rows, seen, reach if np.isfinite(reach) else 1.0)
     assert hull is not None
     furthest, checked = hull.reach(seen)
-    kept = [] if hull.box else _extreme(hull.vertices)
+    kept = [] if hull.box else _extreme_points(hull.vertices)
     rows = hull.rows if hull.box else hull.rows[kept]
     return rows, kept, Coverage(checked, float(furthest), float(hull.spread))
 
 
-class _Frame(NamedTuple):
+class _PlaneCoordinates(NamedTuple):
     """The plane in which the rows lie, and coordinates in it: each reaches over an interval of length 2."""
 
     origin: np.ndarray
@@ -196,29 +200,29 @@ class _Frame(NamedTuple):
     half: np.ndarray
 
     @classmethod
-    def of(cls, rows: np.ndarray) -> "_Frame":
+    def of(cls, rows: np.ndarray) -> "_PlaneCoordinates":
         size, extent = np.abs(rows).max(axis=0), np.ptp(rows, axis=0)
-        varies = extent > SAME * size
+        varies = extent > ENTRY_TOLERANCE * size
         scale = np.where(varies, extent, np.where(size > 0, size, 1.0))
         z = (rows - rows[0]) / scale
         basis = np.linalg.svd(z - z.mean(axis=0), full_matrices=False)[2] * varies
         half = np.ptp(z @ basis.T, axis=0) / 2
-        return cls(rows[0], scale, basis[half > SPAN], half[half > SPAN])
+        return cls(rows[0], scale, basis[half > MIN_RELATIVE_EXTENT], half[half > MIN_RELATIVE_EXTENT])
 
-    def to(self, rows: np.ndarray) -> np.ndarray:
+    def to_plane(self, rows: np.ndarray) -> np.ndarray:
         return (rows - self.origin) / self.scale @ self.basis.T / self.half
 
-    def back(self, y: np.ndarray) -> np.ndarray:
+    def from_plane(self, y: np.ndarray) -> np.ndarray:
         return self.origin + self.scale * (y * self.half @ self.basis)
 
     def holds(self, rows: np.ndarray) -> bool:
-        return bool(np.all(np.abs(self.back(self.to(rows)) - rows) <= 2 * SPAN * self.scale))
+        return bool(np.all(np.abs(self.from_plane(self.to_plane(rows)) - rows) <= 2 * MIN_RELATIVE_EXTENT * self.scale))
 
 
 class _Hull(NamedTuple):
     """Vertices as rows and in the coordinates of a frame; the factor that the corners needed; whether it is a box."""
 
-    frame: _Frame
+    frame: _PlaneCoordinates
     rows: np.ndarray
     vertices: np.ndarray
     spread: float
@@ -227,39 +231,41 @@ class _Hull(NamedTuple):
     @classmethod
     def around(cls, corners: np.ndarray, seen: np.ndarray, margin: float) -> "_Hull":
         """The corners if they cover what was seen, spread by up to WIDEST if not, else a box."""
-        frame = _Frame.of(seen)
-        v, x = frame.to(corners), frame.to(seen)
-        needed = _reach(v, x)[0]
-        spread = 1.0 if needed <= 1 + SLACK else needed * margin * (1 + SLACK)
+        frame = _PlaneCoordinates.of(seen)
+        v, x = frame.to_plane(corners), frame.to_plane(seen)
+        needed = _largest_gauge(v, x)[0]
+        spread = 1.0 if needed <= 1 + GAUGE_TOLERANCE else needed * margin * (1 + GAUGE_TOLERANCE)
         count = 2 ** len(frame.half)
-        if spread <= WIDEST or (np.isfinite(spread) and count > LARGEST):
+        if spread <= MAX_CORNER_SPREAD or (np.isfinite(spread) and count > MAX_VERTICES):
             rows, v = (a.mean(axis=0) + spread * (a - a.mean(axis=0)) if spread > 1 else a for a in (corners, v))
             return cls(frame, rows, v, spread, False)
-        if count > LARGEST:
-            raise ValueError(f"the box needs {count} vertices, more than {LARGEST}: vary fewer parameters, or by less")
-        half, middle = np.ptp(x, axis=0) / 2 * margin * (1 + SLACK), (x.max(axis=0) + x.min(axis=0)) / 2
+        if count > MAX_VERTICES:
+            raise ValueError(
+                f"the box needs {count} vertices, more than {MAX_VERTICES}: vary fewer parameters, or by less"
+            )
+        half, middle = np.ptp(x, axis=0) / 2 * margin * (1 + GAUGE_TOLERANCE), (x.max(axis=0) + x.min(axis=0)) / 2
         v = middle + half * np.array(list(itertools.product((-1.0, 1.0), repeat=len(half))))
-        return cls(frame, frame.back(v), v, spread, True)
+        return cls(frame, frame.from_plane(v), v, spread, True)
 
     def reach(self, rows: np.ndarray) -> tuple[float, int]:
         """The largest gauge of the rows, and how many were looked at."""
         if not self.frame.holds(rows):
             return np.inf, len(rows)
-        x = self.frame.to(rows)
+        x = self.frame.to_plane(rows)
         if self.box:
             middle = self.vertices.mean(axis=0)
             return float(np.max(np.abs(x - middle) / (self.vertices.max(axis=0) - middle))), len(x)
-        return _reach(self.vertices, x)
+        return _largest_gauge(self.vertices, x)
 
 
-def _reach(v: np.ndarray, x: np.ndarray) -> tuple[float, int]:
+def _largest_gauge(v: np.ndarray, x: np.ndarray) -> tuple[float, int]:
     """The largest gauge of points x (N, d) in the hull of v (V, d), and how many of them were looked at: beyond some
     size only those that reach furthest in one of many directions. Infinite if v is flat."""
     centre = v.mean(axis=0)
     v, x, d = v - centre, x - centre, v.shape[1]
     if not d:
         return 0.0, len(x)
-    if np.linalg.matrix_rank(v, tol=FLAT) < d:
+    if np.linalg.matrix_rank(v, tol=RANK_TOLERANCE) < d:
         return np.inf, len(x)
     if d == 1:
         return float(max(x.max() / v.max(), x.min() / v.min())), len(x)
@@ -274,7 +280,7 @@ def _reach(v: np.ndarray, x: np.ndarray) -> tuple[float, int]:
     return max(linprog(np.ones(len(v)), A_eq=v.T, b_eq=x[i]).fun for i in far), len(far)
 
 
-def _extreme(v: np.ndarray) -> list[int]:
+def _extreme_points(v: np.ndarray) -> list[int]:
     """Which points span the hull of v."""
     if not v.shape[1]:
         return [0]

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.pytree import replace
-from diffabs.design.parameter_box import bounds, systems
-from diffabs.design.polytopes import LARGEST, Polytope
+from diffabs.design.parameter_box import check_box_bounds, evaluate_systems
+from diffabs.design.polytopes import MAX_VERTICES, Polytope
 
 
-def gridded(model: Any, over: Mapping[str, Sequence[float]], points: int = 3) -> Polytope:
+def grid_polytope(model: Any, over: Mapping[str, Sequence[float]], points: int = 3) -> Polytope:
     """The polytope whose vertices are the systems of `model` at `points` values of each parameter of the box {path:
     (low, high)}, its ends among them.
 
@@ -26,12 +26,12 @@ def gridded(model: Any, over: Mapping[str, Sequence[float]], points: int = 3) ->
     """
     if points < 2:
         raise ValueError(f"points = {points} is outside [2, inf): a grid has the ends of the box")
-    low, high = bounds(model, over)
+    low, high = check_box_bounds(model, over)
     free = tuple(path for path in over if low[path] < high[path])
-    if points ** len(free) > LARGEST:
-        raise ValueError(f"a grid of {points ** len(free)} systems is more than {LARGEST}; take fewer points")
+    if points ** len(free) > MAX_VERTICES:
+        raise ValueError(f"a grid of {points ** len(free)} systems is more than {MAX_VERTICES}; take fewer points")
     axes = [np.linspace(low[path], high[path], points) for path in free]
     grid = np.array(list(itertools.product(*axes))).reshape(points ** len(free), len(free))
-    data = systems(replace(model, low), free, grid)
+    data = evaluate_systems(replace(model, low), free, grid)
     labels = tuple({**low, **dict(zip(free, row.tolist(), strict=True))} for row in grid)
     return Polytope(*data.matrices, model.period, tuple(model.states), labels)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-LARGEST = 2**12  # vertices; an LMI for each
+MAX_VERTICES = 2**12  # vertices; an LMI for each
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Polytope:
         a, b = self.A.shape, self.B.shape
         if len(a) != 3 or len(b) != 3 or a[1] != a[2] or b[:2] != a[:2] or not a[1] or not b[2]:
             raise ValueError(f"a polytope needs A of shape (V, n, n) and B of shape (V, n, m); got {a} and {b}")
-        if not 1 <= a[0] <= LARGEST:
-            raise ValueError(f"a polytope of {a[0]} vertices is outside [1, {LARGEST}]: an LMI for each")
+        if not 1 <= a[0] <= MAX_VERTICES:
+            raise ValueError(f"a polytope of {a[0]} vertices is outside [1, {MAX_VERTICES}]: an LMI for each")
         if not (np.isfinite(self.A).all() and np.isfinite(self.B).all()):
             raise ValueError("a vertex of the polytope has an entry that is not finite")
 
@@ -69,7 +69,7 @@ class Polytope:
 
     def closed(self, gain: Any) -> np.ndarray:
         """A + B K at each vertex (V, n, n). Raises ValueError for a gain of the wrong shape or not finite."""
-        return self.A + self.B @ checked_gain(gain, (self.inputs, self.order))
+        return self.A + self.B @ as_gain_matrix(gain, (self.inputs, self.order))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class Schedule:
             raise ValueError("the cells of a schedule differ in order, inputs or period")
 
 
-def checked_gain(gain: Any, shape: tuple[int, int]) -> np.ndarray:
+def as_gain_matrix(gain: Any, shape: tuple[int, int]) -> np.ndarray:
     """A gain (m, n); (n,) is one row. Raises ValueError for another shape, or numbers that are not finite."""
     k = np.atleast_2d(np.array(gain, float))
     if k.shape != shape:

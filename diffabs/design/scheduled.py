@@ -15,16 +15,22 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.design.polytopes import Schedule, checked_gain
+from diffabs.design.polytopes import Schedule, as_gain_matrix
 from diffabs.design.proof import exact
 from diffabs.design.proof.certificate import Certificate, Claim
 from diffabs.design.sdp import solver
 from diffabs.design.sdp.scaling import Frame, analysis_frame
-from diffabs.design.sdp.solver import Unknowns, grouped, he
+from diffabs.design.sdp.solver import Unknowns, group_blocks, he
 from diffabs.design.spec import Spec
 
-NEAR = 0.01  # relative: how close the search for the fastest decay comes
-ROOM = (1e-9, 1e-7, 1e-6, 1e-5, 1e-4)  # relative: by how much the answer is loosened until its proof succeeds
+SCHEDULE_DECAY_TOLERANCE = 0.01  # relative: how close the search for the fastest decay comes
+FORM_LOOSENINGS = (
+    1e-9,
+    1e-7,
+    1e-6,
+    1e-5,
+    1e-4,
+)  # relative: by how much the answer is loosened until its proof succeeds
 
 
 def certify_schedule(gain: Any, system: Schedule, spec: Spec, *, fastest: bool = False) -> Certificate:
@@ -39,44 +45,44 @@ def certify_schedule(gain: Any, system: Schedule, spec: Spec, *, fastest: bool =
         raise ValueError("a schedule needs rates, the bounds of its parameter's derivative, and continuous time")
     if spec.damping or spec.l2 or spec.input:
         raise ValueError("over a schedule, decay and cost can be proved; damping, L2 gain, input limit need a polytope")
-    gains = scheduled_gain(gain, system)
-    claims = [_proof(gains, system, spec)]
+    gains = gains_at_nodes(gain, system)
+    claims = [_find_claim(gains, system, spec)]
     if fastest and claims[0] is not None:
-        claims.append(_fastest(gains, system, spec))
+        claims.append(_fastest_decay_claim(gains, system, spec))
     return Certificate(system, gains, tuple(claim for claim in claims if claim is not None))
 
 
-def _fastest(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
+def _fastest_decay_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
     """The claim with the fastest decay, by bisection up to the slowest mode of any vertex."""
     pairs = [(cell, k) for i, cell in enumerate(system.cells) for k in gains[i : i + 2]]
     low, high = spec.decay, min(-np.real(np.linalg.eigvals(cell.closed(k))).max() for cell, k in pairs)
     best = None
-    while high - low > NEAR * high:
+    while high - low > SCHEDULE_DECAY_TOLERANCE * high:
         rate = (low + high) / 2
-        claim = _proof(gains, system, Spec(decay=rate, rates=spec.rates))
+        claim = _find_claim(gains, system, Spec(decay=rate, rates=spec.rates))
         low, high, best = (low, rate, best) if claim is None else (rate, high, claim)
     return best
 
 
-def scheduled_gain(gain: Any, system: Schedule) -> np.ndarray:
+def gains_at_nodes(gain: Any, system: Schedule) -> np.ndarray:
     """Gains at the nodes (N + 1, m, n) from those or from a constant one. Raises ValueError for other shapes."""
     first, k = system.cells[0], np.array(gain, float)
     shape = (first.inputs, first.order)
     if k.ndim < 3:
-        return np.repeat(checked_gain(k, shape)[None], len(system.nodes), axis=0)
+        return np.repeat(as_gain_matrix(k, shape)[None], len(system.nodes), axis=0)
     if len(k) != len(system.nodes):
         raise ValueError(f"the gain has {len(k)} rows of a table; the schedule has {len(system.nodes)} nodes")
-    return np.array([checked_gain(one, shape) for one in k])
+    return np.array([as_gain_matrix(one, shape) for one in k])
 
 
-def _proof(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
+def _find_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
     """The claim with the least mean trace P (with Q, R), or with the largest margin; None where no proof succeeds."""
     n, nodes = system.cells[0].order, range(len(system.nodes))
     middle = [(cell.A + cell.B @ gains[i])[:1] for i, cell in enumerate(system.cells)]
     frame = analysis_frame(np.concatenate(middle), discrete=False)
     unknowns = Unknowns(**{f"P{i}": n for i in nodes}, **({} if spec.Q is not None else {"t": (1, 1)}))
     blocks = [unknowns.affine(lambda v, i=i: v[f"P{i}"]) for i in nodes]
-    for formulas in _everywhere(gains, system, spec, frame):
+    for formulas in _bernstein_formulas(gains, system, spec, frame):
         blocks += unknowns.blocks(formulas)
     if spec.Q is None:
         total = len(nodes) * n
@@ -87,21 +93,21 @@ def _proof(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
     else:
         weight = frame.trace_weight() / np.trace(frame.trace_weight())
         objective = unknowns.row(lambda v: sum(np.einsum("ij,dji->d", weight, v[f"P{i}"]) for i in nodes))
-    answer = solver.solve(objective, grouped(blocks))
+    answer = solver.solve_sdp(objective, group_blocks(blocks))
     if not np.isfinite(answer.y).all():
         return None
     values = unknowns.values(answer.y)
     forms = np.array([frame.form(values[f"P{i}"]) for i in nodes])
     cost = {} if spec.Q is None else {"Q": spec.Q, "R": spec.R}
-    for room in ROOM if cost else (0.0,):
-        data = {"P": forms * (1 + room), "rates": np.array(spec.rates), "rate": spec.decay, **cost}
+    for loosening in FORM_LOOSENINGS if cost else (0.0,):
+        data = {"P": forms * (1 + loosening), "rates": np.array(spec.rates), "rate": spec.decay, **cost}
         claim = Claim("scheduled", data)
-        if exact.verify(claim.kind, system, gains, claim.data):
+        if exact.is_proved(claim.kind, system, gains, claim.data):
             return claim
     return None
 
 
-def _everywhere(gains: np.ndarray, system: Schedule, spec: Spec, frame: Frame) -> Iterator[Any]:
+def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: Frame) -> Iterator[Any]:
     """For each cell, vertex and end of the rates, the Bernstein coefficients as formulas of the P at the nodes."""
     assert spec.rates is not None
     n = system.cells[0].order

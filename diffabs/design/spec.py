@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.linear.weights import weight
+from diffabs.linear.weights import as_weight_matrix
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -53,18 +53,24 @@ class Spec:
             raise ValueError("a quadratic cost needs both Q and R")
         weights = {}
         if self.Q is not None:
-            weights = {"Q": weight("Q", self.Q, order, definite=False), "R": weight("R", self.R, inputs, definite=True)}
+            weights = {
+                "Q": as_weight_matrix("Q", self.Q, order, definite=False),
+                "R": as_weight_matrix("R", self.R, inputs, definite=True),
+            }
         if not (math.isfinite(self.decay) and self.decay >= 0):
             raise ValueError(f"decay = {self.decay:g} is outside [0, inf) 1/s")
         if not 0 <= self.damping < 1:
             raise ValueError(f"damping = {self.damping:g} is outside [0, 1)")
         if self.rates is not None and not (np.isfinite(self.rates).all() and self.rates[0] <= self.rates[1]):
             raise ValueError(f"rates = {self.rates} are not a lower and an upper bound")
-        limit, gain = self.input and _input(self.input, order, inputs), self.l2 and _l2(self.l2, order, inputs)
+        limit, gain = (
+            self.input and _check_input_limit(self.input, order, inputs),
+            self.l2 and _check_l2_gain(self.l2, order, inputs),
+        )
         return dataclasses.replace(self, **weights, input=limit, l2=gain)
 
 
-def _input(limit: InputLimit, order: int, inputs: int) -> InputLimit:
+def _check_input_limit(limit: InputLimit, order: int, inputs: int) -> InputLimit:
     values, points = np.atleast_1d(np.array(limit.limit, float)), np.atleast_2d(np.array(limit.points, float))
     if values.shape != (inputs,) or not (np.isfinite(values) & (values > 0)).all():
         raise ValueError(f"input limit = {values.tolist()}: {inputs} numbers in (0, inf) are needed")
@@ -73,7 +79,7 @@ def _input(limit: InputLimit, order: int, inputs: int) -> InputLimit:
     return InputLimit(values, points)
 
 
-def _l2(gain: L2Gain, order: int, inputs: int) -> L2Gain:
+def _check_l2_gain(gain: L2Gain, order: int, inputs: int) -> L2Gain:
     c = np.atleast_2d(np.array(gain.output, float))
     d = (
         np.zeros((len(c), inputs))

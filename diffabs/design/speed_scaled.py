@@ -50,7 +50,7 @@ class SpeedScaled:
         return _matrices(self, tuple(name in TORQUES for name in self.states))
 
 
-def fall(deceleration: float, speed: float, period: float) -> float:
+def greatest_speed_fall(deceleration: float, speed: float, period: float) -> float:
     """The greatest fall v/v+ - 1 over a period [s], at a deceleration [m/s^2] and from the lowest speed [m/s]."""
     return deceleration * period / (speed - deceleration * period)
 

@@ -32,7 +32,7 @@ from diffabs.core.blocks import Direct, Series
 from diffabs.core.loop import Loop
 from diffabs.core.units import in_words, units_of
 from diffabs.core.validity import check
-from diffabs.design.state_feedback_balance import upright
+from diffabs.design.state_feedback_balance import reduce_balance_loop
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.operating_point import OperatingPoint, loop_gain, operating_point
 from diffabs.linear.slip_model import Continuous, LowPass, Sampling, SlipModel
@@ -40,7 +40,7 @@ from diffabs.references import FixedSlip
 from diffabs.sensors import Bias, Noise
 
 
-class Reduced(NamedTuple):
+class ReducedLoop(NamedTuple):
     """u = gain x on `model`, gain of shape (n,). `exact`: near the target, inside all limits and at a frozen speed,
     this is the loop's own linearisation. `neglected` says what it leaves out, in sentences."""
 
@@ -50,7 +50,7 @@ class Reduced(NamedTuple):
     neglected: tuple[str, ...]
 
 
-def state_feedback(loop: Loop) -> Reduced:
+def reduce_loop(loop: Loop) -> ReducedLoop:
     """The loop at its initial speed and its setpoint as state feedback.
 
     Raises:
@@ -59,9 +59,9 @@ def state_feedback(loop: Loop) -> Reduced:
     """
     check(loop)
     if isinstance(unsampled(loop.controller), BalanceFeedback):
-        return Reduced(*upright(loop))
+        return ReducedLoop(*reduce_balance_loop(loop))
     if not hasattr(loop.plant, "frozen"):
-        return _at_rest(loop)
+        return _reduce_at_rest(loop)
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     controller = unsampled(loop.controller)
     integral, _, derivative, cutoff = map(float, _gains(controller))
@@ -76,14 +76,14 @@ def state_feedback(loop: Loop) -> Reduced:
         filter=LowPass(cutoff=cutoff) if derivative else Direct(),
         integral=integral != 0,
     )
-    gain = np.asarray(feedback(loop, check(model).states), float)
+    gain = np.asarray(feedback_gain(loop, check(model).states), float)
     units = units_of(loop.plant)
-    left_out = (*_of_controller(controller), *by_actuator, *_around(loop))
+    left_out = (*_controller_omissions(controller), *by_actuator, *_loop_omissions(loop))
     neglected = tuple(in_words(line, units) for line in left_out)
-    return Reduced(model, gain, exact and isinstance(loop.sensor, Direct | Noise | Bias), neglected)
+    return ReducedLoop(model, gain, exact and isinstance(loop.sensor, Direct | Noise | Bias), neglected)
 
 
-def feedback(loop: Loop, states: Sequence[str]) -> Any:
+def feedback_gain(loop: Loop, states: Sequence[str]) -> Any:
     """K (n,) of a loop's controller on the states of a `SlipModel`, by their names; 0 on those it does not use.
     Differentiable in the controller's parameters. That of a `ProportionalFeedback` is at its reference speed.
 
@@ -104,15 +104,15 @@ def feedback(loop: Loop, states: Sequence[str]) -> Any:
     return jnp.stack([jnp.asarray(gains.get(name, 0.0), float) for name in states])
 
 
-def _at_rest(loop: Loop) -> Reduced:
+def _reduce_at_rest(loop: Loop) -> ReducedLoop:
     """Any other loop, at rest on its setpoint. Noise and bias of the sensor are disturbances."""
     disturbed = isinstance(loop.sensor, Noise | Bias)
     model = operating_point(dataclasses.replace(loop, sensor=Direct()) if disturbed else loop)
     neglected = ["Everything that is not linear: the proof is about the neighbourhood of rest on the setpoint, inside"
                  " all limits; the gain is the controller's with the parameters of the scenario."]  # fmt: skip
     if disturbed:
-        neglected.append(f"The sensor's {_words(loop.sensor)}, a disturbance.")
-    return Reduced(model, np.asarray(model.gain(), float), True, tuple(neglected))
+        neglected.append(f"The sensor's {_part_name(loop.sensor)}, a disturbance.")
+    return ReducedLoop(model, np.asarray(model.gain(), float), True, tuple(neglected))
 
 
 def _gains(controller: Any) -> tuple[Any, Any, Any, Any]:
@@ -122,7 +122,7 @@ def _gains(controller: Any) -> tuple[Any, Any, Any, Any]:
     if isinstance(controller, PID):
         wc = controller.cutoff
         return -controller.ki, -controller.kp, -controller.kd * wc, wc
-    raise ValueError(f"controller {_words(controller)} is not linear: it cannot be brought to state feedback")
+    raise ValueError(f"controller {_part_name(controller)} is not linear: it cannot be brought to state feedback")
 
 
 def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
@@ -147,14 +147,14 @@ def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
                 neglected.append(f"The actuator's delay of {float(block.time):g} s, which can destabilise.")
             case _:
                 raise ValueError(
-                    f"actuator {_words(block)} is not known to be linear: it cannot be brought to state feedback"
+                    f"actuator {_part_name(block)} is not known to be linear: it cannot be brought to state feedback"
                 )
     if len(lags) > 1:
         raise ValueError("actuator: a linear slip model has room for one lag, not for several in series")
     return (lags[0] if lags else Direct()), tuple(neglected), exact
 
 
-def _of_controller(controller: Any) -> Iterator[str]:
+def _controller_omissions(controller: Any) -> Iterator[str]:
     low, high = map(float, controller.limits())
     if np.isfinite([low, high]).any():
         yield f"The controller's torque limits of {low:g} and {high:g} {{control}}."
@@ -162,19 +162,20 @@ def _of_controller(controller: Any) -> Iterator[str]:
             yield "Anti-windup, which acts at the torque limits only."
 
 
-def _around(loop: Loop) -> Iterator[str]:
+def _loop_omissions(loop: Loop) -> Iterator[str]:
     """What is left out of the rest of the loop."""
     yield "The fall of the speed: it is frozen."
     if isinstance(loop.sensor, Noise | Bias):
-        yield f"The sensor's {_words(loop.sensor)}, a disturbance."
+        yield f"The sensor's {_part_name(loop.sensor)}, a disturbance."
     elif not isinstance(loop.sensor, Direct):
-        yield f"The sensor, {_words(loop.sensor)}: its dynamics, rounding or error."
+        yield f"The sensor, {_part_name(loop.sensor)}: its dynamics, rounding or error."
     if not isinstance(loop.reference, FixedSlip):
-        yield f"The motion of the target ({_words(loop.reference)}), a disturbance; the model is taken at its setpoint."
+        reference = _part_name(loop.reference)
+        yield f"The motion of the target ({reference}), a disturbance; the model is taken at its setpoint."
     if not isinstance(loop.feedforward, HoldingInput):
-        yield f"The error of the feed-forward ({_words(loop.feedforward)}), a disturbance."
+        yield f"The error of the feed-forward ({_part_name(loop.feedforward)}), a disturbance."
 
 
-def _words(part: Any) -> str:
+def _part_name(part: Any) -> str:
     """SlidingMode as `sliding mode`."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower()

@@ -15,7 +15,7 @@ from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import Continuous, Sampling
 
 
-def upright(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tuple[str, ...]]:
+def reduce_balance_loop(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tuple[str, ...]]:
     """Model, gain (6,), whether this is the loop's own linearisation, and what is left out, in sentences.
 
     Raises:
@@ -30,10 +30,10 @@ def upright(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tuple[str, ...]
     sampling = Sampling(period=float(sampled.period), delay=float(sampled.delay)) if sampled else Continuous()
     model = check(BalanceModel(plant=loop.plant, sampling=sampling))
     exact = isinstance(loop.sensor, Direct)
-    return model, np.asarray(controller.gain, float), exact, tuple(_neglected(loop))
+    return model, np.asarray(controller.gain, float), exact, tuple(_balance_omissions(loop))
 
 
-def _neglected(loop: Loop) -> Iterator[Any]:
+def _balance_omissions(loop: Loop) -> Iterator[Any]:
     yield "Everything that is not linear: the proof is about small angles."
     yield "What lies between the points of the grid: a balance is rational in its masses, its hull covers no box."
     if isinstance(loop.actuator, VoltageLimit):

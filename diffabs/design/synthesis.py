@@ -22,16 +22,24 @@ from diffabs.design.analysis import certify
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof.certificate import Certificate
 from diffabs.design.sdp import solver as lmi
-from diffabs.design.sdp.program import Program
+from diffabs.design.sdp.program import DesignProgram
 from diffabs.design.sdp.scaling import Frame, design_frames
 from diffabs.design.sdp.solver import he
 from diffabs.design.spec import Spec
 
 GAP = 1e-6  # relative: how far from the optimum an answer may be
-ROUGH = 1e-4  # the same for a schedule, and for an L2 gain
-FRAMES = 3  # tried for each solver
-LEVELS = np.geomspace(1.0, 1e4, 25)  # of the invariant set for an input limit, relative to the least conceivable
-KINDS = {"Q": "cost", "decay": "decay", "damping": "damping", "l2": "l2", "input": "input"}  # claim of a specification
+ROUGH_GAP = 1e-4  # the same for a schedule, and for an L2 gain
+FRAMES_PER_SOLVER = 3  # tried for each solver
+INPUT_LIMIT_LEVELS = np.geomspace(
+    1.0, 1e4, 25
+)  # of the invariant set for an input limit, relative to the least conceivable
+CLAIM_OF_SPECIFICATION = {
+    "Q": "cost",
+    "decay": "decay",
+    "damping": "damping",
+    "l2": "l2",
+    "input": "input",
+}  # claim of a specification
 
 
 class DesignError(RuntimeError):
@@ -78,11 +86,11 @@ def design(system: Polytope | Schedule, spec: Spec) -> Design:
         DesignError: no gain passes; says for each attempt why.
         ModuleNotFoundError: cvxpy or a solver is missing.
     """
-    whole = pooled(system)
-    spec = _complete(system, whole, spec)
+    whole = pool_vertices(system)
+    spec = _check_specification(system, whole, spec)
     attempts: list[str] = []
     for solver in lmi.solvers():
-        for frame, bound in itertools.islice(_frames(whole, spec), FRAMES):
+        for frame, bound in itertools.islice(_frames(whole, spec), FRAMES_PER_SOLVER):
             lower = bound if spec.Q is not None and isinstance(system, Polytope) else None
             found, trouble = _attempt(system, whole, spec, frame, solver, lower)
             attempts.append(f"{solver}: {trouble or 'passed'}")
@@ -91,7 +99,7 @@ def design(system: Polytope | Schedule, spec: Spec) -> Design:
     raise DesignError("no gain passes its checks. " + "; ".join(dict.fromkeys(attempts)))
 
 
-def pooled(system: Polytope | Schedule) -> Polytope:
+def pool_vertices(system: Polytope | Schedule) -> Polytope:
     """All vertices of a schedule as one polytope; a polytope as it is."""
     if isinstance(system, Polytope):
         return system
@@ -100,7 +108,7 @@ def pooled(system: Polytope | Schedule) -> Polytope:
     return Polytope(A=a, B=b, period=system.cells[0].period, states=system.cells[0].states, corners=corners)
 
 
-def _complete(system: Polytope | Schedule, whole: Polytope, spec: Spec) -> Spec:
+def _check_specification(system: Polytope | Schedule, whole: Polytope, spec: Spec) -> Spec:
     spec = spec.checked(whole.order, whole.inputs)
     if spec.Q is None and (spec.l2 is None or spec.l2.bound is not None):
         raise ValueError("nothing to minimise: give the weights Q and R, or an L2 gain without a bound")
@@ -130,11 +138,11 @@ def _attempt(
     system: Polytope | Schedule, whole: Polytope, spec: Spec, frame: Frame, solver: str, lower: float | None
 ) -> tuple[Design | None, str]:
     """A design in one frame by one solver, and what is wrong with it, if anything."""
-    program = Program(system, whole, spec, frame)
+    program = DesignProgram(system, whole, spec, frame)
     c, best, status = program.objective(), None, "no answer"
-    for level in LEVELS * program.least_level() if spec.input else (1.0,):
+    for level in INPUT_LIMIT_LEVELS * program.least_level() if spec.input else (1.0,):
         blocks = program.blocks(level)
-        answer = lmi.solve(c, blocks, solver)
+        answer = lmi.solve_sdp(c, blocks, solver)
         status = answer.status
         if np.isfinite(answer.y).all() and answer.violation(blocks) < 1e-6:
             value = float(c @ answer.y)
@@ -152,7 +160,7 @@ def _attempt(
     proof = certify(gain, system, spec, fastest=False)
     cost = None if spec.Q is None else value * program.scale
     found = Design(gain, proof, cost, lower, gap, residual)
-    return found, _trouble(found, spec, isinstance(system, Schedule))
+    return found, _rejection_reason(found, spec, isinstance(system, Schedule))
 
 
 def _residual(system: Polytope, k: np.ndarray, p: np.ndarray, spec: Spec) -> float:
@@ -164,10 +172,14 @@ def _residual(system: Polytope, k: np.ndarray, p: np.ndarray, spec: Spec) -> flo
     return float(np.linalg.eigvalsh(root.T @ left @ root).max() / np.linalg.eigvalsh(root.T @ weight @ root).max())
 
 
-def _trouble(found: Design, spec: Spec, scheduled: bool) -> str:
+def _rejection_reason(found: Design, spec: Spec, scheduled: bool) -> str:
     """What is wrong with a design; nothing, if it may leave this module."""
     proof = found.certificate
-    wanted = {"scheduled"} if scheduled else {kind for name, kind in KINDS.items() if _asks(getattr(spec, name))}
+    wanted = (
+        {"scheduled"}
+        if scheduled
+        else {kind for name, kind in CLAIM_OF_SPECIFICATION.items() if _is_specified(getattr(spec, name))}
+    )
     missing = wanted - {claim.kind for claim in proof.claims}
     if missing or not proof.verified_exactly:
         return f"gain {found.gain.tolist()}: not proved: {', '.join(sorted(missing)) or 'its claims'}"
@@ -176,10 +188,10 @@ def _trouble(found: Design, spec: Spec, scheduled: bool) -> str:
         return f"cost {cost:.10g} is below its lower bound {lower:.10g}"
     if cost is not None and guaranteed is not None and not scheduled and guaranteed > cost * (1 + 10 * GAP):
         return f"the gain guarantees {guaranteed:.10g}, not the cost {cost:.10g}"
-    if not found.gap <= (ROUGH if scheduled or spec.Q is None else GAP):
+    if not found.gap <= (ROUGH_GAP if scheduled or spec.Q is None else GAP):
         return f"the answer may be {found.gap:.2g} (relative) above the optimum"
     return ""
 
 
-def _asks(value: object) -> bool:
+def _is_specified(value: object) -> bool:
     return value is not None and (not isinstance(value, float | int) or value > 0)

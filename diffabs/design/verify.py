@@ -23,12 +23,16 @@ from fractions import Fraction
 from typing import Any, NamedTuple
 
 Matrix = list[list[Fraction]]
-LARGEST_FILE, LARGEST_ORDER, LARGEST_SET = 2**24, 64, 2**12  # bytes; states or inputs; vertices, cells, points
-LONGEST = 6.0  # s, so that the command answers within 10
+MAX_CERTIFICATE_BYTES, MAX_STATES_OR_INPUTS, MAX_LIST_ENTRIES = (
+    2**24,
+    64,
+    2**12,
+)  # bytes; states or inputs; vertices, cells, points
+MAX_SECONDS = 6.0  # s, so that the command answers within 10
 _deadline: contextvars.ContextVar[tuple[float, float]] = contextvars.ContextVar(
     "deadline", default=(math.inf, math.inf)
 )
-SHAPES = {  # an axis a letter: n states, m inputs, V vertices, N nodes; "?" need not be there
+FIELD_SHAPES = {  # an axis a letter: n states, m inputs, V vertices, N nodes; "?" need not be there
     "decay": {"P": "nn", "rate?": "", "factor?": ""},
     "cost": {"P": "nn", "Q": "nn", "R": "mm", "x0?": "n"},
     "damping": {"P": "nn", "cot": "", "zeta": ""},
@@ -37,7 +41,7 @@ SHAPES = {  # an axis a letter: n states, m inputs, V vertices, N nodes; "?" nee
     "infeasible": {"W": "Vnn", "rate?": "", "factor?": ""},
     "scheduled": {"P": "Nnn", "rates": "2", "rate?": "", "Q?": "nn", "R?": "mm"},
 }
-RANGES = {
+FIELD_RANGES = {
     "rate": ("[0, inf)", lambda x: x >= 0),
     "factor": ("(0, 1]", lambda x: 0 < x <= 1),
     "zeta": ("[0, 1)", lambda x: 0 <= x < 1),
@@ -50,7 +54,7 @@ RANGES = {
 }
 
 
-class Verdict(NamedTuple):
+class ClaimVerdict(NamedTuple):
     """What a claim says, and why it is not proved; an empty reason if it is."""
 
     kind: str
@@ -65,7 +69,7 @@ class Cell(NamedTuple):
     B: list[Matrix]
 
 
-class Stored(NamedTuple):
+class StoredCertificate(NamedTuple):
     """A file: cells (one, without nodes, of a polytope), the gain (or one for each node), the claims' numbers."""
 
     cells: list[Cell]
@@ -75,7 +79,7 @@ class Stored(NamedTuple):
     claims: list[tuple[str, dict[str, Any]]]
 
 
-def verify(path: str | os.PathLike[str], seconds: float = LONGEST) -> list[Verdict]:
+def verify_file(path: str | os.PathLike[str], seconds: float = MAX_SECONDS) -> list[ClaimVerdict]:
     """A verdict for each claim of a file.
 
     path: of the file; seconds: after which an undecided file is refused
@@ -84,8 +88,11 @@ def verify(path: str | os.PathLike[str], seconds: float = LONGEST) -> list[Verdi
     """
     given = _deadline.set((time.monotonic() + seconds, seconds))
     try:
-        stored = _stored(_parsed(pathlib.Path(path)))
-        return [Verdict(kind, _says(kind, d, stored.discrete), _reason(kind, d, stored)) for kind, d in stored.claims]
+        stored = _certificate_from_json(_read_json(pathlib.Path(path)))
+        return [
+            ClaimVerdict(kind, _describe_claim(kind, d, stored.discrete), _failed_inequality(kind, d, stored))
+            for kind, d in stored.claims
+        ]
     except OSError as error:
         raise ValueError(f"cannot be read: {error.strerror or error}") from None
     except RecursionError:
@@ -109,53 +116,58 @@ def _check_time() -> None:
 # The file
 
 
-def _parsed(path: pathlib.Path) -> Any:
+def _read_json(path: pathlib.Path) -> Any:
     about = path.stat()
-    if not stat.S_ISREG(about.st_mode) or about.st_size > LARGEST_FILE:
-        raise ValueError(f"is not a regular file of at most {LARGEST_FILE} bytes")
+    if not stat.S_ISREG(about.st_mode) or about.st_size > MAX_CERTIFICATE_BYTES:
+        raise ValueError(f"is not a regular file of at most {MAX_CERTIFICATE_BYTES} bytes")
     try:
-        return json.loads(path.read_bytes(), parse_int=float, parse_constant=_no_number, object_pairs_hook=_once)
+        return json.loads(
+            path.read_bytes(),
+            parse_int=float,
+            parse_constant=_reject_constant,
+            object_pairs_hook=_reject_duplicate_names,
+        )
     except UnicodeDecodeError:
         raise ValueError("is not text") from None
     except json.JSONDecodeError as error:
         raise ValueError(f"is not JSON: {error}") from None
 
 
-def _no_number(word: str) -> Any:
+def _reject_constant(word: str) -> Any:
     raise ValueError(f"{word} is not a number that can be proved anything about")
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _reject_duplicate_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) != len(pairs):
         raise ValueError(f"a name comes twice among {', '.join(name for name, _ in pairs)[:200]}")
     return found
 
 
-def _stored(value: Any) -> Stored:
-    file = _members(value, "the file", "format", "version", "system", "gain", "claims")
+def _certificate_from_json(value: Any) -> StoredCertificate:
+    file = _read_members(value, "the file", "format", "version", "system", "gain", "claims")
     if file["format"] != "diffabs certificate" or file["version"] != 1.0:
         raise ValueError("format and version are not those of a diffabs certificate, 1")
     sizes: dict[str, int] = {"2": 2}
     scheduled = isinstance(file["system"], dict) and "cells" in file["system"]
-    nodes, parts = _chain(file["system"], sizes) if scheduled else ([], {"system": file["system"]})
-    cells, periods = zip(*(_cell(part, where, sizes) for where, part in parts.items()), strict=True)
+    nodes, parts = _read_schedule(file["system"], sizes) if scheduled else ([], {"system": file["system"]})
+    cells, periods = zip(*(_read_cell(part, where, sizes) for where, part in parts.items()), strict=True)
     if len(set(periods)) != 1:
         raise ValueError("system.cells must have one period")
     tables = scheduled and _depth(file["gain"]) == 3
-    gains = _tensor(file["gain"], "Nmn" if tables else "mn", sizes, "gain")
+    gains = _read_tensor(file["gain"], "Nmn" if tables else "mn", sizes, "gain")
     claims = file["claims"]
-    if not isinstance(claims, list) or len(claims) > LARGEST_SET:
-        raise ValueError(f"claims must be a list of at most {LARGEST_SET}")
+    if not isinstance(claims, list) or len(claims) > MAX_LIST_ENTRIES:
+        raise ValueError(f"claims must be a list of at most {MAX_LIST_ENTRIES}")
     discrete = periods[0] is not None
-    read = [_claim(claim, f"claims[{i}]", sizes, discrete, scheduled) for i, claim in enumerate(claims)]
-    return Stored(list(cells), nodes, gains if tables else [gains] * max(len(nodes), 1), discrete, read)
+    read = [_read_claim(claim, f"claims[{i}]", sizes, discrete, scheduled) for i, claim in enumerate(claims)]
+    return StoredCertificate(list(cells), nodes, gains if tables else [gains] * max(len(nodes), 1), discrete, read)
 
 
-def _chain(value: Any, sizes: dict[str, int]) -> tuple[list[Fraction], dict[str, Any]]:
+def _read_schedule(value: Any, sizes: dict[str, int]) -> tuple[list[Fraction], dict[str, Any]]:
     """Nodes of a schedule, and its cells by name."""
-    system = _members(value, "system", "parameter", "nodes", "cells")
-    nodes, cells = _tensor(system["nodes"], "N", sizes, "system.nodes"), system["cells"]
+    system = _read_members(value, "system", "parameter", "nodes", "cells")
+    nodes, cells = _read_tensor(system["nodes"], "N", sizes, "system.nodes"), system["cells"]
     if not isinstance(cells, list) or not 0 < len(cells) == len(nodes) - 1:
         raise ValueError("system.cells must be a list of one cell between two nodes")
     if not all(a < b for a, b in itertools.pairwise(nodes)):
@@ -163,45 +175,47 @@ def _chain(value: Any, sizes: dict[str, int]) -> tuple[list[Fraction], dict[str,
     return nodes, {f"system.cells[{i}]": cell for i, cell in enumerate(cells)}
 
 
-def _cell(value: Any, where: str, sizes: dict[str, int]) -> tuple[Cell, float | None]:
+def _read_cell(value: Any, where: str, sizes: dict[str, int]) -> tuple[Cell, float | None]:
     """Vertices and period."""
-    part = _members(value, where, "A", "B", "period", "states", "corners")
+    part = _read_members(value, where, "A", "B", "period", "states", "corners")
     sizes.pop("V", None)  # each cell has its own number of vertices
-    a, b = (_tensor(part[name], f"Vn{columns}", sizes, f"{where}.{name}") for name, columns in (("A", "n"), ("B", "m")))
-    if max(sizes["n"], sizes["m"]) > LARGEST_ORDER:
-        raise ValueError(f"{where} has more than {LARGEST_ORDER} states or inputs")
+    a, b = (
+        _read_tensor(part[name], f"Vn{columns}", sizes, f"{where}.{name}") for name, columns in (("A", "n"), ("B", "m"))
+    )
+    if max(sizes["n"], sizes["m"]) > MAX_STATES_OR_INPUTS:
+        raise ValueError(f"{where} has more than {MAX_STATES_OR_INPUTS} states or inputs")
     period = part["period"]
     if period is not None and not (type(period) is float and 0 < period < math.inf):
         raise ValueError(f"{where}.period must be null or in (0, inf) s")
     return Cell(a, b), period
 
 
-def _claim(
+def _read_claim(
     value: Any, where: str, sizes: dict[str, int], discrete: bool, scheduled: bool
 ) -> tuple[str, dict[str, Any]]:
-    claim = _members(value, where, "kind", "data")
+    claim = _read_members(value, where, "kind", "data")
     kind, data = claim["kind"], claim["data"]
-    if not isinstance(kind, str) or kind not in SHAPES or not isinstance(data, dict):
-        raise ValueError(f"{where} needs a kind, one of {', '.join(SHAPES)}, and data")
+    if not isinstance(kind, str) or kind not in FIELD_SHAPES or not isinstance(data, dict):
+        raise ValueError(f"{where} needs a kind, one of {', '.join(FIELD_SHAPES)}, and data")
     if (kind == "scheduled") != scheduled or (discrete and kind in ("damping", "scheduled")):
         raise ValueError(f"{where}: a claim of kind {kind} does not fit the system")
-    fields = {name.rstrip("?"): shape for name, shape in SHAPES[kind].items()}
+    fields = {name.rstrip("?"): shape for name, shape in FIELD_SHAPES[kind].items()}
     fields.pop("rate" if discrete else "factor", None)
-    needed = {name for name in fields if name in SHAPES[kind]}
+    needed = {name for name in fields if name in FIELD_SHAPES[kind]}
     for name in sorted((set(data) - set(fields)) | (needed - set(data))):
         word = "not a field of" if name in data else "missing in"
         raise ValueError(f"{where}.data.{name} is {word} a claim of kind {kind}")
     found, own = {}, dict(sizes)
     for name, given in data.items():
         shapes = [shape for shape in fields[name].split("|") if len(shape) == _depth(given)]
-        found[name] = _tensor(given, (shapes or fields[name].split("|"))[0], own, f"{where}.data.{name}")
-        says, holds = RANGES.get(name, ("", lambda _: True))
+        found[name] = _read_tensor(given, (shapes or fields[name].split("|"))[0], own, f"{where}.data.{name}")
+        says, holds = FIELD_RANGES.get(name, ("", lambda _: True))
         if kind != "infeasible" and not holds(found[name]):
             raise ValueError(f"{where}.data.{name} is outside {says}")
     return kind, found
 
 
-def _members(value: Any, where: str, *names: str) -> dict[str, Any]:
+def _read_members(value: Any, where: str, *names: str) -> dict[str, Any]:
     if not isinstance(value, dict) or set(value) != set(names):
         raise ValueError(f"{where} must have the members {', '.join(names)} and no other")
     return value
@@ -211,28 +225,28 @@ def _depth(value: Any) -> int:
     return 1 + _depth(value[0]) if isinstance(value, list) and value else 0
 
 
-def _tensor(value: Any, letters: str, sizes: dict[str, int], where: str) -> Any:
+def _read_tensor(value: Any, letters: str, sizes: dict[str, int], where: str) -> Any:
     """Fractions in nested lists whose axes have the sizes of the letters; one not seen yet gets its size."""
     if not letters:
         if type(value) is not float or not math.isfinite(value):
             raise ValueError(f"{where} must be a finite number")
         return Fraction(value)
-    if not isinstance(value, list) or not 0 < len(value) <= LARGEST_SET:
-        raise ValueError(f"{where} must be a list of 1 to {LARGEST_SET}")
+    if not isinstance(value, list) or not 0 < len(value) <= MAX_LIST_ENTRIES:
+        raise ValueError(f"{where} must be a list of 1 to {MAX_LIST_ENTRIES}")
     _check_time()
     if len(value) != sizes.setdefault(letters[0], len(value)):
         raise ValueError(f"{where} has {len(value)} entries; {sizes[letters[0]]} are needed")
-    return [_tensor(each, letters[1:], sizes, f"{where}[{i}]") for i, each in enumerate(value)]
+    return [_read_tensor(each, letters[1:], sizes, f"{where}[{i}]") for i, each in enumerate(value)]
 
 
 # The checker
 
 
-def mul(*factors: Matrix) -> Matrix:
+def multiply_matrices(*factors: Matrix) -> Matrix:
     """A B ..., each product in integers over a common denominator."""
     a, *rest = factors
     for b in rest:
-        (rows, below), (columns, under) = _integers(a), _integers(turned(b))
+        (rows, below), (columns, under) = _integers(a), _integers(transpose_matrix(b))
         a = [[_quotient(map(operator.mul, row, column), below * under) for column in columns] for row in rows]
     return a
 
@@ -248,12 +262,12 @@ def _quotient(terms: Iterable[int], below: int) -> Fraction:
     return Fraction(sum(terms), below)
 
 
-def turned(a: Matrix) -> Matrix:
+def transpose_matrix(a: Matrix) -> Matrix:
     """A'."""
     return [list(row) for row in zip(*a, strict=True)]
 
 
-def add(*terms: tuple[Any, Matrix]) -> Matrix:
+def weighted_sum(*terms: tuple[Any, Matrix]) -> Matrix:
     """Sum of number times matrix."""
     first = terms[0][1]
     return [[sum((k * m[i][j] for k, m in terms), Fraction(0)) for j in range(len(row))] for i, row in enumerate(first)]
@@ -261,25 +275,27 @@ def add(*terms: tuple[Any, Matrix]) -> Matrix:
 
 def he(a: Matrix) -> Matrix:
     """A + A'."""
-    return add((1, a), (1, turned(a)))
+    return weighted_sum((1, a), (1, transpose_matrix(a)))
 
 
-def unit(n: int) -> Matrix:
+def identity_matrix(n: int) -> Matrix:
     """I."""
     return [[Fraction(int(i == j)) for j in range(n)] for i in range(n)]
 
 
-def block(a: Matrix, b: Matrix, d: Matrix) -> Matrix:
+def bordered_matrix(a: Matrix, b: Matrix, d: Matrix) -> Matrix:
     """[[A, B], [B', D]]."""
-    return [[*x, *y] for x, y in zip(a, b, strict=True)] + [[*x, *y] for x, y in zip(turned(b), d, strict=True)]
+    return [[*x, *y] for x, y in zip(a, b, strict=True)] + [
+        [*x, *y] for x, y in zip(transpose_matrix(b), d, strict=True)
+    ]
 
 
-def positive(m: Matrix, semi: bool = False) -> bool:
+def is_positive_definite(m: Matrix, semi: bool = False) -> bool:
     """Whether M is symmetric and its pivots positive; of a semidefinite matrix, a zero pivot's row is zero.
 
     Elimination in integers (Bareiss, 1968): `rows` are those of the upper triangle, every entry a minor of M times the
     common denominator, so divisions leave no rest, and no number grows beyond a minor."""
-    if m != turned(m):
+    if m != transpose_matrix(m):
         return False
     whole, last = _integers(m)[0], 1
     rows = [row[i:] for i, row in enumerate(whole)]
@@ -288,98 +304,127 @@ def positive(m: Matrix, semi: bool = False) -> bool:
         if pivot < 0 or (pivot == 0 and (any(row) or not semi)):
             return False
         if pivot:
-            rows = [_eliminated(pivot, a, row[i:], r, last) for i, (a, r) in enumerate(zip(row, rows, strict=True))]
+            rows = [_eliminate_row(pivot, a, row[i:], r, last) for i, (a, r) in enumerate(zip(row, rows, strict=True))]
             last = pivot
     return True
 
 
-def _eliminated(pivot: int, first: int, above: list[int], row: list[int], last: int) -> list[int]:
+def _eliminate_row(pivot: int, first: int, above: list[int], row: list[int], last: int) -> list[int]:
     _check_time()
     return [(pivot * x - first * y) // last for x, y in zip(row, above, strict=True)]
 
 
-def _reason(kind: str, d: Mapping[str, Any], stored: Stored) -> str:
+def _failed_inequality(kind: str, d: Mapping[str, Any], stored: StoredCertificate) -> str:
     """The first inequality that does not hold; empty if all do."""
     if kind == "scheduled":
-        conditions = _of_schedule(d, stored)
+        conditions = _schedule_conditions(d, stored)
     else:
         cell, k = stored.cells[0], stored.gains[0]
-        loops = [add((1, a), (1, mul(b, k))) for a, b in zip(cell.A, cell.B, strict=True)]
-        conditions = _of_none(d, loops, stored.discrete) if kind == "infeasible" else _of_one(kind, d, loops, k, stored)
+        loops = [weighted_sum((1, a), (1, multiply_matrices(b, k))) for a, b in zip(cell.A, cell.B, strict=True)]
+        conditions = (
+            _infeasibility_conditions(d, loops, stored.discrete)
+            if kind == "infeasible"
+            else _quadratic_conditions(kind, d, loops, k, stored)
+        )
     return next((f"{words} is not positive definite" for words, holds in conditions if not holds), "")
 
 
-def _falls(p: Matrix, c: Matrix, d: Mapping[str, Any], discrete: bool) -> Matrix:
+def _decrease_matrix(p: Matrix, c: Matrix, d: Mapping[str, Any], discrete: bool) -> Matrix:
     """-V' - 2 rate V for V = x'Px, or factor^2 V - V+."""
     if discrete:
-        return add((d.get("factor", 1) ** 2, p), (-1, mul(turned(c), p, c)))
-    return add((-1, he(mul(p, c))), (-2 * d.get("rate", 0), p))
+        return weighted_sum((d.get("factor", 1) ** 2, p), (-1, multiply_matrices(transpose_matrix(c), p, c)))
+    return weighted_sum((-1, he(multiply_matrices(p, c))), (-2 * d.get("rate", 0), p))
 
 
-def _of_none(d: Mapping[str, Any], loops: list[Matrix], discrete: bool) -> Iterator[tuple[str, bool]]:
+def _infeasibility_conditions(d: Mapping[str, Any], loops: list[Matrix], discrete: bool) -> Iterator[tuple[str, bool]]:
     """That no P > 0 decreases at all vertices: it would have 0 >= sum tr(W He(P C)) = tr(P sum He(C W)) > 0."""
-    yield "W", all(positive(w, semi=True) for w in d["W"])
+    yield "W", all(is_positive_definite(w, semi=True) for w in d["W"])
     yield (
         "the sum over the vertices",
-        positive(add(*((-1, _falls(w, turned(c), d, discrete)) for w, c in zip(d["W"], loops, strict=True)))),
+        is_positive_definite(
+            weighted_sum(
+                *(
+                    (-1, _decrease_matrix(w, transpose_matrix(c), d, discrete))
+                    for w, c in zip(d["W"], loops, strict=True)
+                )
+            )
+        ),
     )
 
 
-def _of_one(
-    kind: str, d: Mapping[str, Any], loops: list[Matrix], k: Matrix, stored: Stored
+def _quadratic_conditions(
+    kind: str, d: Mapping[str, Any], loops: list[Matrix], k: Matrix, stored: StoredCertificate
 ) -> Iterator[tuple[str, bool]]:
     """What a claim about one P says, vertex by vertex."""
     p, discrete = d["P"], stored.discrete
-    yield "P", positive(p)
+    yield "P", is_positive_definite(p)
     for i, c in enumerate(loops):
-        falls = _falls(p, c, d, discrete)
-        yield f"vertex {i}: what V falls by", positive(falls)
+        falls = _decrease_matrix(p, c, d, discrete)
+        yield f"vertex {i}: what V falls by", is_positive_definite(falls)
         if kind == "cost":
-            spent = (-1, d["Q"]), (-1, mul(turned(k), d["R"], k))
-            yield f"vertex {i}: what V falls by beyond the cost", positive(add((1, falls), *spent))
+            spent = (-1, d["Q"]), (-1, multiply_matrices(transpose_matrix(k), d["R"], k))
+            yield f"vertex {i}: what V falls by beyond the cost", is_positive_definite(weighted_sum((1, falls), *spent))
         if kind == "damping":
-            m = mul(p, c)
-            skew = add((-d["cot"], m), (d["cot"], turned(m)))
-            yield f"vertex {i}: the cone of the damping", positive(block(falls, skew, falls))
+            m = multiply_matrices(p, c)
+            skew = weighted_sum((-d["cot"], m), (d["cot"], transpose_matrix(m)))
+            yield f"vertex {i}: the cone of the damping", is_positive_definite(bordered_matrix(falls, skew, falls))
         if kind == "l2":
             w = d["Bw"] if isinstance(d["Bw"][0][0], Fraction) else d["Bw"][i]
-            yield f"vertex {i}: what is left of the gain", positive(_gain(p, c, w, falls, d, k, discrete))
+            yield (
+                f"vertex {i}: what is left of the gain",
+                is_positive_definite(_l2_matrix(p, c, w, falls, d, k, discrete)),
+            )
     if kind == "damping":
         yield "cot^2 (1 - zeta^2) - zeta^2", d["cot"] ** 2 * (1 - d["zeta"] ** 2) >= d["zeta"] ** 2
     if kind == "input":
-        yield "1 - x'Px at the points", all(mul([x], p, turned([x]))[0][0] <= 1 for x in d["points"])
+        yield (
+            "1 - x'Px at the points",
+            all(multiply_matrices([x], p, transpose_matrix([x]))[0][0] <= 1 for x in d["points"]),
+        )
         for row, limit in zip(k, d["limit"], strict=True):
-            yield "what is left of the input's limit", positive(block(p, turned([row]), [[limit**2]]))
+            yield (
+                "what is left of the input's limit",
+                is_positive_definite(bordered_matrix(p, transpose_matrix([row]), [[limit**2]])),
+            )
 
 
-def _gain(p: Matrix, c: Matrix, w: Matrix, falls: Matrix, d: Mapping[str, Any], k: Matrix, discrete: bool) -> Matrix:
+def _l2_matrix(
+    p: Matrix, c: Matrix, w: Matrix, falls: Matrix, d: Mapping[str, Any], k: Matrix, discrete: bool
+) -> Matrix:
     """-V' - |z|^2 + gamma^2 |w|^2 as a matrix of (x, w)."""
-    z = add((1, d["C"]), (1, mul(d["D"], k)))
-    supply = add((d["gamma"] ** 2, unit(len(w[0]))), *([(-1, mul(turned(w), p, w))] if discrete else []))
-    cross = mul(turned(c), p, w) if discrete else mul(p, w)
-    return block(add((1, falls), (-1, mul(turned(z), z))), add((-1, cross)), supply)
+    z = weighted_sum((1, d["C"]), (1, multiply_matrices(d["D"], k)))
+    supply = weighted_sum(
+        (d["gamma"] ** 2, identity_matrix(len(w[0]))),
+        *([(-1, multiply_matrices(transpose_matrix(w), p, w))] if discrete else []),
+    )
+    cross = multiply_matrices(transpose_matrix(c), p, w) if discrete else multiply_matrices(p, w)
+    return bordered_matrix(
+        weighted_sum((1, falls), (-1, multiply_matrices(transpose_matrix(z), z))), weighted_sum((-1, cross)), supply
+    )
 
 
-def _of_schedule(d: Mapping[str, Any], stored: Stored) -> Iterator[tuple[str, bool]]:
+def _schedule_conditions(d: Mapping[str, Any], stored: StoredCertificate) -> Iterator[tuple[str, bool]]:
     """P(p) > 0 at the nodes, and in every cell the Bernstein coefficients of -V' - ..., times its width."""
     rate, nodes, p, k = d.get("rate", 0), stored.nodes, d["P"], stored.gains
-    yield "P", all(map(positive, p))
+    yield "P", all(map(is_positive_definite, p))
     for i, cell in enumerate(stored.cells):
-        width, moved = nodes[i + 1] - nodes[i], add((1, p[i + 1]), (-1, p[i]))
+        width, moved = nodes[i + 1] - nodes[i], weighted_sum((1, p[i + 1]), (-1, p[i]))
         for a, b in zip(cell.A, cell.B, strict=True):
-            ends = [(p[j], add((1, a), (1, mul(b, k[j]))), k[j]) for j in (i, i + 1)]
+            ends = [(p[j], weighted_sum((1, a), (1, multiply_matrices(b, k[j]))), k[j]) for j in (i, i + 1)]
             for (px, cx, kx), (py, cy, ky) in ((ends[0], ends[0]), (ends[0], ends[1]), (ends[1], ends[1])):
-                flow = he(add((1, mul(px, cy)), (1, mul(py, cx))))
-                falls = add((-width / 2, flow), (-rate * width, px), (-rate * width, py))
+                flow = he(weighted_sum((1, multiply_matrices(px, cy)), (1, multiply_matrices(py, cx))))
+                falls = weighted_sum((-width / 2, flow), (-rate * width, px), (-rate * width, py))
                 spent = [(-width, d["Q"])] if "Q" in d else []
-                spent += [(-width / 2, he(mul(turned(kx), d["R"], ky)))] if "R" in d else []
+                spent += [(-width / 2, he(multiply_matrices(transpose_matrix(kx), d["R"], ky)))] if "R" in d else []
                 for speed in d["rates"]:
-                    left = add((1, falls), (-speed, moved))
-                    holds = positive(left) and (not spent or positive(add((1, left), *spent)))
+                    left = weighted_sum((1, falls), (-speed, moved))
+                    holds = is_positive_definite(left) and (
+                        not spent or is_positive_definite(weighted_sum((1, left), *spent))
+                    )
                     yield f"cell {i}: what V falls by", holds
 
 
-def _says(kind: str, d: Mapping[str, Any], discrete: bool) -> str:
+def _describe_claim(kind: str, d: Mapping[str, Any], discrete: bool) -> str:
     """A claim in words, with its own numbers."""
     number = {name: float(value) for name, value in d.items() if isinstance(value, Fraction)}
     pace = f"{number.get('rate', 0.0):.9g} 1/s"

@@ -10,7 +10,7 @@ import numpy as np
 from diffabs.core.pytree import get, parameters
 from diffabs.explore.friction import FACTOR
 from diffabs.explore.knobs import is_vehicle, mass
-from diffabs.linear.robustness import even
+from diffabs.linear.robustness import low_discrepancy_points
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.batch import Batch, run_batch
@@ -130,7 +130,7 @@ def members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], st
     there = {path: spec for path, spec, _ in parameters(chosen.loop)}
     wanted = {mass(chosen): spread.mass, FACTOR: spread.road}
     wanted = {path: part for path, part in wanted.items() if path in there and part > 0}
-    unit = 2 * even(MEMBERS, len(wanted)) - 1
+    unit = 2 * low_discrepancy_points(MEMBERS, len(wanted)) - 1
     values, words = {}, []
     for i, (path, part) in enumerate(wanted.items()):
         spec, here = there[path], float(get(chosen.loop, path))

@@ -8,7 +8,7 @@ import numpy as np
 
 from diffabs.core.pytree import replace
 from diffabs.linear.robustness import band
-from diffabs.linear.stability_margins import Margins, closed_poles
+from diffabs.linear.stability_margins import Margins, closed_loop_poles
 from diffabs.scenario.scenario import Scenario
 
 MOST_RANGES = 3  # whose corners are followed while one drags
@@ -66,7 +66,7 @@ def around(chosen: Scenario, known: Around | None = None) -> Around:
         return Around(of, np.array([]), {}, 0, 0)
     over = band(chosen.loop, ranges, 0)
     worst = {name: numbers(one.margins)[name] for name, one in over.worst().items() if name in NAMES}
-    poles = np.concatenate([closed_poles(one.loop.transfer()) for one in over.systems])
+    poles = np.concatenate([closed_loop_poles(one.loop.transfer()) for one in over.systems])
     return Around(of, poles, worst, len(over.unstable), len(over.systems))
 
 
@@ -85,7 +85,7 @@ def stability(chosen: Scenario, corners: Around | None) -> Stability:
     return Stability(
         here.loop.period,
         here.loop.delay,
-        closed_poles(here.loop.transfer()),
+        closed_loop_poles(here.loop.transfer()),
         corners.poles,
         numbers(here.margins),
         corners.worst,

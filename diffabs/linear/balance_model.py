@@ -12,7 +12,7 @@ from diffabs.core.protocols import Plant
 from diffabs.core.pytree import part, pytree, strong
 from diffabs.linear.linearization import StateSpace, linearize
 from diffabs.linear.slip_model import Continuous, Sampling, SlipModel
-from diffabs.linear.zero_order_hold import held
+from diffabs.linear.zero_order_hold import discretise_held_input
 from diffabs.plants import ArmBalance, BalanceStart
 from diffabs.plants.arm_balance import ArmState
 
@@ -50,5 +50,5 @@ def _matrices(model: BalanceModel) -> StateSpace:
     if not isinstance(model.sampling, Sampling):
         return system
     n = len(a)
-    whole = held(system, model.sampling.period, 0.0 * model.sampling.period)
+    whole = discretise_held_input(system, model.sampling.period, 0.0 * model.sampling.period)
     return StateSpace(whole.A[:n, :n], whole.B[:n])

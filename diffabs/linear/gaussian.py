@@ -16,7 +16,7 @@ from diffabs.controllers import ObserverFeedback, Sampled
 from diffabs.controllers.balance import MEASURED, STATES
 from diffabs.core.protocols import Plant
 from diffabs.linear.balance_model import BalanceModel
-from diffabs.linear.lyapunov import matrices
+from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.regulator import dlqr
 from diffabs.linear.riccati import dare
 from diffabs.linear.slip_model import Sampling
@@ -35,7 +35,7 @@ class Filter(NamedTuple):
 def kalman(A: Any, C: Any, W: Any, V: Any) -> Filter:
     """The steady filter; A (n, n), C (p, n), W (n, n), V (p, p) > 0. Differentiable; NaN where there is none. Raises
     ValueError as `dare`."""
-    A, C, W, V = matrices(A, C, W, V)
+    A, C, W, V = as_float_arrays(A, C, W, V)
     found = dare(A.T, C.T, W, V)
     spread = C @ found.P @ C.T + V
     return Filter(jnp.linalg.solve(spread, C @ found.P).T, found.P, found.stabilising)

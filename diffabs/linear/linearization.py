@@ -19,7 +19,9 @@ from diffabs.core.protocols import Plant
 from diffabs.core.pytree import strong
 from diffabs.plants.wheel import FROZEN
 
-NEWTON = 10  # iterations for the rest of the remaining states; one is enough where their equation is linear
+REMAINING_STATE_ITERATIONS = (
+    10  # iterations for the rest of the remaining states; one is enough where their equation is linear
+)
 
 
 class StateSpace(NamedTuple):
@@ -45,7 +47,7 @@ def linearize(plant: Plant, state: Any, control: Any) -> StateSpace:
     return StateSpace(*jax.jacfwd(flow, (0, 1))(x, u))
 
 
-def tracking(
+def tracking_dynamics(
     plant: Plant, state: Any, control: Any, tracked: Sequence[str] = ("slip",), frozen: Sequence[str] = FROZEN
 ) -> StateSpace:
     """The linear dynamics of outputs `tracked` and of the remaining states, with the outputs `frozen` held.
@@ -62,7 +64,7 @@ def tracking(
     plant, state, control = strong((plant, state, control))
     flow, x, u = as_vectors(plant, state, control)
     unravel = ravel_pytree(state)[1]
-    kept = untouched(plant, state, (*tracked, *frozen))
+    kept = independent_components(plant, state, (*tracked, *frozen))
 
     def chart(x: Any) -> Any:
         y = plant.output(unravel(x))
@@ -99,7 +101,7 @@ def _check_chart(by_x: Any, outputs: Sequence[str]) -> None:
             raise ValueError(f"{named} are no coordinates here: they depend on each other (singular Jacobian)")
 
 
-def untouched(plant: Plant, state: Any, outputs: Sequence[str]) -> np.ndarray:
+def independent_components(plant: Plant, state: Any, outputs: Sequence[str]) -> np.ndarray:
     """Return the places in the raveled state of the components that none of the outputs depends on."""
     used = used_leaves(plant, state, outputs)
     sizes = [np.size(leaf) for leaf in jax.tree.leaves(state)]

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-DOUBLINGS = 50  # C^(2^50): a radius of 1 - 1e-13 has contracted, one of 1 has not
+MAX_SMITH_STEPS = 50  # C^(2^50): a radius of 1 - 1e-13 has contracted, one of 1 has not
 
 
 class Lyapunov(NamedTuple):
@@ -31,10 +31,10 @@ def lyapunov(A: Any, Q: Any) -> Lyapunov:
     P = integral of exp(A't) Q exp(At) where A is stable. Q (n, n) need not be symmetric. Differentiable in both modes,
     as often as wanted, but not the residual.
     """
-    A, Q = matrices(A, Q)
+    A, Q = as_float_arrays(A, Q)
     I = jnp.eye(len(A), dtype=A.dtype)
-    P = _linear(jnp.kron(A.T, I) + jnp.kron(I, A.T), Q)
-    return Lyapunov(P, relative(A.T @ P + P @ A + Q, A.T @ P, P @ A, Q))
+    P = _solve_vectorised(jnp.kron(A.T, I) + jnp.kron(I, A.T), Q)
+    return Lyapunov(P, relative_residual(A.T @ P + P @ A + Q, A.T @ P, P @ A, Q))
 
 
 def discrete_lyapunov(A: Any, Q: Any) -> Lyapunov:
@@ -42,35 +42,35 @@ def discrete_lyapunov(A: Any, Q: Any) -> Lyapunov:
 
     P = sum of (A')^k Q A^k where A is stable. The rest as for `lyapunov`.
     """
-    A, Q = matrices(A, Q)
-    P = _linear(jnp.kron(A.T, A.T) - jnp.eye(A.size, dtype=A.dtype), Q)
-    return Lyapunov(P, relative(A.T @ P @ A - P + Q, A.T @ P @ A, P, Q))
+    A, Q = as_float_arrays(A, Q)
+    P = _solve_vectorised(jnp.kron(A.T, A.T) - jnp.eye(A.size, dtype=A.dtype), Q)
+    return Lyapunov(P, relative_residual(A.T @ P @ A - P + Q, A.T @ P @ A, P, Q))
 
 
-def _linear(operator: jax.Array, Q: jax.Array) -> jax.Array:
+def _solve_vectorised(operator: jax.Array, Q: jax.Array) -> jax.Array:
     """P of operator vec(P) = -vec(Q), vec by rows."""
     return jnp.linalg.solve(operator, -Q.ravel()).reshape(Q.shape)
 
 
-def matrices(*given: Any) -> tuple[Any, ...]:
+def as_float_arrays(*given: Any) -> tuple[Any, ...]:
     """As arrays of one floating type."""
     given = tuple(jnp.asarray(x) if isinstance(x, list | tuple) else x for x in given)
     kind = jnp.result_type(float, *given)
     return tuple(jnp.asarray(x, kind) for x in given)
 
 
-def relative(left: jax.Array, *terms: jax.Array) -> jax.Array:
+def relative_residual(left: jax.Array, *terms: jax.Array) -> jax.Array:
     """Norm of a sum over the sum of the norms of its terms; 0 where these are 0. Its derivative is zero."""
     left, terms = lax.stop_gradient((left, terms))
     axes = (0, 1)
-    total = reduce(add, (size(term, axes) for term in terms))
-    return jnp.where(total == 0, 0.0, size(left, axes) / jnp.where(total == 0, 1.0, total))
+    total = reduce(add, (frobenius_norm(term, axes) for term in terms))
+    return jnp.where(total == 0, 0.0, frobenius_norm(left, axes) / jnp.where(total == 0, 1.0, total))
 
 
 # Many small matrices: (rows, columns, lanes)
 
 
-def size(X: jax.Array, axes: Any = (0, 1)) -> jax.Array:
+def frobenius_norm(X: jax.Array, axes: Any = (0, 1)) -> jax.Array:
     """Frobenius norm, per lane."""
     return jnp.sqrt(jnp.sum(X * X, axes))
 
@@ -90,7 +90,7 @@ def eye(n: int, like: jax.Array) -> jax.Array:
     return jnp.broadcast_to(jnp.eye(n, dtype=like.dtype)[..., None], (n, n, like.shape[-1]))
 
 
-def solve(M: jax.Array, W: jax.Array) -> tuple[jax.Array, jax.Array]:
+def gauss_jordan_solve(M: jax.Array, W: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(M^-1 W, log abs det M), per lane, by Gauss-Jordan elimination with partial pivoting.
 
     The pivot's row is gathered: XLA would fuse a masked sum over the rows into its consumer and work it out once per
@@ -122,7 +122,7 @@ def cholesky(R: jax.Array) -> jax.Array:
     return L
 
 
-def smith(C: jax.Array, *right: jax.Array) -> tuple[jax.Array, ...]:
+def solve_stein(C: jax.Array, *right: jax.Array) -> tuple[jax.Array, ...]:
     """X of C' X C - X + W = 0 for each W of `right`, per lane; not finite where C is not stable.
 
     Smith's squared method: X <- X + C' X C, C <- C^2. Where the powers of C do not vanish, C is not stable.
@@ -130,11 +130,11 @@ def smith(C: jax.Array, *right: jax.Array) -> tuple[jax.Array, ...]:
 
     def going(carry: tuple[Any, ...]) -> jax.Array:
         k, C, _ = carry
-        return (k < DOUBLINGS) & jnp.any(size(C) > 1e-9)
+        return (k < MAX_SMITH_STEPS) & jnp.any(frobenius_norm(C) > 1e-9)
 
     def double(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         k, C, X = carry
         return k + 1, times(C, C), tuple(x + times(transpose(C), x, C) for x in X)
 
     _, C, X = lax.while_loop(going, double, (0, C, right))
-    return tuple(jnp.where(size(C) <= 1e-9, x, jnp.nan) for x in X)
+    return tuple(jnp.where(frobenius_norm(C) <= 1e-9, x, jnp.nan) for x in X)

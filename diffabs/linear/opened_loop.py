@@ -24,12 +24,12 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
 from diffabs.core.pytree import strong
 from diffabs.core.tracing import follows
-from diffabs.linear.linearization import StateSpace, untouched
-from diffabs.linear.operating_point import RESIDUE, root
-from diffabs.linear.transfer import WHOLE, Transfer
-from diffabs.linear.zero_order_hold import held
+from diffabs.linear.linearization import StateSpace, independent_components
+from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
+from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer
+from diffabs.linear.zero_order_hold import discretise_held_input
 
-OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)  # of the target, relative, in which directions a limit is left
+TARGET_OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)  # of the target, relative, in which directions a limit is left
 
 
 class OpenLoop(NamedTuple):
@@ -49,11 +49,11 @@ class OpenLoop(NamedTuple):
         """The open loop L, from the command to its negative; `more` is added to the delay [s]."""
         delay = self.delay + more
         if self.period is None:
-            return _pruned(_series(self.plant, self.controller)._replace(delay=delay))
-        whole = int(np.floor(delay / self.period + WHOLE))
+            return _drop_unobserved_states(_series(self.plant, self.controller)._replace(delay=delay))
+        whole = int(np.floor(delay / self.period + WHOLE_PERIOD_TOLERANCE))
         rest = max(delay - whole * self.period, 0.0)
-        plant = _sampled(self.plant, self.period, rest if rest > WHOLE * self.period else 0.0)
-        return _pruned(_series(plant, self.controller)._replace(delay=whole * self.period))
+        plant = _sample_plant(self.plant, self.period, rest if rest > WHOLE_PERIOD_TOLERANCE * self.period else 0.0)
+        return _drop_unobserved_states(_series(plant, self.controller)._replace(delay=whole * self.period))
 
 
 def open_loop(loop: Loop, target: Any = None) -> OpenLoop:
@@ -64,10 +64,12 @@ def open_loop(loop: Loop, target: Any = None) -> OpenLoop:
         ValueError: a block that acts at instants (a relay, a controller that computes in every step but is not
             `Sampled`), a plant that does not come to rest at the setpoint, a command that nothing measured acts on.
     """
-    rational, delay = _without_delays(loop)
+    rational, delay = _split_off_delays(loop)
     _check_continuous(rational)
-    found = jax.device_get(_linearized(rational, _first(loop)[1] if target is None else float(target)))
-    if not found.residue < RESIDUE:
+    found = jax.device_get(
+        _linearize_halves(rational, _start_output_and_setpoint(loop)[1] if target is None else float(target))
+    )
+    if not found.residue < MAX_REST_RESIDUE:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     delay += float(sampled.delay) if sampled else 0.0
@@ -81,7 +83,7 @@ def open_loop(loop: Loop, target: Any = None) -> OpenLoop:
     return model
 
 
-def _without_delays(loop: Loop) -> tuple[Loop, float]:
+def _split_off_delays(loop: Loop) -> tuple[Loop, float]:
     """The loop without its actuator's pure delays, and their sum [s]: they commute with what is linear."""
     blocks = loop.actuator.blocks if isinstance(loop.actuator, Series) else (loop.actuator,)
     delay = float(sum(block.time for block in blocks if isinstance(block, Delay)))
@@ -92,23 +94,26 @@ def _without_delays(loop: Loop) -> tuple[Loop, float]:
 def _check_continuous(loop: Loop) -> None:
     """Raises ValueError for a block that changes at instants by what it is given."""
     start = loop.start()
-    given = {"sensor": loop.plant.output(start.plant), "actuator": 0.0 * loop.plant.holding(*_first(loop))}
+    given = {
+        "sensor": loop.plant.output(start.plant),
+        "actuator": 0.0 * loop.plant.holding(*_start_output_and_setpoint(loop)),
+    }
     if not isinstance(loop.controller, Sampled):
         given["controller"] = None
     for name, signal in given.items():
         block = getattr(loop, name)
-        if offers(block, "margins") or (offers(block, "tick") and (signal is None or _follows(block, signal))):
+        if offers(block, "margins") or (offers(block, "tick") and (signal is None or _ticks_use_signal(block, signal))):
             hint = ": put it into a sampled controller" if name == "controller" and not offers(block, "margins") else ""
             raise ValueError(f"{name} {type(block).__name__} acts at instants: it has no linear model{hint}")
 
 
-def _follows(block: Any, signal: Any) -> bool:
+def _ticks_use_signal(block: Any, signal: Any) -> bool:
     """Whether a block's ticks look at its signal; noise does not."""
     memory, clock = block.start(signal), Clock(0.0, 1e-3, 1, jax.random.key(0))
     return follows(lambda signal: block.tick(clock, memory, signal).held, signal)
 
 
-class _Around(NamedTuple):
+class _SurroundingStates(NamedTuple):
     """What is integrated around the controller."""
 
     plant: Any
@@ -116,7 +121,7 @@ class _Around(NamedTuple):
     actuator: Any
 
 
-class _Linear(NamedTuple):
+class _LinearHalves(NamedTuple):
     """Matrices (A, B, C, D) of both halves; how far from rest they were taken, relative to the state."""
 
     plant: Any
@@ -124,16 +129,16 @@ class _Linear(NamedTuple):
     residue: Any
 
 
-def _first(loop: Loop) -> tuple[Any, Any]:
+def _start_output_and_setpoint(loop: Loop) -> tuple[Any, Any]:
     """What the plant shows at the start, and the setpoint."""
     start = loop.start()
     return loop.plant.output(start.plant), loop.reference.setpoint(start.reference)
 
 
 @jax.jit
-def _linearized(loop: Loop, setpoint: Any) -> _Linear:
+def _linearize_halves(loop: Loop, setpoint: Any) -> _LinearHalves:
     loop, setpoint = strong((loop, setpoint))
-    around, free, residue = _rest(loop, setpoint)
+    around, free, residue = _find_rest(loop, setpoint)
     z, command = free[:-1], free[-1]
     signal, as_signal = ravel_pytree(around.signal(z))
     by_z, b = jax.jacfwd(around.moves, (0, 1))(z, command)
@@ -141,7 +146,7 @@ def _linearized(loop: Loop, setpoint: Any) -> _Linear:
     n = len(z) - around.held
     a, c = (jnp.linalg.solve(chart.T, m.T).T[:, :n] for m in (by_z, jax.jacfwd(around.signals)(z)))
     plant = (a[:n], b[:n, None], c, jnp.zeros((len(signal), 1), a.dtype))
-    return _Linear(plant, _controller(loop, signal, as_signal, command), residue)
+    return _LinearHalves(plant, _linearize_controller(loop, signal, as_signal, command), residue)
 
 
 class _Surroundings:
@@ -150,14 +155,16 @@ class _Surroundings:
 
     def __init__(self, loop: Loop, setpoint: Any):
         state = loop.start()
-        parts = _Around(state.plant, state.sensor.flow, state.actuator.flow)
+        parts = _SurroundingStates(state.plant, state.sensor.flow, state.actuator.flow)
         self.loop, self.setpoint = loop, setpoint
         self.memory = (state.sensor.held, state.actuator.held)
         self.start, self.unravel = ravel_pytree(parts)
         self.frozen: Any = tuple(getattr(loop.plant, "frozen", ()))
         first = loop.plant.shows._fields[0]
         size = ravel_pytree(state.plant)[0].size
-        kept = untouched(loop.plant, state.plant, (first, *self.frozen)) if self.frozen else np.arange(size)
+        kept = (
+            independent_components(loop.plant, state.plant, (first, *self.frozen)) if self.frozen else np.arange(size)
+        )
         self.kept, self.size, self.held = kept, size, len(self.frozen)
 
     def output(self, z: Any) -> Any:
@@ -178,7 +185,7 @@ class _Surroundings:
         x = self.unravel(z)
         actuator = Memory(x.actuator, self.memory[1])
         control = self.loop.actuator.output(0.0, actuator, command)
-        rates = _Around(
+        rates = _SurroundingStates(
             self.loop.plant.derivative(0.0, x.plant, control),
             self.loop.sensor.flow(0.0, Memory(x.sensor, self.memory[0]), self.output(z)),
             self.loop.actuator.flow(0.0, actuator, command),
@@ -197,7 +204,7 @@ class _Surroundings:
         """The rates of the coordinates."""
         return jax.jvp(self.chart, (z,), (self.flow(z, command),))[1]
 
-    def still(self, free: Any) -> Any:
+    def rest_residual(self, free: Any) -> Any:
         """Zero where all but the frozen outputs stand still, those are where they began, and the first signal is the
         setpoint."""
         z, command = free[:-1], free[-1]
@@ -206,18 +213,18 @@ class _Surroundings:
         return jnp.concatenate([rates, where, (self.output(z)[0] - self.setpoint)[None]])
 
 
-def _rest(loop: Loop, setpoint: Any) -> tuple[_Surroundings, Any, Any]:
+def _find_rest(loop: Loop, setpoint: Any) -> tuple[_Surroundings, Any, Any]:
     """The surroundings of the controller, (z, command) at rest, and how far from it they are."""
     around = _Surroundings(loop, setpoint)
     there = around.chart(around.start)
     there = there.at[0].set(around.setpoint) if around.frozen else there
-    near = root(lambda z: around.chart(z) - there, around.start)  # on the setpoint, the rest as it starts
+    near = find_root(lambda z: around.chart(z) - there, around.start)  # on the setpoint, the rest as it starts
     guess = loop.plant.holding(around.output(near), around.setpoint)
-    free = root(around.still, jnp.append(near, guess))
-    return around, free, jnp.max(jnp.abs(around.still(free))) / (1 + jnp.max(jnp.abs(free)))
+    free = find_root(around.rest_residual, jnp.append(near, guess))
+    return around, free, jnp.max(jnp.abs(around.rest_residual(free))) / (1 + jnp.max(jnp.abs(free)))
 
 
-def _controller(loop: Loop, signal: Any, as_signal: Any, command: Any) -> Any:
+def _linearize_controller(loop: Loop, signal: Any, as_signal: Any, command: Any) -> Any:
     """(A, B, C, D) of the controller from its signal to the command, at rest where it commands what holds the plant."""
     controller, memory = loop.controller, loop.start().controller
     sampled = isinstance(controller, Sampled)
@@ -243,11 +250,11 @@ def _controller(loop: Loop, signal: Any, as_signal: Any, command: Any) -> Any:
         setpoint itself the command may begin at a limit."""
         size = jnp.where(signal[0] == 0, 1.0, jnp.abs(signal[0]))
         slopes = jax.jacfwd(holding)(inside, signal.at[0].add(offset * size))
-        c = root(holding, inside - jnp.linalg.pinv(slopes) @ holding(inside))
+        c = find_root(holding, inside - jnp.linalg.pinv(slopes) @ holding(inside))
         return c, jnp.sum(jnp.abs(holding(c)))
 
     if inside.size:
-        each, left = jax.vmap(found)(jnp.asarray(OFFSETS, inside.dtype))
+        each, left = jax.vmap(found)(jnp.asarray(TARGET_OFFSETS, inside.dtype))
         inside = each[jnp.argmin(jnp.where(jnp.isfinite(left), left, jnp.inf))]
     (f, g), (h, j) = jax.jacfwd(compute, (0, 1))(inside, signal)
     return f, g, h[None], j[None]
@@ -262,20 +269,20 @@ def _series(first: Transfer, second: Transfer) -> Transfer:
     return Transfer(a, b, c, np.zeros((len(c), b.shape[1])), second.period)
 
 
-def _sampled(plant: Transfer, period: float, delay: float) -> Transfer:
+def _sample_plant(plant: Transfer, period: float, delay: float) -> Transfer:
     """The plant at the instants of a clock, its input held, and changed `delay` after them."""
     n, m = np.shape(plant.B)
-    a, b = (np.asarray(x) for x in _held(StateSpace(plant.A, plant.B), period, delay))
+    a, b = (np.asarray(x) for x in _discretise_compiled(StateSpace(plant.A, plant.B), period, delay))
     c = np.hstack([plant.C, np.zeros((len(plant.C), m))])
     if not delay:
         a, b, c = a[:n, :n], b[:n], plant.C
     return Transfer(a, b, c, plant.D, period)
 
 
-_held = jax.jit(held)
+_discretise_compiled = jax.jit(discretise_held_input)
 
 
-def _pruned(system: Transfer) -> Transfer:
+def _drop_unobserved_states(system: Transfer) -> Transfer:
     """The system without the states that its output does not depend on, such as an integral whose gain is zero."""
     kept = (system.C != 0).any(axis=0)
     for _ in kept:

@@ -22,11 +22,11 @@ from diffabs.core.pytree import part, pytree, static, strong
 from diffabs.linear.linearization import StateSpace
 from diffabs.stops import NoStop
 
-NEWTON = 10  # iterations for the rest; one is enough where the loop is linear
-RESIDUE = 1e-6  # relative to the state: what is further off than this is no rest
+ROOT_ITERATIONS = 10  # iterations for the rest; one is enough where the loop is linear
+MAX_REST_RESIDUE = 1e-6  # relative to the state: what is further off than this is no rest
 
 
-class Closed(NamedTuple):
+class LinearLoop(NamedTuple):
     """A (n, n), B (n, 1), gain K (n,) of the loop's controller; and how far from rest they were taken."""
 
     A: Any
@@ -64,12 +64,12 @@ class OperatingPoint:
 
     def matrices(self) -> StateSpace:
         """A (n, n) and B (n, 1), differentiable in every parameter; compiled once for each kind of loop."""
-        found, kept = _linearized(self), np.array(self.kept, int)
+        found, kept = _linearize_at_rest(self), np.array(self.kept, int)
         return StateSpace(found.A[kept][:, kept], found.B[kept])
 
     def gain(self) -> Any:
         """K (n,) of the loop's own controller."""
-        return _linearized(self).K[np.array(self.kept, int)]
+        return _linearize_at_rest(self).K[np.array(self.kept, int)]
 
 
 def operating_point(loop: Loop) -> OperatingPoint:
@@ -84,30 +84,30 @@ def operating_point(loop: Loop) -> OperatingPoint:
         if jax.tree.leaves(getattr(start, name).held):
             kind = type(getattr(loop, name)).__name__
             raise ValueError(f"{name} {kind} acts at instants: it has no linear model in continuous time")
-    model = _unstopped(loop)
-    found = jax.device_get(_linearized(model))
-    if not found.residue < RESIDUE:
+    model = _drop_stop(loop)
+    found = jax.device_get(_linearize_at_rest(model))
+    if not found.residue < MAX_REST_RESIDUE:
         raise ValueError(f"plant {type(loop.plant).__name__} does not come to rest at the setpoint: no linear model")
     if not np.any(found.B) or not np.any(found.K):
         raise ValueError("the control is at a limit at the setpoint, or does not act there: no linear model")
     plant = np.arange(len(found.A)) < len(ravel_pytree(start.plant)[0])
-    return dataclasses.replace(model, kept=_needed(found, plant))  # pyright: ignore[reportArgumentType]
+    return dataclasses.replace(model, kept=_needed_states(found, plant))  # pyright: ignore[reportArgumentType]
 
 
 def loop_gain(loop: Loop, states: tuple[str, ...]) -> Any:
     """Return K (n,) of a loop's controller on the states of an `OperatingPoint`, by their names. Differentiable in the
     loop's parameters."""
     names = _names(loop)
-    return _linearized(_unstopped(loop)).K[np.array([names.index(name) for name in states])]
+    return _linearize_at_rest(_drop_stop(loop)).K[np.array([names.index(name) for name in states])]
 
 
-def _unstopped(loop: Loop) -> OperatingPoint:
+def _drop_stop(loop: Loop) -> OperatingPoint:
     """The parts of a loop but its stop."""
     fields = {f.name: getattr(loop, f.name) for f in dataclasses.fields(loop) if f.name != "stop"}  # pyright: ignore[reportArgumentType]
     return OperatingPoint(**fields)
 
 
-def _needed(found: Closed, plant: np.ndarray) -> tuple[int, ...]:
+def _needed_states(found: LinearLoop, plant: np.ndarray) -> tuple[int, ...]:
     """The states of the plant, those that the command depends on, and those that any of these depends on."""
     kept = plant | (found.K != 0)
     for _ in kept:
@@ -115,7 +115,7 @@ def _needed(found: Closed, plant: np.ndarray) -> tuple[int, ...]:
     return tuple(np.flatnonzero(kept).tolist())
 
 
-class _Integrated(NamedTuple):
+class _IntegratedStates(NamedTuple):
     """What is integrated, but for the reference."""
 
     plant: Any
@@ -124,9 +124,9 @@ class _Integrated(NamedTuple):
     actuator: Any
 
 
-def _start(loop: Loop) -> _Integrated:
+def _start(loop: Loop) -> _IntegratedStates:
     state = loop.start()
-    return _Integrated(state.plant, state.sensor.flow, state.controller.flow, state.actuator.flow)
+    return _IntegratedStates(state.plant, state.sensor.flow, state.controller.flow, state.actuator.flow)
 
 
 def _names(loop: Loop) -> list[str]:
@@ -138,7 +138,7 @@ def _names(loop: Loop) -> list[str]:
     return names
 
 
-class _AsVector(NamedTuple):
+class _VectorLoop(NamedTuple):
     """A loop on a setpoint, whose integrated states are one vector z; the actuator is given a command v."""
 
     loop: Loop
@@ -160,7 +160,7 @@ class _AsVector(NamedTuple):
         """dz/dt."""
         loop, x = self.loop, self.unravel(z)
         y, seen = self.tracking(z)
-        rates = _Integrated(
+        rates = _IntegratedStates(
             loop.plant.derivative(0.0, x.plant, loop.actuator.output(0.0, Memory(x.actuator), v)),
             loop.sensor.flow(0.0, Memory(x.sensor), y),
             loop.controller.flow(0.0, Memory(x.controller), seen),
@@ -170,20 +170,20 @@ class _AsVector(NamedTuple):
 
 
 @jax.jit
-def _linearized(model: OperatingPoint) -> Closed:
+def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
     loop = strong(model).loop
     setpoint = loop.reference.setpoint(loop.start().reference)
     z, unravel = ravel_pytree(_start(loop))
-    one = _AsVector(loop, setpoint, unravel)
-    at = _Integrated(*(np.size(ravel_pytree(part)[0]) for part in _start(loop)))
-    inside = np.repeat(np.arange(4) == _Integrated._fields.index("controller"), at)
+    one = _VectorLoop(loop, setpoint, unravel)
+    at = _IntegratedStates(*(np.size(ravel_pytree(part)[0]) for part in _start(loop)))
+    inside = np.repeat(np.arange(4) == _IntegratedStates._fields.index("controller"), at)
 
     def still(free: Any) -> Any:
         """Zero where everything but the controller is at rest, the first signal on the setpoint."""
         moved = z.at[~inside].set(free[:-1])
         return jnp.append(one.flow(moved, free[-1])[~inside], one.tracking(moved)[0][0] - setpoint)
 
-    free = root(still, jnp.append(z[~inside], 0.0))
+    free = find_root(still, jnp.append(z[~inside], 0.0))
     z = z.at[~inside].set(free[:-1])
 
     def holding(memory: Any, z: Any = z) -> Any:
@@ -191,13 +191,13 @@ def _linearized(model: OperatingPoint) -> Closed:
         moved = z.at[inside].set(memory)
         return jnp.append(one.flow(moved, free[-1])[inside], one.command(moved) - free[-1])
 
-    z = z.at[inside].set(root(holding, z[inside]))
+    z = z.at[inside].set(find_root(holding, z[inside]))
     a, b = jax.jacfwd(one.flow, (0, 1))(z, free[-1])
     residue = jnp.max(jnp.abs(still(free))) / (1 + jnp.max(jnp.abs(free)))
-    return Closed(a, b[:, None], jax.jacfwd(one.command)(z), residue)
+    return LinearLoop(a, b[:, None], jax.jacfwd(one.command)(z), residue)
 
 
-def root(function: Any, x: Any) -> Any:
+def find_root(function: Any, x: Any) -> Any:
     """Return where a function is zero, or least in squares, by Gauss and Newton. First and second derivatives are those
     of the last two steps: each doubles their order."""
 
@@ -206,5 +206,5 @@ def root(function: Any, x: Any) -> Any:
 
     if not x.size:
         return x
-    fixed = jax.lax.fori_loop(0, NEWTON, lambda _, x: jax.lax.stop_gradient(step(x)), jax.lax.stop_gradient(x))
+    fixed = jax.lax.fori_loop(0, ROOT_ITERATIONS, lambda _, x: jax.lax.stop_gradient(step(x)), jax.lax.stop_gradient(x))
     return step(step(jax.lax.stop_gradient(fixed)))

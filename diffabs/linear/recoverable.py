@@ -41,7 +41,7 @@ def mode_bounds(A: Any, B: Any, start: Any, limit: float) -> dict[float, float]:
     return found
 
 
-def zeros(A: Any, B: Any, output: Any) -> np.ndarray:
+def transmission_zeros(A: Any, B: Any, output: Any) -> np.ndarray:
     """Finite transmission zeros of x' = A x + B u, y = c'x, one input: where the Rosenbrock matrix loses rank. They are
     the poles of the inverse, which exists on the states that keep y at 0: with relative degree r, the eigenvalues of
     (I - B (c'A^(r-1)B)^-1 c'A^(r-1)) A other than r zeros of its own making."""

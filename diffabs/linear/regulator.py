@@ -15,9 +15,9 @@ from jax.core import Tracer
 
 from diffabs.core.compiling import SAME, compile_once
 from diffabs.linear.riccati import care, dare
-from diffabs.linear.weights import weight
+from diffabs.linear.weights import as_weight_matrix
 
-UNMOVED = 1e-10  # relative: a mode with no more input than this is not moved by it
+PBH_TOLERANCE = 1e-10  # relative: a mode with no more input than this is not moved by it
 
 
 class Regulator(NamedTuple):
@@ -46,8 +46,8 @@ def lqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
             not traced, entries that are not finite, Q or R that are not symmetric, R that is not positive definite, a
             pair that is not stabilisable.
     """
-    _check(A, B, Q, R, discrete=False)
-    return _regulated(A, B, Q, R, S)
+    _check_matrices(A, B, Q, R, discrete=False)
+    return _solve_lqr(A, B, Q, R, S)
 
 
 def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
@@ -62,26 +62,26 @@ def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
     [[-0.618]]
 
     Raises ValueError as `lqr`."""
-    _check(A, B, Q, R, discrete=True)
-    return _regulated_samples(A, B, Q, R, S)
+    _check_matrices(A, B, Q, R, discrete=True)
+    return _solve_dlqr(A, B, Q, R, S)
 
 
 @compile_once(options=SAME)
-def _regulated(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
+def _solve_lqr(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
     found = care(A, B, Q, R, S)
     turned = jnp.asarray(B).T @ found.P + (0.0 if S is None else jnp.asarray(S).T)
     return Regulator(-jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned), *found)
 
 
 @compile_once(options=SAME)
-def _regulated_samples(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
+def _solve_dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
     found = dare(A, B, Q, R, S)
     b = jnp.asarray(B)
     turned = b.T @ found.P @ jnp.asarray(A) + (0.0 if S is None else jnp.asarray(S).T)
     return Regulator(-jnp.linalg.solve(jnp.asarray(R) + b.T @ found.P @ b, turned), *found)
 
 
-def _check(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool) -> None:
+def _check_matrices(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool) -> None:
     """What can be said of numbers."""
     if any(isinstance(x, Tracer) for x in (A, B, Q, R)):
         return
@@ -96,19 +96,19 @@ def _check(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool) -> None:
             raise ValueError(f"{name} has shape {value.shape}; ({size}, {size}) is needed")
         if not np.isfinite(value).all() or not np.allclose(value, value.T, rtol=1e-12, atol=0):
             raise ValueError(f"{name} = {value.tolist()} is not symmetric and finite")
-    weight("R", R, b.shape[1], definite=True)
-    unmoved = unstabilisable(a, b, discrete=discrete)
+    as_weight_matrix("R", R, b.shape[1], definite=True)
+    unmoved = unstabilisable_mode(a, b, discrete=discrete)
     if unmoved is not None:
         raise ValueError(f"the pair (A, B) is not stabilisable: the input does not move the mode at {unmoved:.6g}")
 
 
-def unstabilisable(A: Any, B: Any, *, discrete: bool = False) -> complex | None:
+def unstabilisable_mode(A: Any, B: Any, *, discrete: bool = False) -> complex | None:
     """An eigenvalue of A, not stable, that the input cannot move: (A - s I, B) has rank below n there (Popov, Belevitch
     and Hautus). None if there is none."""
     a, b = np.asarray(A, float), np.asarray(B, float)
     for mode in np.linalg.eigvals(a):
         unstable = abs(mode) >= 1 if discrete else np.real(mode) >= 0
         pencil = np.hstack([a - mode * np.eye(len(a)), b])
-        if unstable and np.linalg.svd(pencil, compute_uv=False)[-1] <= UNMOVED * np.linalg.norm(pencil, 2):
+        if unstable and np.linalg.svd(pencil, compute_uv=False)[-1] <= PBH_TOLERANCE * np.linalg.norm(pencil, 2):
             return complex(mode) if abs(np.imag(mode)) > 0 else float(np.real(mode))
     return None

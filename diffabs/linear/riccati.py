@@ -20,12 +20,12 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.compiling import SAME, compile_once
+from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.lyapunov import discrete_lyapunov as _discrete_lyapunov
 from diffabs.linear.lyapunov import lyapunov as _lyapunov
-from diffabs.linear.lyapunov import matrices
-from diffabs.linear.riccati_batched import one, solve_care, solve_dare
+from diffabs.linear.riccati_batched import solve_care, solve_dare, solve_one
 
-DOUBLE = 'a proven P needs float64, for which JAX is asked by jax.config.update("jax_enable_x64", True)'
+FLOAT64_HINT = 'a proven P needs float64, for which JAX is asked by jax.config.update("jax_enable_x64", True)'
 
 
 class Riccati(NamedTuple):
@@ -53,7 +53,7 @@ def care(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
 
     Raises ValueError for shapes that do not fit, complex matrices, and float32.
     """
-    return _riccati(_continuous, A, B, Q, R, S)
+    return _riccati(_solve_continuous, A, B, Q, R, S)
 
 
 def dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
@@ -62,12 +62,12 @@ def dare(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Riccati:
     A (n, n), B (n, m), Q (n, n), R (m, m), S (n, m) or none. As `care`, but R may be singular, R >= 0, where
     R + B' P B > 0. The feedback is u = -(R + B' P B)^-1 (B' P A + S') x. Raises ValueError as `care`.
     """
-    return _riccati(_discrete, A, B, Q, R, S)
+    return _riccati(_solve_discrete, A, B, Q, R, S)
 
 
 def _riccati(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Riccati:
-    A, B, Q, R = matrices(A, B, Q, R)
-    S = jnp.zeros_like(B) if S is None else matrices(S)[0].astype(B.dtype)
+    A, B, Q, R = as_float_arrays(A, B, Q, R)
+    S = jnp.zeros_like(B) if S is None else as_float_arrays(S)[0].astype(B.dtype)
     if jnp.iscomplexobj(B) or jnp.iscomplexobj(S):
         raise ValueError("A, B, Q, R, S must be real; [[Re, -Im], [Im, Re]] of each is the same equation, real")
     n, m = B.shape
@@ -77,12 +77,12 @@ def _riccati(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Ricc
             f"A, Q, R, S have shapes {shapes}; B of shape {(n, m)} needs {((n, n), (n, n), (m, m), (n, m))}"
         )
     if B.dtype != jnp.float64:
-        raise ValueError(f"A, B, Q, R are {B.dtype}: {DOUBLE}")
-    return _solved(solution, A, B, Q, R, S)
+        raise ValueError(f"A, B, Q, R are {B.dtype}: {FLOAT64_HINT}")
+    return _solve_compiled(solution, A, B, Q, R, S)
 
 
 @compile_once(static=1, options=SAME)
-def _solved(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Riccati:
+def _solve_compiled(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Riccati:
     P, residual = solution(A, B, (Q + Q.T) / 2, (R + R.T) / 2, S)
     return Riccati(P, residual, jnp.all(jnp.isfinite(P)))
 
@@ -91,21 +91,21 @@ def _solved(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Ricca
 
 
 @jax.custom_jvp
-def _continuous(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _solve_continuous(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(P, residual) of the continuous equation."""
-    return one(solve_care, data)
+    return solve_one(solve_care, data)
 
 
 @jax.custom_jvp
-def _discrete(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _solve_discrete(*data: jax.Array) -> tuple[jax.Array, jax.Array]:
     """(P, residual) of the discrete equation."""
-    return one(solve_dare, data)
+    return solve_one(solve_dare, data)
 
 
-@_continuous.defjvp
-def _continuous_jvp(data: Any, tangents: Any) -> Any:
+@_solve_continuous.defjvp
+def _solve_continuous_jvp(data: Any, tangents: Any) -> Any:
     """Ac' dP + dP Ac + (derivative of the left side at constant P) = 0."""
-    P, residual = _continuous(*data)
+    P, residual = _solve_continuous(*data)
 
     def left(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
         PA, T = P @ A, P @ B + S
@@ -116,10 +116,10 @@ def _continuous_jvp(data: Any, tangents: Any) -> Any:
     return (P, residual), (_lyapunov(closed, jax.jvp(left, data, tangents)[1]).P, jnp.zeros_like(residual))
 
 
-@_discrete.defjvp
-def _discrete_jvp(data: Any, tangents: Any) -> Any:
+@_solve_discrete.defjvp
+def _solve_discrete_jvp(data: Any, tangents: Any) -> Any:
     """Ac' dP Ac - dP + (derivative of the left side at constant P) = 0."""
-    P, residual = _discrete(*data)
+    P, residual = _solve_discrete(*data)
 
     def left(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
         T = A.T @ P @ B + S

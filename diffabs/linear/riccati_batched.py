@@ -13,29 +13,45 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from diffabs.linear.lyapunov import cholesky, eye, relative, size, smith, solve, times, transpose
+from diffabs.linear.lyapunov import (
+    cholesky,
+    eye,
+    frobenius_norm,
+    gauss_jordan_solve,
+    relative_residual,
+    solve_stein,
+    times,
+    transpose,
+)
 
-LANES = 128  # that advance together: their matrices stay in the cache, and a hard one delays no more than these
-SWEEPS, DOUBLINGS, SIGNS, STEPS = 12, 40, 40, 16  # at most: of balancing, doubling, the sign iteration, Newton-Kleinman
-ERROR = 1e-7  # largest admitted estimate of the relative error of P in balanced coordinates
-ROUNDING = 1e-12  # of R: pivots below are taken for 0
-RESIDUAL = 1e-9  # largest admitted relative residual in the given coordinates
+CHUNK_MATRICES = (
+    128  # that advance together: their matrices stay in the cache, and a hard one delays no more than these
+)
+BALANCING_SWEEPS, MAX_DOUBLINGS, MAX_SIGN_ITERATIONS, MAX_KLEINMAN_STEPS = (
+    12,
+    40,
+    40,
+    16,
+)  # at most: of balancing, doubling, the sign iteration, Newton-Kleinman
+MAX_RELATIVE_ERROR = 1e-7  # largest admitted estimate of the relative error of P in balanced coordinates
+PIVOT_ROUNDING = 1e-12  # of R: pivots below are taken for 0
+MAX_RELATIVE_RESIDUAL = 1e-9  # largest admitted relative residual in the given coordinates
 
 
 @partial(jax.jit, static_argnums=0)
-def one(solver: Callable, data: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+def solve_one(solver: Callable, data: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
     """(P, residual) of one lane."""
     P, residual = solver(*(x[None] for x in data))
     return P[0], residual[0]
 
 
-def _lanes(solver: Callable) -> Callable:
+def _batch_over_matrices(solver: Callable) -> Callable:
     """`solver` on arrays (lanes, rows, columns), LANES at a time, whose vmap has more lanes."""
 
     @custom_vmap
     def many(*data: jax.Array) -> Any:
         lanes = len(data[0])
-        width = min(LANES, lanes)
+        width = min(CHUNK_MATRICES, lanes)
         padding = -lanes % width
         chunks = [jnp.pad(x, ((0, padding), (0, 0), (0, 0)), mode="edge") for x in data]
         chunks = [x.reshape(-1, width, *x.shape[1:]) for x in chunks]
@@ -52,41 +68,43 @@ def _lanes(solver: Callable) -> Callable:
     return many
 
 
-@_lanes
+@_batch_over_matrices
 def solve_care(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Any:
     """(P, residual) in continuous time, for A, B, Q, R, S; P is NaN where it is not proven."""
-    B, S, a, b, q, d = _prepared(A, B, Q, R, S)
+    B, S, a, b, q, d = _reduce_and_balance(A, B, Q, R, S)
     G = times(b, transpose(b))
     hamiltonian = _blocks(a, -G, -q, -transpose(a))
-    scale = jnp.exp(solve(hamiltonian, hamiltonian[:, :0])[1] / len(hamiltonian))
-    P, found = _doubled(*_cayley(a, G, q, scale))
-    P = _unless(found, P, lambda: _graph(_sign(hamiltonian)))
-    return _given(_refined(partial(_kleinman, a, b, q, scale), P), d, partial(_terms, A, B, Q, S))
+    scale = jnp.exp(gauss_jordan_solve(hamiltonian, hamiltonian[:, :0])[1] / len(hamiltonian))
+    P, found = _solve_by_doubling(*_cayley(a, G, q, scale))
+    P = _fill_unsolved(found, P, lambda: _solution_from_sign(_sign(hamiltonian)))
+    return _unscale_with_residual(
+        _refine_and_prove(partial(_kleinman, a, b, q, scale), P), d, partial(_terms, A, B, Q, S)
+    )
 
 
-@_lanes
+@_batch_over_matrices
 def solve_dare(A: jax.Array, B: jax.Array, Q: jax.Array, R: jax.Array, S: jax.Array) -> Any:
     """The same in discrete time, where R may be singular."""
     pivots, diagonal = (jnp.sum(x * eye(len(R), R), 1) for x in (cholesky(R), R))
-    definite = jnp.all(pivots**2 > ROUNDING * diagonal, 0)
+    definite = jnp.all(pivots**2 > PIVOT_ROUNDING * diagonal, 0)
     regular, same = jnp.all(definite), (Q, R, S, jnp.zeros_like(A))
-    Q, R, S, shift = lax.cond(regular, lambda: same, lambda: _shifted(A, B, Q, R, S, definite))
-    B, S, a, b, q, d = _prepared(A, B, Q, R, S)
+    Q, R, S, shift = lax.cond(regular, lambda: same, lambda: _shift_weights(A, B, Q, R, S, definite))
+    B, S, a, b, q, d = _reduce_and_balance(A, B, Q, R, S)
     I, G = eye(len(a), a), times(b, transpose(b))
 
     def by_sign() -> jax.Array:
         """A Cayley transformation takes the unit circle to the imaginary axis."""
         minus = _blocks(a - I, -G, -q, I - transpose(a))
-        return _graph(_sign(solve(minus, _blocks(a + I, G, -q, I + transpose(a)))[0]))
+        return _solution_from_sign(_sign(gauss_jordan_solve(minus, _blocks(a + I, G, -q, I + transpose(a)))[0]))
 
-    P, found = _doubled(a, G, q)
-    P = _unless(found, P, by_sign)
-    P = _refined(partial(_hewer, a, b, q), P, shift * d * d[:, None])
-    P, residual = _given(P, d, partial(_discrete_terms, A, B, Q, S))
+    P, found = _solve_by_doubling(a, G, q)
+    P = _fill_unsolved(found, P, by_sign)
+    P = _refine_and_prove(partial(_hewer, a, b, q), P, shift * d * d[:, None])
+    P, residual = _unscale_with_residual(P, d, partial(_discrete_terms, A, B, Q, S))
 
     def curved() -> jax.Array:
         """P where R + B' P B > 0."""
-        minimum = jnp.isfinite(size(cholesky(eye(B.shape[1], B) + times(transpose(B), P, B))))
+        minimum = jnp.isfinite(frobenius_norm(cholesky(eye(B.shape[1], B) + times(transpose(B), P, B))))
         return jnp.where(definite | minimum, P + shift, jnp.nan)
 
     return lax.cond(regular, lambda: P, curved), residual
@@ -99,26 +117,26 @@ def _blocks(*blocks: jax.Array) -> jax.Array:
 # Steps 1 and 2
 
 
-def _prepared(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
+def _reduce_and_balance(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Any:
     """B L^-T and S L^-T, L L' = R; A - B R^-1 S', B L^-T, Q - S R^-1 S' balanced, for which R = I and S = 0; and d."""
-    inverse = transpose(solve(cholesky(R), eye(len(R), R))[0])
+    inverse = transpose(gauss_jordan_solve(cholesky(R), eye(len(R), R))[0])
     B, S = times(B, inverse), times(S, inverse)
     a, q = A - times(B, transpose(S)), Q - times(S, transpose(S))
     d = _balance(a, times(B, transpose(B)), q)
     return B, S, a * d / d[:, None], B / d[:, None], q * d * d[:, None], d
 
 
-def _shifted(A: Any, B: Any, Q: Any, R: Any, S: Any, definite: jax.Array) -> tuple[Any, ...]:
+def _shift_weights(A: Any, B: Any, Q: Any, R: Any, S: Any, definite: jax.Array) -> tuple[Any, ...]:
     """Q, R, S of the discrete equation for P less a diagonal matrix, and that matrix: 0 in lanes where R is definite,
     NaN where it is not even semidefinite.
 
     The weight of the inputs then is R + B' shift B, definite if any R + B' P B is. In balanced coordinates the shift is
     as large as Q.
     """
-    weight, one = size(R), eye(len(R), R)
-    semidefinite = jnp.isfinite(size(cholesky(R + jnp.where(weight > 0, ROUNDING * weight, 1.0) * one)))
+    weight, one = frobenius_norm(R), eye(len(R), R)
+    semidefinite = jnp.isfinite(frobenius_norm(cholesky(R + jnp.where(weight > 0, PIVOT_ROUNDING * weight, 1.0) * one)))
     d = _balance(A, times(B, transpose(B)), Q)
-    level = size(Q * d * d[:, None])
+    level = frobenius_norm(Q * d * d[:, None])
     p = jnp.where(semidefinite, jnp.where(level > 0, level, 1.0) / (d * d), jnp.nan)
     shift = jnp.where(definite, 0.0, p)[:, None] * eye(len(A), A)
     moved = times(transpose(A), shift)
@@ -136,7 +154,7 @@ def _balance(A: jax.Array, G: jax.Array, Q: jax.Array) -> jax.Array:
         fine = (row > 0) & (column > 0)
         return d * jnp.where(fine, row / jnp.where(fine, column, 1.0), 1.0) ** 0.25
 
-    d = lax.fori_loop(0, SWEEPS, sweep, jnp.ones_like(A[0]))
+    d = lax.fori_loop(0, BALANCING_SWEEPS, sweep, jnp.ones_like(A[0]))
     return jnp.ldexp(jnp.ones_like(d), jnp.round(jnp.log2(d)).astype(int))
 
 
@@ -148,11 +166,11 @@ def _cayley(A: jax.Array, G: jax.Array, Q: jax.Array, scale: jax.Array) -> tuple
     n, g = len(A), 1.09 * scale
     shifted = A - g * eye(n, A)
     whole = _blocks(shifted, G, -Q, transpose(shifted))
-    whole = eye(2 * n, A) + 2 * g * solve(whole, eye(2 * n, A))[0]
+    whole = eye(2 * n, A) + 2 * g * gauss_jordan_solve(whole, eye(2 * n, A))[0]
     return whole[:n, :n], -whole[:n, n:], whole[n:, :n]
 
 
-def _doubled(A: jax.Array, G: jax.Array, Q: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _solve_by_doubling(A: jax.Array, G: jax.Array, Q: jax.Array) -> tuple[jax.Array, jax.Array]:
     """P of a discrete equation by structured doubling, and whether it converged. It does where P is stabilising and the
     dual equation has a solution too; an unstable mode that costs nothing is an exception.
 
@@ -162,20 +180,20 @@ def _doubled(A: jax.Array, G: jax.Array, Q: jax.Array) -> tuple[jax.Array, jax.A
 
     def going(carry: Any) -> jax.Array:
         k, A, _, _ = carry
-        return (k < DOUBLINGS) & jnp.any(size(A) > 1e-5)  # the error of Q is its square
+        return (k < MAX_DOUBLINGS) & jnp.any(frobenius_norm(A) > 1e-5)  # the error of Q is its square
 
     def double(carry: Any) -> Any:
         k, A, G, Q = carry
-        W = solve(eye(n, A) + times(G, Q), jnp.concatenate([A, G], 1))[0]
+        W = gauss_jordan_solve(eye(n, A) + times(G, Q), jnp.concatenate([A, G], 1))[0]
         T = transpose(A)
         G, Q = G + times(A, W[:, n:], T), Q + times(T, Q, W[:, :n])
         return k + 1, times(A, W[:, :n]), (G + transpose(G)) / 2, (Q + transpose(Q)) / 2
 
     _, A, _, Q = lax.while_loop(going, double, (0, A, G, Q))
-    return Q, (size(A) <= 1e-5) & jnp.isfinite(size(Q))
+    return Q, (frobenius_norm(A) <= 1e-5) & jnp.isfinite(frobenius_norm(Q))
 
 
-def _unless(found: jax.Array, P: jax.Array, otherwise: Callable) -> jax.Array:
+def _fill_unsolved(found: jax.Array, P: jax.Array, otherwise: Callable) -> jax.Array:
     """P, and `otherwise()` in lanes where it was not found: worked out only if there are any."""
     return lax.cond(jnp.all(found), lambda: P, lambda: jnp.where(found, P, otherwise()))
 
@@ -185,30 +203,30 @@ def _sign(Z: jax.Array) -> jax.Array:
 
     def going(carry: Any) -> jax.Array:
         k, _, moved = carry
-        return (k < SIGNS) & jnp.any(moved > 1e-5)  # converges quadratically
+        return (k < MAX_SIGN_ITERATIONS) & jnp.any(moved > 1e-5)  # converges quadratically
 
     def step(carry: Any) -> Any:
         k, Z, _ = carry
-        inverse, log = solve(Z, eye(len(Z), Z))
+        inverse, log = gauss_jordan_solve(Z, eye(len(Z), Z))
         c = jnp.exp(-log / len(Z))
         new = (c * Z + inverse / c) / 2
-        return k + 1, new, size(new - Z) / size(new)
+        return k + 1, new, frobenius_norm(new - Z) / frobenius_norm(new)
 
     return lax.while_loop(going, step, (0, Z, jnp.ones_like(Z[0, 0])))[1]
 
 
-def _graph(Z: jax.Array) -> jax.Array:
+def _solution_from_sign(Z: jax.Array) -> jax.Array:
     """P of (Z + I) (I, P)' = 0, 2n equations, in the sense of least squares."""
     n = len(Z) // 2
     N, M = jnp.split(Z + eye(2 * n, Z), [n], 1)
-    P = solve(times(transpose(M), M), -times(transpose(M), N))[0]
+    P = gauss_jordan_solve(times(transpose(M), M), -times(transpose(M), N))[0]
     return (P + transpose(P)) / 2
 
 
 # Steps 3 and 4
 
 
-def _refined(newton: Callable, P: jax.Array, shift: Any = 0.0) -> jax.Array:
+def _refine_and_prove(newton: Callable, P: jax.Array, shift: Any = 0.0) -> jax.Array:
     """Newton-Kleinman until P moves by less than 1e-7, then the last step and its proof; NaN where there is none.
 
     Errors are relative to P + shift.
@@ -219,23 +237,31 @@ def _refined(newton: Callable, P: jax.Array, shift: Any = 0.0) -> jax.Array:
 
     def step(carry: Any) -> Any:
         _, k, P, moved, *_ = carry
-        last = (k >= STEPS) | ~jnp.any(moved > 1e-7)
+        last = (k >= MAX_KLEINMAN_STEPS) | ~jnp.any(moved > 1e-7)
         terms, D, X = newton(P, eye(len(P), P))  # X is of use in the last step; a copy of this for it compiles as long
-        return last, k + 1, P + D, size(D) / size(P + D), terms, size(D), size(X)
+        return (
+            last,
+            k + 1,
+            P + D,
+            frobenius_norm(D) / frobenius_norm(P + D),
+            terms,
+            frobenius_norm(D),
+            frobenius_norm(X),
+        )
 
     none = jnp.zeros_like(P[0, 0])
     carry = lax.while_loop(going, step, (jnp.array(False), 0, P, none + 1, none, none, none))
     _, _, P, _, terms, moved, proof = carry
-    error, limit = jnp.finfo(P.dtype).eps * proof * terms, ERROR * size(P + shift)
+    error, limit = jnp.finfo(P.dtype).eps * proof * terms, MAX_RELATIVE_ERROR * frobenius_norm(P + shift)
     return jnp.where((error <= limit) & (moved <= limit), P, jnp.nan)
 
 
-def _given(P: jax.Array, d: jax.Array, terms: Callable) -> tuple[jax.Array, jax.Array]:
+def _unscale_with_residual(P: jax.Array, d: jax.Array, terms: Callable) -> tuple[jax.Array, jax.Array]:
     """P and its residual in the given coordinates, x = d z."""
     P = (P + transpose(P)) / 2 / (d * d[:, None])
     parts = terms(P)
-    residual = relative(reduce(add, parts), *parts)
-    return jnp.where(residual <= RESIDUAL, P, jnp.nan), residual
+    residual = relative_residual(reduce(add, parts), *parts)
+    return jnp.where(residual <= MAX_RELATIVE_RESIDUAL, P, jnp.nan), residual
 
 
 def _terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
@@ -247,7 +273,7 @@ def _terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
 def _discrete_terms(A: Any, B: Any, Q: Any, S: Any, P: Any) -> tuple[Any, ...]:
     PA, PB = times(P, A), times(P, B)
     T = times(transpose(B), PA) + transpose(S)
-    gain = solve(eye(B.shape[1], B) + times(transpose(B), PB), T)[0]
+    gain = gauss_jordan_solve(eye(B.shape[1], B) + times(transpose(B), PB), T)[0]
     return times(transpose(A), PA), -P, -times(transpose(T), gain), Q
 
 
@@ -257,13 +283,13 @@ def _kleinman(A: Any, B: Any, Q: Any, scale: Any, P: Any, *extra: Any) -> tuple[
     The Cayley transformation C = (Ac + g)(Ac - g)^-1 makes it C' D C - D + 2 g M' (..) M = 0, M = (Ac - g)^-1.
     """
     I, terms = eye(len(A), A), _terms(A, B, Q, jnp.zeros_like(B), P)
-    M = solve(A - times(B, transpose(B), P) - scale * I, I)[0]
+    M = gauss_jordan_solve(A - times(B, transpose(B), P) - scale * I, I)[0]
     right = (2 * scale * times(transpose(M), W, M) for W in (reduce(add, terms), *extra))
-    return sum(map(size, terms)), *smith(I + 2 * scale * M, *right)
+    return sum(map(frobenius_norm, terms)), *solve_stein(I + 2 * scale * M, *right)
 
 
 def _hewer(A: Any, B: Any, Q: Any, P: Any, *extra: Any) -> tuple[Any, ...]:
     """The same in discrete time: Ac' D Ac - D + (left side at P) = 0."""
     terms, PB = _discrete_terms(A, B, Q, jnp.zeros_like(B), P), times(P, B)
-    gain = solve(eye(B.shape[1], B) + times(transpose(B), PB), times(transpose(PB), A))[0]
-    return sum(map(size, terms)), *smith(A - times(B, gain), reduce(add, terms), *extra)
+    gain = gauss_jordan_solve(eye(B.shape[1], B) + times(transpose(B), PB), times(transpose(PB), A))[0]
+    return sum(map(frobenius_norm, terms)), *solve_stein(A - times(B, gain), reduce(add, terms), *extra)

@@ -12,7 +12,7 @@ from diffabs.core.pytree import replace
 from diffabs.linear.opened_loop import OpenLoop, open_loop
 from diffabs.linear.stability_margins import Margins, margins
 
-MOST_CORNERS = 2**10
+MAX_BAND_CORNERS = 2**10
 
 # How bad a margin is: the greatest is the worst.
 BADNESS: Mapping[str, Callable[[Margins], float]] = {
@@ -64,10 +64,10 @@ def band(loop: Loop, over: Mapping[str, Sequence[float]], samples: int = 32, tar
     for path, (low, high) in free.items():
         if not low <= high:
             raise ValueError(f"{path}: the range ({low:g}, {high:g}) is inverted")
-    if 2 ** len(free) > MOST_CORNERS:
-        raise ValueError(f"{len(free)} ranges have {2 ** len(free)} corners; at most {MOST_CORNERS} are looked at")
+    if 2 ** len(free) > MAX_BAND_CORNERS:
+        raise ValueError(f"{len(free)} ranges have {2 ** len(free)} corners; at most {MAX_BAND_CORNERS} are looked at")
     corners = list(dict.fromkeys(itertools.product(*free.values())))
-    inside = even(samples if any(low < high for low, high in free.values()) else 0, len(free))
+    inside = low_discrepancy_points(samples if any(low < high for low, high in free.values()) else 0, len(free))
     low, high = np.array(list(free.values())).reshape(-1, 2).T
     points = [*corners, *(low + (high - low) * inside).tolist()]
     return Band(
@@ -80,7 +80,7 @@ def _system(loop: Loop, values: dict[str, float], target: Any) -> System:
     return System(values, opened, margins(opened))
 
 
-def even(count: int, dimensions: int) -> np.ndarray:
+def low_discrepancy_points(count: int, dimensions: int) -> np.ndarray:
     """Return points (count, dimensions) that fill the unit cube evenly, always the same: multiples of powers of the
     root of x^(d+1) = x + 1 (Roberts, 2018), the golden ratio in one dimension."""
     root = 2.0

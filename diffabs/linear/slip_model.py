@@ -14,8 +14,15 @@ from diffabs.actuators import Lag
 from diffabs.core.blocks import Direct
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import Scalar, param, part, pytree, static, strong
-from diffabs.linear.linearization import NEWTON, StateSpace, as_vectors, tracking, untouched, used_leaves
-from diffabs.linear.zero_order_hold import held
+from diffabs.linear.linearization import (
+    REMAINING_STATE_ITERATIONS,
+    StateSpace,
+    as_vectors,
+    independent_components,
+    tracking_dynamics,
+    used_leaves,
+)
+from diffabs.linear.zero_order_hold import discretise_held_input
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.plants.wheel import FROZEN
 
@@ -71,7 +78,7 @@ class SlipModel:
     @property
     def states(self) -> tuple[str, ...]:
         """What the states are."""
-        self._supported()
+        self._check_supported()
         start = jax.eval_shape(self.plant.start, BrakeStart(speed=self.speed, slip=self.slip))
         paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(start)]
         used = used_leaves(self.plant, start, ("slip", *FROZEN))
@@ -91,14 +98,14 @@ class SlipModel:
         Raises:
             ValueError: a part that a linear slip model does not know.
         """
-        self._supported()
+        self._check_supported()
         return _matrices(self)
 
     def point(self) -> tuple[Any, Any]:
         """State and control of the linearisation: the slip is held, what remains is at rest, the speed falls."""
         start = self.plant.start(BrakeStart(speed=self.speed, slip=self.slip))
         control = self.plant.holding(self.plant.output(start), self.slip)
-        kept = untouched(self.plant, start, ("slip", *FROZEN))
+        kept = independent_components(self.plant, start, ("slip", *FROZEN))
         if not len(kept):
             return start, control
         flow, x, u = as_vectors(self.plant, start, control)
@@ -109,16 +116,16 @@ class SlipModel:
         def newton(_: Any, z: Any) -> Any:
             return z - jnp.linalg.solve(jax.jacfwd(rate)(z), rate(z))
 
-        rest = jax.lax.fori_loop(0, NEWTON, newton, x[kept])
+        rest = jax.lax.fori_loop(0, REMAINING_STATE_ITERATIONS, newton, x[kept])
         return ravel_pytree(start)[1](x.at[kept].set(rest)), control
 
-    def controlled(self) -> StateSpace:
+    def controlled_system(self) -> StateSpace:
         """Plant and actuator, sampled if the controller is: what the control acts on, the slip error first."""
-        system = tracking(self.plant, *self.point())
+        system = tracking_dynamics(self.plant, *self.point())
         if isinstance(self.actuator, Lag):
             system = _behind_lag(system, self.actuator.time_constant)
         if isinstance(self.sampling, Sampling):
-            system = held(system, self.sampling.period, self.sampling.delay)
+            system = discretise_held_input(system, self.sampling.period, self.sampling.delay)
         return system
 
     def with_memory(self, system: StateSpace) -> StateSpace:
@@ -134,7 +141,7 @@ class SlipModel:
             a = a.at[-1, first].set(rate).at[-1, -1].set(keep - rate)
         return StateSpace(a, jnp.zeros((n, 1), a.dtype).at[first : first + p].set(system.B))
 
-    def _supported(self) -> None:
+    def _check_supported(self) -> None:
         known = {"actuator": (Direct, Lag), "sampling": (Continuous, Sampling), "filter": (Direct, LowPass)}
         for name, types in known.items():
             found = getattr(self, name)
@@ -146,7 +153,7 @@ class SlipModel:
 @jax.jit
 def _matrices(model: SlipModel) -> StateSpace:
     model = strong(model)
-    return model.with_memory(model.controlled())
+    return model.with_memory(model.controlled_system())
 
 
 def _behind_lag(system: StateSpace, time_constant: Any) -> StateSpace:

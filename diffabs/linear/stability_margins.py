@@ -16,13 +16,19 @@ import numpy as np
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.transfer import Transfer
 
-DECADES, PER_DECADE = 4, 60  # beyond the slowest and the fastest pole; points of the grid before it is refined
-CLOSE, PASSES = 0.05, 14  # relative distance of neighbours; how often the grid is refined
-SMALL, TURN = 1e-3, 0.2  # |L| from which on a delay's turns are not resolved; angle of a delay between points [rad]
-MOST = 200_000  # points of a grid
-BISECTIONS, GOLDEN = 70, (math.sqrt(5) - 1) / 2
-EDGE = 1e-9  # relative: |L(0)| and L at half the sampling rate are real but for rounding
-STEPS, FURTHEST = 40, 4.0  # of a search for the delay margin of a sampled loop: steps, multiples of the first guess
+GRID_DECADES, PER_DECADE = 4, 60  # beyond the slowest and the fastest pole; points of the grid before it is refined
+NEIGHBOUR_DISTANCE, MAX_GRID_REFINEMENTS = 0.05, 14  # relative distance of neighbours; how often the grid is refined
+SMALL_LOOP_GAIN, DELAY_TURN_ANGLE = (
+    1e-3,
+    0.2,
+)  # |L| from which on a delay's turns are not resolved; angle of a delay between points [rad]
+MAX_GRID_FREQUENCIES = 200_000  # points of a grid
+ROOT_BISECTIONS, GOLDEN = 70, (math.sqrt(5) - 1) / 2
+REAL_TOLERANCE = 1e-9  # relative: |L(0)| and L at half the sampling rate are real but for rounding
+DELAY_SEARCH_STEPS, MAX_DELAY_MULTIPLE = (
+    40,
+    4.0,
+)  # of a search for the delay margin of a sampled loop: steps, multiples of the first guess
 
 
 class Margins(NamedTuple):
@@ -56,7 +62,7 @@ class Margins(NamedTuple):
         return 1 / self.sensitivity
 
 
-class Crossings(NamedTuple):
+class Crossovers(NamedTuple):
     """Where |L| = 1: frequencies [rad/s] and the phase above -pi there, in (-pi, pi]. Where L is real and negative:
     frequencies and the factors 1/|L|."""
 
@@ -77,10 +83,10 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
     system = loop.transfer() if isinstance(loop, OpenLoop) else loop
     if np.shape(system.D) != (1, 1):
         raise ValueError(f"margins are of one input and one output; the system has {np.shape(system.D)[::-1]}")
-    w = grid(system)
-    found = crossings(system, w)
+    w = frequency_grid(system)
+    found = find_crossovers(system, w)
     crossover = float(found.gain_at.max()) if len(found.gain_at) else math.nan
-    if not stable(system):
+    if not is_stable(system):
         none = (math.nan, math.nan)
         return Margins(False, none, none, *none, math.nan, *none, *none, crossover)
     i = int(np.argmin(np.abs(found.phases))) if len(found.phases) else None
@@ -91,31 +97,31 @@ def margins(loop: OpenLoop | Transfer) -> Margins:
     return Margins(True, gain, gain_at, *angle, _delay_margin(loop, found), *ms, *mt, crossover)
 
 
-def crossings(system: Transfer, w: np.ndarray | None = None) -> Crossings:
+def find_crossovers(system: Transfer, w: np.ndarray | None = None) -> Crossovers:
     """Return where |L| = 1, and where L is real and negative; w is a grid, by default `grid(system)`."""
-    w = grid(system) if w is None else w
+    w = frequency_grid(system) if w is None else w
     gain_at = _roots(lambda w: np.log(np.abs(_response(system, w))), w)
     phases = np.angle(-_response(system, gain_at))
     phase_at = _roots(lambda w: _response(system, w).imag, w)
     ends = [0.0, *([math.pi / system.period] if system.period else [])]
-    phase_at = np.union1d(phase_at, [end for end in ends if _real(system, end)])
+    phase_at = np.union1d(phase_at, [end for end in ends if _is_real(system, end)])
     values = _response(system, phase_at).real
     real = (values < 0) & np.isfinite(values)
     real &= np.abs(_response(system, phase_at).imag) <= 1e-6 * np.abs(values)  # not where a pole turns the sign
-    return Crossings(gain_at, phases, phase_at[real], -1 / values[real])
+    return Crossovers(gain_at, phases, phase_at[real], -1 / values[real])
 
 
-def stable(system: Transfer) -> bool:
+def is_stable(system: Transfer) -> bool:
     """Return whether the closed loop is stable, all its poles inside."""
     if system.period is not None or not system.delay:
         return unstable_poles(system.without_delay()) == 0
     count = unstable_poles(system._replace(delay=0.0))
-    turning = crossings(system._replace(delay=0.0))
+    turning = find_crossovers(system._replace(delay=0.0))
     for w, phase in zip(turning.gain_at, turning.phases, strict=True):
         first = (phase % (2 * math.pi)) / w  # the delay at which a pair of poles is at +-jw
         if system.delay > first:
             times = 1 + math.floor((system.delay - first) * w / (2 * math.pi))
-            falling = abs(_rational(system, w * 1.0001)) < abs(_rational(system, w * 0.9999))
+            falling = abs(_rational_response(system, w * 1.0001)) < abs(_rational_response(system, w * 0.9999))
             count += 2 * times if falling else -2 * times
     return count == 0
 
@@ -124,18 +130,18 @@ def unstable_poles(system: Transfer) -> int:
     """Return how many poles of the closed loop are not inside; of a system without delay."""
     if not 1 + system.D[0, 0]:
         return len(system.A) + 1
-    poles = closed_poles(system)
+    poles = closed_loop_poles(system)
     return int(np.sum(np.real(poles) >= 0 if system.period is None else np.abs(poles) >= 1))
 
 
-def closed_poles(system: Transfer) -> np.ndarray:
+def closed_loop_poles(system: Transfer) -> np.ndarray:
     """Return the poles (order,) of the closed loop, in z where it is sampled, else in s; a delay in continuous time,
     which has infinitely many, is left out."""
     system = system._replace(delay=0.0) if system.period is None else system.without_delay()
     return np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0))
 
 
-def grid(system: Transfer) -> np.ndarray:
+def frequency_grid(system: Transfer) -> np.ndarray:
     """Return frequencies (k,) [rad/s] between which L hardly changes, from well below its slowest pole to well above
     its fastest, or to half the sampling rate."""
     poles = system.poles
@@ -144,18 +150,18 @@ def grid(system: Transfer) -> np.ndarray:
             poles = np.log(poles[np.abs(poles) > 1e-12].astype(complex)) / system.period
     sizes = np.abs(poles)[np.abs(poles) > 1e-9]
     half = math.pi / system.period if system.period else math.inf
-    closed = np.abs(_closed_poles(system))
+    closed = np.abs(_delay_free_closed_poles(system))
     sizes = np.concatenate([sizes, closed[closed > 1e-9]]) if len(closed) else sizes
     low, high = (sizes.min(), sizes.max()) if len(sizes) else (1.0, 1.0)
-    low, high = min(low, half) * 10.0**-DECADES, min(high * 10.0**DECADES, half)
+    low, high = min(low, half) * 10.0**-GRID_DECADES, min(high * 10.0**GRID_DECADES, half)
     w = np.geomspace(low, high, int(PER_DECADE * math.log10(high / low)) + 2)
     around = [abs(p.imag) + abs(p.real) * np.linspace(-5, 5, 41) for p in poles if p.imag > 0]
     w = np.unique(np.concatenate([w, *around]))
-    w = _with_turns(system, w[(w >= low) & (w <= high)])
-    return _refined(system, w)
+    w = _resolve_delay_turns(system, w[(w >= low) & (w <= high)])
+    return _refine_grid(system, w)
 
 
-def _closed_poles(system: Transfer) -> np.ndarray:
+def _delay_free_closed_poles(system: Transfer) -> np.ndarray:
     """Of the loop without its delay, in s."""
     poles = np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0)).astype(complex)
     if system.period is None:
@@ -163,27 +169,27 @@ def _closed_poles(system: Transfer) -> np.ndarray:
     return np.log(poles[np.abs(poles) > 1e-12]) / system.period
 
 
-def _with_turns(system: Transfer, w: np.ndarray) -> np.ndarray:
+def _resolve_delay_turns(system: Transfer, w: np.ndarray) -> np.ndarray:
     """The grid with points at which a delay turns L by little, up to where L has become small."""
     if not system.delay:
         return w
-    large = w[np.abs(_response(system, w)) > SMALL]
+    large = w[np.abs(_response(system, w)) > SMALL_LOOP_GAIN]
     if not len(large):
         return w
-    count = min(MOST, int(large[-1] * system.delay / TURN) + 2)
+    count = min(MAX_GRID_FREQUENCIES, int(large[-1] * system.delay / DELAY_TURN_ANGLE) + 2)
     return np.union1d(w, np.linspace(w[0], large[-1], count))
 
 
-def _refined(system: Transfer, w: np.ndarray) -> np.ndarray:
+def _refine_grid(system: Transfer, w: np.ndarray) -> np.ndarray:
     """The grid with points between neighbours at which L differs, as seen from 0 and from -1."""
     values = _response(system, w)
-    for _ in range(PASSES):
+    for _ in range(MAX_GRID_REFINEMENTS):
         change = np.abs(np.diff(values))
         near = np.minimum(np.abs(values), np.abs(1 + values))
-        wide = change > CLOSE * np.maximum(np.minimum(near[1:], near[:-1]), 1e-6)
-        wide &= np.maximum(np.abs(values[1:]), np.abs(values[:-1])) > SMALL
+        wide = change > NEIGHBOUR_DISTANCE * np.maximum(np.minimum(near[1:], near[:-1]), 1e-6)
+        wide &= np.maximum(np.abs(values[1:]), np.abs(values[:-1])) > SMALL_LOOP_GAIN
         wide &= np.diff(w) > 1e-9 * w[1:]
-        if not wide.any() or len(w) > MOST:
+        if not wide.any() or len(w) > MAX_GRID_FREQUENCIES:
             break
         middle = np.sqrt(w[:-1][wide] * w[1:][wide])
         places = np.flatnonzero(wide) + 1
@@ -195,11 +201,11 @@ def _response(system: Transfer, w: Any) -> Any:
     return system.response(w)[:, 0, 0]
 
 
-def _rational(system: Transfer, w: float) -> complex:
-    return complex(system.rational(w)[0, 0, 0])
+def _rational_response(system: Transfer, w: float) -> complex:
+    return complex(system.rational_response(w)[0, 0, 0])
 
 
-def _closed(values: np.ndarray) -> np.ndarray:
+def _complementary_sensitivity(values: np.ndarray) -> np.ndarray:
     """T, 1 where L is infinite."""
     with np.errstate(all="ignore"):
         return np.where(np.isfinite(values), values / (1 + values), 1.0)
@@ -211,7 +217,7 @@ def _roots(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> np.nd
         sign = np.sign(function(w))
         here = np.flatnonzero((sign[1:] * sign[:-1] < 0) | (sign[1:] == 0))
         low, high, before = w[here], w[here + 1], sign[here]
-        for _ in range(BISECTIONS if len(here) else 0):
+        for _ in range(ROOT_BISECTIONS if len(here) else 0):
             middle = 0.5 * (low + high)
             left = np.sign(function(middle)) == before
             low, high = np.where(left, middle, low), np.where(left, high, middle)
@@ -236,22 +242,26 @@ def _peak(function: Callable[[np.ndarray], np.ndarray], w: np.ndarray) -> tuple[
 def _sensitivities(system: Transfer, w: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
     """The peaks of |S| and |T|, and where; the ends of the axis count too."""
     w = np.concatenate([[0.0], w])
-    peaks = [_peak(function, w) for function in (
-        lambda w: 1 / np.abs(1 + _response(system, w)), lambda w: np.abs(_closed(_response(system, w))),
-    )]  # fmt: skip
+    sensitivities = (
+        lambda w: 1 / np.abs(1 + _response(system, w)),
+        lambda w: np.abs(_complementary_sensitivity(_response(system, w))),
+    )
+    peaks = [_peak(function, w) for function in sensitivities]
     if system.period is None:
         far = system.D[0, 0]
         peaks = [max(peak, (end, math.inf)) for peak, end in zip(peaks, (1 / abs(1 + far), abs(far)), strict=True)]
     return peaks[0], peaks[1]
 
 
-def _real(system: Transfer, w: float) -> bool:
+def _is_real(system: Transfer, w: float) -> bool:
     """Whether L is finite and real at an end of the axis."""
     value = _response(system, w)[0]
-    return bool(np.isfinite(value)) and abs(value.imag) <= EDGE * abs(value) and abs(value) < 1 / EDGE
+    return (
+        bool(np.isfinite(value)) and abs(value.imag) <= REAL_TOLERANCE * abs(value) and abs(value) < 1 / REAL_TOLERANCE
+    )
 
 
-def _gain_margins(found: Crossings) -> tuple[tuple[float, float], tuple[float, float]]:
+def _gain_margins(found: Crossovers) -> tuple[tuple[float, float], tuple[float, float]]:
     """The factors next to 1, below and above, and where."""
     low, high, low_at, high_at = 0.0, math.inf, math.nan, math.nan
     for factor, w in zip(found.factors.tolist(), found.phase_at.tolist(), strict=True):
@@ -262,19 +272,19 @@ def _gain_margins(found: Crossings) -> tuple[tuple[float, float], tuple[float, f
     return (low, high), (low_at, high_at)
 
 
-def _delay_margin(loop: OpenLoop | Transfer, found: Crossings) -> float:
+def _delay_margin(loop: OpenLoop | Transfer, found: Crossovers) -> float:
     """The delay that a stable loop bears [s]."""
     delays = (found.phases % (2 * math.pi)) / found.gain_at
     guess = float(delays.min()) if len(delays) else math.inf
     if not isinstance(loop, OpenLoop) or loop.period is None or not math.isfinite(guess):
         return guess
-    step, low = max(guess, loop.period) / STEPS, 0.0
-    while stable(loop.transfer(low + step)):
+    step, low = max(guess, loop.period) / DELAY_SEARCH_STEPS, 0.0
+    while is_stable(loop.transfer(low + step)):
         low += step
-        if low > FURTHEST * max(guess, loop.period):
+        if low > MAX_DELAY_MULTIPLE * max(guess, loop.period):
             return math.inf
     high = low + step
     while high - low > 1e-12 * high:
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if stable(loop.transfer(middle)) else (low, middle)
+        low, high = (middle, high) if is_stable(loop.transfer(middle)) else (low, middle)
     return 0.5 * (low + high)

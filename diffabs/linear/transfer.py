@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-WHOLE = 1e-9  # of a period: how far from whole periods the delay of a sampled system may be
+WHOLE_PERIOD_TOLERANCE = 1e-9  # of a period: how far from whole periods the delay of a sampled system may be
 
 
 class Transfer(NamedTuple):
@@ -28,17 +28,17 @@ class Transfer(NamedTuple):
         """Of the rational part (n,): in s, or in z."""
         return np.linalg.eigvals(self.A) if len(self.A) else np.zeros(0)
 
-    def rational(self, w: Any) -> np.ndarray:
+    def rational_response(self, w: Any) -> np.ndarray:
         """The response (k, p, m) at w (k,) [rad/s], without the delay. Infinite at a pole."""
         w = np.atleast_1d(np.asarray(w, float))
         point = 1j * w if self.period is None else np.exp(1j * w * self.period)
         shifted = point[:, None, None] * np.eye(len(self.A)) - self.A
         with np.errstate(all="ignore"):
-            return self.C @ _solved(shifted, np.asarray(self.B, complex)) + self.D
+            return self.C @ _solve_or_infinite(shifted, np.asarray(self.B, complex)) + self.D
 
     def response(self, w: Any) -> np.ndarray:
         """The response (k, p, m) at w (k,) [rad/s]."""
-        return self.rational(w) * np.exp(-1j * np.atleast_1d(np.asarray(w, float)) * self.delay)[:, None, None]
+        return self.rational_response(w) * np.exp(-1j * np.atleast_1d(np.asarray(w, float)) * self.delay)[:, None, None]
 
     def without_delay(self) -> "Transfer":
         """The same system with its whole periods of delay among its states: each input is shifted through as many.
@@ -51,31 +51,31 @@ class Transfer(NamedTuple):
                 raise ValueError(f"delay = {self.delay:g} s: in continuous time a pure delay has no finite state")
             return self
         shifts = self.delay / self.period
-        if abs(shifts - round(shifts)) > WHOLE:
+        if abs(shifts - round(shifts)) > WHOLE_PERIOD_TOLERANCE:
             raise ValueError(f"delay = {self.delay:g} s is no whole number of periods of {self.period:g} s")
         system = self
         for _ in range(round(shifts)):
-            system = _shifted(system)
+            system = _delay_one_period(system)
         return system._replace(delay=0.0)
 
 
-def _solved(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _solve_or_infinite(matrices: np.ndarray, right: np.ndarray) -> np.ndarray:
     """x (k, n, m) of M x = right for M (k, n, n), infinite where M is singular."""
     right = np.broadcast_to(right, (len(matrices), *right.shape))
     try:
         return np.linalg.solve(matrices, right)
     except np.linalg.LinAlgError:
-        return np.stack([_one_solved(m, r) for m, r in zip(matrices, right, strict=True)])
+        return np.stack([_solve_one_or_infinite(m, r) for m, r in zip(matrices, right, strict=True)])
 
 
-def _one_solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _solve_one_or_infinite(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     try:
         return np.linalg.solve(matrix, right)
     except np.linalg.LinAlgError:
         return np.full(right.shape, complex(np.inf))
 
 
-def _shifted(system: Transfer) -> Transfer:
+def _delay_one_period(system: Transfer) -> Transfer:
     """The system behind one period of delay: its inputs become states."""
     n, m = np.shape(system.B)
     a = np.block([[system.A, system.B], [np.zeros((m, n + m))]])
@@ -91,7 +91,7 @@ def to_control(system: Transfer, *, pade: int | None = None) -> Any:
         ModuleNotFoundError: python-control is not installed.
         ValueError: a delay in continuous time and no `pade`.
     """
-    control: Any = _control()
+    control: Any = _import_control()
     if system.period is None and system.delay:
         if pade is None:
             raise ValueError(
@@ -110,7 +110,7 @@ def from_control(system: Any) -> Transfer:
         ModuleNotFoundError: python-control is not installed.
         ValueError: a sampled system whose period is not said (dt=True).
     """
-    control: Any = _control()
+    control: Any = _import_control()
     found = control.ss(system)
     if found.dt is True:
         raise ValueError("dt is True: the system is sampled, but nothing says how often; give it a period [s]")
@@ -118,7 +118,7 @@ def from_control(system: Any) -> Transfer:
     return Transfer(*matrices, period=float(found.dt) if found.dt else None)
 
 
-def _control() -> Any:
+def _import_control() -> Any:
     try:
         import control
     except ModuleNotFoundError as error:

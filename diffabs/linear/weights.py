@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 
-def weight(name: str, value: Any, size: int, *, definite: bool) -> np.ndarray:
+def as_weight_matrix(name: str, value: Any, size: int, *, definite: bool) -> np.ndarray:
     """A weight as a symmetric matrix (size, size), from a matrix, a diagonal, or a number for size 1. Raises ValueError
     for another shape, numbers that are not finite, asymmetry, or eigenvalues below 0 (at 0 where `definite`)."""
     array = np.array(value, float)

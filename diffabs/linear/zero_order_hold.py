@@ -7,10 +7,10 @@ import jax.numpy as jnp
 
 from diffabs.linear.linearization import StateSpace
 
-TERMS, SQUARINGS = 14, 16  # of the matrix exponential
+TERMS, EXPONENTIAL_SQUARINGS = 14, 16  # of the matrix exponential
 
 
-def held(system: StateSpace, period: Any, delay: Any) -> StateSpace:
+def discretise_held_input(system: StateSpace, period: Any, delay: Any) -> StateSpace:
     """One period of the system under an input that is the last state, the previous input, until `delay`, then the new
     one: x(T) = e^(A T) x + e^(A (T - d)) G(d) u_old + G(T - d) u,  G(s) = integral of e^(A r) B over r in [0, s]."""
     (a, b), n, m = system, *system.B.shape
@@ -27,7 +27,7 @@ def _exponential(a: Any) -> Any:
     no issue of JAX is known to us; github.com/jax-ml/jax/issues/20428 is one of its kind).
     """
     norm = jax.lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(a), axis=1)))
-    halvings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(norm, 0.25))) + 1, 0, SQUARINGS)
+    halvings = jnp.clip(jnp.ceil(jnp.log2(jnp.maximum(norm, 0.25))) + 1, 0, EXPONENTIAL_SQUARINGS)
     scaled, one = a * 2.0**-halvings, jnp.eye(len(a), dtype=a.dtype)
     series = jax.lax.fori_loop(0, TERMS, lambda i, e: one + scaled @ e / (TERMS - i), one)
-    return jax.lax.fori_loop(0, SQUARINGS, lambda i, e: jnp.where(i < halvings, e @ e, e), series)
+    return jax.lax.fori_loop(0, EXPONENTIAL_SQUARINGS, lambda i, e: jnp.where(i < halvings, e @ e, e), series)

@@ -19,10 +19,10 @@ from diffabs.controllers import BalanceFeedback
 from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import replace
-from diffabs.design.attraction import Basin, Cells, Reach, attraction, largest
+from diffabs.design.attraction import Basin, Cells, Reach, largest_recovered_multiples, region_of_attraction
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.linearization import StateSpace
-from diffabs.linear.recoverable import mode_bounds, zeros
+from diffabs.linear.recoverable import mode_bounds, transmission_zeros
 from diffabs.linear.regulator import lqr
 from diffabs.objectives import BALANCE
 from diffabs.papers import arm_equations, arm_figures, record
@@ -123,7 +123,7 @@ def runs() -> dict[str, Run]:
 def multiples(one: Loop, rows: Mapping[str, Any]) -> list[Reach]:
     """Of each of several values of a parameter, (path, values), the largest of MULTIPLES that is recovered."""
     direction = {"initial.theta": START[0], "initial.phi": START[2]}
-    return largest(one, rows, direction, MULTIPLES, LONG)
+    return largest_recovered_multiples(one, rows, direction, MULTIPLES, LONG)
 
 
 def bounds(plant: ArmBalance, riders: Any) -> np.ndarray:
@@ -146,7 +146,7 @@ def maps(progress: Callable[[str], None]) -> dict[str, Basin]:
     gains, found = {"LQR": regulated(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": TUNED}, {}
     for name, gain in gains.items():
         progress(f"arm-balance: {BOX.number**2} starts, {name}")
-        found[name] = attraction(loop(HANGING, gain), BOX, BOX, LONG)
+        found[name] = region_of_attraction(loop(HANGING, gain), BOX, BOX, LONG)
     return found
 
 
@@ -156,10 +156,10 @@ def robust(progress: Callable[[str], None]) -> dict[str, Any]:
     progress("arm-balance: a gain for 40 to 100 kg")
     try:
         from diffabs.design import Spec, design
-        from diffabs.design.parameter_grid import gridded
+        from diffabs.design.parameter_grid import grid_polytope
 
         over = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (700.0, 1300.0), "plant.damping": (70.0, 130.0)}
-        found = design(gridded(BalanceModel(plant=HANGING), over), Spec(Q=WEIGHTS, R=EFFORT))
+        found = design(grid_polytope(BalanceModel(plant=HANGING), over), Spec(Q=WEIGHTS, R=EFFORT))
         gains["LMI for 40 to 100 kg"] = found.gain[0]
     except ModuleNotFoundError:
         pass
@@ -179,7 +179,7 @@ def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[dict[str
         record.row("correct model", "real pole", "1/s", ours, reference=known)
         for ours, known in zip(real, POLES, strict=True)
     ]
-    zero = np.max(np.real(zeros(a, b, np.eye(6)[0])))
+    zero = np.max(np.real(transmission_zeros(a, b, np.eye(6)[0])))
     rows.append(record.row("correct model", "unstable zero of theta", "1/s", zero, reference=ZERO))
     rows.append(record.row("correct model", "bound, multiple at 48 V", "1", bounds(ArmBalance(), [50.0])[0]))
     rows.append(record.row("hanging arm", "bound, multiple at 48 V", "1", bounds(HANGING, [50.0])[0]))

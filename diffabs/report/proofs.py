@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from diffabs.design.verify import verify
+from diffabs.design.verify import verify_file
 from diffabs.report.documents import Document
 from diffabs.report.page import UNKNOWN, VERDICTS, Section, Table, Verdict, command, listed, model_tables, origin, unit
 
@@ -96,7 +96,7 @@ def _notes(content: Mapping[str, Any]) -> list[str]:
 def certificate(document: Document) -> Section:
     """Return the section of a saved certificate, which is proved again now."""
     content = document.content
-    proved = verify(document.path)
+    proved = verify_file(document.path)
     system = content["system"]
     corners = system.get("corners") or []
     names = list(corners[0]) if corners else []

@@ -32,7 +32,7 @@ Range = tuple[float, float]
 
 def _weight(given: Any, path: str) -> Any:
     """A weight as a number or nested tuples, which compare; its order is for the model to say."""
-    from diffabs.linear.weights import weight
+    from diffabs.linear.weights import as_weight_matrix
 
     if not isinstance(given, list | int | float) or isinstance(given, bool):
         raise wrong(path, given, "a number, a diagonal or a matrix")
@@ -43,7 +43,7 @@ def _weight(given: Any, path: str) -> Any:
         raise ScenarioError(f"{path} = {shown(given)} is not square: {len(rows)} rows need as many numbers each")
     value = _numbers(given, path)
     try:
-        weight(path, value, len(np.atleast_1d(value)), definite=path == "design.R")
+        as_weight_matrix(path, value, len(np.atleast_1d(value)), definite=path == "design.R")
     except ValueError as error:
         raise ScenarioError(str(error)) from None
     return value

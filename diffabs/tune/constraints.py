@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from diffabs.core.loop import Loop
 from diffabs.design.interior.differentiable import certified_decay
 from diffabs.design.polytopes import Polytope
-from diffabs.design.state_feedback import feedback
+from diffabs.design.state_feedback import feedback_gain
 
 DEAD = 1e-9  # |z| of a discrete pole that decays at once
 
@@ -85,11 +85,11 @@ class CertifiedDecay:
         """(decay - what is proved)/max(|decay|, 1), (1,)."""
         del metrics
         system = self.system
-        proved = certified_decay(feedback(loop, system.states), system.A, system.B, system.period)
+        proved = certified_decay(feedback_gain(loop, system.states), system.A, system.B, system.period)
         return ((self.decay - proved) / max(abs(self.decay), 1.0))[None]
 
 
 def _closed(system: Polytope, loop: Loop) -> Any:
     """A + B K (V, n, n), K the loop's."""
-    gain = feedback(loop, system.states)
+    gain = feedback_gain(loop, system.states)
     return jnp.asarray(system.A) + jnp.asarray(system.B) @ gain[None, :]

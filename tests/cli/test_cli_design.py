@@ -16,7 +16,7 @@ from project import ROOT
 from diffabs.cli import console
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.design import Certificate, DesignError, analysis, parameter_box, synthesis
-from diffabs.design.frozen import frozen
+from diffabs.design.frozen import analyse_frozen_loops
 from diffabs.design.sdp import solver
 from diffabs.linear.linearization import StateSpace
 
@@ -227,7 +227,7 @@ def test_what_is_known_besides_of_the_published_gain():
     """Not unstable: poles of every frozen loop in closed form, s^2 = ..., and the proof that follows the speed."""
     result = run("certify", "slip-lmi", "--json", status=1)
     besides, reason = (json.loads(result.stdout)[name] for name in ("besides", "reason"))
-    frozen = besides["frozen"]
+    frozen = besides["analyse_frozen_loops"]
     assert frozen["systems"] == frozen["stable"] == 17**2
     assert frozen["slowest"] == pytest.approx(22.5318, abs=1e-4)  # REFERENCE: 22.5345 at 5.3 kg, and 6.2 kg is slower
     assert frozen["at"] == {"plant.mass": 6.2, "speed": pytest.approx(50 / 3.6)}
@@ -246,7 +246,7 @@ def test_what_is_known_besides_of_the_published_gain():
 @killed_by("design/frozen.py", "int((rates > 0).sum())", "len(grid)")
 def test_frozen_loops_are_counted_at_their_poles():
     """x'' = u, u = -a x - x' with a between -1 and 3: stable for a > 0, 4 of 17 points and the one at 0 are not."""
-    found = frozen([0.0, 0.0], Spring(), {"stiffness": (-1.0, 3.0)})
+    found = analyse_frozen_loops([0.0, 0.0], Spring(), {"stiffness": (-1.0, 3.0)})
     assert (found.systems, found.stable) == (17, 12)
     assert found.slowest == pytest.approx(-(np.sqrt(5) - 1) / 2)  # s^2 + s - 1
     assert found.at == {"stiffness": -1.0}

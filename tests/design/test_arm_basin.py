@@ -11,10 +11,18 @@ from oracles import arm_rates, arm_stays_up
 from diffabs.controllers import BalanceFeedback, ObserverFeedback, Sampled
 from diffabs.core.pytree import replace
 from diffabs.design import Spec, certify, design
-from diffabs.design.attraction import Basin, Cells, Outcomes, attraction, largest, outcomes, recoverable
-from diffabs.design.capture import capture
-from diffabs.design.parameter_grid import gridded
-from diffabs.design.state_feedback_balance import upright
+from diffabs.design.attraction import (
+    Basin,
+    Cells,
+    Outcomes,
+    classify_starts,
+    largest_recovered_multiples,
+    recoverable_multiple,
+    region_of_attraction,
+)
+from diffabs.design.capture import capture_ellipsoids
+from diffabs.design.parameter_grid import grid_polytope
+from diffabs.design.state_feedback_balance import reduce_balance_loop
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import recoverable_bound
 from diffabs.objectives import FinalNorm
@@ -37,7 +45,7 @@ AXIS = Cells(-0.1, 0.1, 9)
 def test_a_region_is_what_its_runs_do():
     """Not symmetric in the two axes. One run after the other, compiled as one, to the very end: fallen, or at rest."""
     first, second = AXIS, Cells(-0.09, 0.12, 5)
-    found = attraction(closed(), first, second, SOLVER)
+    found = region_of_attraction(closed(), first, second, SOLVER)
     long = FixedStep(step=2e-3, duration=20.0)
 
     def one(theta, phi):
@@ -56,13 +64,13 @@ def test_a_region_is_what_its_runs_do():
 
 
 @killed_by(
-    "design/attraction.py", "inside.of(lanes).contain(x) & ~run.stopped & ~run.diverged", "~run.stopped & ~run.diverged"
+    "design/attraction.py", "inside.of(runs).contain(x) & ~run.stopped & ~run.diverged", "~run.stopped & ~run.diverged"
 )
 @pytest.mark.slow
 def test_what_is_not_known_in_time_is_undecided_and_nothing_else():
     """The slow LQR after 3 s: neither on the ground nor where it surely returns. In the end 32.8 % return, not 23.0."""
     loop = closed(controller=BalanceFeedback(gain=SLOW))
-    early, late = (attraction(loop, AXIS, AXIS, FixedStep(2e-3, t)) for t in (3.0, 60.0))
+    early, late = (region_of_attraction(loop, AXIS, AXIS, FixedStep(2e-3, t)) for t in (3.0, 60.0))
     for found in (early, late):
         o = found.outcomes
         np.testing.assert_array_equal(o.recovered.astype(int) + o.fell + o.diverged + o.undecided, 1)
@@ -73,7 +81,7 @@ def test_what_is_not_known_in_time_is_undecided_and_nothing_else():
     assert not np.any(early.outcomes.fell & ~late.outcomes.fell)
     assert 0.5 < np.mean(late.outcomes.recovered[early.outcomes.undecided]) < 1
     assert late.share == pytest.approx(0.33, abs=0.02)
-    assert recoverable(loop, DIRECTION, FixedStep(1e-3, 3.0), most=0.05).undecided
+    assert recoverable_multiple(loop, DIRECTION, FixedStep(1e-3, 3.0), most=0.05).undecided
 
 
 BORDER = 0.01  # relative distance from it
@@ -89,7 +97,7 @@ def test_starts_beside_the_border_end_as_scipy_says(gain):
     rays = [{"initial.theta": float(np.cos(a)), "initial.phi": float(np.sin(a))} for a in angles]
     starts, expected = [], []
     for ray in rays:
-        border = recoverable(loop, ray, COARSE, most=1.0)
+        border = recoverable_multiple(loop, ray, COARSE, most=1.0)
         assert not border.undecided
         for factor in (1 - BORDER, 1 + BORDER):
             x = factor * border.multiple * np.array([ray["initial.theta"], 0, ray["initial.phi"], 0, 0, 0])
@@ -97,7 +105,7 @@ def test_starts_beside_the_border_end_as_scipy_says(gain):
             expected.append(arm_stays_up(HANGING, gain, x, 48.0))
     assert expected == [True, False] * len(rays)
     columns = {"initial.theta": np.array(starts)[:, 0], "initial.phi": np.array(starts)[:, 2]}
-    assert outcomes(loop, columns, COARSE).recovered.tolist() == expected
+    assert classify_starts(loop, columns, COARSE).recovered.tolist() == expected
 
 
 @killed_by(
@@ -117,7 +125,7 @@ def test_a_share_is_one_by_area():
 @pytest.mark.parametrize("voltage", [48.0, *(pytest.param(v, marks=pytest.mark.slow) for v in MULTIPLES if v != 48.0)])
 def test_the_largest_multiple_that_is_recovered(voltage):
     """REFERENCE has 0.080 at 48 V, and 0.046 and 0.116 at 24 and 100 V: there SciPy falls, and agrees with us."""
-    found = recoverable(closed(voltage=voltage), DIRECTION, SOLVER, most=0.12)
+    found = recoverable_multiple(closed(voltage=voltage), DIRECTION, SOLVER, most=0.12)
     assert not found.undecided
     assert found.multiple == pytest.approx(MULTIPLES[voltage], abs=6e-5)
     assert found.multiple < float(recoverable_bound(*model(HANGING), START, voltage))
@@ -127,10 +135,13 @@ def test_the_largest_multiple_that_is_recovered(voltage):
 
 @pytest.mark.slow
 def test_nothing_and_all_can_be_recovered():
-    assert recoverable(closed(), DIRECTION, SOLVER, most=0.01) == (0.01, False)
-    assert recoverable(closed(controller=BalanceFeedback(gain=-GAIN)), DIRECTION, SOLVER, most=0.1) == (0.0, False)
+    assert recoverable_multiple(closed(), DIRECTION, SOLVER, most=0.01) == (0.01, False)
+    assert recoverable_multiple(closed(controller=BalanceFeedback(gain=-GAIN)), DIRECTION, SOLVER, most=0.1) == (
+        0.0,
+        False,
+    )
     with pytest.raises(ValueError, match=r"plant.rider_mass: a direction is one of the initial state"):
-        recoverable(closed(), {**DIRECTION, "plant.rider_mass": 50.0}, SOLVER)
+        recoverable_multiple(closed(), {**DIRECTION, "plant.rider_mass": 50.0}, SOLVER)
 
 
 @pytest.mark.slow
@@ -146,13 +157,17 @@ def test_the_lqr_for_fifty_kilograms_holds_riders_of_up_to_71():
     assert [mass for mass, fine in held.items() if not fine] == [71.3, 72.0]
     assert heaviest(HANGING, GAIN) == pytest.approx(71.229, abs=2e-3)
     heavy = replace(closed(), {"plant.rider_mass": 68.0})
-    found = recoverable(heavy, DIRECTION, SOLVER, most=0.12)
+    found = recoverable_multiple(heavy, DIRECTION, SOLVER, most=0.12)
     assert found.multiple == pytest.approx(0.040, abs=5e-4)
     assert arm_stays_up(heavy.plant, GAIN, 0.99 * found.multiple * START, 48.0)
     assert not arm_stays_up(heavy.plant, GAIN, 1.01 * found.multiple * START, 48.0)
-    rows = largest(closed(), {"plant.rider_mass": np.array([50.0, 68.0, 100.0])}, DIRECTION, RISING, SOLVER)
+    rows = largest_recovered_multiples(
+        closed(), {"plant.rider_mass": np.array([50.0, 68.0, 100.0])}, DIRECTION, RISING, SOLVER
+    )
     assert rows == [(pytest.approx(0.08), False), (pytest.approx(0.04), False), (0.0, False)]
-    gone = outcomes(replace(closed(), {"plant.rider_mass": 72.0}), {"initial.theta": np.array([0.0, 1e-3])}, SOLVER)
+    gone = classify_starts(
+        replace(closed(), {"plant.rider_mass": 72.0}), {"initial.theta": np.array([0.0, 1e-3])}, SOLVER
+    )
     assert gone.unstable.tolist() == [True, True]
     assert not (gone.recovered | gone.undecided).any()
 
@@ -187,7 +202,7 @@ def test_in_the_ellipsoid_its_function_falls(case):
     large enough to be of use: a tenth of a degree of lean at least."""
     gain, mass = CASES[case]
     loop = replace(closed(controller=BalanceFeedback(gain=gain)), {"plant.rider_mass": mass})
-    (s,) = capture(loop, {"plant.rider_mass": np.array([mass])}).shapes
+    (s,) = capture_ellipsoids(loop, {"plant.rider_mass": np.array([mass])}).shapes
     rng = np.random.default_rng(4)
     directions = rng.standard_normal((4000, 6))
     directions /= np.linalg.norm(directions, axis=1)[:, None]
@@ -203,17 +218,17 @@ def test_in_the_ellipsoid_its_function_falls(case):
 def test_no_ellipsoid_where_the_loop_does_not_return():
     """A rider of 72 kg falls, slowly; NaN is no gain; an unlimited motor and a current limit change what is linear."""
     masses = np.array([70.0, 72.0])
-    found = capture(closed(), {"plant.rider_mass": masses})
+    found = capture_ellipsoids(closed(), {"plant.rider_mass": masses})
     assert np.isfinite(found.shapes[0]).all()
     assert np.isinf(found.shapes[1]).all()
     assert found.unstable.tolist() == [False, True]
-    nothing = capture(closed(controller=BalanceFeedback(gain=np.full(6, np.nan))), {"initial.theta": [0.0]})
+    nothing = capture_ellipsoids(closed(controller=BalanceFeedback(gain=np.full(6, np.nan))), {"initial.theta": [0.0]})
     assert np.isinf(nothing.shapes).all()
     assert not nothing.unstable.any()
-    weak = capture(replace(closed(), {"plant.current_max": 1.0}), {"initial.theta": np.zeros(1)}).shapes[0]
+    weak = capture_ellipsoids(replace(closed(), {"plant.current_max": 1.0}), {"initial.theta": np.zeros(1)}).shapes[0]
     row = (GAIN - 30.0 * np.eye(6)[4]) / 3.0
     assert np.sqrt(row @ np.linalg.solve(weak, row)) <= 1.0
-    strong = capture(closed(), {"initial.theta": np.zeros(1)}).shapes[0]
+    strong = capture_ellipsoids(closed(), {"initial.theta": np.zeros(1)}).shapes[0]
     assert np.sqrt(row @ np.linalg.solve(strong, row)) > 1.0
 
 
@@ -250,21 +265,21 @@ def test_loops_of_which_no_ellipsoid_is_known_need_a_band():
     sampled = closed(controller=Sampled(controller=BalanceFeedback(gain=GAIN), period=0.01))
     starts = {"initial.theta": np.array([0.0, 0.02, 0.2]), "initial.phi": np.array([0.0, 0.008, 0.08])}
     with pytest.raises(ValueError, match="no ellipsoid is known for the controller Sampled"):
-        outcomes(sampled, starts, SHORT)
-    assert outcomes(sampled, starts, SHORT, band=1e-2).recovered.tolist() == [True, True, False]
-    short = outcomes(sampled, starts, FixedStep(2e-3, 0.4), band=1e-2)
+        classify_starts(sampled, starts, SHORT)
+    assert classify_starts(sampled, starts, SHORT, band=1e-2).recovered.tolist() == [True, True, False]
+    short = classify_starts(sampled, starts, FixedStep(2e-3, 0.4), band=1e-2)
     assert short.undecided.tolist() == [False, True, True]
     with pytest.raises(ValueError, match="no ellipsoid is known for the plant PrintedArm"):
-        capture(closed(plant=PrintedArm()), starts)
+        capture_ellipsoids(closed(plant=PrintedArm()), starts)
 
 
 @pytest.mark.slow
 def test_float32_and_float64_agree_on_the_region():
     """At most 2 of 400 starts, at the border."""
     cells = Cells(-0.1, 0.1, 20)
-    double = attraction(closed(), cells, cells, SOLVER)
+    double = region_of_attraction(closed(), cells, cells, SOLVER)
     loop = jax.tree.map(jnp.float32, closed())
-    single = attraction(loop, cells, cells, SOLVER)
+    single = region_of_attraction(loop, cells, cells, SOLVER)
     assert np.sum(double.outcomes.recovered != single.outcomes.recovered) <= 2
     assert double.undecided == single.undecided == 0
     assert 0.2 < double.share < 0.8
@@ -294,7 +309,7 @@ def test_the_slope_of_the_time_of_a_fall_is_a_difference():
 @pytest.fixture(scope="module")
 def robust():
     """A proved gain for riders of 40 to 100 kg, springs and dampers +-30 %, on a grid of three points."""
-    return design(gridded(BalanceModel(plant=HANGING), OVER), Spec(Q=np.diag(WEIGHTS), R=EFFORT))
+    return design(grid_polytope(BalanceModel(plant=HANGING), OVER), Spec(Q=np.diag(WEIGHTS), R=EFFORT))
 
 
 @killed_by(
@@ -305,7 +320,7 @@ def robust():
 def test_the_vertices_are_the_systems_on_the_grid():
     """Ends included; the last parameter runs first, as in the corners."""
     over = {"plant.rider_mass": (40.0, 100.0), "plant.stiffness": (1000.0, 1000.0), "plant.damping": (70.0, 130.0)}
-    found = gridded(BalanceModel(plant=HANGING), over)
+    found = grid_polytope(BalanceModel(plant=HANGING), over)
     values = [(m, d) for m in (40.0, 70.0, 100.0) for d in (70.0, 100.0, 130.0)]
     assert [(x["plant.rider_mass"], x["plant.damping"]) for x in found.corners] == values
     assert {x["plant.stiffness"] for x in found.corners} == {1000.0}
@@ -319,7 +334,7 @@ def test_one_gain_for_all_riders_is_proved(robust):
     """On the grid that it was designed on, and on one that has as many points between."""
     assert robust.certificate.verified_exactly
     assert robust.certificate.quadratically_stable
-    finer = gridded(BalanceModel(plant=HANGING), OVER, 5)
+    finer = grid_polytope(BalanceModel(plant=HANGING), OVER, 5)
     assert len(finer.A) == 125
     proof = certify(robust.gain, finer)
     assert proof.quadratically_stable
@@ -328,7 +343,7 @@ def test_one_gain_for_all_riders_is_proved(robust):
 
 
 def test_the_gain_for_one_rider_is_disproved():
-    system = gridded(BalanceModel(plant=HANGING), OVER)
+    system = grid_polytope(BalanceModel(plant=HANGING), OVER)
     proof = certify(GAIN, system)
     assert proof.verified_exactly
     assert not proof.quadratically_stable
@@ -338,17 +353,17 @@ def test_the_gain_for_one_rider_is_disproved():
 
 def test_a_grid_has_two_points_at_least_and_not_too_many_systems():
     with pytest.raises(ValueError, match=r"points = 1 is outside \[2, inf\)"):
-        gridded(BalanceModel(plant=HANGING), OVER, 1)
+        grid_polytope(BalanceModel(plant=HANGING), OVER, 1)
     with pytest.raises(ValueError, match=r"a grid of 4913 systems is more than 4096"):
-        gridded(BalanceModel(plant=HANGING), OVER, 17)
+        grid_polytope(BalanceModel(plant=HANGING), OVER, 17)
 
 
 def test_a_loop_becomes_the_model_that_it_is():
-    plain, gain, exact, neglected = upright(closed())
+    plain, gain, exact, neglected = reduce_balance_loop(closed())
     assert (plain.period, exact) == (None, True)
     np.testing.assert_array_equal(gain, GAIN)
     assert any("voltage limit of 48 V" in line for line in neglected)
-    sampled = upright(closed(controller=Sampled(controller=BalanceFeedback(gain=GAIN), period=0.01)))[0]
+    sampled = reduce_balance_loop(closed(controller=Sampled(controller=BalanceFeedback(gain=GAIN), period=0.01)))[0]
     assert sampled.period == 0.01
     with pytest.raises(ValueError, match="ObserverFeedback is not feedback of the whole state"):
-        upright(closed(controller=ObserverFeedback()))
+        reduce_balance_loop(closed(controller=ObserverFeedback()))

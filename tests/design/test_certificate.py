@@ -59,15 +59,15 @@ def test_numbers_are_exact():
     x[0, 0, :2] = 0.0, 5e-324
     y = rng.standard_normal((3, 3))
     rational = np.vectorize(Fraction, [object])
-    a, b = exact.exactly(x), exact.exactly(y)
+    a, b = exact.as_dyadic(x), exact.as_dyadic(y)
     for ours, truth in (
         (a, rational(x)),
         (a @ b - 3 * a, rational(x) @ rational(y) - 3 * rational(x)),
-        (exact.block([[a.mT, b], [b, 0.1 * a]]), np.block([[rational(x).mT, rational([y, y])],
+        (exact.block_matrix([[a.mT, b], [b, 0.1 * a]]), np.block([[rational(x).mT, rational([y, y])],
                                                           [rational([y, y]), Fraction(0.1) * rational(x)]])),
     ):  # fmt: skip
         assert (rational(ours.ints) * Fraction(2) ** -ours.bits == truth).all()
-    a, b = exact.about(x), exact.about(y)
+    a, b = exact.as_uncertain_dyadic(x), exact.as_uncertain_dyadic(y)
     rho = Fraction(1, 2**40)
     error = (2 * rho + rho**2) * (abs(rational(x)) @ abs(rational(y)))
     assert (rational((a @ b).error) * Fraction(2) ** -(a @ b).bits == error).all()
@@ -80,14 +80,14 @@ def test_positive_is_sylvester_and_knows_singular_matrices():
             factor = rng.integers(-4, 5, (n, rank))
             full = np.linalg.matrix_rank(factor) == n
             square = factor @ factor.T
-            assert exact.positive(square.tolist(), strict=False)
-            assert exact.positive(square.tolist()) == full
+            assert exact.is_positive_definite(square.tolist(), strict=False)
+            assert exact.is_positive_definite(square.tolist()) == full
             square[0, 0] -= 1 if not full else 10**6
             np.testing.assert_equal(
-                exact.positive(square.tolist(), strict=False), np.linalg.eigvalsh(square)[0] > -1e-9
+                exact.is_positive_definite(square.tolist(), strict=False), np.linalg.eigvalsh(square)[0] > -1e-9
             )
-    assert not exact.positive([[0, 1], [1, 0]], strict=False)
-    assert not exact.positive([[0, 0], [0, -1]], strict=False)
+    assert not exact.is_positive_definite([[0, 1], [1, 0]], strict=False)
+    assert not exact.is_positive_definite([[0, 0], [0, -1]], strict=False)
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_right_in_floats_is_not_enough():
         v = rng.standard_normal((3, 2))
         P = v @ v.T  # of rank 2, then rounded
         P = (P + P.T) / 2
-        if np.linalg.eigvalsh(P)[0] > 0 and not exact.positive(exact.exactly(P).ints.tolist()):
+        if np.linalg.eigvalsh(P)[0] > 0 and not exact.is_positive_definite(exact.as_dyadic(P).ints.tolist()):
             found += 1
             assert not both(Polytope([-np.eye(3)], np.zeros((1, 3, 1))), np.zeros((1, 3)), "decay", P=P)
     assert found > 8
@@ -303,7 +303,7 @@ def test_both_verifiers_agree(kind, discrete):
     for stretch in np.linspace(0.1, 12.0 if kind == "infeasible" else 3.0, 40):
         system, gain, data = random_claim(rng, kind, discrete, stretch)
         verdicts.append(both(system, gain, kind, **data))
-        margins = exact.margins(kind, system, np.array(gain), data).values()
+        margins = exact.vertex_margins(kind, system, np.array(gain), data).values()
         assert not verdicts[-1] or min(margins) > 0
     assert 8 <= sum(verdicts) <= 36
 
@@ -570,21 +570,21 @@ def test_a_proof_holds_for_vertices_that_are_off(monkeypatch):
         system, gain, data = random_claim(rng, kind, discrete, 0.3)
         low, high = sorted((data[name], data[name] + sign * (0.59 if name == "factor" and kind == "decay" else 3.9)))
         good, bad = (low, high) if sign > 0 else (high, low)
-        assert exact.verify(kind, system, gain, data | {name: good})
+        assert exact.is_proved(kind, system, gain, data | {name: good})
         while abs(good - bad) > 1e-15:
             middle = (good + bad) / 2
-            good, bad = (middle, bad) if exact.verify(kind, system, gain, data | {name: middle}) else (good, middle)
+            good, bad = (middle, bad) if exact.is_proved(kind, system, gain, data | {name: middle}) else (good, middle)
         data = data | {name: good}
 
         def off(array):
             return array * (1 + 0.999 * 2.0**-40 * rng.choice([-1, 1], array.shape))
 
         with monkeypatch.context() as patch:
-            patch.setattr(exact, "about", exact.exactly)
+            patch.setattr(exact, "as_uncertain_dyadic", exact.as_dyadic)
             for _ in range(50):
                 moved = Polytope(off(system.A), off(system.B), system.period)
                 other = {"Bw": off(data["Bw"])} if "Bw" in data else {}
-                assert exact.verify(kind, moved, gain, data | other)
+                assert exact.is_proved(kind, moved, gain, data | other)
 
 
 @pytest.mark.parametrize("seed", range(5))

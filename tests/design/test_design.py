@@ -231,7 +231,7 @@ def test_two_vertices_refute_where_their_product_has_a_negative_eigenvalue(order
 
 @pytest.mark.parametrize("lie", [lambda y: y + np.nan, lambda y: 0 * y + 1e-14], ids=["no answer", "zero, rounded"])
 def test_what_two_vertices_refute_needs_no_solver(monkeypatch, lie):
-    monkeypatch.setattr(lmi, "solve", tampered(lie))
+    monkeypatch.setattr(lmi, "solve_sdp", tampered(lie))
     for k2 in (-48.0, -76.0):
         assert certify((-11753.0, k2), RIG).quadratically_stable is False
         assert certify((-11753.0, k2), RIG, Spec(decay=1.0)).verified_exactly
@@ -298,7 +298,7 @@ def switched(system, gain, count=40, seed=0, steps=400, h=5e-4):
     return np.stack(states, 1)
 
 
-@killed_by("design/sdp/program.py", "limit.limit * (1 - TIGHTER)", "3 * limit.limit")
+@killed_by("design/sdp/program.py", "limit.limit * (1 - SPECIFICATION_TIGHTENING)", "3 * limit.limit")
 def test_guarantees_hold_while_the_system_switches():
     limit, q, r = 9.03 - 2.8, np.diag([1e6, 1e4]), 1.0
     spec = Spec(Q=q, R=r, decay=3.0, input=InputLimit(limit, [START]))
@@ -322,8 +322,8 @@ def test_guarantees_hold_while_the_system_switches():
 @killed_by("design/sdp/inequalities.py", "return drift - he(flow) - 2 * rate * x", "return drift - he(flow) - rate * x")
 @killed_by(
     "design/sdp/inequalities.py",
-    "-symmetric([[he(flow)], [-skew, he(flow)]])",
-    "-symmetric([[he(flow)], [0 * skew, he(flow)]])",
+    "-symmetric_from_blocks([[he(flow)], [-skew, he(flow)]])",
+    "-symmetric_from_blocks([[he(flow)], [0 * skew, he(flow)]])",
 )
 def test_pole_regions():
     found = design(RIG, Spec(Q=(K1**2, 1.0), R=1.0, decay=90.0, damping=0.95))
@@ -543,7 +543,7 @@ def test_missing_solver(monkeypatch):
 
 def tampered(change):
     """A solver whose status is optimal and whose answer is `change`d."""
-    honest = lmi.solve
+    honest = lmi.solve_sdp
 
     def solve(c, blocks, solver="CLARABEL"):
         answer = honest(c, blocks, solver)
@@ -580,9 +580,11 @@ def test_a_wrong_answer_called_optimal_is_not_believed(monkeypatch, change, reas
 def test_gap_and_violation():
     """min y subject to [[y, 1], [1, 2]] >= 0: y = 1/2."""
     unknowns = lmi.Unknowns(y=(1, 1))
-    blocks = lmi.grouped([unknowns.affine(lambda v: lmi.symmetric([[v["y"]], [np.ones((1, 1)), 2 * np.ones((1, 1))]]))])
+    blocks = lmi.group_blocks(
+        [unknowns.affine(lambda v: lmi.symmetric_from_blocks([[v["y"]], [np.ones((1, 1)), 2 * np.ones((1, 1))]]))]
+    )
     c = unknowns.row(lambda v: v["y"])
-    answer = lmi.solve(c, blocks)
+    answer = lmi.solve_sdp(c, blocks)
     np.testing.assert_allclose(answer.y, [0.5], rtol=1e-7)
     assert answer.violation(blocks) < 1e-8
     assert 0 <= answer.gap(c, blocks) < 1e-7
@@ -595,7 +597,7 @@ def test_gap_and_violation():
 def test_a_gap_counts_what_the_multipliers_leave():
     """Multipliers that do not balance the objective prove nothing: the optimum of the toy program is 1/2."""
     unknowns = lmi.Unknowns(y=(1, 1))
-    blocks = [unknowns.affine(lambda v: lmi.symmetric([[v["y"]], [np.ones((1, 1)), 2 * np.ones((1, 1))]]))]
+    blocks = [unknowns.affine(lambda v: lmi.symmetric_from_blocks([[v["y"]], [np.ones((1, 1)), 2 * np.ones((1, 1))]]))]
     answer = lmi.Answer(np.array([0.8]), [np.array([[[0.5, -0.6], [-0.6, 0.2]]])], "optimal")  # bound 0.8, gap "0"
     assert answer.gap(np.ones(1), blocks) >= 0.3
 

@@ -293,7 +293,7 @@ def test_matrices_that_are_not_finite():
 
 
 def test_box_of_too_many_vertices(monkeypatch):
-    monkeypatch.setattr(boxes, "LARGEST", 2)
+    monkeypatch.setattr(boxes, "MAX_VERTICES", 2)
     with pytest.raises(ValueError, match="the box needs 4 vertices, more than 2: vary fewer parameters, or by less"):
         polytope(made(lambda p, q: scalars(p, p**2)), {"p": (-1.0, 1.0)})
 

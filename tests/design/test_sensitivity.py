@@ -12,7 +12,7 @@ from diffabs.design import Polytope, Spec, analysis, certify, design
 from diffabs.design.interior.decay_rate import certified_decay
 from diffabs.design.interior.differentiable import robust_design, robust_gain
 from diffabs.design.sdp import solver
-from diffabs.design.sdp.program import Program
+from diffabs.design.sdp.program import DesignProgram
 from diffabs.design.sdp.scaling import design_frames
 from diffabs.linear.riccati import care
 
@@ -77,8 +77,8 @@ def agrees(system, weights, tolerance):
 
 @killed_by(
     "design/interior/differentiable.py",
-    "step = -central_path.solved(hessian, by_problem)",
-    "step = central_path.solved(hessian, by_problem)",
+    "step = -central_path.solve_newton_system(hessian, by_problem)",
+    "step = central_path.solve_newton_system(hessian, by_problem)",
     case="ones",
 )
 @killed_by(
@@ -87,7 +87,7 @@ def agrees(system, weights, tolerance):
     '0 * jnp.einsum("ij,abji->ba", total, curved)',
     case="ones",
 )
-@killed_by("design/interior/differentiable.py", "MU = 1e-8", "MU = 1e-3", case="ones")
+@killed_by("design/interior/differentiable.py", "FINAL_MU = 1e-8", "FINAL_MU = 1e-3", case="ones")
 @pytest.mark.parametrize(
     "weights",
     [pytest.param(w, id=name, marks=pytest.mark.slow if name != "middle" else ()) for name, w in PUBLISHED.items()],
@@ -129,9 +129,9 @@ def test_cost_obeys_the_envelope_theorem():
     for q1, q2, r in PUBLISHED.values():
         spec = Spec(Q=(q1, q2), R=r).checked(2, 1)
         frame = next(design_frames(RIG, spec.Q, spec.R))[0]
-        program = Program(RIG, RIG, spec, frame)
+        program = DesignProgram(RIG, RIG, spec, frame)
         blocks = program.blocks(1.0)
-        answer = solver.solve(program.objective(), blocks)
+        answer = solver.solve_sdp(program.objective(), blocks)
         v = program.unknowns.values(answer.y)
         sizes = [float(max(np.abs(b.G).max(), np.abs(b.h).max())) for b in program.common[:4]]
         group = next(w for w, b in zip(answer.multipliers, blocks, strict=True) if b.h.shape[-1] == 5)
@@ -221,7 +221,7 @@ def decay(gain, A, B, period=None):
 GAINS = ((-11753.0, -158.17), (-999.7, -111.07), (-0.834, -2.599))
 
 
-@killed_by("design/interior/decay_rate.py", "EXACT = 1e-8", "EXACT = 1e-2", case="gain0-continuous")
+@killed_by("design/interior/decay_rate.py", "SHIFT_GAP = 1e-8", "SHIFT_GAP = 1e-2", case="gain0-continuous")
 @both_times
 @pytest.mark.parametrize("gain", GAINS)
 def test_decay_is_what_can_be_proved(gain, system):
@@ -239,8 +239,8 @@ def test_decay_is_what_can_be_proved(gain, system):
 )
 @both_times
 def test_derivative_of_the_decay_is_a_difference_of_certificates(system, monkeypatch):
-    monkeypatch.setattr(analysis, "RAISED", 1e-8)
-    monkeypatch.setattr(analysis, "SEARCH", 60)
+    monkeypatch.setattr(analysis, "DECAY_TOLERANCE", 1e-8)
+    monkeypatch.setattr(analysis, "MAX_SEARCH_PROGRAMS", 60)
     gain, h = np.array([-999.7, -111.07]), 0.03
     slope = decay(gain, system.A, system.B, system.period)[1]
     for j in range(2):

@@ -83,7 +83,7 @@ def saved(proof, folder):
 @pytest.mark.parametrize("pair", list(cases()), ids=IDS)
 def test_each_kind_is_proved_if_it_is_true_and_only_then(tmp_path, pair):
     for proof, true in zip(pair, (True, False), strict=True):
-        (verdict,) = verify.verify(saved(proof, tmp_path))
+        (verdict,) = verify.verify_file(saved(proof, tmp_path))
         stored = json.loads((tmp_path / "c.json").read_text(), parse_int=float)
         claim = stored["claims"][0]
         assert (not verdict.reason) is true
@@ -102,7 +102,7 @@ def test_it_agrees_with_the_checker_of_the_tests(tmp_path):
         except np.linalg.LinAlgError:
             continue
         proof = certificate("decay", a, period, P=(p + p.T + off + off.T) / 2)
-        (verdict,) = verify.verify(saved(proof, tmp_path))
+        (verdict,) = verify.verify_file(saved(proof, tmp_path))
         stored = json.loads((tmp_path / "c.json").read_text(), parse_int=float)
         claim = stored["claims"][0]
         seen.append(not verdict.reason)
@@ -159,7 +159,7 @@ FALSE = [
     '"Q": ("a weight: no diagonal entry below 0", lambda x: min(row[i] for i, row in enumerate(x)) >= 0)',
     '"Q": ("", lambda x: True)',
 )
-@killed_by("design/verify.py", 'yield f"vertex {i}: what V falls by", positive(falls)', "pass")
+@killed_by("design/verify.py", 'yield f"vertex {i}: what V falls by", is_positive_definite(falls)', "pass")
 @killed_by(
     "design/verify.py", '("[0, inf)", lambda x: x >= 0),\n    "factor"', '("[0, inf)", lambda x: True),\n    "factor"'
 )
@@ -197,7 +197,7 @@ def test_one_bit_of_a_proof_matters_or_leaves_it_true(tmp_path):
             place[path[-1]] = float(place[path[-1]] * factor if path[0] != "gain" else factor)
             (tmp_path / "changed.json").write_text(json.dumps(changed))
             try:
-                (verdict,) = verify.verify(tmp_path / "changed.json")
+                (verdict,) = verify.verify_file(tmp_path / "changed.json")
             except ValueError:
                 continue
             claim = json.loads(json.dumps(changed), parse_int=float)
@@ -249,7 +249,7 @@ def test_many_states_are_decided(tmp_path):
     path = tmp_path / "c.json"
     path.write_text(json.dumps(large(32)))
     begun = time.monotonic()
-    (verdict,) = verify.verify(path)
+    (verdict,) = verify.verify_file(path)
     assert not verdict.reason
     assert time.monotonic() - begun < 5
 
@@ -267,7 +267,7 @@ def test_what_takes_too_long_is_refused(given, tmp_path):
 
 def test_the_command_takes_as_long_as_the_library():
     (option,) = [one.default for name, one in inspect.signature(design.verify).parameters.items() if name == "seconds"]
-    assert option == verify.LONGEST
+    assert option == verify.MAX_SECONDS
 
 
 def test_no_time_is_no_answer(tmp_path):
@@ -281,7 +281,7 @@ def test_an_answer_or_a_refusal_within_ten_seconds(given, tmp_path):
     path.write_text(json.dumps(large(*given)))
     begun = time.monotonic()
     with contextlib.suppress(ValueError):
-        verify.verify(path)
+        verify.verify_file(path)
     assert time.monotonic() - begun < 10
 
 
@@ -291,7 +291,7 @@ def test_a_trace_beyond_all_doubles_is_one_line(tmp_path):
     system = {**UNSTABLE, "A": [(-np.eye(2)).tolist()], "B": [[[0.0], [0.0]]]}
     path.write_text(json.dumps(document("cost", system, [[0.0, 0.0]], P=huge, Q=np.eye(2).tolist(), R=[[1.0]])))
     with pytest.raises(ValueError, match="beyond the largest double"):
-        verify.verify(path)
+        verify.verify_file(path)
 
 
 def test_elimination_agrees_with_the_eigenvalues():
@@ -305,6 +305,6 @@ def test_elimination_agrees_with_the_eigenvalues():
         exact = [[Fraction(int(x), 3) for x in row] for row in m]
         for semi in (False, True):
             wanted = least > -1e-9 if semi else least > 1e-9
-            assert verify.positive(exact, semi) is bool(wanted), m
+            assert verify.is_positive_definite(exact, semi) is bool(wanted), m
             seen.add((semi, bool(wanted)))
     assert len(seen) == 4

@@ -175,7 +175,7 @@ def operating_point_speed(loop, model):
     return dataclasses.replace(model, plant=loop.plant).matrices().A[1, 1]
 
 
-@killed_by("linear/operating_point.py", "if not found.residue < RESIDUE:", "if False:")
+@killed_by("linear/operating_point.py", "if not found.residue < MAX_REST_RESIDUE:", "if False:")
 def test_what_has_no_linear_model_says_so(servo):
     loop, _ = linear(servo)
     with pytest.raises(ValueError, match="controller Sampled acts at instants"):

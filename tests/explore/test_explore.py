@@ -25,7 +25,7 @@ from diffabs.explore.knobs import STEPS, is_vehicle
 from diffabs.explore.session import AS_GIVEN, Session
 from diffabs.explore.work import Latest
 from diffabs.linear import margins, open_loop
-from diffabs.linear.stability_margins import closed_poles
+from diffabs.linear.stability_margins import closed_loop_poles
 from diffabs.linear.transfer import Transfer
 from diffabs.scenario import dump, load, names
 from diffabs.simulate.run import rollout
@@ -295,17 +295,21 @@ def test_a_draft_is_the_run_to_what_can_be_seen(session):
 
 @killed_by(
     "linear/stability_margins.py",
-    "return np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0))\n\n\ndef grid",
-    "return np.linalg.eigvals(system.A)\n\n\ndef grid",
+    "return np.linalg.eigvals(system.A - system.B @ system.C / ((1 + system.D[0, 0]) or 1.0))\n\n\ndef frequency_grid",
+    "return np.linalg.eigvals(system.A)\n\n\ndef frequency_grid",
 )
 def test_poles_of_a_closed_loop_are_those_of_its_polynomial():
     def of(a, b, c, **more):
         return Transfer(*(np.array(x, float) for x in (a, b, c, [[0.0]])))._replace(**more)
 
     motor = of([[0, 1], [0, -1]], [[0], [1]], [[7.0, 0]])  # 7/(s (s + 1))
-    np.testing.assert_allclose(np.sort_complex(closed_poles(motor)), np.sort_complex(np.roots([1, 1, 7])), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.sort_complex(closed_loop_poles(motor)), np.sort_complex(np.roots([1, 1, 7])), rtol=1e-12
+    )
     late = of([[1]], [[1]], [[0.3]], period=0.1, delay=0.1)  # 0.3/(z (z - 1))
-    np.testing.assert_allclose(np.sort_complex(closed_poles(late)), np.sort_complex(np.roots([1, -1, 0.3])), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.sort_complex(closed_loop_poles(late)), np.sort_complex(np.roots([1, -1, 0.3])), rtol=1e-12
+    )
 
 
 @killed_by(

@@ -14,7 +14,7 @@ from mutants import killed_by
 import diffabs as d
 from diffabs import actuators, controllers, plants, reliability, roads, scenario, stops, sweep, tune
 from diffabs.core.pytree import get
-from diffabs.design.attraction import Cells, attraction
+from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.kernel import binaries, compilers, launch
 from diffabs.objectives import IAE, StopTime
 from diffabs.scenario.defaults import braking
@@ -163,7 +163,9 @@ def test_a_map_of_starts_is_that_of_xla():
     """Runs that end inside of an ellipsoid, that fall, and that do neither; known at the same instant."""
     loop = scenario.load("arm-hanging").loop
     cells = Cells(-1.5, 1.5, 9)
-    maps = [attraction(loop, cells, cells, d.FixedStep(2e-3, 1.0), engine=e).outcomes for e in ("kernel", "xla")]
+    maps = [
+        region_of_attraction(loop, cells, cells, d.FixedStep(2e-3, 1.0), engine=e).outcomes for e in ("kernel", "xla")
+    ]
     for name in ("recovered", "fell", "unstable", "diverged"):
         np.testing.assert_array_equal(getattr(maps[0], name), getattr(maps[1], name), err_msg=name)
     assert maps[1].recovered.any()

@@ -25,8 +25,8 @@ from diffabs.core.blocks import Direct, Series
 from diffabs.core.protocols import BrakeOutput, Clock
 from diffabs.core.pytree import replace, strong
 from diffabs.core.validity import check
-from diffabs.design.state_feedback import state_feedback
-from diffabs.linear.linearization import linearize, tracking
+from diffabs.design.state_feedback import reduce_loop
+from diffabs.linear.linearization import linearize, tracking_dynamics
 from diffabs.linear.slip_model import LowPass, Sampling, SlipModel
 from diffabs.plants import BrakeStart, LabRig, MirroredRig, QuarterCar
 from diffabs.references import FilteredSlip, FixedSlip
@@ -118,7 +118,7 @@ def test_tracking_away_from_equilibrium(brake):
 
     z, u = jnp.array([0.15, brake]), jnp.array([control])
     state = rig.start(BrakeStart(speed=rig.drum_radius * drum, slip=0.15))._replace(brake=brake)
-    a, b = quick(tracking)(rig, state, control)
+    a, b = quick(tracking_dynamics)(rig, state, control)
     np.testing.assert_allclose(a, differences(lambda z: rates(z, u), z, 1e-6), rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(b, differences(lambda u: rates(z, u), u, 1e-6), rtol=1e-6, atol=1e-8)
 
@@ -128,9 +128,9 @@ def test_tracking_needs_coordinates():
     state = car.start(BrakeStart(speed=10.0, slip=0.1))
     for outputs, count in ((("speed", "wheel_speed", "distance"), 4), ((), 2)):
         with pytest.raises(ValueError, match=f"do not depend on are {count} coordinates of 3 states"):
-            jax.eval_shape(lambda x, outputs=outputs: tracking(car, x, 20.0, ("slip",), outputs), state)
+            jax.eval_shape(lambda x, outputs=outputs: tracking_dynamics(car, x, 20.0, ("slip",), outputs), state)
     with pytest.raises(ValueError, match="slip, deceleration, distance are no coordinates here: they depend on each"):
-        tracking(QuarterCar(road=SlipOnly()), state, 20.0, ("slip",), ("deceleration", "distance"))
+        tracking_dynamics(QuarterCar(road=SlipOnly()), state, 20.0, ("slip",), ("deceleration", "distance"))
 
 
 class SlipOnly:
@@ -267,7 +267,7 @@ def test_sampled_loop_is_the_model(controller, delay):
         "actuator": Lag(),
         "initial": BrakeStart(speed=speed, slip=0.2),
     }
-    reduced = state_feedback(braking(plant=MirroredRig(), reference=FixedSlip(slip=0.2), **parts))
+    reduced = reduce_loop(braking(plant=MirroredRig(), reference=FixedSlip(slip=0.2), **parts))
     loop = braking(plant=FrozenRig(speed), reference=FixedSlip(slip=0.2), **parts)
     tau = float(MirroredRig().holding(BrakeOutput(0.2, speed, 0.0, 0.0, 0.0), 0.2))
     pid = isinstance(controller, PID)
@@ -308,7 +308,7 @@ def test_reduction_has_the_modes_of_the_loop(plant, name, actuator):
         controller = replace(controller, {"high": np.inf})
     parts = {"reference": FixedSlip(slip=0.2), "feedforward": HoldingInput(), "controller": controller}
     loop = braking(plant=plant, initial=BrakeStart(speed=9.0, slip=0.2), actuator=actuator, **parts)
-    reduced = state_feedback(loop)
+    reduced = reduce_loop(loop)
     a, b = reduced.model.matrices()
     state = loop.start()
     if not isinstance(actuator, Direct):
@@ -342,7 +342,7 @@ def test_what_is_neglected():
         sensor=WheelSpeed(),
         reference=FilteredSlip(),
     )
-    reduced = state_feedback(loop)
+    reduced = reduce_loop(loop)
     assert not reduced.exact
     assert reduced.neglected == (
         "The controller's torque limits of 0 and 90 N m.",
@@ -357,15 +357,15 @@ def test_what_is_neglected():
     np.testing.assert_array_equal(reduced.gain, [-9.0, -30.0, 0.0])
     assert reduced.model.actuator.time_constant == 0.02
     assert reduced.model.speed == loop.initial.speed
-    plain = state_feedback(replace(loop, {"actuator": RateLimit(rate=70.0), "sensor": Bias(slip=0.01)}))
+    plain = reduce_loop(replace(loop, {"actuator": RateLimit(rate=70.0), "sensor": Bias(slip=0.01)}))
     assert plain.exact
     assert "The actuator's rate limit of 70 N m/s." in plain.neglected
     assert "The sensor's bias, a disturbance." in plain.neglected
-    assert state_feedback(braking(controller=StateFeedback(), feedforward=HoldingInput())).neglected == (
+    assert reduce_loop(braking(controller=StateFeedback(), feedforward=HoldingInput())).neglected == (
         "The fall of the speed: it is frozen.",
     )
     commanded = braking(plant=LabRig(), controller=StateFeedback(torque_min=0.0, torque_max=1.0))
-    assert state_feedback(commanded).neglected[0] == "The controller's torque limits of 0 and 1."  # of no unit
+    assert reduce_loop(commanded).neglected[0] == "The controller's torque limits of 0 and 1."  # of no unit
 
 
 @pytest.mark.parametrize(
@@ -383,7 +383,7 @@ def test_what_is_neglected():
 )
 def test_what_cannot_be_reduced(change, message):
     with pytest.raises(ValueError, match=message):
-        state_feedback(replace(braking(), change))
+        reduce_loop(replace(braking(), change))
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,9 @@ from scipy.signal import cont2discrete
 from diffabs.actuators import Delay, Lag, RateLimit
 from diffabs.controllers import PID, ConstantTorque, HoldingInput, Relay, Sampled, StateFeedback
 from diffabs.core.blocks import Series
-from diffabs.design.state_feedback import state_feedback
+from diffabs.design.state_feedback import reduce_loop
 from diffabs.linear import Transfer, band, from_control, margins, open_loop, to_control
-from diffabs.linear.stability_margins import crossings, stable
+from diffabs.linear.stability_margins import find_crossovers, is_stable
 from diffabs.plants import BrakeStart, LabRig, MirroredRig
 from diffabs.references import FixedSlip
 from diffabs.scenario.defaults import braking
@@ -48,7 +48,7 @@ def random_loop(seed, sampled):
             a, b = cont2discrete((system.A, system.B, system.C, system.D), period)[:2]  # pyright: ignore
             system = system._replace(A=a, B=b, period=period)
         system = system._replace(C=system.C * draw.uniform(0.5, 4.0))
-        if stable(system) and len(crossings(system).gain_at):
+        if is_stable(system) and len(find_crossovers(system).gain_at):
             return system
 
 
@@ -72,7 +72,7 @@ def test_margins_are_those_of_python_control(sampled, seeds):
     compared = 0
     for seed in seeds:
         system = random_loop(seed, sampled)
-        found, crossed = margins(system), crossings(system)
+        found, crossed = margins(system), find_crossovers(system)
         gm, pm, sm, wpc, wgc, _ = control.stability_margins(to_control(system), returnall=True, method="poly")
         there = np.abs(np.abs(system.response(wgc)[:, 0, 0]) - 1)
         if np.max(there, initial=0.0) > 1e-10:
@@ -121,11 +121,11 @@ def test_margins_are_where_the_closed_loop_turns_unstable():
             found = margins(system)
             for factor, step in ((found.gain[1], inside), (found.gain[0], -inside)):
                 if math.isfinite(factor) and factor > 0:
-                    assert stable(system._replace(C=system.C * factor * (1 - step)))
-                    assert not stable(system._replace(C=system.C * factor * (1 + step)))
+                    assert is_stable(system._replace(C=system.C * factor * (1 - step)))
+                    assert not is_stable(system._replace(C=system.C * factor * (1 + step)))
             if not sampled and math.isfinite(found.delay):
-                assert stable(system._replace(delay=found.delay * (1 - inside)))
-                assert not stable(system._replace(delay=found.delay * (1 + inside)))
+                assert is_stable(system._replace(delay=found.delay * (1 - inside)))
+                assert not is_stable(system._replace(delay=found.delay * (1 + inside)))
 
 
 def test_a_delay_in_continuous_time_against_the_closed_form():
@@ -155,12 +155,12 @@ def test_a_delay_can_bring_back_what_it_took():
     )
     for d in np.linspace(0.1, 9.0, 60):
         closed = control.feedback(to_control(loop._replace(delay=d), pade=9), 1)
-        assert stable(loop._replace(delay=d)) == bool(np.all(closed.poles().real < 0)), d
-    assert not stable(loop._replace(delay=3.0))
-    assert stable(loop._replace(delay=6.0))
+        assert is_stable(loop._replace(delay=d)) == bool(np.all(closed.poles().real < 0)), d
+    assert not is_stable(loop._replace(delay=3.0))
+    assert is_stable(loop._replace(delay=6.0))
 
 
-@killed_by("linear/stability_margins.py", "[end for end in ends if _real(system, end)]", "[]")
+@killed_by("linear/stability_margins.py", "[end for end in ends if _is_real(system, end)]", "[]")
 def test_ends_of_the_axis():
     """A first-order loop that needs its gain, L = k/(s - 1), may lose a factor k; sampled, it turns over at z = -1."""
     one = np.ones((1, 1))
@@ -195,7 +195,7 @@ LOOPS = {
 def test_closed_is_the_loop_of_the_certificates(name):
     """Its poles are those of A + B K, which the linear slip model has from elsewhere."""
     loop = rig(**LOOPS[name])
-    reduced = state_feedback(loop)
+    reduced = reduce_loop(loop)
     model = reduced.model.matrices()
     wanted = np.linalg.eigvals(np.asarray(model.A) + np.asarray(model.B) @ reduced.gain[None])
     opened = open_loop(loop).transfer().without_delay()
@@ -208,7 +208,7 @@ def test_closed_is_the_loop_of_the_certificates(name):
 @pytest.mark.slow
 def test_the_brake_lab_rig_and_a_filtered_sensor_come_to_rest():
     lab = rig(plant=LabRig(), initial=BrakeStart(speed=14.0), controller=StateFeedback(gain=(-60.0, -4.0)))
-    reduced = state_feedback(lab)
+    reduced = reduce_loop(lab)
     model = reduced.model.matrices()
     wanted = np.linalg.eigvals(np.asarray(model.A) + np.asarray(model.B) @ reduced.gain[None])
     opened = open_loop(lab).transfer()
@@ -273,7 +273,7 @@ def closed_poles(system):
     return np.linalg.eigvals(system.A - system.B @ system.C)
 
 
-@killed_by("linear/opened_loop.py", "OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)", "OFFSETS = (0.0,)")
+@killed_by("linear/opened_loop.py", "TARGET_OFFSETS = (0.0, 1e-4, -1e-4, 1e-2, -1e-2)", "TARGET_OFFSETS = (0.0,)")
 @killed_by("core/tracing.py", "not _zero(step) and not needed", "not needed")
 @pytest.mark.slow
 def test_noise_is_a_disturbance_and_limits_do_not_act():
@@ -346,7 +346,7 @@ def test_a_band_is_of_the_corners_and_of_samples_between():
 def test_the_command_says_margins_and_where_they_are_worst(tmp_path):
     done = command("margins", "slip-cured", "--json", "--samples", "4", "--plot", str(tmp_path / "loop.png"))
     result = json.loads(done.stdout)
-    assert result["margins"]["stable"]
+    assert result["margins"]["is_stable"]
     assert result["corners"] == 4
     assert len(result["systems"]) == 8
     slow = {"plant.mass": 6.2, "initial.speed": 5 / 3.6}

@@ -15,7 +15,7 @@ from mutants import killed_by
 
 from diffabs.linear.gaussian import kalman
 from diffabs.linear.lyapunov import discrete_lyapunov, lyapunov
-from diffabs.linear.regulator import dlqr, lqr, unstabilisable
+from diffabs.linear.regulator import dlqr, lqr, unstabilisable_mode
 from diffabs.linear.riccati import care, dare
 
 ALPHA, BETA, FAST, SLOW = 83.8796606703, 133.472842636189, 140.291806958, 14.0291806958
@@ -404,7 +404,7 @@ def test_bad_matrices(change, message):
 
 
 def test_the_mode_that_is_not_moved():
-    assert unstabilisable(np.diag([0.6, -1.0]), [[0.0], [1.0]]) == 0.6
-    assert unstabilisable(np.diag([-0.6, 1.0]), [[0.0], [1.0]]) is None
-    assert unstabilisable(np.diag([-0.6, 1.0]), [[0.0], [1.0]], discrete=True) is None
-    assert unstabilisable(np.diag([-1.6, 0.1]), [[0.0], [1.0]], discrete=True) == -1.6
+    assert unstabilisable_mode(np.diag([0.6, -1.0]), [[0.0], [1.0]]) == 0.6
+    assert unstabilisable_mode(np.diag([-0.6, 1.0]), [[0.0], [1.0]]) is None
+    assert unstabilisable_mode(np.diag([-0.6, 1.0]), [[0.0], [1.0]], discrete=True) is None
+    assert unstabilisable_mode(np.diag([-1.6, 0.1]), [[0.0], [1.0]], discrete=True) == -1.6

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from diffabs.core.pytree import replace, strong
 from diffabs.linear.balance_model import BalanceModel
-from diffabs.linear.recoverable import zeros
+from diffabs.linear.recoverable import transmission_zeros
 from diffabs.linear.regulator import lqr
 from diffabs.linear.slip_model import Sampling
 from diffabs.objectives import PeakArmAngle, PeakVoltage
@@ -282,7 +282,9 @@ def test_the_zero_that_nearly_cancels_the_unstable_pole():
     c = np.eye(6)[:1]
     pencil = np.block([[a, b], [c, np.zeros((1, 1))]])
     values = scipy.linalg.eigvals(pencil, np.diag([1.0] * 6 + [0.0]))
-    finite, found = (np.sort_complex(x[(np.abs(x) < 1e4) & (x.imag >= 0)]) for x in (values, zeros(a, b, c[0])))
+    finite, found = (
+        np.sort_complex(x[(np.abs(x) < 1e4) & (x.imag >= 0)]) for x in (values, transmission_zeros(a, b, c[0]))
+    )
     np.testing.assert_allclose(found, finite, rtol=1e-9, atol=0)
     assert np.max(found.real) == pytest.approx(np.sqrt(98.1 / 13.7), rel=1e-10)
 

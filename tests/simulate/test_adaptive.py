@@ -15,7 +15,7 @@ import diffabs as d
 from diffabs import actuators, controllers, plants, references, roads, stops
 from diffabs.core.cubic import Cubic
 from diffabs.core.pytree import arrayed, get, prepared, refined, strong
-from diffabs.design.attraction import Cells, attraction
+from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
 from diffabs.simulate import lengths
@@ -354,7 +354,7 @@ def test_the_worst_case_is_that_of_fixed_steps():
 def test_the_region_of_attraction_is_that_of_fixed_steps():
     chosen, cells = load("arm-hanging"), Cells(-0.1, 0.1, 12)
     solvers = d.Adaptive(1e-5, 60.0), d.FixedStep(1e-3, 60.0)
-    found, fixed = (attraction(chosen.loop, cells, cells, solver) for solver in solvers)
+    found, fixed = (region_of_attraction(chosen.loop, cells, cells, solver) for solver in solvers)
     for name in ("recovered", "fell", "unstable", "diverged"):
         np.testing.assert_array_equal(getattr(found.outcomes, name), getattr(fixed.outcomes, name))
     assert 0.2 < found.share < 0.8

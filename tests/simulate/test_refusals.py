@@ -17,7 +17,7 @@ from diffabs import actuators, controllers, objectives, plants, references, road
 from diffabs.core.protocols import BrakeOutput, Ending, Sample, still
 from diffabs.core.pytree import replace, strong
 from diffabs.core.validity import problems
-from diffabs.design.attraction import outcomes
+from diffabs.design.attraction import classify_starts
 from diffabs.identify import Traces, identify
 from diffabs.objectives import BALANCE, BRAKING
 from diffabs.plants.audit import BrakeAudit
@@ -345,7 +345,7 @@ class TestWhoeverRuns:
             d.Batch(values).check(RIG, SOLVER)
         arm = dataclasses.replace(d.balancing(), stop=Fallen(angle=0.5))
         starts = {"initial.theta": np.array([0.0, 0.6])}
-        found = outcomes(arm, starts, d.FixedStep(1e-3, 0.05), band=0.1)
+        found = classify_starts(arm, starts, d.FixedStep(1e-3, 0.05), band=0.1)
         assert (found.recovered.tolist(), found.diverged.tolist()) == ([True, False], [False, True])
 
     @killed_by("reliability/failure.py", "    if len(bad):", "    if False:")

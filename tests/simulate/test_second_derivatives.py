@@ -11,7 +11,7 @@ from diffabs import actuators, controllers, objectives, plants, references, road
 from diffabs.core.first_order import first_order
 from diffabs.core.pytree import get
 from diffabs.design.interior.decay_rate import certified_decay
-from diffabs.linear.operating_point import root
+from diffabs.linear.operating_point import find_root
 
 WIDTHS = (1e-3, 3e-4, 1e-4)
 METRICS = {
@@ -176,5 +176,5 @@ def test_the_peak_of_a_road_has_the_second_derivatives_of_its_closed_form():
 
 def test_a_rest_has_the_second_derivatives_of_its_closed_form():
     """x^3 = p has x'' = -2/9 p^(-5/3)."""
-    found = jax.jacfwd(jax.jacfwd(lambda p: root(lambda x: x**3 - p, jnp.array([1.5]))[0]))(3.0)
+    found = jax.jacfwd(jax.jacfwd(lambda p: find_root(lambda x: x**3 - p, jnp.array([1.5]))[0]))(3.0)
     assert found == pytest.approx(-2 / 9 * 3.0 ** (-5 / 3), rel=1e-9)

@@ -17,7 +17,7 @@ from diffabs import actuators, controllers, plants, references
 from diffabs.core.protocols import Memory
 from diffabs.core.pytree import pytree, strong
 from diffabs.design.polytopes import Polytope
-from diffabs.design.speed_scaled import SpeedScaled, fall
+from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
 from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
 from diffabs.objectives.tracking import nothing, unchanged
@@ -290,7 +290,7 @@ class TestSpeedScaled:
 
     def test_the_greatest_fall(self):
         v, a, period = 1.4, 7.9, 1e-3
-        np.testing.assert_allclose(fall(a, v, period), v / (v - a * period) - 1, rtol=1e-12)
+        np.testing.assert_allclose(greatest_speed_fall(a, v, period), v / (v - a * period) - 1, rtol=1e-12)
 
     def test_refuses_continuous_time(self):
         with pytest.raises(ValueError, match=r"model.sampling is continuous"):

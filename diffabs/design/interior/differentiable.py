@@ -16,18 +16,18 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.design.interior import central_path
-from diffabs.design.interior.central_path import Path, Point, Problem
+from diffabs.design.interior.central_path import CentralPathState, GuaranteedCostProblem, PathPoint
 from diffabs.design.interior.decay_rate import certified_decay as certified_decay
 from diffabs.design.polytopes import Polytope
-from diffabs.linear.lyapunov import matrices
+from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.riccati import care, dare
 
-MU = 1e-8  # relative: the cost is at most (V + 2) n MU, in discrete time 2 (V + 1) n MU, above its optimum
-FASTER = 0.1  # mu, and a shift's distance from the least, from one centre to the next
-EDGE = 1e-8  # relative: a shift this close to the least, and positive, will not go to zero
+FINAL_MU = 1e-8  # relative: the cost is at most (V + 2) n MU, in discrete time 2 (V + 1) n MU, above its optimum
+CENTRE_REDUCTION = 0.1  # mu, and a shift's distance from the least, from one centre to the next
+SHIFT_TOLERANCE = 1e-8  # relative: a shift this close to the least, and positive, will not go to zero
 
 
-class Robust(NamedTuple):
+class RobustFeedback(NamedTuple):
     """Gain K (m, n), u = K x, and P (n, n): x'P x is the cost that is guaranteed from x, its trace that of `design`."""
 
     gain: Any
@@ -40,7 +40,7 @@ def robust_gain(system: Polytope, Q: Any, R: Any) -> Any:
     return robust_design(system.A, system.B, Q, R, discrete=system.period is not None).gain
 
 
-def robust_design(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool = False) -> Robust:
+def robust_design(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool = False) -> RobustFeedback:
     """The gain that minimises trace P over the vertices A (V, n, n), B (V, n, m): eqs. (29)-(32) of Maeda and Sugiura.
 
     Works under jit, vmap and both modes of differentiation, in all arguments. Everything is of the point of the central
@@ -57,64 +57,72 @@ def robust_design(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool = False) -> 
     Raises:
         ValueError: shapes that do not fit.
     """
-    A, B, Q, R = matrices(A, B, Q, R)
+    A, B, Q, R = as_float_arrays(A, B, Q, R)
     n, m = B.shape[-2:]
     if A.shape != (len(B), n, n) or Q.shape != (n, n) or R.shape != (m, m):
         raise ValueError(f"A, Q, R have shapes {A.shape}, {Q.shape}, {R.shape}; B has {B.shape}")
-    gain, P, _ = _central(discrete, Problem(A, B, (Q + Q.T) / 2, (R + R.T) / 2))
-    return Robust(gain, P)
+    gain, P, _ = _solve_central_path(discrete, GuaranteedCostProblem(A, B, (Q + Q.T) / 2, (R + R.T) / 2))
+    return RobustFeedback(gain, P)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 @partial(jax.jit, static_argnums=0)
-def _central(discrete: bool, problem: Problem) -> tuple[Any, Any, Any]:
+def _solve_central_path(discrete: bool, problem: GuaranteedCostProblem) -> tuple[Any, Any, Any]:
     """K, P, mu of the last centre; NaN where it was not reached."""
-    path = central_path.followed(problem, _begun(problem, discrete), _cheaper, discrete=discrete)
-    fine = (path.settled >= central_path.SETTLED) & (path.shift == 0)
+    path = central_path.follow_path(
+        problem, _start_from_riccati(problem, discrete), _advance_parameters, discrete=discrete
+    )
+    fine = (path.settled >= central_path.FINAL_CENTRE_STEPS) & (path.shift == 0)
     inverse = jnp.linalg.inv(path.point.T)
     K, P, mu = (jnp.where(fine, x, jnp.nan) for x in (path.point.K, inverse.T @ inverse, path.mu))
     return K, P, mu
 
 
-@_central.defjvp
-def _central_jvp(discrete: bool, primals: Any, tangents: Any) -> Any:
+@_solve_central_path.defjvp
+def _solve_central_path_jvp(discrete: bool, primals: Any, tangents: Any) -> Any:
     """H dx + d(gradient of phi at constant x) = 0, in the coordinates of the point."""
     (problem,), (change,) = primals, tangents
-    K, P, mu = _central(discrete, problem)
+    K, P, mu = _solve_central_path(discrete, problem)
     T = jnp.linalg.inv(jnp.linalg.cholesky(P).T)
 
-    def gradient(problem: Problem) -> Any:
-        return central_path.derivatives(central_path.seen(problem, Point(T, K)), 0.0, mu, discrete=discrete)
+    def gradient(problem: GuaranteedCostProblem) -> Any:
+        return central_path.gradient_and_hessian(
+            central_path.localise_problem(problem, PathPoint(T, K)), 0.0, mu, discrete=discrete
+        )
 
     (_, hessian), (by_problem, _) = jax.jvp(gradient, (problem,), (change,))
-    step = -central_path.solved(hessian, by_problem)
+    step = -central_path.solve_newton_system(hessian, by_problem)
     y, g = (jnp.tensordot(step, basis, 1) for basis in central_path.directions(len(P), len(K)))
     inverse = jnp.linalg.inv(T)
     return (K, P, mu), (g @ inverse, -inverse.T @ y @ inverse, jnp.zeros_like(mu))
 
 
-def _begun(problem: Problem, discrete: bool) -> Path:
+def _start_from_riccati(problem: GuaranteedCostProblem, discrete: bool) -> CentralPathState:
     """The path from the Riccati solution of the vertex whose P and gain come nearest to serving all; NaN if one vertex
     has no solution."""
     A, B, Q, R = problem
 
-    def alone(a: Any, b: Any) -> tuple[Any, Point, Any]:
+    def alone(a: Any, b: Any) -> tuple[Any, PathPoint, Any]:
         P = (dare if discrete else care)(a, b, Q, R).P
         K = -jnp.linalg.solve(R + b.T @ P @ b, b.T @ P @ a) if discrete else -jnp.linalg.solve(R, b.T @ P)
-        point = Point(jnp.linalg.inv(jnp.linalg.cholesky(P).T), K)
-        return central_path.least_shift(central_path.seen(problem, point), discrete=discrete), point, jnp.trace(P)
+        point = PathPoint(jnp.linalg.inv(jnp.linalg.cholesky(P).T), K)
+        return (
+            central_path.least_shift(central_path.localise_problem(problem, point), discrete=discrete),
+            point,
+            jnp.trace(P),
+        )
 
     shift, points, traces = jax.vmap(alone)(A, B)
     best = jnp.argmin(shift)
-    return central_path.begun(points.T[best], points.K[best], traces[best] + 0 * jnp.sum(shift))
+    return central_path.start_path(points.T[best], points.K[best], traces[best] + 0 * jnp.sum(shift))
 
 
-def _cheaper(path: Path, least: Any, cost: Any) -> Path:
+def _advance_parameters(path: CentralPathState, least: Any, cost: Any) -> CentralPathState:
     """First the shift goes to zero, then mu to its last value."""
-    found, last = path.shift == 0, path.mu <= 1.01 * MU * cost
+    found, last = path.shift == 0, path.mu <= 1.01 * FINAL_MU * cost
     return path._replace(
-        shift=jnp.where(least < 0, 0.0, least + FASTER * (path.shift - least)),
-        mu=jnp.where(found & ~last, jnp.maximum(FASTER * path.mu, MU * cost), path.mu),
+        shift=jnp.where(least < 0, 0.0, least + CENTRE_REDUCTION * (path.shift - least)),
+        mu=jnp.where(found & ~last, jnp.maximum(CENTRE_REDUCTION * path.mu, FINAL_MU * cost), path.mu),
         settled=path.settled + (found & last & (path.decrement < 0.1)),
-        stuck=(least > 0) & (path.shift - least < EDGE * least),
+        stuck=(least > 0) & (path.shift - least < SHIFT_TOLERANCE * least),
     )

@@ -28,7 +28,7 @@ from diffabs.core import files
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof import exact, schema, serialise
 
-QUADRATIC = ("decay", "cost", "damping", "l2", "input")  # each has one P > 0 that decreases at every vertex
+QUADRATIC_KINDS = ("decay", "cost", "damping", "l2", "input")  # each has one P > 0 that decreases at every vertex
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Claim:
 
     def __post_init__(self) -> None:
         """Numbers as floats."""
-        data = {name: read_only(value) for name, value in self.data.items()}
+        data = {name: as_read_only_array(value) for name, value in self.data.items()}
         data = {name: value if value.ndim else float(value) for name, value in data.items()}
         object.__setattr__(self, "data", MappingProxyType(data))
 
@@ -58,13 +58,13 @@ class Certificate:
 
     def __post_init__(self) -> None:
         """Copies, and shapes and ranges of the claims."""
-        gain = read_only(self.gain)
-        object.__setattr__(self, "gain", read_only(gain[None]) if gain.ndim == 1 else gain)
-        object.__setattr__(self, "system", frozen(self.system))
+        gain = as_read_only_array(self.gain)
+        object.__setattr__(self, "gain", as_read_only_array(gain[None]) if gain.ndim == 1 else gain)
+        object.__setattr__(self, "system", as_read_only_system(self.system))
         object.__setattr__(self, "claims", tuple(self.claims))
         schema.check_gain(self.system, self.gain)
         for claim in self.claims:
-            schema.check(claim.kind, self.system, self.gain, claim.data)
+            schema.check_claim(claim.kind, self.system, self.gain, claim.data)
 
     def verify(self) -> tuple[bool, ...]:
         """For each claim whether it is proved: exactly, and with every vertex off by up to 2^-40 of each entry."""
@@ -72,7 +72,7 @@ class Certificate:
 
     @functools.cached_property
     def _verdicts(self) -> tuple[bool, ...]:
-        return tuple(exact.verify(claim.kind, self.system, self.gain, claim.data) for claim in self.claims)
+        return tuple(exact.is_proved(claim.kind, self.system, self.gain, claim.data) for claim in self.claims)
 
     @property
     def verified_exactly(self) -> bool:
@@ -99,7 +99,7 @@ class Certificate:
     def quadratically_stable(self) -> bool | None:
         """True if one P is proved to decrease at all vertices, False if it is proved that none does, None if open."""
         one = [data["P"] for data in self.proved("scheduled") if (data["P"] == data["P"][0]).all()]
-        if one or any(self.proved(*QUADRATIC)):
+        if one or any(self.proved(*QUADRATIC_KINDS)):
             return True
         refuted = (data.get("rate", 0.0) <= 0 and data.get("factor", 1.0) >= 1 for data in self.proved("infeasible"))
         return False if any(refuted) else None
@@ -107,7 +107,7 @@ class Certificate:
     @property
     def stable(self) -> bool | None:
         """True if stability is proved, by one P or by one that depends on the parameter of a schedule; else None."""
-        return True if any(self.proved(*QUADRATIC, "scheduled")) else None
+        return True if any(self.proved(*QUADRATIC_KINDS, "scheduled")) else None
 
     @property
     def decay_rate(self) -> float | None:
@@ -127,7 +127,7 @@ class Certificate:
         for data in claims:
             if "Q" in data or "R" in data:
                 return max(
-                    rounded_up(sum(map(Fraction, np.diag(P)))) for P in data["P"].reshape(-1, *data["P"].shape[-2:])
+                    round_up(sum(map(Fraction, np.diag(P)))) for P in data["P"].reshape(-1, *data["P"].shape[-2:])
                 )
         return None
 
@@ -137,7 +137,7 @@ class Certificate:
         for data in self.proved("cost"):
             if "x0" in data:
                 x, P = np.vectorize(Fraction, [object])(data["x0"]), np.vectorize(Fraction, [object])(data["P"])
-                return rounded_up(x @ P @ x)
+                return round_up(x @ P @ x)
         return None
 
     @property
@@ -157,7 +157,9 @@ class Certificate:
 
     @functools.cached_property
     def _margins(self) -> list[tuple[str, dict[int, float]]]:
-        return [(claim.kind, exact.margins(claim.kind, self.system, self.gain, claim.data)) for claim in self.claims]
+        return [
+            (claim.kind, exact.vertex_margins(claim.kind, self.system, self.gain, claim.data)) for claim in self.claims
+        ]
 
     @property
     def margins(self) -> dict[str, float]:
@@ -170,7 +172,9 @@ class Certificate:
     @property
     def worst_vertex(self) -> dict[str, Any] | None:
         """Where the margin is smallest: index (of all cells one after the other), cell, corner, claim and margin."""
-        all_of = [(value, i, kind) for kind, each in self._margins for i, value in each.items() if i != exact.ALL]
+        all_of = [
+            (value, i, kind) for kind, each in self._margins for i, value in each.items() if i != exact.ALL_VERTICES
+        ]
         if not all_of:
             return None
         margin, index, kind = min(all_of)
@@ -231,29 +235,29 @@ class Certificate:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file whole or not at all. Raises OSError."""
         claims = ((claim.kind, claim.data) for claim in self.claims)
-        files.write(pathlib.Path(path), serialise.text(self.system, self.gain, claims).encode())
+        files.write(pathlib.Path(path), serialise.format_certificate(self.system, self.gain, claims).encode())
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Certificate":
         """What `save` wrote, nothing proved yet. Raises OSError, or ValueError in one line that names the field."""
         try:
-            system, gain, claims = serialise.read(path)
+            system, gain, claims = serialise.read_certificate(path)
             return Certificate(system, gain, tuple(Claim(kind, data) for kind, data in claims))
         except (ValueError, RecursionError) as error:
             raise ValueError(f"{os.fspath(path)}: {' '.join(str(error).split())}") from None
 
 
-def read_only(value: Any) -> np.ndarray:
+def as_read_only_array(value: Any) -> np.ndarray:
     """A copy as floats that cannot be written to."""
     array = np.array(value, float)
     array.setflags(write=False)
     return array
 
 
-def frozen(system: Polytope | Schedule) -> Any:
+def as_read_only_system(system: Polytope | Schedule) -> Any:
     """A copy whose arrays cannot be written to."""
     if isinstance(system, Schedule):
-        copy = dataclasses.replace(system, cells=tuple(map(frozen, system.cells)))
+        copy = dataclasses.replace(system, cells=tuple(map(as_read_only_system, system.cells)))
         copy.nodes.setflags(write=False)
         return copy
     copy = dataclasses.replace(system)
@@ -262,7 +266,7 @@ def frozen(system: Polytope | Schedule) -> Any:
     return copy
 
 
-def rounded_up(value: Any) -> float:
+def round_up(value: Any) -> float:
     """The least float that is not below a rational number."""
     near = float(value)
     return near if Fraction(near) >= value else math.nextafter(near, math.inf)

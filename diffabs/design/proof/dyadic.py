@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-RHO = 40  # 2^-40
+RELATIVE_ERROR_BITS = 40  # 2^-40
 Matrix = Any  # an array of floats, or Dyadic
 
 
@@ -46,7 +46,7 @@ class Dyadic:
 
     def product(self, other: Any, times: Callable[[Any, Any], Any]) -> "Dyadic":
         """Errors of a product: |a| db + da |b| + da db."""
-        other = exactly(other)
+        other = as_dyadic(other)
         a, b, da, db = self.ints, other.ints, self.error, other.error
         errors = [] if db is None else [times(abs(a), db)]
         errors += [] if da is None else [times(da, abs(b))]
@@ -54,7 +54,7 @@ class Dyadic:
         return Dyadic(times(a, b), self.bits + other.bits, functools.reduce(operator.add, errors) if errors else None)
 
     def __add__(self, other: Any) -> "Dyadic":
-        other = exactly(other)
+        other = as_dyadic(other)
         bits = max(self.bits, other.bits)
         a, b = self.at(bits), other.at(bits)
         errors = [each.error for each in (a, b) if each.error is not None]
@@ -70,7 +70,7 @@ class Dyadic:
         return Dyadic(-self.ints, self.bits, self.error)
 
     def __sub__(self, other: Any) -> "Dyadic":
-        return self + -exactly(other)
+        return self + -as_dyadic(other)
 
     def __rsub__(self, other: Any) -> "Dyadic":
         return -self + other
@@ -81,7 +81,7 @@ class Dyadic:
     __radd__, __rmul__ = __add__, __mul__
 
 
-def exactly(value: Any) -> Dyadic:
+def as_dyadic(value: Any) -> Dyadic:
     """The numbers of `value`, a float, an int or an array of floats. Raises ValueError where one is not finite."""
     if isinstance(value, Dyadic):
         return value
@@ -97,13 +97,13 @@ def exactly(value: Any) -> Dyadic:
     return Dyadic(np.left_shift(ints, shift), 53 - lowest)
 
 
-def about(value: Any) -> Dyadic:
+def as_uncertain_dyadic(value: Any) -> Dyadic:
     """The numbers of `value`, each off by at most a relative 2^-RHO."""
-    ints = exactly(value)
-    return Dyadic(ints.ints * (1 << RHO), ints.bits + RHO, abs(ints.ints))
+    ints = as_dyadic(value)
+    return Dyadic(ints.ints * (1 << RELATIVE_ERROR_BITS), ints.bits + RELATIVE_ERROR_BITS, abs(ints.ints))
 
 
-def positive(matrix: list[list[int]], strict: bool = True) -> bool:
+def is_positive_definite(matrix: list[list[int]], strict: bool = True) -> bool:
     """Whether a symmetric matrix of integers is positive definite (semidefinite where not `strict`).
 
     Bareiss: the pivots are the leading minors, and every division leaves no remainder. A zero pivot of a semidefinite

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from diffabs.design.polytopes import Polytope, Schedule
-from diffabs.design.proof.dyadic import Dyadic, Matrix, about, exactly, positive
-from diffabs.design.proof.schema import check
+from diffabs.design.proof.dyadic import Dyadic, Matrix, as_dyadic, as_uncertain_dyadic, is_positive_definite
+from diffabs.design.proof.schema import check_claim
 
 
 class Inequality(NamedTuple):
@@ -35,7 +35,7 @@ class Inequality(NamedTuple):
     strict: bool = True
 
 
-ALL = -1
+ALL_VERTICES = -1
 
 
 class ClosedLoop(NamedTuple):
@@ -51,7 +51,7 @@ def he(M: Matrix) -> Matrix:
     return M + M.mT
 
 
-def block(rows: list[list[Matrix]]) -> Matrix:
+def block_matrix(rows: list[list[Matrix]]) -> Matrix:
     """The matrices put together; those without leading axes are the same for every vertex."""
     flat = [each for row in rows for each in row]
     lead = np.broadcast_shapes(*(each.shape[:-2] for each in flat))
@@ -61,7 +61,7 @@ def block(rows: list[list[Matrix]]) -> Matrix:
 
     if not isinstance(flat[0], Dyadic):
         return joined(np.asarray)
-    rows = [[exactly(each) for each in row] for row in rows]
+    rows = [[as_dyadic(each) for each in row] for row in rows]
     bits = max(each.bits for row in rows for each in row)
     rows = [[each.at(bits) for each in row] for row in rows]
     return Dyadic(
@@ -69,7 +69,7 @@ def block(rows: list[list[Matrix]]) -> Matrix:
     )
 
 
-def decrease(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> tuple[Matrix, ...]:
+def decrease_terms(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> tuple[Matrix, ...]:
     """Terms of -He(P C) - 2 rate P, in discrete time of factor^2 P - C' P C."""
     if loop.discrete:
         factor = data.get("factor", 1)
@@ -77,24 +77,24 @@ def decrease(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> tuple[M
     return -he(P @ loop.C), -2 * data.get("rate", 0) * P
 
 
-def decay(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def decay_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """V = x' P x falls at least like exp(-2 rate t), in discrete time by factor^2 a period."""
     yield Inequality((data["P"],))
-    yield Inequality(decrease(loop, data["P"], data), 0)
+    yield Inequality(decrease_terms(loop, data["P"], data), 0)
 
 
-def cost(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def cost_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """V' <= -x' (Q + K' R K) x: the integral (sum) of the right side from x0 is at most x0' P x0.
 
     V falls without Q and R too, so that V -> 0 and the bound need no sign of Q, which may have been rounded.
     """
-    terms = decrease(loop, data["P"], {})
+    terms = decrease_terms(loop, data["P"], {})
     yield Inequality((data["P"],))
     yield Inequality(terms)
     yield Inequality((*terms, -data["Q"], -(loop.K.mT @ data["R"] @ loop.K)), 0)
 
 
-def damping(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def damping_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """With M = P C, -[[He(M), cot (M - M')], [cot (M' - M), He(M)]] > 0, cot >= zeta / sqrt(1 - zeta^2).
 
     Eigenvalues of every fixed system of the hull then lie in |Im| < |Re| / cot, left of 0 (Chilali and Gahinet 1996).
@@ -103,10 +103,10 @@ def damping(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality
     skew = cot * (M - M.mT)
     yield Inequality((data["P"],))
     yield Inequality(((cot * cot * (1 - zeta * zeta) - zeta * zeta) * np.eye(1),), strict=False)
-    yield Inequality((-block([[he(M), skew], [skew.mT, he(M)]]),), 0)
+    yield Inequality((-block_matrix([[he(M), skew], [skew.mT, he(M)]]),), 0)
 
 
-def l2(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def l2_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """V' + |z|^2 - gamma^2 |w|^2 < 0 with x' = C x + Bw w, z = (C + D K) x: the gain from w to z is below gamma.
 
     Bounded real lemma; in discrete time V' is the difference V(x+) - V(x).
@@ -115,27 +115,27 @@ def l2(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     none, supply = np.zeros((P.shape[-1], Bw.shape[-1])), data["gamma"] * data["gamma"] * np.eye(Bw.shape[-1])
     yield Inequality((P,))
     if loop.discrete:
-        F = block([[loop.C, Bw]])
-        yield Inequality((block([[P - Z.mT @ Z, none], [none.T, supply]]), -(F.mT @ P @ F)), 0)
+        F = block_matrix([[loop.C, Bw]])
+        yield Inequality((block_matrix([[P - Z.mT @ Z, none], [none.T, supply]]), -(F.mT @ P @ F)), 0)
     else:
         cross = -(P @ Bw)
-        yield Inequality((block([[-he(P @ loop.C) - Z.mT @ Z, cross], [cross.mT, supply]]),), 0)
+        yield Inequality((block_matrix([[-he(P @ loop.C) - Z.mT @ Z, cross], [cross.mT, supply]]),), 0)
 
 
-def inputs(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def input_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """|u_j| <= limit_j for ever from the hull of `points`: they lie in {x' P x <= 1}, which no x leaves, and there
     (K_j x)^2 <= K_j P^-1 K_j' < limit_j^2, by [[P, K_j'], [K_j, limit_j^2]] > 0."""
     P, limit, points = data["P"], data["limit"], data["points"]
     yield Inequality((P,))
-    yield Inequality(decrease(loop, P, {}), 0)
+    yield Inequality(decrease_terms(loop, P, {}), 0)
     for x in (points[i : i + 1] for i in range(points.shape[0])):
         yield Inequality((1 - x @ P @ x.mT,), strict=False)
     for j in range(limit.shape[0]):
         row = loop.K[j : j + 1]
-        yield Inequality((block([[P, row.mT], [row, limit[j] * limit[j] * np.eye(1)]]),))
+        yield Inequality((block_matrix([[P, row.mT], [row, limit[j] * limit[j] * np.eye(1)]]),))
 
 
-def infeasible(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
+def infeasibility_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """No P > 0 has He(P (C_i + rate I)) <= 0 at all vertices: W_i >= 0 and S = sum_i He((C_i + rate I) W_i) > 0.
 
     Such a P would give 0 >= sum_i tr(W_i He(P (C_i + rate I))) = tr(P S) > 0. In discrete time C_i' P C_i <= factor^2 P
@@ -146,10 +146,10 @@ def infeasible(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequal
     S = he(loop.C @ W) + 2 * data.get("rate", 0) * W
     if loop.discrete:
         S = loop.C @ W @ loop.C.mT - factor * factor * W
-    yield Inequality(tuple(S[i] for i in range(W.shape[0])), ALL)
+    yield Inequality(tuple(S[i] for i in range(W.shape[0])), ALL_VERTICES)
 
 
-def scheduled(
+def schedule_conditions(
     cells: list[tuple[Matrix, Matrix]], nodes: Matrix, gain: Matrix, data: Mapping[str, Matrix]
 ) -> Iterator[Inequality]:
     """V = x' P(p) x with V' <= -2 rate V - x' (Q + K' R K) x, P and K linear in the parameter p between nodes.
@@ -177,9 +177,14 @@ def scheduled(
         vertex += A.shape[0]
 
 
-KINDS = {
-    "decay": decay, "cost": cost, "damping": damping, "l2": l2, "input": inputs, "infeasible": infeasible
-}  # fmt: skip
+CLAIM_CONDITIONS = {
+    "decay": decay_conditions,
+    "cost": cost_conditions,
+    "damping": damping_conditions,
+    "l2": l2_conditions,
+    "input": input_conditions,
+    "infeasible": infeasibility_conditions,
+}
 # a letter for each axis: n states, m inputs, V vertices, N nodes, others free; "?" need not be there
 
 
@@ -187,17 +192,19 @@ def conditions(
     kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any], proof: bool
 ) -> Iterator[Inequality]:
     """What a claim of `kind` says, for `proof` in exact numbers. Raises ValueError for data that do not fit."""
-    check(kind, system, gain, data)
-    known, vertex = (exactly, about) if proof else (np.asarray, np.asarray)
+    check_claim(kind, system, gain, data)
+    known, vertex = (as_dyadic, as_uncertain_dyadic) if proof else (np.asarray, np.asarray)
     lifted = {name: (vertex if name == "Bw" else known)(value) for name, value in data.items()}
     K = known(gain)
     if isinstance(system, Schedule):
         cells = [(vertex(cell.A), vertex(cell.B)) for cell in system.cells]
-        return scheduled(cells, known(system.nodes), K, lifted)
-    return KINDS[kind](ClosedLoop(K, vertex(system.A) + vertex(system.B) @ K, system.period is not None), lifted)
+        return schedule_conditions(cells, known(system.nodes), K, lifted)
+    return CLAIM_CONDITIONS[kind](
+        ClosedLoop(K, vertex(system.A) + vertex(system.B) @ K, system.period is not None), lifted
+    )
 
 
-def true(inequality: Inequality) -> bool:
+def is_satisfied(inequality: Inequality) -> bool:
     """Whether an inequality over Dyadic matrices holds, errors included. Matrices that are not symmetric do not."""
     total = functools.reduce(operator.add, inequality.terms)
     k = total.shape[-1]
@@ -205,12 +212,12 @@ def true(inequality: Inequality) -> bool:
     if not (matrices == matrices.mT).all():
         return False
     if total.error is None:
-        return all(positive(matrix, inequality.strict) for matrix in matrices.tolist())
+        return all(is_positive_definite(matrix, inequality.strict) for matrix in matrices.tolist())
     errors = np.broadcast_to(total.error, total.shape).reshape(-1, k, k)
-    return all(robust(matrix, error, total.bits) for matrix, error in zip(matrices, errors, strict=True))
+    return all(is_robustly_positive(matrix, error, total.bits) for matrix, error in zip(matrices, errors, strict=True))
 
 
-def robust(matrix: np.ndarray, error: np.ndarray, bits: int) -> bool:
+def is_robustly_positive(matrix: np.ndarray, error: np.ndarray, bits: int) -> bool:
     """Whether integers 2^-bits `matrix` - diag_i(sum_j error_ij s_i / s_j) > 0, s_i a power of 2 near sqrt(M_ii).
 
     Multiplied from both sides by 1 / s, times a power of 2 that leaves integers: rows of unlike size lose alike. The
@@ -225,15 +232,15 @@ def robust(matrix: np.ndarray, error: np.ndarray, bits: int) -> bool:
     rows = np.left_shift(matrix, shift).tolist()
     for i, taken in enumerate(np.left_shift(error, shift).sum(axis=1)):
         rows[i][i] -= taken
-    return positive(rows)
+    return is_positive_definite(rows)
 
 
-def verify(kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any]) -> bool:
+def is_proved(kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any]) -> bool:
     """Whether a claim is proved, exactly and rounded outward. Raises ValueError for data that do not fit (`SHAPES`)."""
-    return all(map(true, conditions(kind, system, gain, data, proof=True)))
+    return all(map(is_satisfied, conditions(kind, system, gain, data, proof=True)))
 
 
-def margins(kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any]) -> dict[int, float]:
+def vertex_margins(kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any]) -> dict[int, float]:
     """For each vertex the least eigenvalue of a claim's inequality relative to the largest of its terms, in floats.
 
     One under ALL where the inequality is about all vertices together. Side conditions are left out.

@@ -7,7 +7,7 @@ import numpy as np
 
 from diffabs.design.polytopes import Polytope, Schedule
 
-SHAPES = {
+FIELD_SHAPES = {
     "decay": {"P": "nn", "rate?": "", "factor?": ""},
     "cost": {"P": "nn", "Q": "nn", "R": "mm", "x0?": "n"},
     "damping": {"P": "nn", "cot": "", "zeta": ""},
@@ -16,7 +16,7 @@ SHAPES = {
     "infeasible": {"W": "Vnn", "rate?": "", "factor?": ""},
     "scheduled": {"P": "Nnn", "rates": "2", "rate?": "", "Q?": "nn", "R?": "mm"},
 }
-RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
+FIELD_RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "rate": ("not be negative", lambda value: value >= 0),
     "factor": ("lie in (0, 1]", lambda value: 0 < value <= 1),
     "zeta": ("lie in [0, 1)", lambda value: 0 <= value < 1),
@@ -25,20 +25,22 @@ RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "limit": ("be positive", lambda value: value > 0),
     "rates": ("increase", lambda value: value[0] <= value[1]),
 }
-GROWTH = {"factor": ("be positive", RANGES["gamma"][1])}  # that nothing proves a rate may be said of growth, too
+INFEASIBLE_RANGES = {
+    "factor": ("be positive", FIELD_RANGES["gamma"][1])
+}  # that nothing proves a rate may be said of growth, too
 
 
-def check(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Mapping[str, Any]) -> None:
+def check_claim(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Mapping[str, Any]) -> None:
     """Raises ValueError, in one line that names the field, for a claim that does not fit the system and gain."""
     cell = system.cells[0] if isinstance(system, Schedule) else system
-    if (kind == "scheduled") != isinstance(system, Schedule) or kind not in SHAPES:
+    if (kind == "scheduled") != isinstance(system, Schedule) or kind not in FIELD_SHAPES:
         raise ValueError(
-            f"kind {kind!r} is no claim about a {type(system).__name__.lower()}; known: {', '.join(SHAPES)}"
+            f"kind {kind!r} is no claim about a {type(system).__name__.lower()}; known: {', '.join(FIELD_SHAPES)}"
         )
     if cell.period is not None and kind in ("scheduled", "damping"):
         raise ValueError(f"{kind} claims are for continuous time")
     sizes = check_gain(system, gain)
-    fields = {key.rstrip("?"): (shape, "?" in key) for key, shape in SHAPES[kind].items()}
+    fields = {key.rstrip("?"): (shape, "?" in key) for key, shape in FIELD_SHAPES[kind].items()}
     fields.pop("rate" if cell.period is not None else "factor", None)
     if unknown := sorted(set(data) - set(fields)):
         raise ValueError(f"{kind}.{unknown[0]} is not a field of the claim; known: {', '.join(fields)}")
@@ -47,27 +49,30 @@ def check(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Mappin
             raise ValueError(f"{kind}.{name} is missing")
         if name not in data:
             continue
-        if not any(fits(data[name], each, sizes) for each in shape.split("|")):
+        if not any(matches_shape(data[name], each, sizes) for each in shape.split("|")):
             raise ValueError(f"{kind}.{name} has shape {np.shape(data[name])}; needed: {shape or 'a number'}, {sizes}")
         if not np.isfinite(data[name]).all():
             raise ValueError(f"{kind}.{name} has an entry that is not finite")
-        says, holds = (GROWTH if kind == "infeasible" else RANGES).get(name, ("be finite", np.isfinite))
+        says, holds = (INFEASIBLE_RANGES if kind == "infeasible" else FIELD_RANGES).get(
+            name, ("be finite", np.isfinite)
+        )
         if not np.all(holds(data[name])):
             raise ValueError(f"{kind}.{name} must {says}; got {data[name]}")
 
 
 def check_gain(system: Polytope | Schedule, gain: np.ndarray) -> dict[str, int]:
-    """Sizes by letter (`SHAPES`). Raises ValueError for a gain that is not (m, n) or, of a schedule, (N, m, n)."""
+    """Return sizes by letter (`FIELD_SHAPES`). Raises ValueError for a gain that is not (m, n), or (N, m, n) of a
+    schedule."""
     cell = system.cells[0] if isinstance(system, Schedule) else system
     sizes = {"n": cell.order, "m": cell.inputs, "2": 2}
     sizes |= {"N": len(system.nodes)} if isinstance(system, Schedule) else {"V": system.vertices}
     shapes = ("mn", "Nmn") if isinstance(system, Schedule) else ("mn",)
-    if not any(fits(gain, each, sizes) for each in shapes) or not np.isfinite(gain).all():
+    if not any(matches_shape(gain, each, sizes) for each in shapes) or not np.isfinite(gain).all():
         raise ValueError(f"gain must be finite, {cell.inputs} by {cell.order}; has shape {np.shape(gain)}")
     return sizes
 
 
-def fits(value: Any, letters: str, sizes: dict[str, int]) -> bool:
+def matches_shape(value: Any, letters: str, sizes: dict[str, int]) -> bool:
     """Whether the axes of `value` have the sizes of the letters; a letter not seen yet gets its size."""
     shape = np.shape(value)
     return len(shape) == len(letters) and all(

@@ -11,8 +11,8 @@ import numpy as np
 from diffabs.core import files
 from diffabs.design.polytopes import Polytope, Schedule
 
-FORMAT, VERSION = "diffabs certificate", 1
-LARGEST_FILE, LARGEST_ORDER = 2**24, 64  # bytes; states and inputs together
+CERTIFICATE_FORMAT, CERTIFICATE_VERSION = "diffabs certificate", 1
+MAX_CERTIFICATE_BYTES, MAX_STATES_PLUS_INPUTS = 2**24, 64  # bytes; states and inputs together
 
 
 def listed(value: float | np.ndarray) -> Any:
@@ -20,17 +20,17 @@ def listed(value: float | np.ndarray) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
-def described(system: Polytope | Schedule) -> dict[str, Any]:
+def describe_system(system: Polytope | Schedule) -> dict[str, Any]:
     """For JSON; `coverage`, which no claim rests on, is left out."""
     if isinstance(system, Schedule):
-        cells = [described(cell) for cell in system.cells]
+        cells = [describe_system(cell) for cell in system.cells]
         return {"parameter": system.parameter, "nodes": system.nodes.tolist(), "cells": cells}
     corners = [{name: float(value) for name, value in corner.items()} for corner in system.corners]
     names = {"period": system.period, "states": list(system.states), "corners": corners}
     return {"A": system.A.tolist(), "B": system.B.tolist(), **names}
 
 
-def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def reject_duplicate_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """A JSON object. Raises ValueError for a name that comes twice: two readers may take different ones."""
     found = dict(pairs)
     if len(found) != len(pairs):
@@ -38,7 +38,7 @@ def members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def fields(value: Any, where: str, *names: str) -> list[Any]:
+def read_members(value: Any, where: str, *names: str) -> list[Any]:
     """The values of an object with exactly these members. Raises ValueError."""
     if not isinstance(value, dict) or set(value) != set(names):
         has = ", ".join(value) if isinstance(value, dict) else type(value).__name__
@@ -46,14 +46,14 @@ def fields(value: Any, where: str, *names: str) -> list[Any]:
     return [value[name] for name in names]
 
 
-def items(value: Any, where: str, kind: type = dict) -> list[Any]:
+def read_list(value: Any, where: str, kind: type = dict) -> list[Any]:
     """A list of JSON values of one type. Raises ValueError."""
     if not isinstance(value, list) or not all(type(each) is kind for each in value):
         raise ValueError(f"{where} must be a list of {kind.__name__}")
     return value
 
 
-def number(value: Any, where: str = "a number") -> Any:
+def read_numbers(value: Any, where: str = "a number") -> Any:
     """A finite number or lists of them of equal lengths, as an array. Raises ValueError."""
     array = np.array(value, object)
     if not all(type(each) is float and math.isfinite(each) for each in array.flat):
@@ -61,51 +61,63 @@ def number(value: Any, where: str = "a number") -> Any:
     return array.astype(float)
 
 
-def text(system: Polytope | Schedule, gain: np.ndarray, claims: Iterable[tuple[str, Mapping[str, Any]]]) -> str:
+def format_certificate(
+    system: Polytope | Schedule, gain: np.ndarray, claims: Iterable[tuple[str, Mapping[str, Any]]]
+) -> str:
     """The file of a certificate."""
     data = {
-        "format": FORMAT,
-        "version": VERSION,
-        "system": described(system),
+        "format": CERTIFICATE_FORMAT,
+        "version": CERTIFICATE_VERSION,
+        "system": describe_system(system),
         "gain": gain.tolist(),
         "claims": [{"kind": kind, "data": {k: listed(v) for k, v in data.items()}} for kind, data in claims],
     }
     return json.dumps(data, allow_nan=False, indent=1) + "\n"
 
 
-def read(path: str | os.PathLike[str]) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, Any]]]]:
+def read_certificate(
+    path: str | os.PathLike[str],
+) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, Any]]]]:
     """System, gain, and (kind, data) of the claims in a file. Raises OSError, or ValueError that names the field."""
-    raw = files.content(path, LARGEST_FILE + 1)
-    if len(raw) > LARGEST_FILE:
-        raise ValueError(f"the file is larger than {LARGEST_FILE} bytes")
+    raw = files.content(path, MAX_CERTIFICATE_BYTES + 1)
+    if len(raw) > MAX_CERTIFICATE_BYTES:
+        raise ValueError(f"the file is larger than {MAX_CERTIFICATE_BYTES} bytes")
     content = raw.decode()
-    return read_parts(json.loads(content, parse_int=float, parse_constant=number, object_pairs_hook=members))
+    return certificate_from_json(
+        json.loads(content, parse_int=float, parse_constant=read_numbers, object_pairs_hook=reject_duplicate_names)
+    )
 
 
-def read_parts(value: Any) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, Any]]]]:
+def certificate_from_json(value: Any) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, Any]]]]:
     """The same from JSON. Raises ValueError that names the field."""
-    kind, version, system, gain, claims = fields(value, "the file", "format", "version", "system", "gain", "claims")
-    if kind != FORMAT or version != VERSION:
-        raise ValueError(f"format and version must be {FORMAT!r} and {VERSION}; are {kind!r} and {version!r}")
+    kind, version, system, gain, claims = read_members(
+        value, "the file", "format", "version", "system", "gain", "claims"
+    )
+    if kind != CERTIFICATE_FORMAT or version != CERTIFICATE_VERSION:
+        raise ValueError(
+            f"format and version must be {CERTIFICATE_FORMAT!r} and {CERTIFICATE_VERSION}; are {kind!r} and {version!r}"
+        )
     found = []
-    for i, claim in enumerate(items(claims, "claims")):
-        name, data = fields(claim, f"claims[{i}]", "kind", "data")
+    for i, claim in enumerate(read_list(claims, "claims")):
+        name, data = read_members(claim, f"claims[{i}]", "kind", "data")
         if not isinstance(name, str) or not isinstance(data, dict):
             raise ValueError(f"claims[{i}] needs a kind that is a string and data that is an object")
-        found.append((name, {key: number(each, f"claims[{i}].data.{key}") for key, each in data.items()}))
-    if number(gain, "gain").ndim < 2:
+        found.append((name, {key: read_numbers(each, f"claims[{i}].data.{key}") for key, each in data.items()}))
+    if read_numbers(gain, "gain").ndim < 2:
         raise ValueError("gain must be a list of rows, or one of these for each node")
-    return read_system(system), number(gain, "gain"), found
+    return read_system(system), read_numbers(gain, "gain"), found
 
 
 def read_system(value: Any) -> Polytope | Schedule:
     """A polytope or a schedule from JSON. Raises ValueError that names the field."""
     if isinstance(value, dict) and "cells" in value:
-        parameter, nodes, cells = fields(value, "system", "parameter", "nodes", "cells")
+        parameter, nodes, cells = read_members(value, "system", "parameter", "nodes", "cells")
         if not isinstance(parameter, str):
             raise ValueError("system.parameter must be a string")
-        found = tuple(read_polytope(each, f"system.cells[{i}]") for i, each in enumerate(items(cells, "system.cells")))
-        return Schedule(parameter, np.atleast_1d(number(nodes, "system.nodes")), found)
+        found = tuple(
+            read_polytope(each, f"system.cells[{i}]") for i, each in enumerate(read_list(cells, "system.cells"))
+        )
+        return Schedule(parameter, np.atleast_1d(read_numbers(nodes, "system.nodes")), found)
     return read_polytope(value, "system")
 
 
@@ -114,16 +126,16 @@ def read_polytope(value: Any, where: str) -> Polytope:
 
     Its corners stay behind: nothing ties the labels of a file to its matrices, so they are not shown beside a proof.
     """
-    A, B, period, states, corners = fields(value, where, "A", "B", "period", "states", "corners")
+    A, B, period, states, corners = read_members(value, where, "A", "B", "period", "states", "corners")
     if period is not None and not (isinstance(period, float) and 0 < period < math.inf):
         raise ValueError(f"{where}.period must be null or positive [s]")
-    for corner in items(corners, f"{where}.corners"):
-        items(list(corner.values()), f"values of {where}.corners", float)
-        number(list(corner.values()), f"{where}.corners")
-    states = tuple(items(states, f"{where}.states", str))
-    system = Polytope(number(A, f"{where}.A"), number(B, f"{where}.B"), period, states)
+    for corner in read_list(corners, f"{where}.corners"):
+        read_list(list(corner.values()), f"values of {where}.corners", float)
+        read_numbers(list(corner.values()), f"{where}.corners")
+    states = tuple(read_list(states, f"{where}.states", str))
+    system = Polytope(read_numbers(A, f"{where}.A"), read_numbers(B, f"{where}.B"), period, states)
     if len(corners) not in (0, system.vertices) or len(states) not in (0, system.order):
         raise ValueError(f"{where}.corners and {where}.states must be empty or one for each vertex and each state")
-    if system.order + system.inputs > LARGEST_ORDER:
-        raise ValueError(f"{where} has more than {LARGEST_ORDER} states and inputs")
+    if system.order + system.inputs > MAX_STATES_PLUS_INPUTS:
+        raise ValueError(f"{where} has more than {MAX_STATES_PLUS_INPUTS} states and inputs")
     return system

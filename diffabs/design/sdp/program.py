@@ -8,16 +8,18 @@ import numpy as np
 
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.sdp import inequalities
-from diffabs.design.sdp.scaling import Frame, whitening
-from diffabs.design.sdp.solver import Block, Unknowns, grouped
+from diffabs.design.sdp.scaling import Frame, whitening_matrix
+from diffabs.design.sdp.solver import SdpBlock, Unknowns, group_blocks
 from diffabs.design.spec import Spec
 
-FINITE = 1e-4  # weight of trace Z where an L2 gain is minimised: its infimum is often that of infinite feedback
-TIGHTER = 1e-6  # relative: a design aims past the specification, so that the proof has room
+L2_TRACE_WEIGHT = (
+    1e-4  # weight of trace Z where an L2 gain is minimised: its infimum is often that of infinite feedback
+)
+SPECIFICATION_TIGHTENING = 1e-6  # relative: a design aims past the specification, so that the proof has room
 Values = Mapping[str, np.ndarray]
 
 
-class Place(NamedTuple):
+class VertexAtNode(NamedTuple):
     """A vertex (A, B), and E, seen from a node; dX/dt there is the sum of rate times X over `drift`."""
 
     A: np.ndarray
@@ -27,7 +29,7 @@ class Place(NamedTuple):
     drift: tuple[tuple[int, float], ...] = ()
 
 
-class Program:
+class DesignProgram:
     """Minimise the mean over the nodes of trace Z, or the squared L2 gain g, under the specification.
 
     Unknown: X, F, Z for each node (a polytope has one), and g. `level` bounds V on the set of starts of an input limit.
@@ -51,7 +53,7 @@ class Program:
         self.root, self.even = np.zeros((0, n)), np.eye(n)
         if spec.Q is not None:
             k, weight = -frame.inputs(whole.B[0]).T, frame.weight(spec.Q)
-            self.root, self.even = _root(weight), whitening(weight + k.T @ k)
+            self.root, self.even = _root(weight), whitening_matrix(weight + k.T @ k)
         self.common = list(self._common())
 
     def objective(self) -> np.ndarray:
@@ -59,11 +61,11 @@ class Program:
         trace = self.unknowns.row(
             lambda v: sum(np.einsum("ij,dji->d", self.weight, v[f"Z{i}"]) for i in range(self.nodes)) / self.nodes
         )
-        return trace if self.spec.Q is not None else FINITE * trace + self.unknowns.row(lambda v: v["g"])
+        return trace if self.spec.Q is not None else L2_TRACE_WEIGHT * trace + self.unknowns.row(lambda v: v["g"])
 
-    def blocks(self, level: float) -> list[Block]:
+    def blocks(self, level: float) -> list[SdpBlock]:
         """All inequalities, grouped by size."""
-        return grouped([*self.common, *self._input(level)])
+        return group_blocks([*self.common, *self._input(level)])
 
     def least_level(self) -> float:
         """The least V of the frame's own solution that holds the starts of the input limit."""
@@ -88,13 +90,13 @@ class Program:
         gains = [self.frame.gain(v[f"F{i}"] @ inverse) for i, inverse in enumerate(inverses)]
         return np.array(gains), np.array([self.frame.form(inverse) for inverse in inverses])
 
-    def _common(self) -> Iterator[Block]:
-        for place in self._places():
+    def _common(self) -> Iterator[SdpBlock]:
+        for place in self._vertices_at_nodes():
             yield from self._at(place)
         for i in range(self.nodes):
-            yield self.unknowns.affine(lambda v, i=i: inequalities.trace(v[f"X{i}"], v[f"Z{i}"]))
+            yield self.unknowns.affine(lambda v, i=i: inequalities.trace_lmi(v[f"X{i}"], v[f"Z{i}"]))
 
-    def _places(self) -> Iterator[Place]:
+    def _vertices_at_nodes(self) -> Iterator[VertexAtNode]:
         """Where an inequality has to hold. In a cell X and F are linear in the parameter and the system is any of the
         cell's polytope, so the ends of the cell and of the rates suffice."""
         cells = self.system.cells if isinstance(self.system, Schedule) else (self.system,)
@@ -104,14 +106,14 @@ class Program:
                 e = b if l2 is None or l2.disturbance is None else l2.disturbance
                 scaled = frame.states(a), frame.inputs(b), frame.inverse @ e / np.sqrt(frame.tau)
                 if isinstance(self.system, Polytope):
-                    yield Place(*scaled, 0)
+                    yield VertexAtNode(*scaled, 0)
                     continue
                 width = self.system.nodes[i + 1] - self.system.nodes[i]
                 for node, rate in itertools.product((i, i + 1), sorted(set(self.spec.rates or ()))):
                     slope = rate / width / frame.tau
-                    yield Place(*scaled, node, ((i, -slope), (i + 1, slope)))
+                    yield VertexAtNode(*scaled, node, ((i, -slope), (i + 1, slope)))
 
-    def _at(self, place: Place) -> Iterator[Block]:
+    def _at(self, place: VertexAtNode) -> Iterator[SdpBlock]:
         """Every inequality that a vertex has to satisfy."""
         spec, frame, discrete = self.spec, self.frame, self.period is not None
 
@@ -122,16 +124,16 @@ class Program:
 
         def cost(v: Values) -> np.ndarray:
             x, f, flow, drift = seen(v)
-            return inequalities.cost(x, flow, drift, self.root, f, self.even, discrete=discrete)
+            return inequalities.cost_lmi(x, flow, drift, self.root, f, self.even, discrete=discrete)
 
         def decay(v: Values) -> np.ndarray:
             x, _, flow, drift = seen(v)
-            rate = spec.decay * (1 + TIGHTER) * (self.period or 1 / frame.tau)
-            return inequalities.decay(x, flow, drift, rate, discrete=discrete)
+            rate = spec.decay * (1 + SPECIFICATION_TIGHTENING) * (self.period or 1 / frame.tau)
+            return inequalities.decay_lmi(x, flow, drift, rate, discrete=discrete)
 
         def damping(v: Values) -> np.ndarray:
-            zeta = 1 - (1 - spec.damping) * (1 - TIGHTER)
-            return inequalities.damping(seen(v)[2], zeta / np.sqrt(1 - zeta**2))
+            zeta = 1 - (1 - spec.damping) * (1 - SPECIFICATION_TIGHTENING)
+            return inequalities.damping_lmi(seen(v)[2], zeta / np.sqrt(1 - zeta**2))
 
         def gain(v: Values) -> np.ndarray:
             (x, f, flow, drift), l2 = seen(v), spec.l2
@@ -139,23 +141,23 @@ class Program:
             z = (l2.output @ frame.T @ x + l2.feedthrough @ frame.U @ f) / np.sqrt(frame.tau)
             z, e = z / self.output, place.E / self.disturbance
             if l2.bound is None:
-                return inequalities.gain(x, flow, drift, z, e, v["g"], 1.0, discrete=discrete)
-            g = (l2.bound * (1 - TIGHTER) / self.output / self.disturbance) ** 2
-            return inequalities.gain(x, flow, drift, z, e, g, v["s"], discrete=discrete)
+                return inequalities.l2_gain_lmi(x, flow, drift, z, e, v["g"], 1.0, discrete=discrete)
+            g = (l2.bound * (1 - SPECIFICATION_TIGHTENING) / self.output / self.disturbance) ** 2
+            return inequalities.l2_gain_lmi(x, flow, drift, z, e, g, v["s"], discrete=discrete)
 
         wanted = ((spec.Q is not None, cost), (spec.decay > 0, decay), (spec.damping > 0, damping), (spec.l2, gain))
         yield from (self.unknowns.affine(formula) for asked, formula in wanted if asked)
 
-    def _input(self, level: float) -> Iterator[Block]:
+    def _input(self, level: float) -> Iterator[SdpBlock]:
         limit = self.spec.input
         if limit is None:
             return
         for point in limit.points:
             start = self.frame.inverse @ point
-            yield self.unknowns.affine(lambda v, start=start: inequalities.reaches(v["X0"], start, level))
-        for row, bound in zip(self.frame.U, limit.limit * (1 - TIGHTER), strict=True):
+            yield self.unknowns.affine(lambda v, start=start: inequalities.start_lmi(v["X0"], start, level))
+        for row, bound in zip(self.frame.U, limit.limit * (1 - SPECIFICATION_TIGHTENING), strict=True):
             yield self.unknowns.affine(
-                lambda v, row=row, bound=bound: inequalities.limited(v["X0"], row[None] @ v["F0"], bound, level)
+                lambda v, row=row, bound=bound: inequalities.input_limit_lmi(v["X0"], row[None] @ v["F0"], bound, level)
             )
 
 

@@ -49,7 +49,7 @@ class Frame(NamedTuple):
         return self.inverse @ self.inverse.T
 
 
-def whitening(weight: np.ndarray) -> np.ndarray:
+def whitening_matrix(weight: np.ndarray) -> np.ndarray:
     """D with D' weight D = I, but for directions that weigh less than a trillionth of the largest.
 
     A slow closed loop beside a fast one has little cost per unit of time; D M D' makes a solver's tolerance relative.
@@ -58,7 +58,7 @@ def whitening(weight: np.ndarray) -> np.ndarray:
     return vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
 
 
-def frame(p: np.ndarray, a: np.ndarray, r: np.ndarray, *, discrete: bool) -> Frame:
+def lyapunov_frame(p: np.ndarray, a: np.ndarray, r: np.ndarray, *, discrete: bool) -> Frame:
     """The frame in which P is the unit matrix, the closed loops A (V, n, n) have norms about 1, and R is the unit
     matrix. Raises LinAlgError for a P that is not positive definite."""
     lower = np.linalg.cholesky((p + p.T) / 2)
@@ -83,7 +83,7 @@ def design_frames(system: Polytope, q: np.ndarray, r: np.ndarray) -> Iterator[tu
         if system.period is not None:
             k = -np.linalg.solve(r + b.T @ p @ b, b.T @ p @ system.A[i])
         closed = (system.A[i] + b @ k)[None]
-        yield frame(p, closed, r, discrete=system.period is not None), float(traces[i])
+        yield lyapunov_frame(p, closed, r, discrete=system.period is not None), float(traces[i])
 
 
 def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, i: int, system: Polytope) -> np.ndarray:
@@ -93,7 +93,7 @@ def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, i: int,
         if system.period is not None:
             p = solve_discrete_are(a, b, q, r)
         else:
-            p = _hamiltonian(a, b, q, r)
+            p = _solve_by_hamiltonian(a, b, q, r)
             p = solve_continuous_are(a, b, q, r) if p is None else p
         np.linalg.cholesky(p)
     except (np.linalg.LinAlgError, ValueError):
@@ -105,7 +105,7 @@ def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, i: int,
     return p
 
 
-def _hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray | None:
+def _solve_by_hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray | None:
     """The Riccati solution from the stable eigenvectors of the Hamiltonian matrix and a Newton step; None where its
     residual is not small. A thirtieth of the time of SciPy's, whose BLAS may start threads for such small matrices."""
     n, push = len(a), b @ np.linalg.solve(r, b.T)
@@ -145,6 +145,6 @@ def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | N
         p = solve_discrete_lyapunov(a.T, q) if discrete else solve_continuous_lyapunov(a.T, -q)
         mean += p / units / units[:, None] / (np.trace(p) if weight is None else len(closed))
     try:
-        return frame(mean, closed, np.eye(1), discrete=discrete)
+        return lyapunov_frame(mean, closed, np.eye(1), discrete=discrete)
     except np.linalg.LinAlgError:  # a mode on the edge of stability, or a weight that is blind to a state
-        return frame(np.diag(units**-2.0), closed, np.eye(1), discrete=discrete)
+        return lyapunov_frame(np.diag(units**-2.0), closed, np.eye(1), discrete=discrete)

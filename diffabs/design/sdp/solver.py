@@ -20,10 +20,10 @@ import numpy as np
 SOLVERS = ("CLARABEL", "MOSEK", "CVXOPT")  # in this order, of those installed; SCS is wrong by 1e-3 and never asked
 OPTIONS = {"CLARABEL": {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}}
 HINT = 'pip install ".[design]" in a clone'
-LOCK = threading.Lock()  # a compiled program is shared, and holds its parameters
+SOLVER_LOCK = threading.Lock()  # a compiled program is shared, and holds its parameters
 
 
-class Block(NamedTuple):
+class SdpBlock(NamedTuple):
     """Inequalities of one size: h (b, k, k), G (b, d, k, k)."""
 
     h: np.ndarray
@@ -37,12 +37,12 @@ class Answer(NamedTuple):
     multipliers: list[np.ndarray]
     status: str
 
-    def violation(self, blocks: list[Block]) -> float:
+    def violation(self, blocks: list[SdpBlock]) -> float:
         """How far the least eigenvalue of any block is below 0; 0 if none is."""
         values = (b.h + np.einsum("d,bdij->bij", self.y, b.G) for b in blocks)
         return max(0.0, *(-float(np.linalg.eigvalsh(value).min()) for value in values))
 
-    def gap(self, c: np.ndarray, blocks: list[Block]) -> float:
+    def gap(self, c: np.ndarray, blocks: list[SdpBlock]) -> float:
         """Bound on how far c'y is above the optimum: duality gap, and the multipliers' residual times the unknowns."""
         bound = -sum(float(np.sum(b.h * w)) for b, w in zip(blocks, self.multipliers, strict=True))
         found = sum(np.einsum("bdij,bij->d", b.G, w) for b, w in zip(blocks, self.multipliers, strict=True))
@@ -67,13 +67,13 @@ class Unknowns:
         """The matrices in a vector."""
         return {name: np.tensordot(y, unit, 1) for name, unit in self.basis.items()}
 
-    def blocks(self, formulas: Callable[[Mapping[str, np.ndarray]], list[Any]]) -> list[Block]:
+    def blocks(self, formulas: Callable[[Mapping[str, np.ndarray]], list[Any]]) -> list[SdpBlock]:
         """The blocks h + sum y_d G_d of formulas that are affine in the unknowns and work on stacks of them."""
         values = formulas(self.stacked)
         wholes = [np.broadcast_to(value, (self.size + 1, *value.shape[-2:])) for value in values]
-        return [Block(whole[:1], (whole[1:] - whole[0])[None]) for whole in wholes]
+        return [SdpBlock(whole[:1], (whole[1:] - whole[0])[None]) for whole in wholes]
 
-    def affine(self, formula: Callable[[Mapping[str, np.ndarray]], Any]) -> Block:
+    def affine(self, formula: Callable[[Mapping[str, np.ndarray]], Any]) -> SdpBlock:
         """The block of one formula."""
         return self.blocks(lambda v: [formula(v)])[0]
 
@@ -98,7 +98,7 @@ def he(m: np.ndarray) -> np.ndarray:
     return m + np.swapaxes(m, -1, -2)
 
 
-def symmetric(rows: list[list[Any]]) -> np.ndarray:
+def symmetric_from_blocks(rows: list[list[Any]]) -> np.ndarray:
     """A symmetric matrix, or a stack of them, from the blocks on and below its diagonal; None is zero."""
     stack = np.broadcast_shapes(*(np.shape(x)[:-2] for row in rows for x in row if x is not None))
     sizes = [np.shape(row[-1])[-1] for row in rows]
@@ -113,18 +113,18 @@ def symmetric(rows: list[list[Any]]) -> np.ndarray:
     return whole
 
 
-def grouped(blocks: Iterable[Block]) -> list[Block]:
+def group_blocks(blocks: Iterable[SdpBlock]) -> list[SdpBlock]:
     """Blocks of equal size in one group, each scaled so that its largest coefficient is 1."""
-    groups: dict[int, list[Block]] = {}
+    groups: dict[int, list[SdpBlock]] = {}
     for block in blocks:
         size = max(float(np.abs(block.G).max()), float(np.abs(block.h).max()))
-        groups.setdefault(block.h.shape[-1], []).append(Block(block.h / size, block.G / size))
-    return [joined(group) for group in groups.values()]
+        groups.setdefault(block.h.shape[-1], []).append(SdpBlock(block.h / size, block.G / size))
+    return [stack_blocks(group) for group in groups.values()]
 
 
-def joined(blocks: list[Block]) -> Block:
+def stack_blocks(blocks: list[SdpBlock]) -> SdpBlock:
     """Blocks of one size as one group."""
-    return Block(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
+    return SdpBlock(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
 @functools.cache
@@ -141,10 +141,10 @@ def solvers() -> tuple[str, ...]:
     return found
 
 
-def solve(c: np.ndarray, blocks: list[Block], solver: str = "CLARABEL") -> Answer:
+def solve_sdp(c: np.ndarray, blocks: list[SdpBlock], solver: str = "CLARABEL") -> Answer:
     """Minimise c'y under grouped blocks. An answer that a solver fails to give has NaN in y."""
     shapes = tuple(b.h.shape[:2] for b in blocks)
-    with LOCK:
+    with SOLVER_LOCK:
         program = _program(len(c), shapes)
         program.cost.value = c
         for block, h, g in zip(blocks, program.h, program.g, strict=True):
