@@ -1,0 +1,15 @@
+"""Names of types for annotations. What a tracer may stand for is an `Array`; `pytree.Scalar` is a number or an array."""
+
+from collections.abc import Mapping
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+
+Array: TypeAlias = jax.Array
+Key: TypeAlias = jax.Array  # a key of jax.random
+NumPyArray: TypeAlias = np.ndarray
+Bool: TypeAlias = bool | jax.Array  # of one run, or of a batch
+Int: TypeAlias = int | jax.Array
+PyTree: TypeAlias = Any  # leaves and structure are the caller's
+Params: TypeAlias = Mapping[str, Any]  # values by dotted path, "plant.mass"
