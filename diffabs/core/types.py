@@ -1,4 +1,4 @@
-"""Names of types for annotations. What a tracer may stand for is an `Array`; `pytree.Scalar` is a number or an array."""
+"""Names of types for annotations. An `Array` may be a tracer; a `pytree.Scalar` is a number or an array."""
 
 from collections.abc import Mapping
 from typing import Any, TypeAlias

@@ -227,7 +227,7 @@ def test_what_is_known_besides_of_the_published_gain():
     """Not unstable: poles of every frozen loop in closed form, s^2 = ..., and the proof that follows the speed."""
     result = run("certify", "slip-lmi", "--json", status=1)
     besides, reason = (json.loads(result.stdout)[name] for name in ("besides", "reason"))
-    frozen = besides["analyse_frozen_loops"]
+    frozen = besides["frozen"]
     assert frozen["systems"] == frozen["stable"] == 17**2
     assert frozen["slowest"] == pytest.approx(22.5318, abs=1e-4)  # REFERENCE: 22.5345 at 5.3 kg, and 6.2 kg is slower
     assert frozen["at"] == {"plant.mass": 6.2, "speed": pytest.approx(50 / 3.6)}

@@ -572,7 +572,7 @@ def tampered(change):
     ids=["smaller", "negative", "larger Z", "NaN"],
 )
 def test_a_wrong_answer_called_optimal_is_not_believed(monkeypatch, change, reason):
-    monkeypatch.setattr(synthesis.lmi, "solve", tampered(change))
+    monkeypatch.setattr(synthesis.lmi, "solve_sdp", tampered(change))
     with pytest.raises(DesignError, match=reason):
         design(RIG, Spec(Q=(1e6, 1e4), R=1.0))
 

@@ -222,8 +222,10 @@ def test_it_needs_no_solver_and_the_checker_nothing_of_the_package(tmp_path):
     code += f"import diffabs.cli.main as c; c.app(['verify', {str(path)!r}])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.split(":")[0]) == (0, "proved  decay"), done.stderr
-    alone = f"import sys; sys.modules.update(jax=None, numpy=None, diffabs=None); import runpy; "\
-            f"m = runpy.run_path({verify.__file__!r}); assert not m['verify']({str(path)!r})[0].reason"  # fmt: skip
+    alone = (
+        "import sys; sys.modules.update(jax=None, numpy=None, diffabs=None); import runpy; "
+        f"m = runpy.run_path({verify.__file__!r}); assert not m['verify_file']({str(path)!r})[0].reason"
+    )
     done = subprocess.run([sys.executable, "-c", alone], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

@@ -346,7 +346,7 @@ def test_a_band_is_of_the_corners_and_of_samples_between():
 def test_the_command_says_margins_and_where_they_are_worst(tmp_path):
     done = command("margins", "slip-cured", "--json", "--samples", "4", "--plot", str(tmp_path / "loop.png"))
     result = json.loads(done.stdout)
-    assert result["margins"]["is_stable"]
+    assert result["margins"]["stable"]
     assert result["corners"] == 4
     assert len(result["systems"]) == 8
     slow = {"plant.mass": 6.2, "initial.speed": 5 / 3.6}
