@@ -33,8 +33,8 @@ import diffabs
 from diffabs import scenario
 from diffabs.core.pytree import get
 from diffabs.kernel import cuda, gpu, launch, nvrtc
-from diffabs.kernel.graph import Level, real
-from diffabs.kernel.program import Program, live
+from diffabs.kernel.graph import UpdateLevel, is_real
+from diffabs.kernel.program import ScalarProgram, live_nodes
 from diffabs.simulate import native
 
 ACCURACY = 1e-4
@@ -60,7 +60,7 @@ extern "C" __global__ void run_all(const Arrays arrays, const void* shared, long
 def rate(on: Any, rounds: int) -> float:
     """Return the card's single-precision operations per second, an addition and a multiplication each one."""
     code = on.compiled(RATE)
-    blocks = -(-THREADS // cuda.THREADS) * cuda.THREADS
+    blocks = -(-THREADS // cuda.THREADS_PER_BLOCK) * cuda.THREADS_PER_BLOCK
 
     def start(context, outs, ins):
         addresses = (ctypes.c_void_p * 3)(on.address(ins), on.address(outs[0]), 0)
@@ -76,19 +76,19 @@ def rate(on: Any, rounds: int) -> float:
 def held(on: Any, code: pathlib.Path) -> int:
     """Return how many threads a launch has: no more than the card holds at once."""
     blocks = next(one.blocks for (path, _), one in on._loaded.items() if path == code)
-    return min(blocks, -(-THREADS // cuda.THREADS)) * cuda.THREADS
+    return min(blocks, -(-THREADS // cuda.THREADS_PER_BLOCK)) * cuda.THREADS_PER_BLOCK
 
 
-def arithmetic(program: Program) -> int:
+def arithmetic(program: ScalarProgram) -> int:
     """Return how many real operations a step has."""
-    nodes = live(program.results["step"])
-    return sum(COUNTED.get(node.op, 0) for node in nodes if node.level == Level.STEP and real(node.dtype))
+    nodes = live_nodes(program.results["step"])
+    return sum(COUNTED.get(node.op, 0) for node in nodes if node.level == UpdateLevel.STEP and is_real(node.dtype))
 
 
-def programs() -> list[Program]:
+def programs() -> list[ScalarProgram]:
     """Return a list to which every program that is translated from now on is added."""
-    found, source = [], cuda.source
-    cuda.source = lambda program, shape: (found.append(program), source(program, shape))[1]
+    found, source = [], cuda.emit_cuda
+    cuda.emit_cuda = lambda program, shape: (found.append(program), source(program, shape))[1]
     return found
 
 
@@ -163,7 +163,7 @@ def translated(name, dtype):
     one, path = scenario.load(name), "initial.theta" if name.startswith("arm") else "initial.speed"
     lanes = diffabs.Batch({path: np.full(2, float(get(one.loop, path)))}, np.arange(2))
     given = (one.loop, lanes, one.solver, one.objectives)
-    with jax.enable_x64(dtype == "float64"), mock.patch.object(launch, "_launched", launched):
+    with jax.enable_x64(dtype == "float64"), mock.patch.object(launch, "_launch_lanes", launched):
         native._run.clear_cache()
         try:
             diffabs.run_batch(*given, together=False, accepted=True, engine="kernel")
@@ -178,11 +178,11 @@ def in_registers(dtypes):
     for name in scenario.names():
         for dtype in dtypes:
             program, shape = translated(name, dtype)
-            source = cuda.source(program, shape)
-            operations = (len(live(program.results["step"])), arithmetic(program))
+            source = cuda.emit_cuda(program, shape)
+            operations = (len(live_nodes(program.results["step"])), arithmetic(program))
             for architecture in ("sm_80", "sm_90"):
-                log = nvrtc.machine_code(source.text, architecture).with_suffix(".log").read_text()
-                used = nvrtc.registers(log)["run_all"]
+                log = nvrtc.build_cubin(source.text, architecture).with_suffix(".log").read_text()
+                used = nvrtc.parse_register_usage(log)["run_all"]
                 numbers = map(str, (*operations, used["registers"], used["spilled"]))
                 table.add_row(name, dtype, architecture, *numbers)
     Console().print(table)
@@ -190,7 +190,7 @@ def in_registers(dtypes):
 
 def on_a_gpu(options):
     """Measure, print, write. Exits where JAX runs on no GPU."""
-    on = gpu.device()
+    on = gpu.find_gpu()
     if on is None:
         raise SystemExit("JAX runs on no GPU here: pip install jax[cuda13] on a machine with one")
     peak, rounds = rate(on, options.rounds), options.rounds

@@ -51,7 +51,7 @@ class Peer:
         told = self.answer()
         self.refused = told.get("refused")
         self.title, self.ladder = told.get("title", name), told.get("ladder", [])
-        self.some, self.versions = min(told.get("many") or options.lanes, options.lanes), told.get("versions", {})
+        self.any_factor, self.versions = min(told.get("many") or options.lanes, options.lanes), told.get("versions", {})
 
     def answer(self) -> dict[str, Any]:
         """The next reply; {"refused": why} where there is none."""
@@ -73,12 +73,18 @@ class Peer:
         """Try the ladder until one setting is accurate, and on to one that is much more so, for the curve."""
         out = f"{folder}/{self.name}.npy"
         for setting in self.ladder:
-            asked = {"do": "prepare", "lanes": self.options.lanes, "some": self.some, "setting": setting, "out": out}
+            asked = {
+                "do": "prepare",
+                "lanes": self.options.lanes,
+                "some": self.any_factor,
+                "setting": setting,
+                "out": out,
+            }
             reply = self.asked(**asked)
             if "refused" in reply:
                 self.refused = reply["refused"]
                 return
-            errors = problem.errors(np.load(out), answers[:, chosen(self.options.lanes, self.some)])
+            errors = problem.errors(np.load(out), answers[:, chosen(self.options.lanes, self.any_factor)])
             each = dict(zip(problem.METRICS, errors.tolist(), strict=True))
             self.points[setting] = {"error": max(each.values()), "errors": each, **reply}
             if self.points[setting]["error"] <= self.options.accuracy / FACTOR:
@@ -129,13 +135,13 @@ def summary(peers: list[Peer], taken: dict[Any, list[float]], apart: float | Non
     found = {"rows": {}, "points": {}, "reference": {"method": "C, rtol 1e-10", "DOP853 apart": apart}}
     seconds = {}
     for peer in peers:
-        whole = options.lanes / peer.some
+        whole = options.lanes / peer.any_factor
         for setting, point in peer.points.items():
             seconds[peer.name, setting] = [whole * t for t in taken[peer.name, setting]]
             median = statistics.median(seconds[peer.name, setting])
             point |= {"setting": setting, "run_s": median, "runs_per_s": options.lanes / median}
         found["points"][peer.name] = list(peer.points.values())
-        row = {"title": peer.title, "lanes": peer.some, "refused": peer.refused, "versions": peer.versions}
+        row = {"title": peer.title, "lanes": peer.any_factor, "refused": peer.refused, "versions": peer.versions}
         if point := peer.best():
             row |= point | {"prepare_s": max(each["prepare_s"] for each in peer.points.values())}
         found["rows"][peer.name] = row

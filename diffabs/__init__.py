@@ -9,9 +9,9 @@ from diffabs.core.pytree import replace as replace
 from diffabs.plants import BrakeStart as BrakeStart
 from diffabs.scenario.defaults import balancing as balancing
 from diffabs.scenario.defaults import braking as braking
+from diffabs.simulate.admissible import check as check
 from diffabs.simulate.batch import Batch as Batch
 from diffabs.simulate.batch import run_batch as run_batch
-from diffabs.simulate.refusals import check as check
 from diffabs.simulate.run import measure as measure
 from diffabs.simulate.run import rollout as rollout
 from diffabs.simulate.solution import Adaptive as Adaptive

@@ -30,7 +30,7 @@ from diffabs.plants import GRAVITY, LabRig, MirroredRig
 from diffabs.plants.lab_rig import LabRigState
 from diffabs.references import FixedSlip
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.batch import stacked
+from diffabs.simulate.batch import stack_loops
 from diffabs.stops import SpeedReached
 
 
@@ -74,7 +74,7 @@ def checks(config: Config) -> list[dict[str, Any]]:
 def open_loop(config: Config) -> dict[str, Run]:
     """The rig at constant commands."""
     start, stop = BrakeStart(speed=config.start_kmh / 3.6), SpeedReached(speed=config.stop_kmh / 3.6)
-    lanes = stacked(
+    lanes = stack_loops(
         [
             braking(plant=LabRig(), initial=start, controller=ConstantTorque(torque=u), stop=stop)
             for u in config.commands
@@ -160,7 +160,7 @@ def lag_table(config: Config) -> tuple[list[dict[str, Any]], dict[str, Run]]:
         f"0..{config.torque_max:g}": (0.0, config.torque_max),
     }
     cases = [(name, lag) for name in limits for lag in config.lags]
-    lanes = stacked([lagged(config, lag, *limits[name]) for name, lag in cases])
+    lanes = stack_loops([lagged(config, lag, *limits[name]) for name, lag in cases])
     solver = FixedStep(step=config.step, duration=config.duration, every=5)
     runs = run_batch(*lanes, solver, BRAKING, trajectories=True, accepted=True)
     rows, drawn = [], {}
@@ -179,7 +179,7 @@ def lag_table(config: Config) -> tuple[list[dict[str, Any]], dict[str, Run]]:
 def settles(config: Config) -> list[dict[str, Any]]:
     """Does the simulation agree with the eigenvalues? Slip error that is left at the end, just below and above T*."""
     lags = [factor * bisected(config, config.start_kmh / 3.6 / MirroredRig().body_radius) for factor in (0.9, 1.1)]
-    lanes = stacked([lagged(config, lag, -math.inf, math.inf) for lag in lags])
+    lanes = stack_loops([lagged(config, lag, -math.inf, math.inf) for lag in lags])
     solver = FixedStep(step=config.step, duration=config.duration)
     metrics = run_batch(*lanes, solver, BRAKING, together=True, accepted=True).metrics
     return [

@@ -25,7 +25,7 @@ from diffabs.plants import QuarterCar
 from diffabs.references import FixedSlip, PeakLatch
 from diffabs.roads import MagicFormula
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.batch import stacked
+from diffabs.simulate.batch import stack_loops
 from diffabs.stops import Standstill
 
 
@@ -72,7 +72,7 @@ def slowest(config: Config, period: float, delay: float) -> float:
 def sweep(config: Config) -> list[dict[str, Any]]:
     """Time and distance for each controller, period and delay."""
     cases = [(name, p, d) for name in gains(config) for d in config.delays for p in config.periods]
-    lanes = stacked([loop(config, gains(config)[name], p, d * p) for name, p, d in cases])
+    lanes = stack_loops([loop(config, gains(config)[name], p, d * p) for name, p, d in cases])
     solver = FixedStep(step=config.step, duration=config.duration)
     metrics = run_batch(*lanes, solver, BRAKING, together=True, accepted=True).metrics
     return [
@@ -102,7 +102,7 @@ def all_at_one_kilohertz(config: Config) -> list[dict[str, Any]]:
     """Conventional and proposed with everything sampled: the step is the period, so the estimator sees 1 kHz too."""
     solver, rows = FixedStep(step=1e-3, duration=config.duration), []
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
-        lanes = stacked([loop(config, pid, 1e-3, 0.0, reference) for pid in gains(config).values()])
+        lanes = stack_loops([loop(config, pid, 1e-3, 0.0, reference) for pid in gains(config).values()])
         metrics = run_batch(*lanes, solver, BRAKING, together=True, accepted=True).metrics
         for i, name in enumerate(gains(config)):
             time, distance = float(metrics["stop_time"][i]), float(metrics["stop_distance"][i])
@@ -112,7 +112,7 @@ def all_at_one_kilohertz(config: Config) -> list[dict[str, Any]]:
 
 def traces(config: Config) -> dict[str, Run]:
     """P control at a few periods, one of them as delay."""
-    lanes = stacked([loop(config, gains(config)["P"], p, p) for p in config.drawn_periods])
+    lanes = stack_loops([loop(config, gains(config)["P"], p, p) for p in config.drawn_periods])
     solver = FixedStep(step=config.step, duration=config.duration, every=20)
     runs = run_batch(*lanes, solver, BRAKING, trajectories=True, accepted=True)
     return {f"{1e3 * p:g} ms": record.lane(runs, i) for i, p in enumerate(config.drawn_periods)}

@@ -30,7 +30,7 @@ from diffabs.references import FixedSlip, PeakLatch, PeakRobust
 from diffabs.roads import MagicFormula
 from diffabs.scenario.defaults import braking
 from diffabs.sensors import IntegratedAccelerometer, Noise
-from diffabs.simulate.batch import stacked
+from diffabs.simulate.batch import stack_loops
 from diffabs.stops import Standstill
 
 
@@ -71,7 +71,7 @@ def noisy(config: Config, loops: list[Loop], duration: float) -> tuple[Any, Any]
     keys = jax.random.split(jax.random.key(config.seed), config.seeds)
     solver = FixedStep(step=config.step, duration=duration)
     one = jax.vmap(lambda loop, key: measure(loop, solver, OBJECTIVES, key=key), (None, 0))
-    first, lanes = stacked(loops)
+    first, lanes = stack_loops(loops)
     run = lanes.each(first, lambda loop, key: one(loop, keys))
     stopped = np.asarray(run.stopped)
     return np.where(stopped, run.metrics["distance"], run.ending.sample.output.distance), stopped
@@ -137,7 +137,7 @@ def biased(config: Config) -> list[dict[str, Any]]:
             )
             for f, b in cases
         ]
-        run = run_batch(*stacked(loops), solver, OBJECTIVES, together=True, accepted=True)
+        run = run_batch(*stack_loops(loops), solver, OBJECTIVES, together=True, accepted=True)
         distances = np.where(run.stopped, run.metrics["distance"], np.nan).reshape(len(config.floors), -1)
         for floor, line in zip(config.floors, distances, strict=True):
             columns = {f"{b:+g}": None if np.isnan(x) else float(x) for b, x in zip(config.biases, line, strict=True)}

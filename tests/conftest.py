@@ -61,10 +61,11 @@ def _float64():
 @pytest.fixture(scope="module")
 def any_step_is_stable():
     """Loading a scenario without the seconds of the stability check, which has tests of its own."""
-    from diffabs.simulate import refusals
+
+    from diffabs.simulate import admissible
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(refusals, "stable_step", lambda loop: np.inf)
+        patch.setattr(admissible, "stable_step", lambda loop: np.inf)
         yield
 
 

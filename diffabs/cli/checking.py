@@ -11,10 +11,10 @@ import numpy as np
 
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.accuracy import accuracy, needs_key, reasons
-from diffabs.simulate.refusals import MOST_STEPS
+from diffabs.simulate.accuracy import estimate_accuracy, incomparability_reasons, needs_key
+from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.run import measure
-from diffabs.simulate.solution import Adaptive, Run, Solver, described, finer
+from diffabs.simulate.solution import Adaptive, Run, Solver, describe_solver, refine_solver
 
 SMALL = 1e-6  # of a value: below, nobody asks for its order
 FINEST = 4  # the shortest step is this part of the scenario's
@@ -27,14 +27,14 @@ def checked(chosen: Scenario, key: Any) -> dict[str, Any]:
     again, the order, the error, and what single precision changes. Raises ScenarioError for a step too short to be
     shortened."""
     solver = chosen.solver
-    if FINEST * solver.duration / solver.step > MOST_STEPS:
-        least = FINEST * solver.duration / MOST_STEPS
+    if FINEST * solver.duration / solver.step > MAX_SOLVER_STEPS:
+        least = FINEST * solver.duration / MAX_SOLVER_STEPS
         raise ScenarioError(
             f"solver.step = {solver.step:g} s is outside [{least:g}, {solver.duration:g}] s: a quarter of it takes too "
             "many steps for --check"
         )
-    why = reasons(chosen.loop, solver, key)
-    found = jax.device_get(accuracy(chosen.loop, solver, chosen.objectives, key=key))
+    why = incomparability_reasons(chosen.loop, solver, key)
+    found = jax.device_get(estimate_accuracy(chosen.loop, solver, chosen.objectives, key=key))
     single = {} if needs_key(chosen.loop) else _single(chosen)
     metrics = {}
     for name in chosen.objectives:
@@ -51,7 +51,7 @@ def checked(chosen: Scenario, key: Any) -> dict[str, Any]:
             "float32 difference": None if low is None else low - value,
         }
     return {
-        "solvers": [described(finer(solver, times)) for times in (1, 2, FINEST)],
+        "solvers": [describe_solver(refine_solver(solver, times)) for times in (1, 2, FINEST)],
         "comparable": not why,
         "reasons": why,
         "ended alike": bool(found.alike),

@@ -7,15 +7,15 @@ import typer
 
 from diffabs.cli import console
 from diffabs.core.values import unknown
-from diffabs.simulate.engine import ENGINES
+from diffabs.simulate.engine import REQUESTABLE_ENGINES
 
 Engine = Annotated[str, typer.Option(help="xla, kernel (a program of this machine, by its C++ compiler), or auto.")]
 
 
 def check(engine: str) -> None:
     """Raises ScenarioError for a name of none."""
-    if engine not in ENGINES:
-        raise unknown(f"--engine {engine} is unknown", engine, ENGINES)
+    if engine not in REQUESTABLE_ENGINES:
+        raise unknown(f"--engine {engine} is unknown", engine, REQUESTABLE_ENGINES)
 
 
 def decided(engine: str, objection: Callable[[], str | None]) -> str:

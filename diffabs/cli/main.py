@@ -47,7 +47,7 @@ from diffabs.scenario import model
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.matlab import write_mat
 from diffabs.simulate.run import measure, rollout
-from diffabs.simulate.solution import Adaptive, Run, described
+from diffabs.simulate.solution import Adaptive, Run, describe_solver
 
 if COLLECTS:
     gc.enable()
@@ -252,7 +252,7 @@ def _result(chosen: Scenario, run: Run, limited: float, files: dict[str, pathlib
         "title": chosen.title,
         "parts": model.parts(chosen),
         "parameters": model.numbers(chosen),
-        "solver": {**described(chosen.solver), "seed": chosen.seed},
+        "solver": {**describe_solver(chosen.solver), "seed": chosen.seed},
         "versions": provenance.versions(),
         "files": {name: str(path) for name, path in files.items() if path},
     }

@@ -17,7 +17,7 @@ from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.scenario.toml import value
-from diffabs.simulate.engine import described
+from diffabs.simulate.engine import describe_engine
 
 if TYPE_CHECKING:
     from diffabs.reliability.subset_simulation import Progress, RareEvent
@@ -132,6 +132,6 @@ def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str,
         "gradients": found.gradients,
         "diverged": found.diverged,
         "seed": study.seed,
-        "engine": described(study.engine),
+        "engine": describe_engine(study.engine),
         "versions": provenance.versions("numpy", "scipy"),
     }

@@ -24,8 +24,8 @@ from diffabs.core.values import ScenarioError, unknown
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads
+from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.engine import EngineError
-from diffabs.simulate.refusals import first_line
 
 if TYPE_CHECKING:
     from diffabs.sweep import Progress as Told
@@ -115,7 +115,7 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
 def _check_runnable(study: "Study", number: int) -> tuple[Any, jax.Array]:
     """Loop and key of a sample. Raises ScenarioError for one that must not be run."""
     loop, key = study.lane(number)
-    if line := first_line(loop, {}, study.solver):
+    if line := first_refusal(loop, {}, study.solver):
         raise ScenarioError(f"sample {number} was refused: {line}")
     return loop, key
 

@@ -17,8 +17,8 @@ from diffabs.cli import engine as engines
 from diffabs.cli.tune_document import Proved, Work, documented
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, dump
+from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.engine import EngineError
-from diffabs.simulate.refusals import first_line
 from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Trajectory
 
@@ -132,7 +132,7 @@ def work_of(chosen: Scenario) -> Work:
 
     goal = chosen.tune.check(chosen.loop)
     batch = goal.batch(chosen.seed).check(chosen.loop)
-    if line := first_line(chosen.loop, batch.values, chosen.solver):
+    if line := first_refusal(chosen.loop, batch.values, chosen.solver):
         raise ScenarioError(f"tune.over: {line}")
     constraints: dict[str, Any] = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
     task = certificates.task(chosen) if goal.decay or goal.damping else None

@@ -14,7 +14,7 @@ from diffabs.linear.robustness import low_discrepancy_points
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.frames import columns
+from diffabs.simulate.convert import trajectory_columns
 from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Adaptive, FixedStep, Run, Solver
 
@@ -150,7 +150,7 @@ def _quantiles(values: np.ndarray) -> np.ndarray:
 
 def _panels(run: Run, plant: Any) -> tuple[np.ndarray, tuple[Panel, ...]]:
     """The instants of one run, and what is drawn of them."""
-    count = len(columns(run, plant)["t"][1])
+    count = len(trajectory_columns(run, plant)["t"][1])
     assert run.trajectory is not None
     cut = tuple(
         Panel(panel.unit, tuple(Line(line.name, _finite(line.values[:count])) for line in panel.lines))

@@ -18,7 +18,7 @@ from diffabs.explore.curves import Spread
 from diffabs.explore.knobs import Knob
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import Scenario, load
-from diffabs.simulate.refusals import together, unstable
+from diffabs.simulate.admissible import find_mismatches, find_unstable_step
 
 CERTIFIED, REFUTED, UNDECIDED, UNKNOWN = "certified", "refuted", "undecided", "unknown"
 AS_GIVEN = "as in the scenario"
@@ -176,5 +176,5 @@ def _value(value: Any, knob: Knob) -> float:
 
 def objections(chosen: Scenario) -> list[str]:
     """Return why a scenario must not be run, a line each: as a file with these numbers would be refused."""
-    lines = list(problems(chosen.loop)) or list(together(chosen.loop, chosen.solver))
-    return lines or list(unstable(chosen.loop, chosen.solver))
+    lines = list(problems(chosen.loop)) or list(find_mismatches(chosen.loop, chosen.solver))
+    return lines or list(find_unstable_step(chosen.loop, chosen.solver))

@@ -10,7 +10,7 @@ from diffabs.export.device import Device, NotExported
 from diffabs.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
 from diffabs.kernel.graph import Node
 from diffabs.kernel.primitives import Unsupported
-from diffabs.kernel.program import live
+from diffabs.kernel.program import live_nodes
 
 
 def c_source(found: Device, name: str, notes: Sequence[str] = ()) -> str:
@@ -105,9 +105,9 @@ class _Text:
 
     def _body(self, stored: dict[str, Node], more: Sequence[Node]) -> Iterator[str]:
         """Yield the statements that compute `stored` and `more`, and store them in the memory."""
-        nodes = live([*stored.values(), *more])
+        nodes = live_nodes([*stored.values(), *more])
         moving = self.program.moving if more else {}
-        used = {node.id for node in nodes} | {node.id for node in live(list(moving.values()))}
+        used = {node.id for node in nodes} | {node.id for node in live_nodes(list(moving.values()))}
         for struct, names in ((INPUTS, self.program.inputs), (NUMBERS, self.program.numbers)):
             if not any(node.id in used for node in names.values()):
                 yield f"  (void){struct};"
@@ -121,7 +121,7 @@ class _Text:
     def _moves(self, moving: dict[str, Node]) -> Iterator[str]:
         """What moves by itself until the next sample, by as many steps as the simulation takes."""
         yield f"  for (int i = 0; i < {self.device.moves}; i++) {{"
-        yield from self.words.operations(live(list(moving.values())), "    ")
+        yield from self.words.operations(live_nodes(list(moving.values())), "    ")
         for name, node in moving.items():
             if node is not self.program.state[name]:
                 yield f"    s->{self.fields[MEMORY][name]} = {self.words.name(node)};"

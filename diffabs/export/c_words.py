@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.kernel.graph import Node, real
+from diffabs.kernel.graph import Node, is_real
 from diffabs.kernel.primitives import Unsupported
 
 TYPES = {"int64": "int64_t", "uint64": "uint64_t", "int32": "int32_t", "uint32": "uint32_t", "bool": "bool"}
@@ -54,7 +54,7 @@ class Words:
 
     def type(self, node: Node) -> str:
         """Of a number."""
-        return self.real if real(node.dtype) else TYPES[node.dtype.name]
+        return self.real if is_real(node.dtype) else TYPES[node.dtype.name]
 
     def name(self, node: Node) -> str:
         """What stands for a number: a literal, a variable, a place."""
@@ -70,7 +70,7 @@ class Words:
         x = node.attr
         if node.dtype.kind == "b":
             return "true" if x else "false"
-        return self.literal(x) if real(node.dtype) else f"(({TYPES[node.dtype.name]}){int(x)})"
+        return self.literal(x) if is_real(node.dtype) else f"(({TYPES[node.dtype.name]}){int(x)})"
 
     def literal(self, x: Any) -> str:
         """A real number, of NumPy, as it is written."""
@@ -95,7 +95,7 @@ class Words:
         if node.op in EXTREMES:  # NaN where either is
             a, b = args
             return f"{a} != {a} || {a} {EXTREMES[node.op]} {b} ? {a} : {b}"
-        if node.op in FUNCTIONS and real(node.dtype):
+        if node.op in FUNCTIONS and is_real(node.dtype):
             return f"{FUNCTIONS[node.op]}{suffix}({', '.join(args)})"
         if node.op == "is_finite":
             return f"isfinite({args[0]}) != 0"

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from diffabs.kernel.graph import Graph, Level, Node
+from diffabs.kernel.graph import Graph, Node, UpdateLevel
 
 PACKAGE = pathlib.Path(__file__).parents[1]
 CARRIERS = (pathlib.Path(jax.__file__).parent, *(PACKAGE / name for name in ("core", "kernel", "export")))
@@ -32,7 +32,9 @@ class Labelled(Graph):
         """Take its label for what follows."""
         self._label = self.labels.get(id(eqn), self._label)
 
-    def _make(self, op: str, args: tuple[Node, ...], dtype: Any, attr: Any = None, level: Level | None = None) -> Node:
+    def _make(
+        self, op: str, args: tuple[Node, ...], dtype: Any, attr: Any = None, level: UpdateLevel | None = None
+    ) -> Node:
         node = super()._make(op, args, dtype, attr, level)
         node.label = node.label or self._label
         return node

@@ -11,11 +11,11 @@ import numpy as np
 
 from diffabs.export.device import Device
 from diffabs.export.labels import Labelled, label
-from diffabs.kernel.graph import Array, Graph, Level, Node
-from diffabs.kernel.primitives import known, translate
-from diffabs.kernel.program import RULES, live
+from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel
+from diffabs.kernel.primitives import constant_array, lower_jaxpr
+from diffabs.kernel.program import RULE_MODULES, live_nodes
 
-assert RULES is not None  # registered where they are imported
+assert RULE_MODULES is not None  # registered where they are imported
 
 MEMORY, INPUTS, NUMBERS = "s", "in", "p"  # where an input of the graph is, the first word of its `attr`
 
@@ -41,7 +41,7 @@ class Lowered:
         held = filled(found.state, self.state)
         shapes = (found.parts, found.state, found.input)
         *after, self.held = outputs(graph, lambda all: found.step(*all), shapes, [*parts, *held, *given])
-        self.place = graph.input(np.int64, Level.UNIFORM, ("", "i"))
+        self.place = graph.input(np.int64, UpdateLevel.UNIFORM, ("", "i"))
         moved: list[Node] = []
         if found.moves:
             place, count = np.full((), self.place, object), jax.ShapeDtypeStruct((), np.int64)
@@ -55,7 +55,7 @@ class Lowered:
         self.begun = {name: node for name, node in zip(self.state, started, strict=True) if name in self.kept}
         self.stored = {name: self.after[name] for name in self.kept if name in self.after and name not in moving}
         roots = [self.held, *(self.after[name] for name in self.kept if name in self.after), *self.begun.values()]
-        seen = {node.id for node in live(roots)}
+        seen = {node.id for node in live_nodes(roots)}
         self.read = [name for name, node in self.inputs.items() if node.id in seen]
         self.used = [name for name, node in self.numbers.items() if node.id in seen]
 
@@ -64,7 +64,7 @@ class Lowered:
         kept = {"command"}
         roots = [self.command, self.held]
         while True:
-            needed = {node.id for node in live(roots)}
+            needed = {node.id for node in live_nodes(roots)}
             more = {name for name, node in self.state.items() if node.id in needed} - kept
             if not more:
                 break
@@ -80,7 +80,7 @@ def named(shape: Any, graph: Graph, where: str, flat: Any) -> dict[str, Node]:
         words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
         for at in np.ndindex(leaf.shape):
             name = flat(".".join([*words, *map(str, at)]))
-            found[name] = graph.input(leaf.dtype, Level.UNIFORM, (where, name))
+            found[name] = graph.input(leaf.dtype, UpdateLevel.UNIFORM, (where, name))
     return found
 
 
@@ -99,8 +99,8 @@ def outputs(graph: Labelled, function: Any, shape: Any, inputs: list[Array]) -> 
     """Return what a function returns, number by number; what it closes over is known."""
     closed = jax.make_jaxpr(function)(shape)
     graph.labels = {id(eqn): label(eqn) for eqn in closed.jaxpr.eqns}
-    constants = [known(graph, np.asarray(x)) for x in closed.consts]
-    return [node for array in translate(graph, closed.jaxpr, constants, inputs) for node in array.flat]
+    constants = [constant_array(graph, np.asarray(x)) for x in closed.consts]
+    return [node for array in lower_jaxpr(graph, closed.jaxpr, constants, inputs) for node in array.flat]
 
 
 def _numbers_of(parts: Any) -> list[float]:

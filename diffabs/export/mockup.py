@@ -22,7 +22,7 @@ from diffabs.core.values import printable
 from diffabs.export.c_words import is_name
 from diffabs.export.device import NotExported
 from diffabs.export.plant_c import PlantSource, Variable, plant_source
-from diffabs.kernel.compilers import NoCompiler, compiler
+from diffabs.kernel.compilers import NoCompiler, find_compiler
 
 FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-fPIC")
 LONGEST = 600  # s
@@ -92,7 +92,7 @@ def _compiled(source: str) -> bytes:
         text, result = pathlib.Path(folder) / "fmu.c", pathlib.Path(folder) / "fmu.lib"
         text.write_text(source, encoding="utf-8")
         try:
-            command = [*compiler().command, *FLAGS, str(text), "-o", str(result), "-lm"]
+            command = [*find_compiler().command, *FLAGS, str(text), "-o", str(result), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST)
         except (NoCompiler, OSError, subprocess.TimeoutExpired) as error:
             raise NotExported(f"an FMU needs a C compiler: {' '.join(str(error).split())}") from None

@@ -17,9 +17,9 @@ from diffabs.export.c_words import Words
 from diffabs.export.device import NotExported
 from diffabs.export.labels import Labelled
 from diffabs.export.lowered import filled, named, outputs
-from diffabs.kernel.graph import Level, Node, real
+from diffabs.kernel.graph import Node, UpdateLevel, is_real
 from diffabs.kernel.primitives import Unsupported
-from diffabs.kernel.program import live
+from diffabs.kernel.program import live_nodes
 from diffabs.simulate.rk4 import rk4_step
 
 CONTROL = "control"
@@ -104,13 +104,13 @@ class _Written:
         own = given[: len(jax.tree.leaves(plant))]
         state = jax.eval_shape(lambda both: prepared(both[0]).start(both[1]), typed)
         held = filled(state, named(state, graph, "x", str))
-        if any(not real(leaf.dtype) for leaf in jax.tree.leaves(state)):
+        if any(not is_real(leaf.dtype) for leaf in jax.tree.leaves(state)):
             raise NotExported(f"plant {type(plant).__name__} has a state that is no real number")
         self.order = {node.attr[1]: k for k, node in enumerate(node for array in held for node in array.flat)}
         self.states = len(self.order)
         one = jax.ShapeDtypeStruct((), np.float64)
         control, time, length = (
-            np.full((), graph.input(np.float64, Level.UNIFORM, place), object)
+            np.full((), graph.input(np.float64, UpdateLevel.UNIFORM, place), object)
             for place in (("v", CONTROL), ("", "t"), ("", "h"))
         )
         self.begun = outputs(graph, lambda both: prepared(both[0]).start(both[1]), typed, given)
@@ -131,7 +131,7 @@ class _Written:
         """Results are stored when all are known: one may be what another is made of."""
         yield f"static void {head}\n{{"
         yield from (f"  (void){name};" for name in unused)
-        yield from self.words.operations(live(list(results.values())), "  ")
+        yield from self.words.operations(live_nodes(list(results.values())), "  ")
         for k, node in results.items():
             yield f"  const double n{k} = {self.words.name(node)};"
         yield from (f"  m->{array}[{k}] = n{k};" for k in results)

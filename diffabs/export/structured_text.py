@@ -14,9 +14,9 @@ import numpy as np
 from diffabs.export.c_words import commented
 from diffabs.export.device import Device, NotExported
 from diffabs.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
-from diffabs.kernel.graph import Node, real
+from diffabs.kernel.graph import Node, is_real
 from diffabs.kernel.primitives import Unsupported
-from diffabs.kernel.program import live
+from diffabs.kernel.program import live_nodes
 
 INTEGERS = {"int64": "LINT", "uint64": "ULINT", "int32": "DINT", "uint32": "UDINT"}
 INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/"}
@@ -140,7 +140,7 @@ class _Block:
 
     def _assigned(self, stored: dict[str, Node], more: Sequence[Node], indent: str) -> Iterator[str]:
         """The operations that these need, the command, and the memory's new values."""
-        yield from self._operations(live([*stored.values(), *more]), indent)
+        yield from self._operations(live_nodes([*stored.values(), *more]), indent)
         for node in more:
             yield f"{indent}held := {self._value(node)};"
         if more and self.program.moving:
@@ -154,7 +154,7 @@ class _Block:
         moving = self.program.moving
         self.temporary["i"] = "INT"
         yield f"{indent}FOR i := 0 TO {self.device.moves - 1} DO"
-        yield from self._operations(live(list(moving.values())), indent + "  ")
+        yield from self._operations(live_nodes(list(moving.values())), indent + "  ")
         for name, node in moving.items():
             if node is not self.program.state[name]:
                 yield f"{indent}  {self.names[MEMORY, name]} := {self._value(node)};"
@@ -185,7 +185,7 @@ class _Block:
         return self.called[node.id]
 
     def _type(self, node: Node) -> str:
-        if real(node.dtype):
+        if is_real(node.dtype):
             return self.real
         return "BOOL" if node.dtype.kind == "b" else INTEGERS[node.dtype.name]
 
@@ -200,7 +200,7 @@ class _Block:
     def _literal(self, x: float, node: Node) -> str:
         if node.dtype.kind == "b":
             return "TRUE" if x else "FALSE"
-        if not real(node.dtype):
+        if not is_real(node.dtype):
             return f"{self._type(node)}#{int(x)}"
         return self._real(x)
 
@@ -233,7 +233,7 @@ class _Block:
             return f"-{args[0]}"
         if op == "any":
             return args[0]
-        if op == "rem" and not real(node.dtype):
+        if op == "rem" and not is_real(node.dtype):
             return f"{args[0]} MOD {args[1]}"
         if op == "table":
             return f"{self._variable(node)}_table[{args[0]}]"
@@ -246,7 +246,7 @@ class _Block:
     def _function(self, node: Node, args: list[str]) -> str:
         """Of the standard's functions, and what is made of them."""
         op = node.op
-        if op == "abs" or (op in FUNCTIONS and real(node.dtype)):
+        if op == "abs" or (op in FUNCTIONS and is_real(node.dtype)):
             return f"{FUNCTIONS[op]}({', '.join(args)})"
         if op in HYPERBOLIC:
             return HYPERBOLIC[op].format(args[0], "1.0", "2.0")

@@ -18,7 +18,7 @@ from diffabs.core.validity import check
 from diffabs.identify.data import Comparison, Data
 from diffabs.identify.fit import Identified, Tolerances, fit
 from diffabs.identify.residuals import Prior
-from diffabs.simulate.refusals import refusals
+from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.solution import Solver
 from diffabs.simulate.stable_step import stable_steps
 
@@ -44,7 +44,7 @@ def identify(
     solver: of every run
     absolute, prior, starts, norm, tolerances, progress, stopping: as in `fit`
 
-    A point is rejected where a run diverges, or must not be run: see `refusals`.
+    A point is rejected where a run diverges, or must not be run: see `batch_admissibility`.
 
     Raises:
         ValueError: what `fit` and the data object to; a run that must not be run at the start.
@@ -79,5 +79,5 @@ def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], against: Comp
 
 def _refused(loop: Any, against: Comparison, solver: Solver) -> str | None:
     """Why the first run that must not be run must not."""
-    asked = (refusals(None, jax.device_get(strong(batch)), solver) for batch in against.loops(loop))
+    asked = (batch_admissibility(None, jax.device_get(strong(batch)), solver) for batch in against.loops(loop))
     return next((next(filter(None, found.texts)) for found in asked if found.number), None)

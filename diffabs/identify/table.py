@@ -14,7 +14,7 @@ from diffabs.core.pytree import get, parameters, replace, strong
 from diffabs.core.validity import check
 from diffabs.identify.data import Comparison, check_positive
 from diffabs.objectives import BRAKING
-from diffabs.simulate.batch import Batch, by_structure, stacked
+from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import Solver
 
@@ -43,9 +43,9 @@ class Table:
         """Compare with the metrics of every row's loop."""
         self._check(loop, free)
         loops = [self.loops[row] for row in self.values]
-        groups = by_structure(loops)
+        groups = group_by_structure(loops)
         order = [list(self.values)[i] for places in groups for i in places]
-        lanes = (stacked([loops[i] for i in places]) for places in groups)
+        lanes = (stack_loops([loops[i] for i in places]) for places in groups)
         batches = [(strong(one), batch.values) for one, batch in lanes]
         metrics = list(dict.fromkeys(metric for _, metric in self.labels))
         place = np.array([(order.index(row), metrics.index(metric)) for row, metric in self.labels])

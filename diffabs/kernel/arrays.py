@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.kernel.elementwise import extreme
+from diffabs.kernel.elementwise import max_or_min
 from diffabs.kernel.graph import Array, Graph, Node
-from diffabs.kernel.primitives import Unsupported, each, entry, known, rule
+from diffabs.kernel.primitives import Unsupported, as_node_array, constant_array, lowering_rule, map_entries
 
 
-@rule("broadcast_in_dim", "shape broadcast_dimensions sharding")
+@lowering_rule("broadcast_in_dim", "shape broadcast_dimensions sharding")
 def _broadcast(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     shape = eqn.params["shape"]
     wide = [1] * len(shape)
@@ -19,28 +19,28 @@ def _broadcast(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [np.broadcast_to(ins[0].reshape(wide), shape)]
 
 
-@rule("reshape", "new_sizes dimensions sharding")
-@rule("squeeze", "dimensions")
-@rule("expand_dims", "dimensions")
+@lowering_rule("reshape", "new_sizes dimensions sharding")
+@lowering_rule("squeeze", "dimensions")
+@lowering_rule("expand_dims", "dimensions")
 def _reshape(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     if eqn.primitive.name == "reshape" and eqn.params["dimensions"] is not None:
         raise Unsupported("reshape", "in another order of dimensions")
     return [ins[0].reshape(eqn.outvars[0].aval.shape)]
 
 
-@rule("slice", "start_indices limit_indices strides")
+@lowering_rule("slice", "start_indices limit_indices strides")
 def _slice(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     p = eqn.params
     strides = p["strides"] or [1] * ins[0].ndim
     return [ins[0][tuple(map(slice, p["start_indices"], p["limit_indices"], strides))]]
 
 
-@rule("concatenate", "dimension")
+@lowering_rule("concatenate", "dimension")
 def _concatenate(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [np.concatenate(ins, eqn.params["dimension"])]
 
 
-@rule("pad", "padding_config")
+@lowering_rule("pad", "padding_config")
 def _pad(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """Before, after and between the entries of each axis; less than none cuts off."""
     x, value = ins[0], ins[1].item()
@@ -54,81 +54,81 @@ def _pad(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [x]
 
 
-@rule("transpose", "permutation")
+@lowering_rule("transpose", "permutation")
 def _transpose(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [ins[0].transpose(eqn.params["permutation"])]
 
 
-@rule("rev", "dimensions")
+@lowering_rule("rev", "dimensions")
 def _rev(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [np.flip(ins[0], eqn.params["dimensions"])]
 
 
-@rule("stack", "axis")
+@lowering_rule("stack", "axis")
 def _stack(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [np.stack(ins, eqn.params["axis"])]
 
 
-@rule("unstack", "axis")
+@lowering_rule("unstack", "axis")
 def _unstack(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    return [entry(x) for x in np.moveaxis(ins[0], eqn.params["axis"], 0)]
+    return [as_node_array(x) for x in np.moveaxis(ins[0], eqn.params["axis"], 0)]
 
 
-@rule("split", "axis sizes")
+@lowering_rule("split", "axis sizes")
 def _split(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return list(np.split(ins[0], np.cumsum(eqn.params["sizes"])[:-1], eqn.params["axis"]))
 
 
-@rule("iota", "dtype shape dimension sharding")
+@lowering_rule("iota", "dtype shape dimension sharding")
 def _iota(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     shape, dimension = eqn.params["shape"], eqn.params["dimension"]
     along = np.arange(shape[dimension], dtype=eqn.params["dtype"])
     along = along.reshape([-1 if i == dimension else 1 for i in range(len(shape))])
-    return [known(graph, np.broadcast_to(along, shape))]
+    return [constant_array(graph, np.broadcast_to(along, shape))]
 
 
-JOINED: dict[str, str] = {"sum": "add", "prod": "mul"}
+REDUCTION_OPERATIONS: dict[str, str] = {"sum": "add", "prod": "mul"}
 
 
-@rule("reduce_sum", "axes out_sharding")
-@rule("reduce_prod", "axes out_sharding")
-@rule("reduce_max", "axes out_sharding")
-@rule("reduce_min", "axes out_sharding")
-@rule("reduce_and reduce_or", "axes")
+@lowering_rule("reduce_sum", "axes out_sharding")
+@lowering_rule("reduce_prod", "axes out_sharding")
+@lowering_rule("reduce_max", "axes out_sharding")
+@lowering_rule("reduce_min", "axes out_sharding")
+@lowering_rule("reduce_and reduce_or", "axes")
 def _reduce(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """In pairs: a short chain."""
     kind, x = eqn.primitive.name.removeprefix("reduce_"), ins[0]
-    name: Any = JOINED.get(kind, kind)
+    name: Any = REDUCTION_OPERATIONS.get(kind, kind)
 
     def join(a: Node, b: Node) -> Node:
-        return extreme(graph, name, a, b) if name in ("max", "min") else graph.op(name, a, b)
+        return max_or_min(graph, name, a, b) if name in ("max", "min") else graph.op(name, a, b)
 
     for axis in sorted(eqn.params["axes"], reverse=True):
-        rows = list(np.moveaxis(x, axis, 0)) or [_of_nothing(graph, eqn, np.delete(x.shape, axis))]
+        rows = list(np.moveaxis(x, axis, 0)) or [_reduce_nothing(graph, eqn, np.delete(x.shape, axis))]
         while len(rows) > 1:
-            pairs = [each(join, *rows[i : i + 2]) for i in range(0, len(rows) - 1, 2)]
+            pairs = [map_entries(join, *rows[i : i + 2]) for i in range(0, len(rows) - 1, 2)]
             rows = pairs + rows[2 * len(pairs) :]
-        x = entry(rows[0])
+        x = as_node_array(rows[0])
     return [x]
 
 
-def _of_nothing(graph: Graph, eqn: Any, shape: Any) -> Array:
+def _reduce_nothing(graph: Graph, eqn: Any, shape: Any) -> Array:
     whole = {"reduce_sum": 0, "reduce_prod": 1, "reduce_and": True, "reduce_or": False}
     if eqn.primitive.name not in whole:
         raise Unsupported(eqn.primitive.name, "of nothing")
-    return known(graph, np.full(shape, whole[eqn.primitive.name], eqn.outvars[0].aval.dtype))
+    return constant_array(graph, np.full(shape, whole[eqn.primitive.name], eqn.outvars[0].aval.dtype))
 
 
-@rule("cumsum", "axis reverse")
+@lowering_rule("cumsum", "axis reverse")
 def _cumsum(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     order = slice(None, None, -1 if eqn.params["reverse"] else 1)
     rows = list(np.moveaxis(ins[0], eqn.params["axis"], 0)[order])
     for i in range(1, len(rows)):
-        rows[i] = each(lambda a, b: graph.op("add", a, b), rows[i - 1], rows[i])
+        rows[i] = map_entries(lambda a, b: graph.op("add", a, b), rows[i - 1], rows[i])
     return [np.moveaxis(np.stack(rows)[order], 0, eqn.params["axis"])]
 
 
-@rule("argmin argmax", "axes index_dtype")
+@lowering_rule("argmin argmax", "axes index_dtype")
 def _first_extreme(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """The first of equal ones, or the first NaN."""
     if len(eqn.params["axes"]) != 1:
@@ -146,10 +146,10 @@ def _first_extreme(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
             best = graph.select(better, best, x)
         return place
 
-    return [each(first, *(entry(row) for row in rows))]
+    return [map_entries(first, *(as_node_array(row) for row in rows))]
 
 
-@rule("dot_general", "dimension_numbers precision preferred_element_type out_sharding")
+@lowering_rule("dot_general", "dimension_numbers precision preferred_element_type out_sharding")
 def _dot(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     (left, right), batch = eqn.params["dimension_numbers"]
     if any(batch):

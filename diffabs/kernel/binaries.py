@@ -14,7 +14,7 @@ import sys
 from diffabs.core import files
 
 CACHE = "DIFFABS_KERNEL_CACHE"  # the folder of the libraries, if set
-ROOM = 1 << 28  # bytes of libraries, some 800; beyond, the half that was not used for longest goes
+MAX_CACHE_BYTES = 1 << 28  # bytes of libraries, some 800; beyond, the half that was not used for longest goes
 CONTENT = 32  # hexadecimal digits of the content's digest in a name
 log = logging.getLogger("diffabs")
 
@@ -33,7 +33,7 @@ def cache_folder() -> pathlib.Path:
     return caches / "diffabs" / "kernel"
 
 
-def own_folder() -> pathlib.Path:
+def make_cache_folder() -> pathlib.Path:
     """Return the cache folder, made if it is not there. Raises OSError if it cannot be made, or if other users may
     write to it: they could put their code there."""
     folder = cache_folder()
@@ -43,15 +43,15 @@ def own_folder() -> pathlib.Path:
     return folder
 
 
-def find(made_of: str, suffix: str) -> pathlib.Path | None:
+def find_library(made_of: str, suffix: str) -> pathlib.Path | None:
     """Return the file of a library, or None where there is none. A damaged file is removed, with one line in the log.
-    Raises OSError for a file that cannot be read, and as `own_folder`.
+    Raises OSError for a file that cannot be read, and as `make_cache_folder`.
 
     Args:
         made_of: digest of everything that decides the library
         suffix: end of the file's name
     """
-    for path in sorted(own_folder().glob(f"{made_of}-*{suffix}")):
+    for path in sorted(make_cache_folder().glob(f"{made_of}-*{suffix}")):
         try:
             content = files.content(path)
         except FileNotFoundError:  # another process has removed it
@@ -65,10 +65,10 @@ def find(made_of: str, suffix: str) -> pathlib.Path | None:
     return None
 
 
-def write(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
+def write_library(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
     """Write a library and return its file, which is whole at every instant at which it is there. Raises OSError."""
-    folder = own_folder()
-    files.make_room(folder, f"*{suffix}", ROOM)
+    folder = make_cache_folder()
+    files.make_room(folder, f"*{suffix}", MAX_CACHE_BYTES)
     return files.write_synced(folder / _file_name(made_of, content, suffix), content)
 
 

@@ -15,105 +15,112 @@ from jax.interpreters import ad, batching, mlir
 from jax.interpreters import partial_eval as pe
 
 from diffabs.kernel import tangents
-from diffabs.kernel.graph import Level, real
-from diffabs.kernel.program import Functions, Program
-from diffabs.kernel.tangents import LEVELS, Derivative, Key
+from diffabs.kernel.graph import UpdateLevel, is_real
+from diffabs.kernel.program import ScalarProgram, TracedFunctions
+from diffabs.kernel.tangents import INPUT_LEVELS, ArrayKey, DerivativeProgram
 
-MOST = 8  # tangents of one launch
-REVERSE = "a kernel has no reverse mode: forward mode (jax.jvp, jax.jacfwd) has its derivatives, engine = 'xla' both"
+MAX_TANGENTS_PER_LAUNCH = 8  # tangents of one launch
+NO_REVERSE_MODE = (
+    "a kernel has no reverse mode: forward mode (jax.jvp, jax.jacfwd) has its derivatives, engine = 'xla' both"
+)
 
 
-class Lanes:
+class LanePrograms:
     """Functions of one lane, and what was made of them so far. Equal only to itself."""
 
     def __init__(
         self,
-        functions: Functions,
-        launch: Callable[[Program, list[Any], list[Any]], list[Any]],
+        functions: TracedFunctions,
+        launch: Callable[[ScalarProgram, list[Any], list[Any]], list[Any]],
         wanted: tuple[int, ...] | None = None,
     ):
         """launch: of a program, the arrays before those of the carry, and these; returns the carry. wanted: arrays of
         the carry whose tangents matter in the end, None for all. Translated at once: raises Unsupported."""
         self.functions, self.launch, self.wanted = functions, launch, wanted
-        self._made: dict[Any, Any] = {}
+        self._derivatives: dict[Any, Any] = {}
         self.derivative(None)
 
-    def derivative(self, begins: tuple[tuple[Level, int], ...] | None) -> Derivative:
+    def derivative(self, begins: tuple[tuple[UpdateLevel, int], ...] | None) -> DerivativeProgram:
         """Return the program in which these arrays have tangents, one each. Raises Unsupported."""
-        if begins not in self._made:
-            moving = {level: tuple(i for one, i in begins or () if one == level) for level in LEVELS}
+        if begins not in self._derivatives:
+            moving = {level: tuple(i for one, i in begins or () if one == level) for level in INPUT_LEVELS}
             plain = begins is None
-            self._made[begins] = (
-                tangents.plain(self.functions) if plain else tangents.derivative(self.functions, moving, self.wanted)
+            self._derivatives[begins] = (
+                tangents.lower_without_tangents(self.functions)
+                if plain
+                else tangents.differentiate_functions(self.functions, moving, self.wanted)
             )
-        return self._made[begins]
+        return self._derivatives[begins]
 
-    def program(self, begins: Any, many: int, as_lanes: frozenset[int]) -> Program:
+    def program(self, begins: Any, many: int, as_lanes: frozenset[int]) -> ScalarProgram:
         """Return the program of so many tangents. Raises Unsupported."""
         one = self.derivative(begins)
         if begins is None and not as_lanes:
             return one.program
-        return tangents.spread(self.functions, one, many, as_lanes)
+        return tangents.replicate_tangents(self.functions, one, many, as_lanes)
 
     @functools.cached_property
-    def keys(self) -> list[Key]:
+    def keys(self) -> list[ArrayKey]:
         """Arrays without their tangents, in the order of the operation's arguments."""
-        return [Key(level, i, False) for level in LEVELS for i in range(len(self.functions.types[level]))]
+        return [ArrayKey(level, i, False) for level in INPUT_LEVELS for i in range(len(self.functions.types[level]))]
 
-    def slopes(self, begins: Any) -> list[Key]:
+    def slopes(self, begins: Any) -> list[ArrayKey]:
         """Those that begin with tangents, which follow."""
-        return [Key(level, i, True) for level, i in begins or ()]
+        return [ArrayKey(level, i, True) for level, i in begins or ()]
 
-    def ends(self, begins: Any) -> list[Key]:
+    def ends(self, begins: Any) -> list[ArrayKey]:
         """The results: the carry, and those of it that have tangents."""
-        carry = range(len(self.functions.types[Level.STEP]))
-        do = self.derivative(begins).do[Level.STEP]
-        return [*(Key(Level.STEP, i, False) for i in carry), *(Key(Level.STEP, i, True) for i in do)]
+        carry = range(len(self.functions.types[UpdateLevel.STEP]))
+        do = self.derivative(begins).moved_arrays[UpdateLevel.STEP]
+        return [
+            *(ArrayKey(UpdateLevel.STEP, i, False) for i in carry),
+            *(ArrayKey(UpdateLevel.STEP, i, True) for i in do),
+        ]
 
 
-operation = jex.Primitive("run_lanes")
-operation.multiple_results = True
+run_lanes_primitive = jex.Primitive("run_lanes")
+run_lanes_primitive.multiple_results = True
 
 
-def bound(lanes: Lanes, arrays: Sequence[Any]) -> list[Any]:
+def bind_lanes(lanes: LanePrograms, arrays: Sequence[Any]) -> list[Any]:
     """Return the carry of lanes that are all over; of the arrays of all lanes, the lanes and their carry, as words."""
-    return operation.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=frozenset())
+    return run_lanes_primitive.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=frozenset())
 
 
-@operation.def_impl
+@run_lanes_primitive.def_impl
 def _run(*arrays: Any, **how: Any) -> list[Any]:
-    return jax.jit(functools.partial(operation.bind, **how))(*arrays)
+    return jax.jit(functools.partial(run_lanes_primitive.bind, **how))(*arrays)
 
 
-@operation.def_abstract_eval
-def _shapes(*arrays: Any, lanes: Lanes, begins: Any, many: int, as_lanes: frozenset[int]) -> list[Any]:
-    carry = arrays[len(lanes.keys) - len(lanes.functions.types[Level.STEP]) : len(lanes.keys)]
+@run_lanes_primitive.def_abstract_eval
+def _shapes(*arrays: Any, lanes: LanePrograms, begins: Any, many: int, as_lanes: frozenset[int]) -> list[Any]:
+    carry = arrays[len(lanes.keys) - len(lanes.functions.types[UpdateLevel.STEP]) : len(lanes.keys)]
 
-    def shape(key: Key) -> Any:
+    def shape(key: ArrayKey) -> Any:
         x = carry[key.number]
         return x.update(shape=(x.shape[0], many, *x.shape[1:])) if key.tangent else x.update(weak_type=False)
 
     return [shape(key) for key in lanes.ends(begins)]
 
 
-def _call(*arrays: Any, lanes: Lanes, begins: Any, many: int, as_lanes: frozenset[int]) -> list[Any]:
+def _launch_in_parts(*arrays: Any, lanes: LanePrograms, begins: Any, many: int, as_lanes: frozenset[int]) -> list[Any]:
     """With some more zeros, if the tangents are many, so that each launch has as many."""
     keys = [*lanes.keys, *lanes.slopes(begins)]
-    launches = max(1, math.ceil(many / MOST))
+    launches = max(1, math.ceil(many / MAX_TANGENTS_PER_LAUNCH))
     each = math.ceil(many / launches)
     given = dict(zip(keys, arrays, strict=True))
     if not many:
-        return _launched(lanes, begins, 0, as_lanes, given)
+        return _launch_once(lanes, begins, 0, as_lanes, given)
 
     def part(first: int) -> list[Any]:
-        def cut(key: Key, x: Any) -> Any:
-            axis = 0 if key.level == Level.UNIFORM and key.number not in as_lanes else 1
+        def cut(key: ArrayKey, x: Any) -> Any:
+            axis = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
             lacking = max(0, first + each - many)
             wide = [(0, lacking if i == axis else 0) for i in range(x.ndim)]
             return jax.lax.slice_in_dim(jnp.pad(x, wide), first, first + each, axis=axis)
 
         some = {key: cut(key, x) if key.tangent else x for key, x in given.items()}
-        return _launched(lanes, begins, each, as_lanes, some)
+        return _launch_once(lanes, begins, each, as_lanes, some)
 
     parts = [part(first) for first in range(0, each * launches, each)]
     return [
@@ -122,101 +129,107 @@ def _call(*arrays: Any, lanes: Lanes, begins: Any, many: int, as_lanes: frozense
     ]
 
 
-mlir.register_lowering(operation, mlir.lower_fun(_call, multiple_results=True))
+mlir.register_lowering(run_lanes_primitive, mlir.lower_fun(_launch_in_parts, multiple_results=True))
 
 
-def _launched(lanes: Lanes, begins: Any, many: int, as_lanes: frozenset[int], given: dict[Key, Any]) -> list[Any]:
+def _launch_once(
+    lanes: LanePrograms, begins: Any, many: int, as_lanes: frozenset[int], given: dict[ArrayKey, Any]
+) -> list[Any]:
     """The results of one launch; what begins without tangents has zeros."""
 
-    def array(key: Key) -> Any:
+    def array(key: ArrayKey) -> Any:
         if key in given:
             return given[key]
         x = given[key._replace(tangent=False)]
         return jnp.zeros((x.shape[0], many, *x.shape[1:]), x.dtype)
 
-    order = tangents.arranged(lanes.functions, lanes.derivative(begins).do, as_lanes)
-    carry = [array(key) for key in order[Level.STEP]]
-    before = [array(key) for level in (Level.UNIFORM, Level.LANE) for key in order[level]]
+    order = tangents.arrange_arrays(lanes.functions, lanes.derivative(begins).moved_arrays, as_lanes)
+    carry = [array(key) for key in order[UpdateLevel.STEP]]
+    before = [array(key) for level in (UpdateLevel.UNIFORM, UpdateLevel.LANE) for key in order[level]]
     return lanes.launch(lanes.program(begins, many, as_lanes), before, carry)
 
 
-def _push(arrays: Sequence[Any], slopes: Sequence[Any], *, lanes: Lanes, begins: Any, many: int, as_lanes: Any) -> Any:
+def _jvp_rule(
+    arrays: Sequence[Any], slopes: Sequence[Any], *, lanes: LanePrograms, begins: Any, many: int, as_lanes: Any
+) -> Any:
     """Values and tangents."""
     if begins is not None:
         raise ValueError("a kernel has no second derivatives; engine = 'xla' has")
-    moving = [type(x) is not ad.Zero and real(jax.typeof(x).dtype) for x in slopes]
+    moving = [type(x) is not ad.Zero and is_real(jax.typeof(x).dtype) for x in slopes]
     begins = tuple((key.level, key.number) for key, on in zip(lanes.keys, moving, strict=True) if on)
     if not begins:
-        found = operation.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=as_lanes)
-        return found, [_none(x) for x in found]
+        found = run_lanes_primitive.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=as_lanes)
+        return found, [_zero_tangent(x) for x in found]
 
     lanes.derivative(begins)  # now: where JAX 0.12 asks for shapes nothing can be traced
 
-    def alone(key: Key, x: Any) -> Any:
-        return jnp.expand_dims(x, 0 if key.level == Level.UNIFORM and key.number not in as_lanes else 1)
+    def alone(key: ArrayKey, x: Any) -> Any:
+        return jnp.expand_dims(x, 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1)
 
     given = [alone(key, x) for key, x, on in zip(lanes.keys, slopes, moving, strict=True) if on]
-    found = operation.bind(*arrays, *given, lanes=lanes, begins=begins, many=1, as_lanes=as_lanes)
-    values = found[: len(lanes.functions.types[Level.STEP])]
-    results = [_none(x) for x in values]
+    found = run_lanes_primitive.bind(*arrays, *given, lanes=lanes, begins=begins, many=1, as_lanes=as_lanes)
+    values = found[: len(lanes.functions.types[UpdateLevel.STEP])]
+    results = [_zero_tangent(x) for x in values]
     for key, x in zip(lanes.ends(begins)[len(values) :], found[len(values) :], strict=True):
         results[key.number] = x[:, 0]
     return values, results
 
 
-ad.primitive_jvps[operation] = _push
+ad.primitive_jvps[run_lanes_primitive] = _jvp_rule
 
 
-def _none(x: Any) -> Any:
+def _zero_tangent(x: Any) -> Any:
     return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
-def _batched(arrays: Sequence[Any], axes: Sequence[Any], *, lanes: Lanes, begins: Any, many: int, as_lanes: Any) -> Any:
+def _batching_rule(
+    arrays: Sequence[Any], axes: Sequence[Any], *, lanes: LanePrograms, begins: Any, many: int, as_lanes: Any
+) -> Any:
     """More tangents, or more lanes."""
     values = len(lanes.keys)
     size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
     how = {"lanes": lanes, "begins": begins}
     if all(axis is None for axis in axes[:values]):
         slopes = zip(lanes.slopes(begins), arrays[values:], axes[values:], strict=True)
-        more = [_more_tangents(key, x, axis, size, as_lanes) for key, x, axis in slopes]
-        found = operation.bind(*arrays[:values], *more, **how, many=size * many, as_lanes=as_lanes)
+        more = [_merge_tangent_axes(key, x, axis, size, as_lanes) for key, x, axis in slopes]
+        found = run_lanes_primitive.bind(*arrays[:values], *more, **how, many=size * many, as_lanes=as_lanes)
         results = [
             x.reshape(x.shape[0], size, many, *x.shape[2:]) if key.tangent else x
             for key, x in zip(lanes.ends(begins), found, strict=True)
         ]
         return results, [1 if key.tangent else None for key in lanes.ends(begins)]
     keys = [*lanes.keys, *lanes.slopes(begins)]
-    own = {k.number for k, axis in zip(keys, axes, strict=True) if k.level == Level.UNIFORM and axis is not None}
+    own = {k.number for k, axis in zip(keys, axes, strict=True) if k.level == UpdateLevel.UNIFORM and axis is not None}
     given = [
-        _more_lanes(key, x, axis, size, own, as_lanes, _count(lanes, arrays, axes))
+        _merge_lane_axes(key, x, axis, size, own, as_lanes, _count(lanes, arrays, axes))
         for key, x, axis in zip(keys, arrays, axes, strict=True)
     ]
-    found = operation.bind(*given, **how, many=many, as_lanes=as_lanes | own)
+    found = run_lanes_primitive.bind(*given, **how, many=many, as_lanes=as_lanes | own)
     return [x.reshape(size, -1, *x.shape[1:]) for x in found], [0] * len(found)
 
 
-batching.primitive_batchers[operation] = _batched
+batching.primitive_batchers[run_lanes_primitive] = _batching_rule
 
 
-def _count(lanes: Lanes, arrays: Sequence[Any], axes: Sequence[Any]) -> int:
+def _count(lanes: LanePrograms, arrays: Sequence[Any], axes: Sequence[Any]) -> int:
     """Lanes before there were more."""
     last = len(lanes.keys) - 1
     return arrays[last].shape[1 if axes[last] == 0 else 0]
 
 
-def _more_tangents(key: Key, x: Any, axis: int | None, size: int, as_lanes: frozenset[int]) -> Any:
+def _merge_tangent_axes(key: ArrayKey, x: Any, axis: int | None, size: int, as_lanes: frozenset[int]) -> Any:
     """(batch, tangents) where there were tangents."""
-    at = 0 if key.level == Level.UNIFORM and key.number not in as_lanes else 1
+    at = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
     x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
     x = jnp.moveaxis(x, 0, at)
     return x.reshape(*x.shape[:at], -1, *x.shape[at + 2 :])
 
 
-def _more_lanes(
-    key: Key, x: Any, axis: int | None, size: int, own: set[int], as_lanes: frozenset[int], count: int
+def _merge_lane_axes(
+    key: ArrayKey, x: Any, axis: int | None, size: int, own: set[int], as_lanes: frozenset[int], count: int
 ) -> Any:
     """(batch, lanes) where there were lanes; and where what was the same for all of them is no more."""
-    shared = key.level == Level.UNIFORM and key.number not in as_lanes
+    shared = key.level == UpdateLevel.UNIFORM and key.number not in as_lanes
     if shared and key.number not in own:
         return x
     x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
@@ -225,16 +238,16 @@ def _more_lanes(
     return x.reshape(-1, *x.shape[2:])
 
 
-def _unknown(trace: Any, *tracers: Any, **how: Any) -> Any:
+def _refuse_partial_evaluation(trace: Any, *tracers: Any, **how: Any) -> Any:
     """A derivative is to be known only later, when it is transposed: reverse mode, or `jax.linearize`."""
     del trace, tracers, how
-    raise ValueError(REVERSE)
+    raise ValueError(NO_REVERSE_MODE)
 
 
-def _transposed(*args: Any, **how: Any) -> Any:
+def _refuse_transpose(*args: Any, **how: Any) -> Any:
     del args, how
-    raise ValueError(REVERSE)
+    raise ValueError(NO_REVERSE_MODE)
 
 
-pe.custom_partial_eval_rules[operation] = _unknown
-ad.primitive_transposes[operation] = _transposed
+pe.custom_partial_eval_rules[run_lanes_primitive] = _refuse_partial_evaluation
+ad.primitive_transposes[run_lanes_primitive] = _refuse_transpose

@@ -21,19 +21,19 @@ from typing import NamedTuple
 import jax.ffi
 
 from diffabs.core import stopwatch
-from diffabs.kernel.binaries import cache_folder, find, own_folder, write
+from diffabs.kernel.binaries import cache_folder, find_library, make_cache_folder, write_library
 
-NATIVE = pathlib.Path(__file__).parent / "native"
+NATIVE_FOLDER = pathlib.Path(__file__).parent / "native"
 COMPILER = "DIFFABS_KERNEL_COMPILER"  # the compiler's command; set but empty, no compiler is used
 CANDIDATES = (["c++"], ["clang++"], ["g++"])
 # No flag may change NaN or infinity: of -ffast-math only no-math-errno and no-trapping-math. It must not be given at
 # linking either, where it changes how the whole process treats subnormal numbers.
-FLAGS = (
+CPP_FLAGS = (
     *("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
     *("-fno-exceptions", "-fno-rtti", "-fPIC", "-shared", "-pthread", "-w"),
 )
-LONGEST_S = 300  # that a compiler may take for a kernel; the largest take some 20 s
-LONGEST_TRY_S = 30  # and to say its version, or to make a library of one line
+COMPILE_TIMEOUT_S = 300  # that a compiler may take for a kernel; the largest take some 20 s
+PROBE_TIMEOUT_S = 30  # and to say its version, or to make a library of one line
 
 
 class NoCompiler(Exception):
@@ -48,17 +48,17 @@ class Compiler(NamedTuple):
 
 
 @functools.cache
-def _tried(command: tuple[str, ...]) -> Compiler | str:
+def _probe_compiler(command: tuple[str, ...]) -> Compiler | str:
     """The compiler of a command, or why it is none: it has to make a library that this process can load. That it did so
     once is noted beside the libraries."""
     try:
-        version = _output([*command, "--version"], LONGEST_TRY_S)
+        version = _run_command([*command, "--version"], PROBE_TIMEOUT_S)
         made = Compiler(command, version.stdout.partition("\n")[0].strip())
         note = cache_folder() / f".{_digest('works', made)[:32]}"
         if not note.is_file():
             _check_loads(command)
             with contextlib.suppress(OSError):
-                (own_folder() / note.name).touch()
+                (make_cache_folder() / note.name).touch()
     except (OSError, NoCompiler) as error:
         return f"{' '.join(command)}: {error}"
     return made
@@ -69,11 +69,11 @@ def _check_loads(command: tuple[str, ...]) -> None:
     with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
         source, library = pathlib.Path(folder) / "one.cpp", pathlib.Path(folder) / "one.so"
         source.write_text('#include "functions.h"\nextern "C" double one(double x) { return k_exp(all(x))[0]; }\n')
-        _compile(command, source, library, LONGEST_TRY_S)
+        _compile(command, source, library, PROBE_TIMEOUT_S)
         ctypes.CDLL(str(library))
 
 
-def compiler() -> Compiler:
+def find_compiler() -> Compiler:
     """Return the first compiler that works: c++, clang++, g++, then that of the package ziglang. Raises NoCompiler."""
     said = os.environ.get(COMPILER)
     if said is not None and not said.strip():
@@ -83,46 +83,46 @@ def compiler() -> Compiler:
         commands.append([sys.executable, "-m", "ziglang", "cc", "-x", "c++"])
     reasons = []
     for command in commands:
-        tried = _tried(tuple(command))
+        tried = _probe_compiler(tuple(command))
         if isinstance(tried, Compiler):
             return tried
         reasons.append(tried)
     raise NoCompiler("; ".join(reasons) or 'no C++ compiler; pip install ".[kernel]" in a clone brings one')
 
 
-def library(text: str) -> pathlib.Path:
+def build_library(text: str) -> pathlib.Path:
     """Return the file of the library of a text, which is compiled if it is not there yet. Raises NoCompiler, also for a
     folder that cannot be written or that others may write to."""
-    made = compiler()
+    made = find_compiler()
     digest = _digest(text, made)
     try:
-        if path := find(digest, ".so"):
+        if path := find_library(digest, ".so"):
             return path
-        with tempfile.TemporaryDirectory(prefix=f".{digest[:16]}-", dir=own_folder()) as own:
+        with tempfile.TemporaryDirectory(prefix=f".{digest[:16]}-", dir=make_cache_folder()) as own:
             source, result = pathlib.Path(own) / "kernel.cpp", pathlib.Path(own) / "kernel.so"
             source.write_text(text)
             with stopwatch.compiling():
-                _compile(made.command, source, result, LONGEST_S)
-            return write(digest, ".so", result.read_bytes())
+                _compile(made.command, source, result, COMPILE_TIMEOUT_S)
+            return write_library(digest, ".so", result.read_bytes())
     except OSError as error:
         raise NoCompiler(f"no kernel in {cache_folder()}: {error.strerror or error}") from None
 
 
-def described() -> dict[str, str]:
+def describe_compiler() -> dict[str, str]:
     """Return what decides the bits besides the text: compiler, flags, processor. Raises NoCompiler."""
-    return {"compiler": compiler().version, "flags": " ".join(FLAGS), "processor": _processor()}
+    return {"compiler": find_compiler().version, "flags": " ".join(CPP_FLAGS), "processor": _processor()}
 
 
 def _compile(command: tuple[str, ...], source: pathlib.Path, result: pathlib.Path, longest: float) -> None:
-    include = [f"-I{NATIVE}", f"-I{jax.ffi.include_dir()}"]
-    done = _output([*command, *FLAGS, *include, "-o", str(result), str(source), "-lm"], longest)
+    include = [f"-I{NATIVE_FOLDER}", f"-I{jax.ffi.include_dir()}"]
+    done = _run_command([*command, *CPP_FLAGS, *include, "-o", str(result), str(source), "-lm"], longest)
     if done.returncode or not result.is_file():
         lines = [line for line in done.stderr.splitlines() if line.strip()] or [f"exit status {done.returncode}"]
         errors = [line for line in lines if "error" in line]
         raise NoCompiler(f"{' '.join(command)}: {(errors or lines)[0][:300]}")
 
 
-def _output(words: list[str], longest: float) -> subprocess.CompletedProcess[str]:
+def _run_command(words: list[str], longest: float) -> subprocess.CompletedProcess[str]:
     """Run a command for at most so many seconds. Raises NoCompiler for one that takes longer, OSError where the
     command does not exist."""
     told = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -141,8 +141,8 @@ def _output(words: list[str], longest: float) -> subprocess.CompletedProcess[str
 
 def _digest(text: str, made: Compiler) -> str:
     interface = pathlib.Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
-    headers = [path.read_bytes() for path in (*sorted(NATIVE.glob("*.h")), interface)]
-    said = [text.encode(), *headers, repr((made, FLAGS, _processor())).encode()]
+    headers = [path.read_bytes() for path in (*sorted(NATIVE_FOLDER.glob("*.h")), interface)]
+    said = [text.encode(), *headers, repr((made, CPP_FLAGS, _processor())).encode()]
     return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in said)).hexdigest()
 
 

@@ -3,17 +3,17 @@ literals."""
 
 import numpy as np
 
-from diffabs.kernel.graph import Node, real
+from diffabs.kernel.graph import Node, is_real
 
-TYPES = {
+CPP_TYPES = {
     "float32": "f32", "float64": "f64", "int32": "i32", "int64": "i64", "uint32": "u32", "uint64": "u64",
 }  # fmt: skip
-INFIX = {
+CPP_INFIX = {
     "add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/", "and": "&", "or": "|", "xor": "^",
     "shift_left": "<<", "shift_right_logical": ">>",
 }  # fmt: skip
 PREFIX = {"neg": "-", "not": "~"}
-NAMED = {
+CPP_FUNCTIONS = {
     "lt": "lt", "le": "le", "eq": "eq", "ne": "ne", "max": "most", "min": "least", "lower": "lower",
     "higher": "higher", "abs": "size", "sqrt": "root",
     "rint": "whole", "floor": "down", "ceil": "up", "rem": "rest", "is_finite": "finite",
@@ -23,28 +23,28 @@ NAMED = {
 }  # fmt: skip
 
 
-def truth(dtype: np.dtype) -> bool:
+def is_boolean(dtype: np.dtype) -> bool:
     """Return whether numbers of this type are truths."""
     return dtype.kind == "b"
 
 
-def kind(dtype: np.dtype) -> str:
+def scalar_type(dtype: np.dtype) -> str:
     """Return the type of one number."""
-    return "u8" if truth(dtype) else TYPES[dtype.name]
+    return "u8" if is_boolean(dtype) else CPP_TYPES[dtype.name]
 
 
-def vector(dtype: np.dtype) -> str:
+def vector_type(dtype: np.dtype) -> str:
     """Return the type of a vector of them."""
-    return "mask" if truth(dtype) else "v" + TYPES[dtype.name]
+    return "mask" if is_boolean(dtype) else "v" + CPP_TYPES[dtype.name]
 
 
 def literal(node: Node) -> str:
     """Return a known number in every lane."""
     x = node.attr
-    if truth(node.dtype):
+    if is_boolean(node.dtype):
         return f"all({'true' if x else 'false'})"
-    name = TYPES[node.dtype.name]
-    if not real(node.dtype):
+    name = CPP_TYPES[node.dtype.name]
+    if not is_real(node.dtype):
         ends = {"i32": "", "u32": "u", "i64": "ll", "u64": "ull"}[name]
         number = (
             f"INT{x.itemsize * 8}_MIN" if node.dtype.kind == "i" and x == np.iinfo(x.dtype).min else f"{int(x)}{ends}"

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.kernel.graph import Array, Graph, Node
-from diffabs.kernel.primitives import Unsupported, called, each, known, rule
+from diffabs.kernel.primitives import Unsupported, constant_array, inline_program, lowering_rule, map_entries
 
-MANY = 16  # numbers that are drawn at once, at most
+MAX_NUMBERS_PER_DRAW = 16  # numbers that are drawn at once, at most
 PARITY = 0x1BD11BDA  # of Threefry's key schedule
-TURNS = ((13, 15, 26, 6), (17, 29, 16, 24))  # places by which its words are turned, in rounds of four
+THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # places by which its words are turned, in rounds of four
 
 
 def key_shape(aval: Any) -> tuple[tuple[int, ...], np.dtype]:
@@ -25,42 +25,42 @@ def key_shape(aval: Any) -> tuple[tuple[int, ...], np.dtype]:
     return (*aval.shape, 2), np.dtype(np.uint32)
 
 
-@rule("random_wrap", "impl")
-@rule("random_unwrap")
-def _wrapped(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+@lowering_rule("random_wrap", "impl")
+@lowering_rule("random_unwrap")
+def _wrap_key(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     key_shape((eqn.outvars if eqn.primitive.name == "random_wrap" else eqn.invars)[0].aval)
     return ins
 
 
-@rule("random_fold_in")
+@lowering_rule("random_fold_in")
 def _fold_in(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     if key_shape(eqn.invars[0].aval)[0] != (2,) or ins[1].ndim:
         raise Unsupported("random_fold_in", "of several keys")
     fold = jer.threefry_prng_impl.fold_in
     program = jax.make_jaxpr(fold)(*(jax.ShapeDtypeStruct(*one) for one in (((2,), np.uint32), ((), np.uint32))))
-    return called(graph, program, [ins[0], each(lambda x: graph.convert(x, np.uint32), ins[1])])
+    return inline_program(graph, program, [ins[0], map_entries(lambda x: graph.convert(x, np.uint32), ins[1])])
 
 
-@rule("random_bits", "bit_width shape")
+@lowering_rule("random_bits", "bit_width shape")
 def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     width, shape = eqn.params["bit_width"], eqn.params["shape"]
-    if key_shape(eqn.invars[0].aval)[0] != (2,) or math.prod(shape) > MANY:
+    if key_shape(eqn.invars[0].aval)[0] != (2,) or math.prod(shape) > MAX_NUMBERS_PER_DRAW:
         raise Unsupported("random_bits", f"of {math.prod(shape)} numbers at once, or of several keys")
     draw = jax.make_jaxpr(lambda key: jer.threefry_prng_impl.random_bits(key, width, shape))
-    return called(graph, draw(jax.ShapeDtypeStruct((2,), np.uint32)), ins)
+    return inline_program(graph, draw(jax.ShapeDtypeStruct((2,), np.uint32)), ins)
 
 
-@rule("iota_2x32_shape", "shape")
-def _counted(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+@lowering_rule("iota_2x32_shape", "shape")
+def _iota_words(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """The places of an array, in two words each."""
     places = np.arange(math.prod(eqn.params["shape"]), dtype=np.uint32).reshape(eqn.params["shape"])
-    return [known(graph, 0 * places), known(graph, places)]
+    return [constant_array(graph, 0 * places), constant_array(graph, places)]
 
 
-@rule("threefry2x32")
+@lowering_rule("threefry2x32")
 def _threefry(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """Salmon, Moraes, Dror and Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011), 20 rounds."""
-    return [each(lambda *words, i=i: threefry(graph, *words)[i], *ins) for i in range(2)]
+    return [map_entries(lambda *words, i=i: threefry(graph, *words)[i], *ins) for i in range(2)]
 
 
 def threefry(graph: Graph, k0: Node, k1: Node, x0: Node, x1: Node) -> tuple[Node, Node]:
@@ -72,7 +72,7 @@ def threefry(graph: Graph, k0: Node, k1: Node, x0: Node, x1: Node) -> tuple[Node
     keys = [k0, k1, graph.op("xor", graph.op("xor", k0, k1), word(PARITY))]
     x0, x1 = graph.op("add", x0, keys[0]), graph.op("add", x1, keys[1])
     for i in range(5):
-        for places in TURNS[i % 2]:
+        for places in THREEFRY_ROTATIONS[i % 2]:
             x0 = graph.op("add", x0, x1)
             high, low = (
                 graph.op("shift_left", x1, word(places)),
@@ -86,7 +86,7 @@ def threefry(graph: Graph, k0: Node, k1: Node, x0: Node, x1: Node) -> tuple[Node
 
 # M. Giles, Approximating the erfinv function (2012): polynomials in w = -log(1 - x^2), highest power first, each for a
 # range of w, in the variable of the range. These are those that XLA has.
-SINGLE = (
+ERF_INV_SINGLE = (
     (5.0, lambda graph, w: graph.op("sub", w, graph.const(2.5, w.dtype)), (
         2.81022636e-08, 3.43273939e-07, -3.5233877e-06, -4.39150654e-06, 0.00021858087, -0.00125372503, -0.00417768164,
         0.246640727, 1.50140941)),
@@ -94,7 +94,7 @@ SINGLE = (
         -0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773, -0.0076224613, 0.00943887047,
         1.00167406, 2.83297682)),
 )  # fmt: skip
-DOUBLE = (
+ERF_INV_DOUBLE = (
     (6.25, lambda graph, w: graph.op("sub", w, graph.const(3.125, w.dtype)), (
         -3.6444120640178196996e-21, -1.685059138182016589e-19, 1.2858480715256400167e-18, 1.115787767802518096e-17,
         -1.333171662854620906e-16, 2.0972767875968561637e-17, 6.6376381343583238325e-15, -4.0545662729752068639e-14,
@@ -117,16 +117,16 @@ DOUBLE = (
 )  # fmt: skip
 
 
-@rule("erf_inv", "accuracy")
+@lowering_rule("erf_inv", "accuracy")
 def _erf_inv(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    return [each(lambda x: erf_inv(graph, x), *ins)]
+    return [map_entries(lambda x: erf_inv(graph, x), *ins)]
 
 
 def erf_inv(graph: Graph, x: Node) -> Node:
     """Return y with erf(y) = x: infinite at the ends of [-1, 1], NaN beyond."""
     w = graph.op("neg", graph.op("log1p", graph.op("neg", graph.op("mul", x, x))))
     found: Node | None = None
-    for most, shifted, powers in reversed(SINGLE if x.dtype == np.float32 else DOUBLE):
+    for most, shifted, powers in reversed(ERF_INV_SINGLE if x.dtype == np.float32 else ERF_INV_DOUBLE):
         at, y = shifted(graph, w), graph.const(powers[0], x.dtype)
         for power in powers[1:]:
             y = graph.op("add", graph.op("mul", y, at), graph.const(power, x.dtype))

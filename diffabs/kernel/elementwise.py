@@ -4,25 +4,27 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.kernel.graph import Array, Graph, Node, real
-from diffabs.kernel.primitives import Unsupported, each, rule
+from diffabs.kernel.graph import Array, Graph, Node, is_real
+from diffabs.kernel.primitives import Unsupported, lowering_rule, map_entries
 
 
-@rule("and or xor not neg sqrt exp log log1p expm1 sin cos tan tanh atan asin acos sinh cosh atan2", "accuracy")
-@rule("div sub is_finite floor ceil eq ne lt le gt ge pow", "accuracy")
-@rule("add mul", "out_dtype")
-def _same(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+@lowering_rule(
+    "and or xor not neg sqrt exp log log1p expm1 sin cos tan tanh atan asin acos sinh cosh atan2", "accuracy"
+)
+@lowering_rule("div sub is_finite floor ceil eq ne lt le gt ge pow", "accuracy")
+@lowering_rule("add mul", "out_dtype")
+def _elementwise(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     name = eqn.primitive.name
     if eqn.params.get("accuracy") is not None:
         raise Unsupported(name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
     if eqn.params.get("out_dtype") not in (None, eqn.outvars[0].aval.dtype):
         raise Unsupported(name, f"its result is to be {eqn.params['out_dtype']}")
-    if name == "div" and not real(eqn.outvars[0].aval.dtype):
-        return [each(lambda x, y: _quotient(graph, x, y), *ins)]
-    return [each(lambda *x: graph.op(name, *x), *ins)]
+    if name == "div" and not is_real(eqn.outvars[0].aval.dtype):
+        return [map_entries(lambda x, y: _integer_quotient(graph, x, y), *ins)]
+    return [map_entries(lambda *x: graph.op(name, *x), *ins)]
 
 
-def _quotient(graph: Graph, x: Node, y: Node) -> Node:
+def _integer_quotient(graph: Graph, x: Node, y: Node) -> Node:
     """Of whole numbers, towards zero; as XLA has it by 0, where a processor ends the process, -1, and all bits."""
     zero, one = graph.const(0, y.dtype), graph.const(1, y.dtype)
     nothing, turned = graph.op("eq", y, zero), graph.const(False)
@@ -33,24 +35,24 @@ def _quotient(graph: Graph, x: Node, y: Node) -> Node:
     return graph.select(nothing, found, graph.op("not", zero))
 
 
-@rule("add_any")
+@lowering_rule("add_any")
 def _sum_of_tangents(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    return [each(lambda x, y: graph.op("add", x, y), *ins)]
+    return [map_entries(lambda x, y: graph.op("add", x, y), *ins)]
 
 
-@rule("stop_gradient copy copy_p optimization_barrier pvary")
-@rule("reshard", "dst_sharding concrete_mesh")
-def _unchanged(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+@lowering_rule("stop_gradient copy copy_p optimization_barrier pvary")
+@lowering_rule("reshard", "dst_sharding concrete_mesh")
+def _identity(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return ins
 
 
-@rule("max min")
-def _extreme(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+@lowering_rule("max min")
+def _max_min(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """NaN if either is."""
-    return [each(lambda x, y: extreme(graph, eqn.primitive.name, x, y), *ins)]
+    return [map_entries(lambda x, y: max_or_min(graph, eqn.primitive.name, x, y), *ins)]
 
 
-def extreme(graph: Graph, name: str, x: Node, y: Node) -> Node:
+def max_or_min(graph: Graph, name: str, x: Node, y: Node) -> Node:
     """Return the larger or smaller of two numbers; NaN if either is."""
     if x is y:
         return x
@@ -59,12 +61,12 @@ def extreme(graph: Graph, name: str, x: Node, y: Node) -> Node:
     return graph.op(name, x, y)
 
 
-@rule("abs")
+@lowering_rule("abs")
 def _abs(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    return [each(lambda x: graph.op("abs", x), *ins)]
+    return [map_entries(lambda x: graph.op("abs", x), *ins)]
 
 
-@rule("sign")
+@lowering_rule("sign")
 def _sign(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """NaN and zeros are their own sign."""
 
@@ -73,15 +75,15 @@ def _sign(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         low = graph.select(graph.op("lt", x, zero), x, less)
         return graph.select(graph.op("gt", x, zero), low, one)
 
-    return [each(sign, *ins)]
+    return [map_entries(sign, *ins)]
 
 
-@rule("square")
+@lowering_rule("square")
 def _square(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    return [each(lambda x: graph.op("mul", x, x), *ins)]
+    return [map_entries(lambda x: graph.op("mul", x, x), *ins)]
 
 
-@rule("integer_pow", "y")
+@lowering_rule("integer_pow", "y")
 def _integer_pow(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     def power(x: Node) -> Node:
         n, result = abs(eqn.params["y"]), None
@@ -93,10 +95,10 @@ def _integer_pow(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         one = graph.const(1, x.dtype)
         return (result or one) if eqn.params["y"] >= 0 else graph.op("div", one, result or one)
 
-    return [each(power, *ins)]
+    return [map_entries(power, *ins)]
 
 
-@rule("rsqrt logistic", "accuracy")
+@lowering_rule("rsqrt logistic", "accuracy")
 def _inverse(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     if eqn.params["accuracy"] is not None:
         raise Unsupported(eqn.primitive.name, f"an accuracy is asked of it: {eqn.params['accuracy']}")
@@ -107,26 +109,26 @@ def _inverse(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
             return graph.op("div", one, graph.op("sqrt", x))
         return graph.op("div", one, graph.op("add", one, graph.op("exp", graph.op("neg", x))))
 
-    return [each(inverse, *ins)]
+    return [map_entries(inverse, *ins)]
 
 
-@rule("rem")
+@lowering_rule("rem")
 def _rem(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    if ins[1].size and not real(ins[1].flat[0].dtype) and any(x.op != "const" or x.attr == 0 for x in ins[1].flat):
-        return [each(lambda x, y: _whole_rest(graph, x, y), *ins)]
-    return [each(lambda x, y: graph.op("rem", x, y), *ins)]
+    if ins[1].size and not is_real(ins[1].flat[0].dtype) and any(x.op != "const" or x.attr == 0 for x in ins[1].flat):
+        return [map_entries(lambda x, y: _integer_remainder(graph, x, y), *ins)]
+    return [map_entries(lambda x, y: graph.op("rem", x, y), *ins)]
 
 
-def _whole_rest(graph: Graph, x: Node, y: Node) -> Node:
+def _integer_remainder(graph: Graph, x: Node, y: Node) -> Node:
     """By 0 the rest is the number itself, and not the end of the process."""
     zero = graph.op("eq", y, graph.const(0, y.dtype))
     return graph.select(zero, graph.op("rem", x, graph.select(zero, y, graph.const(1, y.dtype))), x)
 
 
-@rule("round", "rounding_method")
+@lowering_rule("round", "rounding_method")
 def _round(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     if eqn.params["rounding_method"].name == "TO_NEAREST_EVEN":
-        return [each(lambda x: graph.op("rint", x), *ins)]
+        return [map_entries(lambda x: graph.op("rint", x), *ins)]
 
     def away(x: Node) -> Node:
         """A half goes away from zero. What the size lacks to its whole part is exact, and its half plus 1/2 is not."""
@@ -136,36 +138,36 @@ def _round(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         size = graph.select(up, down, graph.op("add", down, graph.const(1, x.dtype)))
         return graph.select(graph.op("lt", x, graph.const(0, x.dtype)), size, graph.op("neg", size))
 
-    return [each(away, *ins)]
+    return [map_entries(away, *ins)]
 
 
-@rule("select_n")
+@lowering_rule("select_n")
 def _select(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     which, *cases = ins
     if len(cases) != 2 or eqn.invars[0].aval.dtype != bool:
         raise Unsupported("select_n", f"between {len(cases)} cases")
-    return [each(graph.select, which, *cases)]
+    return [map_entries(graph.select, which, *cases)]
 
 
-@rule("clamp")
+@lowering_rule("clamp")
 def _clamp(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     low, x, high = ins
-    return [each(lambda a, b, c: extreme(graph, "min", extreme(graph, "max", a, b), c), low, x, high)]
+    return [map_entries(lambda a, b, c: max_or_min(graph, "min", max_or_min(graph, "max", a, b), c), low, x, high)]
 
 
-@rule("convert_element_type", "new_dtype weak_type sharding")
+@lowering_rule("convert_element_type", "new_dtype weak_type sharding")
 def _convert(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    return [each(lambda x: graph.convert(x, eqn.params["new_dtype"]), *ins)]
+    return [map_entries(lambda x: graph.convert(x, eqn.params["new_dtype"]), *ins)]
 
 
-@rule("bitcast_convert_type", "new_dtype")
+@lowering_rule("bitcast_convert_type", "new_dtype")
 def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     if eqn.invars[0].aval.dtype.itemsize != np.dtype(eqn.params["new_dtype"]).itemsize:
         raise Unsupported("bitcast_convert_type", "between types of different sizes")
-    return [each(lambda x: graph.bits(x, eqn.params["new_dtype"]), *ins)]
+    return [map_entries(lambda x: graph.bits(x, eqn.params["new_dtype"]), *ins)]
 
 
-@rule("shift_left shift_right_logical")
+@lowering_rule("shift_left shift_right_logical")
 def _shift(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """By as many places as there are, or more, nothing is left."""
     name = eqn.primitive.name
@@ -181,10 +183,10 @@ def _shift(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
             inside = graph.op("and", inside, graph.op("ge", by, graph.const(0, by.dtype)))
         return graph.select(inside, zero, graph.op(name, x, graph.select(inside, graph.const(0, by.dtype), by)))
 
-    return [each(shift, *ins)]
+    return [map_entries(shift, *ins)]
 
 
-@rule("population_count")
+@lowering_rule("population_count")
 def _population(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """The bits that are set: sums of neighbours, of pairs, of fours, and by a product of bytes."""
 
@@ -202,4 +204,4 @@ def _population(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         bytes_ = graph.op("mul", part(fours, 0, 0x0F0F0F0F), graph.const(0x01010101, x.dtype))
         return graph.op("shift_right_logical", bytes_, graph.const(24, x.dtype))
 
-    return [each(count, *ins)]
+    return [map_entries(count, *ins)]

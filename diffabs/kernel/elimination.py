@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from diffabs.kernel.graph import Graph, Level, Node
-from diffabs.kernel.linear import ONE, Algebra, Factor, Sum, Vertex, steps, terms
+from diffabs.kernel.graph import Graph, Node, UpdateLevel
+from diffabs.kernel.linear import UNIT_FACTOR, Algebra, Factor, Sum, Vertex, changes_in_step, count_terms
 
 
 class Elimination:
@@ -20,10 +20,10 @@ class Elimination:
         self.vertices: dict[int, Vertex] = {}
         self.readers: dict[int, set[int]] = {}
         self.kept: set[int] = set()  # as they are read by name
-        self.levels: dict[int, Level] = {}
-        self.some = graph.input(dtype, Level.STEP, "any factor")
+        self.levels: dict[int, UpdateLevel] = {}
+        self.any_factor = graph.input(dtype, UpdateLevel.STEP, "any factor")
 
-    def begin(self, node: int, level: Level) -> None:
+    def begin(self, node: int, level: UpdateLevel) -> None:
         """Add a tangent that is given."""
         self.levels[node] = level
         self.readers[node] = set()
@@ -38,7 +38,7 @@ class Elimination:
             self.readers[x].add(node.id)
         factors = [f.number.level for sum in new.sums() for f in sum.values() if f.number is not None]
         factors += [new.which.level] if new.which is not None else []
-        self.levels[node.id] = max([Level.UNIFORM, *factors, *(self.levels[x] for x in reads)])
+        self.levels[node.id] = max([UpdateLevel.UNIFORM, *factors, *(self.levels[x] for x in reads)])
         if new.reads and any(not moves(x) for x in node.args):
             self.levels[node.id] = max([self.levels[node.id], *(value(x).level for x in node.args if not moves(x))])
 
@@ -46,46 +46,50 @@ class Elimination:
 
     def _cost(self, vertex: Vertex) -> int:
         """Operations for all tangents, as it is or with a choice of factors."""
-        cost = self.many * (sum(map(terms, vertex.sums())) + (vertex.which is not None))
-        return min(cost, self._decided_cost(vertex)) if self._decides(vertex) else cost
+        cost = self.many * (sum(map(count_terms, vertex.sums())) + (vertex.which is not None))
+        return min(cost, self._factor_choice_cost(vertex)) if self._can_choose_factors(vertex) else cost
 
-    def _decides(self, vertex: Vertex) -> bool:
+    def _can_choose_factors(self, vertex: Vertex) -> bool:
         """Whether factors may be chosen in place of tangents. A tangent that is not chosen, and no number, must not
         matter: 0 times it would. Only what is given to the steps is a number for certain: a try may lead anywhere."""
         once = set(vertex.sum) ^ set(vertex.others)
-        return vertex.which is not None and all(x not in self.vertices and self.levels[x] < Level.STEP for x in once)
+        return vertex.which is not None and all(
+            x not in self.vertices and self.levels[x] < UpdateLevel.STEP for x in once
+        )
 
-    def _decided_cost(self, vertex: Vertex) -> int:
+    def _factor_choice_cost(self, vertex: Vertex) -> int:
         keys = set(vertex.sum) | set(vertex.others)
         chosen = [x for x in keys if vertex.sum.get(x) != vertex.others.get(x)]
         units = any(x not in chosen and vertex.sum[x].number is None for x in keys)
         return self.many * (len(keys) - units) + len(chosen)
 
-    def _without(self, key: int, inner: Sum) -> int:
+    def _saving_without(self, key: int, inner: Sum) -> int:
         """How many operations are spared without a vertex that is this sum."""
-        spared = self.many * terms(inner)
+        spared = self.many * count_terms(inner)
         for reader in self.readers[key]:
             old = self.vertices[reader]
             new, more = [], 0
             for outer in old.sums():
-                merged, products = self._merged(outer, key, inner) if key in outer else (outer, 0)
+                merged, products = self._substituted_sum(outer, key, inner) if key in outer else (outer, 0)
                 new.append(merged)
                 more += products
             spared += self._cost(old) - self._cost(Vertex(new[0], old.which, *new[1:])) - more
         return spared
 
-    def _merged(self, outer: Sum, key: int, inner: Sum) -> tuple[Sum, int]:
+    def _substituted_sum(self, outer: Sum, key: int, inner: Sum) -> tuple[Sum, int]:
         """A sum with another one in the place of a vertex, whose factors are not worked out; operations on these."""
         factor, more = outer[key], 0
         found = {x: one for x, one in outer.items() if x != key}
         for x, one in inner.items():
-            many = sum(map(steps, (factor, one)))
+            many = sum(map(changes_in_step, (factor, one)))
             if x in found:
-                more += many > 0 or steps(found[x])
-                found[x] = Factor(False, self.some)
+                more += many > 0 or changes_in_step(found[x])
+                found[x] = Factor(False, self.any_factor)
             else:
                 more += many == 2
-                found[x] = one if factor.number is None else factor if one.number is None else Factor(False, self.some)
+                found[x] = (
+                    one if factor.number is None else factor if one.number is None else Factor(False, self.any_factor)
+                )
         return found, more
 
     # which are eliminated ---------------------------------------------------------------------------------------------
@@ -102,33 +106,33 @@ class Elimination:
 
     def _try(self, key: int) -> None:
         vertex = self.vertices[key]
-        if vertex.reads or self.levels[key] < Level.STEP:
+        if vertex.reads or self.levels[key] < UpdateLevel.STEP:
             return
         if not self.readers[key] and key not in self.kept:
-            self._settle(key, {})
+            self._replace_by_sum(key, {})
             self._eliminate(key)
             return
-        if key not in self.kept and self._joined(key):
+        if key not in self.kept and self._join_choices(key):
             return
         decided, before = vertex.sum, self._cost(vertex)
         if vertex.which is not None:
-            if not self._decides(vertex):
+            if not self._can_choose_factors(vertex):
                 return
             decided = self.algebra.decided(vertex)
-        spared = before - (self._decided_cost(vertex) if vertex.which is not None else before)
-        if key not in self.kept and spared + self._without(key, decided) >= 0:
-            self._settle(key, decided)
+        spared = before - (self._factor_choice_cost(vertex) if vertex.which is not None else before)
+        if key not in self.kept and spared + self._saving_without(key, decided) >= 0:
+            self._replace_by_sum(key, decided)
             self._eliminate(key)
         elif vertex.which is not None and spared >= 0:
-            self._settle(key, decided)
+            self._replace_by_sum(key, decided)
 
-    def _joined(self, key: int) -> bool:
+    def _join_choices(self, key: int) -> bool:
         """Whether a choice of one thing or nothing was made one with those by which alone it is read."""
         vertex = self.vertices[key]
         one = vertex.sum or vertex.others
         if vertex.which is None or len(one) != 1 or (vertex.sum and vertex.others):
             return False
-        whole = {key: ONE}
+        whole = {key: UNIT_FACTOR}
         readers = [self.vertices[reader] for reader in self.readers[key]]
         if any(r.which is None or any(side and side not in (one, whole) for side in r.sums()) for r in readers):
             return False
@@ -144,7 +148,7 @@ class Elimination:
         del self.vertices[key]
         return True
 
-    def _settle(self, key: int, decided: Sum) -> None:
+    def _replace_by_sum(self, key: int, decided: Sum) -> None:
         old = self.vertices[key]
         self.vertices[key] = Vertex(decided)
         for x in {x for sum in old.sums() for x in sum} - set(decided):

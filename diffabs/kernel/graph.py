@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffabs.kernel.operations import COMPARED, CONTRARY, FOLDED, MIRRORED, SYMMETRIC
+from diffabs.kernel.operations import COMPARISONS, FOLDABLE, MIRRORED, NEGATED, SYMMETRIC
 
 Array = Any  # of nodes, of NumPy
 
 
-class Level(enum.IntEnum):
+class UpdateLevel(enum.IntEnum):
     """How often a value changes: never, with the launch, with the lane, with the step."""
 
     KNOWN, UNIFORM, LANE, STEP = range(4)
@@ -25,7 +25,7 @@ class Node:
 
     __slots__ = ("args", "attr", "dtype", "id", "label", "level", "op")
 
-    def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: Any, level: Level):
+    def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: Any, level: UpdateLevel):
         """Made by a `Graph` alone."""
         self.id, self.op, self.args, self.dtype, self.attr, self.level = id, op, args, dtype, attr, level
         self.label = ""  # what the source calls it, of a graph that asks
@@ -54,11 +54,13 @@ class Graph:
     def begins(self, eqn: Any) -> None:
         """Be told that the nodes that follow are of this operation of JAX."""
 
-    def _make(self, op: str, args: tuple[Node, ...], dtype: Any, attr: Any = None, level: Level | None = None) -> Node:
+    def _make(
+        self, op: str, args: tuple[Node, ...], dtype: Any, attr: Any = None, level: UpdateLevel | None = None
+    ) -> Node:
         dtype = np.dtype(dtype)
         key = (op, tuple(arg.id for arg in args), dtype, attr)
         if key not in self._known:
-            most = max((Level.UNIFORM, *(arg.level for arg in args))) if level is None else level
+            most = max((UpdateLevel.UNIFORM, *(arg.level for arg in args))) if level is None else level
             self.nodes.append(Node(len(self.nodes), op, args, dtype, attr, most))
             self._known[key] = self.nodes[-1]
         return self._known[key]
@@ -68,24 +70,24 @@ class Graph:
         x = np.asarray(value, dtype)[()]
         key = ("const", x.dtype, x.tobytes())
         if key not in self._known:
-            self.nodes.append(Node(len(self.nodes), "const", (), x.dtype, x, Level.KNOWN))
+            self.nodes.append(Node(len(self.nodes), "const", (), x.dtype, x, UpdateLevel.KNOWN))
             self._known[key] = self.nodes[-1]
         return self._known[key]
 
-    def input(self, dtype: Any, level: Level, place: Any) -> Node:
+    def input(self, dtype: Any, level: UpdateLevel, place: Any) -> Node:
         """Return a number that comes from outside, from this place."""
         return self._make("input", (), dtype, place, level)
 
     def op(self, name: str, *args: Node) -> Node:
-        """Return an operation on numbers of one type: one of `FOLDED`, or a function that a back end has."""
-        boolean = name in COMPARED or name == "is_finite"
+        """Return an operation on numbers of one type: one of `FOLDABLE`, or a function that a back end has."""
+        boolean = name in COMPARISONS or name == "is_finite"
         dtype = np.dtype(bool) if boolean else args[0].dtype
-        if name in FOLDED and all(arg.op == "const" for arg in args):
+        if name in FOLDABLE and all(arg.op == "const" for arg in args):
             with np.errstate(all="ignore"):
-                return self.const(FOLDED[name](*(arg.attr for arg in args)), dtype)
+                return self.const(FOLDABLE[name](*(arg.attr for arg in args)), dtype)
         if name in MIRRORED:
             name, args = MIRRORED[name], args[::-1]
-        found = _SIMPLER[name](self, *args) if name in _SIMPLER else None
+        found = _SIMPLIFICATIONS[name](self, *args) if name in _SIMPLIFICATIONS else None
         if found is not None:
             return found
         if name in SYMMETRIC and args[0].id > args[1].id:
@@ -99,7 +101,7 @@ class Graph:
         if which.op == "not":
             return self.select(which.args[0], yes, no)
         if no.dtype == bool:
-            return self._decided(which, no, yes)
+            return self._select_boolean(which, no, yes)
         yes = yes.args[2] if yes.op == "select" and yes.args[0] is which else yes
         no = no.args[1] if no.op == "select" and no.args[0] is which else no
         if no is yes:
@@ -108,7 +110,7 @@ class Graph:
             return self._make("lower" if yes is which.args[0] else "higher", (yes, no), yes.dtype)
         return self._make("select", (which, no, yes), yes.dtype)
 
-    def _decided(self, which: Node, no: Node, yes: Node) -> Node:
+    def _select_boolean(self, which: Node, no: Node, yes: Node) -> Node:
         """A selection of truths is a truth."""
         if yes.op == "const":
             return self.op("or", which, no) if yes.attr else self.op("and", self.op("not", which), no)
@@ -172,7 +174,7 @@ class Graph:
         return self.op(node.op, *args)
 
 
-def real(dtype: Any) -> bool:
+def is_real(dtype: Any) -> bool:
     """Return whether numbers of this type are real ones."""
     return np.issubdtype(dtype, np.floating)
 
@@ -198,7 +200,7 @@ def _div(graph: Graph, x: Node, y: Node) -> Node | None:
     """A divisor that does not change in a step is inverted before: one rounding more."""
     if y.is_number(1):
         return x
-    if not real(x.dtype) or x.level < Level.STEP or y.level == Level.STEP:
+    if not is_real(x.dtype) or x.level < UpdateLevel.STEP or y.level == UpdateLevel.STEP:
         return None
     inverse = graph.op("div", graph.const(1, y.dtype), y)
     if inverse.op == "const" and not np.finfo(y.dtype).tiny <= abs(inverse.attr) < np.inf:
@@ -239,7 +241,7 @@ def _xor(graph: Graph, x: Node, y: Node) -> Node | None:
 def _not(graph: Graph, x: Node) -> Node | None:
     if x.op == "not":
         return x.args[0]
-    return graph.op(CONTRARY[x.op], *x.args) if x.op in CONTRARY else None
+    return graph.op(NEGATED[x.op], *x.args) if x.op in NEGATED else None
 
 
 def _ne(graph: Graph, x: Node, y: Node) -> Node | None:
@@ -261,7 +263,7 @@ def _same_shift(graph: Graph, x: Node, y: Node) -> Node | None:
     return x if y.is_number(0) else None
 
 
-_SIMPLER: dict[str, Callable[..., Node | None]] = {
+_SIMPLIFICATIONS: dict[str, Callable[..., Node | None]] = {
     "add": _add,
     "sub": _sub,
     "mul": _mul,

@@ -4,19 +4,19 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.kernel.elementwise import extreme
-from diffabs.kernel.graph import Array, Graph, Level, Node
-from diffabs.kernel.primitives import Unsupported, each, entry, rule
+from diffabs.kernel.elementwise import max_or_min
+from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel
+from diffabs.kernel.primitives import Unsupported, as_node_array, lowering_rule, map_entries
 
-LONGEST = 64  # entries of which a lane chooses by comparing, or writes one
-
-
-def _inside(graph: Graph, index: Node, most: int) -> Node:
-    low = extreme(graph, "max", index, graph.const(0, index.dtype))
-    return extreme(graph, "min", low, graph.const(most, index.dtype))
+MAX_COMPARED_ENTRIES = 64  # entries of which a lane chooses by comparing, or writes one
 
 
-@rule("dynamic_slice", "slice_sizes")
+def _clamp_index(graph: Graph, index: Node, most: int) -> Node:
+    low = max_or_min(graph, "max", index, graph.const(0, index.dtype))
+    return max_or_min(graph, "min", low, graph.const(most, index.dtype))
+
+
+@lowering_rule("dynamic_slice", "slice_sizes")
 def _dynamic_slice(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     x, places = ins[0], [place.item() for place in ins[1:]]
     for axis, (size, place) in enumerate(zip(eqn.params["slice_sizes"], places, strict=True)):
@@ -33,15 +33,15 @@ def _part(graph: Graph, x: Array, axis: int, place: Node, size: int) -> Array:
     if place.op == "const":
         start = int(np.clip(place.attr, 0, most))
         return np.moveaxis(rows[start : start + size], 0, axis)
-    place = _inside(graph, place, most)
-    taken: Any = [each(lambda *x: _entry(graph, place, x), *rows[i : i + most + 1]) for i in range(size)]
+    place = _clamp_index(graph, place, most)
+    taken: Any = [map_entries(lambda *x: _entry(graph, place, x), *rows[i : i + most + 1]) for i in range(size)]
     return np.moveaxis(np.stack(taken), 0, axis)
 
 
 def _entry(graph: Graph, index: Node, column: tuple[Node, ...]) -> Node:
-    if len(column) > 2 and all(x.level < Level.LANE for x in column):
+    if len(column) > 2 and all(x.level < UpdateLevel.LANE for x in column):
         return graph.table(index, column)
-    if len(column) > LONGEST:
+    if len(column) > MAX_COMPARED_ENTRIES:
         raise Unsupported("dynamic_slice", f"of {len(column)} entries that differ between lanes")
     (_, found), *others = reversed([*enumerate(column)])
     for i, x in others:
@@ -49,7 +49,7 @@ def _entry(graph: Graph, index: Node, column: tuple[Node, ...]) -> Node:
     return found
 
 
-@rule("gather", "dimension_numbers slice_sizes indices_are_sorted unique_indices mode fill_value")
+@lowering_rule("gather", "dimension_numbers slice_sizes indices_are_sorted unique_indices mode fill_value")
 def _gather(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """x[i] along the first axis, for each of some i."""
     x, places = ins
@@ -70,22 +70,25 @@ def _gather(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     return [out]
 
 
-@rule("dynamic_update_slice")
+@lowering_rule("dynamic_update_slice")
 def _dynamic_update(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     x, new, places = ins[0], ins[1], [place.item() for place in ins[2:]]
     for axis, place in enumerate(places):
-        _writable(eqn, x.shape[axis] if new.shape[axis] != x.shape[axis] and place.op != "const" else 0)
+        _check_writable(eqn, x.shape[axis] if new.shape[axis] != x.shape[axis] and place.op != "const" else 0)
     room = [a - b for a, b in zip(x.shape, new.shape, strict=True)]
-    starts = [_inside(graph, place, most) for place, most in zip(places, room, strict=True)]
+    starts = [_clamp_index(graph, place, most) for place, most in zip(places, room, strict=True)]
     out = x.copy()
     for start in np.ndindex(*(most + 1 for most in room)):
         hits = [graph.op("eq", s, graph.const(o, s.dtype)) for s, o in zip(starts, start, strict=True)]
-        hit, inside = _all(graph, hits), tuple(slice(o, o + size) for o, size in zip(start, new.shape, strict=True))
-        out[inside] = each(lambda a, b, hit=hit: graph.select(hit, a, b), out[inside], new)
+        hit, inside = (
+            _all_true(graph, hits),
+            tuple(slice(o, o + size) for o, size in zip(start, new.shape, strict=True)),
+        )
+        out[inside] = map_entries(lambda a, b, hit=hit: graph.select(hit, a, b), out[inside], new)
     return [out]
 
 
-@rule("scatter", "dimension_numbers indices_are_sorted mode unique_indices update_consts update_jaxpr")
+@lowering_rule("scatter", "dimension_numbers indices_are_sorted mode unique_indices update_consts update_jaxpr")
 def _scatter(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """x.at[i].set(value) of one i along the first axis; nothing where that is outside."""
     x, places, new = ins
@@ -96,22 +99,24 @@ def _scatter(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     mode = str(eqn.params["mode"]).rsplit(".", 1)[-1]
     if mode not in ("FILL_OR_DROP", "PROMISE_IN_BOUNDS", "CLIP"):
         raise Unsupported("scatter", f"with the mode {mode}")
-    _writable(eqn, len(x))
+    _check_writable(eqn, len(x))
     index, out = places.ravel()[0], np.empty(x.shape, object)
-    index = _inside(graph, index, len(x) - 1) if mode == "CLIP" else index
+    index = _clamp_index(graph, index, len(x) - 1) if mode == "CLIP" else index
     for i in range(len(x)):
         hit = graph.op("eq", index, graph.const(i, index.dtype))
-        out[i, ...] = each(lambda a, b, hit=hit: graph.select(hit, a, b), entry(x[i]), new.reshape(x.shape[1:]))
+        out[i, ...] = map_entries(
+            lambda a, b, hit=hit: graph.select(hit, a, b), as_node_array(x[i]), new.reshape(x.shape[1:])
+        )
     return [out]
 
 
-def _all(graph: Graph, truths: list[Node]) -> Node:
+def _all_true(graph: Graph, truths: list[Node]) -> Node:
     found = graph.const(True)
     for one in truths:
         found = graph.op("and", found, one)
     return found
 
 
-def _writable(eqn: Any, count: int) -> None:
-    if count > LONGEST:
-        raise Unsupported(eqn.primitive.name, f"into {count} entries; {LONGEST} are the most")
+def _check_writable(eqn: Any, count: int) -> None:
+    if count > MAX_COMPARED_ENTRIES:
+        raise Unsupported(eqn.primitive.name, f"into {count} entries; {MAX_COMPARED_ENTRIES} are the most")

@@ -14,9 +14,9 @@ import numpy as np
 
 from diffabs.kernel import binding, compilers, cpp, gpu, program
 
-LINES = 10_000  # of a step; the blocks of a larger program are of fewer vectors, or compiling takes long
-VECTORS = 4
-NAME = "diffabs_kernel_"  # begins the names of libraries
+MAX_STEP_LINES = 10_000  # of a step; the blocks of a larger program are of fewer vectors, or compiling takes long
+VECTORS_PER_BLOCK = 4
+LIBRARY_NAME_PREFIX = "diffabs_kernel_"  # begins the names of libraries
 _lock = threading.Lock()
 _loaded: dict[str, Any] = {}
 
@@ -42,51 +42,55 @@ def run_lanes(
 
     Works under jit and vmap, with derivatives forward. Raises Unsupported for an operation that has no rule, NoCompiler
     where there is none, ValueError for reverse mode."""
-    if not gpu.device():
-        compilers.compiler()
-    functions = program.traced(
-        {"renew": renew, "step": step, "running": running}, jax.tree.map(_one, lane), jax.tree.map(_one, carry)
+    if not gpu.find_gpu():
+        compilers.find_compiler()
+    functions = program.trace_functions(
+        {"renew": renew, "step": step, "running": running},
+        jax.tree.map(_lane_type, lane),
+        jax.tree.map(_lane_type, carry),
     )
     leaves, tree = jax.tree.flatten(carry)
-    given = [data(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
-    launch = functools.partial(_launched, shape=cpp.Shape(VECTORS, steps, rounds))
+    given = [unwrap_key(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
+    launch = functools.partial(_launch_lanes, shape=cpp.LaunchShape(VECTORS_PER_BLOCK, steps, rounds))
     which = None if wanted is None else tuple(i for i, on in enumerate(jax.tree.leaves(wanted)) if on)
-    lanes = binding.Lanes(functions._replace(uniform=[]), launch, which)
-    found = binding.bound(lanes, given)
+    lanes = binding.LanePrograms(functions._replace(uniform=[]), launch, which)
+    found = binding.bind_lanes(lanes, given)
     return tree.unflatten([_like(x, leaf) for x, leaf in zip(found, leaves, strict=True)])
 
 
-def _launched(made: program.Program, before: list[Any], carry: list[Any], shape: cpp.Shape) -> list[Any]:
+def _launch_lanes(
+    made: program.ScalarProgram, before: list[Any], carry: list[Any], shape: cpp.LaunchShape
+) -> list[Any]:
     """The carry of lanes that are all over; `before`: what is the same for all lanes, and what is a lane's own."""
     first, results = len(before), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
-    if gpu.device():
-        return gpu.call(made, shape, [*before, *carry], results)
+    if gpu.find_gpu():
+        return gpu.call_kernel(made, shape, [*before, *carry], results)
     call = jax.ffi.ffi_call(
-        target(made, shape),
+        build_target(made, shape),
         results,
         input_output_aliases={first + i: i for i in range(len(carry))},
     )
-    return list(call(*before, *carry, threads=np.int64(threads())))
+    return list(call(*before, *carry, threads=np.int64(thread_count())))
 
 
-def target(made: program.Program, shape: cpp.Shape) -> str:
+def build_target(made: program.ScalarProgram, shape: cpp.LaunchShape) -> str:
     """Return the name under which XLA knows a program; compiled, if it was not before. Raises NoCompiler."""
     shape = shape._replace(vectors=max(1, shape.vectors // max(1, made.tangents)))  # tangents do not wait, either
-    source = cpp.text(made, shape)
-    while cpp.operations(source) * shape.vectors > LINES and shape.vectors > 1:
+    source = cpp.emit_cpp(made, shape)
+    while cpp.count_operations(source) * shape.vectors > MAX_STEP_LINES and shape.vectors > 1:
         shape = shape._replace(vectors=shape.vectors // 2)
-        source = cpp.text(made, shape)
-    return register(compilers.library(source))
+        source = cpp.emit_cpp(made, shape)
+    return register_library(compilers.build_library(source))
 
 
-def described() -> dict[str, str]:
+def describe_kernel_build() -> dict[str, str]:
     """Return what decides the bits of a kernel besides its text: compiler, flags, processor. Raises NoCompiler."""
-    return gpu.described() if gpu.device() else compilers.described()
+    return gpu.describe_gpu_compiler() if gpu.find_gpu() else compilers.describe_compiler()
 
 
-def register(path: pathlib.Path) -> str:
+def register_library(path: pathlib.Path) -> str:
     """Return the name under which XLA knows a library from now on. Raises NoCompiler for one that is not there."""
-    name = f"{NAME}{path.stem[:32]}"
+    name = f"{LIBRARY_NAME_PREFIX}{path.stem[:32]}"
     with _lock:
         if name not in _loaded:
             handler = _handler(path)
@@ -95,12 +99,12 @@ def register(path: pathlib.Path) -> str:
     return name
 
 
-def names() -> list[str]:
+def library_names() -> list[str]:
     """Return the names under which XLA knows libraries."""
     return list(_loaded)
 
 
-def path(name: str) -> pathlib.Path:
+def library_path(name: str) -> pathlib.Path:
     """Return the library of a name."""
     return _loaded[name][1]
 
@@ -113,7 +117,7 @@ def _handler(path: pathlib.Path) -> Any:
         raise compilers.NoCompiler(f"{path.parent}: {error}") from None
 
 
-def threads() -> int:
+def thread_count() -> int:
     """Return how many processors a device may use: those of this process, shared by all that run at the same time."""
     return max(1, _processors() // max(1, jax.local_device_count("cpu")))
 
@@ -123,12 +127,12 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _one(x: Any) -> Any:
+def _lane_type(x: Any) -> Any:
     """A lane of an array."""
     return jax.ShapeDtypeStruct(jnp.shape(x)[1:], x.dtype)
 
 
-def data(x: Any) -> Any:
+def unwrap_key(x: Any) -> Any:
     """Return an array, of a key its words."""
     if is_key(x):
         return jax.random.key_data(x)

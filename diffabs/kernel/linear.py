@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.kernel.graph import Graph, Level, Node
+from diffabs.kernel.graph import Graph, Node, UpdateLevel
 
-SUMMED = {"add": (0, 1), "sub": (0, 1), "select": (1, 2)}  # operands that are tangents, or zero
+TANGENT_OPERANDS = {"add": (0, 1), "sub": (0, 1), "select": (1, 2)}  # operands that are tangents, or zero
 
 
 class Factor(NamedTuple):
@@ -19,7 +19,7 @@ class Factor(NamedTuple):
     number: Node | None
 
 
-ONE = Factor(False, None)
+UNIT_FACTOR = Factor(False, None)
 Sum = dict[int, Factor]  # of tangents, by the numbers of their nodes
 
 
@@ -51,7 +51,7 @@ class Algebra:
         def alone(i: int, negative: bool = False) -> Sum:
             return {args[i].id: Factor(negative, None)} if on[i] else {}
 
-        linear = all(on[i] or _nothing(value(args[i])) for i in SUMMED.get(node.op, ()))
+        linear = all(on[i] or _is_zero_tangent(value(args[i])) for i in TANGENT_OPERANDS.get(node.op, ()))
         match node.op:
             case "add" | "sub" if linear:
                 return Vertex(self._plus(alone(0), alone(1, node.op == "sub")))
@@ -123,19 +123,19 @@ def _factor(node: Node) -> Factor:
     return Factor(node.is_number(-1), None) if node.is_number(1) or node.is_number(-1) else Factor(False, node)
 
 
-def _nothing(node: Node) -> bool:
+def _is_zero_tangent(node: Node) -> bool:
     """Whether a number is that of a tangent that is zero."""
     if node.op in ("mul", "neg", "div"):
-        return any(_nothing(x) for x in node.args[: 1 if node.op == "div" else None])
-    return node.is_number(0) or (node.op in ("add", "sub") and all(map(_nothing, node.args)))
+        return any(_is_zero_tangent(x) for x in node.args[: 1 if node.op == "div" else None])
+    return node.is_number(0) or (node.op in ("add", "sub") and all(map(_is_zero_tangent, node.args)))
 
 
-def steps(factor: Factor) -> bool:
+def changes_in_step(factor: Factor) -> bool:
     """Return whether a factor is a number that changes in a step."""
-    return factor.number is not None and factor.number.level == Level.STEP
+    return factor.number is not None and factor.number.level == UpdateLevel.STEP
 
 
-def terms(sum: Sum) -> int:
+def count_terms(sum: Sum) -> int:
     """Return the operations of a sum for each tangent: a product and a sum are one."""
-    alone = len(sum) == 1 and next(iter(sum.values())) == ONE
-    return 0 if alone or not sum else max(1, len(sum) - any(one == ONE for one in sum.values()))
+    alone = len(sum) == 1 and next(iter(sum.values())) == UNIT_FACTOR
+    return 0 if alone or not sum else max(1, len(sum) - any(one == UNIT_FACTOR for one in sum.values()))

@@ -7,33 +7,40 @@ import jax.extend.core as jex
 import numpy as np
 
 from diffabs.kernel.graph import Array, Graph
-from diffabs.kernel.primitives import Unsupported, called, each, entry, rule, single
+from diffabs.kernel.primitives import (
+    Unsupported,
+    as_node_array,
+    inline_program,
+    lowering_rule,
+    map_entries,
+    scalar_array,
+)
 
-LONGEST = 64  # steps of a scan, which is written out
+MAX_UNROLLED_STEPS = 64  # steps of a scan, which is written out
 
 
-@rule(
+@lowering_rule(
     "jit pjit closed_call core_call remat remat2 checkpoint",
     "jaxpr call_jaxpr name inline in_shardings out_shardings in_layouts out_layouts donated_invars ctx_mesh keep_unused"
     " compiler_options_kvs prevent_cse differentiated policy",
 )
-@rule("custom_jvp_call", "call_jaxpr jvp_jaxpr_fun num_consts symbolic_zeros")
-@rule("custom_vjp_call", "call_jaxpr fwd_jaxpr_thunk bwd num_consts out_trees symbolic_zeros")
+@lowering_rule("custom_jvp_call", "call_jaxpr jvp_jaxpr_fun num_consts symbolic_zeros")
+@lowering_rule("custom_vjp_call", "call_jaxpr fwd_jaxpr_thunk bwd num_consts out_trees symbolic_zeros")
 def _call(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    return called(graph, eqn.params["call_jaxpr" if "call_jaxpr" in eqn.params else "jaxpr"], ins)
+    return inline_program(graph, eqn.params["call_jaxpr" if "call_jaxpr" in eqn.params else "jaxpr"], ins)
 
 
-@rule("custom_vmap_call", "call rule in_tree out_tree")
-def _of_a_batch(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+@lowering_rule("custom_vmap_call", "call rule in_tree out_tree")
+def _custom_vmap_any(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     """A rule of its own for batches may be anything; it is known if it says of truths whether any is."""
     call = eqn.params["call"].jaxpr
     truth = len(ins) == 1 and eqn.invars[0].aval.dtype == bool and ins[0].ndim == 0
-    if not truth or call.eqns or call.invars != call.outvars or not _says_any(eqn):
+    if not truth or call.eqns or call.invars != call.outvars or not _is_any_rule(eqn):
         raise Unsupported("custom_vmap_call", "its rule for batches is not `any`")
-    return [single(graph.any(ins[0].item()))]
+    return [scalar_array(graph.any(ins[0].item()))]
 
 
-def _says_any(eqn: Any) -> bool:
+def _is_any_rule(eqn: Any) -> bool:
     told = jex.DebugInfo("kernel", "any", None, None)
     body = jex.Jaxpr((), list(eqn.invars), list(eqn.outvars), [eqn], eqn.effects, told)
     found = jax.vmap(lambda x: jex.jaxpr_as_fun(jex.ClosedJaxpr(body, ()))(x)[0])
@@ -41,39 +48,39 @@ def _says_any(eqn: Any) -> bool:
         return all(bool(found(np.array(x)).all()) == any(x) for x in ([False, False], [False, True], [True, True]))
 
 
-@rule("cond", "branches")
+@lowering_rule("cond", "branches")
 def _cond(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     which, rest, branches = ins[0].item(), ins[1:], eqn.params["branches"]
     if which.op == "const":
-        return called(graph, branches[int(np.clip(which.attr, 0, len(branches) - 1))], rest)
-    taken = called(graph, branches[0], rest)
+        return inline_program(graph, branches[int(np.clip(which.attr, 0, len(branches) - 1))], rest)
+    taken = inline_program(graph, branches[0], rest)
     for i, branch in enumerate(branches[1:], 1):
         asked = graph.convert(which, bool)
         if len(branches) > 2:
             asked = graph.op("ge", which, graph.const(i, which.dtype))
-        other = called(graph, branch, rest)
+        other = inline_program(graph, branch, rest)
         flat = [[node for array in arrays for node in array.flat] for arrays in (taken, other)]
         gated = iter(graph.gate(asked, *flat))
-        taken = [each(lambda _: next(gated), array) for array in taken]  # noqa: B023  used at once
+        taken = [map_entries(lambda _: next(gated), array) for array in taken]  # noqa: B023  used at once
     return taken
 
 
-@rule("scan", "length reverse jaxpr num_consts num_carry linear unroll _split_transpose ft_in ft_out")
+@lowering_rule("scan", "length reverse jaxpr num_consts num_carry linear unroll _split_transpose ft_in ft_out")
 def _scan(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     p = eqn.params
-    if p["length"] > LONGEST:
-        raise Unsupported("scan", f"of {p['length']} steps within a step; {LONGEST} are the most")
-    constants, many = _counts(p, len(ins))
+    if p["length"] > MAX_UNROLLED_STEPS:
+        raise Unsupported("scan", f"of {p['length']} steps within a step; {MAX_UNROLLED_STEPS} are the most")
+    constants, many = _scan_input_counts(p, len(ins))
     fixed, carry, rows = ins[:constants], ins[constants : constants + many], ins[constants + many :]
     order = range(p["length"])[:: -1 if p["reverse"] else 1]
     seen: dict[int, list[Array]] = {}
     for i in order:
-        outs = called(graph, p["jaxpr"], [*fixed, *carry, *(entry(row[i]) for row in rows)])
+        outs = inline_program(graph, p["jaxpr"], [*fixed, *carry, *(as_node_array(row[i]) for row in rows)])
         carry, seen[i] = outs[:many], outs[many:]
     return [*carry, *(np.stack(column) for column in zip(*(seen[i] for i in sorted(seen)), strict=True))]
 
 
-def _counts(params: Any, inputs: int) -> tuple[int, int]:
+def _scan_input_counts(params: Any, inputs: int) -> tuple[int, int]:
     """How many inputs of a scan are constants, and how many are carried: numbers until JAX 0.10, then a structure of
     three groups of inputs, in their order."""
     if "num_carry" in params:

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-COMPARED: dict[str, Any] = {
+COMPARISONS: dict[str, Any] = {
     "eq": np.equal,
     "ne": np.not_equal,
     "lt": np.less,
@@ -12,7 +12,7 @@ COMPARED: dict[str, Any] = {
     "gt": np.greater,
     "ge": np.greater_equal,
 }
-FOLDED: dict[str, Any] = COMPARED | {
+FOLDABLE: dict[str, Any] = COMPARISONS | {
     "add": np.add,
     "sub": np.subtract,
     "mul": np.multiply,
@@ -39,4 +39,4 @@ FOLDED: dict[str, Any] = COMPARED | {
 }
 SYMMETRIC = {"add", "mul", "and", "or", "xor", "eq", "ne"}
 MIRRORED = {"gt": "lt", "ge": "le"}  # of the other operands in turn
-CONTRARY = {"eq": "ne", "ne": "eq"}  # of the ordered ones NaN is not the contrary
+NEGATED = {"eq": "ne", "ne": "eq"}  # of the ordered ones NaN is not the contrary

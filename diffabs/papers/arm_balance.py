@@ -30,7 +30,7 @@ from diffabs.papers.digest import Digest, Refuted, digest
 from diffabs.plants import ACROBOT, ArmBalance, BalanceStart, PrintedArm
 from diffabs.scenario.defaults import balancing
 from diffabs.simulate.run import rollout
-from diffabs.simulate.solution import Adaptive, FixedStep, Run, described
+from diffabs.simulate.solution import Adaptive, FixedStep, Run, describe_solver
 
 TITLE = "Fumita: a two-wheeler balanced by an arm"
 SOLVER = FixedStep(step=1e-3, duration=10.0)
@@ -253,7 +253,7 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
             name: [float(m) for m, reach in zip(RIDERS, reaches, strict=True) if reach.undecided]
             for name, (_, reaches) in over_riders.items()
         },
-        "solver": record.solver(SOLVER, counted=described(LONG)),
+        "solver": record.solver(SOLVER, counted=describe_solver(LONG)),
         "made": provenance.made(("reproduce", "arm-balance")),
         "versions": record.origin(),
     }

@@ -25,7 +25,7 @@ from diffabs.plants import GRAVITY, QuarterCar
 from diffabs.references import FixedSlip, PeakLatch, PeakLiteral
 from diffabs.roads import MagicFormula, peak
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.batch import run_batch, stacked
+from diffabs.simulate.batch import run_batch, stack_loops
 from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import FixedStep, Run
 
@@ -92,7 +92,7 @@ def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
     locked = rollout(loop(car, FixedSlip(), ConstantTorque(torque=90.0)), solver, BRAKING)
     runs = {"no ABS": jax.tree.map(np.asarray, locked)}
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
-        lanes = stacked(
+        lanes = stack_loops(
             [loop(car, reference, PID(kp=3893.0, ki=ki, kd=kd, low=0.0, high=90.0)) for ki, kd in GAINS.values()]
         )
         done = run_batch(*lanes, solver, BRAKING, trajectories=True, accepted=True)

@@ -24,7 +24,7 @@ from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip
 from diffabs.roads import RIG, peak
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.batch import run_batch, stacked
+from diffabs.simulate.batch import run_batch, stack_loops
 from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import FixedStep, Run, Trajectory
 from diffabs.stops import SpeedReached
@@ -120,7 +120,7 @@ def loop(case: Case, reference: Any = None) -> Loop:
 def run() -> dict[str, Run]:
     """Every case, by name."""
     cases = CASES + GAINS
-    done = run_batch(*stacked([loop(case) for case in cases]), SOLVER, BRAKING, trajectories=True, accepted=True)
+    done = run_batch(*stack_loops([loop(case) for case in cases]), SOLVER, BRAKING, trajectories=True, accepted=True)
     return {case.name: record.lane(done, i) for i, case in enumerate(cases)}
 
 
@@ -132,7 +132,7 @@ def run_filtered() -> Run:
 
 def convergence(fine: Mapping[str, Run]) -> Errors:
     """Relative errors against a finer run at each step length, by case and quantity."""
-    lanes = stacked([loop(case) for case in CONVERGENCE])
+    lanes = stack_loops([loop(case) for case in CONVERGENCE])
     solvers = [FixedStep(step=step, duration=step * HALVING_STEPS) for step in HALVINGS]
     runs = [run_batch(*lanes, solver, BRAKING, together=True, accepted=True) for solver in solvers]
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from diffabs.reliability.importance_sampling import STARTS, Gradient
 from diffabs.reliability.subset_simulation import RareEvent, subset_simulation
+from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.refusals import refusals
 from diffabs.sweep.study import Study, noise_key, precision
 
 STEP = 1e-4  # of the differences in z: errors of 1e-9 and 1e-12 of the values
@@ -70,7 +70,7 @@ def objection(study: Study, metric: str) -> str | None:
 
     values = study.space.normal(np.zeros((1, study.space.dimension)))
     with precision(study.dtype):
-        return native.objection(*_posed(study, metric, values))
+        return native.kernel_objection(*_posed(study, metric, values))
 
 
 def _posed(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
@@ -98,7 +98,7 @@ def _measured(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
 
 def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) -> None:
     """Raises ValueError, in a line, for points of which the first `count` cannot all be run."""
-    refused = refusals(study.loop, values, study.solver)
+    refused = batch_admissibility(study.loop, values, study.solver)
     bad = np.flatnonzero(refused.codes[:count])
     if len(bad):
         at = ", ".join(f"{path} = {column[bad[0]]:.6g}" for path, column in values.items())

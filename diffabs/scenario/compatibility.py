@@ -12,7 +12,7 @@ from diffabs.core.protocols import Clock, Memory, Objective, Sample, still
 from diffabs.core.pytree import strong
 from diffabs.core.values import kebab
 from diffabs.scenario.registry import joined
-from diffabs.simulate.advance import begin
+from diffabs.simulate.advance import initial_point
 
 
 def misfits(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
@@ -38,7 +38,7 @@ def _everything(loop: Loop, objectives: Mapping[str, Objective]) -> Any:
 
 def _once(loop: Loop) -> Any:
     """Once around the loop, and through an instant."""
-    return begin(loop, {}, Clock(0.0, 1e-3, 0, jax.random.key(0)))
+    return initial_point(loop, {}, Clock(0.0, 1e-3, 0, jax.random.key(0)))
 
 
 def _measured(loop: Loop, objective: Objective) -> Any:

@@ -9,7 +9,7 @@ from diffabs.core.pytree import parameters
 from diffabs.core.units import units_of
 from diffabs.scenario import registry
 from diffabs.scenario.scenario import Scenario
-from diffabs.simulate.solution import described
+from diffabs.simulate.solution import describe_solver
 
 
 def model(chosen: Scenario) -> dict[str, Any]:
@@ -20,7 +20,7 @@ def model(chosen: Scenario) -> dict[str, Any]:
         "description": chosen.description,
         "parts": parts(chosen),
         "parameters": numbers(chosen),
-        "solver": {**described(chosen.solver), "seed": chosen.seed},
+        "solver": {**describe_solver(chosen.solver), "seed": chosen.seed},
         "metrics": {name: registry.unit_of(one, chosen.loop.plant) for name, one in chosen.objectives.items()},
     }
 

@@ -34,7 +34,7 @@ from diffabs.scenario import parameter_paths, section_design, section_solver, se
 from diffabs.scenario.compatibility import misfits
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.registry import FAMILIES, OTHERS, build, inner_fields, joined, loop_of, type_name, types
-from diffabs.simulate.refusals import together, unstable
+from diffabs.simulate.admissible import find_mismatches, find_unstable_step
 from diffabs.simulate.solution import Adaptive, Solver
 
 LARGEST_FILE = 1_000_000  # bytes
@@ -128,7 +128,7 @@ def loads(
         table |= _titled(name, overrides)
     scenario = _assembled(name, table, folder)
     asked = (scenario.loop, scenario.solver)
-    _refuse(together(*asked), unstable(*asked) if integrated else ())
+    _refuse(find_mismatches(*asked), find_unstable_step(*asked) if integrated else ())
     return scenario
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from diffabs.core.pytree import Spec
 from diffabs.core.values import entry, members, ranged, read_one, switch, within
-from diffabs.simulate.refusals import MOST_STEPS
-from diffabs.simulate.solution import TYPES, Adaptive, FixedStep, Solver
+from diffabs.simulate.admissible import MAX_SOLVER_STEPS
+from diffabs.simulate.solution import SOLVER_TYPES, Adaptive, FixedStep, Solver
 
 TIME = Spec("s", low=0.0, open_low=True)
 TOLERANCE = Spec("1", low=1e-12, high=0.01)
@@ -21,7 +21,7 @@ class _Any:
 
     step: float = entry(ranged(TIME), FixedStep.step)
     duration: float = entry(ranged(TIME), FixedStep.duration)
-    every: int = entry(within(1, int(MOST_STEPS)), FixedStep.every)
+    every: int = entry(within(1, int(MAX_SOLVER_STEPS)), FixedStep.every)
     seed: int = entry(within(0, 2**32 - 1), 0)
 
 
@@ -49,7 +49,7 @@ def read(given: Any) -> tuple[Solver, int]:
     said = members(found)
     seed = said.pop("seed")
     kind = next(name for name, section in SECTIONS.items() if type(found) is section)
-    return TYPES[kind](**said), seed
+    return SOLVER_TYPES[kind](**said), seed
 
 
 def _usual(given: Mapping[str, Any]) -> str:
@@ -59,6 +59,6 @@ def _usual(given: Mapping[str, Any]) -> str:
 
 def table(solver: Solver, seed: int) -> dict[str, Any]:
     """Return the section that is read so."""
-    kind = next(name for name, one in TYPES.items() if type(solver) is one)
+    kind = next(name for name, one in SOLVER_TYPES.items() if type(solver) is one)
     said = {name: value for name, value in members(solver).items() if value is not None}
     return {"type": kind, **said, "seed": seed}

@@ -12,15 +12,15 @@ from diffabs.core.compiling import traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import arrayed, get, parameters, replace
-from diffabs.simulate.engine import by_engine, check_process
-from diffabs.simulate.placement import divided
-from diffabs.simulate.refill import Enough, run_refilled
-from diffabs.simulate.refusals import first_line, refusals
-from diffabs.simulate.run import refuse, run_any
+from diffabs.simulate.admissible import batch_admissibility, first_refusal
+from diffabs.simulate.engine import check_process, run_with_engine
+from diffabs.simulate.packed import EarlyEnd, run_packed
+from diffabs.simulate.run import refuse, run_unchecked
+from diffabs.simulate.sharding import run_on_auto_mesh
 from diffabs.simulate.solution import Run, Solver
 
-TOGETHER = "lanes run together, for trajectories or for derivatives in either mode"
-LONGER = 2.0  # lanes that run together differ by less than this factor in length
+TOGETHER_REASON = "lanes run together, for trajectories or for derivatives in either mode"
+MAX_LENGTH_RATIO = 2.0  # lanes that run together differ by less than this factor in length
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Batch:
 
     def check(self, loop: Any, solver: Solver | None = None) -> "Batch":
         """Return the batch if its lanes fit the loop. Raises ValueError for a path that does not exist, columns of
-        different lengths, a value out of range, and, with a solver, a lane that must not be run: see `refusals`."""
+        different lengths, a value out of range, and, with a solver, a lane that must not be run: see `batch_admissibility`."""
         specs, _ = {path: spec for path, spec, _ in parameters(loop)}, self.size
         for path, column in self.values.items():
             if path not in specs:
@@ -66,14 +66,14 @@ class Batch:
             column = getattr(self, name)
             if column is not None and not (np.isfinite(column) & (np.asarray(column) > 0)).all():
                 raise ValueError(f"{name} = {np.min(column):g} ... {np.max(column):g} are not all positive and finite")
-        if solver and (line := first_line(loop, self.values, solver)):
+        if solver and (line := first_refusal(loop, self.values, solver)):
             raise ValueError(line)
         return self
 
     def groups(self, duration: float) -> list[tuple[np.ndarray, float]]:
         """Lanes (their numbers) of similar `durations`, and for how long [s] they are run, at most `duration`."""
         wanted = np.minimum(np.asarray(self.durations, float), duration)
-        classes = np.floor(np.log(wanted.max() / wanted) / np.log(LONGER)).astype(int)
+        classes = np.floor(np.log(wanted.max() / wanted) / np.log(MAX_LENGTH_RATIO)).astype(int)
         members = [np.flatnonzero(classes == i) for i in np.unique(classes)]
         return [(lanes, float(wanted[lanes].max())) for lanes in members]
 
@@ -106,7 +106,7 @@ def run_batch(
     trajectories: bool = False,
     together: bool | None = None,
     accepted: Any = None,
-    enough: Enough | None = None,
+    enough: EarlyEnd | None = None,
     engine: str = "xla",
 ) -> Run:
     """Run every lane of a batch and return what `measure` returns of each: a `Run` with a leading axis, in their order.
@@ -121,7 +121,7 @@ def run_batch(
         room for the next, so that few long ones do not hold up the rest. The two agree to rounding. None is True if
         the call is traced (inside jit, grad, vmap); trajectories and an empty batch are always run together
     accepted: which lanes are run (lanes,), or True for all; the others have `diverged`, and their metrics are NaN.
-        None is those that `refusals` accepts, or all if the call is traced
+        None is those that `batch_admissibility` accepts, or all if the call is traced
     enough: ends runs early, which then have neither stopped, timed out nor diverged; not together
     engine: "kernel" makes of the loop's step a program of this machine (a C++ compiler is needed): the same numbers to
         rounding, and derivatives, forward (`jax.jvp`, `jax.jacfwd`) and not in reverse; no trajectories. "auto" does so
@@ -148,12 +148,12 @@ def run_batch(
 
     def run(loop: Loop, values: Any, keys: Any, objectives: Any, accepted: Any, enough: Any) -> Run:
         lanes = dataclasses.replace(batch, values=values, keys=keys)
-        return _made(loop, lanes, solver, objectives, trajectories, together, accepted, enough, engine)
+        return _dispatch_batch(loop, lanes, solver, objectives, trajectories, together, accepted, enough, engine)
 
-    return divided(run, (loop, dict(batch.values), batch.keys, dict(objectives or {}), accepted, enough))
+    return run_on_auto_mesh(run, (loop, dict(batch.values), batch.keys, dict(objectives or {}), accepted, enough))
 
 
-def _made(
+def _dispatch_batch(
     loop: Loop,
     batch: Batch,
     solver: Solver,
@@ -161,7 +161,7 @@ def _made(
     trajectories: bool,
     together: bool | None,
     accepted: Any,
-    enough: Enough | None,
+    enough: EarlyEnd | None,
     engine: str,
 ) -> Run:
     count = batch.size
@@ -171,7 +171,11 @@ def _made(
     live = traced(loop, dict(batch.values), dict(objectives))
     if accepted is None:
         asked = bool(batch.values) and not live
-        accepted = refusals(loop, batch.values, solver).accepted if asked else live or not first_line(loop, {}, solver)
+        accepted = (
+            batch_admissibility(loop, batch.values, solver).accepted
+            if asked
+            else live or not first_refusal(loop, {}, solver)
+        )
     given = (
         loop,
         batch.values,
@@ -191,20 +195,22 @@ def _made(
 
     def by_xla() -> Run:
         if not as_one:
-            return run_refilled(*given, enough)
-        return _flagged(_together(loop, batch, solver, objectives, trajectories), accepted)
+            return run_packed(*given, enough)
+        return _mark_refused(_run_vmapped(loop, batch, solver, objectives, trajectories), accepted)
 
-    why_not = TOGETHER if trajectories or together or (as_one and engine == "auto") else ""
-    return by_engine(engine, by_kernel, by_xla, why_not)
+    why_not = TOGETHER_REASON if trajectories or together or (as_one and engine == "auto") else ""
+    return run_with_engine(engine, by_kernel, by_xla, why_not)
 
 
-def _together(loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], trajectories: bool) -> Run:
+def _run_vmapped(
+    loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str, Objective], trajectories: bool
+) -> Run:
     """In groups of similar length, but trajectories have all the same instants."""
     every = solver.every if trajectories else 0
 
     def found(lanes: Any, duration: float) -> Run:
         like = dataclasses.replace(solver, duration=duration)
-        return batch.each(loop, lambda one, key: run_any(one, like, objectives, key, every), lanes)
+        return batch.each(loop, lambda one, key: run_unchecked(one, like, objectives, key, every), lanes)
 
     if trajectories or batch.durations is None:
         return found(None, solver.duration)
@@ -213,7 +219,7 @@ def _together(loop: Loop, batch: Batch, solver: Solver, objectives: Mapping[str,
     return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *(found(*group) for group in groups))
 
 
-def _flagged(run: Run, accepted: Any) -> Run:
+def _mark_refused(run: Run, accepted: Any) -> Run:
     """With lanes that are not accepted as refilled ones are."""
     if accepted is True:
         return run
@@ -223,7 +229,7 @@ def _flagged(run: Run, accepted: Any) -> Run:
     return run._replace(metrics=metrics, diverged=run.diverged | ~accepted, **flags)
 
 
-def by_structure(loops: Sequence[Any]) -> list[list[int]]:
+def group_by_structure(loops: Sequence[Any]) -> list[list[int]]:
     """Return the places of those loops that can be lanes of one batch: of equal structure and shapes."""
     groups: dict[Any, list[int]] = {}
     for place, loop in enumerate(map(arrayed, loops)):
@@ -231,10 +237,10 @@ def by_structure(loops: Sequence[Any]) -> list[list[int]]:
     return list(groups.values())
 
 
-def stacked(loops: Sequence[Any]) -> tuple[Any, Batch]:
+def stack_loops(loops: Sequence[Any]) -> tuple[Any, Batch]:
     """Return loops of one structure as lanes, for `run_batch`: the first of them, and every parameter of each (lanes,
-    ...). Raises ValueError for loops of different structures: see `by_structure`."""
-    if (kinds := len(by_structure(loops))) != 1:
+    ...). Raises ValueError for loops of different structures: see `group_by_structure`."""
+    if (kinds := len(group_by_structure(loops))) != 1:
         raise ValueError(f"loops of {kinds} structures are no lanes of one batch")
     each = [{path: value for path, _, value in parameters(loop)} for loop in loops]
     return loops[0], Batch({path: np.stack([np.asarray(one[path], float) for one in each]) for path in each[0]})

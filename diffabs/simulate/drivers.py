@@ -12,30 +12,30 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from diffabs.simulate.checkpoint import anyone, forgetful, repeated
+from diffabs.simulate.checkpoint import any_lane, rematerialise, repeat_step
 
 Carry = Any  # of whatever chooses the steps; it says whether it is `running`
 Step = Callable[..., Carry]  # of a carry, and of the instant to which it goes, `until`, where it is not the end
-BLOCK = 16  # steps between two questions whether anything still runs
+STEPS_PER_BLOCK = 16  # steps between two questions whether anything still runs
 
 
-def slots(count: int) -> int:
+def round_up_capacity(count: int) -> int:
     """Return the least number of at most four significant bits that is not less than `count`: up to an eighth more."""
     unit = 1 << max((count - 1).bit_length() - 4, 0)
     return -(-count // unit) * unit
 
 
-def until(step: Step, renew: Step, carry: Carry) -> Carry:
+def run_to_end(step: Step, renew: Step, carry: Carry) -> Carry:
     """Return the carry (one run, or a batch under `jax.vmap`) of a run that is over; `renew` is called once for a block
     of steps. Not for reverse mode."""
 
     def block(carry: Carry) -> Carry:
-        return jax.lax.scan(lambda carry, _: (step(carry), None), renew(carry), length=BLOCK)[0]
+        return jax.lax.scan(lambda carry, _: (step(carry), None), renew(carry), length=STEPS_PER_BLOCK)[0]
 
-    return jax.lax.while_loop(lambda carry: anyone(carry.running), block, carry)
+    return jax.lax.while_loop(lambda carry: any_lane(carry.running), block, carry)
 
 
-def watch(
+def run_with_trajectory(
     step: Step,
     renew: Step,
     before: Callable[[Carry, Any], Any],
@@ -56,18 +56,18 @@ def watch(
         def some(carry: Carry) -> Carry:
             return step(renew(carry), until=until)
 
-        carry = jax.lax.while_loop(lambda carry: anyone(before(carry, until)), some, at[0])
+        carry = jax.lax.while_loop(lambda carry: any_lane(before(carry, until)), some, at[0])
         return carry, jax.tree.map(lambda all, x: all.at[i].set(x), at[1], look(carry, until))
 
     return jax.lax.fori_loop(0, count, segment, (carry, seen))
 
 
-def scan(step: Step, carry: Carry, room: int) -> Carry:
+def scan_to_end(step: Step, carry: Carry, room: int) -> Carry:
     """Return the carry of a run that is over, after at most `room` tries; for derivatives."""
-    return repeated(step, carry, room, lambda carry: _on(carry.running))
+    return repeat_step(step, carry, room, lambda carry: _any_running(carry.running))
 
 
-def scan_and_watch(
+def scan_with_trajectory(
     step: Step,
     before: Callable[[Carry, Any], Any],
     look: Callable[[Carry, Any], Any],
@@ -83,16 +83,16 @@ def scan_and_watch(
         until = (i + 1) * every
 
         def on(carry: Carry) -> Any:
-            return _on(before(carry, until))
+            return _any_running(before(carry, until))
 
         def some(carry: Carry) -> Carry:
-            return repeated(lambda carry: step(carry, until=until), carry, room, on)
+            return repeat_step(lambda carry: step(carry, until=until), carry, room, on)
 
         carry = jax.lax.cond(i < count, some, lambda carry: carry, carry)
         return carry, look(carry, until)
 
-    return jax.lax.scan(forgetful(segment), carry, jnp.arange(instants))
+    return jax.lax.scan(rematerialise(segment), carry, jnp.arange(instants))
 
 
-def _on(running: Any) -> Any:
-    return anyone(jax.lax.stop_gradient(running))
+def _any_running(running: Any) -> Any:
+    return any_lane(jax.lax.stop_gradient(running))

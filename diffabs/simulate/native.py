@@ -2,7 +2,7 @@
 
 Starts and judgements are XLA's, as for every other run; what lies between, the step of a `FixedStep` or of `Adaptive`
 as it is, with everything in it that the parts have, is translated from its jaxpr (package `kernel`). A lane that has
-ended makes room for the next one, as on the belt of `refill`."""
+ended makes room for the next one, as in `packed`."""
 
 import operator
 from collections.abc import Mapping
@@ -20,17 +20,17 @@ from diffabs.core.tracing import asked, moving, pushed
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
-from diffabs.simulate.condition import Condition
-from diffabs.simulate.drivers import BLOCK
+from diffabs.simulate.condition import RunStatus
+from diffabs.simulate.drivers import STEPS_PER_BLOCK
 from diffabs.simulate.engine import check_process
-from diffabs.simulate.methods import AtPace
-from diffabs.simulate.outcome import judge
-from diffabs.simulate.pursuit import Pursuing, Pursuit
-from diffabs.simulate.refill import ROUND, Enough, by_lane
-from diffabs.simulate.run import arguments, refuse_derivative, without_derivatives
+from diffabs.simulate.methods import AdaptiveStepping
+from diffabs.simulate.packed import STEPS_PER_EXCHANGE, EarlyEnd, split_by_lane
+from diffabs.simulate.pursuit import LaggedReplay, LaggedReplayStepping
+from diffabs.simulate.result import finish_run
+from diffabs.simulate.run import forbid_derivatives, prepare_arguments, refuse_derivative
 from diffabs.simulate.solution import Run, Solver
 
-MOST = 1 << 17  # lanes that are started together: the carries of more would fill the memory
+MAX_LANES_PER_LAUNCH = 1 << 17  # lanes that are started together: the carries of more would fill the memory
 
 
 def run_native(
@@ -40,15 +40,15 @@ def run_native(
     solver: Solver,
     objectives: Mapping[str, Objective],
     accepted: Any,
-    enough: Enough | None = None,
+    enough: EarlyEnd | None = None,
 ) -> Run:
-    """Return what `refill.run_refilled` returns, to rounding; with derivatives, forward.
+    """Return what `packed.run_packed` returns, to rounding; with derivatives, forward.
 
     Raises Unsupported for a step that cannot be translated, NoCompiler where there is none, ValueError for what
     `measure` objects to."""
-    loop, objectives, method = arguments(loop, solver, objectives)
+    loop, objectives, method = prepare_arguments(loop, solver, objectives)
     values = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
-    values = {**values, **without_derivatives(loop, values)}
+    values = {**values, **forbid_derivatives(loop, values)}
     count = len(accepted)
     enough = jax.tree.map(jnp.asarray, enough)
     own = None if enough is None else jax.vmap(enough.own)(jnp.arange(count))
@@ -56,16 +56,21 @@ def run_native(
 
     def made(mine: Any) -> Run:
         given = loop, mine[0], dict(objectives), method, *mine[1:], enough
-        return _made(given) if traced(given) else _run(*given)  # a rule for derivatives takes longer than a short run
+        return (
+            _run_differentiable(given) if traced(given) else _run(*given)
+        )  # a rule for derivatives takes longer than a short run
 
-    if count <= MOST:
+    if count <= MAX_LANES_PER_LAUNCH:
         return made(lanes)
-    runs = [made(jax.tree.map(operator.itemgetter(slice(i, i + MOST)), lanes)) for i in range(0, count, MOST)]
+    runs = [
+        made(jax.tree.map(operator.itemgetter(slice(i, i + MAX_LANES_PER_LAUNCH)), lanes))
+        for i in range(0, count, MAX_LANES_PER_LAUNCH)
+    ]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *runs)
 
 
 @jax.custom_jvp
-def _made(given: Any) -> Run:
+def _run_differentiable(given: Any) -> Run:
     """The runs of (loop, values, objectives, method, keys, accepted), and what is enough of each, and when."""
     return _run(*given)
 
@@ -80,13 +85,17 @@ def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
     def run(given: Any) -> Run:
         loop, values, objectives, method, *rest = given
         loop = differentiated(loop, paths)
-        method = Pursuing(method.noted()) if isinstance(method, AtPace) else method.located()
+        method = (
+            LaggedReplayStepping(method.for_replay())
+            if isinstance(method, AdaptiveStepping)
+            else method.for_derivatives()
+        )
         return _run(loop, values, objectives, method, *rest)
 
     return pushed(run, primals, tangents)
 
 
-_made.defjvp(_rule, symbolic_zeros=True)
+_run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 
 @jax.jit
@@ -98,12 +107,12 @@ def _run(
     keys: Any,
     accepted: Any,
     own: Any,
-    enough: Enough | None,
+    enough: EarlyEnd | None,
 ) -> Run:
-    leaves, built = by_lane(loop, values, objectives)
+    leaves, built = split_by_lane(loop, values, objectives)
 
     def start(mine: Any, key: Any, accepted: Any) -> Any:
-        return _only(accepted, method.start(*built(mine), key))
+        return _stop_unaccepted(accepted, method.start(*built(mine), key))
 
     def running(lane: Any, carry: Any) -> Any:
         if enough is None:
@@ -112,7 +121,7 @@ def _run(
         return carry.running & ~enough.reached(lane[2], output)
 
     def judged(mine: Any, carry: Any) -> Run:
-        return judge(*built(mine), carry)[0]
+        return finish_run(*built(mine), carry)[0]
 
     begins = jax.vmap(start)(leaves, keys, accepted)
     carry = run_lanes(
@@ -121,22 +130,24 @@ def _run(
         running,
         (leaves, keys, own),
         begins,
-        steps=BLOCK,
-        rounds=1 if enough is None else ROUND // BLOCK,
+        steps=STEPS_PER_BLOCK,
+        rounds=1 if enough is None else STEPS_PER_EXCHANGE // STEPS_PER_BLOCK,
         wanted=moving(judged, leaves, begins),
     )
     return jax.vmap(judged)(leaves, carry)
 
 
-def _only(accepted: Any, carry: Any) -> Any:
+def _stop_unaccepted(accepted: Any, carry: Any) -> Any:
     """A carry that does not run if it is not accepted."""
-    if isinstance(carry, Pursuit):
-        return carry._replace(ahead=_only(accepted, carry.ahead))
-    condition = jnp.where(accepted, carry.condition, Condition.DIVERGED)
-    return carry._replace(condition=condition.astype(carry.condition.dtype))
+    if isinstance(carry, LaggedReplay):
+        return carry._replace(ahead=_stop_unaccepted(accepted, carry.ahead))
+    status = jnp.where(accepted, carry.status, RunStatus.DIVERGED)
+    return carry._replace(status=status.astype(carry.status.dtype))
 
 
-def objection(loop: Loop, values: Mapping[str, Any], solver: Solver, objectives: Mapping[str, Objective]) -> str | None:
+def kernel_objection(
+    loop: Loop, values: Mapping[str, Any], solver: Solver, objectives: Mapping[str, Objective]
+) -> str | None:
     """Return why these runs cannot be made by a kernel, or None: an operation of a part that has no translation, no
     compiler on this machine, numbers that are not known yet.
 
@@ -146,7 +157,7 @@ def objection(loop: Loop, values: Mapping[str, Any], solver: Solver, objectives:
     check_process()
     if traced(loop, dict(values), dict(objectives)):
         return "this is traced; ask with numbers"
-    checked, measured, method = arguments(loop, solver, objectives)
+    checked, measured, method = prepare_arguments(loop, solver, objectives)
     columns = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     count = len(next(iter(columns.values())))
     keys = jax.vmap(jax.random.key)(jnp.arange(count))

@@ -11,18 +11,18 @@ from typing import Any, NamedTuple
 import jax
 
 from diffabs.core.loop import Loop
-from diffabs.simulate.checkpoint import anyone
+from diffabs.simulate.checkpoint import any_lane
 from diffabs.simulate.dynamics import Objectives
-from diffabs.simulate.methods import AtPace
-from diffabs.simulate.replay import Place, noted, place_at_start, repeat_try
-from diffabs.simulate.tries import Carry
+from diffabs.simulate.methods import AdaptiveStepping
+from diffabs.simulate.replay import ReplayState, log_attempt, replay_attempt, start_replay
+from diffabs.simulate.tries import AdaptiveCarry
 
 
-class Pursuit(NamedTuple):
+class LaggedReplay(NamedTuple):
     """A run on its way, ahead, and where its repetition is."""
 
-    ahead: Carry
-    point: Place
+    ahead: AdaptiveCarry
+    point: ReplayState
 
     @property
     def running(self) -> Any:
@@ -30,39 +30,41 @@ class Pursuit(NamedTuple):
         return self.ahead.running
 
     @property
-    def condition(self) -> Any:
+    def status(self) -> Any:
         """That of the run ahead."""
-        return self.ahead.condition
+        return self.ahead.status
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["pace"], meta_fields=[])
 @dataclasses.dataclass(frozen=True)
-class Pursuing:
+class LaggedReplayStepping:
     """The steps of `Adaptive` as they are differentiated, forward; `pace` is that of a run that is noted."""
 
-    pace: AtPace
+    pace: AdaptiveStepping
 
-    def start(self, loop: Loop, objectives: Objectives, key: Any) -> Pursuit:
+    def start(self, loop: Loop, objectives: Objectives, key: Any) -> LaggedReplay:
         """Return the carry at t = 0."""
-        ahead = self.pace.start(_still(loop), _still(objectives), key)
-        return Pursuit(ahead, place_at_start(loop, objectives, self.pace, key))
+        ahead = self.pace.start(_stop_gradients(loop), _stop_gradients(objectives), key)
+        return LaggedReplay(ahead, start_replay(loop, objectives, self.pace, key))
 
-    def step(self, loop: Loop, objectives: Objectives, key: Any, carry: Pursuit) -> Pursuit:
+    def step(self, loop: Loop, objectives: Objectives, key: Any, carry: LaggedReplay) -> LaggedReplay:
         """Return the carry after one try of the run ahead, which is repeated if it led on."""
-        old = _still(carry.ahead)
-        new = _still(self.pace.step(_still(loop), _still(objectives), key, old))
-        note = noted(old, new)
+        old = _stop_gradients(carry.ahead)
+        new = _stop_gradients(self.pace.step(_stop_gradients(loop), _stop_gradients(objectives), key, old))
+        note = log_attempt(old, new)
 
-        def repeated() -> Place:
-            return repeat_try(loop, objectives, self.pace, key, carry.point, note)[0]
+        def repeated() -> ReplayState:
+            return replay_attempt(loop, objectives, self.pace, key, carry.point, note)[0]
 
-        return Pursuit(new, jax.lax.cond(anyone(note.moved), repeated, lambda: carry.point))
+        return LaggedReplay(new, jax.lax.cond(any_lane(note.moved), repeated, lambda: carry.point))
 
-    def renew(self, loop: Loop, carry: Pursuit) -> Pursuit:
+    def renew(self, loop: Loop, carry: LaggedReplay) -> LaggedReplay:
         """Return the carry with the longest stable step, if that was not looked at for a while."""
-        return carry._replace(ahead=_still(self.pace.renew(_still(loop), _still(carry.ahead))))
+        return carry._replace(
+            ahead=_stop_gradients(self.pace.renew(_stop_gradients(loop), _stop_gradients(carry.ahead)))
+        )
 
 
-def _still(tree: Any) -> Any:
+def _stop_gradients(tree: Any) -> Any:
     """Without derivatives."""
     return jax.tree.map(jax.lax.stop_gradient, tree)

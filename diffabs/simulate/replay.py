@@ -17,29 +17,41 @@ import jax.numpy as jnp
 from diffabs.core.blocks import Passage
 from diffabs.core.log import lend, tables, written
 from diffabs.core.loop import Loop, LoopState, Margins
+from diffabs.core.modes import Mode, ModeBits
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Clock, Memory, Segment, Shown
-from diffabs.core.regime import Regime, Words
-from diffabs.simulate.adaptive import passed
-from diffabs.simulate.advance import start
-from diffabs.simulate.checkpoint import anyone, forgetful
-from diffabs.simulate.condition import Condition, goes_on
-from diffabs.simulate.drivers import BLOCK
-from diffabs.simulate.dynamics import Ahead, Dynamics, Objectives, Tally, dynamics, parted
+from diffabs.simulate.adaptive import build_passages
+from diffabs.simulate.advance import start_state
+from diffabs.simulate.checkpoint import any_lane, rematerialise
+from diffabs.simulate.condition import RunStatus, is_running
+from diffabs.simulate.drivers import STEPS_PER_BLOCK
+from diffabs.simulate.dynamics import (
+    Accumulators,
+    Dynamics,
+    LoopEvaluationWithRates,
+    Objectives,
+    build_dynamics,
+    split_flow_and_held,
+)
 from diffabs.simulate.landing import select
-from diffabs.simulate.methods import AtPace
-from diffabs.simulate.outcome import observe
-from diffabs.simulate.solution import ORDER, Adaptive, Trajectory
-from diffabs.simulate.span import Span
-from diffabs.simulate.stepper import typed
-from diffabs.simulate.tries import Carry
+from diffabs.simulate.methods import AdaptiveStepping
+from diffabs.simulate.result import observe
+from diffabs.simulate.solution import ADAPTIVE_ERROR_ORDER, Adaptive, Trajectory
+from diffabs.simulate.span import HermiteStep
+from diffabs.simulate.stepper import cast_floats
+from diffabs.simulate.tries import AdaptiveCarry
 from diffabs.simulate.tsit5 import tsit5_step_from
 
-MOST, TICKED = 4096, 2  # tries that can be noted at an error of 1e-5, and for each instant of a grid with clocks
-NEAR = 1e-3  # of the try in which it was seen: no event or comparison at the end of a step is so far from its zero
+BASE_LOG_CAPACITY, LOG_CAPACITY_PER_TICK = (
+    4096,
+    2,
+)  # tries that can be noted at an error of 1e-5, and for each instant of a grid with clocks
+MAX_SHIFT_FRACTION = (
+    1e-3  # of the try in which it was seen: no event or comparison at the end of a step is so far from its zero
+)
 
 
-class Notes(NamedTuple):
+class StepLog(NamedTuple):
     """Of every try, in blocks (blocks, BLOCK, ...): whether it led on; the time at its end and its length; the length
     of the first try from there; the number of the instant of the grid at which a clock has struck last; a bit for each
     event at its end; its regime, and whether that did not count; the number of the comparison that changes at its end,
@@ -50,70 +62,76 @@ class Notes(NamedTuple):
     length: Any
     base: Any
     k: Any
-    fired: Any
-    words: Words
-    blunt: Any
+    triggered: Any
+    words: ModeBits
+    unrestricted: Any
     lands: Any
 
 
-class Place(NamedTuple):
+class ReplayState(NamedTuple):
     """A run on its way: time, how much later that is than its noted one, state, accumulators, and the number of the
     clock's last instant."""
 
     t: Any
     late: Any
     state: LoopState
-    tally: Tally
+    accumulators: Accumulators
     k: Any
 
 
-class Recorded(NamedTuple):
+class RecordedSignals(NamedTuple):
     """What blocks record at an instant, and its rates."""
 
     t: Any
     recorded: tuple[dict[str, Any], dict[str, Any]]
 
 
-class Repeated(NamedTuple):
+class ReplayedRun(NamedTuple):
     """A run that is over, as a judge sees it."""
 
-    point: Place
-    condition: Any
+    point: ReplayState
+    status: Any
 
-    running = property(goes_on)  # never
+    running = property(is_running)  # never
 
 
-def room(loop: Loop, solver: Adaptive) -> int:
+def log_capacity(loop: Loop, solver: Adaptive) -> int:
     """Return for how many tries there is room in the notes of a run."""
-    return math.ceil(MOST * max(1.0, 1e-5 / solver.rtol) ** (1 / ORDER)) + (TICKED * solver.steps if loop.ticks else 0)
+    return math.ceil(BASE_LOG_CAPACITY * max(1.0, 1e-5 / solver.rtol) ** (1 / ADAPTIVE_ERROR_ORDER)) + (
+        LOG_CAPACITY_PER_TICK * solver.steps if loop.ticks else 0
+    )
 
 
-def noted(old: Carry, new: Carry) -> Notes:
+def log_attempt(old: AdaptiveCarry, new: AdaptiveCarry) -> StepLog:
     """Return the notes of one try, between these carries."""
-    moved = (new.point.t > old.point.t) | (new.fired != 0)
-    landed = (old.condition == Condition.LANDING) & (new.fired == 0)
+    moved = (new.point.t > old.point.t) | (new.triggered != 0)
+    landed = (old.status == RunStatus.LANDING) & (new.triggered == 0)
     lands = jnp.where(landed, old.search.which, -1)
-    return Notes(moved, new.point.t, old.length, old.base, new.k, new.fired, old.point.words, old.blunt, lands)
+    return StepLog(
+        moved, new.point.t, old.length, old.base, new.k, new.triggered, old.point.words, old.unrestricted, lands
+    )
 
 
-def note(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, tries: int) -> tuple[Notes, Any]:
+def log_steps(
+    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, tries: int
+) -> tuple[StepLog, Any]:
     """Return the notes of a run, with room for so many tries, and how it ended: it has diverged if it took more."""
 
-    def one(carry: Carry, _: Any) -> tuple[Carry, Notes]:
-        new = pace.step(loop, objectives, key, carry)
-        return new, noted(carry, new)
+    def one(carry: AdaptiveCarry, _: Any) -> tuple[AdaptiveCarry, StepLog]:
+        new = stepping.step(loop, objectives, key, carry)
+        return new, log_attempt(carry, new)
 
-    def some(carry: Carry) -> tuple[Carry, Notes]:
-        return jax.lax.scan(one, pace.renew(loop, carry), length=BLOCK)
+    def some(carry: AdaptiveCarry) -> tuple[AdaptiveCarry, StepLog]:
+        return jax.lax.scan(one, stepping.renew(loop, carry), length=STEPS_PER_BLOCK)
 
-    carry = pace.start(loop, objectives, key)
-    carry, notes = _skipping(some, lambda carry, _: carry.running, carry, None, -(-tries // BLOCK))
+    carry = stepping.start(loop, objectives, key)
+    carry, notes = _scan_active(some, lambda carry, _: carry.running, carry, None, -(-tries // STEPS_PER_BLOCK))
 
     notes = jax.tree.map(jax.lax.stop_gradient, notes)
-    return notes, jnp.where(carry.running, Condition.DIVERGED, carry.condition)
+    return notes, jnp.where(carry.running, RunStatus.DIVERGED, carry.status)
 
 
-def _skipping(work: Any, on: Any, carry: Any, xs: Any, length: int | None = None, reverse: bool = False) -> Any:
+def _scan_active(work: Any, on: Any, carry: Any, xs: Any, length: int | None = None, reverse: bool = False) -> Any:
     """A scan of work(carry) or, with xs, work(carry, x), which is skipped where no lane of a batch is on(carry, x):
     it leaves zeros there."""
 
@@ -124,141 +142,157 @@ def _skipping(work: Any, on: Any, carry: Any, xs: Any, length: int | None = None
         def skip() -> tuple[Any, Any]:
             return carry, jax.tree.map(lambda y: jnp.zeros(y.shape, y.dtype), jax.eval_shape(run)[1])
 
-        return jax.lax.cond(anyone(on(carry, x)), run, skip)
+        return jax.lax.cond(any_lane(on(carry, x)), run, skip)
 
     return jax.lax.scan(body, carry, xs, length=length, reverse=reverse)
 
 
-def repeat(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes: Notes, condition: Any) -> Repeated:
+def replay_run(
+    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, notes: StepLog, status: Any
+) -> ReplayedRun:
     """Return the run of these notes once more, which can be differentiated in every leaf of loop and objectives."""
-    return Repeated(_repeated(loop, objectives, pace, key, notes)[0], condition)
+    return ReplayedRun(_replay_steps(loop, objectives, stepping, key, notes)[0], status)
 
 
-def repeat_and_watch(
-    loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes: Notes, condition: Any, instants: Any
-) -> tuple[Repeated, Trajectory, Trajectory]:
+def replay_with_trajectory(
+    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, notes: StepLog, status: Any, instants: Any
+) -> tuple[ReplayedRun, Trajectory, Trajectory]:
     """Return the same run, what is seen at its beginning, and what at these instants (n,) of the grid: by the cubics of
     its steps."""
-    last, spans = _repeated(loop, objectives, pace, key, notes)
+    last, spans = _replay_steps(loop, objectives, stepping, key, notes)
     # What was skipped is zero, and comes after the end.
     starts = jnp.where(jnp.any(notes.moved, axis=1)[:, None], jax.lax.stop_gradient(spans.t), jnp.inf)
     spans = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), spans)
 
     def seen(instant: Any) -> Trajectory:
-        t = instant * pace.h
+        t = instant * stepping.h
         place = jnp.searchsorted(starts.ravel(), t, side="right") - 1
         span = jax.tree.map(lambda x: x[place], spans)
         return observe(loop, t, span.at(t), t < jax.lax.stop_gradient(last.t))
 
-    first = observe(loop, 0.0 * pace.h, jax.tree.map(lambda x: x[0], spans.state), jnp.asarray(True))
-    return Repeated(last, condition), first, jax.vmap(seen)(instants)
+    first = observe(loop, 0.0 * stepping.h, jax.tree.map(lambda x: x[0], spans.state), jnp.asarray(True))
+    return ReplayedRun(last, status), first, jax.vmap(seen)(instants)
 
 
-def _repeated(loop: Loop, objectives: Objectives, pace: AtPace, key: Any, notes: Notes) -> tuple[Place, Any]:
-    """The end of the run, and the `Span` of every try, where they are kept."""
-    begun = place_at_start(loop, objectives, pace, key)
+def _replay_steps(
+    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, notes: StepLog
+) -> tuple[ReplayState, Any]:
+    """The end of the run, and the `HermiteStep` of every try, where they are kept."""
+    begun = start_replay(loop, objectives, stepping, key)
 
-    def step(place: Place, one: Notes) -> tuple[Place, Any]:
-        return repeat_try(loop, objectives, pace, key, place, one)
+    def step(place: ReplayState, one: StepLog) -> tuple[ReplayState, Any]:
+        return replay_attempt(loop, objectives, stepping, key, place, one)
 
-    @forgetful
-    def block(place: Place, some: Notes) -> tuple[Place, Any]:
-        return jax.lax.scan(forgetful(step), place, some)
+    @rematerialise
+    def block(place: ReplayState, some: StepLog) -> tuple[ReplayState, Any]:
+        return jax.lax.scan(rematerialise(step), place, some)
 
-    return _skipping(block, lambda _, some: jnp.any(some.moved), begun, notes)
+    return _scan_active(block, lambda _, some: jnp.any(some.moved), begun, notes)
 
 
-def place_at_start(loop: Loop, objectives: Objectives, pace: AtPace, key: Any) -> Place:
+def start_replay(loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any) -> ReplayState:
     """Return where a run begins."""
-    zero = 0.0 * pace.h
-    state, tally = start(loop, objectives, Clock(zero, pace.h, 0, key))
-    return typed(Place(zero, zero, lend(state, tables(state)), tally, jnp.asarray(0)), pace.h.dtype)
+    zero = 0.0 * stepping.h
+    state, accumulators = start_state(loop, objectives, Clock(zero, stepping.h, 0, key))
+    return cast_floats(
+        ReplayState(zero, zero, lend(state, tables(state)), accumulators, jnp.asarray(0)), stepping.h.dtype
+    )
 
 
-def repeat_try(
-    loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes
-) -> tuple[Place, Any]:
-    """Return where a try leads, if it led on; its `Span`, where they are kept."""
+def replay_attempt(
+    loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, place: ReplayState, one: StepLog
+) -> tuple[ReplayState, Any]:
+    """Return where a try leads, if it led on; its `HermiteStep`, where they are kept."""
     logs, place = written(place.state), place._replace(state=lend(place.state, None))
-    new, span = _step(loop, objectives, pace, key, place, one, logs)
+    new, span = _step(loop, objectives, stepping, key, place, one, logs)
     place = select(one.moved, new, place)
     return place._replace(state=lend(place.state, logs)), span
 
 
 def _step(
-    loop: Loop, objectives: Objectives, pace: AtPace, key: Any, place: Place, one: Notes, logs: list[Any]
-) -> tuple[Place, Any]:
-    """One step within its regime, and what happens at its end; its `Span`, where they are kept. The rows of the logs,
-    which the state is without."""
-    system = dynamics(loop, objectives, place.t, place.state, place.tally, kinks=True)
-    within, h = Regime(one.words, one.blunt), one.length - place.late
-    begin = system.ahead(place.t, place.state, place.tally, within)
-    z, held = parted(place.state, place.tally)
+    loop: Loop,
+    objectives: Objectives,
+    stepping: AdaptiveStepping,
+    key: Any,
+    place: ReplayState,
+    one: StepLog,
+    logs: list[Any],
+) -> tuple[ReplayState, Any]:
+    """Return where one step leads, within its mode and with what happens at its end; and its `HermiteStep`, where these
+    are kept. `logs` are the rows of the logs, which the state is without."""
+    system = build_dynamics(loop, objectives, place.t, place.state, place.accumulators, kinks=True)
+    within, h = Mode(one.words, one.unrestricted), one.length - place.late
+    begin = system.ahead(place.t, place.state, place.accumulators, within)
+    z, held = split_flow_and_held(place.state, place.accumulators)
 
-    def flow(t: Any, z: Any, given: tuple[Any, Regime]) -> Any:
+    def flow(t: Any, z: Any, given: tuple[Any, Mode]) -> Any:
         return system.rates(t, z, *given)
 
     z = tsit5_step_from(flow, place.t, z, begin.seen[:2], h, (held, within))
     noted_end = system.ahead(one.t, *_with_flow(place, z), within)
-    strikes = (one.k != place.k) & (one.k < pace.steps)
+    strikes = (one.k != place.k) & (one.k < stepping.steps)
     shift = _shift(noted_end, one, one.k != place.k)
     t = one.t + shift
     z = axpy(shift, noted_end.seen[:2], z)
-    state, tally = _with_flow(place, z)
-    end = system.ahead(t, state, tally, within)  # rates, too, are those of the shifted end
+    state, accumulators = _with_flow(place, z)
+    end = system.ahead(t, state, accumulators, within)  # rates, too, are those of the shifted end
     state = state._replace(plant=loop.plant.project(state.plant))
     sample = end.seen.signals.sample
     segment = Segment(
         begin.seen.signals.sample,
         sample,
         h + shift,
-        pace.h,
+        stepping.h,
         lambda: (Shown.of(begin.moving), Shown.of(end.moving)),
         lambda: (begin.moving, end.moving),
         smooth=True,
-        within=(True, ~one.blunt),
+        within=(True, ~one.unrestricted),
     )
-    tally = {name: Memory(tally[name].flow, o.update(tally[name], segment)) for name, o in objectives.items()}
-    ends = (t, state.flow(), end.seen.rate) if pace.keeps else ()
-    span = Span(place.t, place.state, begin.seen.rate, *ends) if pace.keeps else ()
+    accumulators = {
+        name: Memory(accumulators[name].flow, o.update(accumulators[name], segment)) for name, o in objectives.items()
+    }
+    ends = (t, state.flow(), end.seen.rate) if stepping.keeps else ()
+    span = HermiteStep(place.t, place.state, begin.seen.rate, *ends) if stepping.keeps else ()
     if loop.changes:
         ends = (begin.seen.signals.recorded, begin.recorded), (end.seen.signals.recorded, end.recorded)
-        step = passed(*(Recorded(*both) for both in zip((place.t, t), ends, strict=True)))
-        clock, state = Clock(t, pace.h, one.k, key, strikes), lend(state, logs)
-        state = lend(_changed(system, clock, state, end.seen.margins, one.fired, step), None)
-    return Place(t, shift, state, tally, one.k), span
+        step = build_passages(*(RecordedSignals(*both) for both in zip((place.t, t), ends, strict=True)))
+        clock, state = Clock(t, stepping.h, one.k, key, strikes), lend(state, logs)
+        state = lend(_commit_changes(system, clock, state, end.seen.margins, one.triggered, step), None)
+    return ReplayState(t, shift, state, accumulators, one.k), span
 
 
-def _with_flow(place: Place, z: Any) -> tuple[LoopState, Tally]:
+def _with_flow(place: ReplayState, z: Any) -> tuple[LoopState, Accumulators]:
     """State and accumulators with other continuous memories, not projected: a projection may end at a comparison."""
-    return place.state.with_flow(z[0]), {name: memory._replace(flow=z[1][name]) for name, memory in place.tally.items()}
+    return place.state.with_flow(z[0]), {
+        name: memory._replace(flow=z[1][name]) for name, memory in place.accumulators.items()
+    }
 
 
-def _shift(end: Ahead, one: Notes, strikes: Any) -> Any:
+def _shift(end: LoopEvaluationWithRates, one: StepLog, strikes: Any) -> Any:
     """How much later [s] than its noted end a step has come to its event, or to the comparison that changes there; 0
     where there is none, or a clock decides."""
-    shift, most = jnp.zeros_like(one.length), NEAR * one.base
+    shift, most = jnp.zeros_like(one.length), MAX_SHIFT_FRACTION * one.base
     for comparison in end.comparisons:
         on = comparison.numbers == one.lands
         each = (jnp.ravel(jnp.asarray(x)) for x in (on, comparison.value, comparison.rate))
         for which, margin, rate in zip(*each, strict=True):
-            close, later = _until(which, margin, rate, most)
+            close, later = _time_to_zero(which, margin, rate, most)
             shift = jnp.where(close, later, shift)
     shift = jnp.where(strikes, 0.0, shift)
     events = zip(jax.tree.leaves(end.seen.margins), jax.tree.leaves(end.falls), strict=True)
     for i, (margin, fall) in reversed(list(enumerate(events))):
-        close, later = _until(one.fired & (1 << i) != 0, margin, fall, most)
+        close, later = _time_to_zero(one.triggered & (1 << i) != 0, margin, fall, most)
         shift = jnp.where(close, later, shift)
     return shift
 
 
-def _until(on: Any, margin: Any, fall: Any, most: Any) -> tuple[Any, Any]:
+def _time_to_zero(on: Any, margin: Any, fall: Any, most: Any) -> tuple[Any, Any]:
     """Whether a margin is zero within so many seconds, and in how many."""
     close = on & (jnp.abs(margin) < jnp.abs(jax.lax.stop_gradient(most) * fall))
     return close, -margin / jax.lax.stop_gradient(jnp.where(close, fall, 1.0))  # the margin is 0, but for rounding
 
 
-def _changed(
+def _commit_changes(
     system: Dynamics, clock: Clock, state: LoopState, margins: Margins, fired: Any, step: dict[str, Passage]
 ) -> LoopState:
     """The state after the events and the ticks at the end of a step."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from diffabs.core.numerics import axpy
 from diffabs.core.pytree import Scalar
 from diffabs.core.tracing import pushed
-from diffabs.simulate.checkpoint import forgetful
+from diffabs.simulate.checkpoint import rematerialise
 
 X = TypeVar("X")
 
@@ -26,7 +26,7 @@ def rk4_step(derivative: Callable[[Scalar, X], X], t: Scalar, x: X, h: Scalar) -
 
     Local error O(h^5). On dx/dt = lambda x it is stable where |1 + z + z^2/2 + z^3/6 + z^4/24| <= 1, z = h lambda.
     """
-    return _written_out(derivative, t, x, derivative(t, x), h)
+    return _unrolled_step(derivative, t, x, derivative(t, x), h)
 
 
 def rk4_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, rate: X, h: Scalar, given: Any) -> X:
@@ -41,7 +41,7 @@ def rk4_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, ra
     return _step(derivative, t, x, rate, h, (given, *constants))
 
 
-def _written_out(f: Any, t: Any, x: Any, rate: Any, h: Any) -> Any:
+def _unrolled_step(f: Any, t: Any, x: Any, rate: Any, h: Any) -> Any:
     total = rate
     for place, weight in STAGES:
         rate, total = _stage(f, t, x, h, rate, total, place, weight)
@@ -50,7 +50,7 @@ def _written_out(f: Any, t: Any, x: Any, rate: Any, h: Any) -> Any:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _step(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
-    return _written_out(lambda t, x: f(t, x, *constants), t, x, rate, h)
+    return _unrolled_step(lambda t, x: f(t, x, *constants), t, x, rate, h)
 
 
 def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
@@ -58,7 +58,9 @@ def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
         rates = _stage(lambda t, x: f(t, x, *constants), t, x, h, *carry, *at)
         return jax.tree.map(lambda rate, zero: jnp.asarray(rate, zero.dtype), rates, carry), None
 
-    (rate, total), _ = jax.lax.scan(forgetful(stage), (rate, rate), tuple(jnp.asarray(STAGES, jnp.result_type(h)).T))
+    (rate, total), _ = jax.lax.scan(
+        rematerialise(stage), (rate, rate), tuple(jnp.asarray(STAGES, jnp.result_type(h)).T)
+    )
     return axpy(h / 6, total, x)
 
 

@@ -20,15 +20,21 @@ from diffabs.core.pytree import arrayed, differentiated, parameters, replace, st
 from diffabs.core.tracing import asked, pushed
 from diffabs.core.validity import broken, misshapen, rules
 from diffabs.objectives import Variation
-from diffabs.simulate.drivers import scan, scan_and_watch, slots, until, watch
-from diffabs.simulate.methods import AtPace, method_of
-from diffabs.simulate.outcome import judge, prepare
-from diffabs.simulate.refusals import impossible
-from diffabs.simulate.replay import note, repeat, repeat_and_watch, room
+from diffabs.simulate.admissible import find_impossible_values
+from diffabs.simulate.drivers import (
+    round_up_capacity,
+    run_to_end,
+    run_with_trajectory,
+    scan_to_end,
+    scan_with_trajectory,
+)
+from diffabs.simulate.methods import AdaptiveStepping, build_stepping
+from diffabs.simulate.replay import log_capacity, log_steps, replay_run, replay_with_trajectory
+from diffabs.simulate.result import finish_run, prepare
 from diffabs.simulate.solution import Adaptive, Run, Solver, Trajectory
 
-MEASURES = ("start", "flow", "update", "value")  # methods of an objective
-MOST_STEPS = 2**31 - 8  # that a counter in 32 bits holds, landing included
+OBJECTIVE_METHODS = ("start", "flow", "update", "value")  # methods of an objective
+MAX_COUNTED_STEPS = 2**31 - 8  # that a counter in 32 bits holds, landing included
 
 
 def rollout(loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | None = None, *, key: Any = None) -> Run:
@@ -53,7 +59,7 @@ def rollout(loop: Loop, solver: Solver, objectives: Mapping[str, Objective] | No
     """
     objectives = objectives or {}
     refuse_values(loop, solver, objectives)
-    return run_any(loop, solver, objectives, key, solver.every)
+    return run_unchecked(loop, solver, objectives, key, solver.every)
 
 
 def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, key: Any = None) -> Run:
@@ -68,24 +74,24 @@ def measure(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], *, 
     43.85 m
     """
     refuse_values(loop, solver, objectives)
-    return run_any(loop, solver, objectives, key, 0)
+    return run_unchecked(loop, solver, objectives, key, 0)
 
 
-def run_any(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
+def run_unchecked(loop: Loop, solver: Solver, objectives: Mapping[str, Objective], key: Any, every: int) -> Run:
     """Return a run, with a trajectory of one in `every` instants, or without for 0. The values of the parameters may be
     impossible; then it has diverged."""
-    loop, objectives, method = arguments(loop, solver, objectives)
+    loop, objectives, method = prepare_arguments(loop, solver, objectives)
     steps, every = solver.steps, int(every)
     count = -(-steps // every) if every else 0
-    between = min(every, steps) if every else slots(steps)
-    tries = room(loop, solver) if isinstance(solver, Adaptive) else method.room(loop, between)
-    method = method.watched() if every else method
-    places = Places(tries, slots(count) if every else 0, every)
-    run = _simulated(places, (loop, objectives, method, key))
-    return run._replace(trajectory=_shortened(run.trajectory, count + 1)) if every else run
+    between = min(every, steps) if every else round_up_capacity(steps)
+    tries = log_capacity(loop, solver) if isinstance(solver, Adaptive) else method.room(loop, between)
+    method = method.with_trajectory() if every else method
+    places = RunCapacity(tries, round_up_capacity(count) if every else 0, every)
+    run = _run_differentiable(places, (loop, objectives, method, key))
+    return run._replace(trajectory=_truncate_trajectory(run.trajectory, count + 1)) if every else run
 
 
-class Places(NamedTuple):
+class RunCapacity(NamedTuple):
     """What is known when a program is compiled: places for so many tries (between two instants of a trajectory, if
     there is one), and for so many instants, one in every so many steps."""
 
@@ -95,20 +101,20 @@ class Places(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=1)
-def _shortened(trajectory: Any, count: int) -> Any:
+def _truncate_trajectory(trajectory: Any, count: int) -> Any:
     return jax.tree.map(lambda x: x[:count], trajectory)
 
 
-def arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
+def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
     """Loop, objectives, and what chooses the steps, of one data type. Raises ValueError."""
     refuse(loop, solver, objectives)
     loop, objectives = strong((arrayed(loop), {name: arrayed(part) for name, part in objectives.items()}))
     if traced(loop):
-        loop = replace(loop, without_derivatives(loop, {path: value for path, _, value in parameters(loop)}))
-    return loop, objectives, method_of(solver, jax.tree.leaves(loop)[0].dtype)
+        loop = replace(loop, forbid_derivatives(loop, {path: value for path, _, value in parameters(loop)}))
+    return loop, objectives, build_stepping(solver, jax.tree.leaves(loop)[0].dtype)
 
 
-def without_derivatives(loop: Loop, values: Mapping[str, Any]) -> dict[str, Any]:
+def forbid_derivatives(loop: Loop, values: Mapping[str, Any]) -> dict[str, Any]:
     """Return those of the values, by path of the loop, on which a run does not depend smoothly. Whoever
     differentiates by them gets a ValueError."""
     coarse = {path for path, spec, _ in parameters(loop) if not spec.tunable}
@@ -117,12 +123,14 @@ def without_derivatives(loop: Loop, values: Mapping[str, Any]) -> dict[str, Any]
 
 def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
     """Raise ValueError for what is no run, whatever its numbers are."""
-    lines = [*_wrong_solver(solver), *misshapen(loop)]
+    lines = [*_find_solver_faults(solver), *misshapen(loop)]
     for name, part in objectives.items():
-        if all(callable(getattr(part, method, None)) for method in MEASURES):
+        if all(callable(getattr(part, method, None)) for method in OBJECTIVE_METHODS):
             lines += misshapen(part, f"objectives.{name}.")
         else:
-            lines.append(f"objectives.{name} = {kinds.shown(part)} is no objective: it needs {', '.join(MEASURES)}")
+            lines.append(
+                f"objectives.{name} = {kinds.shown(part)} is no objective: it needs {', '.join(OBJECTIVE_METHODS)}"
+            )
     if lines:
         raise ValueError("; ".join(lines))
 
@@ -132,25 +140,25 @@ def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective
     refuse(loop, solver, objectives)
     if traced(loop, dict(objectives)):
         return
-    lines = impossible(loop, solver.step)
+    lines = find_impossible_values(loop, solver.step)
     lines += [line for name, part in objectives.items() for line in broken(rules(part, f"objectives.{name}."))]
     if lines:
         raise ValueError("; ".join(lines))
 
 
-def _wrong_solver(solver: Solver) -> Iterator[str]:
+def _find_solver_faults(solver: Solver) -> Iterator[str]:
     """One line for each field that no run can have."""
     names = ["step", "duration", "every", *(["rtol"] if isinstance(solver, Adaptive) else [])]
-    lines = [f"solver.{name} {line}" for name in names if (line := _wrong_number(solver, name))]
+    lines = [f"solver.{name} {line}" for name in names if (line := _find_number_fault(solver, name))]
     if lines:
         yield from lines
     elif solver.step > solver.duration:
         yield f"solver.step = {solver.step} s is longer than solver.duration = {solver.duration} s"
-    elif solver.duration / solver.step > MOST_STEPS:
-        yield f"solver.step = {solver.step} s takes more than {MOST_STEPS} steps of {solver.duration} s"
+    elif solver.duration / solver.step > MAX_COUNTED_STEPS:
+        yield f"solver.step = {solver.step} s takes more than {MAX_COUNTED_STEPS} steps of {solver.duration} s"
 
 
-def _wrong_number(solver: Solver, name: str) -> str:
+def _find_number_fault(solver: Solver, name: str) -> str:
     value = getattr(solver, name)
     if line := kinds.objection(value) or (kinds.shape(value) and f"has shape {kinds.shape(value)}"):
         return f"= {kinds.shown(value)} {line}; a number is needed"
@@ -160,26 +168,26 @@ def _wrong_number(solver: Solver, name: str) -> str:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _simulated(places: Places, run: Any) -> Run:
+def _run_differentiable(places: RunCapacity, run: Any) -> Run:
     """The run of (loop, objectives, method, key)."""
     loop, objectives, method, key = run
     return _run(loop, objectives, method, key, jax.device_put(places.every), places=places.instants)
 
 
-def _rule(places: Places, primals: Any, tangents: Any) -> tuple[Any, Any]:
+def _rule(places: RunCapacity, primals: Any, tangents: Any) -> tuple[Any, Any]:
     loop, objectives, method, _ = primals[0]
     refuse_derivative(loop, objectives, method)
     paths = asked(tangents[0][0])
 
     def reversible(run: Any) -> Run:
-        return _reversible(differentiated(run[0], paths), *run[1:], places=places)
+        return _run_reversible(differentiated(run[0], paths), *run[1:], places=places)
 
-    return pushed(reversible, primals, tangents, once=_only_once(loop, method))
+    return pushed(reversible, primals, tangents, once=_second_derivative_objection(loop, method))
 
 
 def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: Any) -> None:
     """Raise ValueError for a run whose derivatives would be wrong."""
-    if isinstance(method, AtPace) and loop.recorders:
+    if isinstance(method, AdaptiveStepping) and loop.recorders:
         # A repeated run sees bends of the delayed command, to rounding, elsewhere than the run that it repeats.
         names = [name for name, one in objectives.items() if isinstance(one, Variation)]
         if names:
@@ -189,66 +197,70 @@ def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: A
             )
 
 
-def _only_once(loop: Loop, method: Any) -> str:
+def _second_derivative_objection(loop: Loop, method: Any) -> str:
     """Why a run has no second derivatives; nothing where it has."""
-    if isinstance(method, AtPace):
+    if isinstance(method, AdaptiveStepping):
         return "runs with adaptive steps have no second derivatives; d.FixedStep has"
     if loop.recorders:
         return "runs with a pure delay have no second derivatives; controllers.Sampled(delay=) and actuators.Lag have"
     return ""
 
 
-_simulated.defjvp(_rule, symbolic_zeros=True)
+_run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 
 @compile_once(static=("places",), options=SAME)
 def _run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, every: Any, *, places: int) -> Run:
     """For values: `places` for a trajectory, 0 without."""
-    loop, objectives, stepped = _prepared(loop, objectives, method, key)
+    loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
     carry = method.start(loop, objectives, key)
     if not places:
-        return judge(loop, objectives, until(stepped, partial(method.renew, loop), carry))[0]
+        return finish_run(loop, objectives, run_to_end(stepped, partial(method.renew, loop), carry))[0]
     first, count = method.seen(loop, carry, 0), -(-method.steps // every)
     seen = partial(method.seen, loop)
-    carry, seen = watch(stepped, partial(method.renew, loop), method.before, seen, carry, every, count, places)
-    return _with_trajectory(judge(loop, objectives, carry), first, seen)
+    carry, seen = run_with_trajectory(
+        stepped, partial(method.renew, loop), method.before, seen, carry, every, count, places
+    )
+    return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
 
 
 @partial(jax.jit, static_argnames="places")
-def _reversible(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, *, places: Places) -> Run:
+def _run_reversible(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, *, places: RunCapacity) -> Run:
     """For derivatives."""
-    if isinstance(method, AtPace):
-        return _repeated(loop, objectives, method.noted(), key, places)
-    method = method.located()
-    loop, objectives, stepped = _prepared(loop, objectives, method, key)
+    if isinstance(method, AdaptiveStepping):
+        return _run_by_replay(loop, objectives, method.for_replay(), key, places)
+    method = method.for_derivatives()
+    loop, objectives, stepped = _prepare_run(loop, objectives, method, key)
     carry, (tries, instants, every) = method.start(loop, objectives, key), places
     if not every:
-        return judge(loop, objectives, scan(stepped, carry, tries))[0]
+        return finish_run(loop, objectives, scan_to_end(stepped, carry, tries))[0]
     first, count = method.seen(loop, carry, 0), -(-method.steps // every)
-    carry, seen = scan_and_watch(
+    carry, seen = scan_with_trajectory(
         stepped, method.before, partial(method.seen, loop), carry, every, count, instants, tries
     )
-    return _with_trajectory(judge(loop, objectives, carry), first, seen)
+    return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
 
 
-def _repeated(loop: Loop, objectives: dict[str, Objective], method: AtPace, key: Any, places: Places) -> Run:
+def _run_by_replay(
+    loop: Loop, objectives: dict[str, Objective], method: AdaptiveStepping, key: Any, places: RunCapacity
+) -> Run:
     loop, audit = prepare(loop)
     objectives, (tries, instants, every) = objectives | audit, places
     still, measures = jax.tree.map(jax.lax.stop_gradient, (loop, objectives))
-    run = (loop, objectives, method, key, *note(still, measures, method.unwatched(), key, tries))
+    run = (loop, objectives, method, key, *log_steps(still, measures, method.without_trajectory(), key, tries))
     if not every:
-        return judge(loop, objectives, repeat(*run))[0]
-    carry, first, seen = repeat_and_watch(*run, jnp.arange(1, instants + 1) * every)
-    return _with_trajectory(judge(loop, objectives, carry), first, seen)
+        return finish_run(loop, objectives, replay_run(*run))[0]
+    carry, first, seen = replay_with_trajectory(*run, jnp.arange(1, instants + 1) * every)
+    return _attach_trajectory(finish_run(loop, objectives, carry), first, seen)
 
 
-def _prepared(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any) -> tuple[Loop, Any, Any]:
+def _prepare_run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any) -> tuple[Loop, Any, Any]:
     loop, audit = prepare(loop)
     objectives = objectives | audit
     return loop, objectives, partial(method.step, loop, objectives, key)
 
 
-def _with_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: Any) -> Run:
+def _attach_trajectory(judged: tuple[Run, Trajectory], first: Trajectory, seen: Any) -> Run:
     """The first instant, those seen, and the last one in place of everything after the end."""
     run, last = judged
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.protocols import Ending, Sample
-from diffabs.simulate import frames
+from diffabs.simulate import convert
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,20 +57,20 @@ class Adaptive:
 
 
 Solver = FixedStep | Adaptive
-TYPES: dict[str, type[Any]] = {"fixed": FixedStep, "adaptive": Adaptive}  # by their names in a scenario
-ORDER = 4  # of the error of an adaptive step, in its length
+SOLVER_TYPES: dict[str, type[Any]] = {"fixed": FixedStep, "adaptive": Adaptive}  # by their names in a scenario
+ADAPTIVE_ERROR_ORDER = 4  # of the error of an adaptive step, in its length
 
 
-def finer(solver: Solver, times: int) -> Solver:
+def refine_solver(solver: Solver, times: int) -> Solver:
     """Return the solver whose steps, and those of its grid, are so many times shorter, over the same whole ones."""
     step = solver.step / times
     shorter = dataclasses.replace(solver, step=step, duration=solver.steps * times * step)
     if isinstance(shorter, Adaptive):
-        return dataclasses.replace(shorter, rtol=shorter.rtol / times**ORDER)
+        return dataclasses.replace(shorter, rtol=shorter.rtol / times**ADAPTIVE_ERROR_ORDER)
     return shorter
 
 
-def described(solver: Solver) -> dict[str, Any]:
+def describe_solver(solver: Solver) -> dict[str, Any]:
     """Return what decides a run's results, for a file."""
     said = {"step": solver.step, "duration": solver.duration}
     return said | ({"type": "adaptive", "rtol": solver.rtol} if isinstance(solver, Adaptive) else {})
@@ -101,23 +101,23 @@ class Run(NamedTuple):
 
     def __repr__(self) -> str:
         """How it ended, and what was measured."""
-        return str(frames.summary(self))
+        return str(convert.summarise_run(self))
 
     def _repr_html_(self) -> str:
         """The same for a notebook."""
-        return frames.summary(self)._repr_html_()
+        return convert.summarise_run(self)._repr_html_()
 
     def pandas(self, plant: Any = None) -> Any:
         """The trajectory as a pandas.DataFrame indexed by time, with `attrs["units"]`; of a run without one its
         metrics, a row for each lane. `plant` says the unit of the control. Raises ValueError for many trajectories."""
-        return frames.to_pandas(self, plant)
+        return convert.to_pandas(self, plant)
 
     def xarray(self, plant: Any = None) -> Any:
         """The trajectory as an xarray.Dataset over the time, each variable with `units`. Raises ValueError for a run
         without one, or for many."""
-        return frames.to_xarray(self, plant)
+        return convert.to_xarray(self, plant)
 
     def plot(self, plant: Any = None, *, title: str = "") -> Any:
         """The run as a figure of matplotlib (extra `plot`); `plant` says the unit of the control. Raises
         ValueError for a run without a trajectory."""
-        return frames.to_figure(self, plant, title)
+        return convert.to_figure(self, plant, title)

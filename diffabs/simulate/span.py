@@ -10,7 +10,7 @@ from diffabs.core.loop import LoopState
 from diffabs.core.numerics import clamp
 
 
-class Span(NamedTuple):
+class HermiteStep(NamedTuple):
     """A step: time [s], state and rates after what changed at its beginning; those of what is integrated before what
     changes at its end."""
 

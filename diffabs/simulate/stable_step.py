@@ -25,25 +25,25 @@ from diffabs.core.protocols import Memory, Reference
 from diffabs.core.pytree import Scalar, part, pytree, replace, strong
 from diffabs.core.tracing import separated
 
-SQUARINGS = 4  # k = 16: within 3 % of the radius for the loops of the papers
-TOGETHER = 256  # lanes whose matrices stay in a processor's cache
-MANY = 1 << 17  # matrices of all lanes, from which on they are worked out number by number
-BALANCING = 30  # rounds
-SAFE = 1.01  # what single precision may take away from a bound
+BOUND_SQUARINGS = 4  # k = 16: within 3 % of the radius for the loops of the papers
+LANES_PER_CHUNK = 256  # lanes whose matrices stay in a processor's cache
+MIN_ENTRYWISE_MATRICES = 1 << 17  # matrices of all lanes, from which on they are worked out number by number
+BALANCING_ROUNDS = 30  # rounds
+BOUND_SAFETY_FACTOR = 1.01  # what single precision may take away from a bound
 RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 3.5 of the origin
 
 
 def stable_step(loop: Loop) -> float:
     """Largest step [s] at which RK4 damps every damped mode of the loop, between its initial speed and its stop."""
-    return float(_smallest(np.asarray(_jacobian(strong(loop)))[None])[0])
+    return float(_largest_stable_steps(np.asarray(_jacobian(strong(loop)))[None])[0])
 
 
 def stable_steps(loops: Loop) -> np.ndarray:
     """The same for a batch of loops, whose leaves have a leading axis (n,); returns (n,)."""
-    return _smallest(np.asarray(_jacobians(loops)))
+    return _largest_stable_steps(np.asarray(_jacobians(loops)))
 
 
-def _smallest(matrices: np.ndarray) -> np.ndarray:
+def _largest_stable_steps(matrices: np.ndarray) -> np.ndarray:
     """The largest stable step of each lane (n,) for its matrices (n, k, d, d)."""
     known = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
     modes = np.linalg.eigvals(np.where(known[..., None, None], matrices, 0.0))
@@ -53,19 +53,21 @@ def _smallest(matrices: np.ndarray) -> np.ndarray:
     return limits.min(axis=tuple(range(1, limits.ndim)), initial=np.inf)
 
 
-def stable(loop: Any, values: Any, step: float) -> np.ndarray:
+def is_step_stable(loop: Any, values: Any, step: float) -> np.ndarray:
     """Whether a step [s] is stable for each lane of a loop that differ in these values (lanes,) by path; without a loop
     (None) the values are loops, whose leaves have a leading axis. Returns bool (lanes,)."""
     with jax.enable_x64(False), np.errstate(over="ignore"):  # what single precision cannot hold is infinite
-        fine = step * np.asarray(_bounds(*_single(loop, values), squarings=0)) <= WITHIN
-        for squarings in (SQUARINGS, None):
+        fine = step * np.asarray(_bounds(*_as_single_precision(loop, values), squarings=0)) <= MIN_BOUNDARY_RADIUS
+        for squarings in (BOUND_SQUARINGS, None):
             left = np.flatnonzero(~fine)
-            for lanes in np.split(left, range(TOGETHER, len(left), TOGETHER)) if len(left) else ():
-                fine[lanes] = _judged(loop, _at(values, np.resize(lanes, TOGETHER)), step, squarings)[: len(lanes)]
+            for lanes in np.split(left, range(LANES_PER_CHUNK, len(left), LANES_PER_CHUNK)) if len(left) else ():
+                fine[lanes] = _is_known_stable(loop, _at(values, np.resize(lanes, LANES_PER_CHUNK)), step, squarings)[
+                    : len(lanes)
+                ]
     return fine
 
 
-def _single(*trees: Any) -> Any:
+def _as_single_precision(*trees: Any) -> Any:
     """In single precision already here: several threads at once do not agree on what `enable_x64` makes of an array."""
     return jax.tree.map(lambda x: np.asarray(x, np.float32), trees)
 
@@ -74,16 +76,18 @@ def _at(values: Any, lanes: np.ndarray) -> Any:
     return jax.tree.map(lambda x: np.asarray(x)[lanes], values)
 
 
-def _judged(loop: Any, values: Any, step: float, squarings: int | None) -> np.ndarray:
+def _is_known_stable(loop: Any, values: Any, step: float, squarings: int | None) -> np.ndarray:
     """Whether the step is known to be stable; by the eigenvalues themselves if not by so many squarings."""
     if squarings is not None:
-        return step * np.asarray(_bounds(*_single(loop, values), squarings=squarings)) <= WITHIN
+        return (
+            step * np.asarray(_bounds(*_as_single_precision(loop, values), squarings=squarings)) <= MIN_BOUNDARY_RADIUS
+        )
     with jax.enable_x64(True):
-        return stable_steps(_built(loop, values)) >= step
+        return stable_steps(_build_loops(loop, values)) >= step
 
 
 @jax.jit
-def _built(loop: Any, values: Any) -> Loop:
+def _build_loops(loop: Any, values: Any) -> Loop:
     return strong(jax.vmap(_lane(loop))(values))
 
 
@@ -102,19 +106,21 @@ def _bounds(loop: Any, values: Any, *, squarings: int) -> jax.Array:
     one = matrices(jax.tree.map(lambda x: x[0], values))
     balance = _balance(one)
     if not separated(matrices, values)[0]:  # no lane has other matrices than the first
-        return jnp.full(count, _fastest(one, balance, squarings))
-    places = jnp.minimum(jnp.arange(-(-count // TOGETHER) * TOGETHER), count - 1)  # whole batches: one program
-    filled = jax.tree.map(lambda x: x[places], values) if count > TOGETHER else values
+        return jnp.full(count, _power_norm_bound(one, balance, squarings))
+    places = jnp.minimum(
+        jnp.arange(-(-count // LANES_PER_CHUNK) * LANES_PER_CHUNK), count - 1
+    )  # whole batches: one program
+    filled = jax.tree.map(lambda x: x[places], values) if count > LANES_PER_CHUNK else values
 
     def bound(values: Any) -> jax.Array:
-        if squarings or len(one) * count < MANY:
-            return _fastest(matrices(values), balance, squarings)
-        return _norm(_probed(_entries, _lane(loop)(values)), balance)
+        if squarings or len(one) * count < MIN_ENTRYWISE_MATRICES:
+            return _power_norm_bound(matrices(values), balance, squarings)
+        return _norm(_map_over_probes(_entries, _lane(loop)(values)), balance)
 
-    return jax.lax.map(bound, filled, batch_size=min(TOGETHER, count))[:count]
+    return jax.lax.map(bound, filled, batch_size=min(LANES_PER_CHUNK, count))[:count]
 
 
-def _fastest(matrices: jax.Array, balance: jax.Array, squarings: int) -> jax.Array:
+def _power_norm_bound(matrices: jax.Array, balance: jax.Array, squarings: int) -> jax.Array:
     """The greatest bound of some matrices (k, n, n) with their D (k, n); the norm is that of rows, or of columns."""
     a = matrices * (balance[:, None, :] / balance[:, :, None])
     log = jnp.zeros(len(a), a.dtype)  # of what has been divided out, to the power of one over k
@@ -124,7 +130,7 @@ def _fastest(matrices: jax.Array, balance: jax.Array, squarings: int) -> jax.Arr
         a = jnp.matmul(a, a, precision="highest")
     rows, columns = (jnp.max(jnp.sum(jnp.abs(a), axis), -1) for axis in (-1, -2))
     bound = jnp.max(jnp.exp(log) * jnp.minimum(rows, columns) ** (1 / 2**squarings))
-    return jnp.where(jnp.isfinite(bound), SAFE * bound, jnp.inf)
+    return jnp.where(jnp.isfinite(bound), BOUND_SAFETY_FACTOR * bound, jnp.inf)
 
 
 def _norm(entries: list[list[jax.Array]], balance: jax.Array) -> jax.Array:
@@ -133,7 +139,7 @@ def _norm(entries: list[list[jax.Array]], balance: jax.Array) -> jax.Array:
     sizes = [[jnp.abs(x * (balance[:, j] / balance[:, i])) for j, x in enumerate(row)] for i, row in enumerate(entries)]
     rows, columns = (reduce(jnp.maximum, map(sum, lines)) for lines in (sizes, zip(*sizes, strict=True)))
     bound = jnp.max(jnp.minimum(rows, columns))
-    return jnp.where(jnp.isfinite(bound), SAFE * bound, jnp.inf)
+    return jnp.where(jnp.isfinite(bound), BOUND_SAFETY_FACTOR * bound, jnp.inf)
 
 
 def _balance(matrices: jax.Array) -> jax.Array:
@@ -148,16 +154,16 @@ def _balance(matrices: jax.Array) -> jax.Array:
         change = 0.25 * jnp.log(jnp.where(fine, rows, 1.0) / jnp.where(fine, columns, 1.0))
         return jnp.clip(log + change, -30.0, 30.0)
 
-    return jnp.exp(jax.lax.fori_loop(0, BALANCING, halve, jnp.zeros(matrices.shape[:-1], matrices.dtype)))
+    return jnp.exp(jax.lax.fori_loop(0, BALANCING_ROUNDS, halve, jnp.zeros(matrices.shape[:-1], matrices.dtype)))
 
 
 def _radius(direction: np.ndarray) -> np.ndarray:
     """How far along each direction of the complex plane RK4 stays stable."""
     angles = np.abs(np.angle(direction))  # the region is symmetric
-    return np.interp(angles, ANGLES, REACH)
+    return np.interp(angles, BOUNDARY_ANGLES, BOUNDARY_RADII)
 
 
-def _reach(angle: np.ndarray) -> np.ndarray:
+def _find_boundary_radii(angle: np.ndarray) -> np.ndarray:
     """The first of RADII along each direction at which RK4 grows, or the last one: by bisection, since the region is
     star-shaped and a table of all of them would cost every command half a second."""
     low, high = np.zeros(angle.shape, int), np.full(angle.shape, len(RADII) - 1)
@@ -169,17 +175,17 @@ def _reach(angle: np.ndarray) -> np.ndarray:
     return RADII[high]
 
 
-ANGLES = np.linspace(np.pi / 2, np.pi, 2001)
-REACH = _reach(ANGLES)
-WITHIN = float(REACH.min())  # a damped mode of whatever direction is stable up to here
+BOUNDARY_ANGLES = np.linspace(np.pi / 2, np.pi, 2001)
+BOUNDARY_RADII = _find_boundary_radii(BOUNDARY_ANGLES)
+MIN_BOUNDARY_RADIUS = float(BOUNDARY_RADII.min())  # a damped mode of whatever direction is stable up to here
 
 
 def _jacobians_of(loop: Loop) -> jax.Array:
-    """d(flow)/d(flow) (k, n, n) where `_probed` looks."""
-    return _probed(_of_flow, loop)
+    """d(flow)/d(flow) (k, n, n) where `_map_over_probes` looks."""
+    return _map_over_probes(_flow_jacobian, loop)
 
 
-def _probed(function: Callable[[Loop], Any], loop: Loop) -> Any:
+def _map_over_probes(function: Callable[[Loop], Any], loop: Loop) -> Any:
     """What a function says of the loop (k, ...) where the plant says that it may be stiffest (`probes`); else at its
     start and at a start of zero, far from the target and on it."""
     probes = getattr(loop.plant, "probes", None)
@@ -187,7 +193,7 @@ def _probed(function: Callable[[Loop], Any], loop: Loop) -> Any:
         starts = probes(loop.initial, loop.reference.setpoint(loop.start().reference), loop.stop)
         return jax.vmap(lambda start: function(dataclasses.replace(loop, initial=start)))(starts)
     starts = jax.tree.map(lambda x: jnp.array([0.0, 1.0]) * x, loop.initial)
-    arrived = dataclasses.replace(loop, reference=_Arrived(reference=loop.reference))
+    arrived = dataclasses.replace(loop, reference=_AtTarget(reference=loop.reference))
     found = [
         jax.vmap(lambda start, one=one: function(dataclasses.replace(one, initial=start)))(starts)
         for one in (loop, arrived)
@@ -204,7 +210,7 @@ def _jacobians(loops: Loop) -> jax.Array:
 
 
 @pytree
-class _Arrived:
+class _AtTarget:
     """A reference whose target is wherever the plant is: the controller is not at a limit there."""
 
     reference: Reference = part()
@@ -223,7 +229,7 @@ class _Arrived:
         return self.reference.setpoint(memory)
 
 
-def _of_flow(loop: Loop) -> jax.Array:
+def _flow_jacobian(loop: Loop) -> jax.Array:
     state = loop.start()
     z, unravel = jax.flatten_util.ravel_pytree(state.flow())
 

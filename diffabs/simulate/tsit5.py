@@ -22,40 +22,47 @@ import jax.numpy as jnp
 from diffabs.core.numerics import axpy
 from diffabs.core.pytree import Scalar
 from diffabs.core.tracing import pushed
-from diffabs.simulate.checkpoint import forgetful
+from diffabs.simulate.checkpoint import rematerialise
 
 X = TypeVar("X")
 
-PLACES = (0.161, 0.327, 0.9, 0.9800255409045097, 1.0)  # c2 ... c6
-WEIGHTS = (  # a2j ... a6j
+STAGE_NODES = (0.161, 0.327, 0.9, 0.9800255409045097, 1.0)  # c2 ... c6
+STAGE_COEFFICIENTS = (  # a2j ... a6j
     (0.161,),
     (-0.008480655492356989, 0.335480655492357),
     (2.8971530571054935, -6.359448489975075, 4.3622954328695815),
     (5.325864828439257, -11.748883564062828, 7.4955393428898365, -0.09249506636175525),
     (5.86145544294642, -12.92096931784711, 8.159367898576159, -0.071584973281401, -0.028269050394068383),
 )
-LAST = (0.09646076681806523, 0.01, 0.4798896504144996, 1.379008574103742, -3.290069515436081, 2.324710524099774)  # b
+STEP_WEIGHTS = (
+    0.09646076681806523,
+    0.01,
+    0.4798896504144996,
+    1.379008574103742,
+    -3.290069515436081,
+    2.324710524099774,
+)  # b
 # d, of what the paper says of the middle: b(1/2) - b/2, less the cubic's 1/8 (k1 - k7)
-OFF = (
+MIDPOINT_ERROR_WEIGHTS = (
     *(-0.0658180311080639, 0.00635625, 0.15566420535320324, -1.0342564305778064, 2.961220122676205),
     *(-2.1794161163435377, 0.15625),
 )
 
 
-def tsit5_pair(derivative: Callable[[Scalar, X], X], t: Scalar, x: X, rate: X, h: Scalar) -> tuple[X, X]:
-    """Return x(t + h), and what the rates so far say of how far the cubic is off: `off_in_the_middle` needs the next.
+def tsit5_step_with_error(derivative: Callable[[Scalar, X], X], t: Scalar, x: X, rate: X, h: Scalar) -> tuple[X, X]:
+    """Return x(t + h), and what the rates so far say of how far the cubic is off: `midpoint_error` needs the next.
 
     rate: derivative(t, x)"""
     rates = [rate]
-    for place, weights in zip(PLACES, WEIGHTS, strict=True):
-        rates.append(derivative(t + place * h, axpy(h, _weighted(weights, rates), x)))
-    return axpy(h, _weighted(LAST, rates), x), _weighted(OFF[:-1], rates)
+    for place, weights in zip(STAGE_NODES, STAGE_COEFFICIENTS, strict=True):
+        rates.append(derivative(t + place * h, axpy(h, _weighted_sum(weights, rates), x)))
+    return axpy(h, _weighted_sum(STEP_WEIGHTS, rates), x), _weighted_sum(MIDPOINT_ERROR_WEIGHTS[:-1], rates)
 
 
-def off_in_the_middle(so_far: X, last: X, h: Scalar) -> X:
+def midpoint_error(so_far: X, last: X, h: Scalar) -> X:
     """Return the difference of the step's own solution and of the cubic, in the middle; `last` is the rate at the
     end."""
-    return jax.tree.map(lambda a, b: h * (a + OFF[-1] * b), so_far, last)
+    return jax.tree.map(lambda a, b: h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b), so_far, last)
 
 
 def tsit5_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, rate: X, h: Scalar, given: Any) -> X:
@@ -65,7 +72,7 @@ def tsit5_step_from(derivative: Callable[[Scalar, X, Any], X], t: Scalar, x: X, 
     return _step(derivative, t, x, rate, h, (given, *constants))
 
 
-def _weighted(weights: Sequence[float], rates: Sequence[X]) -> X:
+def _weighted_sum(weights: Sequence[float], rates: Sequence[X]) -> X:
     def total(*rates: Any) -> Any:
         first, *others = (weight * rate for weight, rate in zip(weights, rates, strict=True))
         return sum(others, first)
@@ -75,13 +82,13 @@ def _weighted(weights: Sequence[float], rates: Sequence[X]) -> X:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _step(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
-    return tsit5_pair(lambda t, x: f(t, x, *constants), t, x, rate, h)[0]
+    return tsit5_step_with_error(lambda t, x: f(t, x, *constants), t, x, rate, h)[0]
 
 
 def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
     """The stages as rounds of a loop, which fills a table of rates."""
-    count = len(LAST)
-    rows = [[*weights, *(count - len(weights)) * [0.0]] for weights in WEIGHTS]
+    count = len(STEP_WEIGHTS)
+    rows = [[*weights, *(count - len(weights)) * [0.0]] for weights in STAGE_COEFFICIENTS]
 
     def weighted(weights: Any, rates: Any) -> Any:
         return jax.tree.map(lambda k: jnp.sum(weights.reshape(-1, *(k.ndim - 1) * [1]) * k, axis=0), rates)
@@ -96,9 +103,9 @@ def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
         return jnp.zeros((count, *rate.shape), rate.dtype).at[0].set(rate)
 
     dtype = jnp.result_type(h)
-    rounds = (jnp.arange(1, count), jnp.asarray(PLACES, dtype), jnp.asarray(rows, dtype))
-    rates = jax.lax.scan(forgetful(stage), jax.tree.map(table, rate), rounds)[0]
-    return axpy(h, weighted(jnp.asarray(LAST, dtype), rates), x)
+    rounds = (jnp.arange(1, count), jnp.asarray(STAGE_NODES, dtype), jnp.asarray(rows, dtype))
+    rates = jax.lax.scan(rematerialise(stage), jax.tree.map(table, rate), rounds)[0]
+    return axpy(h, weighted(jnp.asarray(STEP_WEIGHTS, dtype), rates), x)
 
 
 def _rule(f: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.simulate.accuracy import comparable, measure_finer, share
-from diffabs.simulate.batch import Batch, by_structure, stacked
-from diffabs.simulate.solution import Run, described
+from diffabs.simulate.accuracy import is_comparable, measure_finer, relative_difference
+from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
+from diffabs.simulate.solution import Run, describe_solver
 from diffabs.sweep.results import Results
 from diffabs.sweep.study import Study, precision
 
@@ -38,7 +38,7 @@ def checked(study: Study, found: Results, count: int) -> dict[str, Any]:
     return {
         "samples": rows.tolist(),
         "step": study.solver.step / 2,
-        "solver": described(study.solver),
+        "solver": describe_solver(study.solver),
         "ended otherwise": int((fine & ~alike).sum()),
         "not comparable": int((~fine).sum()),
         "metrics": {name: row for name, row in changes.items() if row},
@@ -81,8 +81,8 @@ def _flagged(found: Results, flag: str) -> np.ndarray:
 def _halved(study: Study, samples: np.ndarray) -> Iterator[tuple[list[int], Run, np.ndarray]]:
     """Lanes of one structure at a time: their places among the samples, their runs, whether they can be compared."""
     loops, keys = zip(*map(study.lane, samples.tolist()), strict=True) if len(samples) else ((), ())
-    for places in by_structure(loops):
-        loop, batch = stacked([loops[i] for i in places])
+    for places in group_by_structure(loops):
+        loop, batch = stack_loops([loops[i] for i in places])
         lanes = batch.values, jnp.stack([keys[i] for i in places])
         with precision(study.dtype):
             both = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, partial(_run, study)))(*lanes)
@@ -91,7 +91,7 @@ def _halved(study: Study, samples: np.ndarray) -> Iterator[tuple[list[int], Run,
 
 
 def _run(study: Study, loop: Any, key: Any) -> tuple[Run, Any]:
-    return measure_finer(loop, study.solver, study.objectives, 2, key=key), comparable(loop, study.solver, key)
+    return measure_finer(loop, study.solver, study.objectives, 2, key=key), is_comparable(loop, study.solver, key)
 
 
 def _changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def _changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> dict[
     if not len(values):
         return {}
     typical = np.maximum(np.abs(values), np.median(np.abs(values)))
-    relative = np.asarray(share(half - values, typical))
+    relative = np.asarray(relative_difference(half - values, typical))
     worst = int(np.argmax(relative))
     return {
         "median": float(np.median(relative)),

@@ -147,7 +147,7 @@ def _check(client: Client, engine: str) -> None:
 
 def _origin(engine: str) -> dict[str, str]:
     """What can change a bit of the results, here: versions; of a kernel, the compiler and the processor."""
-    return provenance.origin(*DECISIVE) | (launch.described() if engine == "kernel" else {})
+    return provenance.origin(*DECISIVE) | (launch.describe_kernel_build() if engine == "kernel" else {})
 
 
 def _completed(client: Client, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Iterator[Done]:

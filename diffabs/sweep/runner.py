@@ -17,9 +17,9 @@ import jax
 import numpy as np
 
 from diffabs.kernel.compilers import NoCompiler
+from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.engine import EngineError
-from diffabs.simulate.refusals import refusals
 from diffabs.sweep.study import FLAGS, Study, noise_key, numbers, precision
 
 PARTS_OF_A_CHUNK = 8
@@ -89,7 +89,7 @@ class Runner:
 
     def _alone(self, loop: Any, program: Any, block: _Block, device: Any) -> Columns:
         with jax.default_device(device):
-            asked = refusals(loop, block.values, self.study.solver)
+            asked = batch_admissibility(loop, block.values, self.study.solver)
         with precision(self.study.dtype), _compiling():
             given = self._arguments(block, asked.accepted)
             found = jax.device_get(program(*jax.device_put(given, device)))

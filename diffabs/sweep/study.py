@@ -20,8 +20,8 @@ from diffabs.core.validity import problems
 from diffabs.core.values import plain, unknown
 from diffabs.kernel import launch
 from diffabs.objectives import usual
-from diffabs.simulate.refusals import ill
-from diffabs.simulate.solution import Solver, described
+from diffabs.simulate.admissible import find_solver_faults
+from diffabs.simulate.solution import Solver, describe_solver
 from diffabs.sweep.discrete import Categorical
 from diffabs.sweep.variables import Space
 
@@ -120,12 +120,12 @@ class Study:
         own: dict[str, Any] = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
         own |= {"failures": self.bounded, "success": self.success}
         if self.engine != "xla":
-            own |= {"engine": {"name": self.engine, **launch.described()}}
+            own |= {"engine": {"name": self.engine, **launch.describe_kernel_build()}}
         return json.loads(
             json.dumps(
                 {
                     **own,
-                    "solver": described(self.solver),
+                    "solver": describe_solver(self.solver),
                     "space": self.space.table(),
                     "loop": plain(self.loop),
                     "parts": plain(self.parts),
@@ -149,7 +149,7 @@ class Study:
             if not 0 < getattr(self.solver, name) < np.inf:
                 yield f"solver.{name} = {getattr(self.solver, name)} is not positive and finite"
                 return
-        yield from ill(self.solver)
+        yield from find_solver_faults(self.solver)
         for name in {"sample", *FLAGS, *self.space.paths} & self.objectives.keys():
             yield f"objectives.{name}: another column of the table has this name"
         for name, bound in self.failures.items():

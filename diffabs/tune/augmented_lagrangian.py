@@ -15,7 +15,7 @@ import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
-from diffabs.simulate.engine import described
+from diffabs.simulate.engine import describe_engine
 from diffabs.tune.descent import Descent, Lane, Optimiser, Point, at, lbfgs
 from diffabs.tune.problem import Multipliers, Problem, Seen
 from diffabs.tune.result import Method, Progress, Start, StartError, Tuned
@@ -155,7 +155,7 @@ class Search:
             starts=[start(lane) for lane in lanes],
             mode=self.problem.mode,
             diverged=(int(self.before.diverged), int(best.seen.diverged)),
-            engine=described(self.problem.engine),
+            engine=describe_engine(self.problem.engine),
         )
 
     def _values(self, z: np.ndarray) -> dict[str, Any]:

@@ -24,9 +24,9 @@ from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import strong
 from diffabs.kernel.compilers import NoCompiler
+from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.engine import ENGINES, EngineError, tell
-from diffabs.simulate.refusals import first_line, refusals
+from diffabs.simulate.engine import REQUESTABLE_ENGINES, EngineError, log_xla_reason
 from diffabs.simulate.solution import Run, Solver
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.risk import Aggregate
@@ -100,8 +100,8 @@ class Problem:
         once why it is not. Of a kernel the mode is forward, if none is asked for.
 
         Raises EngineError for a kernel in reverse mode."""
-        if engine not in ENGINES:
-            raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(ENGINES)}")
+        if engine not in REQUESTABLE_ENGINES:
+            raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}")
         if engine == "xla":
             return self
         line = REVERSE if mode is Mode.REVERSE else None
@@ -109,7 +109,7 @@ class Problem:
         if engine == "kernel" and line:
             raise EngineError.of(line)
         if engine == "auto" and (line := line or found.objection()):
-            tell(line)
+            log_xla_reason(line)
             return self
         return found
 
@@ -178,7 +178,7 @@ class Problem:
 
     def refused(self) -> str | None:
         """The first lane of the part as it is that must not be run, and why, in a line; None if all may."""
-        return first_line(built(self.subject), self.batch.values, self.solver)
+        return first_refusal(built(self.subject), self.batch.values, self.solver)
 
     def steady(self) -> Callable[[np.ndarray], np.ndarray]:
         """(starts, p) -> whether every lane may be run there (starts,): the parts' rules, and a stable step. Compiled
@@ -191,7 +191,7 @@ class Problem:
 
         def accepted(z: np.ndarray) -> np.ndarray:
             flat = jax.tree.map(lambda x: np.reshape(x, (-1, *x.shape[2:])), jax.device_get(compiled(jnp.asarray(z))))
-            return refusals(None, flat, self.solver).accepted.reshape(len(z), -1).min(axis=1)
+            return batch_admissibility(None, flat, self.solver).accepted.reshape(len(z), -1).min(axis=1)
 
         return accepted
 

@@ -24,8 +24,8 @@ from diffabs.core.pytree import replace
 from diffabs.core.reason import Reason
 from diffabs.core.validity import check
 from diffabs.objectives import usual
+from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.batch import Batch, run_batch
-from diffabs.simulate.refusals import first_line
 from diffabs.simulate.solution import Run, Solver
 from diffabs.tune.descent import Descent, Lane, Stopping, lbfgs
 from diffabs.tune.problem import Mode, Multipliers, Problem, automatic
@@ -162,7 +162,7 @@ def _price(problem: Problem) -> float:
 
 def _screened(loop: Any, lanes: Batch, solver: Solver, measured: Mapping[str, Objective], engine: str) -> Run:
     """Run every point. Raises ValueError for one that cannot be run."""
-    if line := first_line(loop, lanes.values, solver):
+    if line := first_refusal(loop, lanes.values, solver):
         raise ValueError(f"the box has points that cannot be run; {line}")
     return jax.device_get(run_batch(loop, lanes, solver, measured, accepted=True, engine=engine))
 

@@ -21,7 +21,7 @@ from diffabs.core.blocks import Passage, Series
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import param, pytree, strong
 from diffabs.objectives import TorqueRate
-from diffabs.simulate.dynamics import dynamics
+from diffabs.simulate.dynamics import build_dynamics
 from diffabs.simulate.stepper import init_carry
 
 
@@ -348,7 +348,9 @@ def test_nobody_looks_for_the_ends_of_smooth_pieces():
 
     def traced():
         carry = init_carry(there, {}, jnp.asarray(H), None, kinks=True)
-        kinks.append(dynamics(there, {}, carry.point.t, carry.point.state, carry.point.tally, kinks=True).kinks)
+        kinks.append(
+            build_dynamics(there, {}, carry.point.t, carry.point.state, carry.point.accumulators, kinks=True).kinks
+        )
 
     jax.eval_shape(traced)
     assert kinks == [0]

@@ -43,7 +43,7 @@ def stable():
     """Seconds saved in every run (the step has a test of its own), and no lines that depend on the machine's load."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(main.console, "PATIENCE", math.inf)
-        patch.setattr("diffabs.simulate.refusals.stable_step", lambda loop: np.inf)
+        patch.setattr("diffabs.simulate.admissible.stable_step", lambda loop: np.inf)
         yield
 
 
@@ -201,7 +201,7 @@ def test_bad_scenario_is_one_line_and_leaves_nothing(tmp_path, args, needed):
 
 
 def test_step_that_is_not_stable(monkeypatch):
-    monkeypatch.setattr("diffabs.simulate.refusals.stable_step", stable_step)
+    monkeypatch.setattr("diffabs.simulate.admissible.stable_step", stable_step)
     result = run("simulate", "slip-lmi", "--set", "solver.step=0.01", status=2)
     assert_one_error_line(result)
     assert "solver.step = 0.01 s is not stable" in result.stderr

@@ -28,7 +28,7 @@ def quiet():
     """No lines that depend on the machine's load, and no seconds for whether the step is stable."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr("diffabs.simulate.refusals.stable_step", lambda loop: np.inf)
+        patch.setattr("diffabs.simulate.admissible.stable_step", lambda loop: np.inf)
         yield
 
 

@@ -72,7 +72,7 @@ def quiet():
     """No lines that depend on the machine's load; and nothing is integrated, so no step need be stable."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr("diffabs.simulate.refusals.stable_step", lambda loop: pytest.fail("asked for a stable step"))
+        patch.setattr("diffabs.simulate.admissible.stable_step", lambda loop: pytest.fail("asked for a stable step"))
         yield
 
 

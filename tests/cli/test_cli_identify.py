@@ -18,7 +18,7 @@ from diffabs.identify.fit import Identified
 from diffabs.identify.uncertainty import uncertainty
 from diffabs.scenario.measurements import read
 from diffabs.scenario.scenario import ScenarioError, load
-from diffabs.simulate import refusals
+from diffabs.simulate import admissible
 from diffabs.simulate.solution import FixedStep
 from diffabs.tune import Reason
 
@@ -54,7 +54,7 @@ def quick():
     """No lines that depend on the machine's load, and no seconds for what has tests of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr(refusals, "stable_step", lambda loop: np.inf)
+        patch.setattr(admissible, "stable_step", lambda loop: np.inf)
         yield
 
 

@@ -27,7 +27,7 @@ from diffabs.core import interrupt
 from diffabs.core.pytree import parameters, replace
 from diffabs.design.sdp import solver
 from diffabs.scenario.scenario import load
-from diffabs.simulate import refusals
+from diffabs.simulate import admissible
 from diffabs.simulate.run import measure
 from diffabs.tune import Mode, Reason, StartError, Tuned
 
@@ -66,7 +66,7 @@ def quick():
     """No lines that depend on the machine's load, and no seconds for what has tests of its own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr(refusals, "stable_step", lambda loop: np.inf)
+        patch.setattr(admissible, "stable_step", lambda loop: np.inf)
         patch.setitem(sys.modules, "diffabs.plot.tuning", types.SimpleNamespace(tuning=drawn))
         yield
 

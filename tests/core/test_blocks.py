@@ -216,8 +216,8 @@ def test_two_events_in_one_step():
 
 @killed_by(
     "simulate/stepper.py",
-    "jnp.where(lost, Condition.DIVERGED, condition)",
-    "jnp.where(lost, Condition.TIMED_OUT, condition)",
+    "jnp.where(lost, RunStatus.DIVERGED, status)",
+    "jnp.where(lost, RunStatus.TIMED_OUT, status)",
 )
 def test_what_switches_in_every_step_is_no_run():
     """A relay on the rig with hardly a band: it would switch some ten times in each step of 1 ms."""

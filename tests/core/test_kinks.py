@@ -22,11 +22,11 @@ from diffabs.controllers import (
     ScheduledFeedback,
     StateFeedback,
 )
-from diffabs.core.kinks import Program
+from diffabs.core.comparisons import SwitchedProgram
 from diffabs.core.loop import Loop
+from diffabs.core.modes import Mode, find_contradicted
 from diffabs.core.numerics import quotient, searchsorted
 from diffabs.core.pytree import param, pytree, static
-from diffabs.core.regime import Regime, crossing
 from diffabs.objectives import IAE, Effort, FinalError
 from diffabs.plants import LabRig, MirroredRig
 from diffabs.references import FixedSlip, Setpoint
@@ -62,14 +62,14 @@ KINKED: dict[str, tuple[Callable[[Any, Any], Any], int]] = {  # of x, which move
 }
 
 
-def program(f: Callable[[Any, Any], Any]) -> Program:
+def program(f: Callable[[Any, Any], Any]) -> SwitchedProgram:
     """Of the whole function."""
-    return Program(f, jnp.asarray(0.1), jnp.asarray(0.6), lambda out: out)
+    return SwitchedProgram(f, jnp.asarray(0.1), jnp.asarray(0.6), lambda out: out)
 
 
-def held(one: Program, x: float, p: float = 0.6) -> Regime:
+def held(one: SwitchedProgram, x: float, p: float = 0.6) -> Mode:
     """The answers at x."""
-    return Regime(one.look(lambda out: out, x, p, Regime(None))[1].words)
+    return Mode(one.look(lambda out: out, x, p, Mode(None))[1].words)
 
 
 def same(out: Any) -> Any:
@@ -78,16 +78,19 @@ def same(out: Any) -> Any:
 
 
 @killed_by(
-    "core/kinks.py", "key = (y, x, not strict) if turned else (x, y, strict)", "key = (x, y, strict)", case="a contrary"
+    "core/comparisons.py",
+    "key = (y, x, not strict) if turned else (x, y, strict)",
+    "key = (x, y, strict)",
+    case="a contrary",
 )
-@killed_by("core/kinks.py", "asks = name if moves and real", "asks = name if real", case="of what is fixed")
+@killed_by("core/comparisons.py", "asks = name if moves and real", "asks = name if real", case="of what is fixed")
 @pytest.mark.parametrize("name", KINKED)
 def test_a_program_is_the_function(name):
     f, count = KINKED[name]
     one = program(f)
     assert sum(int(np.prod(shape)) for _, shape in one.places) == count
     for x in POINTS:
-        for regime in (Regime(None), held(one, x), held(one, 0.1)._replace(free=True)):
+        for regime in (Mode(None), held(one, x), held(one, 0.1)._replace(free=True)):
             np.testing.assert_array_equal(one(same, x, 0.6, regime), f(jnp.asarray(x), jnp.asarray(0.6)))
 
 
@@ -104,7 +107,7 @@ def test_a_regime_goes_on_beyond_its_kinks(name, at, beyond, value, slope):
     np.testing.assert_allclose([found, move], [value, slope], rtol=1e-15)
 
 
-@killed_by("core/regime.py", "against = margin < -_rounding(x)", "against = margin < -jnp.inf", case="gt")
+@killed_by("core/modes.py", "against = margin < -_rounding(x)", "against = margin < -jnp.inf", case="gt")
 @pytest.mark.parametrize("name", [name for name, (_, count) in KINKED.items() if count])
 def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
     f, _ = KINKED[name]
@@ -112,42 +115,42 @@ def test_who_looks_sees_what_is_contradicted_and_by_how_much(name):
     for x in (-3.0, 0.2, 9.0):
         regime = held(one, x)
         answers = one.look(same, x, 0.6, regime)[1]
-        assert not any(answers.crossed)
+        assert not any(answers.contradicted)
         assert answers.words == regime.words
         for y in (-2.7, 0.31, 2.2, 8.0):
             answers = one.look(same, y, 0.6, regime)[1]
             contrary = [a ^ b for a, b in zip(regime.words, held(one, y).words, strict=True)]
-            assert any(answers.crossed) == any(contrary)
-            other, crossed, chosen, margin = crossing(answers, jnp.asarray(0), jnp.asarray(y))
+            assert any(answers.contradicted) == any(contrary)
+            other, crossed, chosen, margin = find_contradicted(answers, jnp.asarray(0), jnp.asarray(y))
             assert bool((other >= 0) | crossed) == any(contrary)
             if any(contrary):
                 assert int(contrary[int(chosen) // 32]) >> (int(chosen) % 32) & 1
                 assert margin < 0
-        gives_way = regime._replace(loose=(~jnp.uint32(0),) * one.words, free=jnp.asarray(True))
+        gives_way = regime._replace(released=(~jnp.uint32(0),) * one.words, free=jnp.asarray(True))
         value, answers = one.look(same, 2.2, 0.6, gives_way)
         np.testing.assert_array_equal(value, f(jnp.asarray(2.2), jnp.asarray(0.6)))
         assert answers.words == held(one, 2.2).words
 
 
-@killed_by("core/regime.py", "most.eps**ROUNDING *", "0.0 *")
+@killed_by("core/modes.py", "most.eps**ROUNDING_POWER *", "0.0 *")
 def test_numbers_that_are_equal_to_rounding_say_nothing():
     one = program(lambda x, p: jnp.where(x > p, 1.0, 0.0))
     regime = held(one, 0.1)
     for excess, sees in ((1e-14, False), (1e-9, True)):
-        assert any(one.look(same, 0.6 + excess, 0.6, regime)[1].crossed) == sees
+        assert any(one.look(same, 0.6 + excess, 0.6, regime)[1].contradicted) == sees
 
 
-@killed_by("core/regime.py", "against |= gives & (margin == 0) & (says() != taken)", "pass")
+@killed_by("core/modes.py", "against |= gives & (margin == 0) & (says() != taken)", "pass")
 def test_a_product_that_has_become_0_is_held_by_nobody():
     """(x - min(x, p)) x > 0 above p, and 0 > 0 below, which contradicts nobody: it gives way all the same."""
     one = program(lambda x, p: jnp.where((x - jnp.minimum(x, p)) * x > 0, 1.0, 0.0))
     above = held(one, 2.0)
-    gives_way = above._replace(loose=(~jnp.uint32(0),) * one.words)
+    gives_way = above._replace(released=(~jnp.uint32(0),) * one.words)
     assert one.look(same, 2.1, 0.6, gives_way)[0] == 1
     value, answers = one.look(same, 0.5, 0.6, gives_way)
     assert value == 0
     assert answers.words == held(one, 0.5).words
-    assert not any(answers.crossed)
+    assert not any(answers.contradicted)
 
 
 class Shown(NamedTuple):
@@ -228,7 +231,7 @@ def clockwork(rate: Any, place: Any) -> Loop:
 
 
 @killed_by(
-    "core/regime.py",
+    "core/modes.py",
     "next = below + jnp.where(high < -_rounding(x), 1, 0) - jnp.where(low < -_rounding(x), 1, 0)",
     "next = below",
     case="a table",
@@ -300,7 +303,7 @@ def test_a_run_that_slides_along_a_kink_is_a_run():
     np.testing.assert_allclose(run.metrics["y"], [0.2, 0.4], atol=0.02)
 
 
-@killed_by("simulate/stepper.py", "fine &= carry.blunt | _plausible(carry, here) if kinks else True", "pass")
+@killed_by("simulate/stepper.py", "fine &= carry.unrestricted | _is_plausible(carry, here) if kinks else True", "pass")
 def test_where_a_step_is_too_long_a_regime_is_not_believed():
     """Below its crawl speed a wheel is stiffer than any step, and a curve of friction beyond its kinks has no bound."""
     loop = braking(

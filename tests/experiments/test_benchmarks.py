@@ -220,7 +220,7 @@ def test_useful_operations_are_those_of_real_numbers_in_a_step():
         x, k = carry
         return jnp.where(x > 1.0, (x * lane + 2.0 * lane) / x - 1.0, x), k + 1
 
-    found = program.build({"step": step}, 1.0, (1.0, 1))
+    found = program.build_program({"step": step}, 1.0, (1.0, 1))
     assert module("bench_gpu").arithmetic(found) == 4
 
 

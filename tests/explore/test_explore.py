@@ -143,17 +143,19 @@ def test_nonsense_is_refused_with_the_field_named(session, key, given, said):
 
 @pytest.mark.parametrize("given", ["much", "-1", "91", "nan", None])
 def test_a_spread_that_is_none_is_refused(session, given):
+
     with pytest.raises(ScenarioError, match=r"fan\.mass = .*\[0, 90\] %"):
         session.widen("mass", given)
     assert session.spread == Spread()
 
 
-@killed_by("explore/session.py", "return lines or list(unstable(chosen.loop, chosen.solver))", "return lines")
+@killed_by("explore/session.py", "return lines or list(find_unstable_step(chosen.loop, chosen.solver))", "return lines")
 def test_a_step_that_is_not_stable_is_refused(file, monkeypatch):
-    from diffabs.simulate import refusals
+
+    from diffabs.simulate import admissible
 
     found = Session(str(file(SHORT)))
-    monkeypatch.setattr(refusals, "stable_step", lambda loop: 5.75e-3 / loop.plant.mass)
+    monkeypatch.setattr(admissible, "stable_step", lambda loop: 5.75e-3 / loop.plant.mass)
     found.turn("plant.mass", "5.5")
     with pytest.raises(ScenarioError, match=r"plant.mass = 6 kg: solver.step = 0.001 s is not stable"):
         found.turn("plant.mass", "6")

@@ -579,8 +579,8 @@ def test_a_block_begins_anew_when_it_is_told_to():
 
 @killed_by(
     "export/structured_text.py",
-    "yield from self._operations(live([*stored.values(), *more]), indent)",
-    "yield from (*self._moves(indent), *self._operations(live([*stored.values(), *more]), indent))",
+    "yield from self._operations(live_nodes([*stored.values(), *more]), indent)",
+    "yield from (*self._moves(indent), *self._operations(live_nodes([*stored.values(), *more]), indent))",
 )
 def test_what_a_sample_stores_does_not_change_while_the_target_moves():
     """A controller that remembers the very number that the target's own movement computes anew."""

@@ -20,13 +20,13 @@ from mutants import killed_by
 import diffabs as d
 from diffabs import controllers, plants, scenario, sensors
 from diffabs.kernel import binaries, compilers, launch
-from diffabs.kernel.graph import Graph, Level
-from diffabs.kernel.primitives import Unsupported, known, translate
+from diffabs.kernel.graph import Graph, UpdateLevel
+from diffabs.kernel.primitives import Unsupported, constant_array, lower_jaxpr
 from diffabs.objectives import BRAKING
 from diffabs.scenario import section_sweep
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import native
-from diffabs.simulate.engine import tell
+from diffabs.simulate.engine import log_xla_reason
 from diffabs.stops import SpeedReached
 from diffabs.sweep import SweepError, sweep
 
@@ -88,7 +88,7 @@ class TestRuns:
         same(found, expected, rtol=1e-13, atol=1e-15)
 
     def test_do_not_depend_on_their_order_nor_on_threads(self, runs, monkeypatch):
-        monkeypatch.setattr(launch, "threads", lambda: 3)
+        monkeypatch.setattr(launch, "thread_count", lambda: 3)
         native._run.clear_cache()
         order = np.random.default_rng(1).permutation(LANES)
         values = {path: column[order] for path, column in VALUES.items()}
@@ -97,7 +97,7 @@ class TestRuns:
             np.testing.assert_array_equal(found.metrics[name], value[order])
 
     def test_of_new_numbers_are_the_same_program(self, runs, monkeypatch):
-        monkeypatch.setattr(compilers, "library", None)
+        monkeypatch.setattr(compilers, "build_library", None)
         loop = d.replace(LOOP, {"controller.gain.0": -3900.0, "plant.mass": 6.0})
         found = jax.device_get(self._by_kernel(VALUES, KEYS, loop))
         assert not np.any(found.metrics["iae"] == runs[0].metrics["iae"])
@@ -114,7 +114,7 @@ class TestRuns:
 
     @pytest.mark.slow
     def test_of_lanes_in_two_parts(self, runs, monkeypatch):
-        monkeypatch.setattr(native, "MOST", 32)
+        monkeypatch.setattr(native, "MAX_LANES_PER_LAUNCH", 32)
         found = jax.device_get(self._by_kernel(VALUES, KEYS))
         for name, value in runs[0].metrics.items():
             np.testing.assert_array_equal(found.metrics[name], value)
@@ -139,16 +139,16 @@ class TestObjections:
     """Each is said by `objection`, refused with engine = "kernel", and said once with "auto"."""
 
     def test_there_is_none(self):
-        assert native.objection(LOOP, VALUES, SOLVER, MEASURED) is None
+        assert native.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) is None
 
     @killed_by("kernel/compilers.py", "if said is not None and not said.strip():", "if False:")
-    @killed_by("simulate/engine.py", "    tell(why_not)\n", "")
+    @killed_by("simulate/engine.py", "    log_xla_reason(why_not)\n", "")
     def test_without_a_compiler(self, monkeypatch, caplog):
         monkeypatch.setenv(compilers.COMPILER, "")
-        tell.cache_clear()
+        log_xla_reason.cache_clear()
         native._run.clear_cache()
         loop = d.replace(LOOP, {"sensor": braking(plant=LOOP.plant).sensor})
-        line = native.objection(loop, VALUES, SOLVER, {})
+        line = native.kernel_objection(loop, VALUES, SOLVER, {})
         assert line == f"{compilers.COMPILER} is empty"
         with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {line}"):
             d.run_batch(loop, d.Batch(VALUES), SOLVER, {}, accepted=True, engine="kernel")
@@ -162,15 +162,17 @@ class TestObjections:
     def test_of_a_compiler_that_does_not_work(self, command, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, command)
         with pytest.raises(compilers.NoCompiler, match=command):
-            compilers.compiler()
+            compilers.find_compiler()
 
-    @killed_by("simulate/engine.py", "if engine not in ENGINES:", "if False:")
+    @killed_by("simulate/engine.py", "if engine not in REQUESTABLE_ENGINES:", "if False:")
     def test_of_another_name(self):
         with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
             d.run_batch(LOOP, d.Batch(VALUES, KEYS), SOLVER, MEASURED, engine="gpu")
 
     @killed_by(
-        "simulate/batch.py", "why_not = TOGETHER if trajectories or together or", "why_not = TOGETHER if False and"
+        "simulate/batch.py",
+        "why_not = TOGETHER_REASON if trajectories or together or",
+        "why_not = TOGETHER_REASON if False and",
     )
     @pytest.mark.parametrize("more", [{"together": True}, {"trajectories": True}])
     def test_of_lanes_that_run_together(self, more):
@@ -186,11 +188,13 @@ class TestObjections:
         with pytest.raises(ValueError, match="a kernel has no reverse mode: forward mode"):
             jax.grad(iae)(-4000.0)
 
-    @killed_by("kernel/nested.py", "or not _says_any(eqn)", "")
-    @killed_by("kernel/primitives.py", "if name not in RULES:", 'if name not in RULES and name != "while":')
-    @killed_by("kernel/nested.py", 'if p["length"] > LONGEST:', "if False:")
-    @killed_by("kernel/indexing.py", "if count > LONGEST:", "if False:")
-    @killed_by("kernel/indexing.py", "if len(column) > LONGEST:", "if False:")
+    @killed_by("kernel/nested.py", "or not _is_any_rule(eqn)", "")
+    @killed_by(
+        "kernel/primitives.py", "if name not in LOWERING_RULES:", 'if name not in LOWERING_RULES and name != "while":'
+    )
+    @killed_by("kernel/nested.py", 'if p["length"] > MAX_UNROLLED_STEPS:', "if False:")
+    @killed_by("kernel/indexing.py", "if count > MAX_COMPARED_ENTRIES:", "if False:")
+    @killed_by("kernel/indexing.py", "if len(column) > MAX_COMPARED_ENTRIES:", "if False:")
     @killed_by("kernel/draws.py", 'if str(aval.dtype) != "key<fry>":', "if False:")
     @pytest.mark.parametrize(
         ("function", "line"),
@@ -217,16 +221,16 @@ class TestObjections:
         params = {name: x for name, x in eqn.params.items() if name not in ("num_consts", "num_carry")}
         new = jaxpr.replace(eqns=[eqn.replace(params=params | {"ft_in": structure})])
         with pytest.raises(Unsupported, match="scan: its parameter ft_in is not known"):
-            translate(Graph(), new, [], [known(Graph(), 1.0)])
+            lower_jaxpr(Graph(), new, [], [constant_array(Graph(), 1.0)])
 
-    @killed_by("kernel/primitives.py", "sorted(set(eqn.params) - RULES[name].known)", "[]")
+    @killed_by("kernel/primitives.py", "sorted(set(eqn.params) - LOWERING_RULES[name].known)", "[]")
     def test_of_a_parameter_that_is_not_known(self):
         """A later JAX may say something with it."""
         jaxpr = jax.make_jaxpr(lambda x: jnp.exp(x))(1.0).jaxpr
         eqn = jaxpr.eqns[0]
         new = jaxpr.replace(eqns=[eqn.replace(params=eqn.params | {"colour": "red"})])
         with pytest.raises(Unsupported, match="exp: its parameter colour is not known"):
-            translate(Graph(), new, [], [known(Graph(), 1.0)])
+            lower_jaxpr(Graph(), new, [], [constant_array(Graph(), 1.0)])
 
 
 class TestSweep:
@@ -245,7 +249,7 @@ class TestSweep:
             columns = [table[name].to_numpy() for table in tables.values()]
             np.testing.assert_allclose(*columns, rtol=1e-12, atol=1e-14, err_msg=name)
         written = json.loads((tmp_path / "kernel" / "manifest.json").read_text())["study"]["engine"]
-        assert written == {"name": "kernel", **compilers.described()}
+        assert written == {"name": "kernel", **compilers.describe_compiler()}
         assert "engine" not in json.loads((tmp_path / "xla" / "manifest.json").read_text())["study"]
         with pytest.raises(SweepError, match="engine"):
             sweep(study, tmp_path / "kernel", resume=True)
@@ -277,7 +281,7 @@ class TestGraph:
     @killed_by("kernel/operations.py", '"add", "mul", "and"', '"add", "sub", "mul", "and"')
     def test_equal_operations_are_one(self):
         graph = Graph()
-        x, y = (graph.input(float, Level.STEP, i) for i in range(2))
+        x, y = (graph.input(float, UpdateLevel.STEP, i) for i in range(2))
         assert graph.op("add", x, y) is graph.op("add", y, x)
         assert graph.op("gt", x, y) is graph.op("lt", y, x)
         assert graph.op("sub", x, y) is not graph.op("sub", y, x)
@@ -286,16 +290,20 @@ class TestGraph:
         graph = Graph()
         assert graph.op("add", graph.const(1.0), graph.const(2.0)).attr == 3.0
         assert graph.op("quotient", graph.const(-7), graph.const(2)).attr == -3
-        x = graph.input(float, Level.STEP, 0)
+        x = graph.input(float, UpdateLevel.STEP, 0)
         assert graph.op("mul", x, graph.const(1.0)) is x
         assert graph.op("mul", x, graph.const(0.0)) is not graph.const(0.0)  # x may be infinite
 
     @killed_by("kernel/graph.py", 'if inverse.op == "const" and not', "if False and not")
     def test_a_divisor_of_before_the_step_is_inverted_there(self):
         graph = Graph()
-        x, fixed, tiny = graph.input(float, Level.STEP, 0), graph.input(float, Level.UNIFORM, 1), graph.const(1e-310)
+        x, fixed, tiny = (
+            graph.input(float, UpdateLevel.STEP, 0),
+            graph.input(float, UpdateLevel.UNIFORM, 1),
+            graph.const(1e-310),
+        )
         product = graph.op("div", x, fixed)
-        assert (product.op, min(arg.level for arg in product.args)) == ("mul", Level.UNIFORM)
+        assert (product.op, min(arg.level for arg in product.args)) == ("mul", UpdateLevel.UNIFORM)
         assert graph.op("div", x, tiny).op == "div"  # its inverse is infinite
         assert graph.op("div", x, x).op == "div"
 
@@ -309,22 +317,22 @@ class TestLibrary:
     )
 
     def test_is_made_once(self, tmp_path, monkeypatch):
-        compilers.compiler()  # has been tried, which is noted
+        compilers.find_compiler()  # has been tried, which is noted
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
-        path = compilers.library(self.TEXT % 1)
+        path = compilers.build_library(self.TEXT % 1)
         monkeypatch.setattr(compilers, "_compile", None)
-        assert compilers.library(self.TEXT % 1) == path
+        assert compilers.build_library(self.TEXT % 1) == path
         assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
     @pytest.mark.parametrize("how", ["empty", "cut off", "one bit", "another library"])
     def test_that_is_damaged_is_compiled_again(self, how, tmp_path, monkeypatch, caplog):
         """Also one whose file is a library, but another one: no damaged file is ever loaded."""
-        compilers.compiler()
+        compilers.find_compiler()
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
         monkeypatch.setattr(
             compilers, "_compile", lambda words, source, result, s: result.write_bytes(source.read_bytes())
         )
-        path, other = compilers.library("one library"), compilers.library("another")
+        path, other = compilers.build_library("one library"), compilers.build_library("another")
         whole = path.read_bytes()
         damaged = {
             "empty": b"",
@@ -333,19 +341,19 @@ class TestLibrary:
             "another library": other.read_bytes(),
         }
         path.write_bytes(damaged[how])
-        assert compilers.library("one library").read_bytes() == whole
+        assert compilers.build_library("one library").read_bytes() == whole
         assert [record.message for record in caplog.records] == [f"{path} is damaged; it is compiled again"]
         assert sorted(tmp_path.iterdir()) == sorted([path, other])
 
     @pytest.mark.skipif(not hasattr(os, "getuid"), reason="Windows has no such modes")
     def test_in_a_folder_that_others_may_write_to_is_refused(self, tmp_path, monkeypatch):
-        compilers.compiler()
+        compilers.find_compiler()
         tmp_path.chmod(0o770)
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
         with pytest.raises(
             compilers.NoCompiler, match=r"other users may write to it: `chmod go-w` it, or name another"
         ):
-            compilers.library(self.TEXT % 1)
+            compilers.build_library(self.TEXT % 1)
         assert list(tmp_path.iterdir()) == []
 
     @pytest.mark.skipif(sys.platform == "win32", reason="the compiler of this test is a shell script")
@@ -355,37 +363,37 @@ class TestLibrary:
         path.write_text("#!/bin/sh\nsleep 60 &\nwait\n")
         path.chmod(0o755)
         monkeypatch.setenv(compilers.COMPILER, str(path))
-        monkeypatch.setattr(compilers, "LONGEST_TRY_S", 0.2)
+        monkeypatch.setattr(compilers, "PROBE_TIMEOUT_S", 0.2)
         begun = time.monotonic()
         with pytest.raises(compilers.NoCompiler, match=rf"{path} did not end within 0\.2 s and was stopped"):
-            compilers.compiler()
+            compilers.find_compiler()
         assert time.monotonic() - begun < 20
 
     def test_that_was_not_used_for_longest_goes(self, tmp_path, monkeypatch):
-        compilers.compiler()
+        compilers.find_compiler()
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
         monkeypatch.setattr(compilers, "_compile", lambda words, source, result, s: result.write_bytes(bytes(10)))
-        first, second, third = (compilers.library(text) for text in ("first", "second", "third"))
+        first, second, third = (compilers.build_library(text) for text in ("first", "second", "third"))
         for i, path in enumerate((first, second, third)):
             os.utime(path, (i, i))
-        compilers.library("first")  # is used again
-        monkeypatch.setattr(binaries, "ROOM", 30)
-        fourth = compilers.library("fourth")
+        compilers.build_library("first")  # is used again
+        monkeypatch.setattr(binaries, "MAX_CACHE_BYTES", 30)
+        fourth = compilers.build_library("fourth")
         assert set(tmp_path.glob("*.so")) == {first, second, third, fourth}
-        monkeypatch.setattr(binaries, "ROOM", 39)
-        fifth = compilers.library("fifth")
+        monkeypatch.setattr(binaries, "MAX_CACHE_BYTES", 39)
+        fifth = compilers.build_library("fifth")
         assert set(tmp_path.glob("*.so")) == {first, fourth, fifth}
 
-    @killed_by("kernel/compilers.py", "repr((made, FLAGS, _processor()))", "repr(made)")
+    @killed_by("kernel/compilers.py", "repr((made, CPP_FLAGS, _processor()))", "repr(made)")
     @pytest.mark.parametrize("changed", ["FLAGS", "_processor"])
     def test_is_another_for_other_flags_and_processors(self, changed, tmp_path, monkeypatch):
-        compilers.compiler()
+        compilers.find_compiler()
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
         monkeypatch.setattr(compilers, "_compile", lambda words, source, result, s: result.write_bytes(b""))
-        path, made = compilers.library("one"), compilers.compiler()
-        monkeypatch.setattr(compilers, "compiler", lambda: made)
+        path, made = compilers.build_library("one"), compilers.find_compiler()
+        monkeypatch.setattr(compilers, "find_compiler", lambda: made)
         monkeypatch.setattr(compilers, changed, ("-O1",) if changed == "FLAGS" else lambda: "another")
-        assert compilers.library("one") != path
+        assert compilers.build_library("one") != path
 
     @killed_by(
         "kernel/compilers.py",
@@ -396,13 +404,13 @@ class TestLibrary:
         (tmp_path / "file").write_text("")
         monkeypatch.setenv(binaries.CACHE, str(tmp_path / "file" / "kernel"))
         with pytest.raises(compilers.NoCompiler, match=r"no kernel in .*file.kernel: Not a directory"):
-            compilers.library(self.TEXT % 3)
+            compilers.build_library(self.TEXT % 3)
 
     @killed_by("kernel/launch.py", "except (OSError, AttributeError) as error:", "except AttributeError as error:")
     def test_that_is_none_cannot_be_loaded(self, tmp_path, monkeypatch):
         (tmp_path / "none.so").write_text("nothing")
         with pytest.raises(compilers.NoCompiler, match=r"invalid ELF header|file too short|not a mach-o"):
-            launch.register(tmp_path / "none.so")
+            launch.register_library(tmp_path / "none.so")
 
     @pytest.mark.slow
     def test_of_two_processes_at_once_and_of_one_that_is_killed(self, tmp_path):
@@ -425,5 +433,5 @@ class TestLibrary:
         assert len(whole) == 1
 
     def test_no_flag_changes_what_is_finite(self):
-        assert not any("fast-math" in flag or "finite" in flag or "unsafe" in flag for flag in compilers.FLAGS)
-        assert pathlib.Path(compilers.NATIVE / "lanes.h").is_file()
+        assert not any("fast-math" in flag or "finite" in flag or "unsafe" in flag for flag in compilers.CPP_FLAGS)
+        assert pathlib.Path(compilers.NATIVE_FOLDER / "lanes.h").is_file()

@@ -43,7 +43,7 @@ def _own_folder(monkeypatch):
 @pytest.fixture
 def processor(monkeypatch):
     found = Processor()
-    monkeypatch.setattr(gpu, "device", lambda: found)
+    monkeypatch.setattr(gpu, "find_gpu", lambda: found)
     return found
 
 
@@ -136,7 +136,7 @@ class TestMachineCode:
     @pytest.fixture(autouse=True)
     def _compiler(self):
         try:
-            nvrtc.version()
+            nvrtc.nvrtc_version()
         except NoCompiler as error:
             pytest.skip(str(error))
 
@@ -147,10 +147,10 @@ class TestMachineCode:
     )
     def test_of_a_scenario_stays_in_registers(self, name, dtype, architecture, monkeypatch):
         monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-        source = cuda.source(*importlib.import_module("bench_gpu").translated(name, dtype))
-        code = nvrtc.machine_code(source.text, architecture)
+        source = cuda.emit_cuda(*importlib.import_module("bench_gpu").translated(name, dtype))
+        code = nvrtc.build_cubin(source.text, architecture)
         assert code.read_bytes()[:4] == b"\x7fELF"
-        used = nvrtc.registers(code.with_suffix(".log").read_text())["run_all"]
+        used = nvrtc.parse_register_usage(code.with_suffix(".log").read_text())["run_all"]
         most, spilled = MOST[dtype]
         assert used["registers"] <= most
         assert used["spilled"] <= LARGE.get(name, {}).get(dtype, spilled)
@@ -158,24 +158,26 @@ class TestMachineCode:
     def test_of_a_wrong_text_is_an_objection(self, tmp_path, monkeypatch):
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
         with pytest.raises(NoCompiler, match=r"NVRTC, sm_90: kernel.cu\(1\): error"):
-            nvrtc.machine_code("nonsense", "sm_90")
+            nvrtc.build_cubin("nonsense", "sm_90")
         assert not [*tmp_path.iterdir()]
 
 
-@killed_by("kernel/nvrtc.py", "repr((FLAGS, version(), architecture))", "repr((version(), architecture))")
+@killed_by(
+    "kernel/nvrtc.py", "repr((NVRTC_FLAGS, nvrtc_version(), architecture))", "repr((nvrtc_version(), architecture))"
+)
 def test_machine_code_is_made_once(tmp_path, monkeypatch):
     """For the same text, flags and architecture."""
     made = []
     monkeypatch.setenv(binaries.CACHE, str(tmp_path))
-    monkeypatch.setattr(nvrtc, "version", lambda: (13, 5))
-    monkeypatch.setattr(nvrtc, "_compiled", lambda *args: (made.append(args), (b"code", "what was said"))[1])
-    path = nvrtc.machine_code("text", "sm_90")
-    assert nvrtc.machine_code("text", "sm_90") == path
+    monkeypatch.setattr(nvrtc, "nvrtc_version", lambda: (13, 5))
+    monkeypatch.setattr(nvrtc, "_compile_cubin", lambda *args: (made.append(args), (b"code", "what was said"))[1])
+    path = nvrtc.build_cubin("text", "sm_90")
+    assert nvrtc.build_cubin("text", "sm_90") == path
     assert (len(made), path.read_bytes(), path.with_suffix(".log").read_text()) == (1, b"code", "what was said")
     assert sorted(p.suffix for p in tmp_path.iterdir()) == [".cubin", ".log"]
-    others = {nvrtc.machine_code("text", "sm_80"), nvrtc.machine_code("other", "sm_90")}
-    monkeypatch.setattr(nvrtc, "FLAGS", (*nvrtc.FLAGS, "-w"))
-    assert len({path, *others, nvrtc.machine_code("text", "sm_90")}) == 4
+    others = {nvrtc.build_cubin("text", "sm_80"), nvrtc.build_cubin("other", "sm_90")}
+    monkeypatch.setattr(nvrtc, "NVRTC_FLAGS", (*nvrtc.NVRTC_FLAGS, "-w"))
+    assert len({path, *others, nvrtc.build_cubin("text", "sm_90")}) == 4
 
 
 class TestObjections:
@@ -183,18 +185,18 @@ class TestObjections:
         monkeypatch.setattr(nvrtc.importlib.util, "find_spec", lambda name: None)
         monkeypatch.setattr(nvrtc.ctypes, "CDLL", lambda path: (_ for _ in ()).throw(OSError(path)))
         with pytest.raises(NoCompiler, match="no CUDA compiler; the package nvidia-cuda-nvrtc"):
-            nvrtc._library.__wrapped__()
+            nvrtc._load_nvrtc.__wrapped__()
 
     @killed_by("kernel/gpu.py", 'if not capability.replace(".", "").isdigit():', "if False:")
     def test_of_a_gpu_of_another_make(self, monkeypatch):
         monkeypatch.setattr(gpu.jax, "devices", lambda platform=None: [Home("gpu", "gfx942")])
-        gpu._cuda.cache_clear()
+        gpu._find_cuda_device.cache_clear()
         line = "kernels are for processors and NVIDIA's GPUs, not for gpu gfx942"
-        assert native.objection(LOOP, VALUES, SOLVER, MEASURED) == line
+        assert native.kernel_objection(LOOP, VALUES, SOLVER, MEASURED) == line
         monkeypatch.setattr(gpu.jax, "devices", lambda platform=None: [Home("gpu", "9.0")])
-        gpu._cuda.cache_clear()
-        assert gpu.device().architecture == "sm_90"
-        gpu._cuda.cache_clear()
+        gpu._find_cuda_device.cache_clear()
+        assert gpu.find_gpu().architecture == "sm_90"
+        gpu._find_cuda_device.cache_clear()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -235,18 +237,20 @@ class Driver:
 
 class TestDriver:
     def start(self, driver, count, monkeypatch, tmp_path):
-        monkeypatch.setattr(gpu, "_driver", lambda: driver)
+        monkeypatch.setattr(gpu, "_load_driver", lambda: driver)
         code = tmp_path / "one.cubin"
         code.write_bytes(b"")
-        arrays = gpu._arrays([1, 2, 3, 4, 5, 6], [1, 1, 2, 2])
+        arrays = gpu._pack_addresses([1, 2, 3, 4, 5, 6], [1, 1, 2, 2])
         assert [x or 0 for x in arrays] == [1, 0, 2, 0, 3, 4, 0, 5, 6, 0]
-        on = gpu.Cuda("sm_90")
+        on = gpu.CudaDevice("sm_90")
         on.start(code, arrays, 4096, count, Context(77))
         return on, code, arrays
 
-    @killed_by("kernel/gpu.py", "ctypes.c_int64(blocks * cuda.THREADS)", "ctypes.c_int64(blocks)")
-    @killed_by("kernel/gpu.py", "cuda.THREADS, context.stream, arrays", "cuda.THREADS, 0, arrays")
-    @killed_by("kernel/gpu.py", "min(one.blocks, -(-count // cuda.THREADS))", "-(-count // cuda.THREADS)")
+    @killed_by("kernel/gpu.py", "ctypes.c_int64(blocks * cuda.THREADS_PER_BLOCK)", "ctypes.c_int64(blocks)")
+    @killed_by("kernel/gpu.py", "cuda.THREADS_PER_BLOCK, context.stream, arrays", "cuda.THREADS_PER_BLOCK, 0, arrays")
+    @killed_by(
+        "kernel/gpu.py", "min(one.blocks, -(-count // cuda.THREADS_PER_BLOCK))", "-(-count // cuda.THREADS_PER_BLOCK)"
+    )
     def test_is_told_of_arrays_threads_and_lanes(self, monkeypatch, tmp_path):
         """No more blocks than there are lanes for, nor than the device holds; one thread first; XLA's stream."""
         for count, blocks in ((1000, 8), (10**6, 3 * 132)):
@@ -254,8 +258,8 @@ class TestDriver:
             self.start(driver, count, monkeypatch, tmp_path)
             first, second = driver.launches
             shared = 4096 + cuda.COUNTER
-            assert first == (1, 1, 77, [1, shared, 4096, blocks * cuda.THREADS])
-            assert second == (blocks, cuda.THREADS, 77, [1, shared, 4096, count])
+            assert first == (1, 1, 77, [1, shared, 4096, blocks * cuda.THREADS_PER_BLOCK])
+            assert second == (blocks, cuda.THREADS_PER_BLOCK, 77, [1, shared, 4096, count])
             assert driver.asked.count("cuCtxPushCurrent_v2") == driver.asked.count("cuCtxPopCurrent_v2") == 2
 
     def test_loads_machine_code_once(self, monkeypatch, tmp_path):
@@ -266,7 +270,9 @@ class TestDriver:
         assert len(driver.launches) == 4
 
     @killed_by(
-        "kernel/gpu.py", '    finally:\n        _do("cuCtxPop', '    except ZeroDivisionError:\n        _do("cuCtxPop'
+        "kernel/gpu.py",
+        '    finally:\n        _call_driver("cuCtxPop',
+        '    except ZeroDivisionError:\n        _call_driver("cuCtxPop',
     )
     def test_objects(self, monkeypatch, tmp_path):
         driver = Driver(failing="cuModuleLoadData")

@@ -19,7 +19,7 @@ from diffabs.kernel import binaries, compilers, launch
 from diffabs.objectives import IAE, StopTime
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import native
-from diffabs.simulate.engine import EngineError, tell
+from diffabs.simulate.engine import EngineError, log_xla_reason
 from diffabs.tune.problem import Mode
 
 pytestmark = pytest.mark.xdist_group("kernel engines")
@@ -57,7 +57,7 @@ def _own_folder(monkeypatch):
 @pytest.fixture
 def no_compiler(monkeypatch):
     monkeypatch.setenv(compilers.COMPILER, "")
-    tell.cache_clear()
+    log_xla_reason.cache_clear()
     jax.clear_caches()
     yield
     jax.clear_caches()
@@ -69,7 +69,7 @@ class TestTune:
         """Two starts, each with its lanes, in one launch; the values of what is tuned to the last digits."""
         method = tune.Method(starts=2)
         found, expected = (tune.tune(LOOP, **TUNED, method=method, engine=e) for e in ("kernel", "xla"))
-        assert found.engine == {"name": "kernel", **compilers.described()}
+        assert found.engine == {"name": "kernel", **compilers.describe_compiler()}
         assert expected.engine == {"name": "xla"}
         np.testing.assert_allclose(found.objective, expected.objective, rtol=1e-9)
         np.testing.assert_allclose(found.values["controller.torque"], expected.values["controller.torque"], rtol=1e-6)
@@ -98,7 +98,7 @@ class TestTune:
         with pytest.raises(EngineError, match="engine = 'kernel' is not possible: a kernel has no reverse mode"):
             tune.tune(LOOP, **TUNED, method=method, engine="kernel")
 
-    @killed_by("tune/problem.py", "if engine not in ENGINES:", "if False:")
+    @killed_by("tune/problem.py", "if engine not in REQUESTABLE_ENGINES:", "if False:")
     def test_of_another_name(self):
         with pytest.raises(ValueError, match="engine = 'gpu' is unknown; there is auto, xla, kernel"):
             tune.tune(LOOP, **TUNED, engine="gpu")
@@ -115,7 +115,7 @@ class TestTune:
         assert len(caplog.records) == 1
         assert NONE in caplog.records[0].getMessage()
 
-    @killed_by("kernel/primitives.py", "error.method = error.method or _asked_by(eqn)", "pass")
+    @killed_by("kernel/primitives.py", "error.method = error.method or _calling_method(eqn)", "pass")
     def test_of_what_has_no_rule_names_the_part(self):
         line = tune.posed(DELAYED, **TUNED, engine="kernel").objection()
         why = "dynamic_slice: of 1296 entries that differ between lanes (in Delay.tick)"
@@ -126,14 +126,14 @@ class TestTune:
         """It writes what made it; without a compiler it is an objection, or XLA, and says so."""
         few = ("--set", "tune.iterations=1", "--json")
         document = json.loads(run("tune", "slip-lmi", *few, "--engine", "kernel").stdout)
-        assert document["engine"] == {"name": "kernel", **compilers.described()}
+        assert document["engine"] == {"name": "kernel", **compilers.describe_compiler()}
         monkeypatch.setenv(compilers.COMPILER, "")
         assert NONE in run("tune", "slip-lmi", *few, "--engine", "kernel", status=2).stderr
         done = run("tune", "slip-lmi", *few, "--engine", "auto")
         assert f"note: runs are made by XLA: engine = 'kernel' is not possible: {NONE}" in done.stderr
         assert json.loads(done.stdout)["engine"] == {"name": "xla"}
 
-    @killed_by("cli/engine.py", "if engine not in ENGINES:", "if False:")
+    @killed_by("cli/engine.py", "if engine not in REQUESTABLE_ENGINES:", "if False:")
     @pytest.mark.parametrize("command", [("tune", "slip-lmi"), ("rare", "slip-lmi", "overshoot")])
     def test_another_engine_is_refused_by_the_command(self, command):
         assert "--engine gpu is unknown" in run(*command, "--engine", "gpu", status=2).stderr
@@ -145,8 +145,8 @@ class TestTune:
 def test_the_worst_case_is_that_of_xla(monkeypatch):
     """Screened without derivatives and ascended with them, both by a kernel."""
     native._run.clear_cache()
-    launches, launched = [], launch._launched
-    monkeypatch.setattr(launch, "_launched", lambda made, *a, **k: launches.append(made) or launched(made, *a, **k))
+    launches, launched = [], launch._launch_lanes
+    monkeypatch.setattr(launch, "_launch_lanes", lambda made, *a, **k: launches.append(made) or launched(made, *a, **k))
     over = {"plant.mass": (14.0, 16.0), "initial.speed": (25.0, 28.0)}
     given = {"over": over, "metric": "iae", "solver": TUNED["solver"], "measured": TUNED["measured"]}
     found, expected = (
@@ -157,7 +157,7 @@ def test_the_worst_case_is_that_of_xla(monkeypatch):
     assert {bool(made.tangents) for made in launches} == {False, True}
 
 
-@killed_by("simulate/native.py", "ROUND // BLOCK", "1")
+@killed_by("simulate/native.py", "STEPS_PER_EXCHANGE // STEPS_PER_BLOCK", "1")
 @pytest.mark.slow
 def test_a_map_of_starts_is_that_of_xla():
     """Runs that end inside of an ellipsoid, that fall, and that do neither; known at the same instant."""

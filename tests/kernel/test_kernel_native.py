@@ -23,7 +23,7 @@ PLAIN = [False, pytest.param(True, marks=pytest.mark.slow)]
 def _own_folder(monkeypatch):
     """And blocks of one vector, which are compiled in a fourth of the time."""
     monkeypatch.setenv(binaries.CACHE, FOLDER)
-    monkeypatch.setattr(launch, "VECTORS", 1)
+    monkeypatch.setattr(launch, "VECTORS_PER_BLOCK", 1)
 
 
 def _arguments(dtype):
@@ -54,7 +54,7 @@ def _ulps(found, expected, dtype):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_elementary_functions_are_right_to_a_unit_in_the_last_place(dtype, plain, monkeypatch):
     if plain:
-        monkeypatch.setattr(compilers, "FLAGS", (*compilers.FLAGS, "-DPLAIN"))
+        monkeypatch.setattr(compilers, "CPP_FLAGS", (*compilers.CPP_FLAGS, "-DPLAIN"))
     x = _arguments(dtype)
     with jax.enable_x64(dtype is np.float64):
         found = applied({name: getattr(jnp, name) for name in (*REAL, *EXACT)}, jnp.asarray(x))
@@ -73,7 +73,7 @@ def test_elementary_functions_are_right_to_a_unit_in_the_last_place(dtype, plain
 def test_ends_of_functions(plain, monkeypatch):
     """Infinite, NaN, zeros of either sign, and what flows over."""
     if plain:
-        monkeypatch.setattr(compilers, "FLAGS", (*compilers.FLAGS, "-DPLAIN"))
+        monkeypatch.setattr(compilers, "CPP_FLAGS", (*compilers.CPP_FLAGS, "-DPLAIN"))
     x = np.array([np.inf, -np.inf, np.nan, 0.0, -0.0, 1.0, -1.0, 710.0, -746.0, 1e300, -1e300, 1e6, -3e5])
     found = applied({name: getattr(jnp, name) for name in (*REAL, *EXACT)}, x)
     with np.errstate(all="ignore"):
@@ -137,7 +137,7 @@ RULES = {
 
 @killed_by("kernel/native/lanes.h", "REALLY(mask_max)(x, R_MASK(cmpeq)(x, x), x, y)", "REALLY(max)(x, y)")
 @killed_by(
-    "kernel/operations.py", 'CONTRARY = {"eq": "ne", "ne": "eq"}', 'CONTRARY = {"eq": "ne", "ne": "eq", "lt": "le"}'
+    "kernel/operations.py", 'NEGATED = {"eq": "ne", "ne": "eq"}', 'NEGATED = {"eq": "ne", "ne": "eq", "lt": "le"}'
 )
 @killed_by("kernel/elementwise.py", '"TO_NEAREST_EVEN"', '"NEVER"')
 @killed_by(

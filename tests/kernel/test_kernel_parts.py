@@ -38,7 +38,7 @@ LAST_DIGIT = {
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
     monkeypatch.setenv(binaries.CACHE, FOLDER)
-    monkeypatch.setattr(launch, "VECTORS", 2)
+    monkeypatch.setattr(launch, "VECTORS_PER_BLOCK", 2)
 
 
 def close(name, kind):

@@ -24,7 +24,7 @@ import diffabs as d
 from diffabs import controllers, plants, scenario
 from diffabs.core.pytree import arrayed, get, parameters
 from diffabs.kernel import binaries, launch, tangents
-from diffabs.kernel.graph import Level
+from diffabs.kernel.graph import UpdateLevel
 from diffabs.kernel.launch import run_lanes
 from diffabs.objectives import IAE, usual
 from diffabs.scenario.defaults import braking
@@ -47,7 +47,7 @@ PARTS_HERE = [case for case in CASES if case[0] != "stop"]
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
     monkeypatch.setenv(binaries.CACHE, FOLDER)
-    monkeypatch.setattr(launch, "VECTORS", 2)
+    monkeypatch.setattr(launch, "VECTORS_PER_BLOCK", 2)
 
 
 def chain(gain, rates, engine="kernel", wanted=None):
@@ -98,7 +98,9 @@ class TestLaunch:
         case="of both",
     )
     @killed_by("kernel/linear.py", 'self.graph.op("mul", x.number, y.number)', "x.number", case="three tangents")
-    @killed_by("kernel/tangents.py", "copy_of(new[x.id], k) for", "copy_of(new[x.id], 0) for", case="three tangents")
+    @killed_by(
+        "kernel/tangents.py", "tangent_copy(new[x.id], k) for", "tangent_copy(new[x.id], 0) for", case="three tangents"
+    )
     @killed_by(
         "kernel/binding.py",
         "jnp.pad(x, wide), first, first + each,",
@@ -123,31 +125,37 @@ class TestLaunch:
         assert np.abs(expected[..., :3]).max() > 0
         np.testing.assert_allclose(found, expected, rtol=2e-13, atol=1e-13)
 
-    @killed_by("kernel/tangents.py", "if reached == do[Level.STEP]:", "if True:")
+    @killed_by("kernel/tangents.py", "if reached == moved_arrays[UpdateLevel.STEP]:", "if True:")
     def test_only_what_moves_is_carried(self, monkeypatch):
         """The fourth number moves with nothing, and what comes from no tangent is no operation."""
         seen = []
-        spread = tangents.spread
-        monkeypatch.setattr(tangents, "spread", lambda f, one, *more: seen.append(one.do) or spread(f, one, *more))
+        spread = tangents.replicate_tangents
+        monkeypatch.setattr(
+            tangents, "replicate_tangents", lambda f, one, *more: seen.append(one.moved_arrays) or spread(f, one, *more)
+        )
         jax.jvp(lambda g: chain(g, RATES), (2.0,), (1.0,))
-        assert seen[-1][Level.STEP] == (1, 2, 3)
-        assert seen[-1][Level.LANE] == ()
+        assert seen[-1][UpdateLevel.STEP] == (1, 2, 3)
+        assert seen[-1][UpdateLevel.LANE] == ()
 
-    @killed_by("kernel/tangents.py", "if wanted is not None:", "if False:")
+    @killed_by("kernel/tangents.py", "if outputs_needed is not None:", "if False:")
     def test_only_what_is_asked_for_is_carried(self, monkeypatch):
         """The third number leads to nothing but itself, and has no tangent; the second has those that it has anyway."""
         seen = []
-        spread = tangents.spread
-        monkeypatch.setattr(tangents, "spread", lambda f, one, *more: seen.append(one.do) or spread(f, one, *more))
+        spread = tangents.replicate_tangents
+        monkeypatch.setattr(
+            tangents, "replicate_tangents", lambda f, one, *more: seen.append(one.moved_arrays) or spread(f, one, *more)
+        )
         wanted = (False, False, True, False, False)
         found = jax.jvp(lambda g: chain(g, RATES, wanted=wanted), (2.0,), (1.0,))[1]
         known = jax.jvp(lambda g: chain(g, RATES, "xla"), (2.0,), (1.0,))[1]
-        assert seen[-1][Level.STEP] == (1, 2)
+        assert seen[-1][UpdateLevel.STEP] == (1, 2)
         np.testing.assert_allclose(found[1], known[1], rtol=2e-13)
         assert not np.any(found[2])
 
     @killed_by(
-        "kernel/elimination.py", "all(x not in self.vertices and self.levels[x] < Level.STEP for x in once)", "True"
+        "kernel/elimination.py",
+        "x not in self.vertices and self.levels[x] < UpdateLevel.STEP for x in once",
+        "True for x in once",
     )
     def test_what_is_not_chosen_does_not_matter(self):
         """A try may lead to what is no number, and is then not taken: neither are its tangents."""
@@ -164,16 +172,18 @@ class TestLaunch:
         known = jnp.outer((1 + 0.1 * RATES) ** STEPS * RATES, jnp.ones(3))
         np.testing.assert_allclose(jax.jacfwd(run)(jnp.arange(3.0)), known, rtol=1e-13)
 
-    @killed_by("kernel/binding.py", "MOST = 8 ", "MOST = 1 ", case="8-1")
+    @killed_by("kernel/binding.py", "MAX_TANGENTS_PER_LAUNCH = 8 ", "MAX_TANGENTS_PER_LAUNCH = 1 ", case="8-1")
     @pytest.mark.parametrize(("many", "launches"), [(8, 1), (9, 2)])
     def test_tangents_are_one_launch(self, many, launches, monkeypatch):
         made = []
-        launched = launch._launched
-        monkeypatch.setattr(launch, "_launched", lambda *args, **how: made.append(1) or launched(*args, **how))
+        launched = launch._launch_lanes
+        monkeypatch.setattr(launch, "_launch_lanes", lambda *args, **how: made.append(1) or launched(*args, **how))
         jax.jacfwd(lambda x: chain(jnp.sum(x), RATES))(jnp.ones(many))
         assert len(made) == launches
 
-    @killed_by("kernel/binding.py", "pe.custom_partial_eval_rules[operation] = _unknown", "")
+    @killed_by(
+        "kernel/binding.py", "pe.custom_partial_eval_rules[run_lanes_primitive] = _refuse_partial_evaluation", ""
+    )
     @pytest.mark.parametrize(
         "reverse",
         [
@@ -288,7 +298,7 @@ def test_a_part(family, name):
     compare((loop, d.FixedStep(1e-3, 0.06, kinks=False), usual(loop.plant), path), ROUNDED.get(name, EXACT))
 
 
-@killed_by("simulate/native.py", "else method.located()", "else method")
+@killed_by("simulate/native.py", "else method.for_derivatives()", "else method")
 @pytest.mark.slow
 def test_steps_end_on_kinks_where_those_of_xla_do():
     """Of a torque that comes to its limits: without, the derivatives would be others."""
@@ -306,7 +316,7 @@ def test_steps_end_on_kinks_where_those_of_xla_do():
     assert np.abs(blunt - known).max() > 1e-5 * np.abs(known).max()
 
 
-@killed_by("simulate/pursuit.py", "anyone(note.moved)", "anyone(note.fired != 0)", case="slip-lmi-adaptive")
+@killed_by("simulate/pursuit.py", "any_lane(note.moved)", "any_lane(note.fired != 0)", case="slip-lmi-adaptive")
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["grid", "kinks", "adaptive"])
 @pytest.mark.parametrize("name", scenario.names())

@@ -330,7 +330,7 @@ def test_ranges_by_the_names_of_the_linear_model(file):
 
 
 def test_no_stable_step_is_needed_for_what_is_not_integrated(monkeypatch):
-    monkeypatch.setattr("diffabs.simulate.refusals.stable_step", lambda loop: pytest.fail("asked"))
+    monkeypatch.setattr("diffabs.simulate.admissible.stable_step", lambda loop: pytest.fail("asked"))
     load("slip-lmi", integrated=False)
 
 

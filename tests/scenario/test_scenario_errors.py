@@ -269,7 +269,7 @@ def test_nothing_is_evaluated(file):
 def checked_step(monkeypatch):
     from diffabs.simulate.stable_step import stable_step
 
-    monkeypatch.setattr("diffabs.simulate.refusals.stable_step", stable_step)
+    monkeypatch.setattr("diffabs.simulate.admissible.stable_step", stable_step)
 
 
 def test_unstable_step(checked_step):

@@ -19,9 +19,9 @@ from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
 from diffabs.simulate import lengths
-from diffabs.simulate.foresight import Margin, bit, kinks
-from diffabs.simulate.replay import MOST, room
-from diffabs.simulate.run import arguments
+from diffabs.simulate.foresight import SwitchingFunction, forecast_crossings, read_bits
+from diffabs.simulate.replay import BASE_LOG_CAPACITY, log_capacity
+from diffabs.simulate.run import prepare_arguments
 from diffabs.tune import worst_case
 
 LIMITS = ("controller.torque_min=0.0", "controller.torque_max=9.03")
@@ -107,8 +107,8 @@ def test_a_computer_strikes_on_its_own_clock_and_not_on_the_grid():
 
 @killed_by(
     "simulate/methods.py",
-    "        inside = (t < now.t) & (carry.past.until > carry.past.t)",
-    "        inside = (t < now.t) & (carry.past.until < carry.past.t)",
+    "        inside = (t < now.t) & (carry.last_step.until > carry.last_step.t)",
+    "        inside = (t < now.t) & (carry.last_step.until < carry.last_step.t)",
 )
 @pytest.mark.slow
 def test_a_trajectory_is_kept_on_the_grid_and_changes_nothing():
@@ -157,14 +157,14 @@ def test_a_computer_in_single_precision_keeps_its_time():
     close(run, exact, 2e-4)
 
 
-@killed_by("simulate/methods.py", "ROUNDING = 32 ", "ROUNDING = 0 ")
+@killed_by("simulate/methods.py", "MIN_RTOL_EPS = 32 ", "MIN_RTOL_EPS = 0 ")
 @pytest.mark.slow
 def test_single_precision_asks_for_no_smaller_error_than_it_has():
     chosen = rig()
     exact = d.measure(chosen.loop, d.Adaptive(1e-9, 2.5), {"iae": IAE()})
     with jax.enable_x64(False):
         loop = jax.tree.map(lambda x: np.asarray(x, np.float32), chosen.loop)
-        assert arguments(loop, d.Adaptive(1e-9, 2.5), {})[2].rtol == np.float32(32 * np.finfo(np.float32).eps)
+        assert prepare_arguments(loop, d.Adaptive(1e-9, 2.5), {})[2].rtol == np.float32(32 * np.finfo(np.float32).eps)
         run = d.measure(loop, d.Adaptive(1e-9, 2.5), {"iae": IAE()})
     np.testing.assert_allclose(run.metrics["iae"], exact.metrics["iae"], rtol=1e-4)
 
@@ -184,9 +184,9 @@ def on_limits(solver):
 @killed_by(
     "simulate/adaptive.py",
     "exact = fine & (((here.error <= 1) & (here.late <= 0)) | short)",
-    "exact = fine & ((here.error <= 1) | short)",
+    "exact = fine & ((here.error_norm <= 1) | short)",
 )
-@killed_by("simulate/adaptive.py", "system.kinks if pace.notes else 0", "0")
+@killed_by("simulate/adaptive.py", "system.kinks if control.notes else 0", "0")
 @pytest.mark.slow
 def test_derivatives_on_limits_agree_with_differences_of_three_widths():
     slopes = jax.jit(jax.jacfwd(on_limits(d.Adaptive(1e-5, 2.5))))(jnp.zeros(2))
@@ -307,8 +307,8 @@ def test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps(
 
 @killed_by(
     "simulate/replay.py",
-    "(t, state.flow(), end.seen.rate) if pace.keeps",
-    "(t, state.flow(), begin.seen.rate) if pace.keeps",
+    "(t, state.flow(), end.seen.rate) if stepping.keeps",
+    "(t, state.flow(), begin.seen.rate) if stepping.keeps",
     case="limits",
 )
 @pytest.mark.slow
@@ -362,9 +362,9 @@ def test_the_region_of_attraction_is_that_of_fixed_steps():
 
 def test_there_is_room_for_smaller_steps():
     loop, sampled = rig().loop, load("slip-cured").loop
-    assert room(loop, d.Adaptive(1e-5, 2.5)) == MOST
-    assert room(loop, d.Adaptive(1e-9, 2.5)) == 10 * MOST
-    assert room(sampled, d.Adaptive(1e-5, 2.0, 1e-3)) == MOST + 2 * 2000
+    assert log_capacity(loop, d.Adaptive(1e-5, 2.5)) == BASE_LOG_CAPACITY
+    assert log_capacity(loop, d.Adaptive(1e-9, 2.5)) == 10 * BASE_LOG_CAPACITY
+    assert log_capacity(sampled, d.Adaptive(1e-5, 2.0, 1e-3)) == BASE_LOG_CAPACITY + 2 * 2000
 
 
 @pytest.mark.parametrize(
@@ -394,13 +394,13 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
     numbers = [0, 1, 33, np.array([2, 3])]
     values = [jnp.asarray(3.0), jnp.asarray(-2.0), jnp.asarray(1.0), jnp.array([0.5, 4.0])]
     rates = [jnp.asarray(-1.0), jnp.asarray(1.0), jnp.asarray(4.0), jnp.array([1.0, -40.0])]
-    margins = [Margin(*one) for one in zip(numbers, values, rates, strict=True)]
+    margins = [SwitchingFunction(*one) for one in zip(numbers, values, rates, strict=True)]
     words = (jnp.uint32(0b1100), jnp.uint32(0b10))
-    np.testing.assert_array_equal(bit(words, np.array([2, 3, 33, 1])), [True, True, True, False])
-    found = kinks(margins, jnp.asarray(1.0), 0.0, words, jnp.asarray(1.0))
+    np.testing.assert_array_equal(read_bits(words, np.array([2, 3, 33, 1])), [True, True, True, False])
+    found = forecast_crossings(margins, jnp.asarray(1.0), 0.0, words, jnp.asarray(1.0))
     assert found.ahead == pytest.approx(0.1)  # 4 falls by 40/s
     assert found.late == pytest.approx(0.5)  # of bits 2 and 33, 0.5 s and 0.25 s ago
-    none = kinks(margins, jnp.asarray(1.0), 0.0, (jnp.uint32(0),) * 2, jnp.asarray(1.0))
+    none = forecast_crossings(margins, jnp.asarray(1.0), 0.0, (jnp.uint32(0),) * 2, jnp.asarray(1.0))
     assert none.late == 0
 
 
@@ -419,11 +419,11 @@ def test_the_error_of_a_step_is_that_of_the_worst_state():
     state = loop.start()
     state = state.with_flow(jax.tree.map(lambda x: x + 2.0, state.flow()))
     sample = loop.signals(0.0, state).sample
-    scale = lengths.sizes(state, sample)
+    scale = lengths.error_scales(state, sample)
     none = jax.tree.map(lambda x: 0.0 * x, state)
-    assert lengths.error(loop, state, none.flow(), scale, sample) == 0
+    assert lengths.error_norm(loop, state, none.flow(), scale, sample) == 0
     off = none._replace(actuator=none.actuator._replace(flow=0.01 * state.actuator.flow))
-    assert lengths.error(loop, state, off.flow(), scale, sample) == pytest.approx(0.01)
+    assert lengths.error_norm(loop, state, off.flow(), scale, sample) == pytest.approx(0.01)
     slower = none._replace(plant=none.plant._replace(wheel=0.01 * state.plant.wheel))
     slip = abs(
         float(
@@ -431,7 +431,7 @@ def test_the_error_of_a_step_is_that_of_the_worst_state():
             - sample.output[0]
         )
     )
-    first = lengths.error(loop, state, slower.flow(), scale, sample)
+    first = lengths.error_norm(loop, state, slower.flow(), scale, sample)
     assert first == pytest.approx(max(0.01, slip / float(scale[0])), rel=1e-9)
     assert slip > 0.01 * float(scale[0])
 
@@ -449,9 +449,9 @@ def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
             at = state.with_flow(tree(z))
             return jax.flatten_util.ravel_pytree(loop.flow(0.0, at, loop.signals(0.0, at)))[0]
 
-        sizes = lengths.sizes(state, loop.signals(0.0, state).sample)
-        return jax.jacfwd(flow)(z), lengths.longest_stable(loop, jnp.asarray(0.0), state, sizes)
+        sizes = lengths.error_scales(state, loop.signals(0.0, state).sample)
+        return jax.jacfwd(flow)(z), lengths.spectral_step_limit(loop, jnp.asarray(0.0), state, sizes)
 
     jacobian, longest = both()
     radius = np.max(np.abs(np.linalg.eigvals(jacobian)))
-    assert 0.7 < float(longest) * radius / lengths.STABLE < 1.4
+    assert 0.7 < float(longest) * radius / lengths.STABILITY_RADIUS < 1.4

@@ -21,10 +21,10 @@ from diffabs.core.pytree import replace
 from diffabs.objectives import BRAKING
 from diffabs.scenario.defaults import braking
 from diffabs.sensors import Noise
-from diffabs.simulate import refill
-from diffabs.simulate.batch import Batch, by_structure, grid, latin, stacked
-from diffabs.simulate.placement import divided
-from diffabs.simulate.refill import ROUND
+from diffabs.simulate import packed
+from diffabs.simulate.batch import Batch, grid, group_by_structure, latin, stack_loops
+from diffabs.simulate.packed import STEPS_PER_EXCHANGE
+from diffabs.simulate.sharding import run_on_auto_mesh
 from diffabs.stops import SpeedReached, Standstill
 
 LOOP = braking(
@@ -81,7 +81,7 @@ class Slow(NamedTuple):
 @pytest.fixture(params=cases(["refilled", "together"], "together"))
 def driven(request, monkeypatch):
     """`run_batch` by each of its drivers, results as NumPy arrays."""
-    monkeypatch.setattr(refill, "WIDTH", SOME)
+    monkeypatch.setattr(packed, "LANES_AT_ONCE", SOME)
     together = request.param == "together"
     return lambda *args, **more: jax.device_get(d.run_batch(*args, together=together, **more))
 
@@ -91,16 +91,16 @@ class TestLanes:
         taken = expected.ending.sample.t / SOLVER.step
         assert np.flatnonzero(expected.diverged).tolist() == [AT_ONCE, DIVERGING]  # one begins below its stop
         assert sorted(np.flatnonzero(~expected.stopped)) == [NEVER, AT_ONCE, DIVERGING]
-        assert taken[NEVER] == SOLVER.steps > 3 * ROUND
+        assert taken[NEVER] == SOLVER.steps > 3 * STEPS_PER_EXCHANGE
         assert taken[AT_ONCE] == 0
-        assert 0 < taken[SHORT] < ROUND
+        assert 0 < taken[SHORT] < STEPS_PER_EXCHANGE
         assert np.isnan(expected.metrics["iae"]).tolist() == expected.diverged.tolist()
         assert len(np.unique(expected.metrics["iae"][[SHORT, 6]])) == 2  # noise of their own, everything else is equal
 
     @pytest.mark.parametrize("width", cases(WIDTHS, 4))
     def test_are_those_of_single_runs(self, width, keys, expected, monkeypatch):
         """Of whom enough is never seen: no car is slower than 0."""
-        monkeypatch.setattr(refill, "WIDTH", width)
+        monkeypatch.setattr(packed, "LANES_AT_ONCE", width)
         never = Slow(jnp.zeros(len(SPEEDS)))
         run = d.run_batch(LOOP, Batch(VALUES, keys), SOLVER, MEASURED, accepted=True, enough=never)
         same(jax.device_get(run), expected)
@@ -145,9 +145,9 @@ class TestLanes:
 
     @killed_by("simulate/batch.py", "    if accepted is True:\n        return run", "    return run", case="together")
     @killed_by(
-        "simulate/refill.py",
-        "jnp.where(run & (number < count), carry.condition",
-        "jnp.where(number < count, carry.condition",
+        "simulate/packed.py",
+        "jnp.where(run & (number < count), carry.status",
+        "jnp.where(number < count, carry.status",
         case="refilled",
     )
     def test_that_are_not_accepted(self, driven, keys, expected):
@@ -178,22 +178,24 @@ class TestLanes:
         same(jax.device_get(d.run_batch(LOOP, lanes, SOLVER, MEASURED, together=True, accepted=True)), expected)
 
     def test_are_compiled_once(self, keys, monkeypatch):
-        monkeypatch.setattr(refill, "WIDTH", SOME)
+        monkeypatch.setattr(packed, "LANES_AT_ONCE", SOME)
         lanes = Batch(VALUES, keys)
         d.run_batch(LOOP, lanes, SOLVER, MEASURED, accepted=True)
-        before = refill._run._cache_size()
+        before = packed._run._cache_size()
         faster = Batch({**VALUES, "initial.speed": 1.01 * SPEEDS}, keys)
         d.run_batch(LOOP, faster, d.FixedStep(2e-3, 0.4), MEASURED, accepted=True)
-        assert refill._run._cache_size() == before
+        assert packed._run._cache_size() == before
 
 
 @killed_by(
-    "simulate/refill.py", "free = ~belt.carry.running | _seen_enough(enough, built, belt)", "free = ~belt.carry.running"
+    "simulate/packed.py",
+    "free = ~slots.carry.running | _lanes_ended_early(enough, built, slots)",
+    "free = ~slots.carry.running",
 )
 @pytest.mark.parametrize("width", cases(WIDTHS, 4))
 def test_a_lane_of_which_enough_is_seen_is_taken_off(keys, expected, width, monkeypatch):
     """At the next look; it has not stopped, and the others are what they were."""
-    monkeypatch.setattr(refill, "WIDTH", width)
+    monkeypatch.setattr(packed, "LANES_AT_ONCE", width)
     limits = np.zeros(len(SPEEDS))
     limits[NEVER], limits[8], limits[SHORT] = 24.5, 7.5, 6.9
     slow = Slow(jnp.asarray(limits))
@@ -202,7 +204,7 @@ def test_a_lane_of_which_enough_is_seen_is_taken_off(keys, expected, width, monk
     assert not (found.stopped | found.diverged | found.timed_out)[early].any()
     assert np.all(found.ending.sample.output.speed[early] < limits[early])
     taken = found.ending.sample.t[early] / SOLVER.step
-    np.testing.assert_allclose(taken, ROUND * np.round(taken / ROUND), rtol=1e-12)
+    np.testing.assert_allclose(taken, STEPS_PER_EXCHANGE * np.round(taken / STEPS_PER_EXCHANGE), rtol=1e-12)
     assert np.all(taken < 0.9 * expected.ending.sample.t[early] / SOLVER.step)
     same(*(jax.tree.map(lambda x: x[~early], run) for run in (found, expected)))
 
@@ -271,7 +273,7 @@ class TestStacked:
     def test_loops_become_lanes(self):
         """Each parameter of its own, by path; whatever is done to them is done to each."""
         loops = [replace(QUIET, {"plant.mass": m, "controller.gain.0": k}) for m, k in ((5.0, -4e3), (6.0, -5e3))]
-        first, lanes = stacked(loops)
+        first, lanes = stack_loops(loops)
         assert lanes.size == 2
         for i, loop in enumerate(loops):
             same(lanes.lane(first, i), loop)
@@ -281,9 +283,9 @@ class TestStacked:
     @killed_by("simulate/batch.py", "(jax.tree.structure(loop), *map", "(0, *map")
     def test_of_one_structure(self):
         other = replace(QUIET, {"stop": Standstill(speed=5.0)})  # of equal shapes
-        assert by_structure([QUIET, other, replace(QUIET, {"plant.mass": 6.0})]) == [[0, 2], [1]]
+        assert group_by_structure([QUIET, other, replace(QUIET, {"plant.mass": 6.0})]) == [[0, 2], [1]]
         with pytest.raises(ValueError, match="loops of 2 structures are no lanes of one batch"):
-            stacked([QUIET, other])
+            stack_loops([QUIET, other])
 
 
 class TestBatch:
@@ -332,7 +334,7 @@ def placed(values, keys, kind):
     return {path: jax.device_put(x, place) for path, x in values.items()}, jax.device_put(keys, place)
 
 
-@killed_by("simulate/placement.py", "    if not meshes:", "    if True:")
+@killed_by("simulate/sharding.py", "    if not meshes:", "    if True:")
 def test_lanes_on_an_explicit_mesh_are_run_on_an_auto_one():
     """Gathers say nothing of where they lie there; results come back."""
     (speeds,), numbers = (given := placed({"speed": SPEEDS[:4]}, np.arange(4), AxisType.Explicit))[0].values(), given[1]
@@ -340,7 +342,7 @@ def test_lanes_on_an_explicit_mesh_are_run_on_an_auto_one():
         speeds[numbers]
     for around in (contextlib.nullcontext, jax.set_mesh):
         with around(speeds.sharding.mesh):
-            found = divided(lambda x, which, one: {"x": x[which], "one": one}, (speeds, numbers, 3.0))
+            found = run_on_auto_mesh(lambda x, which, one: {"x": x[which], "one": one}, (speeds, numbers, 3.0))
         np.testing.assert_array_equal(found["x"], SPEEDS[:4])
         assert found["x"].sharding.mesh == speeds.sharding.mesh
         assert found["one"] == 3.0

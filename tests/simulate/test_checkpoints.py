@@ -14,8 +14,8 @@ from diffabs.core.pytree import get
 from diffabs.objectives import IAE, StopDistance
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import checkpoint
-from diffabs.simulate.checkpoint import GROUP, SLOTS, levels, repeated
-from diffabs.simulate.drivers import slots
+from diffabs.simulate.checkpoint import MAX_SAVED_CARRIES, SCAN_GROUP_STEPS, nested_scan_lengths, repeat_step
+from diffabs.simulate.drivers import round_up_capacity
 from diffabs.stops import SpeedReached
 
 LOOP = braking(
@@ -55,7 +55,7 @@ def memory(steps):
     return analysis.temp_size_in_bytes
 
 
-@killed_by("simulate/checkpoint.py", "SLOTS = 1800", "SLOTS = 10**9")
+@killed_by("simulate/checkpoint.py", "MAX_SAVED_CARRIES = 1800", "MAX_SAVED_CARRIES = 10**9")
 @pytest.mark.slow
 def test_memory_of_reverse_mode_hardly_grows_with_the_number_of_steps():
     sizes = [memory(steps) for steps in (1000, 4000, 16000)]
@@ -67,17 +67,17 @@ def test_memory_of_reverse_mode_hardly_grows_with_the_number_of_steps():
 )
 @pytest.mark.parametrize("count", [1, 2, 7, 900, 1800, 1801, 1804, 4004, 16004, 10**6])
 def test_nested_scans_make_enough_steps_and_keep_few_carries(count):
-    groups, steps = levels(count)
-    assert count <= groups * steps <= count + max(GROUP, 0.002 * count)
-    if count > SLOTS:  # what is kept: the carry of each group, and in one group at a time of each step
-        assert SLOTS / 2 <= groups + steps <= 1.5 * SLOTS
+    groups, steps = nested_scan_lengths(count)
+    assert count <= groups * steps <= count + max(SCAN_GROUP_STEPS, 0.002 * count)
+    if count > MAX_SAVED_CARRIES:  # what is kept: the carry of each group, and in one group at a time of each step
+        assert MAX_SAVED_CARRIES / 2 <= groups + steps <= 1.5 * MAX_SAVED_CARRIES
 
 
 @pytest.mark.parametrize("count", [1, 5, 17, 1000, 4004, 123457])
 def test_slots_leave_little_over_and_are_few(count):
-    room = slots(count)
+    room = round_up_capacity(count)
     assert count <= room <= 1.125 * count + 1
-    assert len({slots(n) for n in range(1000, 4000)}) <= 17
+    assert len({round_up_capacity(n) for n in range(1000, 4000)}) <= 17
 
 
 def test_groups_after_the_end_are_skipped_and_have_no_derivative():
@@ -85,10 +85,10 @@ def test_groups_after_the_end_are_skipped_and_have_no_derivative():
         def step(carry):
             return carry[0] * x, carry[1] + 1
 
-        return repeated(step, (1.0, 0), room, lambda carry: carry[1] < count)
+        return repeat_step(step, (1.0, 0), room, lambda carry: carry[1] < count)
 
     for room in (100, 4000):
-        made = levels(room)[1] * math.ceil(70 / levels(room)[1])
+        made = nested_scan_lengths(room)[1] * math.ceil(70 / nested_scan_lengths(room)[1])
         value, times = jax.jit(power, static_argnums=2)(1.01, 70, room)
         assert times == made
         np.testing.assert_allclose(value, 1.01**made, rtol=1e-12)
@@ -103,9 +103,9 @@ def test_groups_after_the_end_are_skipped_and_have_no_derivative():
 )
 @pytest.mark.slow
 def test_reverse_forward_and_differences_agree_in_nested_scans(monkeypatch):
-    monkeypatch.setattr(checkpoint, "SLOTS", 16)
+    monkeypatch.setattr(checkpoint, "MAX_SAVED_CARRIES", 16)
     jax.clear_caches()
-    assert levels(104) == (15, 7)
+    assert nested_scan_lengths(104) == (15, 7)
     mean, zero = objective(100, lanes=2, step=2e-3), jnp.zeros(len(PATHS))
     reverse, forward = jax.jit(jax.grad(mean))(zero), jax.jit(jax.jacfwd(mean))(zero)
     moves = 1e-5 * jnp.eye(len(PATHS))

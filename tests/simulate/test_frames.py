@@ -77,7 +77,7 @@ def test_a_summary_is_text_and_html():
     assert "<td>0</td>" in html
 
 
-@killed_by("simulate/frames.py", '"reached its stop {end}" if run.stopped', '"reached its stop {end}" if True')
+@killed_by("simulate/convert.py", '"reached its stop {end}" if run.stopped', '"reached its stop {end}" if True')
 def test_a_run_says_what_it_is(run):
     lines = repr(run).splitlines()
     end = float(run.ending.sample.t)
@@ -112,8 +112,10 @@ def test_many_runs_are_counted_and_a_traced_one_can_be_shown():
     assert frame["stopped"].tolist() == [True] * 3
 
 
-@killed_by("simulate/frames.py", "[:count]) for name, (unit, values)", ") for name, (unit, values)")
-@killed_by("simulate/frames.py", "plant.control_unit if plant is not None else RELATIVE", "RELATIVE")
+@killed_by("simulate/convert.py", "[:count]) for name, (unit, values)", ") for name, (unit, values)")
+@killed_by(
+    "simulate/convert.py", "plant.control_unit if plant is not None else DEFAULT_CONTROL_UNIT", "DEFAULT_CONTROL_UNIT"
+)
 def test_frames_have_units_and_end_where_the_run_does(run):
     count = int(np.sum(run.trajectory.running)) + 1
     frame, plant = run.pandas(rig().plant), rig().plant

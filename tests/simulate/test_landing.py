@@ -51,10 +51,10 @@ class Slips:
 
 
 @killed_by(
-    "simulate/adaptive.py", "jnp.where(again, Condition.SEEKING, Condition.LANDING)", "jnp.asarray(Condition.LANDING)"
+    "simulate/adaptive.py", "jnp.where(again, RunStatus.SEEKING, RunStatus.LANDING)", "jnp.asarray(RunStatus.LANDING)"
 )
 @killed_by("simulate/landing.py", "((off > probe) | ((off == 0) & (search.margin != 0)))", "(off > probe)")
-@killed_by("simulate/landing.py", "missed & ~search.at_once & (search.tries < TRIES)", "missed & False")
+@killed_by("simulate/landing.py", "missed & ~search.at_once & (search.tries < MAX_LOCATION_ATTEMPTS)", "missed & False")
 @pytest.mark.parametrize("solver", [d.FixedStep(H, 0.01, kinks=False), d.Adaptive(1e-5, 0.01, H)])
 def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
     """Where it is still flat, a parabola through three tries may take it for near its zero, and its fall there leads

@@ -23,8 +23,8 @@ from diffabs.objectives import BALANCE, BRAKING
 from diffabs.plants.audit import BrakeAudit
 from diffabs.reliability.failure import failure_probability
 from diffabs.scenario.defaults import braking
-from diffabs.simulate import refusals, stable_step
-from diffabs.simulate.outcome import _impossible
+from diffabs.simulate import admissible, stable_step
+from diffabs.simulate.result import _is_impossible
 from diffabs.stops import Fallen, SpeedReached
 from diffabs.sweep import Results, sweep
 from diffabs.sweep.statistics.summary import summary
@@ -95,15 +95,17 @@ BAD = {  # a loop, values by lane of which the first is fine, and what is said o
 @pytest.fixture
 def any_step(monkeypatch):
     """Without the seconds that the stability takes to compile."""
-    monkeypatch.setattr(refusals, "stable", lambda loop, values, step: np.ones(len(jax.tree.leaves(values)[0]), bool))
-    monkeypatch.setattr(refusals, "stable_step", lambda loop: np.inf)
+    monkeypatch.setattr(
+        admissible, "is_step_stable", lambda loop, values, step: np.ones(len(jax.tree.leaves(values)[0]), bool)
+    )
+    monkeypatch.setattr(admissible, "stable_step", lambda loop: np.inf)
 
 
 class TestBeforeARun:
     @killed_by(
-        "simulate/refusals.py",
-        "    yield _begun(loop)\n    yield from grid_rules(loop, step)",
-        "    yield _begun(loop)",
+        "simulate/admissible.py",
+        "    yield _start_rule(loop)\n    yield from grid_rules(loop, step)",
+        "    yield _start_rule(loop)",
         case="ring",
     )
     @killed_by(
@@ -118,7 +120,7 @@ class TestBeforeARun:
         loop, values, reasons = BAD[name]
         values = {path: np.array(column) for path, column in values.items()}
         for given in (loop, jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), loop)):
-            found = refusals.refusals(given, values, SOLVER)
+            found = admissible.batch_admissibility(given, values, SOLVER)
             assert found.accepted.tolist() == [True, False, False]
             assert set(found.texts[1:]) == set(reasons)
             assert found.number == 2
@@ -137,7 +139,7 @@ class TestBeforeARun:
         """Inside the compiled call a gain given as a tuple is a tuple of traced numbers."""
         for gain in ((-11753.0, -48.0), np.array([-11753.0, -48.0])):
             loop = d.braking(plant=plants.MirroredRig(), controller=controllers.StateFeedback(gain=gain))
-            found = refusals.refusals(loop, {"plant.mass": np.array([5.3, -1.0])}, SOLVER)
+            found = admissible.batch_admissibility(loop, {"plant.mass": np.array([5.3, -1.0])}, SOLVER)
             assert found.accepted.tolist() == [True, False], found.texts
 
     def test_a_solver_that_fits_nothing_is_named(self, any_step):
@@ -146,7 +148,7 @@ class TestBeforeARun:
             (d.FixedStep(1e-9, 1.0), "too many steps"),
         ):
             with pytest.raises(ValueError, match=message):
-                refusals.refusals(RIG, {"plant.mass": np.array([5.0])}, solver)
+                admissible.batch_admissibility(RIG, {"plant.mass": np.array([5.0])}, solver)
             with pytest.raises(ValueError, match=message):
                 d.check(RIG, solver)
 
@@ -164,12 +166,12 @@ class TestBeforeARun:
         lanes = jax.vmap(lambda v: replace(strong(RIG), v))({path: jnp.asarray(x) for path, x in values.items()})
         steps = stable_step.stable_steps(lanes)
         for h in (1e-4, float(steps[7]), float(steps[8]) * (1 + 1e-6)):
-            np.testing.assert_array_equal(stable_step.stable(RIG, values, h), steps >= h)
-        quick = 1e-4 * np.asarray(stable_step._bounds(RIG, values, squarings=0)) <= stable_step.WITHIN
+            np.testing.assert_array_equal(stable_step.is_step_stable(RIG, values, h), steps >= h)
+        quick = 1e-4 * np.asarray(stable_step._bounds(RIG, values, squarings=0)) <= stable_step.MIN_BOUNDARY_RADIUS
         assert np.mean(quick) > 0.7 * np.mean(steps >= 1e-4)  # few are left to the eigenvalues
         alike = {"initial.slip": np.linspace(0.0, 0.5, 5)}  # moves no matrix
-        assert stable_step.stable(RIG, alike, 1e-4).all()
-        assert not stable_step.stable(RIG, alike, 2e-2).any()
+        assert stable_step.is_step_stable(RIG, alike, 1e-4).all()
+        assert not stable_step.is_step_stable(RIG, alike, 2e-2).any()
 
     @killed_by(
         "simulate/stable_step.py",
@@ -186,7 +188,7 @@ class TestBeforeARun:
             return np.asarray(jax.jit(lambda values: bound(RIG, values, squarings=0))(values))
 
         few = bounds()
-        monkeypatch.setattr(stable_step, "MANY", 0)
+        monkeypatch.setattr(stable_step, "MIN_ENTRYWISE_MATRICES", 0)
         many = bounds()
         np.testing.assert_allclose(many, few, rtol=1e-6)
         loops = jax.vmap(lambda v: replace(strong(RIG), v))({path: jnp.asarray(x) for path, x in values.items()})
@@ -201,7 +203,7 @@ class TestBeforeARun:
 
 
 class TestAfterARun:
-    @killed_by("simulate/outcome.py", 'audit = getattr(loop.plant, "audit", None)', "audit = None")
+    @killed_by("simulate/result.py", 'audit = getattr(loop.plant, "audit", None)', "audit = None")
     @pytest.mark.parametrize("step", [1e-4, 1e-3])
     def test_an_unstable_step_is_seen_although_every_number_is_finite(self, step):
         """At 1e-6 s the run ends after three steps at -1e13 m: it has not stopped, and there is no mean to enter."""
@@ -216,8 +218,8 @@ class TestAfterARun:
 
     @killed_by(
         "simulate/stepper.py",
-        "zero + Condition.RUNNING, zero + Condition.DIVERGED",
-        "zero + Condition.RUNNING, zero + Condition.STOPPED",
+        "zero + RunStatus.RUNNING, zero + RunStatus.DIVERGED",
+        "zero + RunStatus.RUNNING, zero + RunStatus.STOPPED",
     )
     def test_a_traced_start_beyond_the_stop_is_no_run(self):
         braked = jax.jit(lambda start: d.measure(replace(RIG, {"initial.speed": start}), SOLVER, BRAKING))
@@ -228,7 +230,7 @@ class TestAfterARun:
         balanced = jax.jit(lambda start: d.measure(replace(d.balancing(), {"initial.theta": start}), SOLVER, BALANCE))
         assert balanced(2.0).diverged
 
-    @killed_by("simulate/outcome.py", "(value >= low - ROUNDING)", "(value >= -jnp.inf)")
+    @killed_by("simulate/result.py", "(value >= low - PHYSICAL_RANGE_TOLERANCE)", "(value >= -jnp.inf)")
     def test_a_metric_outside_its_range_is_a_run_that_diverged(self):
         for part in (*BRAKING.values(), *BALANCE.values()):
             assert type(part).physical[0] <= 0
@@ -242,7 +244,7 @@ class TestAfterARun:
             ("", objectives.StopTime(), 0.5, False),
             ("own", object(), -5.0, False),
         ):
-            assert bool(_impossible(name, part, jnp.asarray(value))) is bad, (name, value)
+            assert bool(_is_impossible(name, part, jnp.asarray(value))) is bad, (name, value)
 
     @pytest.mark.slow
     def test_a_torque_that_drives_the_wheel_is_no_alarm(self):
@@ -334,7 +336,7 @@ class TestWhoeverRuns:
         assert found["failures"]["not stopped"]["value"] < 0.5
         assert found["failures"]["any"]["high"] < 1 / 2
 
-    @killed_by("simulate/refill.py", "carry.condition, Condition.DIVERGED)", "carry.condition, Condition.TIMED_OUT)")
+    @killed_by("simulate/packed.py", "carry.status, RunStatus.DIVERGED)", "carry.status, RunStatus.TIMED_OUT)")
     @pytest.mark.slow
     def test_a_batch_does_not_run_them(self, any_step):
         values = {"initial.speed": np.array([8.0, 1.0, 9.0])}

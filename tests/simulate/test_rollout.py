@@ -14,10 +14,10 @@ from diffabs import controllers, plants, references, roads
 from diffabs.actuators import Lag
 from diffabs.objectives import BRAKING, Effort, MaxSlip, TorqueRate, Variation
 from diffabs.scenario.defaults import braking
-from diffabs.simulate.outcome import judge, prepare
-from diffabs.simulate.run import _run, arguments
+from diffabs.simulate.result import finish_run, prepare
+from diffabs.simulate.run import _run, prepare_arguments
 from diffabs.simulate.stable_step import stable_step
-from diffabs.simulate.stepper import room
+from diffabs.simulate.stepper import attempt_capacity
 from diffabs.stops import SpeedReached, Standstill
 
 RIG = braking(
@@ -87,9 +87,9 @@ def test_the_peak_of_a_falling_slip_is_its_first_value():
 
 
 @killed_by(
-    "simulate/outcome.py",
-    "(carry.condition == Condition.TIMED_OUT) & ~diverged",
-    "(carry.condition == Condition.LANDING) & ~diverged",
+    "simulate/result.py",
+    "(carry.status == RunStatus.TIMED_OUT) & ~diverged",
+    "(carry.status == RunStatus.LANDING) & ~diverged",
 )
 @killed_by("simulate/stepper.py", "(on_grid & (carry.k + 1 >= steps))", "(on_grid & False)")
 def test_a_run_that_does_not_stop_is_charged_the_rest():
@@ -166,7 +166,7 @@ def plainly(loop, objectives, method, tries):
     over = jax.lax.fori_loop(
         0, tries, lambda _, carry: method.step(loop, objectives, None, method.renew(loop, carry)), carry
     )
-    return judge(loop, objectives, over)[0]
+    return finish_run(loop, objectives, over)[0]
 
 
 @pytest.mark.parametrize(
@@ -180,8 +180,8 @@ def test_another_duration_is_the_same_program_and_the_same_steps(duration, like)
     before = _run._cache_size()
     run = d.measure(RIG, solver, BRAKING)
     assert _run._cache_size() == before
-    loop, objectives, method = arguments(RIG, solver, BRAKING)
-    alone = plainly(loop, objectives, method, room(loop, solver.steps))
+    loop, objectives, method = prepare_arguments(RIG, solver, BRAKING)
+    alone = plainly(loop, objectives, method, attempt_capacity(loop, solver.steps))
     assert bool(run.stopped) == (duration == 3.0)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-13), run, alone)
 
@@ -203,8 +203,8 @@ def test_trajectories_of_other_durations_and_strides_are_of_one_program():
 
 @killed_by(
     "simulate/drivers.py",
-    "jax.lax.while_loop(lambda carry: anyone(carry.running), block",
-    "jax.lax.while_loop(lambda carry: ~anyone(~carry.running), block",
+    "jax.lax.while_loop(lambda carry: any_lane(carry.running), block",
+    "jax.lax.while_loop(lambda carry: ~any_lane(~carry.running), block",
 )
 @killed_by("simulate/checkpoint.py", "jnp.any(running, axis=0)", "jnp.all(running, axis=0)")
 @pytest.mark.slow
@@ -223,7 +223,7 @@ def test_a_batch_ends_with_its_last_lane():
             np.testing.assert_allclose(many.ending.sample.t[0, i], run(speed, duration).ending.sample.t, rtol=1e-12)
 
 
-@killed_by("simulate/outcome.py", "jnp.where(diverged, jnp.nan, value)", "value")
+@killed_by("simulate/result.py", "jnp.where(diverged, jnp.nan, value)", "value")
 def test_a_diverging_lane_is_flagged_and_leaves_the_others_alone():
     solver = d.FixedStep(1e-3, 0.5)
 

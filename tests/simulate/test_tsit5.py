@@ -12,12 +12,12 @@ from scipy.integrate import solve_ivp
 
 from diffabs.core.cubic import Cubic
 from diffabs.simulate import tsit5
-from diffabs.simulate.tsit5 import off_in_the_middle, tsit5_pair, tsit5_step_from
+from diffabs.simulate.tsit5 import midpoint_error, tsit5_step_from, tsit5_step_with_error
 
 A = np.zeros((6, 6))
-for i, row in enumerate(tsit5.WEIGHTS, 1):
+for i, row in enumerate(tsit5.STAGE_COEFFICIENTS, 1):
     A[i, : len(row)] = row
-B, C = np.array(tsit5.LAST), np.array([0.0, *tsit5.PLACES])
+B, C = np.array(tsit5.STEP_WEIGHTS), np.array([0.0, *tsit5.STAGE_NODES])
 
 
 def trees(order):
@@ -73,7 +73,7 @@ def ended(count):
     h, z = 2.0 / count, {"angle": jnp.asarray(1.0), "rate": jnp.asarray([0.5, -0.2])[0]}
 
     def step(i, z):
-        return tsit5_pair(pendulum, i * h, z, pendulum(i * h, z), h)[0]
+        return tsit5_step_with_error(pendulum, i * h, z, pendulum(i * h, z), h)[0]
 
     return jax.lax.fori_loop(0, count, step, z)
 
@@ -100,13 +100,15 @@ def test_the_middle_of_a_power_is_that_of_its_cubic_or_known(power):
     def f(t, x):
         return power * t ** (power - 1) + 0.0 * x
 
-    x, so_far = tsit5_pair(f, float(t), jnp.asarray(float(t**power)), f(float(t), 0.0), float(h))
+    x, so_far = tsit5_step_with_error(f, float(t), jnp.asarray(float(t**power)), f(float(t), 0.0), float(h))
     assert float(x) == pytest.approx(float((t + h) ** power), rel=1e-14)
-    off = off_in_the_middle(so_far, f(float(t + h), 0.0), float(h))
+    off = midpoint_error(so_far, f(float(t + h), 0.0), float(h))
     assert float(off) == pytest.approx(float(h) ** 4 / 16 if power == 4 else 0.0, abs=1e-14)
 
 
-@killed_by("simulate/tsit5.py", "h * (a + OFF[-1] * b)", "0.5 * h * (a + OFF[-1] * b)")
+@killed_by(
+    "simulate/tsit5.py", "h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b)", "0.5 * h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b)"
+)
 def test_what_is_said_of_the_middle_is_how_far_the_cubic_is_off_there():
     """x' = -x + sin 2t: against the closed form."""
 
@@ -118,8 +120,8 @@ def test_what_is_said_of_the_middle_is_how_far_the_cubic_is_off_there():
 
     for h in (0.1, 0.05):
         t, x = 0.4, exact(0.4)
-        end, so_far = tsit5_pair(f, t, x, f(t, x), h)
-        off = off_in_the_middle(so_far, f(t + h, end), h)
+        end, so_far = tsit5_step_with_error(f, t, x, f(t, x), h)
+        off = midpoint_error(so_far, f(t + h, end), h)
         cubic = Cubic(x, end, h * f(t, x), h * f(t + h, end))(0.5)
         assert float(off) == pytest.approx(exact(t + h / 2) - float(cubic), rel=0.4 * h)
 
@@ -137,14 +139,14 @@ def moved(step):
 
 
 def written_out(f, t, x, rate, h, given):
-    return tsit5_pair(lambda t, x: f(t, x, given), t, x, rate, h)[0]
+    return tsit5_step_with_error(lambda t, x: f(t, x, given), t, x, rate, h)[0]
 
 
 @pytest.mark.slow
 @killed_by(
     "simulate/tsit5.py",
-    "rounds = (jnp.arange(1, count), jnp.asarray(PLACES, dtype), jnp.asarray(rows, dtype))",
-    "rounds = (jnp.arange(1, count - 1), jnp.asarray(PLACES[:-1], dtype), jnp.asarray(rows[:-1], dtype))",
+    "rounds = (jnp.arange(1, count), jnp.asarray(STAGE_NODES, dtype), jnp.asarray(rows, dtype))",
+    "rounds = (jnp.arange(1, count - 1), jnp.asarray(STAGE_NODES[:-1], dtype), jnp.asarray(rows[:-1], dtype))",
 )
 def test_derivatives_by_a_loop_over_stages_are_those_of_the_stages_written_out():
     end, at = moved(tsit5_step_from)

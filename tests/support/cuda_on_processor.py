@@ -21,7 +21,7 @@ class Processor:
 
     def compiled(self, text):
         before, after = ((HERE / name).read_text() for name in ("stand_ins.h", "one_by_one.h"))
-        return compilers.library(before + text + after)
+        return compilers.build_library(before + text + after)
 
     def address(self, buffer):
         array = np.asarray(buffer)

@@ -11,23 +11,23 @@ from jax.core import Tracer
 
 from diffabs.core.summary import Summary, number
 
-NUMBERS = (jax.Array, np.ndarray, np.generic, float, int, bool)
-RELATIVE = "control"  # the unit of the control where no plant says it
+NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float, int, bool)
+DEFAULT_CONTROL_UNIT = "control"  # the unit of the control where no plant says it
 
 
-def known(run: Any) -> bool:
+def is_concrete(run: Any) -> bool:
     """Return whether a run has numbers: not within a function that JAX traces."""
     leaves = jax.tree.leaves(run)
-    return all(isinstance(x, NUMBERS) and not isinstance(x, Tracer) for x in leaves)
+    return all(isinstance(x, NUMBER_TYPES) and not isinstance(x, Tracer) for x in leaves)
 
 
-def summary(run: Any) -> Summary:
+def summarise_run(run: Any) -> Summary:
     """Return what a run is: how it ended, and what was measured."""
     shape, kept = np.shape(run.stopped), run.trajectory is not None
-    if not known(run):
+    if not is_concrete(run):
         return Summary(f"Run being traced, of {len(run.metrics)} metrics")
     if shape:
-        return _of_many(run, int(np.prod(shape)))
+        return _summarise_runs(run, int(np.prod(shape)))
     seen = f"; a trajectory of {len(run.trajectory.running)} instants" if kept else ""
     end = f"at t = {number(run.ending.sample.t)} s"
     how = "diverged" if run.diverged else f"reached its stop {end}" if run.stopped else f"ended {end}"
@@ -35,7 +35,7 @@ def summary(run: Any) -> Summary:
     return Summary(f"Run that {how}{seen}", ("metric", "value"), rows)
 
 
-def _of_many(run: Any, count: int) -> Summary:
+def _summarise_runs(run: Any, count: int) -> Summary:
     lost, stopped = np.asarray(run.diverged).reshape(-1), int(np.sum(run.stopped))
     rows = []
     for name, values in run.metrics.items():
@@ -45,7 +45,7 @@ def _of_many(run: Any, count: int) -> Summary:
     return Summary(title, ("metric", "mean", "least", "greatest"), tuple(rows), "of those that did not diverge")
 
 
-def columns(run: Any, plant: Any = None) -> dict[str, tuple[str, np.ndarray]]:
+def trajectory_columns(run: Any, plant: Any = None) -> dict[str, tuple[str, np.ndarray]]:
     """Return unit and values (instants,) of what was seen in a run up to its end, by name; the time is `t`.
 
     plant: whose unit the control has; without one that is said as "control"
@@ -60,7 +60,7 @@ def columns(run: Any, plant: Any = None) -> dict[str, tuple[str, np.ndarray]]:
     count = int(np.sum(seen.running)) + 1  # after the end the last sample is repeated
     sample, units = seen.sample, type(seen.sample.output).units
     shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}
-    control = plant.control_unit if plant is not None else RELATIVE
+    control = plant.control_unit if plant is not None else DEFAULT_CONTROL_UNIT
     target = units[sample.output._fields[0]]
     rest = {"target": (target, sample.target), "setpoint": (target, sample.setpoint)}
     given = {name: (control, getattr(sample, name)) for name in ("feedforward", "command", "control")}
@@ -78,7 +78,7 @@ def to_pandas(run: Any, plant: Any = None) -> Any:
             name: np.atleast_1d(np.asarray(values)).reshape(-1) for name, values in {**run.metrics, **flags}.items()
         }
         return pandas.DataFrame(rows)
-    found = columns(run, plant)
+    found = trajectory_columns(run, plant)
     frame = pandas.DataFrame({name: values for name, (_, values) in found.items()}).set_index("t")
     frame.attrs |= {"units": {name: unit for name, (unit, _) in found.items()}, **_attributes(run)}
     return frame
@@ -88,7 +88,7 @@ def to_xarray(run: Any, plant: Any = None) -> Any:
     """Return the trajectory as a data set over the time, each variable with its `units`."""
     import xarray  # pyright: ignore[reportMissingImports]  # the user has it, or not
 
-    found = columns(run, plant)
+    found = trajectory_columns(run, plant)
     each = {name: ("t", values, {"units": unit}) for name, (unit, values) in found.items()}
     return xarray.Dataset(each, coords={"t": each.pop("t")}, attrs=_attributes(run))
 

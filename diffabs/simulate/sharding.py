@@ -9,45 +9,47 @@ import jax
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding
 
-TRACED = (
+TRACED_EXPLICIT_AXES = (
     "lanes lie on a mesh with axes of type Explicit, within jit or a derivative; there they need Auto ones:"
     " jax.make_mesh(..., axis_types=(jax.sharding.AxisType.Auto,))"
 )
 
 
-def divided(run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+def run_on_auto_mesh(run: Callable[..., Any], given: tuple[Any, ...]) -> Any:
     """Return run(*given); what of it lies on a mesh of Explicit axes is handed over on one of Auto axes of the same
     devices, nothing moved, and the results come back on the first.
 
     Raises ValueError where such arrays are traced."""
-    meshes = {_auto(x.sharding.mesh): x.sharding.mesh for x in jax.tree.leaves(given) if _explicit(x)}
+    meshes = {_auto_mesh(x.sharding.mesh): x.sharding.mesh for x in jax.tree.leaves(given) if _has_explicit_axes(x)}
     if not meshes:
         return run(*given)
 
     def back(x: Any) -> Any:
         mesh = getattr(getattr(x, "sharding", None), "mesh", None)
-        return _on(x, meshes[mesh]) if mesh in meshes else x
+        return _put_on_mesh(x, meshes[mesh]) if mesh in meshes else x
 
     meant = jax.sharding.get_abstract_mesh().axis_names
     with jax.set_mesh(next(iter(meshes))) if meant else contextlib.nullcontext():
-        found = run(*jax.tree.map(lambda x: _on(x, _auto(x.sharding.mesh)) if _explicit(x) else x, given))
+        found = run(
+            *jax.tree.map(lambda x: _put_on_mesh(x, _auto_mesh(x.sharding.mesh)) if _has_explicit_axes(x) else x, given)
+        )
     return jax.tree.map(back, found)
 
 
-def _explicit(x: Any) -> bool:
+def _has_explicit_axes(x: Any) -> bool:
     """Whether an array lies on a mesh whose axes are part of its type. Raises ValueError for one that is traced."""
     if not isinstance(x, jax.Array):
         return False
     sharding = jax.typeof(x).sharding if isinstance(x, Tracer) else x.sharding
     explicit = isinstance(sharding, NamedSharding) and AxisType.Explicit in sharding.mesh.axis_types
     if explicit and isinstance(x, Tracer):
-        raise ValueError(TRACED)
+        raise ValueError(TRACED_EXPLICIT_AXES)
     return explicit
 
 
-def _auto(mesh: Any) -> Mesh:
+def _auto_mesh(mesh: Any) -> Mesh:
     return Mesh(mesh.devices, mesh.axis_names, axis_types=(AxisType.Auto,) * len(mesh.axis_names))
 
 
-def _on(x: jax.Array, mesh: Any) -> jax.Array:
+def _put_on_mesh(x: jax.Array, mesh: Any) -> jax.Array:
     return jax.device_put(x, NamedSharding(mesh, x.sharding.spec))  # pyright: ignore[reportAttributeAccessIssue]

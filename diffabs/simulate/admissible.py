@@ -1,7 +1,7 @@
 """What must not be run: a loop that its parts, the integration grid or its step do not allow, alone or in a batch.
 
     check(loop, solver)                 raises for one loop, with its numbers
-    refusals(loop, values, solver)      for every lane of a batch, before it runs: a code, 0 where it is accepted
+    batch_admissibility(loop, values, solver)   for every lane of a batch, before it runs: a code, 0 where it is accepted
 
 Both ask the same things in the same order: ranges of fields and rules between them (`rules`), the start against the
 stop, the parts against the step, and last whether the step is stable, which is the dearest question."""
@@ -23,13 +23,13 @@ from diffabs.core.rules import Rule
 from diffabs.core.validity import broken, grid_rules, rules
 from diffabs.core.validity import check as check_parts
 from diffabs.simulate.solution import Adaptive, Solver
-from diffabs.simulate.stable_step import stable, stable_step
+from diffabs.simulate.stable_step import is_step_stable, stable_step
 
-MOST_STEPS = 1e8
+MAX_SOLVER_STEPS = 1e8
 T = TypeVar("T")
 
 
-class Refusals(NamedTuple):
+class Admissibility(NamedTuple):
     """Which lanes must not run: a code for each (lanes,), and what the codes mean; code 0 is accepted."""
 
     codes: np.ndarray
@@ -60,39 +60,39 @@ def check(part: T, solver: Solver | None = None) -> T:
     """
     check_parts(part)
     if isinstance(part, Loop) and solver is not None:
-        for lines in (together(part, solver), unstable(part, solver)):
+        for lines in (find_mismatches(part, solver), find_unstable_step(part, solver)):
             if found := list(lines):
                 raise ValueError("; ".join(found))
     return part
 
 
-def impossible(loop: Loop, step: float) -> list[str]:
+def find_impossible_values(loop: Loop, step: float) -> list[str]:
     """A line for each value of a loop that no run may have, alone or on a grid of this step [s]."""
-    begun = _begun(loop)
+    begun = _start_rule(loop)
     return list(broken(rules(loop))) or ([] if begun.holds else [begun.says()]) or list(broken(grid_rules(loop, step)))
 
 
-def together(loop: Loop, solver: Solver) -> Iterator[str]:
+def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
     """What does not go together: start and stop, parts and step; a line each."""
-    begun = _begun(loop)
+    begun = _start_rule(loop)
     if not begun.holds:
         yield begun.says()
         return
-    yield from ill(solver) or broken(grid_rules(loop, solver.step))
+    yield from find_solver_faults(solver) or broken(grid_rules(loop, solver.step))
 
 
-def ill(solver: Solver) -> list[str]:
+def find_solver_faults(solver: Solver) -> list[str]:
     """What is wrong with the solver itself, whatever it integrates."""
     step, duration = solver.step, solver.duration
     if step > duration:
         return [f"solver.step = {step:g} s is outside (0, {duration:g}] s: longer than solver.duration"]
-    if duration / step > MOST_STEPS:
-        least = duration / MOST_STEPS
+    if duration / step > MAX_SOLVER_STEPS:
+        least = duration / MAX_SOLVER_STEPS
         return [f"solver.step = {step:g} s is outside [{least:g}, {duration:g}] s: too many steps"]
     return []
 
 
-def unstable(loop: Loop, solver: Solver) -> Iterator[str]:
+def find_unstable_step(loop: Loop, solver: Solver) -> Iterator[str]:
     """A line for a step that is too long for the loop; `Adaptive` finds its steps by itself."""
     if isinstance(solver, Adaptive):
         return
@@ -107,12 +107,12 @@ def unstable(loop: Loop, solver: Solver) -> Iterator[str]:
         )
 
 
-def refusals(loop: Loop | None, values: Any, solver: Solver) -> Refusals:
+def batch_admissibility(loop: Loop | None, values: Any, solver: Solver) -> Admissibility:
     """The lanes of a loop that differ in the values (lanes,) at these paths: what `check` says of each, in one compiled
     call for all. Without a loop (None) `values` is a batch of loops, whose leaves have a leading axis.
 
     Raises ValueError for a solver that is wrong whatever it integrates."""
-    if lines := ill(solver):
+    if lines := find_solver_faults(solver):
         raise ValueError(lines[0])
     values = {path: np.asarray(x, float) for path, x in values.items()} if isinstance(values, Mapping) else values
     loop, values = jax.tree.map(lambda x: np.asarray(x, float), (loop, values))
@@ -122,11 +122,11 @@ def refusals(loop: Loop | None, values: Any, solver: Solver) -> Refusals:
     if not codes.all() and not isinstance(solver, Adaptive):
         fine = np.flatnonzero(codes == 0)
         asked = values if len(fine) == len(codes) else jax.tree.map(lambda x: x[np.resize(fine, len(codes))], values)
-        codes[fine[~stable(loop, asked, solver.step)[: len(fine)]]] = -1
-    return _named(loop, values, solver.step, codes)
+        codes[fine[~is_step_stable(loop, asked, solver.step)[: len(fine)]]] = -1
+    return _name_reasons(loop, values, solver.step, codes)
 
 
-def _named(loop: Loop | None, values: Any, step: float, codes: np.ndarray) -> Refusals:
+def _name_reasons(loop: Loop | None, values: Any, step: float, codes: np.ndarray) -> Admissibility:
     """Only those reasons that occur; -1 is the step's."""
     there = [code for code in np.unique(codes).tolist() if code] if codes.any() else []
     named = {-1: f"solver.step = {step:g} s is not stable"}
@@ -135,16 +135,16 @@ def _named(loop: Loop | None, values: Any, step: float, codes: np.ndarray) -> Re
             first = _lane(loop, jax.tree.map(lambda x: x[0], values))
             named |= {i: rule.broken for i, rule in enumerate(_rules(first, step), 1)}
     numbers = np.select([codes == code for code in there], range(1, len(there) + 1), 0) if there else codes
-    return Refusals(numbers, ("", *(named[code] for code in there)))
+    return Admissibility(numbers, ("", *(named[code] for code in there)))
 
 
-def first_line(loop: Loop, values: Mapping[str, Any], solver: Solver) -> str | None:
+def first_refusal(loop: Loop, values: Mapping[str, Any], solver: Solver) -> str | None:
     """The first refused lane and why, in a line with its numbers; None if all lanes are accepted. Without values the
     loop is the lane."""
     if not values:
-        lines = [*broken(rules(loop)), *together(loop, solver)] or list(unstable(loop, solver))
+        lines = [*broken(rules(loop)), *find_mismatches(loop, solver)] or list(find_unstable_step(loop, solver))
         return "; ".join(lines) or None
-    found = refusals(loop, values, solver)
+    found = batch_admissibility(loop, values, solver)
     if not found.number:
         return None
     i = int(np.flatnonzero(found.codes)[0])
@@ -164,7 +164,7 @@ def _lane(loop: Loop | None, values: Any) -> Loop:
 def _rules(loop: Loop, step: float) -> Iterator[Rule]:
     """Everything but the stability, in the order of `check`."""
     yield from rules(loop)
-    yield _begun(loop)
+    yield _start_rule(loop)
     yield from grid_rules(loop, step)
 
 
@@ -185,7 +185,7 @@ def _margin(plant: Any, initial: Any, stop: Any) -> jax.Array:
     return stop.margin(plant.output(plant.start(initial)))
 
 
-def _begun(loop: Loop) -> Rule:
+def _start_rule(loop: Loop) -> Rule:
     """A run starts on this side of its stop."""
     after = ": the run would end before it starts"
     margin = _margin(*strong((loop.plant, loop.initial, loop.stop)))  # a number of Python raises OverflowError

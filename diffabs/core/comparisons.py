@@ -15,10 +15,10 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.regime import WORD, Answers, Asked, Place, Regime
+from diffabs.core.modes import WORD_BITS, BitRange, ComparisonAnswers, ComparisonTrace, Mode
 
-INLINED = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint")
-SEARCH = "searchsorted"  # of `jax.numpy`, in at most WORD knots
+INLINED_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint")
+SEARCHSORTED = "searchsorted"  # of `jax.numpy`, in at most WORD knots
 
 
 class _Op(NamedTuple):
@@ -30,10 +30,10 @@ class _Op(NamedTuple):
     outs: tuple[int, ...]
     shape: tuple[int, ...]
     name: str = ""
-    asks: tuple[tuple[int, bool], ...] = ()
+    queries: tuple[tuple[int, bool], ...] = ()
 
 
-class Program:
+class SwitchedProgram:
     """f(moving, fixed), of pytrees and to one. Comparisons count that depend on `moving`, and on which the outputs
     depend that `counts` picks. Only shapes and types of the arguments matter."""
 
@@ -41,7 +41,7 @@ class Program:
         """Trace f for arguments of these shapes; `counts` picks outputs."""
         closed, shape = jax.make_jaxpr(f, return_shape=True)(moving, fixed)
         self.ops: list[_Op] = []
-        self.places: list[Place] = []
+        self.places: list[BitRange] = []
         self._constants: dict[int, Any] = {}
         self._names: list[Any] = []  # of values; the same for one operation on the same values
         self._moves: list[bool] = []
@@ -49,9 +49,9 @@ class Program:
         self._zero = self._value("zero", False)
         moves = [True] * len(jax.tree.leaves(moving)) + [False] * len(jax.tree.leaves(fixed))
         self._inputs = [self._value(("in", i), on) for i, on in enumerate(moves)]
-        flat = self._flattened(closed.jaxpr, self._kept(closed.consts), self._inputs)
+        flat = self._add_jaxpr(closed.jaxpr, self._kept(closed.consts), self._inputs)
         self.outputs = jax.tree.unflatten(jax.tree.structure(shape), flat)
-        self._ask(set(jax.tree.leaves(counts(self.outputs))))
+        self._number_comparisons(set(jax.tree.leaves(counts(self.outputs))))
         self._orders: dict[tuple[int, ...], list[_Op]] = {}
 
     @property
@@ -62,33 +62,35 @@ class Program:
     @property
     def words(self) -> int:
         """How many words hold them; at least one."""
-        return max(1, -(-self.answers // WORD))
+        return max(1, -(-self.answers // WORD_BITS))
 
-    def __call__(self, pick: Callable[[Any], Any], moving: Any, fixed: Any, regime: Regime) -> Any:
+    def __call__(self, pick: Callable[[Any], Any], moving: Any, fixed: Any, mode: Mode) -> Any:
         """What `pick` picks of the outputs."""
-        return self._run(pick, moving, fixed, regime, False)[0]
+        return self._run(pick, moving, fixed, mode, False)[0]
 
-    def look(self, pick: Callable[[Any], Any], moving: Any, fixed: Any, regime: Regime) -> tuple[Any, Answers]:
+    def look(self, pick: Callable[[Any], Any], moving: Any, fixed: Any, mode: Mode) -> tuple[Any, ComparisonAnswers]:
         """The same, and the answers to all comparisons."""
-        return self._run(pick, moving, fixed, regime, True)
+        return self._run(pick, moving, fixed, mode, True)
 
-    def _run(self, pick: Any, moving: Any, fixed: Any, regime: Regime, look: bool) -> tuple[Any, Any]:
+    def _run(self, pick: Any, moving: Any, fixed: Any, mode: Mode, look: bool) -> tuple[Any, Any]:
         values = dict(self._constants)
         values.update(zip(self._inputs, map(jnp.asarray, jax.tree.leaves((moving, fixed))), strict=True))
         picked, tree = jax.tree.flatten(pick(self.outputs))
-        asked = Asked(self.places, self.words, regime, look)
+        trace = ComparisonTrace(self.places, self.words, mode, look)
         for op in self._order(tuple(picked)):
             ins = [values[i] for i in op.ins]
-            outs = _DECIDED[op.name](asked, op, *ins) if op.asks else op.apply(*ins)
+            outs = _RESULT_FROM_ANSWERS[op.name](trace, op, *ins) if op.queries else op.apply(*ins)
             values.update(zip(op.outs, outs, strict=True))
-        return tree.unflatten([values[i] for i in picked]), asked.answers() if look else None
+        return tree.unflatten([values[i] for i in picked]), trace.answers() if look else None
 
     def _order(self, wanted: tuple[int, ...]) -> list[_Op]:
         if wanted not in self._orders:
-            self._orders[wanted] = [op for op, on in zip(self.ops, self._needed(set(wanted)), strict=True) if on]
+            self._orders[wanted] = [
+                op for op, on in zip(self.ops, self._needed_operations(set(wanted)), strict=True) if on
+            ]
         return self._orders[wanted]
 
-    def _needed(self, values: set[int]) -> list[bool]:
+    def _needed_operations(self, values: set[int]) -> list[bool]:
         """Whether these values depend on each of the operations."""
         needed = []
         for op in reversed(self.ops):
@@ -112,7 +114,7 @@ class Program:
         self._constants[new] = x.astype(literal.aval.dtype)[()]
         return new
 
-    def _flattened(self, jaxpr: Any, constants: list[int], inputs: list[int]) -> list[int]:
+    def _add_jaxpr(self, jaxpr: Any, constants: list[int], inputs: list[int]) -> list[int]:
         """Add the operations of a jaxpr, and return its outputs."""
         at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
@@ -121,12 +123,12 @@ class Program:
 
         for eqn in jaxpr.eqns:
             ins = tuple(read(atom) for atom in eqn.invars)
-            inner = eqn.params.get("jaxpr") if eqn.primitive.name in INLINED else None
-            if inner is None or _searches(eqn):
+            inner = eqn.params.get("jaxpr") if eqn.primitive.name in INLINED_CALLS else None
+            if inner is None or _is_knot_search(eqn):
                 outs = self._operation(eqn, ins)
             else:
                 body, kept = (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, [])
-                outs = self._flattened(body, self._kept(kept), list(ins))
+                outs = self._add_jaxpr(body, self._kept(kept), list(ins))
             at.update(zip(eqn.outvars, outs, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
@@ -136,22 +138,22 @@ class Program:
         moves = any(self._moves[i] for i in ins)
         outs = [self._value((*same, i), moves) for i in range(len(eqn.outvars))]
         real = all(jnp.issubdtype(atom.aval.dtype, jnp.floating) for atom in eqn.invars)
-        name = SEARCH if _searches(eqn) else eqn.primitive.name
-        shape = eqn.invars[0].aval.shape if name == SEARCH else eqn.outvars[0].aval.shape
-        asks = name if moves and real and name in _DECIDED else ""
-        self.ops.append(_Op(_applied(eqn), ins, tuple(outs), shape, asks))
+        name = SEARCHSORTED if _is_knot_search(eqn) else eqn.primitive.name
+        shape = eqn.invars[0].aval.shape if name == SEARCHSORTED else eqn.outvars[0].aval.shape
+        asks = name if moves and real and name in _RESULT_FROM_ANSWERS else ""
+        self.ops.append(_Op(_bind_equation(eqn), ins, tuple(outs), shape, asks))
         return outs
 
-    def _ask(self, counted: set[int]) -> None:
+    def _number_comparisons(self, counted: set[int]) -> None:
         """Number the comparisons that count."""
         numbers: dict[Any, int] = {}
-        for i, (op, on) in enumerate(zip(self.ops, self._needed(counted), strict=True)):
+        for i, (op, on) in enumerate(zip(self.ops, self._needed_operations(counted), strict=True)):
             if on and op.name:
                 asks = [
                     self._number(numbers, x, y, strict, op.shape)
-                    for x, y, strict in _ASKED[op.name](self._zero, *op.ins)
+                    for x, y, strict in _COMPARISONS[op.name](self._zero, *op.ins)
                 ]
-                self.ops[i] = op._replace(asks=tuple(asks))
+                self.ops[i] = op._replace(queries=tuple(asks))
 
     def _number(self, numbers: dict[Any, int], x: int, y: int, strict: bool, shape: Any) -> tuple[int, bool]:
         """The number of x > y, or x >= y, and whether what has the number is its contrary, y >= x, or y > x."""
@@ -161,19 +163,19 @@ class Program:
         if key not in numbers:
             numbers[key] = len(self.places)
             first, size = self.answers, int(np.prod(shape))
-            fits = first % WORD + size <= WORD or size > WORD
-            self.places.append((first if fits else -(-first // WORD) * WORD, shape))
+            fits = first % WORD_BITS + size <= WORD_BITS or size > WORD_BITS
+            self.places.append((first if fits else -(-first // WORD_BITS) * WORD_BITS, shape))
         return numbers[key], turned
 
 
-def _searches(eqn: Any) -> bool:
+def _is_knot_search(eqn: Any) -> bool:
     """Whether this is the search of one number in a few knots."""
     shapes = [atom.aval.shape for atom in eqn.invars]
-    named = eqn.primitive.name in INLINED and eqn.params.get("name") == SEARCH
-    return named and len(shapes) == 2 and shapes[1] == () and len(shapes[0]) == 1 and shapes[0][0] <= WORD
+    named = eqn.primitive.name in INLINED_CALLS and eqn.params.get("name") == SEARCHSORTED
+    return named and len(shapes) == 2 and shapes[1] == () and len(shapes[0]) == 1 and shapes[0][0] <= WORD_BITS
 
 
-def _applied(eqn: Any) -> Callable[..., Sequence[Any]]:
+def _bind_equation(eqn: Any) -> Callable[..., Sequence[Any]]:
     """An operation as a function. One with a function inside is run as a program of its own."""
     if not any(callable(x) or hasattr(x, "eqns") or hasattr(x, "jaxpr") for x in eqn.params.values()):
 
@@ -198,7 +200,7 @@ def _applied(eqn: Any) -> Callable[..., Sequence[Any]]:
 
 
 # What an operation asks, as (x, y, strict) of its inputs after zero, and what it makes of the answers.
-_ASKED: dict[str, Callable[..., list[tuple[int, int, bool]]]] = {
+_COMPARISONS: dict[str, Callable[..., list[tuple[int, int, bool]]]] = {
     "gt": lambda zero, x, y: [(x, y, True)],
     "ge": lambda zero, x, y: [(x, y, False)],
     "lt": lambda zero, x, y: [(y, x, True)],
@@ -208,34 +210,34 @@ _ASKED: dict[str, Callable[..., list[tuple[int, int, bool]]]] = {
     "abs": lambda zero, x: [(x, zero, False)],
     "sign": lambda zero, x: [(x, zero, True), (zero, x, True)],
     "clamp": lambda zero, low, x, high: [(low, x, True), (x, high, True)],
-    SEARCH: lambda zero, knots, x: [(x, knots, True)],
+    SEARCHSORTED: lambda zero, knots, x: [(x, knots, True)],
 }
 
 
-def _sign(asked: Asked, op: _Op, x: Any) -> list[Any]:
+def _sign(trace: ComparisonTrace, op: _Op, x: Any) -> list[Any]:
     zero = jnp.zeros_like(x)
-    up, down = asked(op.asks[0], x, zero, True), asked(op.asks[1], zero, x, True)
+    up, down = trace(op.queries[0], x, zero, True), trace(op.queries[1], zero, x, True)
     return [jnp.where(up, 1, jnp.where(down, -1, 0)).astype(x.dtype)]
 
 
-def _clamp(asked: Asked, op: _Op, low: Any, x: Any, high: Any) -> list[Any]:
+def _clamp(trace: ComparisonTrace, op: _Op, low: Any, x: Any, high: Any) -> list[Any]:
     low, high = jnp.broadcast_to(low, jnp.shape(x)), jnp.broadcast_to(high, jnp.shape(x))
-    return [jnp.where(asked(op.asks[0], low, x, True), low, jnp.where(asked(op.asks[1], x, high, True), high, x))]
+    return [jnp.where(trace(op.queries[0], low, x, True), low, jnp.where(trace(op.queries[1], x, high, True), high, x))]
 
 
-def _search(asked: Asked, op: _Op, knots: Any, x: Any) -> list[Any]:
-    return [asked.search(op.asks[0], lambda: op.apply(knots, x)[0], knots, x)]
+def _search(trace: ComparisonTrace, op: _Op, knots: Any, x: Any) -> list[Any]:
+    return [trace.search(op.queries[0], lambda: op.apply(knots, x)[0], knots, x)]
 
 
-_DECIDED: dict[str, Callable[..., list[Any]]] = {
-    "gt": lambda asked, op, x, y: [asked(op.asks[0], x, y, True)],
-    "ge": lambda asked, op, x, y: [asked(op.asks[0], x, y, False)],
-    "lt": lambda asked, op, x, y: [asked(op.asks[0], y, x, True)],
-    "le": lambda asked, op, x, y: [asked(op.asks[0], y, x, False)],
-    "max": lambda asked, op, x, y: [jnp.where(asked(op.asks[0], x, y, False), x, y)],
-    "min": lambda asked, op, x, y: [jnp.where(asked(op.asks[0], y, x, False), x, y)],
-    "abs": lambda asked, op, x: [jnp.where(asked(op.asks[0], x, jnp.zeros_like(x), False), x, -x)],
+_RESULT_FROM_ANSWERS: dict[str, Callable[..., list[Any]]] = {
+    "gt": lambda trace, op, x, y: [trace(op.queries[0], x, y, True)],
+    "ge": lambda trace, op, x, y: [trace(op.queries[0], x, y, False)],
+    "lt": lambda trace, op, x, y: [trace(op.queries[0], y, x, True)],
+    "le": lambda trace, op, x, y: [trace(op.queries[0], y, x, False)],
+    "max": lambda trace, op, x, y: [jnp.where(trace(op.queries[0], x, y, False), x, y)],
+    "min": lambda trace, op, x, y: [jnp.where(trace(op.queries[0], y, x, False), x, y)],
+    "abs": lambda trace, op, x: [jnp.where(trace(op.queries[0], x, jnp.zeros_like(x), False), x, -x)],
     "sign": _sign,
     "clamp": _clamp,
-    SEARCH: _search,
+    SEARCHSORTED: _search,
 }

@@ -7,22 +7,22 @@ import numpy as np
 from diffabs.kernel.elimination import Elimination
 from diffabs.kernel.graph import Graph, Node
 from diffabs.kernel.linear import Sum, Vertex
-from diffabs.kernel.program import live
+from diffabs.kernel.program import live_nodes
 
 
-def following(nodes: Iterable[Node], first: set[int]) -> set[int]:
+def dependents(nodes: Iterable[Node], first: set[int]) -> set[int]:
     """Return what is made of these, themselves included; nodes with arguments first."""
     found = set(first)
     found.update(node.id for node in nodes if any(x.id in found for x in node.args))
     return found
 
 
-def copy_of(nodes: list[Node], k: int) -> Node:
+def tangent_copy(nodes: list[Node], k: int) -> Node:
     """Return the k-th of so many, or of all of them the one that there is."""
     return nodes[k if len(nodes) > 1 else 0]
 
 
-def rebuilt(
+def replicate_nodes(
     graph: Graph,
     roots: list[Node],
     given: dict[int, list[Node]],
@@ -33,9 +33,9 @@ def rebuilt(
 
     given: inputs, of this graph; slopes: the inputs that are tangents, of which those that are not given are zero
     size: how many tangents, of what type"""
-    nodes = live(roots)
-    moving = following(nodes, {i for i in slopes if i in given})
-    slopes = following(nodes, slopes)
+    nodes = live_nodes(roots)
+    moving = dependents(nodes, {i for i in slopes if i in given})
+    slopes = dependents(nodes, slopes)
     factors = Graph()
     values = _values(factors, nodes, given, slopes, moving)
     plan = Elimination(factors, *size)
@@ -47,7 +47,7 @@ def rebuilt(
         else:
             plan.add(node, lambda x: x.id in moving, lambda x: values[x.id])
     plan.reduce({node.id for node in roots if node.id in plan.vertices})
-    return _Written(graph, plan, values, given).write(nodes)
+    return _ReplicaWriter(graph, plan, values, given).write(nodes)
 
 
 def _values(
@@ -68,7 +68,7 @@ def _values(
     return found
 
 
-class _Written:
+class _ReplicaWriter:
     """A plan as nodes of a program: numbers in their order, tangents behind those that they are made of."""
 
     def __init__(self, graph: Graph, plan: Elimination, values: dict[int, Node], given: dict[int, list[Node]]):
@@ -106,12 +106,12 @@ class _Written:
             args = [
                 self.tangents[x.id] if x.id in self.tangents else [self._number(self.values[x.id])] for x in node.args
             ]
-            return [self.graph.again(node, [copy_of(x, k) for x in args]) for k in range(self.plan.many)]
+            return [self.graph.again(node, [tangent_copy(x, k) for x in args]) for k in range(self.plan.many)]
         sums = [self._sum(sum, node) for sum in vertex.sums()]
         if vertex.which is None:
             return sums[0]
         which = self._number(vertex.which)
-        return [self.graph.select(which, *(copy_of(x, k) for x in sums)) for k in range(self.plan.many)]
+        return [self.graph.select(which, *(tangent_copy(x, k) for x in sums)) for k in range(self.plan.many)]
 
     def _sum(self, sum: Sum, node: Node) -> list[Node]:
         if not sum:
@@ -126,5 +126,7 @@ class _Written:
                 found = [self.graph.op("neg", term) for term in terms] if factor.negative else terms
             else:
                 name = "sub" if factor.negative else "add"
-                found = [self.graph.op(name, copy_of(found, k), copy_of(terms, k)) for k in range(self.plan.many)]
+                found = [
+                    self.graph.op(name, tangent_copy(found, k), tangent_copy(terms, k)) for k in range(self.plan.many)
+                ]
         return found
