@@ -1,7 +1,7 @@
 """What must not be run: a loop that its parts, the integration grid or its step do not allow, alone or in a batch.
 
-    check(loop, solver)                 raises for one loop, with its numbers
-    batch_admissibility(loop, values, solver)   for every lane of a batch, before it runs: a code, 0 where it is accepted
+    check(loop, solver)                         raises for one loop, with its numbers
+    batch_admissibility(loop, values, solver)   a code for every lane of a batch, 0 where it is accepted
 
 Both ask the same things in the same order: ranges of fields and rules between them (`rules`), the start against the
 stop, the parts against the step, and last whether the step is stable, which is the dearest question."""

@@ -52,7 +52,7 @@ class Batch:
 
     def check(self, loop: Any, solver: Solver | None = None) -> "Batch":
         """Return the batch if its lanes fit the loop. Raises ValueError for a path that does not exist, columns of
-        different lengths, a value out of range, and, with a solver, a lane that must not be run: see `batch_admissibility`."""
+        different lengths, a value out of range, and, with a solver, a lane that `batch_admissibility` refuses."""
         specs, _ = {path: spec for path, spec, _ in parameters(loop)}, self.size
         for path, column in self.values.items():
             if path not in specs:
