@@ -195,7 +195,7 @@ def _next_carry(
         search=search,
         tries=carry.tries + 1,
         last_step=select(verdict.taken, last, carry.last_step) if control.keeps else (),
-        crossing_steps=crossing_steps,
+        turns=crossing_steps,
         stability_fraction=stability_fraction,
         unrestricted=unrestricted,
         triggered=pack_events(verdict.triggered),
