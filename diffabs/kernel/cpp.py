@@ -101,7 +101,7 @@ class Text:
         carried = [f"{vector_type(n.dtype)} c{n.id}[VECTORS];" for _, n in self._given(UpdateLevel.STEP)]
         lanes = {n.id: n for n in [*(n for _, n in self._given(UpdateLevel.LANE)), *self.lanes]}
         own = [f"{vector_type(n.dtype)} l{n.id}[VECTORS];" for n in lanes.values() if n.op != "const"]
-        yield "struct ScheduleBlock { " + " ".join([*carried, *own]) + " int none; };"
+        yield "struct Block { " + " ".join([*carried, *own]) + " int none; };"
 
     def _prepare(self) -> Iterator[str]:
         """static void prepare(Shared&, arrays): what is the same for all lanes."""
