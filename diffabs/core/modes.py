@@ -1,4 +1,4 @@
-"""Answers to the comparisons of a program (`core.kinks`), given from outside: packed in words, a bit for each."""
+"""Answers to the comparisons of a program (`core.comparisons`), given from outside: packed in words, a bit for each."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

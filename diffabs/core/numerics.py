@@ -62,7 +62,7 @@ def power(base: Scalar, exponent: Scalar) -> Any:
     """base ** exponent for base >= 0 and exponent > 1, with slope 0 at base = 0 in both arguments.
 
     exp(q log x): XLA's own power is three to four times slower on a CPU. By the square of the base, so that a step that
-    goes on beyond 0 before it is tried again (`core.kinks`) finds a number there.
+    goes on beyond 0 before it is tried again (`core.comparisons`) finds a number there.
     """
     square = base * base
     fine = jnp.not_equal(square, 0)
@@ -72,7 +72,7 @@ def power(base: Scalar, exponent: Scalar) -> Any:
 
 @jax.jit
 def searchsorted(knots: Any, x: Scalar) -> Any:
-    """How many of a few knots (n,), which increase, are not above x. The name is that of JAX's, by which `core.kinks`
+    """How many of a few knots (n,), which increase, are not above x. The name is that of JAX's, by which `core.comparisons`
     knows a search, as this function is too; that one looks for NaN among the knots, each time."""
     return jnp.sum(x >= knots).astype(jnp.int32)
 

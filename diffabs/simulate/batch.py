@@ -139,7 +139,7 @@ def run_batch(
 
     Raises:
         ValueError: columns of different lengths; what `measure` objects to; `enough` for lanes that run together; what
-            stands against the engine "kernel" (`simulate.native.objection` says it without running anything).
+            stands against the engine "kernel" (`simulate.native.kernel_objection` says it without running anything).
         KeyError: a path that does not exist.
         RuntimeError: a kernel in a process that was forked after JAX had started.
     """

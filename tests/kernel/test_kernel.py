@@ -385,14 +385,14 @@ class TestLibrary:
         assert set(tmp_path.glob("*.so")) == {first, fourth, fifth}
 
     @killed_by("kernel/compilers.py", "repr((made, CPP_FLAGS, _processor()))", "repr(made)")
-    @pytest.mark.parametrize("changed", ["FLAGS", "_processor"])
+    @pytest.mark.parametrize("changed", ["CPP_FLAGS", "_processor"])
     def test_is_another_for_other_flags_and_processors(self, changed, tmp_path, monkeypatch):
         compilers.find_compiler()
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
         monkeypatch.setattr(compilers, "_compile", lambda words, source, result, s: result.write_bytes(b""))
         path, made = compilers.build_library("one"), compilers.find_compiler()
         monkeypatch.setattr(compilers, "find_compiler", lambda: made)
-        monkeypatch.setattr(compilers, changed, ("-O1",) if changed == "FLAGS" else lambda: "another")
+        monkeypatch.setattr(compilers, changed, ("-O1",) if changed == "CPP_FLAGS" else lambda: "another")
         assert compilers.build_library("one") != path
 
     @killed_by(
