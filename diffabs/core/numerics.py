@@ -72,8 +72,10 @@ def power(base: Scalar, exponent: Scalar) -> Any:
 
 @jax.jit
 def searchsorted(knots: Any, x: Scalar) -> Any:
-    """How many of a few knots (n,), which increase, are not above x. The name is that of JAX's, by which `core.comparisons`
-    knows a search, as this function is too; that one looks for NaN among the knots, each time."""
+    """Return how many of a few increasing knots (n,) are not above x.
+
+    `core.comparisons` recognises a search by this name, which is JAX's. JAX's own looks for NaN among the knots each
+    time."""
     return jnp.sum(x >= knots).astype(jnp.int32)
 
 

@@ -1,8 +1,8 @@
 """The loop and its objectives as one function of time and state.
 
-Values are computed as the parts have it. For derivatives it is a program whose comparisons are visible (`core.comparisons`),
-so that a step has one regime: a derivative through a step with a kink in it would be off by as much as one step in the
-kink's moment, however exact the value is."""
+Values are computed as the parts have it. For derivatives the function is a program whose comparisons are visible
+(`core.comparisons`), so that a step has one mode. A derivative through a step with a kink inside is off by up
+to one step in the kink's moment, however exact the value is."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
