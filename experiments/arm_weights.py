@@ -28,7 +28,7 @@ from diffabs.objectives import SoftLoss
 from diffabs.papers import record
 from diffabs.scenario.scenario import load
 from diffabs.tune import Method, Stopping, grid, tune
-from diffabs.tune.weights import lq_weights, regulator
+from diffabs.tune.weights import lq_weights, lqr_gain_design
 
 PAPER_START = {"initial.theta": 0.5, "initial.phi": 0.2}
 
@@ -59,7 +59,7 @@ class Config:
 def tuned(config: Config) -> Any:
     """Weights that lose fewer starts."""
     loop = load("arm-hanging").loop
-    design = regulator(BalanceModel(plant=loop.plant))
+    design = lqr_gain_design(BalanceModel(plant=loop.plant))
     first, second = config.tuned_starts
     axes = {"initial.theta": np.linspace(0, config.box, first), "initial.phi": np.linspace(-1, 1, second) * config.box}
     return tune(

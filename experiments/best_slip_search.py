@@ -15,7 +15,7 @@ from best_slip_rules import Ranges, start
 from diffabs import FixedStep, Loop, run_batch
 from diffabs.core.bijectors import space
 from diffabs.objectives import LockedTime, StopDistance
-from diffabs.tune import Method, Stopping, Tuned, posed, tune
+from diffabs.tune import Method, Stopping, Tuned, build_problem, tune
 from diffabs.tune.problem import Problem
 
 MEASURED = {"stop_distance": StopDistance(), "locked_time": LockedTime()}
@@ -104,7 +104,7 @@ def described(found: Found) -> dict[str, Any]:
 def problem(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges, one: Loop) -> Problem:
     """The tuning's problem on all of its roads, around a loop."""
     known = lanes(fixed, search.roads, fixed.roads.seed)
-    return posed(one, **task(search, fixed, sensors, rule, ranges, known))
+    return build_problem(one, **task(search, fixed, sensors, rule, ranges, known))
 
 
 def by_cma_es(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ranges) -> dict[str, Any]:
@@ -112,7 +112,7 @@ def by_cma_es(search: Search, fixed: Fixed, sensors: str, rule: str, ranges: Ran
     begun = time.process_time()
     one = start(ranges, fixed, sensors, rule)
     posed_ = problem(search, fixed, sensors, rule, ranges, one)
-    seen = posed_.valuer()
+    seen = posed_.objective_evaluator()
     options = {"maxfevals": search.cma_evaluations, "verbose": -9, "verb_log": 0, "seed": search.seed}
     strategy = cma.CMAEvolutionStrategy(posed_.space.place(one), search.spread, options)
     while not strategy.stop():

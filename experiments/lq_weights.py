@@ -32,7 +32,7 @@ from diffabs.design import Spec, certify, design
 from diffabs.papers import record
 from diffabs.tune import Method, Stopping, Tuned, tune
 from diffabs.tune.problem import Problem
-from diffabs.tune.tuning import posed
+from diffabs.tune.tuning import build_problem
 from diffabs.tune.weights import LQWeights
 
 TUNE, GRADIENTS, DIFFERENCES = "tune", "L-BFGS-B", "L-BFGS-B, differences"
@@ -53,7 +53,7 @@ def allowed(config: Config, parameters: int) -> int:
 def compared(config: Config, name: str) -> tuple[dict[str, Any], Tuned]:
     """One problem, all searches. Traces of `TUNE` and `GRADIENTS` count gradients, the others rollouts."""
     pose = problems(config)[name]
-    problem = bare(pose(posed))
+    problem = bare(pose(build_problem))
     large = int(problem.space.size > 2)
     prices = searches.prices(problem, config.repeats)
     mode = min(prices, key=lambda mode: prices[mode])

@@ -33,7 +33,7 @@ from diffabs.roads import MagicFormula
 from diffabs.scenario.defaults import braking
 from diffabs.stops import SpeedReached, Standstill
 from diffabs.tune import grid, latin
-from diffabs.tune.weights import lq_weights, regulator, robust
+from diffabs.tune.weights import lq_weights, lqr_gain_design, robust_gain_design
 
 NAMES = ("gain", "Riccati", "LMI", "schedule", "table 6", "table 12", "table 24", "together", "eight")
 
@@ -197,7 +197,7 @@ def problems(config: Config) -> dict[str, Callable[..., Any]]:
         "controller.gains": (first, last),
         "reference.time_constant": config.filter_range,
     }
-    at = regulator(SlipModel(speed=config.design_speed / plot.KMH))
+    at = lqr_gain_design(SlipModel(speed=config.design_speed / plot.KMH))
     many, roads = car(config)
     long = FixedStep(step=config.car_step, duration=config.car_duration)
     measured = {**BRAKING, "effort": Effort()}
@@ -205,7 +205,9 @@ def problems(config: Config) -> dict[str, Callable[..., Any]]:
     return {
         "gain": lambda f, **k: f(loop, free={"controller.gain": config.gain_range}, **rest, **k),
         "Riccati": lambda f, **k: f(lq_weights(loop, config.weights, 1.0, at), free=weighed, **rest, **k),
-        "LMI": lambda f, **k: f(lq_weights(loop, config.weights, 1.0, robust(box(config))), free=weighed, **rest, **k),
+        "LMI": lambda f, **k: f(
+            lq_weights(loop, config.weights, 1.0, robust_gain_design(box(config))), free=weighed, **rest, **k
+        ),
         "schedule": lambda f, **k: f(thirteen, free=slow, **rest, **k),
         **{f"table {n}": table(config, n, rest) for n in (6, 12, 24)},
         "together": lambda f, **k: f(together(config), free=ALL_RANGES, **whole(config), **k),

@@ -41,7 +41,7 @@ def prices(problem: Problem, repeats: int) -> dict[Mode, float]:
     m = Multipliers(jnp.zeros((1, 0)), jnp.ones(1))
     modes = [mode for mode in Mode if mode is Mode.REVERSE or problem.space.size <= FORWARD]
     gradients = {mode: dataclasses.replace(problem, mode=mode).evaluator(1.0) for mode in modes}
-    value = problem.valuer()
+    value = problem.objective_evaluator()
     jax.block_until_ready([value(z), *(gradient(z, m) for gradient in gradients.values())])
     ratios: dict[Mode, list[float]] = {mode: [] for mode in modes}
     for _ in range(repeats):
@@ -62,7 +62,7 @@ class Counted:
 
     def __init__(self, problem: Problem):
         """Compiled once for each number of points that are asked for together."""
-        self._seen, self._steady = problem.valuer(), problem.steady()
+        self._seen, self._steady = problem.objective_evaluator(), problem.steady()
         self._asked: np.ndarray | None = None
         self.count, self.least = 0, np.inf
         self.trace: Trace = []

@@ -38,13 +38,13 @@ def compare(
 
 def _check_same(a: "Results", b: "Results") -> None:
     """Raises ScenarioError for sweeps over different samples, or that are not complete."""
-    from diffabs.sweep.store import differences
+    from diffabs.sweep.store import describe_differences
 
     for found in (a, b):
         warn_of_strays(found)
         if not found.complete:
             raise ScenarioError(f"{found.folder} is not complete; --resume goes on with it")
-    for line in differences({k: a.study[k] for k in SAME}, {k: b.study[k] for k in SAME}):
+    for line in describe_differences({k: a.study[k] for k in SAME}, {k: b.study[k] for k in SAME}):
         raise ScenarioError(
             f"the samples are not the same: {line.replace(' there, ', ' in the first, ')} in the second"
         )
@@ -62,7 +62,7 @@ def _compared(a: "Results", b: "Results", metrics: list[str]) -> dict[str, Any]:
     """Paired statistics of second minus first, over samples that diverged or were refused in neither. A sample that
     never settles in one of them is left out of that metric, and counted."""
     from diffabs.sweep.statistics.estimates import Moments
-    from diffabs.sweep.statistics.paired import paired
+    from diffabs.sweep.statistics.paired import compare_pairs
 
     lost = a.column("diverged") | b.column("diverged") | ~a.accepted | ~b.accepted
     rows = {}
@@ -71,7 +71,7 @@ def _compared(a: "Results", b: "Results", metrics: list[str]) -> dict[str, Any]:
         before, after = a.column(name)[both], b.column(name)[both]
         if both.sum() < FEWEST:
             continue
-        found = paired(after, before)
+        found = compare_pairs(after, before)
         rows[name] = {
             "first": Moments.of(before).mean().value,
             "second": Moments.of(after).mean().value,

@@ -20,7 +20,7 @@ from diffabs.scenario.toml import value
 from diffabs.simulate.engine import describe_engine
 
 if TYPE_CHECKING:
-    from diffabs.reliability.subset_simulation import Progress, RareEvent
+    from diffabs.reliability.subset_simulation import RareEvent, SubsetProgress
     from diffabs.sweep import Study
 
 SHOWN = 5  # failures
@@ -54,10 +54,10 @@ def rare(
 
 def _by_engine(study: "Study", metric: str, engine: str) -> "Study":
     """Raises ScenarioError for a study that cannot be run."""
-    from diffabs.reliability.failure import objection
+    from diffabs.reliability.failure import find_metric_objection
 
     try:
-        return dataclasses.replace(study, engine=engines.decided(engine, lambda: objection(study, metric)))
+        return dataclasses.replace(study, engine=engines.decided(engine, lambda: find_metric_objection(study, metric)))
     except ValueError as error:
         raise ScenarioError(str(error)) from None
 
@@ -77,9 +77,9 @@ def _failure(text: str, chosen: Scenario) -> tuple[str, float]:
 def _estimated(study: "Study", metric: str, bound: float, samples: int, gradients: bool) -> "RareEvent":
     """Raises ScenarioError for what cannot be asked, typer.Exit where too many runs diverge."""
     from diffabs.reliability.failure import failure_probability
-    from diffabs.reliability.importance_sampling import Diverged
+    from diffabs.reliability.importance_sampling import DivergenceError
 
-    levels: list[Progress] = []
+    levels: list[SubsetProgress] = []
 
     def far() -> str:
         if not levels:
@@ -99,13 +99,13 @@ def _estimated(study: "Study", metric: str, bound: float, samples: int, gradient
             raise
         console.say(f"interrupted: {_reached(levels, metric)}, by {levels[-1].evaluations:,} runs; no further")
         raise typer.Exit(console.INTERRUPTED) from None
-    except Diverged as error:
+    except DivergenceError as error:
         console.fail(str(error), console.FAILED)
     except ValueError as error:
         raise ScenarioError(str(error)) from None
 
 
-def _reached(levels: "list[Progress]", metric: str) -> str:
+def _reached(levels: "list[SubsetProgress]", metric: str) -> str:
     """What the levels tell that are finished."""
     probability = math.prod(level.share for level in levels)
     return f"{metric} >= {levels[-1].threshold:.4g} has a probability of about {probability:.2g}"

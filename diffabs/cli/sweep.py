@@ -28,8 +28,8 @@ from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.engine import EngineError
 
 if TYPE_CHECKING:
-    from diffabs.sweep import Progress as Told
     from diffabs.sweep import Results, Study
+    from diffabs.sweep import SweepProgress as Told
 
 PLACES = ("local", "dask")
 SUMMARY, FIGURES = "summary.json", "figures"
@@ -93,7 +93,7 @@ def _check_any(result: dict[str, Any], chosen: Scenario) -> None:
 def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     """A sample of a sweep as a scenario, and the key of its noise. Raises SweepError or ValueError."""
     console.need_extra("sweep")
-    from diffabs.sweep.store import SweepError, check_owner, differences, read_manifest
+    from diffabs.sweep.store import SweepError, check_owner, describe_differences, read_manifest
 
     manifest = read_manifest(folder)
     source = manifest["source"]
@@ -102,7 +102,7 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     chosen = loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
     study = section_sweep.study(chosen)
     swept = {name: value for name, value in manifest["study"].items() if name != "engine"}  # a sample is run by XLA
-    for line in differences(swept, study.table(), "study"):
+    for line in describe_differences(swept, study.table(), "study"):
         raise SweepError(f"{folder}: the scenario in its manifest is not what was swept: {line}")
     if not 0 <= number < study.samples:
         console.fail(f"--sample {number} is outside [0, {study.samples - 1}]")
@@ -192,10 +192,10 @@ def _with_engine(study: "Study", engine: str) -> "Study":
     """The study, whose engine is "kernel" if that is asked for, or possible and left to us."""
     if engine == "xla":
         return study
-    from diffabs.sweep.runner import objection
+    from diffabs.sweep.runner import find_study_objection
 
     by_kernel = dataclasses.replace(study.check(), engine="kernel")
-    line = console.waited(lambda: objection(by_kernel), "compiling a kernel")
+    line = console.waited(lambda: find_study_objection(by_kernel), "compiling a kernel")
     if line and engine == "kernel":
         console.fail(line)
     if line:
@@ -246,9 +246,9 @@ def _listed(numbers: tuple[int, ...]) -> str:
 
 
 def _warn(accuracy: dict[str, Any] | None) -> None:
-    from diffabs.sweep.checking import said
+    from diffabs.sweep.checking import accuracy_warnings
 
-    for line in said(accuracy) if accuracy else ():
+    for line in accuracy_warnings(accuracy) if accuracy else ():
         console.say(f"warning: {line}")
 
 
@@ -256,17 +256,17 @@ def _result(
     found: "Results", study: "Study", out: pathlib.Path, kept: list[int], figures: bool, check: int
 ) -> dict[str, Any]:
     """The JSON document, which is also written into the folder."""
-    from diffabs.sweep.checking import checked
-    from diffabs.sweep.statistics.summary import summary
-    from diffabs.sweep.trajectories import keep
+    from diffabs.sweep.checking import check_accuracy
+    from diffabs.sweep.statistics.summary import summarise_sweep
+    from diffabs.sweep.trajectories import write_trajectories
 
     with ThreadPoolExecutor(1) as beside:
-        halved = beside.submit(checked, study, found, check) if check else None
-        said = summary(found)
+        halved = beside.submit(check_accuracy, study, found, check) if check else None
+        said = summarise_sweep(found)
     accuracy = halved.result() if halved else None
     result = {"out": str(out), **said, "accuracy": accuracy, "made": console.made(), "files": {}}
     if kept:
-        result["files"]["trajectories"] = str(keep(study, out, kept))
+        result["files"]["trajectories"] = str(write_trajectories(study, out, kept))
     if figures:
         from diffabs.plot.sweeps import draw
 

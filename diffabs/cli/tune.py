@@ -23,7 +23,7 @@ from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Trajectory
 
 if TYPE_CHECKING:
-    from diffabs.tune import Progress, Tuned
+    from diffabs.tune import Tuned, TuningProgress
 
 OF_THE_COMMAND = ("scenario", "model", "made", "versions", "files")  # of a certificate: the tuning says the same
 ROUNDING = 1e-9  # relative: of a decay rate as a factor for one period, with plenty to spare
@@ -148,7 +148,7 @@ def _watched(work: Work, engine: str) -> tuple["Tuned", bool]:
     from diffabs import tune
     from diffabs.tune import Method, StartError, Stopping
 
-    goal, told = work.chosen.tune, list["Progress"]()
+    goal, told = work.chosen.tune, list["TuningProgress"]()
     ending = console.Ending("the evaluation in hand", nothing=lambda: not told)
     method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
     posed: dict[str, Any] = {
@@ -162,7 +162,7 @@ def _watched(work: Work, engine: str) -> tuple["Tuned", bool]:
     }
     loop = work.chosen.loop
     most = None if work.constraints else goal.iterations  # constraints take rounds of as many, nobody knows how many
-    engine = engines.decided(engine, lambda: tune.posed(loop, **posed, engine="kernel").objection())
+    engine = engines.decided(engine, lambda: tune.build_problem(loop, **posed, engine="kernel").objection())
 
     def tuned() -> "Tuned":
         told_to = {"method": method, "progress": told.append, "stopping": ending}
@@ -176,7 +176,7 @@ def _watched(work: Work, engine: str) -> tuple["Tuned", bool]:
         console.fail(str(error))
 
 
-def _said(told: "list[Progress]", most: int | None = None) -> progress.Far:
+def _said(told: "list[TuningProgress]", most: int | None = None) -> progress.Far:
     """How far it is, in one line; of so many iterations at most, where that is known."""
     if not told:
         return progress.Far(progress.COMPILING)

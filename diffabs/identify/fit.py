@@ -21,10 +21,10 @@ from diffabs.core.pytree import replace, strong
 from diffabs.core.reason import Reason
 from diffabs.core.summary import Summary, number
 from diffabs.core.validity import check
-from diffabs.identify.residuals import Prior, Problem, Residuals, Seen, traced
+from diffabs.identify.residuals import FitProblem, Prior, ResidualEvaluation, Residuals, as_partial
 from diffabs.identify.uncertainty import Uncertainty, uncertainty
 
-REASONS = {0: Reason.LIMIT, 1: Reason.GRADIENT, 2: Reason.CHANGE, 3: Reason.CHANGE, 4: Reason.CHANGE}
+SCIPY_REASONS = {0: Reason.LIMIT, 1: Reason.GRADIENT, 2: Reason.CHANGE, 3: Reason.CHANGE, 4: Reason.CHANGE}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,21 +120,21 @@ def fit(
     part = strong(check(part))
     where = space(part, free)
     points = [where.place(check(replace(part, dict(start)))) for start in starts] or [where.place(part)]
-    problem = Problem(where, part, residuals, data, traced(prior), norm, usable)
+    problem = FitProblem(where, part, residuals, data, as_partial(prior), norm, usable)
     n, k = problem.shapes()
-    _check(where.size, n, k, sigma, norm, absolute)
+    _check_fit(where.size, n, k, sigma, norm, absolute)
     deviations = np.broadcast_to(np.asarray(1.0 if sigma is None else sigma, float), (n,))
     estimated = sigma is None or not absolute
-    watch = _Watch(progress or (lambda _, __: None), stopping)
-    return _best(problem, points, deviations, estimated, tolerances or Tolerances(), watch)
+    watch = _FitMonitor(progress or (lambda _, __: None), stopping)
+    return _fit_all_starts(problem, points, deviations, estimated, tolerances or Tolerances(), watch)
 
 
-class _Stopped(Exception):
+class _FitInterrupted(Exception):
     """Somebody has had enough."""
 
 
 @dataclasses.dataclass
-class _Watch:
+class _FitMonitor:
     """Who is told, who is asked, and the evaluations of the starts before."""
 
     progress: Callable[[int, float], None]
@@ -142,7 +142,7 @@ class _Watch:
     before: int = 0
 
 
-def _check(p: int, n: int, k: int, sigma: Any, norm: float, absolute: bool) -> None:
+def _check_fit(p: int, n: int, k: int, sigma: Any, norm: float, absolute: bool) -> None:
     if sigma is not None:
         given = np.asarray(sigma, float)
         if given.shape not in ((), (n,)):
@@ -159,67 +159,74 @@ def _check(p: int, n: int, k: int, sigma: Any, norm: float, absolute: bool) -> N
         raise ValueError(f"norm = {norm:g} is outside [2, inf)")
 
 
-def _best(
-    problem: Problem,
+def _fit_all_starts(
+    problem: FitProblem,
     points: Sequence[np.ndarray],
     sigma: np.ndarray,
     estimated: bool,
     tolerances: Tolerances,
-    watch: _Watch,
+    watch: _FitMonitor,
 ) -> Identified:
     """The best fit from these points, with all others. Raises ValueError where none can be used."""
     fits: list[Identified | None] = []
     for z in points:
         if not (any(fits) and watch.stopping()):
-            fits.append(_fitted(problem, z, sigma, estimated, tolerances, watch))
+            fits.append(_fit_start(problem, z, sigma, estimated, tolerances, watch))
     done = tuple(one for one in fits if one is not None)
     if not done:
         raise ValueError(f"the run diverges, or its step is not stable, at each of the {len(fits)} starts")
-    diverged = tuple(_values(problem.space, z) for z, one in zip(points, fits, strict=False) if one is None)
+    diverged = tuple(_values_by_path(problem.space, z) for z, one in zip(points, fits, strict=False) if one is None)
     return dataclasses.replace(min(done, key=lambda one: one.cost), starts=done, diverged=diverged)
 
 
-def _fitted(
-    problem: Problem, start: np.ndarray, sigma: np.ndarray, estimated: bool, tolerances: Tolerances, watch: _Watch
+def _fit_start(
+    problem: FitProblem,
+    start: np.ndarray,
+    sigma: np.ndarray,
+    estimated: bool,
+    tolerances: Tolerances,
+    watch: _FitMonitor,
 ) -> Identified | None:
     """From one start; None if it cannot be used."""
     problem.evaluations, problem.last = 0, None
     if problem.at(start) is None:
         return None
-    end, reason, history = _descended(problem, start, sigma, tolerances, watch)
+    end, reason, history = _minimise(problem, start, sigma, tolerances, watch)
     evaluations = problem.evaluations  # the point found may have to be computed once more, which was not SciPy's wish
     watch.before += evaluations
-    seen = _known(problem, end)
+    seen = _accepted_evaluation(problem, end)
     return Identified(
         part=jax.tree.map(np.asarray, problem.space.at(problem.part, jnp.asarray(end))),
-        values=_values(problem.space, end),
+        values=_values_by_path(problem.space, end),
         residuals=seen.residuals,
         sigma=sigma,
         chi2=float(np.sum((seen.residuals / sigma) ** 2)),
         cost=float(np.sum(problem.vector(seen, sigma) ** 2)),
-        uncertainty=_uncertainty(problem.space, end, seen, sigma, estimated),
+        uncertainty=_parameter_uncertainty(problem.space, end, seen, sigma, estimated),
         history=history,
         evaluations=evaluations,
         reason=reason,
-        start=_values(problem.space, start),
+        start=_values_by_path(problem.space, start),
     )
 
 
-def _descended(
-    problem: Problem, start: np.ndarray, sigma: np.ndarray, tolerances: Tolerances, watch: _Watch
+def _minimise(
+    problem: FitProblem, start: np.ndarray, sigma: np.ndarray, tolerances: Tolerances, watch: _FitMonitor
 ) -> tuple[np.ndarray, Reason, list[float]]:
     """Where it ended and why, and the cost at every accepted point."""
-    rejected = np.full(len(problem.vector(_known(problem, start), sigma)), np.nan)  # SciPy then shrinks the region
+    rejected = np.full(
+        len(problem.vector(_accepted_evaluation(problem, start), sigma)), np.nan
+    )  # SciPy then shrinks the region
     history, accepted = [], [start]
 
     def value(z: np.ndarray) -> np.ndarray:
         if watch.stopping():
-            raise _Stopped
+            raise _FitInterrupted
         seen = problem.at(z)
         return rejected if seen is None else problem.vector(seen, sigma)
 
     def jacobian(z: np.ndarray) -> np.ndarray:
-        seen = _known(problem, z)
+        seen = _accepted_evaluation(problem, z)
         history.append(float(np.sum(problem.vector(seen, sigma) ** 2)))
         accepted.append(z.copy())
         watch.progress(watch.before + problem.evaluations, history[-1])
@@ -237,12 +244,12 @@ def _descended(
             gtol=tolerances.gradient,
             max_nfev=tolerances.evaluations,
         )
-    except _Stopped:
+    except _FitInterrupted:
         return accepted[-1], Reason.INTERRUPTED, history
-    return found.x, REASONS[found.status], history
+    return found.x, SCIPY_REASONS[found.status], history
 
 
-def _known(problem: Problem, z: np.ndarray) -> Seen:
+def _accepted_evaluation(problem: FitProblem, z: np.ndarray) -> ResidualEvaluation:
     """Of a point that was accepted before."""
     seen = problem.at(z)
     if seen is None:
@@ -250,11 +257,13 @@ def _known(problem: Problem, z: np.ndarray) -> Seen:
     return seen
 
 
-def _uncertainty(free: Space, z: np.ndarray, seen: Seen, sigma: np.ndarray, estimated: bool) -> Uncertainty:
+def _parameter_uncertainty(
+    free: Space, z: np.ndarray, seen: ResidualEvaluation, sigma: np.ndarray, estimated: bool
+) -> Uncertainty:
     """In the parameters themselves: dr/dp = dr/dz / (dp/dz), since each parameter has its own z. One that has arrived
     at the end of its range (dp/dz = 0) is not determined."""
     slope = np.array([float(jax.grad(m.value)(x)) for m, x in zip(_maps(free), z, strict=True)])
-    values = np.concatenate([np.ravel(x) for x in _values(free, z).values()])
+    values = np.concatenate([np.ravel(x) for x in _values_by_path(free, z).values()])
     chi2 = float(np.sum((seen.residuals / sigma) ** 2))
     scale = float(np.sqrt(chi2 / (len(sigma) - free.size))) if estimated else 1.0
     size = np.maximum(np.abs(values), np.abs(slope))
@@ -267,5 +276,5 @@ def _maps(free: Space) -> list[Any]:
     return [m for entry in free.entries for m in entry.maps]
 
 
-def _values(free: Space, z: np.ndarray) -> dict[str, Any]:
+def _values_by_path(free: Space, z: np.ndarray) -> dict[str, Any]:
     return {path: np.asarray(value) for path, value in free.values(jnp.asarray(z)).items()}

@@ -50,34 +50,34 @@ def identify(
         ValueError: what `fit` and the data object to; a run that must not be run at the start.
     """
     check(loop)
-    against = data.against(loop, list(free), solver)
-    _check_starts(loop, starts or ({},), against, solver)
+    comparison = data.against(loop, list(free), solver)
+    _check_starts(loop, starts or ({},), comparison, solver)
     return fit(
         loop,
         free,
-        against.residuals,
-        data=against.data,
-        sigma=against.sigma,
+        comparison.residuals,
+        data=comparison.data,
+        sigma=comparison.sigma,
         absolute=absolute,
         prior=prior,
         starts=starts,
         norm=norm,
         tolerances=tolerances,
-        usable=lambda part: _refused(part, against, solver) is None,
+        usable=lambda part: _describe_refusal(part, comparison, solver) is None,
         progress=progress,
         stopping=stopping,
     )
 
 
-def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], against: Comparison, solver: Solver) -> None:
+def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], comparison: Comparison, solver: Solver) -> None:
     """Raises ValueError for a start from which a run must not be run, with the longest step that may."""
     for start in starts:
-        if why := _refused(first := replace(loop, dict(start)), against, solver):
-            most = min(float(stable_steps(strong(batch)).min()) for batch in against.loops(first))
+        if why := _describe_refusal(first := replace(loop, dict(start)), comparison, solver):
+            most = min(float(stable_steps(strong(batch)).min()) for batch in comparison.loops(first))
             raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
 
 
-def _refused(loop: Any, against: Comparison, solver: Solver) -> str | None:
+def _describe_refusal(loop: Any, comparison: Comparison, solver: Solver) -> str | None:
     """Why the first run that must not be run must not."""
-    asked = (batch_admissibility(None, jax.device_get(strong(batch)), solver) for batch in against.loops(loop))
+    asked = (batch_admissibility(None, jax.device_get(strong(batch)), solver) for batch in comparison.loops(loop))
     return next((next(filter(None, found.texts)) for found in asked if found.number), None)

@@ -18,7 +18,7 @@ Prior = Callable[[Any], Any]  # part -> (k,), in standard deviations
 
 
 @dataclasses.dataclass(frozen=True)
-class _Gaussian:
+class _GaussianPrior:
     """Independent normal distributions of these parameters."""
 
     paths: tuple[str, ...]
@@ -36,20 +36,22 @@ def gaussian(known: Mapping[str, tuple[Any, Any]]) -> Prior:
         if not (np.asarray(deviation, float) > 0).all():
             raise ValueError(f"{path}: the prior's standard deviation is {np.min(deviation):g}; it must be positive")
     means, deviations = zip(*known.values(), strict=True)
-    return Partial(_Gaussian(tuple(known)), *(list(map(jnp.asarray, map(np.float64, x))) for x in (means, deviations)))
+    return Partial(
+        _GaussianPrior(tuple(known)), *(list(map(jnp.asarray, map(np.float64, x))) for x in (means, deviations))
+    )
 
 
-def traced(prior: Prior | None) -> Prior:
+def as_partial(prior: Prior | None) -> Prior:
     """As a pytree that can be called: a `Partial`, whose arguments are traced, stays one."""
-    return prior if isinstance(prior, Partial) else Partial(prior or _nothing)
+    return prior if isinstance(prior, Partial) else Partial(prior or _empty_prior)
 
 
-def _nothing(part: Any) -> Any:
+def _empty_prior(part: Any) -> Any:
     del part
     return jnp.zeros(0)
 
 
-class Seen(NamedTuple):
+class ResidualEvaluation(NamedTuple):
     """At one z: residuals (n,), prior (k,), and their derivatives in z (n, p) and (k, p)."""
 
     residuals: Any
@@ -62,7 +64,9 @@ class Seen(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("free", "residuals"))
-def _seen(free: Space, residuals: Residuals, prior: Prior, part: Any, data: Any, z: Any) -> Seen:
+def _evaluate_residuals(
+    free: Space, residuals: Residuals, prior: Prior, part: Any, data: Any, z: Any
+) -> ResidualEvaluation:
     """Compiled once for equal functions, spaces and structures."""
 
     def both(z: Any) -> tuple[Any, Any]:
@@ -71,11 +75,11 @@ def _seen(free: Space, residuals: Residuals, prior: Prior, part: Any, data: Any,
         return values, values
 
     slopes, values = jax.jacfwd(both, has_aux=True)(z)
-    return Seen(values[0], values[1], slopes)
+    return ResidualEvaluation(values[0], values[1], slopes)
 
 
 @dataclasses.dataclass(eq=False)
-class Problem:
+class FitProblem:
     """Remembers the last point, since SciPy asks for value and Jacobian one after the other."""
 
     space: Space
@@ -86,7 +90,7 @@ class Problem:
     norm: float
     usable: Callable[[Any], bool] | None
     evaluations: int = 0
-    last: tuple[np.ndarray, Seen | None] | None = None
+    last: tuple[np.ndarray, ResidualEvaluation | None] | None = None
 
     def shapes(self) -> tuple[int, int]:
         """n and k, without a run."""
@@ -94,26 +98,26 @@ class Problem:
         k = jax.eval_shape(lambda part: self.prior(part), self.part).size
         return r.size, k
 
-    def at(self, z: np.ndarray) -> Seen | None:
+    def at(self, z: np.ndarray) -> ResidualEvaluation | None:
         """None where a number is not finite, or the part not usable."""
         if self.last is None or not np.array_equal(self.last[0], z):
-            self.last = z.copy(), self._evaluated(z)
+            self.last = z.copy(), self._evaluate_at(z)
             self.evaluations += 1
         return self.last[1]
 
-    def _evaluated(self, z: np.ndarray) -> Seen | None:
+    def _evaluate_at(self, z: np.ndarray) -> ResidualEvaluation | None:
         if self.usable and not self.usable(self.space.at(self.part, jnp.asarray(z))):
             return None
-        seen = _seen(self.space, self.residuals, self.prior, self.part, self.data, jnp.asarray(z))
+        seen = _evaluate_residuals(self.space, self.residuals, self.prior, self.part, self.data, jnp.asarray(z))
         seen = jax.tree.map(lambda x: np.asarray(x, float), jax.device_get(seen))
         return seen if seen.finite() else None
 
-    def vector(self, seen: Seen, sigma: np.ndarray) -> np.ndarray:
+    def vector(self, seen: ResidualEvaluation, sigma: np.ndarray) -> np.ndarray:
         """sgn(r) |r/sigma|^(norm/2), and the prior: the sum of squares is the cost. (n + k,)."""
         x = seen.residuals / sigma
         return np.concatenate([np.sign(x) * np.abs(x) ** (self.norm / 2), seen.prior])
 
-    def jacobian(self, seen: Seen, sigma: np.ndarray) -> np.ndarray:
+    def jacobian(self, seen: ResidualEvaluation, sigma: np.ndarray) -> np.ndarray:
         """Derivative of the vector in z (n + k, p)."""
         x = (self.norm / 2) * np.abs(seen.residuals / sigma) ** (self.norm / 2 - 1) / sigma
         return np.concatenate([x[:, None] * seen.slopes[0], seen.slopes[1]])

@@ -52,7 +52,7 @@ class Table:
         target = np.array([self.values[row][metric] for row, metric in self.labels])
         weights = self.sigma
         sigma = None if weights is None else np.array([weights[metric] for _, metric in self.labels])
-        measured = _Measured(solver, tuple(free), tuple((name, self.measured[name]) for name in metrics))
+        measured = _MetricResiduals(solver, tuple(free), tuple((name, self.measured[name]) for name in metrics))
         data = batches, place, target
         return Comparison(measured, data, sigma, lambda part: measured.each(part, batches, lambda loop: loop))
 
@@ -84,7 +84,7 @@ class Table:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Measured:
+class _MetricResiduals:
     """Metrics of rows of loops minus data. Equal ones are compiled once."""
 
     solver: Solver

@@ -51,10 +51,14 @@ class Traces:
         self._check(loop, free, solver)
         kept = np.flatnonzero(self._kept())
         over = {path: np.asarray(rows, float) for path, rows in self.over.items()}
-        target = np.concatenate([self._full(column) for column in self.columns.values()])[kept]
+        target = np.concatenate([self._broadcast_column(column) for column in self.columns.values()])[kept]
         weights = self.sigma
-        sigma = None if weights is None else np.concatenate([self._full(weights[name]) for name in self.columns])[kept]
-        simulated = _Simulated(solver, tuple(self.columns))
+        sigma = (
+            None
+            if weights is None
+            else np.concatenate([self._broadcast_column(weights[name]) for name in self.columns])[kept]
+        )
+        simulated = _TraceResiduals(solver, tuple(self.columns))
         return Comparison(
             simulated,
             (over, np.asarray(self.t, float), kept, target),
@@ -68,7 +72,7 @@ class Traces:
         whole[np.flatnonzero(self._kept())] = found.residuals
         return dict(zip(self.columns, whole.reshape(len(self.columns), *self.shape), strict=True))
 
-    def _full(self, column: Any) -> np.ndarray:
+    def _broadcast_column(self, column: Any) -> np.ndarray:
         return np.broadcast_to(np.asarray(column, float), self.shape).ravel()
 
     def _kept(self) -> np.ndarray:
@@ -85,9 +89,9 @@ class Traces:
             raise ValueError(f"t has shape {t.shape}; it must be finite numbers in increasing order [s]")
         if t[0] < 0 or t[-1] > solver.duration:
             raise ValueError(f"t = {t[0]:g} ... {t[-1]:g} s leaves [0, {solver.duration:g}] s, the solver's duration")
-        if not self.columns or set(self.columns) - set(_shown(loop)):
+        if not self.columns or set(self.columns) - set(_output_names(loop)):
             named = ", ".join(self.columns) or "none"
-            raise ValueError(f"columns: {named}; there is {', '.join(_shown(loop))}")
+            raise ValueError(f"columns: {named}; there is {', '.join(_output_names(loop))}")
         shapes = (self.shape, self.shape[1:]) if self.shape[0] == 1 else (self.shape,)
         for name, column in self.columns.items():
             _check_column(name, np.asarray(column, float), t, shapes)
@@ -108,13 +112,13 @@ class Traces:
             check_positive(f"sigma.{name}", value, units[name])
 
 
-def _shown(loop: Loop) -> tuple[str, ...]:
+def _output_names(loop: Loop) -> tuple[str, ...]:
     """What the plant shows of itself."""
     return jax.eval_shape(lambda loop: loop.plant.output(loop.plant.start(loop.initial)), strong(loop))._fields
 
 
 @dataclasses.dataclass(frozen=True)
-class _Simulated:
+class _TraceResiduals:
     """Traces of a loop minus data. Equal ones are compiled once."""
 
     solver: Solver

@@ -16,7 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-WIDE = 1.0  # relative spread beyond which a direction counts as not determined: as wide as the parameters are large
+MAX_RELATIVE_SPREAD = (
+    1.0  # relative spread beyond which a direction counts as not determined: as wide as the parameters are large
+)
 
 
 class Direction(NamedTuple):
@@ -52,7 +54,7 @@ class Uncertainty:
     degrees: int
     directions: list[Direction]
 
-    def undetermined(self, beyond: float = WIDE) -> list[Direction]:
+    def undetermined(self, beyond: float = MAX_RELATIVE_SPREAD) -> list[Direction]:
         """The directions that the data leave open: those with a relative spread beyond a threshold."""
         return [one for one in self.directions if not one.spread <= beyond]
 
@@ -65,8 +67,8 @@ class Uncertainty:
 def uncertainty(names: Sequence[str], size: np.ndarray, data: Any, prior: Any, scale: float) -> Uncertainty:
     """From sizes (p,), A (n, p), P (k, p) and s."""
     degrees, known = len(data) - len(names), data * size / scale
-    _, values, vectors = _decomposed(np.concatenate([known, prior * size]))
-    spread = vectors.T / np.maximum(values, _zero(values, len(data)))  # a root of the relative covariance
+    _, values, vectors = _padded_svd(np.concatenate([known, prior * size]))
+    spread = vectors.T / np.maximum(values, _zero_threshold(values, len(data)))  # a root of the relative covariance
     covariance = size[:, None] * (spread @ spread.T) * size
     deviations = np.sqrt(np.diag(covariance))
     return Uncertainty(
@@ -81,8 +83,8 @@ def uncertainty(names: Sequence[str], size: np.ndarray, data: Any, prior: Any, s
 
 
 def _directions(names: Sequence[str], known: np.ndarray) -> list[Direction]:
-    _, values, vectors = _decomposed(known)
-    zero, found = _zero(values, len(known)), []
+    _, values, vectors = _padded_svd(known)
+    zero, found = _zero_threshold(values, len(known)), []
     for value, vector in zip(values, vectors, strict=True):
         vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
         spread = 1 / float(value) if value > zero else float("inf")
@@ -90,12 +92,12 @@ def _directions(names: Sequence[str], known: np.ndarray) -> list[Direction]:
     return found
 
 
-def _decomposed(matrix: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+def _padded_svd(matrix: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
     """Singular values and right vectors, p of each: zeros for directions beyond the number of rows."""
     missing = max(0, matrix.shape[1] - matrix.shape[0])
     return np.linalg.svd(np.concatenate([matrix, np.zeros((missing, matrix.shape[1]))]), full_matrices=False)
 
 
-def _zero(values: np.ndarray, rows: int) -> float:
+def _zero_threshold(values: np.ndarray, rows: int) -> float:
     """What counts as zero among singular values; positive even where all are zero."""
     return max(float(values[0]) * max(rows, len(values)) * np.finfo(float).eps, float(np.finfo(float).tiny))

@@ -11,7 +11,7 @@ import numpy as np
 
 from diffabs.plot.style import COLOURS, GREY, Axes, Figure, label, logarithmic, save, sheet
 from diffabs.plot.sweep_view import Variable, View, cells
-from diffabs.sweep.engines import missing
+from diffabs.sweep.engines import describe_wrong_end
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics.estimates import Count, Tail
 
@@ -24,7 +24,9 @@ ABOVE = dict(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False
 
 
 def draw(found: Results, document: Any, folder: pathlib.Path, units: Mapping[str, str]) -> list[pathlib.Path]:
-    """Write every figure that has something in it as PNG. `document`: of `diffabs.sweep.statistics.summary.summary`."""
+    """Write every figure that has something in it as PNG.
+
+    document: of `diffabs.sweep.statistics.summary.summarise_sweep`."""
     figures = {
         "distributions": distributions(found, units),
         "exceedance": exceedance(found, units, document["confidence"]),
@@ -164,7 +166,7 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     ax.yaxis.set_visible(len(ones) > 1)
     _name_axes(ax, ones)
     bounds = "".join(f", {name} > {bound:g}" for name, bound in view.bounds.items())
-    ax.set_title(f"failed: diverged, {missing(found.study['success'])}{bounds}", fontsize=9.5)
+    ax.set_title(f"failed: diverged, {describe_wrong_end(found.study['success'])}{bounds}", fontsize=9.5)
     return figure
 
 

@@ -17,13 +17,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.reliability.importance_sampling import STARTS, Gradient
+from diffabs.reliability.importance_sampling import DESIGN_POINT_STARTS, Gradient
 from diffabs.reliability.subset_simulation import RareEvent, subset_simulation
 from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.sweep.study import Study, noise_key, precision
 
-STEP = 1e-4  # of the differences in z: errors of 1e-9 and 1e-12 of the values
+DIFFERENCE_STEP = 1e-4  # of the differences in z: errors of 1e-9 and 1e-12 of the values
 
 
 def failure_probability(
@@ -56,13 +56,13 @@ def failure_probability(
         raise ValueError(f"{', '.join(study.parts)}: alternatives of parts have no normal coordinates")
 
     def score(z: np.ndarray) -> np.ndarray:
-        return _scores(study, metric, z)
+        return _run_scores(study, metric, z)
 
-    gradient = _gradient(study, metric) if gradients else None
+    gradient = _make_gradient(study, metric) if gradients else None
     return subset_simulation(score, study.space.dimension, bound, gradient=gradient, **options)
 
 
-def objection(study: Study, metric: str) -> str | None:
+def find_metric_objection(study: Study, metric: str) -> str | None:
     """Return why a kernel cannot make these runs, or None. None is made, but what makes them is compiled.
 
     Raises ValueError for what cannot be run at all."""
@@ -70,27 +70,27 @@ def objection(study: Study, metric: str) -> str | None:
 
     values = study.space.normal(np.zeros((1, study.space.dimension)))
     with precision(study.dtype):
-        return native.kernel_objection(*_posed(study, metric, values))
+        return native.kernel_objection(*_cast_arguments(study, metric, values))
 
 
-def _posed(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
+def _cast_arguments(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
     """Loop, values, solver and objectives, of the study's type."""
     given = study.loop, {metric: study.objectives[metric]}
     loop, objective = jax.tree.map(lambda x: np.asarray(x, study.dtype), given)
     return loop, values, study.solver, objective
 
 
-def _scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
+def _run_scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
     """The metric at z (n, dimension), NaN where the run diverges. n is filled up to a power of two: few programs."""
-    values = study.space.normal(_filled(z, 1 << (len(z) - 1).bit_length()))
+    values = study.space.normal(_pad_with_last(z, 1 << (len(z) - 1).bit_length()))
     _check_runnable(study, values, len(z))
     with precision(study.dtype):
-        return np.asarray(_measured(study, metric, values), float)[: len(z)]
+        return np.asarray(_measure_metric(study, metric, values), float)[: len(z)]
 
 
-def _measured(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
+def _measure_metric(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
     """The metric of lanes (n,) that share one sequence of noise."""
-    loop, _, solver, objective = _posed(study, metric, values)
+    loop, _, solver, objective = _cast_arguments(study, metric, values)
     keys = jax.vmap(lambda _: noise_key(study.seed, 0))(np.arange(Batch(values).size))
     lanes = Batch(values, keys)
     return run_batch(loop, lanes, solver, objective, accepted=True, engine=study.engine).metrics[metric]
@@ -106,28 +106,28 @@ def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) 
         raise ValueError(f"no probability: {len(bad)} of {count} points cannot be run: {why}; narrow the ranges")
 
 
-def _gradient(study: Study, metric: str) -> Gradient:
+def _make_gradient(study: Study, metric: str) -> Gradient:
     """The metric (n,) and its derivative (n, dimension) at z (n, dimension), n at most STARTS."""
-    slopes = _slopes(study, metric)
+    slopes = _compile_derivatives(study, metric)
 
     def gradient(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        values = study.space.normal(_filled(z, STARTS))
+        values = study.space.normal(_pad_with_last(z, DESIGN_POINT_STARTS))
         _check_runnable(study, values, len(z))
         values = {path: column.astype(study.dtype) for path, column in values.items()}
         with precision(study.dtype):
             score, by_value = jax.device_get(slopes(values))
-        chain = [by_value[path][: len(z), None] * column for path, column in _steepness(study, z).items()]
+        chain = [by_value[path][: len(z), None] * column for path, column in _parameter_slopes(study, z).items()]
         return np.array(score[: len(z)], float), np.sum(chain, axis=0)
 
     return gradient
 
 
-def _slopes(study: Study, metric: str) -> Callable[[Mapping[str, Any]], Any]:
+def _compile_derivatives(study: Study, metric: str) -> Callable[[Mapping[str, Any]], Any]:
     """The metric of a batch of values, and its derivative in each: in reverse, by a kernel forward. Compiled once."""
 
     def forward(values: Mapping[str, Any]) -> Any:
         def along(way: Mapping[str, Any]) -> Any:
-            return jax.jvp(lambda values: _measured(study, metric, values), (values,), (way,))
+            return jax.jvp(lambda values: _measure_metric(study, metric, values), (values,), (way,))
 
         rows = dict(zip(values, np.eye(len(values)), strict=True))
         ways = {path: jnp.outer(rows[path], jnp.ones_like(column)) for path, column in values.items()}
@@ -135,21 +135,21 @@ def _slopes(study: Study, metric: str) -> Callable[[Mapping[str, Any]], Any]:
         return scores, dict(zip(values, rates, strict=True))
 
     def slopes(values: Mapping[str, Any]) -> Any:
-        scores, pull = jax.vjp(lambda values: _measured(study, metric, values), values)
+        scores, pull = jax.vjp(lambda values: _measure_metric(study, metric, values), values)
         return scores, *pull(jnp.ones_like(scores))
 
     return jax.jit(forward if study.engine == "kernel" else slopes)
 
 
-def _steepness(study: Study, z: np.ndarray) -> dict[str, np.ndarray]:
+def _parameter_slopes(study: Study, z: np.ndarray) -> dict[str, np.ndarray]:
     """dv/dz (n, dimension) of each parameter: zero for lists of values, but next to their edges."""
     n, d = z.shape
-    offsets = STEP * np.eye(d)
+    offsets = DIFFERENCE_STEP * np.eye(d)
     points = np.stack([z[:, None] + offsets, z[:, None] - offsets]).reshape(-1, d)
     ends = {path: column.reshape(2, n, d) for path, column in study.space.normal(points).items()}
-    return {path: (above - below) / (2 * STEP) for path, (above, below) in ends.items()}
+    return {path: (above - below) / (2 * DIFFERENCE_STEP) for path, (above, below) in ends.items()}
 
 
-def _filled(z: np.ndarray, size: int) -> np.ndarray:
+def _pad_with_last(z: np.ndarray, size: int) -> np.ndarray:
     """With copies of the last row."""
     return np.concatenate([z, np.repeat(z[-1:], size - len(z), axis=0)])

@@ -20,29 +20,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-COMPONENTS = (1, 2, 4, 8, 16)  # numbers of centres that are tried
-FITTING = 15  # steps of expectation maximisation
-DEFENCE = 0.1  # of the draws, shared equally by all centres: the failures at hand may miss where others are
-SCALES = 0.8, 2.0  # least and greatest s: the weights' variance is finite above sqrt(1/2)
-ITERATIONS = 30  # of a search for a design point, and so its gradients
-SAME = 0.5  # distance below which two design points are one
-CLOSE = 0.05  # length of a step that ends a search: a centre need not be more accurate
-SHORTEST = 1e-3  # share of a step
+COMPONENT_COUNTS = (1, 2, 4, 8, 16)  # numbers of centres that are tried
+EM_STEPS = 15  # steps of expectation maximisation
+DEFENSIVE_SHARE = 0.1  # of the draws, shared equally by all centres: the failures at hand may miss where others are
+SCALE_RANGE = 0.8, 2.0  # least and greatest s: the weights' variance is finite above sqrt(1/2)
+MAX_DESIGN_POINT_STEPS = 30  # of a search for a design point, and so its gradients
+MIN_POINT_DISTANCE = 0.5  # distance below which two design points are one
+STEP_TOLERANCE = 0.05  # length of a step that ends a search: a centre need not be more accurate
+MIN_STEP_SHARE = 1e-3  # share of a step
 CONFIDENCE = 0.95
-STARTS = 8  # of searches for design points
-GAIN = 0.5  # of the coefficient of variation, that importance sampling must promise
-APART = 4.0  # standard deviations between two estimates that do not agree
+DESIGN_POINT_STARTS = 8  # of searches for design points
+MAX_COV_RATIO = 0.5  # of the coefficient of variation, that importance sampling must promise
+MAX_DEVIATIONS_APART = 4.0  # standard deviations between two estimates that do not agree
 
 Score = Callable[[np.ndarray], np.ndarray]
 Gradient = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 Fit = Callable[[np.ndarray], "Mixture"]
 
 
-class Diverged(ValueError):
+class DivergenceError(ValueError):
     """Too many runs diverged to tell a probability; one line."""
 
 
-class Estimate(NamedTuple):
+class ProbabilityEstimate(NamedTuple):
     """A probability, its coefficient of variation, and an interval of 95 %."""
 
     probability: float
@@ -50,17 +50,17 @@ class Estimate(NamedTuple):
     interval: tuple[float, float]
 
 
-class Importance(NamedTuple):
+class ImportanceEstimate(NamedTuple):
     """Importance sampling around `centres` (k, d); the effective sample size (sum w)^2/sum w^2; the coefficient of
     variation that was foretold."""
 
-    estimate: Estimate
-    effective: float
-    foretold: float
+    estimate: ProbabilityEstimate
+    effective_samples: float
+    predicted_cov: float
     centres: np.ndarray
 
 
-class Runs:
+class CountedScore:
     """The score and its gradient, counted; NaN becomes -inf, which fails at no threshold."""
 
     def __init__(self, score: Score, gradient: Gradient | None, tolerated: float):
@@ -93,7 +93,9 @@ class Runs:
         """How many runs diverged, after that many before; too many are an error."""
         lost, of = self.diverged - diverged, self.evaluations - evaluations
         if lost > self.tolerated * of:
-            raise Diverged(f"{lost} of {of} runs diverged: make the score +inf or -inf there, or `tolerated` greater")
+            raise DivergenceError(
+                f"{lost} of {of} runs diverged: make the score +inf or -inf there, or `tolerated` greater"
+            )
         return lost
 
 
@@ -135,7 +137,7 @@ class Mixture(NamedTuple):
         return np.log(self.weights) + log_q + 0.5 * square, across
 
 
-def proposal(
+def fit_proposal(
     failures: np.ndarray, group: np.ndarray, probability: float, centres: np.ndarray | None = None
 ) -> tuple[Mixture, float]:
     """The mixture of least second moment E_q[w^2 1_F]/P^2, and the logarithm of that.
@@ -145,9 +147,11 @@ def proposal(
     probability: P
     centres (k, d): an alternative to those fitted to the failures; only their weights are fitted
     """
-    fits: list[Fit] = [lambda z, k=k: _fitted(z, spread(z, k), moving=True) for k in COMPONENTS]
+    fits: list[Fit] = [
+        lambda z, k=k: _fit_mixture(z, choose_spread_points(z, k), moving=True) for k in COMPONENT_COUNTS
+    ]
     if centres is not None:
-        fits.append(lambda z: _fitted(z, centres, moving=False))
+        fits.append(lambda z: _fit_mixture(z, centres, moving=False))
     odd = group % 2 == 1
     moments = [_second_moment(fit, failures, odd) - np.log(probability) for fit in fits]
     best = int(np.argmin(moments))
@@ -163,23 +167,23 @@ def _second_moment(fit: Fit, failures: np.ndarray, odd: np.ndarray) -> float:
     return np.logaddexp.reduce(np.concatenate(logs)) - np.log(len(failures))
 
 
-def _fitted(z: np.ndarray, centres: np.ndarray, *, moving: bool) -> Mixture:
+def _fit_mixture(z: np.ndarray, centres: np.ndarray, *, moving: bool) -> Mixture:
     """Weights and scales of most likelihood, and centres, too, if `moving`."""
     count, d = len(centres), z.shape[1]
     found = Mixture(centres, np.full(count, 1 / count), np.ones(count))
-    for _ in range(FITTING):
+    for _ in range(EM_STEPS):
         parts, across = found.parts(z)
         total = np.maximum(parts.sum(axis=0), np.finfo(float).tiny)
         square = np.sum(parts * across, axis=0) / total / max(d - 1, 1)
         found = Mixture(
             parts.T @ z / total[:, None] if moving else centres,
-            (1 - DEFENCE) * parts.mean(axis=0) + DEFENCE / count,
-            np.clip(np.sqrt(square), *SCALES),
+            (1 - DEFENSIVE_SHARE) * parts.mean(axis=0) + DEFENSIVE_SHARE / count,
+            np.clip(np.sqrt(square), *SCALE_RANGE),
         )
     return found
 
 
-def spread(z: np.ndarray, count: int) -> np.ndarray:
+def choose_spread_points(z: np.ndarray, count: int) -> np.ndarray:
     """Up to `count` of the points z (n, d): the nearest to the origin, then always the one whose direction is farthest
     from those chosen before."""
     size = np.linalg.norm(z, axis=1)
@@ -204,13 +208,13 @@ def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> n
     z = starts.copy()
     score, slope = gradient(z)
     t = np.ones(len(z))
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_DESIGN_POINT_STEPS):
         with np.errstate(all="ignore"):
             squared = np.sum(slope**2, axis=1)
             move = ((np.sum(slope * z, axis=1) + threshold - score) / squared)[:, None] * slope - z
             penalty = 2 * (np.linalg.norm(z, axis=1) + 1) / np.sqrt(squared)
             length = np.linalg.norm(move, axis=1)
-            go = np.flatnonzero(np.isfinite(length) & (length > CLOSE) & (t > SHORTEST))
+            go = np.flatnonzero(np.isfinite(length) & (length > STEP_TOLERANCE) & (t > MIN_STEP_SHARE))
         if len(go) == 0:
             break
         trial = z[go] + t[go, None] * move[go]
@@ -220,75 +224,77 @@ def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> n
         taken = go[better]
         z[taken], score[taken], slope[taken] = trial[better], value[better], steep[better]
         t[go] = np.where(better, 1.0, 0.5 * t[go])
-    return _distinct(z[np.argsort(np.linalg.norm(z, axis=1), kind="stable")])
+    return _drop_duplicates(z[np.argsort(np.linalg.norm(z, axis=1), kind="stable")])
 
 
-def _distinct(points: np.ndarray) -> np.ndarray:
+def _drop_duplicates(points: np.ndarray) -> np.ndarray:
     kept: list[np.ndarray] = []
     for point in points:
-        if all(np.linalg.norm(point - other) > SAME for other in kept):
+        if all(np.linalg.norm(point - other) > MIN_POINT_DISTANCE for other in kept):
             kept.append(point)
     return np.array(kept)
 
 
-def refined(
-    runs: Runs,
+def try_importance_sampling(
+    runs: CountedScore,
     failures: np.ndarray,
     group: np.ndarray,
-    subset: Estimate,
+    subset: ProbabilityEstimate,
     *,
     threshold: float,
     draws: int,
     rng: np.random.Generator,
-) -> tuple[Importance | None, str]:
+) -> tuple[ImportanceEstimate | None, str]:
     """Importance sampling, if the failures (n, d) of subset simulation foretell that it pays, and what came of it.
     `group` (n,) as for `proposal`."""
     centres = None
     if runs.slope:
-        centres = design_points(runs.gradient, spread(failures, STARTS), threshold)
-    mixture, moment = proposal(failures, group, subset.probability, centres)
-    foretold = math.sqrt(math.expm1(min(max(moment, 0.0), 700.0)) / draws)
-    if foretold > GAIN * subset.cov:
-        return None, f"subset simulation: {foretold:.2g} is the coefficient of variation to be had otherwise"
+        centres = design_points(runs.gradient, choose_spread_points(failures, DESIGN_POINT_STARTS), threshold)
+    mixture, moment = fit_proposal(failures, group, subset.probability, centres)
+    predicted_cov = math.sqrt(math.expm1(min(max(moment, 0.0), 700.0)) / draws)
+    if predicted_cov > MAX_COV_RATIO * subset.cov:
+        return None, f"subset simulation: {predicted_cov:.2g} is the coefficient of variation to be had otherwise"
     before = runs.evaluations, runs.diverged
-    found = importance_sampling(runs, threshold, mixture, draws, foretold, rng)
+    found = importance_sampling(runs, threshold, mixture, draws, predicted_cov, rng)
     runs.since(*before)
-    if pays(found, subset):
+    if is_better_estimate(found, subset):
         return found, "importance sampling: less uncertain than subset simulation, and not in contradiction"
     return found, "subset simulation: importance sampling is far below, or more uncertain"
 
 
-def pays(found: Importance, subset: Estimate) -> bool:
+def is_better_estimate(found: ImportanceEstimate, subset: ProbabilityEstimate) -> bool:
     """Whether importance sampling is less uncertain, and not too low, as it is where it misses failures."""
     cov = found.estimate.cov
     if cov > subset.cov:
         return False
     below = math.log(subset.probability / found.estimate.probability)
-    return below <= APART * math.sqrt(math.log1p(cov**2) + math.log1p(subset.cov**2))
+    return below <= MAX_DEVIATIONS_APART * math.sqrt(math.log1p(cov**2) + math.log1p(subset.cov**2))
 
 
 def importance_sampling(
-    score: Score, threshold: float, mixture: Mixture, draws: int, foretold: float, rng: np.random.Generator
-) -> Importance:
+    score: Score, threshold: float, mixture: Mixture, draws: int, predicted_cov: float, rng: np.random.Generator
+) -> ImportanceEstimate:
     """Unbiased whatever the mixture. The coefficient of variation is the one seen or foretold, whichever is greater,
     as both are low where heavy weights are rare. Interval: of log P, by Student's t of (effective size - 1) degrees."""
     z = mixture.draw(draws, rng)
     weights = np.where(score(z) >= threshold, np.exp(mixture.log_weight(z)), 0.0)
     probability = float(np.mean(weights))
     if probability == 0:
-        return Importance(Estimate(0.0, np.inf, (0.0, 1.0)), 0.0, foretold, mixture.centres)
-    cov = max(float(np.std(weights, ddof=1)) / math.sqrt(draws) / probability, foretold)
+        return ImportanceEstimate(ProbabilityEstimate(0.0, np.inf, (0.0, 1.0)), 0.0, predicted_cov, mixture.centres)
+    cov = max(float(np.std(weights, ddof=1)) / math.sqrt(draws) / probability, predicted_cov)
     effective = float(np.sum(weights) ** 2 / np.sum(weights**2))
-    return Importance(around(probability, cov, cov, effective - 1), effective, foretold, mixture.centres)
+    return ImportanceEstimate(
+        lognormal_estimate(probability, cov, cov, effective - 1), effective, predicted_cov, mixture.centres
+    )
 
 
-def around(probability: float, cov: float, deviation: float, degrees: float) -> Estimate:
+def lognormal_estimate(probability: float, cov: float, deviation: float, degrees: float) -> ProbabilityEstimate:
     """With the interval P exp(+- t deviation) of a standard deviation of log P."""
-    reach = math.exp(min(student(degrees) * deviation, 700.0))
-    return Estimate(probability, cov, (probability / reach, min(1.0, probability * reach)))
+    reach = math.exp(min(student_quantile(degrees) * deviation, 700.0))
+    return ProbabilityEstimate(probability, cov, (probability / reach, min(1.0, probability * reach)))
 
 
-def student(degrees: float) -> float:
+def student_quantile(degrees: float) -> float:
     """The upper quantile of Student's t for a two-sided interval of 95 %, Cornish and Fisher's expansion about the
     normal: within 2 % from 4 degrees, and fewer are counted as 2."""
     z, n = statistics.NormalDist().inv_cdf(0.5 + CONFIDENCE / 2), max(degrees, 2.0)

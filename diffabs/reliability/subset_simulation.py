@@ -28,15 +28,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from diffabs.reliability.importance_sampling import Estimate, Gradient, Importance, Runs, Score, around, pays, refined
+from diffabs.reliability.importance_sampling import (
+    CountedScore,
+    Gradient,
+    ImportanceEstimate,
+    ProbabilityEstimate,
+    Score,
+    is_better_estimate,
+    lognormal_estimate,
+    try_importance_sampling,
+)
 
-ACCEPTANCE, SPREAD = 0.44, 0.6  # aimed at, and the s of the first step: Papaioannou et al.
-KEPT = 100  # failures in a result
-RULE = 3.0  # 0/n with 95 % confidence: less than 3/n
+TARGET_ACCEPTANCE, FIRST_SPREAD = 0.44, 0.6  # aimed at, and the s of the first step: Papaioannou et al.
+MAX_FAILING_POINTS = 100  # failures in a result
+RULE_OF_THREE = 3.0  # 0/n with 95 % confidence: less than 3/n
 Rng = np.random.Generator
 
 
-class Reason(enum.Enum):
+class SubsetReason(enum.Enum):
     """Why no further level was made."""
 
     REACHED = "the threshold was reached"
@@ -44,7 +53,7 @@ class Reason(enum.Enum):
     LEVELS = "the levels were exhausted"
 
 
-class Progress(NamedTuple):
+class SubsetProgress(NamedTuple):
     """After each level: its number from 1, and what it reached."""
 
     level: int
@@ -53,7 +62,7 @@ class Progress(NamedTuple):
     evaluations: int  # so far
 
 
-class Level(NamedTuple):
+class SubsetLevel(NamedTuple):
     """Samples of F_j-1, of which `share` are in F_j."""
 
     threshold: float  # b_j
@@ -80,10 +89,10 @@ class RareEvent:
     probability: float
     cov: float
     interval: tuple[float, float]
-    reason: Reason
-    levels: list[Level]
-    subset: Estimate
-    importance: Importance | None
+    reason: SubsetReason
+    levels: list[SubsetLevel]
+    subset: ProbabilityEstimate
+    importance: ImportanceEstimate | None
     note: str
     failing: np.ndarray
     evaluations: int
@@ -110,7 +119,7 @@ def subset_simulation(
     gradient: Gradient | None = None,
     price: float = 3.0,
     tolerated: float = 0.05,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[SubsetProgress], None] | None = None,
 ) -> RareEvent:
     """Return an estimate of P[score(z) >= threshold] for z ~ N(0, I) in R^dimension.
 
@@ -127,13 +136,13 @@ def subset_simulation(
 
     Raises ValueError: no such dimension, threshold or number of samples; a score of another shape; too many diverged.
     """
-    plan = _plan(dimension, threshold, samples, share, levels, draws)
-    runs = Runs(score, gradient, tolerated)
+    plan = _make_plan(dimension, threshold, samples, share, levels, draws)
+    runs = CountedScore(score, gradient, tolerated)
     first, second = (np.random.default_rng(each) for each in np.random.SeedSequence(seed).spawn(2))
-    walked = _walk(runs, dimension, plan, first, progress)
-    subset = _subset(walked, plan)
-    tried, note = _importance(runs, walked, subset, plan, second)
-    return _event(runs, walked, subset, tried, note, price)
+    sequence = _run_levels(runs, dimension, plan, first, progress)
+    subset = _subset_estimate(sequence, plan)
+    tried, note = _importance_estimate(runs, sequence, subset, plan, second)
+    return _build_rare_event(runs, sequence, subset, tried, note, price)
 
 
 class _Plan(NamedTuple):
@@ -144,7 +153,7 @@ class _Plan(NamedTuple):
     draws: int
 
 
-def _plan(dimension: int, threshold: float, samples: int, share: float, levels: int, draws: int) -> _Plan:
+def _make_plan(dimension: int, threshold: float, samples: int, share: float, levels: int, draws: int) -> _Plan:
     chains = round(samples * share)
     if dimension < 1:
         raise ValueError(f"dimension must be at least 1, not {dimension}")
@@ -172,36 +181,38 @@ class _Population(NamedTuple):
     diverged: int
 
 
-class _Walked(NamedTuple):
+class _LevelSequence(NamedTuple):
     """All levels; the last one's samples, and which of them fail (n,); why there is no further one."""
 
-    levels: list[Level]
+    levels: list[SubsetLevel]
     last: _Population
     hits: np.ndarray
-    reason: Reason
+    reason: SubsetReason
 
 
-def _walk(runs: Runs, dimension: int, plan: _Plan, rng: Rng, progress: Callable[[Progress], None] | None) -> _Walked:
+def _run_levels(
+    runs: CountedScore, dimension: int, plan: _Plan, rng: Rng, progress: Callable[[SubsetProgress], None] | None
+) -> _LevelSequence:
     z = rng.standard_normal((plan.samples, dimension))
     scores = runs(z)
-    now = _Population(z, scores, np.arange(plan.samples), 1, 1.0, SPREAD, runs.since(0, 0))
-    made: list[Level] = []
+    now = _Population(z, scores, np.arange(plan.samples), 1, 1.0, FIRST_SPREAD, runs.since(0, 0))
+    made: list[SubsetLevel] = []
     while True:
-        aim = _aim(now.scores, plan)
+        aim = _next_threshold(now.scores, plan)
         ends = aim is None or aim >= plan.threshold or len(made) + 1 == plan.levels
         value = plan.threshold if ends or aim is None else aim
         hits = now.scores >= value
-        part, cov = float(np.mean(hits)), _cov(hits.reshape(now.length, -1))
-        made.append(Level(value, part, cov, now.acceptance, now.spread, now.diverged))
+        part, cov = float(np.mean(hits)), _level_cov(hits.reshape(now.length, -1))
+        made.append(SubsetLevel(value, part, cov, now.acceptance, now.spread, now.diverged))
         if progress:
-            progress(Progress(len(made), value, part, runs.evaluations))
+            progress(SubsetProgress(len(made), value, part, runs.evaluations))
         if ends:
-            reached = Reason.REACHED if aim == plan.threshold else Reason.LEVELS
-            return _Walked(made, now, hits, Reason.PLATEAU if aim is None else reached)
-        now = _advanced(runs, now, hits, value, plan, rng)
+            reached = SubsetReason.REACHED if aim == plan.threshold else SubsetReason.LEVELS
+            return _LevelSequence(made, now, hits, SubsetReason.PLATEAU if aim is None else reached)
+        now = _advance_chains(runs, now, hits, value, plan, rng)
 
 
-def _aim(scores: np.ndarray, plan: _Plan) -> float | None:
+def _next_threshold(scores: np.ndarray, plan: _Plan) -> float | None:
     """The next level: the threshold if half as many samples as there are chains fail (another level would cost more
     than it tells), else the score that `chains` samples reach. If ties let more than half of all reach it: the next
     greater score, if a tenth of the chains can start from there or nothing else would be gained. None if all samples
@@ -215,7 +226,9 @@ def _aim(scores: np.ndarray, plan: _Plan) -> float | None:
     return float(reached) if share < 1 else None
 
 
-def _advanced(runs: Runs, old: _Population, hits: np.ndarray, value: float, plan: _Plan, rng: Rng) -> _Population:
+def _advance_chains(
+    runs: CountedScore, old: _Population, hits: np.ndarray, value: float, plan: _Plan, rng: Rng
+) -> _Population:
     """Chains from the samples that reached a level; some samples start several where there are fewer than chains."""
     before = runs.evaluations, runs.diverged
     seeds = np.resize(rng.permutation(np.flatnonzero(hits)), plan.chains)
@@ -229,13 +242,13 @@ def _advanced(runs: Runs, old: _Population, hits: np.ndarray, value: float, plan
         points.append(z)
         values.append(scores)
         taken.append(float(np.mean(accepted)))
-        s = min(1.0, s * math.exp((taken[-1] - ACCEPTANCE) / math.sqrt(step)))
+        s = min(1.0, s * math.exp((taken[-1] - TARGET_ACCEPTANCE) / math.sqrt(step)))
     family = np.tile(old.family[seeds], length)
     lost = runs.since(*before)
     return _Population(np.concatenate(points), np.concatenate(values), family, length, float(np.mean(taken)), s, lost)
 
 
-def _cov(hits: np.ndarray) -> float:
+def _level_cov(hits: np.ndarray) -> float:
     """sqrt((1 - p)/(p n) (1 + 2 sum_k (1 - k/length) correlation_k)) of hits (length, chains): Au and Beck."""
     p, length = float(np.mean(hits)), len(hits)
     if p in (0.0, 1.0):
@@ -245,34 +258,43 @@ def _cov(hits: np.ndarray) -> float:
     return math.sqrt((1 - p) / (p * hits.size) * (1 + max(0.0, excess)))
 
 
-def _subset(walked: _Walked, plan: _Plan) -> Estimate:
+def _subset_estimate(sequence: _LevelSequence, plan: _Plan) -> ProbabilityEstimate:
     """What the levels tell; an upper bound where nothing failed."""
-    levels, last, hits, _ = walked
-    found = _estimate(levels, last.family[hits])
-    return found if hits.any() else found._replace(interval=(0.0, _bound(levels[:-1], last, plan.samples)))
+    levels, last, hits, _ = sequence
+    found = _product_estimate(levels, last.family[hits])
+    return found if hits.any() else found._replace(interval=(0.0, _upper_bound(levels[:-1], last, plan.samples)))
 
 
-def _importance(runs: Runs, walked: _Walked, subset: Estimate, plan: _Plan, rng: Rng) -> tuple[Importance | None, str]:
-    levels, last, hits, _ = walked
+def _importance_estimate(
+    runs: CountedScore, sequence: _LevelSequence, subset: ProbabilityEstimate, plan: _Plan, rng: Rng
+) -> tuple[ImportanceEstimate | None, str]:
+    levels, last, hits, _ = sequence
     if not hits.any() or plan.draws == 0 or len(levels) == 1:
         return None, "subset simulation: no importance sampling of what one level shows, or without failures or draws"
     chain = np.flatnonzero(hits) % plan.chains
-    return refined(runs, last.z[hits], chain, subset, threshold=plan.threshold, draws=plan.draws, rng=rng)
+    return try_importance_sampling(
+        runs, last.z[hits], chain, subset, threshold=plan.threshold, draws=plan.draws, rng=rng
+    )
 
 
-def _event(
-    runs: Runs, walked: _Walked, subset: Estimate, tried: Importance | None, note: str, price: float
+def _build_rare_event(
+    runs: CountedScore,
+    sequence: _LevelSequence,
+    subset: ProbabilityEstimate,
+    tried: ImportanceEstimate | None,
+    note: str,
+    price: float,
 ) -> RareEvent:
     """The better estimate, and all that was seen."""
-    failing = np.unique(walked.last.z[walked.hits], axis=0)
+    failing = np.unique(sequence.last.z[sequence.hits], axis=0)
     return RareEvent(
-        *(tried.estimate if tried and pays(tried, subset) else subset),
-        reason=walked.reason,
-        levels=walked.levels,
+        *(tried.estimate if tried and is_better_estimate(tried, subset) else subset),
+        reason=sequence.reason,
+        levels=sequence.levels,
         subset=subset,
         importance=tried,
         note=note,
-        failing=failing[np.argsort(np.sum(failing**2, axis=1), kind="stable")][:KEPT],
+        failing=failing[np.argsort(np.sum(failing**2, axis=1), kind="stable")][:MAX_FAILING_POINTS],
         evaluations=runs.evaluations,
         gradients=runs.gradients,
         diverged=runs.diverged,
@@ -280,20 +302,20 @@ def _event(
     )
 
 
-def _estimate(levels: list[Level], family: np.ndarray) -> Estimate:
+def _product_estimate(levels: list[SubsetLevel], family: np.ndarray) -> ProbabilityEstimate:
     """The product of the shares, with the variance that the families of the failures show."""
     covs = np.array([level.cov for level in levels])
     if not np.all(np.isfinite(covs)):
-        return Estimate(0.0, np.inf, (0.0, 1.0))
+        return ProbabilityEstimate(0.0, np.inf, (0.0, 1.0))
     parts = np.bincount(family) / len(family)
     cov = float(np.clip(np.sqrt(np.sum(parts**2)), np.sqrt(np.sum(covs**2)), np.sum(covs)))
     probability, spread = math.prod(level.share for level in levels), math.log1p(cov**2)
-    middle = around(probability * math.exp(spread / 2), cov, math.sqrt(spread), 1 / max(cov**2, 1e-9))
-    return Estimate(probability, cov, middle.interval)
+    middle = lognormal_estimate(probability * math.exp(spread / 2), cov, math.sqrt(spread), 1 / max(cov**2, 1e-9))
+    return ProbabilityEstimate(probability, cov, middle.interval)
 
 
-def _bound(levels: list[Level], last: _Population, samples: int) -> float:
+def _upper_bound(levels: list[SubsetLevel], last: _Population, samples: int) -> float:
     """What P is below: the upper end for the last level, times 3/n if none of n independent samples fails. Of chains
     only the different starts count."""
     starts = len(np.unique(last.z[: samples // last.length], axis=0))
-    return _estimate(levels, last.family).interval[1] * min(1.0, RULE / starts)
+    return _product_estimate(levels, last.family).interval[1] * min(1.0, RULE_OF_THREE / starts)

@@ -70,12 +70,12 @@ class Choice:
 class Variation:
     """What varies, in SI. `over`: distributions, and choices of parts, by path of the loop."""
 
-    samples: int = entry(within(0, sampling.MOST), 0)
-    seed: int = entry(within(0, sampling.MOST), 0)
+    samples: int = entry(within(0, sampling.MAX_UINT32), 0)
+    seed: int = entry(within(0, sampling.MAX_UINT32), 0)
     chunk: int = entry(within(1, 2**20), 4096)
     check: int = entry(within(0, 4096), 16)
     dtype: str = entry(one_of("float64", "float32"), "float64")
-    design: sampling.Design = entry(sampling.read, sampling.Random)
+    design: sampling.SamplingDesign = entry(sampling.read_sampling_design, sampling.Random)
     over: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     correlation: Correlation | None = None
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
@@ -136,10 +136,10 @@ def _distribution(item: Entry, folder: pathlib.Path) -> Any:
         given = {"type": "uniform", "low": given[0], "high": given[1]}
     if not isinstance(given, dict):
         raise wrong(item.where, given, "a pair [low, high] or a table with a type")
-    found = distributions.read(_with_numbers(given, item.where, folder), item.where)
-    if line := distributions.leaving(found, item.spec, item.where):
+    found = distributions.read_distribution(_with_numbers(given, item.where, folder), item.where)
+    if line := distributions.describe_out_of_range(found, item.spec, item.where):
         raise ScenarioError(line)
-    return distributions.in_si(found, item.scale)
+    return distributions.convert_distribution_to_si(found, item.scale)
 
 
 def _with_numbers(given: Mapping[str, Any], where: str, folder: pathlib.Path) -> Mapping[str, Any]:
@@ -156,7 +156,7 @@ def _with_numbers(given: Mapping[str, Any], where: str, folder: pathlib.Path) ->
     except ImportError:
         raise ScenarioError(f'{where}: reading a file needs pip install ".[sweep]" in a clone') from None
     try:
-        values = sample_files.read(folder / file, column)
+        values = sample_files.read_column(folder / file, column)
     except ValueError as error:
         raise ScenarioError(f"{where}: {error}") from None
     return {key: value for key, value in given.items() if key not in ("file", "column")} | {"values": values.tolist()}
@@ -169,7 +169,7 @@ def _choice(key: str, given: Any, default: Any) -> Choice:
     if not isinstance(table, dict) or not isinstance(table.get("choices"), list) or not table["choices"]:
         raise wrong(where, given, "a list of parts, or a table of choices and weights,")
     names = [item if isinstance(item, str) else f"{i}" for i, item in enumerate(table["choices"])]
-    drawn = distributions.read({**table, "type": "categorical", "choices": names}, where)
+    drawn = distributions.read_distribution({**table, "type": "categorical", "choices": names}, where)
     family = key if key in FAMILIES else family_of(key, key)
     items = enumerate(zip(names, table["choices"], strict=True))
     return Choice(given, drawn, {name: build(family, item, default, f"{where}.{i}") for i, (name, item) in items})

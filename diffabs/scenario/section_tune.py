@@ -59,8 +59,8 @@ MOST_LANES = 100_000
 
 def _aggregate(given: Any, path: str) -> dict[str, Any]:
     """Type and fields."""
-    part = read_one(risk.KINDS, given, path)
-    return {"type": next(name for name, kind in risk.KINDS.items() if type(part) is kind), **members(part)}
+    part = read_one(risk.AGGREGATE_TYPES, given, path)
+    return {"type": next(name for name, kind in risk.AGGREGATE_TYPES.items() if type(part) is kind), **members(part)}
 
 
 def _mean() -> dict[str, Any]:
@@ -116,7 +116,7 @@ class Goal:
 
     def aggregated(self) -> risk.Aggregate:
         """From a number per lane to one."""
-        return read_one(risk.KINDS, self.aggregate, "tune.aggregate")
+        return read_one(risk.AGGREGATE_TYPES, self.aggregate, "tune.aggregate")
 
 
 def read(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:

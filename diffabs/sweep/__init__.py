@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from diffabs.sweep.distributions import Uniform as Uniform
     from diffabs.sweep.engines import Local as Local
     from diffabs.sweep.results import Results as Results
-    from diffabs.sweep.run import Progress as Progress
+    from diffabs.sweep.run import SweepProgress as SweepProgress
     from diffabs.sweep.run import sweep as sweep
     from diffabs.sweep.sampling import Corners as Corners
     from diffabs.sweep.sampling import Grid as Grid

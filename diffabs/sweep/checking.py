@@ -14,27 +14,27 @@ from diffabs.simulate.solution import Run, describe_solver
 from diffabs.sweep.results import Results
 from diffabs.sweep.study import Study, precision
 
-STREAM = 0x0ACC  # of random numbers, beside those of the designs
-EXCLUDED = ("diverged", "refused")  # flags of lanes whose metrics are none
-NOTHING = 1e-9  # in the unit of the metric: a change that is none; nor is one of less than solver.rtol
-LOOSE = 0.01  # relative: a metric that a half step changes by more
+ACCURACY_STREAM = 0x0ACC  # of random numbers, beside those of the designs
+EXCLUDED_FLAGS = ("diverged", "refused")  # flags of lanes whose metrics are none
+NEGLIGIBLE_CHANGE = 1e-9  # in the unit of the metric: a change that is none; nor is one of less than solver.rtol
+MAX_RELATIVE_CHANGE = 0.01  # relative: a metric that a half step changes by more
 
 
-def checked(study: Study, found: Results, count: int) -> dict[str, Any]:
+def check_accuracy(study: Study, found: Results, count: int) -> dict[str, Any]:
     """Of at most `count` lanes that ran to their end, chosen by the seed: the median and the largest change of each
     metric by a half step, relative to its value or, where that is less, to its median; the lane with the largest; how
     many ended in another way, or draw other noise, and are left out."""
-    samples = _chosen(study, found, count)
+    samples = _choose_samples(study, found, count)
     half = {name: np.full(len(samples), np.nan) for name in found.metrics}
     alike, fine = np.zeros(len(samples), bool), np.zeros(len(samples), bool)
     stopped = found.column("stopped")[samples]
-    for places, run, known in _halved(study, samples):
+    for places, run, known in _rerun_halved_step(study, samples):
         for name, column in half.items():
             column[places] = run.metrics[name]
         fine[places] = known
         alike[places] = ~np.asarray(run.diverged) & (np.asarray(run.stopped) == stopped[places])
     rows = samples[fine & alike]
-    changes = {n: _changes(found.column(n)[rows], column[fine & alike], rows) for n, column in half.items()}
+    changes = {n: _summarise_changes(found.column(n)[rows], column[fine & alike], rows) for n, column in half.items()}
     return {
         "samples": rows.tolist(),
         "step": study.solver.step / 2,
@@ -45,12 +45,12 @@ def checked(study: Study, found: Results, count: int) -> dict[str, Any]:
     }
 
 
-def said(result: dict[str, Any]) -> list[str]:
+def accuracy_warnings(result: dict[str, Any]) -> list[str]:
     """What a reader of the statistics must know, a line each."""
     lines = []
     rows = result["metrics"].items()
-    nothing = max(NOTHING, result.get("solver", {}).get("rtol", 0.0))
-    loose = {name: row for name, row in rows if row["largest"] > LOOSE and row["difference"] > nothing}
+    nothing = max(NEGLIGIBLE_CHANGE, result.get("solver", {}).get("rtol", 0.0))
+    loose = {name: row for name, row in rows if row["largest"] > MAX_RELATIVE_CHANGE and row["difference"] > nothing}
     if loose:
         each = (f"{name} by up to {100 * row['largest']:.3g} % (sample {row['sample']})" for name, row in loose.items())
         cure = "lower solver.rtol" if "rtol" in result.get("solver", {}) else "shorten solver.step"
@@ -62,14 +62,14 @@ def said(result: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _chosen(study: Study, found: Results, count: int) -> np.ndarray:
+def _choose_samples(study: Study, found: Results, count: int) -> np.ndarray:
     """Numbers of lanes, which are also their rows."""
-    good = np.flatnonzero(~np.any([_flagged(found, flag) for flag in EXCLUDED], axis=0))
-    random = np.random.default_rng([study.seed, STREAM])
+    good = np.flatnonzero(~np.any([_has_flag(found, flag) for flag in EXCLUDED_FLAGS], axis=0))
+    random = np.random.default_rng([study.seed, ACCURACY_STREAM])
     return np.sort(random.choice(good, min(count, len(good)), replace=False))
 
 
-def _flagged(found: Results, flag: str) -> np.ndarray:
+def _has_flag(found: Results, flag: str) -> np.ndarray:
     """Which lanes have a flag, or a reason; none in a table without this column."""
     try:
         column = found.column(flag)
@@ -78,23 +78,25 @@ def _flagged(found: Results, flag: str) -> np.ndarray:
     return column != "" if column.dtype.kind in "OU" else column.astype(bool)
 
 
-def _halved(study: Study, samples: np.ndarray) -> Iterator[tuple[list[int], Run, np.ndarray]]:
+def _rerun_halved_step(study: Study, samples: np.ndarray) -> Iterator[tuple[list[int], Run, np.ndarray]]:
     """Lanes of one structure at a time: their places among the samples, their runs, whether they can be compared."""
     loops, keys = zip(*map(study.lane, samples.tolist()), strict=True) if len(samples) else ((), ())
     for places in group_by_structure(loops):
         loop, batch = stack_loops([loops[i] for i in places])
         lanes = batch.values, jnp.stack([keys[i] for i in places])
         with precision(study.dtype):
-            both = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, partial(_run, study)))(*lanes)
+            both = jax.jit(lambda *lanes, loop=loop: Batch(*lanes).each(loop, partial(_measure_half_step, study)))(
+                *lanes
+            )
             run, known = jax.device_get(both)
         yield places, run, known
 
 
-def _run(study: Study, loop: Any, key: Any) -> tuple[Run, Any]:
+def _measure_half_step(study: Study, loop: Any, key: Any) -> tuple[Run, Any]:
     return measure_finer(loop, study.solver, study.objectives, 2, key=key), is_comparable(loop, study.solver, key)
 
 
-def _changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> dict[str, Any]:
+def _summarise_changes(values: np.ndarray, half: np.ndarray, samples: np.ndarray) -> dict[str, Any]:
     known = np.isfinite(values) & np.isfinite(half)  # a run that never settles has an infinite settling time
     values, half, samples = values[known], half[known], samples[known]
     if not len(values):

@@ -12,26 +12,26 @@ from diffabs.core.pytree import Spec
 from diffabs.core.values import FINITE, POSITIVE, any_number, as_given, entry, listed, plain, table_of
 
 
-def chosen(u: ArrayLike, count: int, weights: Sequence[float] | None = None) -> np.ndarray:
+def choose_indices(u: ArrayLike, count: int, weights: Sequence[float] | None = None) -> np.ndarray:
     """Which of `count` items the uniform u picks: the smallest k with u < F(k), the probabilities proportional to the
     weights; at u = 1 the last that has any."""
-    edges = _edges(count, weights)
+    edges = _cumulative_probabilities(count, weights)
     return np.minimum(np.searchsorted(edges, u, side="right"), np.searchsorted(edges, 1.0))
 
 
-def middles(count: int, weights: Sequence[float] | None = None) -> np.ndarray:
+def probability_midpoints(count: int, weights: Sequence[float] | None = None) -> np.ndarray:
     """One u for each item that has a weight."""
-    edges = _edges(count, weights)
+    edges = _cumulative_probabilities(count, weights)
     widths = np.diff(edges, prepend=0.0)
     return (edges - widths / 2)[widths > 0]
 
 
-def _edges(count: int, weights: Sequence[float] | None) -> np.ndarray:
+def _cumulative_probabilities(count: int, weights: Sequence[float] | None) -> np.ndarray:
     edges = np.cumsum(np.ones(count) if weights is None else np.asarray(weights, float))
     return edges / edges[-1]
 
 
-def _weightless(weights: Sequence[float] | None, count: int, name: str, each: Spec) -> Iterator[str]:
+def _weight_problems(weights: Sequence[float] | None, count: int, name: str, each: Spec) -> Iterator[str]:
     """Lines on weights that are not as many as what they weigh, not all in `each`, or all zero."""
     if weights is None:
         return
@@ -43,7 +43,7 @@ def _weightless(weights: Sequence[float] | None, count: int, name: str, each: Sp
         yield f"{name}: weights have sum {np.sum(weights):g}"
 
 
-class _Listed:
+class _Discrete:
     """What is drawn from a list has its value at Phi(z) at the u = Phi(z)."""
 
     def value(self, u: ArrayLike) -> Any:
@@ -56,7 +56,7 @@ class _Listed:
 
 
 @dataclasses.dataclass(frozen=True)
-class Categorical(_Listed):
+class Categorical(_Discrete):
     """One of some numbers, or of some texts. `weights`: in proportion to the probabilities; all equal if None."""
 
     choices: tuple[float | str, ...]
@@ -65,7 +65,7 @@ class Categorical(_Listed):
 
     def index(self, u: ArrayLike) -> np.ndarray:
         """The number of the choice, from 0."""
-        return chosen(u, len(self.choices), self.weights)
+        return choose_indices(u, len(self.choices), self.weights)
 
     def value(self, u: ArrayLike) -> np.ndarray:
         """The choice: an array of objects for texts."""
@@ -77,7 +77,7 @@ class Categorical(_Listed):
 
     def middles(self) -> np.ndarray:
         """The u that give each choice once."""
-        return middles(len(self.choices), self.weights)
+        return probability_midpoints(len(self.choices), self.weights)
 
     def support(self) -> tuple[float, float]:
         """Of the choices' numbers, from 0, if they are texts."""
@@ -92,11 +92,11 @@ class Categorical(_Listed):
             yield f"{name}: choices = {reprlib.repr(list(self.choices))} mix numbers and texts"
         if not FINITE.holds(np.array(numbers, float)):
             yield f"{name}: choices = {reprlib.repr(list(self.choices))} are not all in {FINITE.interval()}"
-        yield from _weightless(self.weights, len(self.choices), name, POSITIVE)
+        yield from _weight_problems(self.weights, len(self.choices), name, POSITIVE)
 
 
 @dataclasses.dataclass(frozen=True)
-class Empirical(_Listed):
+class Empirical(_Discrete):
     """The values of a sample, in any order, each as likely: the smallest with F(value) >= u. `interpolated`: linearly
     between neighbours, the k-th of n at u = (k - 1)/(n - 1), as `numpy.quantile` does."""
 
@@ -118,16 +118,16 @@ class Empirical(_Listed):
             yield f"{name}: values = {reprlib.repr(list(self.values))} are not all in {FINITE.interval()}"
 
 
-def _columns(given: Any, where: str) -> dict[str, np.ndarray]:
+def _read_columns(given: Any, where: str) -> dict[str, np.ndarray]:
     return {path: np.array(column) for path, column in table_of(listed(as_given), "lists")(given, where).items()}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Rows(_Listed):
+class Rows(_Discrete):
     """Whole rows of a table, each as likely or by its weight: the joint distribution of its columns, which are
     parameters by path. One uniform picks a row."""
 
-    columns: Mapping[str, Any] = entry(_columns)
+    columns: Mapping[str, Any] = entry(_read_columns)
     weights: Any = entry(listed(any_number), None)
 
     @property
@@ -137,12 +137,12 @@ class Rows(_Listed):
 
     def value(self, u: ArrayLike) -> dict[str, np.ndarray]:
         """The rows at u, by column."""
-        rows = chosen(u, self.size, self.weights)
+        rows = choose_indices(u, self.size, self.weights)
         return {path: np.asarray(column)[rows] for path, column in self.columns.items()}
 
     def middles(self) -> np.ndarray:
         """The u that give each row once."""
-        return middles(self.size, self.weights)
+        return probability_midpoints(self.size, self.weights)
 
     def problems(self, name: str) -> Iterator[str]:
         """One line for each field that cannot be."""
@@ -155,4 +155,4 @@ class Rows(_Listed):
         for path, column in self.columns.items():
             if np.asarray(column).dtype.kind in "fiu" and not np.isfinite(column).all():
                 yield f"{name}: column {path} is not finite in row {int(np.argmin(np.isfinite(column)))}"
-        yield from _weightless(self.weights, self.size, name, Spec("1", low=0.0))
+        yield from _weight_problems(self.weights, self.size, name, Spec("1", low=0.0))

@@ -19,7 +19,7 @@ from diffabs.core.values import kebab, read_one, sound, written
 from diffabs.sweep.discrete import Categorical as Categorical
 from diffabs.sweep.discrete import Empirical as Empirical
 
-LEAST = 1e-290  # probability between the limits of a distribution; below, its tails have no digits
+MIN_TRUNCATED_PROBABILITY = 1e-290  # probability between the limits of a distribution; below, its tails have no digits
 
 
 class Distribution(Protocol):
@@ -72,9 +72,9 @@ class _Continuous:
                 lines.append(f"{name}: {field.name} = {value:g} is outside {spec.interval()}")
         if self.low >= self.high:
             lines.append(f"{name}: low = {self.low:g} is not below high = {self.high:g}")
-        yield from lines or self._impossible(name)
+        yield from lines or self._consistency_problems(name)
 
-    def _impossible(self, name: str) -> Iterator[str]:
+    def _consistency_problems(self, name: str) -> Iterator[str]:
         """What cannot be although each number by itself could."""
         del name
         yield from ()
@@ -119,8 +119,8 @@ class Normal(_Continuous):
     def _limits(self) -> tuple[float, float]:
         return (self.low - self.mean) / self.deviation, (self.high - self.mean) / self.deviation
 
-    def _impossible(self, name: str) -> Iterator[str]:
-        if self.left() < LEAST:
+    def _consistency_problems(self, name: str) -> Iterator[str]:
+        if self.left() < MIN_TRUNCATED_PROBABILITY:
             yield f"{name}: {written(self)} has nothing between its limits"
 
     def left(self) -> float:
@@ -151,8 +151,8 @@ class LogNormal(_Continuous):
         low, high = (math.log(end) if end > 0 else -math.inf for end in self.support())
         return Normal(math.log(self.median), self.deviation, low, high)
 
-    def _impossible(self, name: str) -> Iterator[str]:
-        if self._logarithm().left() < LEAST:
+    def _consistency_problems(self, name: str) -> Iterator[str]:
+        if self._logarithm().left() < MIN_TRUNCATED_PROBABILITY:
             yield f"{name}: {written(self)} has nothing between its limits"
 
 
@@ -170,22 +170,24 @@ class Triangular(_Continuous):
         rising, falling = self.low + np.sqrt(p * width * rise), self.high - np.sqrt(q * width * fall)
         return np.clip(np.where(p * width < rise, rising, falling), self.low, self.high)
 
-    def _impossible(self, name: str) -> Iterator[str]:
+    def _consistency_problems(self, name: str) -> Iterator[str]:
         between = Spec("1", self.low, self.high)
         if not between.holds(self.mode):
             yield f"{name}: mode = {self.mode:g} is outside {between.interval()}"
 
 
-KINDS = {kebab(cls.__name__): cls for cls in (Uniform, Normal, LogNormal, Triangular, Categorical, Empirical)}
+DISTRIBUTION_TYPES = {
+    kebab(cls.__name__): cls for cls in (Uniform, Normal, LogNormal, Triangular, Categorical, Empirical)
+}
 
 
-def read(given: Any, where: str, kinds: Mapping[str, type] = KINDS) -> Any:
+def read_distribution(given: Any, where: str, kinds: Mapping[str, type] = DISTRIBUTION_TYPES) -> Any:
     """The distribution of a table. Raises ScenarioError, one line, for an unknown type, a missing or unknown field, a
     value that is not a number, and for whatever the distribution itself objects to."""
     return sound(read_one(kinds, given, where), where)
 
 
-def in_si(distribution: Any, scale: float) -> Any:
+def convert_distribution_to_si(distribution: Any, scale: float) -> Any:
     """Return the distribution of a parameter in SI, given in units of which `scale` make one."""
 
     def divided(value: Any) -> Any:
@@ -194,18 +196,18 @@ def in_si(distribution: Any, scale: float) -> Any:
     return dataclasses.replace(distribution, **{n: divided(getattr(distribution, n)) for n in distribution.scaled})
 
 
-def reach(distribution: Distribution) -> Spec:
+def support_interval(distribution: Distribution) -> Spec:
     """The support as an interval: open where u = 0 or 1 alone would get there."""
     low, high = distribution.support()
     open_low = low == -math.inf or (isinstance(distribution, LogNormal) and low == 0)
     return Spec("1", low, high, open_low, high == math.inf)
 
 
-def leaving(distribution: Distribution, spec: Spec, name: str) -> str | None:
+def describe_out_of_range(distribution: Distribution, spec: Spec, name: str) -> str | None:
     """A line if a parameter that is distributed so can leave its range, else None."""
     if isinstance(distribution, Categorical) and distribution.textual():
         return f"{name} = {written(distribution)} is text; a number in {spec.interval()} is needed"
-    own = reach(distribution)
+    own = support_interval(distribution)
     below = own.low < spec.low or (own.low == spec.low and spec.open_low and not own.open_low)
     above = own.high > spec.high or (own.high == spec.high and spec.open_high and not own.open_high)
     if not (below or above):

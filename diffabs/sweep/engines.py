@@ -8,14 +8,14 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from diffabs.sweep.manifest import DECISIVE as DECISIVE
-from diffabs.sweep.manifest import Seals, described
+from diffabs.sweep.manifest import DECISIVE_PACKAGES as DECISIVE_PACKAGES
+from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.runner import Columns, Runner
-from diffabs.sweep.seal import Seal, encoded
+from diffabs.sweep.seal import Seal, encode_chunk
 from diffabs.sweep.study import Study
 
 
-class Done(NamedTuple):
+class ComputedChunk(NamedTuple):
     """A chunk: the bytes of its file, how many lanes it has, and how many of them failed, diverged and were refused."""
 
     chunk: int
@@ -29,7 +29,9 @@ class Done(NamedTuple):
 class Engine(Protocol):
     """Computes chunks in any order."""
 
-    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Generator[Done, None, None]:
+    def run(
+        self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
+    ) -> Generator[ComputedChunk, None, None]:
         """Every chunk once; ends early, after what it has begun, when `stopping()`, and without giving that when it is
         closed."""
         ...
@@ -43,10 +45,12 @@ class Local:
         """All local ones if not given."""
         self.devices = list(devices or jax.local_devices())
 
-    def run(self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]) -> Generator[Done, None, None]:
+    def run(
+        self, study: Study, chunks: Sequence[int], stopping: Callable[[], bool]
+    ) -> Generator[ComputedChunk, None, None]:
         """In order. While chunks are counted, encoded and written, the next ones run."""
-        runner, seals = Runner(study, self.devices), Seals(described(study))
-        rest = batched(chunks[jax.process_index() :: jax.process_count()], len(self.devices))
+        runner, seals = Runner(study, self.devices), Seals(describe_owner(study))
+        rest = group_items(chunks[jax.process_index() :: jax.process_count()], len(self.devices))
         with ThreadPoolExecutor(1) as beside:
             together = next(rest, None)
             coming = beside.submit(runner.run, together) if together else None
@@ -55,45 +59,47 @@ class Local:
                 together = None if stopping() else next(rest, None)
                 coming = beside.submit(runner.run, together) if together else None
                 for chunk, columns in zip(here, found, strict=True):
-                    yield done(study, seals.of(chunk), columns)
+                    yield encode_computed_chunk(study, seals.of(chunk), columns)
 
 
-def done(study: Study, seal: Seal, columns: Columns) -> Done:
+def encode_computed_chunk(study: Study, seal: Seal, columns: Columns) -> ComputedChunk:
     """A chunk's columns, counted and encoded."""
-    failed = failures(study, columns)
+    failed = has_failed(study, columns)
     counts = (
         len(failed),
         int(failed.sum()),
-        int(np.sum(columns["diverged"] & accepted(columns["refused"]))),
-        int(np.sum(~accepted(columns["refused"]))),
+        int(np.sum(columns["diverged"] & is_accepted(columns["refused"]))),
+        int(np.sum(~is_accepted(columns["refused"]))),
     )
-    return Done(seal.chunk, encoded(columns, seal, study.units()), *counts)
+    return ComputedChunk(seal.chunk, encode_chunk(columns, seal, study.units()), *counts)
 
 
-def accepted(refused: Any) -> np.ndarray:
+def is_accepted(refused: Any) -> np.ndarray:
     """Lanes that were run, of the reasons why not (lanes,)."""
     return np.asarray(refused).astype(str) == ""
 
 
-def failures(study: Study, columns: Any) -> np.ndarray:
+def has_failed(study: Study, columns: Any) -> np.ndarray:
     """Lanes that were run and diverged, ended as they should not, or left a bound of the study (lanes,)."""
-    failed = np.asarray(columns["diverged"]) | missed(columns["stopped"], study.success)
-    failed = np.any([failed, *(np.asarray(columns[name]) > bound for name, bound in study.bounded.items())], axis=0)
-    return failed & accepted(columns["refused"])
+    failed = np.asarray(columns["diverged"]) | has_wrong_end(columns["stopped"], study.success)
+    failed = np.any(
+        [failed, *(np.asarray(columns[name]) > bound for name, bound in study.failure_bounds.items())], axis=0
+    )
+    return failed & is_accepted(columns["refused"])
 
 
-def missed(stopped: Any, success: bool) -> np.ndarray:
+def has_wrong_end(stopped: Any, success: bool) -> np.ndarray:
     """Return which lanes (lanes,) ended as they should not: without reaching a stop that is a `success`, or at one that
     is not."""
     return np.asarray(stopped) != success
 
 
-def missing(success: bool) -> str:
+def describe_wrong_end(success: bool) -> str:
     """Return what is said of those lanes."""
     return "not stopped" if success else "stopped"
 
 
-def batched(items: Sequence[int], size: int) -> Iterator[list[int]]:
+def group_items(items: Sequence[int], size: int) -> Iterator[list[int]]:
     """Lists of `size`, the last one shorter."""
     rest = iter(items)
     while batch := list(itertools.islice(rest, size)):

@@ -37,23 +37,23 @@ from diffabs.core.values import (
     wrong,
 )
 from diffabs.sweep import variables
-from diffabs.sweep.seal import Seal, SweepError, digest
-from diffabs.sweep.study import DTYPES, FLAGS, RANGES, Study
+from diffabs.sweep.seal import Seal, SweepError, json_digest
+from diffabs.sweep.study import DTYPES, FLAG_COLUMNS, RANGES, Study
 from diffabs.sweep.variables import Space
 
-FORMAT = 3
-MANIFEST = "manifest.json"
-LARGEST = 2**30  # bytes
-DECISIVE = ("jaxlib", "numpy", "scipy", "pyarrow")  # packages beside JAX that can change a bit of the result
-SECONDS = Spec("s", low=0.0, open_low=True)
-OWNING = ("format", "study", "versions")
-EARLIER = (1, 2)
-OLD = "written by an earlier diffabs: read its chunks with pandas, or sweep again"
+MANIFEST_FORMAT = 3
+MANIFEST_NAME = "manifest.json"
+MAX_MANIFEST_BYTES = 2**30  # bytes
+DECISIVE_PACKAGES = ("jaxlib", "numpy", "scipy", "pyarrow")  # packages beside JAX that can change a bit of the result
+POSITIVE_SECONDS = Spec("s", low=0.0, open_low=True)
+OWNER_KEYS = ("format", "study", "versions")
+EARLIER_FORMATS = (1, 2)
+EARLIER_FORMAT_MESSAGE = "written by an earlier diffabs: read its chunks with pandas, or sweep again"
 
 
-def described(study: Study) -> dict[str, Any]:
+def describe_owner(study: Study) -> dict[str, Any]:
     """What owns the chunks of a study, computed here and now."""
-    return {"format": FORMAT, "study": study.table(), "versions": provenance.origin(*DECISIVE)}
+    return {"format": MANIFEST_FORMAT, "study": study.table(), "versions": provenance.origin(*DECISIVE_PACKAGES)}
 
 
 class Seals:
@@ -62,10 +62,10 @@ class Seals:
     def __init__(self, manifest: Mapping[str, Any]):
         """Works out once what is the same for all."""
         self.study = manifest["study"]
-        self.owner = digest({name: manifest[name] for name in OWNING})
+        self.owner = json_digest({name: manifest[name] for name in OWNER_KEYS})
         self.count = -(-self.study["samples"] // self.study["chunk"])
-        varied = variables.read(self.study["space"], "study.space").paths
-        self.columns = frozenset({"sample", *FLAGS, *self.study["objectives"], *varied})
+        varied = variables.read_space(self.study["space"], "study.space").paths
+        self.columns = frozenset({"sample", *FLAG_COLUMNS, *self.study["objectives"], *varied})
 
     def of(self, chunk: int) -> Seal:
         """Of this chunk."""
@@ -74,35 +74,35 @@ class Seals:
         return Seal(self.owner, chunk, self.study["seed"], rows, self.columns)
 
 
-def sealed(manifest: Mapping[str, Any]) -> bytes:
+def encode_manifest(manifest: Mapping[str, Any]) -> bytes:
     """The file."""
-    return json.dumps({**manifest, "digest": digest(manifest)}, indent=1).encode()
+    return json.dumps({**manifest, "digest": json_digest(manifest)}, indent=1).encode()
 
 
 def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """The manifest, without its digest. Raises SweepError, one line, if there is none, or it is not as it was written,
     or something in it cannot be."""
     try:
-        raw = files.content(pathlib.Path(folder) / MANIFEST, LARGEST)
+        raw = files.content(pathlib.Path(folder) / MANIFEST_NAME, MAX_MANIFEST_BYTES)
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
-        raise SweepError(f"{folder} is no sweep: {MANIFEST}: {why}") from None
+        raise SweepError(f"{folder} is no sweep: {MANIFEST_NAME}: {why}") from None
     try:
-        return _checked(json.loads(raw))
+        return _check_manifest(json.loads(raw))
     except (ValueError, RecursionError) as error:
         why = "nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
-        raise SweepError(f"{folder} is no sweep that can be read: {MANIFEST}: {why}") from None
+        raise SweepError(f"{folder} is no sweep that can be read: {MANIFEST_NAME}: {why}") from None
 
 
-def _checked(given: Any) -> dict[str, Any]:
+def _check_manifest(given: Any) -> dict[str, Any]:
     if not isinstance(given, dict):
         raise wrong("it", given, "a table")
-    if given.get("format") in EARLIER:
-        raise ValueError(OLD)
-    if given.get("format") != FORMAT:
-        raise wrong("format", given.get("format"), str(FORMAT))
+    if given.get("format") in EARLIER_FORMATS:
+        raise ValueError(EARLIER_FORMAT_MESSAGE)
+    if given.get("format") != MANIFEST_FORMAT:
+        raise wrong("format", given.get("format"), str(MANIFEST_FORMAT))
     manifest = {name: value for name, value in given.items() if name != "digest"}
-    if given.get("digest") != digest(manifest):
+    if given.get("digest") != json_digest(manifest):
         raise ValueError("it was changed after it was written: its digest is another one")
     _check_study(read(_Manifest, manifest, "", "a manifest"))
     return manifest
@@ -115,11 +115,11 @@ def _check_study(manifest: "_Manifest") -> None:
         if name not in study.objectives:
             raise unknown(f"study.failures.{shown(name)} is not measured", name, study.objectives)
     study.space.check(study.samples)
-    for name in {"sample", *FLAGS, *study.space.paths} & study.objectives.keys():
+    for name in {"sample", *FLAG_COLUMNS, *study.space.paths} & study.objectives.keys():
         raise ScenarioError(f"study.objectives.{name}: another column of the table has this name")
 
 
-def _utf8(given: Any, path: str) -> str:
+def _read_utf8(given: Any, path: str) -> str:
     try:
         text(given, path).encode()
     except UnicodeEncodeError:
@@ -129,8 +129,8 @@ def _utf8(given: Any, path: str) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Solver:
-    step: float = entry(ranged(SECONDS))
-    duration: float = entry(ranged(SECONDS))
+    step: float = entry(ranged(POSITIVE_SECONDS))
+    duration: float = entry(ranged(POSITIVE_SECONDS))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +138,7 @@ class _Adaptive(_Solver):
     rtol: float = entry(ranged(FINITE))
 
 
-def _solver(given: Any, path: str) -> _Solver:
+def _read_solver(given: Any, path: str) -> _Solver:
     table = {"type": "fixed", **given} if isinstance(given, Mapping) else given
     return read_one({"fixed": _Solver, "adaptive": _Adaptive}, table, path)
 
@@ -153,8 +153,8 @@ class _Study:
     dtype: str = entry(one_of(*DTYPES))
     failures: Mapping[str, float] = entry(table_of(ranged(FINITE)))
     success: bool = entry(switch)
-    solver: _Solver = entry(_solver)
-    space: Space = entry(variables.read)
+    solver: _Solver = entry(_read_solver)
+    space: Space = entry(variables.read_space)
     loop: Mapping[str, Any] = entry(table_of(as_given))
     parts: Mapping[str, Any] = entry(table_of(table_of(as_given)))
     objectives: Mapping[str, Any] = entry(table_of(as_given))
@@ -166,6 +166,6 @@ class _Manifest:
     format: int = entry(as_given)
     study: _Study = entry(partial(read, _Study))
     versions: Mapping[str, str] = entry(table_of(text))
-    source: Mapping[str, str] = entry(table_of(_utf8))
+    source: Mapping[str, str] = entry(table_of(_read_utf8))
     commit: str = entry(text, "")
     units: Mapping[str, str] = entry(table_of(text), dict)

@@ -13,11 +13,11 @@ import pyarrow.parquet as pq
 from diffabs.core import files
 from diffabs.core.summary import Summary
 from diffabs.sweep import seal
-from diffabs.sweep.engines import accepted, missed, missing
+from diffabs.sweep.engines import describe_wrong_end, has_wrong_end, is_accepted
 from diffabs.sweep.manifest import Seals, read_manifest
 from diffabs.sweep.seal import SweepError
-from diffabs.sweep.store import listing, read_chunk
-from diffabs.sweep.study import FLAGS
+from diffabs.sweep.store import list_chunks, read_chunk
+from diffabs.sweep.study import FLAG_COLUMNS
 
 
 class Results:
@@ -35,7 +35,7 @@ class Results:
         self.folder = pathlib.Path(folder)
         self.manifest = read_manifest(self.folder)
         self._seals = Seals(self.manifest)
-        named, self.strays = listing(self.folder, self._seals.count)
+        named, self.strays = list_chunks(self.folder, self._seals.count)
         if twice := next((paths for paths in named.values() if len(paths) > 1), None):
             raise SweepError(f"{twice[0]} and {twice[1].name} are the same chunk; --resume finds out which is damaged")
         self.files = {chunk: paths[0] for chunk, paths in named.items()}
@@ -87,7 +87,7 @@ class Results:
     @property
     def variables(self) -> list[str]:
         """Paths of what varies."""
-        known = {"sample", *FLAGS, *self.metrics}
+        known = {"sample", *FLAG_COLUMNS, *self.metrics}
         return [name for name in self._schema().names if name not in known]
 
     def is_number(self, name: str) -> bool:
@@ -96,26 +96,26 @@ class Results:
         return pa.types.is_floating(kind) or pa.types.is_integer(kind)
 
     def _schema(self) -> pa.Schema:
-        with self._opened(min(self.files)) as file:
+        with self._open_chunk(min(self.files)) as file:
             return file.schema_arrow
 
     @contextlib.contextmanager
-    def _opened(self, chunk: int) -> Iterator[pq.ParquetFile]:
+    def _open_chunk(self, chunk: int) -> Iterator[pq.ParquetFile]:
         """A chunk, verified unless its file is as it was then."""
         path = self.files[chunk]
-        state = _state(path)
+        state = _file_identity(path)
         if state is not None and self._seen.get(chunk) == state:
             with files.opened(path) as file:
                 yield pq.ParquetFile(file)
             return
-        found = seal.verified(read_chunk(path), path, self._seals.of(chunk))
+        found = seal.verify_chunk(read_chunk(path), path, self._seals.of(chunk))
         if state is not None:
             self._seen[chunk] = state
         yield found
 
-    def _read(self, chunk: int, names: list[str] | None) -> pa.Table:
+    def _read_table(self, chunk: int, names: list[str] | None) -> pa.Table:
         try:
-            with self._opened(chunk) as file:
+            with self._open_chunk(chunk) as file:
                 return file.read(columns=names).replace_schema_metadata()
         except (pa.ArrowException, OSError) as error:
             raise SweepError(f"{self.files[chunk]} cannot be read: {' '.join(str(error).split())}") from None
@@ -123,7 +123,7 @@ class Results:
     @property
     def digest(self) -> str:
         """SHA-256 over the contents of all chunks in order: equal for equal tables in chunks of one size."""
-        return seal.contents(self._read(chunk, None) for chunk in sorted(self.files))
+        return seal.tables_digest(self._read_table(chunk, None) for chunk in sorted(self.files))
 
     def failures(self) -> dict[str, np.ndarray]:
         """Which samples (n,) failed, by how: diverged, an end that the stop does not call a success, a metric beyond
@@ -131,7 +131,7 @@ class Results:
         study, run = self.study, self.accepted
         kinds = {
             "diverged": self.column("diverged"),
-            missing(study["success"]): missed(self.column("stopped"), study["success"]),
+            describe_wrong_end(study["success"]): has_wrong_end(self.column("stopped"), study["success"]),
         }
         kinds |= {f"{name} > {bound:g}": self.column(name) > bound for name, bound in study["failures"].items()}
         return {name: failed & run for name, failed in kinds.items()}
@@ -143,7 +143,7 @@ class Results:
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
         """Rows in the order of the samples; some columns, or all."""
         names = list(columns) if columns is not None else None
-        return pa.concat_tables([self._read(chunk, names) for chunk in sorted(self.files)]).unify_dictionaries()
+        return pa.concat_tables([self._read_table(chunk, names) for chunk in sorted(self.files)]).unify_dictionaries()
 
     def column(self, name: str) -> np.ndarray:
         """A column in the order of the samples. Raises KeyError."""
@@ -173,7 +173,7 @@ class Results:
     @property
     def accepted(self) -> np.ndarray:
         """Which samples were run, in their order."""
-        return accepted(self.column("refused"))
+        return is_accepted(self.column("refused"))
 
     def diverged(self) -> pa.Table:
         """The rows of lanes that were run and diverged: they are in no statistic."""
@@ -186,7 +186,7 @@ class Results:
         return self.table().take(order)
 
 
-def _state(path: pathlib.Path) -> tuple[int, ...] | None:
+def _file_identity(path: pathlib.Path) -> tuple[int, ...] | None:
     """By which a file that was changed is told; None where nothing can be said of it."""
     try:
         there = os.stat(path)

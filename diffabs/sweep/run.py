@@ -12,16 +12,16 @@ from jax.experimental import multihost_utils
 
 from diffabs.core import provenance, stopwatch
 from diffabs.sweep.engines import Engine, Local
-from diffabs.sweep.manifest import Seals, described
+from diffabs.sweep.manifest import Seals, describe_owner
 from diffabs.sweep.results import Results
-from diffabs.sweep.runner import objection
+from diffabs.sweep.runner import find_study_objection
 from diffabs.sweep.store import Store, SweepError
 from diffabs.sweep.study import Study
 
-HERE, MISSING, UNKNOWN = 0, 1, 2  # a chunk
+CHUNK_PRESENT, CHUNK_MISSING, CHUNK_UNKNOWN = 0, 1, 2  # a chunk
 
 
-class Progress(NamedTuple):
+class SweepProgress(NamedTuple):
     """How far a sweep is: samples that are done, of how many, those that this run has done in how many seconds
     (compiling left out, where `stopwatch.listen` counts it), and how many of these failed, diverged and were refused;
     `damaged`: chunks found damaged that are computed again."""
@@ -47,7 +47,7 @@ def sweep(
     *,
     resume: bool = False,
     on: Engine | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[SweepProgress], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
     source: Mapping[str, Any] | None = None,
 ) -> Results:
@@ -70,48 +70,48 @@ def sweep(
         OSError: a full disk; what is there stays, and `resume` goes on.
     """
     study.check()
-    if study.engine != "xla" and (line := objection(study)):
+    if study.engine != "xla" and (line := find_study_objection(study)):
         raise ValueError(line)
     store = Store(pathlib.Path(out))
-    with _begun(store, study, resume, source or {}) as (missing, damaged):
-        tally = _Tally(study, missing, tuple(damaged), progress)
+    with _begin_sweep(store, study, resume, source or {}) as (missing, damaged):
+        counter = _ProgressCounter(study, missing, tuple(damaged), progress)
         if missing:
             with contextlib.closing((on or Local()).run(study, missing, stopping)) as finished:
                 for done in finished:
                     store.write(done.chunk, done.data)
-                    tally.add(done)
+                    counter.add(done)
     return Results(store.folder)
 
 
 @contextlib.contextmanager
-def _begun(
+def _begin_sweep(
     store: Store, study: Study, resume: bool, source: Mapping[str, Any]
 ) -> Iterator[tuple[list[int], list[int]]]:
     """The chunks that are missing, and those of them that were damaged. Until every process is done, the first one has
     the folder's lock."""
-    found, damaged = np.full(study.chunks, UNKNOWN, np.int8), []
+    found, damaged = np.full(study.chunks, CHUNK_UNKNOWN, np.int8), []
     with contextlib.ExitStack() as held:
         try:
             if jax.process_index() == 0:
                 held.enter_context(store.locked())
                 notes = {**provenance.commit(), "source": dict(source), "units": study.units()}
-                manifest = {**described(study), **notes}
+                manifest = {**describe_owner(study), **notes}
                 store.begin(manifest, resume=resume)
                 whole, damaged = store.scan(Seals(manifest))
-                found[:] = np.where(np.isin(np.arange(study.chunks), list(whole)), HERE, MISSING)
+                found[:] = np.where(np.isin(np.arange(study.chunks), list(whole)), CHUNK_PRESENT, CHUNK_MISSING)
         finally:  # whatever happened: the others wait for this
-            found = _together(multihost_utils.broadcast_one_to_all, found)
-        if UNKNOWN in found:
+            found = _synchronise(multihost_utils.broadcast_one_to_all, found)
+        if CHUNK_UNKNOWN in found:
             raise SweepError(f"{store.folder}: the first process could not begin, and says why")
         try:
-            yield np.flatnonzero(found == MISSING).tolist(), damaged
+            yield np.flatnonzero(found == CHUNK_MISSING).tolist(), damaged
         except Exception:  # a process that left at once would take those with it that still compute
-            _together(multihost_utils.sync_global_devices, "chunks")
+            _synchronise(multihost_utils.sync_global_devices, "chunks")
             raise
-        _together(multihost_utils.sync_global_devices, "chunks")
+        _synchronise(multihost_utils.sync_global_devices, "chunks")
 
 
-def _together(meet: Callable[[Any], Any], what: Any) -> Any:
+def _synchronise(meet: Callable[[Any], Any], what: Any) -> Any:
     """What all processes do at the same time; nothing where there is but one. Raises SweepError if one has died."""
     if jax.process_count() == 1:
         return what
@@ -121,7 +121,7 @@ def _together(meet: Callable[[Any], Any], what: Any) -> Any:
         raise SweepError("another process died; finished chunks stay, and resume goes on") from error
 
 
-class _Tally:
+class _ProgressCounter:
     """Counts what is done, and tells."""
 
     def __init__(self, study: Study, missing: list[int], damaged: tuple[int, ...], told: Any):
@@ -142,4 +142,4 @@ class _Tally:
         if self.told:
             seconds = time.monotonic() - self.begun - stopwatch.compiled(self.begun)
             counts = (self.before + self.here, self.total, self.here, seconds, self.failed, self.diverged)
-            self.told(Progress(*counts, self.damaged, self.refused))
+            self.told(SweepProgress(*counts, self.damaged, self.refused))

@@ -20,9 +20,9 @@ from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.engine import EngineError
-from diffabs.sweep.study import FLAGS, Study, noise_key, numbers, precision
+from diffabs.sweep.study import FLAG_COLUMNS, Study, noise_key, numeric_values, precision
 
-PARTS_OF_A_CHUNK = 8
+BLOCKS_PER_CHUNK = 8
 
 Columns = dict[str, np.ndarray]
 
@@ -43,36 +43,36 @@ class Runner:
         """`devices`: all local ones if not given."""
         self.study = study
         self.devices = list(devices or jax.local_devices())
-        self.size = study.chunk if not study.parts else -(-study.chunk // PARTS_OF_A_CHUNK)
+        self.size = study.chunk if not study.parts else -(-study.chunk // BLOCKS_PER_CHUNK)
         self._programs: dict[tuple[str, ...], Any] = {}
         self._pool = ThreadPoolExecutor(len(self.devices))
 
     def run(self, chunks: Sequence[int]) -> list[Columns]:
         """The columns of each chunk: sample, one per variable, metrics, stopped, diverged, refused (why, or '')."""
-        drawn = [self._drawn(c) for c in chunks]
+        drawn = [self._draw_chunk(c) for c in chunks]
         for columns in drawn:
             columns |= {name: np.zeros(len(columns["sample"]), self.study.dtype) for name in self.study.objectives}
-            columns |= {name: np.zeros(len(columns["sample"]), bool) for name in FLAGS[:-1]}
-            columns |= {FLAGS[-1]: np.full(len(columns["sample"]), "", object)}
-        for names, blocks in self._sorted(drawn).items():
+            columns |= {name: np.zeros(len(columns["sample"]), bool) for name in FLAG_COLUMNS[:-1]}
+            columns |= {FLAG_COLUMNS[-1]: np.full(len(columns["sample"]), "", object)}
+        for names, blocks in self._sort_into_blocks(drawn).items():
             for k in range(0, len(blocks), len(self.devices)):
                 together = blocks[k : k + len(self.devices)]
-                for block, found in zip(together, self._together(names, together), strict=True):
+                for block, found in zip(together, self._run_on_devices(names, together), strict=True):
                     for name, column in found.items():
                         drawn[block.chunk][name][block.lanes] = column[: len(block.lanes)]
         return drawn
 
-    def _drawn(self, chunk: int) -> Columns:
+    def _draw_chunk(self, chunk: int) -> Columns:
         start, stop = self.study.bounds(chunk)
         return {"sample": np.arange(start, stop), **self.study.draw(start, stop)}
 
-    def _sorted(self, drawn: list[Columns]) -> dict[tuple[str, ...], list[_Block]]:
+    def _sort_into_blocks(self, drawn: list[Columns]) -> dict[tuple[str, ...], list[_Block]]:
         """Blocks by the names of their parts."""
         found: dict[tuple[str, ...], list[_Block]] = {}
         for c, columns in enumerate(drawn):
             names = np.array([np.asarray(columns[path], str) for path in self.study.parts]).T
             names = names.reshape(len(columns["sample"]), len(self.study.parts))
-            values = numbers({path: columns[path] for path in self.study.space.paths})
+            values = numeric_values({path: columns[path] for path in self.study.space.paths})
             for kind in sorted(set(map(tuple, names.tolist()))):
                 members = np.flatnonzero((names == np.array(kind, dtype=names.dtype)).all(axis=1))
                 for k in range(0, len(members), self.size):
@@ -82,15 +82,17 @@ class Runner:
                     found.setdefault(kind, []).append(block)
         return found
 
-    def _together(self, names: tuple[str, ...], blocks: list[_Block]) -> Iterator[Columns]:
+    def _run_on_devices(self, names: tuple[str, ...], blocks: list[_Block]) -> Iterator[Columns]:
         """One block on each device, or fewer."""
         loop, program = self._variant(names), self._program(names)
-        return self._pool.map(lambda block, device: self._alone(loop, program, block, device), blocks, self.devices)
+        return self._pool.map(
+            lambda block, device: self._run_on_device(loop, program, block, device), blocks, self.devices
+        )
 
-    def _alone(self, loop: Any, program: Any, block: _Block, device: Any) -> Columns:
+    def _run_on_device(self, loop: Any, program: Any, block: _Block, device: Any) -> Columns:
         with jax.default_device(device):
             asked = batch_admissibility(loop, block.values, self.study.solver)
-        with precision(self.study.dtype), _compiling():
+        with precision(self.study.dtype), _convert_compiler_errors():
             given = self._arguments(block, asked.accepted)
             found = jax.device_get(program(*jax.device_put(given, device)))
         return found | {"refused": asked.texts.astype(object)}
@@ -99,9 +101,9 @@ class Runner:
         values = {path: column.astype(self.study.dtype) for path, column in block.values.items()}
         return values, block.samples.astype(np.uint32), accepted
 
-    def _compiled(self, names: tuple[str, ...], block: _Block) -> None:
+    def _compile_program(self, names: tuple[str, ...], block: _Block) -> None:
         """Have the program of some parts traced, and its kernel compiled."""
-        with precision(self.study.dtype), _compiling():
+        with precision(self.study.dtype), _convert_compiler_errors():
             self._program(names).lower(*self._arguments(block, np.ones(self.size, bool)))
 
     def _variant(self, names: tuple[str, ...]) -> Any:
@@ -113,12 +115,12 @@ class Runner:
                 lambda x: np.asarray(x, self.study.dtype), (self._variant(names), dict(self.study.objectives))
             )
             study = dataclasses.replace(self.study, objectives=objectives)
-            self._programs[names] = jax.jit(partial(_block, study, loop))
+            self._programs[names] = jax.jit(partial(_measure_block, study, loop))
         return self._programs[names]
 
 
 @contextlib.contextmanager
-def _compiling() -> Iterator[None]:
+def _convert_compiler_errors() -> Iterator[None]:
     """Raises EngineError where a kernel turns out not to be possible once it is compiled: a full disk, say."""
     try:
         yield
@@ -127,19 +129,19 @@ def _compiling() -> Iterator[None]:
 
 
 @functools.lru_cache(maxsize=4)
-def objection(study: Study) -> str | None:
+def find_study_objection(study: Study) -> str | None:
     """Return why its engine cannot make the runs of a study, those of the first chunk, or None. Nothing is run, but
     what makes them is compiled."""
     runner = Runner(study, jax.local_devices()[:1])
     try:
-        for names, blocks in runner._sorted([runner._drawn(0)]).items():
-            runner._compiled(names, blocks[0])
+        for names, blocks in runner._sort_into_blocks([runner._draw_chunk(0)]).items():
+            runner._compile_program(names, blocks[0])
     except ValueError as error:
         return str(error)
     return None
 
 
-def _block(study: Study, loop: Any, values: Mapping[str, Any], samples: Any, accepted: Any) -> dict[str, Any]:
+def _measure_block(study: Study, loop: Any, values: Mapping[str, Any], samples: Any, accepted: Any) -> dict[str, Any]:
     """Metrics and flags of a block of lanes, of which those run that are accepted."""
     keys = jax.vmap(lambda sample: noise_key(study.seed, sample))(samples)
     given = (loop, Batch(values, keys), study.solver, study.objectives)

@@ -10,37 +10,37 @@ import pyarrow.parquet as pq
 from diffabs.core import files
 from diffabs.core.values import unknown
 
-READERS = {".csv": pc.read_csv, ".parquet": pq.read_table}
+TABLE_READERS = {".csv": pc.read_csv, ".parquet": pq.read_table}
 
 
-def read(path: pathlib.Path, column: str) -> np.ndarray:
+def read_column(path: pathlib.Path, column: str) -> np.ndarray:
     """The numbers, in float64. Raises ValueError, in one line, for a file that cannot be read, a column that is not
     there, and whatever is no finite number."""
-    if path.suffix.lower() not in READERS:
-        raise ValueError(f"{path} is neither {' nor '.join(READERS)}")
+    if path.suffix.lower() not in TABLE_READERS:
+        raise ValueError(f"{path} is neither {' nor '.join(TABLE_READERS)}")
     try:
         with files.opened(path) as file:
-            table = READERS[path.suffix.lower()](file)
+            table = TABLE_READERS[path.suffix.lower()](file)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or str(error).splitlines()[0]}") from None
     except pa.ArrowException as error:
         raise ValueError(f"{path} is no {path.suffix[1:]} file: {str(error).splitlines()[0]}") from None
     if column not in table.column_names:
         raise unknown(f"{path} has no column {column}", column, table.column_names)
-    return _numbers(table.column(column), f"{path}, column {column}")
+    return _parse_numbers(table.column(column), f"{path}, column {column}")
 
 
-def _numbers(values: pa.ChunkedArray, where: str) -> np.ndarray:
+def _parse_numbers(values: pa.ChunkedArray, where: str) -> np.ndarray:
     if len(values) == 0:
         raise ValueError(f"{where} is empty")
-    found = np.array([_number(value) for value in values.to_pylist()])
+    found = np.array([_parse_number(value) for value in values.to_pylist()])
     wrong = np.flatnonzero(~np.isfinite(found))
     if len(wrong):
         raise ValueError(f"{where}: {values[wrong[0]].as_py()!r} in row {wrong[0] + 1} is no finite number")
     return found
 
 
-def _number(value: object) -> float:
+def _parse_number(value: object) -> float:
     """NaN for what is none, and for what is missing."""
     try:
         return float(value) if isinstance(value, str | float | int) and not isinstance(value, bool) else np.nan

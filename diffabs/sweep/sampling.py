@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.values import any_number, entry, kebab, listed, read_one, sound, table_of, whole, within, written
-from diffabs.sweep.distributions import reach
+from diffabs.sweep.distributions import support_interval
 
-MOST = 2**32 - 1  # samples, whose numbers have 32 bits in JAX's keys and in the sequences; and the greatest seed
-MOST_AT_ONCE = 1_000_000  # of a Latin hypercube, which has to be made as a whole
-BITS = 32
+MAX_UINT32 = 2**32 - 1  # samples, whose numbers have 32 bits in JAX's keys and in the sequences; and the greatest seed
+MAX_HYPERCUBE_SAMPLES = 1_000_000  # of a Latin hypercube, which has to be made as a whole
+SOBOL_BITS = 32
 
 
-class Design(Protocol):
+class SamplingDesign(Protocol):
     """How samples fill the unit cube."""
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
@@ -40,82 +40,86 @@ class Design(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class Random(Design):
+class Random(SamplingDesign):
     """Independent samples: bits of JAX's `fold_in(key(seed), i)` (Threefry), 52 to a number."""
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         del samples
-        high, low = np.moveaxis(np.asarray(_words(_seed(seed), np.uint32(start), stop - start, dimension)), -1, 0)
+        high, low = np.moveaxis(
+            np.asarray(_random_words(_check_seed(seed), np.uint32(start), stop - start, dimension)), -1, 0
+        )
         return (high * 2.0**20 + (low >> 12) + 0.5) * 2.0**-52
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
         del variables
-        return _counted(samples)
+        return _check_samples(samples)
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
-def _words(seed: Any, start: Any, count: int, dimension: int) -> jax.Array:
+def _random_words(seed: Any, start: Any, count: int, dimension: int) -> jax.Array:
     key = jax.random.key(seed, impl="threefry2x32")
     numbers = start + jax.lax.iota(jnp.uint32, count)
     return jax.vmap(lambda i: jax.random.bits(jax.random.fold_in(key, i), (dimension, 2), jnp.uint32))(numbers)
 
 
 @dataclasses.dataclass(frozen=True)
-class Sobol(Design):
+class Sobol(SamplingDesign):
     """Scrambled Sobol' sequences (SciPy's: linear matrix scramble and digital shift, Matousek 1998), one after another.
 
     replicates: how many, scrambled independently: the spread of their means tells the error. Each is balanced only if
         it has a power of two of samples (Owen 2020, arXiv:2008.08051)"""
 
-    replicates: int = entry(within(1, MOST), 1)
+    replicates: int = entry(within(1, MAX_UINT32), 1)
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         block = samples // self.replicates
         points = [np.empty((0, dimension))]
         for r in range(start // block, math.ceil(stop / block)):
             first, last = max(start - r * block, 0), min(stop - r * block, block)
-            points.append(_sequence(seed, r, first, last, dimension))
+            points.append(_sobol_points(seed, r, first, last, dimension))
         return np.concatenate(points)
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
         del variables
-        return _multiple(_counted(samples), self.replicates, "the number of replicates")
+        return _check_multiple(_check_samples(samples), self.replicates, "the number of replicates")
 
     def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
         if self.replicates < 1:
             yield f"{name}: replicates = {self.replicates} is not positive"
 
 
-def _sequence(seed: int, replicate: int, start: int, stop: int, dimension: int) -> np.ndarray:
+def _sobol_points(seed: int, replicate: int, start: int, stop: int, dimension: int) -> np.ndarray:
     """Points of one scrambled sequence, moved by half of their last bit. Skipping 10^7 points takes a tenth of a
     second."""
     from scipy.stats import qmc
 
-    engine = qmc.Sobol(dimension, bits=BITS, rng=_generator(seed, replicate))
+    engine = qmc.Sobol(dimension, bits=SOBOL_BITS, rng=_generator(seed, replicate))
     if start == 0 < stop:
         # The first point by itself: a first draw that is no power of two would warn, but chunks may have any length.
         points = np.concatenate([engine.random(1), engine.random(stop - 1)])
     else:
         points = engine.fast_forward(start).random(stop - start)
-    return points + 0.5 ** (BITS + 1)
+    return points + 0.5 ** (SOBOL_BITS + 1)
 
 
 @dataclasses.dataclass(frozen=True)
-class LatinHypercube(Design):
+class LatinHypercube(SamplingDesign):
     """SciPy's Latin hypercube: each variable has one sample in each of its N strata. All are drawn at once and kept."""
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
-        return _hypercube(seed, samples, dimension)[start:stop]
+        return _hypercube_points(seed, samples, dimension)[start:stop]
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
         del variables
-        if (count := _counted(samples)) > MOST_AT_ONCE:
-            raise ValueError(f"samples = {count} are more than a latin-hypercube can have, {MOST_AT_ONCE}; use sobol")
+        if (count := _check_samples(samples)) > MAX_HYPERCUBE_SAMPLES:
+            raise ValueError(
+                f"samples = {count} are more than a latin-hypercube can have, {MAX_HYPERCUBE_SAMPLES}; use sobol"
+            )
         return count
 
 
 @functools.lru_cache(1)
-def _hypercube(seed: int, samples: int, dimension: int) -> np.ndarray:
+def _hypercube_points(seed: int, samples: int, dimension: int) -> np.ndarray:
     from scipy.stats import qmc
 
     points = qmc.LatinHypercube(dimension, rng=_generator(seed, 0)).random(samples)
@@ -124,22 +128,22 @@ def _hypercube(seed: int, samples: int, dimension: int) -> np.ndarray:
     return points
 
 
-def _level(given: Any, where: str) -> Any:
-    return listed(any_number)(given, where) if isinstance(given, list | tuple) else whole(given, 2, MOST, where)
+def _read_level(given: Any, where: str) -> Any:
+    return listed(any_number)(given, where) if isinstance(given, list | tuple) else whole(given, 2, MAX_UINT32, where)
 
 
-def _levels(given: Any, where: str) -> Any:
-    return table_of(_level)(given, where) if isinstance(given, Mapping) else whole(given, 2, MOST, where)
+def _read_levels(given: Any, where: str) -> Any:
+    return table_of(_read_level)(given, where) if isinstance(given, Mapping) else whole(given, 2, MAX_UINT32, where)
 
 
 @dataclasses.dataclass(frozen=True)
-class Grid(Design):
+class Grid(SamplingDesign):
     """Every combination of levels, the last variable changing fastest.
 
     levels: of every variable, or of each by name: how many, which are equally spaced in u from 0 to 1, or a tuple of u.
         What is drawn from a list, `Categorical` and `Rows`, has a level for each of its items unless it is given u."""
 
-    levels: int | Mapping[str, int | tuple[float, ...]] = entry(_levels)
+    levels: int | Mapping[str, int | tuple[float, ...]] = entry(_read_levels)
 
     def over(self, variables: Mapping[str, Any]) -> "Grid":
         """The same with the levels u of each of these variables, in their order."""
@@ -163,7 +167,7 @@ class Grid(Design):
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
         sizes = [len(self._axis(name, item)) for name, item in variables.items()]
-        return _exactly(math.prod(sizes), samples, f"the grid {' x '.join(map(str, sizes))}")
+        return _check_exact_count(math.prod(sizes), samples, f"the grid {' x '.join(map(str, sizes))}")
 
     def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
         given = {"levels": self.levels} if isinstance(self.levels, int) else self.levels
@@ -180,29 +184,29 @@ class Grid(Design):
             yield from (f"{name}: {path} is not a variable" for path in self.levels if path not in variables)
         for path, variable in variables.items():
             if not hasattr(variable, "middles") and {0.0, 1.0} & set(self._axis(path, variable)):
-                yield from _unbounded(name, path, variable, "grid")
+                yield from _support_problems(name, path, variable, "grid")
 
 
 @dataclasses.dataclass(frozen=True)
-class Corners(Design):
+class Corners(SamplingDesign):
     """The 2^d corners of the box of supports, the last variable changing fastest."""
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         return Grid(2).unit(seed, start, stop, dimension, samples)
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
-        return _exactly(2 ** len(variables), samples, "the corners")
+        return _check_exact_count(2 ** len(variables), samples, "the corners")
 
     def problems(self, name: str, variables: Mapping[str, Any] | None = None) -> Iterator[str]:
         for path, variable in (variables or {}).items():
             if not hasattr(variable, "middles"):
-                yield from _unbounded(name, path, variable, "corners")
+                yield from _support_problems(name, path, variable, "corners")
             elif len(variable.middles()) != 2:
                 yield f"{name}: {path} is one of {len(variable.middles())}; corners need two ends; use grid"
 
 
 @dataclasses.dataclass(frozen=True)
-class Saltelli(Design):
+class Saltelli(SamplingDesign):
     """Rows of d + 2 samples for Sobol' sensitivity indices: A, B, and A with column j from B for j = 0, ..., d - 1.
 
     Row r of A and B is point r of one scrambled Sobol' sequence of dimension 2 d. Saltelli et al. 2010, Computer
@@ -212,41 +216,41 @@ class Saltelli(Design):
         del samples
         row, which = np.divmod(np.arange(start, stop), dimension + 2)
         first, last = start // (dimension + 2), math.ceil(stop / (dimension + 2))
-        a, b = np.split(_sequence(seed, 0, first, last, 2 * dimension)[row - first], 2, axis=1)
+        a, b = np.split(_sobol_points(seed, 0, first, last, 2 * dimension)[row - first], 2, axis=1)
         from_b = (which[:, None] - 2 == np.arange(dimension)) | (which[:, None] == 1)
         return np.where(from_b, b, a)
 
     def count(self, variables: Mapping[str, Any], samples: int | None) -> int:
-        return _multiple(_counted(samples), len(variables) + 2, "the number of variables plus 2")
+        return _check_multiple(_check_samples(samples), len(variables) + 2, "the number of variables plus 2")
 
 
-KINDS = {kebab(cls.__name__): cls for cls in (Random, Sobol, LatinHypercube, Grid, Corners, Saltelli)}
+DESIGN_TYPES = {kebab(cls.__name__): cls for cls in (Random, Sobol, LatinHypercube, Grid, Corners, Saltelli)}
 
 
-def read(given: Any, where: str) -> Design:
+def read_sampling_design(given: Any, where: str) -> SamplingDesign:
     """The design of a table, or of the bare name of a type. Raises ScenarioError, in one line."""
-    return sound(read_one(KINDS, given, where), where)
+    return sound(read_one(DESIGN_TYPES, given, where), where)
 
 
-def _seed(seed: int) -> np.uint32:
-    if not 0 <= seed <= MOST:
-        raise ValueError(f"seed = {seed} is outside [0, {MOST}]")
+def _check_seed(seed: int) -> np.uint32:
+    if not 0 <= seed <= MAX_UINT32:
+        raise ValueError(f"seed = {seed} is outside [0, {MAX_UINT32}]")
     return np.uint32(seed)
 
 
 def _generator(seed: int, stream: int) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence(int(_seed(seed)), spawn_key=(stream,)))
+    return np.random.default_rng(np.random.SeedSequence(int(_check_seed(seed)), spawn_key=(stream,)))
 
 
-def _counted(samples: int | None) -> int:
+def _check_samples(samples: int | None) -> int:
     if samples is None:
         raise ValueError("samples is missing: how many there shall be")
-    if not 1 <= samples <= MOST:
-        raise ValueError(f"samples = {samples} is outside [1, {MOST}]")
+    if not 1 <= samples <= MAX_UINT32:
+        raise ValueError(f"samples = {samples} is outside [1, {MAX_UINT32}]")
     return samples
 
 
-def _multiple(samples: int, of: int, what: str) -> int:
+def _check_multiple(samples: int, of: int, what: str) -> int:
     below = samples // of * of
     if below != samples:
         near = f"{below} or {below + of}" if below else str(of)
@@ -254,13 +258,13 @@ def _multiple(samples: int, of: int, what: str) -> int:
     return samples
 
 
-def _exactly(count: int, samples: int | None, what: str) -> int:
+def _check_exact_count(count: int, samples: int | None, what: str) -> int:
     if samples not in (None, count):
         raise ValueError(f"samples = {samples} is not {count}, the number of points of {what}")
-    return _counted(count)
+    return _check_samples(count)
 
 
-def _unbounded(name: str, path: str, variable: Any, design: str) -> Iterator[str]:
-    own = reach(variable)
+def _support_problems(name: str, path: str, variable: Any, design: str) -> Iterator[str]:
+    own = support_interval(variable)
     if own.open_low or own.open_high:
         yield f"{name}: {path} = {written(variable)} reaches {own.interval()}; {design} needs a finite, closed support"

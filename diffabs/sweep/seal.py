@@ -18,8 +18,8 @@ import pyarrow.parquet as pq
 
 from diffabs.core.values import ScenarioError
 
-NAME = re.compile(r"part-(\d{8,})-([0-9a-f]{16})\.parquet")
-DIGITS = 16
+CHUNK_NAME_PATTERN = re.compile(r"part-(\d{8,})-([0-9a-f]{16})\.parquet")
+DIGEST_DIGITS = 16
 
 
 class SweepError(ScenarioError):
@@ -45,15 +45,15 @@ class Seal(NamedTuple):
         return {f"diffabs.{name}".encode(): value.encode() for name, value in told.items()}
 
 
-def digest(value: Any) -> str:
+def json_digest(value: Any) -> str:
     """SHA-256 of values of JSON. The order of names counts: it is that of a design's columns."""
     return hashlib.sha256(json.dumps(value, separators=(",", ":")).encode()).hexdigest()
 
 
-def encoded(columns: Mapping[str, np.ndarray], seal: Seal, units: Mapping[str, str] | None = None) -> bytes:
+def encode_chunk(columns: Mapping[str, np.ndarray], seal: Seal, units: Mapping[str, str] | None = None) -> bytes:
     """A chunk as the bytes of its Parquet file: the same columns of the same sweep give the same bytes. A column whose
     unit is known has it in its field's metadata, under `unit`."""
-    arrays = {name: _array(column) for name, column in columns.items()}
+    arrays = {name: _arrow_array(column) for name, column in columns.items()}
     told = {name: {"unit": unit} for name, unit in (units or {}).items()}
     schema = pa.schema([pa.field(n, array.type, metadata=told.get(n)) for n, array in arrays.items()], seal.metadata())
     buffer = io.BytesIO()
@@ -61,36 +61,40 @@ def encoded(columns: Mapping[str, np.ndarray], seal: Seal, units: Mapping[str, s
     return buffer.getvalue()
 
 
-def _array(column: np.ndarray) -> pa.Array:
+def _arrow_array(column: np.ndarray) -> pa.Array:
     return pa.array(column.astype(str)).dictionary_encode() if column.dtype.kind in "OU" else pa.array(column)
 
 
-def name(chunk: int, data: bytes) -> str:
+def chunk_file_name(chunk: int, data: bytes) -> str:
     """The name of a chunk's file."""
-    return f"part-{chunk:08d}-{hashlib.sha256(data).hexdigest()[:DIGITS]}.parquet"
+    return f"part-{chunk:08d}-{hashlib.sha256(data).hexdigest()[:DIGEST_DIGITS]}.parquet"
 
 
-def verified(data: bytes, path: pathlib.Path, seal: Seal) -> pq.ParquetFile:
+def verify_chunk(data: bytes, path: pathlib.Path, seal: Seal) -> pq.ParquetFile:
     """The chunk in these bytes of a file. Raises DamagedError, or SweepError for a chunk of another sweep."""
-    if name(seal.chunk, data) != path.name:
+    if chunk_file_name(seal.chunk, data) != path.name:
         raise DamagedError(f"{path} is damaged: its contents do not match its name; --resume computes it again")
     try:
         found = pq.ParquetFile(pa.BufferReader(data))
         told = found.schema_arrow.metadata or {}
         wrong = next((key for key, value in seal.metadata().items() if told.get(key) != value), None)
         if wrong in (b"diffabs.owner", b"diffabs.seed"):
-            raise SweepError(f"{path} is a chunk of another sweep: its {_named(wrong, told)}; move it away")
+            raise SweepError(f"{path} is a chunk of another sweep: its {_describe_metadata(wrong, told)}; move it away")
         if wrong:
-            raise DamagedError(f"{path} is not that chunk: its {_named(wrong, told)}; --resume computes it again")
+            raise DamagedError(
+                f"{path} is not that chunk: its {_describe_metadata(wrong, told)}; --resume computes it again"
+            )
         _check_table(found, path, seal)
     except (pa.ArrowException, OSError) as error:
         raise DamagedError(f"{path} is no chunk: {_line(error)}; --resume computes it again") from None
     return found
 
 
-def _named(key: bytes, told: Mapping[bytes, bytes]) -> str:
+def _describe_metadata(key: bytes, told: Mapping[bytes, bytes]) -> str:
     kind = key.decode().removeprefix("diffabs.")
-    return f"{kind} is {told[key].decode(errors='replace')[:DIGITS]!r}" if key in told else f"{kind} is not in it"
+    return (
+        f"{kind} is {told[key].decode(errors='replace')[:DIGEST_DIGITS]!r}" if key in told else f"{kind} is not in it"
+    )
 
 
 def _check_table(found: pq.ParquetFile, path: pathlib.Path, seal: Seal) -> None:
@@ -104,7 +108,7 @@ def _check_table(found: pq.ParquetFile, path: pathlib.Path, seal: Seal) -> None:
         raise DamagedError(f"{path} does not have {wanted}; --resume computes it again")
 
 
-def contents(tables: Iterable[pa.Table]) -> str:
+def tables_digest(tables: Iterable[pa.Table]) -> str:
     """SHA-256 over names, types and values of all columns: equal for equal tables, whatever file they are in."""
     whole = hashlib.sha256()
     for table in tables:

@@ -16,15 +16,15 @@ import filelock
 
 from diffabs.core import files
 from diffabs.sweep import seal
-from diffabs.sweep.manifest import MANIFEST as MANIFEST
-from diffabs.sweep.manifest import Seals, sealed
+from diffabs.sweep.manifest import MANIFEST_NAME as MANIFEST_NAME
+from diffabs.sweep.manifest import Seals, encode_manifest
 from diffabs.sweep.manifest import read_manifest as read_manifest
 from diffabs.sweep.seal import DamagedError
 from diffabs.sweep.seal import SweepError as SweepError
 
-CHUNKS, LOCK = "chunks", ".lock"
-MOST_SHOWN = 60
-PASSING = (".", "_")  # beginnings of names that no reader of data sets takes for a part of one
+CHUNKS_FOLDER, LOCK_FILE = "chunks", ".lock"
+MAX_VALUE_CHARACTERS = 60
+IGNORED_PREFIXES = (".", "_")  # beginnings of names that no reader of data sets takes for a part of one
 
 
 class Store:
@@ -32,7 +32,7 @@ class Store:
 
     def __init__(self, folder: pathlib.Path):
         """Nothing is read or written yet."""
-        self.folder, self.chunks = pathlib.Path(folder), pathlib.Path(folder) / CHUNKS
+        self.folder, self.chunks = pathlib.Path(folder), pathlib.Path(folder) / CHUNKS_FOLDER
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -40,7 +40,7 @@ class Store:
         cannot be written."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            lock = filelock.FileLock(self.folder / LOCK, timeout=0)
+            lock = filelock.FileLock(self.folder / LOCK_FILE, timeout=0)
             lock.acquire()
         except filelock.Timeout:
             raise SweepError(f"{self.folder} is in use by another process") from None
@@ -55,9 +55,9 @@ class Store:
         """Write the manifest, or compare it with the one that is there. Raises SweepError for a folder that holds
         another configuration (naming the first differences), finished chunks although `resume` is not set, or other
         files. A sweep that never finished a chunk (its scheduler did not answer, say) is begun anew."""
-        for leftover in (self.folder / f"{MANIFEST}.tmp", *self.chunks.glob("part-*.parquet.tmp")):
+        for leftover in (self.folder / f"{MANIFEST_NAME}.tmp", *self.chunks.glob("part-*.parquet.tmp")):
             leftover.unlink(missing_ok=True)
-        if not (self.folder / MANIFEST).exists():
+        if not (self.folder / MANIFEST_NAME).exists():
             self._begin_new(manifest)
             return
         there = read_manifest(self.folder)
@@ -66,7 +66,7 @@ class Store:
                 raise SweepError(f"{self.folder} already holds a sweep; --resume continues it")
             self._begin_new(manifest)
             return
-        found = list(differences(_decisive(there), _decisive(manifest)))
+        found = list(describe_differences(_decisive_entries(there), _decisive_entries(manifest)))
         if found:
             more = f", and {len(found) - 3} more" if len(found) > 3 else ""
             raise SweepError(f"{self.folder} holds another sweep: {'; '.join(found[:3])}{more}")
@@ -74,22 +74,24 @@ class Store:
 
     def _begin_new(self, manifest: Mapping[str, Any]) -> None:
         if self.chunks.is_dir() and any(self.chunks.iterdir()):
-            raise SweepError(f"{self.folder} has chunks but no {MANIFEST}; it cannot be continued")
+            raise SweepError(f"{self.folder} has chunks but no {MANIFEST_NAME}; it cannot be continued")
         names = (path.name for path in self.folder.iterdir())
-        others = sorted(name for name in names if name not in (CHUNKS, MANIFEST) and not name.startswith("."))
+        others = sorted(
+            name for name in names if name not in (CHUNKS_FOLDER, MANIFEST_NAME) and not name.startswith(".")
+        )
         if others:
             raise SweepError(f"{self.folder} is no sweep, but holds {others[0]}; choose a folder that is new or empty")
         self.chunks.mkdir(exist_ok=True)
-        files.write_durably(self.folder / MANIFEST, sealed(manifest))
+        files.write_durably(self.folder / MANIFEST_NAME, encode_manifest(manifest))
 
     def scan(self, seals: Seals) -> tuple[dict[int, pathlib.Path], list[int]]:
         """Chunks of a sweep that are there and whole, and those that are damaged. A damaged file is removed; one of
         another name is left alone. Raises SweepError for a chunk of another sweep, and for what is no file."""
         whole, damaged = {}, []
-        for chunk, paths in listing(self.folder, seals.count)[0].items():
+        for chunk, paths in list_chunks(self.folder, seals.count)[0].items():
             for path in paths:
                 try:
-                    seal.verified(read_chunk(path), path, seals.of(chunk))
+                    seal.verify_chunk(read_chunk(path), path, seals.of(chunk))
                     whole[chunk] = path
                 except DamagedError:
                     damaged.append(chunk)
@@ -98,18 +100,18 @@ class Store:
 
     def write(self, chunk: int, data: bytes) -> pathlib.Path:
         """A chunk, whole or not at all."""
-        return files.write_durably(self.chunks / seal.name(chunk, data), data)
+        return files.write_durably(self.chunks / seal.chunk_file_name(chunk, data), data)
 
 
-def listing(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathlib.Path]], list[pathlib.Path]]:
+def list_chunks(folder: pathlib.Path, count: int) -> tuple[dict[int, list[pathlib.Path]], list[pathlib.Path]]:
     """Files with the name of one of `count` chunks, by number, and whatever else lies beside them that another reader
     would take for a part of the data set."""
     named, strays = {}, []
-    for path in sorted((folder / CHUNKS).glob("*")):
-        number = seal.NAME.fullmatch(path.name)
+    for path in sorted((folder / CHUNKS_FOLDER).glob("*")):
+        number = seal.CHUNK_NAME_PATTERN.fullmatch(path.name)
         if number and int(number[1]) < count:
             named.setdefault(int(number[1]), []).append(path)
-        elif not path.name.startswith(PASSING) and path.suffix != ".tmp":
+        elif not path.name.startswith(IGNORED_PREFIXES) and path.suffix != ".tmp":
             strays.append(path)
     return named, strays
 
@@ -118,13 +120,13 @@ def check_owner(folder: pathlib.Path, manifest: Mapping[str, Any], sample: int) 
     """Whether the manifest is that of the chunks: of the one with this sample, or, while it is not there, of the first.
     Raises SweepError."""
     seals = Seals(manifest)
-    named = listing(folder, seals.count)[0]
+    named = list_chunks(folder, seals.count)[0]
     if not named:
         raise SweepError(f"{folder} has no finished chunk yet; --resume continues it")
     wanted = sample // manifest["study"]["chunk"]
     chunk = wanted if wanted in named else min(named)
     for path in named[chunk]:
-        seal.verified(read_chunk(path), path, seals.of(chunk))
+        seal.verify_chunk(read_chunk(path), path, seals.of(chunk))
 
 
 def read_chunk(path: pathlib.Path) -> bytes:
@@ -135,21 +137,21 @@ def read_chunk(path: pathlib.Path) -> bytes:
         raise SweepError(f"{path} cannot be read: {error.strerror}; move it away") from None
 
 
-def differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
+def describe_differences(there: Any, wanted: Any, path: str = "") -> Iterator[str]:
     """Where two documents differ, a line each."""
     if isinstance(there, dict) and isinstance(wanted, dict):
         for key in [*there, *(key for key in wanted if key not in there)]:
             inner = f"{path}.{key}" if path else str(key)
-            yield from differences(there.get(key), wanted.get(key), inner)
+            yield from describe_differences(there.get(key), wanted.get(key), inner)
     elif there != wanted:
-        yield f"{path} is {_short(there)} there, {_short(wanted)} here"
+        yield f"{path} is {_abbreviate(there)} there, {_abbreviate(wanted)} here"
 
 
-def _decisive(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def _decisive_entries(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """What results depend on: everything but the commit, which is a note."""
     return {key: value for key, value in manifest.items() if key not in ("commit", "source", "units")}
 
 
-def _short(value: Any) -> str:
+def _abbreviate(value: Any) -> str:
     text = json.dumps(value)
-    return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."
+    return text if len(text) <= MAX_VALUE_CHARACTERS else f"{text[: MAX_VALUE_CHARACTERS - 3]}..."

@@ -26,10 +26,12 @@ from diffabs.sweep.discrete import Categorical
 from diffabs.sweep.variables import Space
 
 DTYPES = ("float32", "float64")
-ENGINES = ("xla", "kernel")
+STUDY_ENGINES = ("xla", "kernel")
 RANGES = {"samples": (1, 2**32 - 1), "chunk": (1, 2**20), "seed": (0, 2**32 - 1)}  # keys are folded with 32 bits
-NOISE = 2**32 - 1  # of the stream of keys, folded into the seed where the random design folds the number of a sample
-FLAGS = ("stopped", "diverged", "refused")
+NOISE_STREAM = (
+    2**32 - 1
+)  # of the stream of keys, folded into the seed where the random design folds the number of a sample
+FLAG_COLUMNS = ("stopped", "diverged", "refused")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -77,7 +79,7 @@ class Study:
         return {**varied, **{name: unit for name, unit in measured.items() if unit}}
 
     @property
-    def bounded(self) -> dict[str, float]:
+    def failure_bounds(self) -> dict[str, float]:
         """Bounds of metrics beyond which a lane has failed: those of the objectives themselves, then the study's."""
         said = {name: getattr(part, "failure", None) for name, part in self.objectives.items()}
         own = {name: float(bound) for name, bound in said.items() if bound is not None}
@@ -94,7 +96,7 @@ class Study:
 
     def check(self) -> "Study":
         """Raises ValueError, in one line, for everything that is wrong."""
-        lines = [*self._wrong_numbers(), *self._wrong_variables()] or list(problems(self.loop))
+        lines = [*self._number_problems(), *self._variable_problems()] or list(problems(self.loop))
         if lines:
             raise ValueError("; ".join(dict.fromkeys(lines)))
         return self
@@ -109,7 +111,7 @@ class Study:
             raise ValueError(f"sample {i} is outside [0, {self.samples - 1}]")
         values = {path: column[0] for path, column in self.draw(i, i + 1).items()}
         with precision("float64"):
-            return replace(self.variant(values), numbers(values)), noise_key(self.seed, i)
+            return replace(self.variant(values), numeric_values(values)), noise_key(self.seed, i)
 
     def variant(self, values: Mapping[str, Any]) -> Loop:
         """The loop with the parts that a sample's names stand for."""
@@ -118,7 +120,7 @@ class Study:
     def table(self) -> dict[str, Any]:
         """Everything that decides the results, as values of JSON. Raises NoCompiler for a kernel without one."""
         own: dict[str, Any] = {name: getattr(self, name) for name in ("samples", "seed", "chunk", "dtype")}
-        own |= {"failures": self.bounded, "success": self.success}
+        own |= {"failures": self.failure_bounds, "success": self.success}
         if self.engine != "xla":
             own |= {"engine": {"name": self.engine, **launch.describe_kernel_build()}}
         return json.loads(
@@ -134,7 +136,7 @@ class Study:
             )
         )
 
-    def _wrong_numbers(self) -> Iterator[str]:
+    def _number_problems(self) -> Iterator[str]:
         for name, (least, most) in RANGES.items():
             value = getattr(self, name)
             if not isinstance(value, int):
@@ -143,14 +145,14 @@ class Study:
                 yield f"{name} = {value} is outside [{least}, {most}]"
         if self.dtype not in DTYPES:
             yield f"dtype = {self.dtype} is neither {' nor '.join(DTYPES)}"
-        if self.engine not in ENGINES:
-            yield f"engine = {self.engine} is neither {' nor '.join(ENGINES)}"
+        if self.engine not in STUDY_ENGINES:
+            yield f"engine = {self.engine} is neither {' nor '.join(STUDY_ENGINES)}"
         for name in ("step", "duration"):
             if not 0 < getattr(self.solver, name) < np.inf:
                 yield f"solver.{name} = {getattr(self.solver, name)} is not positive and finite"
                 return
         yield from find_solver_faults(self.solver)
-        for name in {"sample", *FLAGS, *self.space.paths} & self.objectives.keys():
+        for name in {"sample", *FLAG_COLUMNS, *self.space.paths} & self.objectives.keys():
             yield f"objectives.{name}: another column of the table has this name"
         for name, bound in self.failures.items():
             if name not in self.objectives:
@@ -158,25 +160,25 @@ class Study:
             elif not np.isfinite(bound):
                 yield f"failures.{name} = {bound} is not a finite number"
 
-    def _wrong_variables(self) -> Iterator[str]:
+    def _variable_problems(self) -> Iterator[str]:
         wrong = list(self.space.problems())
         yield from wrong
         known = elements(self.loop)
         for path in self.space.paths:
             if path in self.parts:
-                yield from _wrong_parts(path, self.space.variables.get(path), self.parts[path], self.loop)
+                yield from _part_problems(path, self.space.variables.get(path), self.parts[path], self.loop)
             elif path not in known:
                 yield str(unknown(f"{path} is not a parameter of this loop", path, known))
         yield from (f"parts.{path} has no distribution" for path in self.parts if path not in self.space.paths)
         if not wrong:
-            yield from self.space.leaving(known)
+            yield from self.space.describe_out_of_range(known)
             try:
                 self.space.design.count(self.space.variables, self.samples)
             except ValueError as error:
                 yield str(error)
 
 
-def _wrong_parts(path: str, distribution: Any, choices: Mapping[str, Any], loop: Loop) -> Iterator[str]:
+def _part_problems(path: str, distribution: Any, choices: Mapping[str, Any], loop: Loop) -> Iterator[str]:
     try:
         get(loop, path)
     except KeyError as error:
@@ -191,7 +193,7 @@ def _wrong_parts(path: str, distribution: Any, choices: Mapping[str, Any], loop:
         yield from problems(part, f"{path} {name}: ")
 
 
-def numbers(values: Mapping[str, Any]) -> dict[str, Any]:
+def numeric_values(values: Mapping[str, Any]) -> dict[str, Any]:
     """Those values that are numbers, not names."""
     return {path: value for path, value in values.items() if np.asarray(value).dtype.kind in "fiu"}
 
@@ -205,4 +207,4 @@ def precision(dtype: str) -> Iterator[None]:
 
 def noise_key(seed: Any, i: Any) -> jax.Array:
     """The key of sample i's sensors."""
-    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), NOISE), i)
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), NOISE_STREAM), i)

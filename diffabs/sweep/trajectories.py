@@ -17,16 +17,16 @@ from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Trajectory
 from diffabs.sweep.study import Study, precision
 
-NAME = "trajectories.zarr"
-MOST_INSTANTS = 2000  # of a trajectory
+TRAJECTORIES_NAME = "trajectories.zarr"
+MAX_INSTANTS = 2000  # of a trajectory
 
 
-def keep(study: Study, folder: str | pathlib.Path, samples: Sequence[int]) -> pathlib.Path:
+def write_trajectories(study: Study, folder: str | pathlib.Path, samples: Sequence[int]) -> pathlib.Path:
     """Run these samples again and write their trajectories, whole or not at all, in place of earlier ones.
 
     Raises ValueError for a sample that is not in the sweep."""
-    path = pathlib.Path(folder) / NAME
-    seen = [signals(trajectory(study, i).sample, study.loop.plant) for i in samples]
+    path = pathlib.Path(folder) / TRAJECTORIES_NAME
+    seen = [signals(rerun_sample(study, i).sample, study.loop.plant) for i in samples]
     with files.new_folder(path) as folder:
         group = zarr.open_group(folder, mode="w")
         numbers = {"sample": ("", np.asarray(samples, np.int64))}
@@ -40,10 +40,10 @@ def keep(study: Study, folder: str | pathlib.Path, samples: Sequence[int]) -> pa
     return path
 
 
-def trajectory(study: Study, i: int) -> Trajectory:
+def rerun_sample(study: Study, i: int) -> Trajectory:
     """One sample's run, on the host. After its end the last instant is repeated."""
     loop, key = study.lane(i)
-    every = max(study.solver.every, -(-study.solver.steps // MOST_INSTANTS))
+    every = max(study.solver.every, -(-study.solver.steps // MAX_INSTANTS))
     with precision(study.dtype):
         loop = jax.tree.map(lambda x: jnp.asarray(x, study.dtype), loop)
         run = jax.device_get(rollout(loop, dataclasses.replace(study.solver, every=every), key=key))

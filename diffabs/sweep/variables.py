@@ -11,11 +11,11 @@ from diffabs.core.pytree import Spec
 from diffabs.core.values import any_number, entry, kebab, listed, members, plain, sound, table_of
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.discrete import Rows as Rows
-from diffabs.sweep.distributions import Distribution, Normal, leaving
-from diffabs.sweep.sampling import Design, Grid, LatinHypercube, Random, Sobol
+from diffabs.sweep.distributions import Distribution, Normal, describe_out_of_range
+from diffabs.sweep.sampling import Grid, LatinHypercube, Random, SamplingDesign, Sobol
 
-LEAST = 1e-10  # eigenvalue of a correlation matrix: below, its factor has no digits
-SAME = 1e-9  # relative, of entries that have to be equal
+MIN_CORRELATION_EIGENVALUE = 1e-10  # eigenvalue of a correlation matrix: below, its factor has no digits
+ENTRY_TOLERANCE = 1e-9  # relative, of entries that have to be equal
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -39,13 +39,13 @@ class Correlation:
             if not variance > 0:
                 raise ValueError(f"covariance: the variance of {path} = {variance:g} is not positive")
             marginal = (variables or {}).get(path)
-            if isinstance(marginal, Normal) and abs(marginal.deviation / np.sqrt(variance) - 1) > SAME:
+            if isinstance(marginal, Normal) and abs(marginal.deviation / np.sqrt(variance) - 1) > ENTRY_TOLERANCE:
                 root = f"{np.sqrt(variance):g}, the root of its variance in the covariance"
                 raise ValueError(f"{path}: deviation = {marginal.deviation:g} is not {root}")
         matrix = covariance / np.sqrt(np.outer(variances, variances))
         return Correlation(tuple(paths), tuple(map(tuple, matrix.tolist())))
 
-    def mixed(self, z: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def correlate(self, z: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """L z: independent standard normals of these paths, correlated."""
         factor = np.linalg.cholesky(np.asarray(self.matrix, float))
         # Term by term: a matrix product may round a sample differently in chunks of different lengths.
@@ -61,9 +61,9 @@ class Correlation:
                 yield f"{name}: {path} is named {self.paths.count(path)} times"
             if variables is not None and (path not in variables or isinstance(variables[path], Rows)):
                 yield f"{name}: {path} is not a variable with a distribution of its own"
-        yield from self._indefinite(name)
+        yield from self._matrix_problems(name)
 
-    def _indefinite(self, name: str) -> Iterator[str]:
+    def _matrix_problems(self, name: str) -> Iterator[str]:
         n = len(self.paths)
         try:
             matrix = np.asarray(self.matrix, float)
@@ -73,12 +73,13 @@ class Correlation:
             yield f"{name}: matrix needs {n} rows of {n} numbers, as many as paths"
         elif not np.isfinite(matrix).all():
             yield f"{name}: matrix is not finite"
-        elif not np.allclose(matrix, matrix.T, rtol=0, atol=SAME):
+        elif not np.allclose(matrix, matrix.T, rtol=0, atol=ENTRY_TOLERANCE):
             yield f"{name}: matrix is not symmetric"
-        elif not np.allclose(np.diag(matrix), 1, rtol=0, atol=SAME):
+        elif not np.allclose(np.diag(matrix), 1, rtol=0, atol=ENTRY_TOLERANCE):
             yield f"{name}: matrix has {np.diag(matrix).tolist()} on its diagonal, not ones"
-        elif (least := np.linalg.eigvalsh(matrix)[0]) < LEAST:
-            yield f"{name}: matrix is not positive definite: its least eigenvalue is {least:.3g}, below {LEAST:g}"
+        elif (least := np.linalg.eigvalsh(matrix)[0]) < MIN_CORRELATION_EIGENVALUE:
+            low = f"its least eigenvalue is {least:.3g}, below {MIN_CORRELATION_EIGENVALUE:g}"
+            yield f"{name}: matrix is not positive definite: {low}"
 
 
 def read_correlation(given: Any, where: str) -> Correlation:
@@ -86,8 +87,8 @@ def read_correlation(given: Any, where: str) -> Correlation:
     return sound(values.read(Correlation, given, where), where)
 
 
-def _variable(given: Any, where: str) -> Any:
-    return distributions.read(given, where, distributions.KINDS | {"rows": Rows})
+def _read_variable(given: Any, where: str) -> Any:
+    return distributions.read_distribution(given, where, distributions.DISTRIBUTION_TYPES | {"rows": Rows})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -95,9 +96,9 @@ class Space:
     """The variables of a sweep, in the order of the columns of its design. Those whose value is a `Distribution` are
     parameters, by path; `Rows` hold several and may have any name."""
 
-    variables: Mapping[str, Distribution | Rows] = entry(table_of(_variable))
+    variables: Mapping[str, Distribution | Rows] = entry(table_of(_read_variable))
     correlation: Correlation | None = entry(read_correlation, None)
-    design: Design = entry(sampling.read, Random)
+    design: SamplingDesign = entry(sampling.read_sampling_design, Random)
 
     @property
     def dimension(self) -> int:
@@ -107,7 +108,7 @@ class Space:
     @property
     def paths(self) -> tuple[str, ...]:
         """The parameters, in order."""
-        return tuple(path for name, item in self.variables.items() for path in _paths(name, item))
+        return tuple(path for name, item in self.variables.items() for path in _variable_paths(name, item))
 
     def check(self, samples: int | None = None) -> int:
         """How many samples the design has. Raises ValueError, in one line, for everything that is wrong."""
@@ -126,7 +127,7 @@ class Space:
         design = self.design.over(self.variables) if isinstance(self.design, Grid) else self.design
         u = self._columns(design.unit(seed, start, stop, self.dimension, count))
         z = (
-            self.correlation.mixed({name: ndtri(u[name]) for name in self.correlation.paths})
+            self.correlation.correlate({name: ndtri(u[name]) for name in self.correlation.paths})
             if self.correlation
             else {}
         )
@@ -134,14 +135,14 @@ class Space:
             name: item.from_normal(z[name]) if name in z else item.value(u[name])
             for name, item in self.variables.items()
         }
-        return _flat(drawn)
+        return _flatten_rows(drawn)
 
     def normal(self, z: Any) -> dict[str, np.ndarray]:
         """The values at independent standard normal coordinates z (n, dimension), correct to their last digits in both
         tails: an array for each path."""
         columns = self._columns(np.asarray(z, float))
-        columns |= self.correlation.mixed(columns) if self.correlation else {}
-        return _flat({name: item.from_normal(columns[name]) for name, item in self.variables.items()})
+        columns |= self.correlation.correlate(columns) if self.correlation else {}
+        return _flatten_rows({name: item.from_normal(columns[name]) for name, item in self.variables.items()})
 
     def _columns(self, points: np.ndarray) -> dict[str, np.ndarray]:
         return dict(zip(self.variables, np.ascontiguousarray(points.T), strict=True))
@@ -162,7 +163,7 @@ class Space:
             if not isinstance(self.design, Random | Sobol | LatinHypercube):
                 yield f"correlation: a {kebab(type(self.design).__name__)} design needs independent variables"
 
-    def leaving(self, specs: Mapping[str, Spec], prefix: str = "") -> Iterator[str]:
+    def describe_out_of_range(self, specs: Mapping[str, Spec], prefix: str = "") -> Iterator[str]:
         """A line for each parameter with one of these specs that can leave its range."""
         for name, item in self.variables.items():
             if isinstance(item, Rows):
@@ -170,7 +171,7 @@ class Space:
                     if path in specs and not specs[path].holds(column):
                         reached = f"{np.min(column):g} ... {np.max(column):g}"
                         yield f"{prefix}{name}: column {path} = {reached} leaves {specs[path].interval()}"
-            elif name in specs and (line := leaving(item, specs[name], prefix + name)):
+            elif name in specs and (line := describe_out_of_range(item, specs[name], prefix + name)):
                 yield line
 
     def table(self) -> dict[str, Any]:
@@ -180,17 +181,17 @@ class Space:
         return {"variables": variables, **correlation, "design": plain(self.design, brief=True)}
 
 
-def read(given: Any, where: str) -> Space:
+def read_space(given: Any, where: str) -> Space:
     """The space of a table with `variables`, and maybe `correlation` and `design`. Raises ScenarioError, in one line,
     for whatever is wrong with one of them; `Space.check` says what is wrong with them together."""
     return values.read(Space, given, where)
 
 
-def _paths(name: str, item: Any) -> tuple[str, ...]:
+def _variable_paths(name: str, item: Any) -> tuple[str, ...]:
     return tuple(item.columns) if isinstance(item, Rows) else (name,)
 
 
-def _flat(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _flatten_rows(values: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """The columns of rows in the place of their variable."""
     flat = {}
     for name, drawn in values.items():

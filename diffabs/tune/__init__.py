@@ -11,18 +11,18 @@ if TYPE_CHECKING:
     from diffabs.tune.constraints import AtMost as AtMost
     from diffabs.tune.constraints import CertifiedDecay as CertifiedDecay
     from diffabs.tune.constraints import Poles as Poles
-    from diffabs.tune.descent import Point as Point
+    from diffabs.tune.descent import DescentPoint as DescentPoint
     from diffabs.tune.descent import Stopping as Stopping
     from diffabs.tune.problem import Mode as Mode
     from diffabs.tune.result import Method as Method
-    from diffabs.tune.result import Progress as Progress
     from diffabs.tune.result import StartError as StartError
     from diffabs.tune.result import Tuned as Tuned
+    from diffabs.tune.result import TuningProgress as TuningProgress
     from diffabs.tune.risk import CVaR as CVaR
     from diffabs.tune.risk import Mean as Mean
     from diffabs.tune.risk import Quantile as Quantile
     from diffabs.tune.risk import SmoothWorst as SmoothWorst
-    from diffabs.tune.tuning import posed as posed
+    from diffabs.tune.tuning import build_problem as build_problem
     from diffabs.tune.tuning import tune as tune
     from diffabs.tune.worst import WorstCase as WorstCase
     from diffabs.tune.worst import worst_case as worst_case

@@ -16,24 +16,24 @@ import optax
 
 from diffabs.core.reason import Reason
 from diffabs.simulate.engine import describe_engine
-from diffabs.tune.descent import Descent, Lane, Optimiser, Point, at, lbfgs
-from diffabs.tune.problem import Multipliers, Problem, Seen
-from diffabs.tune.result import Method, Progress, Start, StartError, Tuned
+from diffabs.tune.descent import Descent, DescentPoint, DescentState, Optimiser, lbfgs, slice_start
+from diffabs.tune.problem import Multipliers, ObjectiveEvaluation, Problem
+from diffabs.tune.result import Method, StartError, StartResult, Tuned, TuningProgress
 
-PENALTY = 10.0  # at first; the loss is of the order of one
-HARDER = 4.0  # how much the penalty grows where the violation does not shrink enough
-SHRINK = 0.3
-HARDEST = 1e7
+FIRST_PENALTY = 10.0  # at first; the loss is of the order of one
+PENALTY_GROWTH = 4.0  # how much the penalty grows where the violation does not shrink enough
+MAX_VIOLATION_RATIO = 0.3
+MAX_PENALTY = 1e7
 
 
-class Search:
+class AugmentedLagrangianSearch:
     """Descents under multipliers that are raised until the constraints hold."""
 
     def __init__(
         self,
         problem: Problem,
         method: Method,
-        progress: Callable[[Progress], None] | None,
+        progress: Callable[[TuningProgress], None] | None,
         stopping: Callable[[], bool] = lambda: False,
     ):
         """Starts: the subject itself, and as many random ones as the method asks for. Raises StartError if the subject
@@ -46,14 +46,16 @@ class Search:
         drawn = problem.space.spread(jax.random.key(method.seed), method.starts - 1)
         self.starts = np.concatenate([own, drawn])
         alike = np.repeat(own, len(self.starts), axis=0)  # one program serves this and the search
-        self.before: Seen = jax.device_get(at(problem.evaluator(1.0)(alike, self._multipliers()).seen, 0))
+        self.before: ObjectiveEvaluation = jax.device_get(
+            slice_start(problem.evaluator(1.0)(alike, self._multipliers()).seen, 0)
+        )
         if self.refused:  # its numbers mean nothing
             self.before = jax.tree.map(lambda x: np.full(np.shape(x), np.nan), self.before)._replace(diverged=0)
         size = abs(float(self.before.objective))
         self.scale = size if np.isfinite(size) and size > 0 else 1.0
         self.round = 0
-        self.earlier: list[list[Point]] = [[] for _ in self.starts]  # points of the rounds before
-        self.best: Lane | None = None  # so far, as it was when it was met
+        self.earlier: list[list[DescentPoint]] = [[] for _ in self.starts]  # points of the rounds before
+        self.best: DescentState | None = None  # so far, as it was when it was met
 
     def result(self) -> Tuned:
         """Raises StartError if no start could be left."""
@@ -73,56 +75,64 @@ class Search:
             self._told,
             self.stopping,
         )
-        lanes = self._rounds(descent)
-        usable = [lane for lane in lanes if lane.reason is not Reason.START]
+        descent_states = self._run_rounds(descent)
+        usable = [descent_state for descent_state in descent_states if descent_state.reason is not Reason.START]
         if not usable:
-            raise StartError(f"{Reason.START.value}: {self._unusable()}")
-        for lane in usable:
-            lane.go_back()
-        best = min(usable, key=lambda lane: self._rank(lane.history[-1]))
+            raise StartError(f"{Reason.START.value}: {self._describe_failure()}")
+        for descent_state in usable:
+            descent_state.go_back()
+        best = min(usable, key=lambda descent_state: self._rank(descent_state.history[-1]))
         if self.stopping() and self.best:
             best = dataclasses.replace(self.best, reason=Reason.INTERRUPTED)
-        return self._tuned(best, lanes)
+        return self._build_result(best, descent_states)
 
-    def _rounds(self, descent: Descent) -> list[Lane]:
+    def _run_rounds(self, descent: Descent) -> list[DescentState]:
         m = self._multipliers()
-        lanes = descent.run(self.starts, m)
+        descent_states = descent.run(self.starts, m)
         if not self.problem.excesses:
-            return lanes
-        worst = _violations(lanes)
+            return descent_states
+        worst = _violations(descent_states)
         while self.round < self.method.rounds and not all(w <= 0 for w in worst):
             if self.stopping():
                 break
             self.round += 1
-            m = _raised(m, lanes)
-            self.earlier = [lane.history for lane in lanes]
-            last, lanes = lanes, descent.run(np.stack([lane.z for lane in lanes]), m)
-            for before, lane in zip(last, lanes, strict=True):
-                lane.history = _continued(before.history, lane.history)
-                lane.keep(before.kept)
-            m, worst = _harder(m, worst, _violations(lanes)), _violations(lanes)
-        return lanes
+            m = _raise_multipliers(m, descent_states)
+            self.earlier = [descent_state.history for descent_state in descent_states]
+            last, descent_states = (
+                descent_states,
+                descent.run(np.stack([descent_state.z for descent_state in descent_states]), m),
+            )
+            for before, descent_state in zip(last, descent_states, strict=True):
+                descent_state.history = _join_histories(before.history, descent_state.history)
+                descent_state.keep(before.kept)
+            m, worst = _raise_penalty(m, worst, _violations(descent_states)), _violations(descent_states)
+        return descent_states
 
     def _multipliers(self) -> Multipliers:
         """At the start."""
         count, k = len(self.starts), self.problem.excesses
-        return Multipliers(np.zeros((count, k)), np.full(count, PENALTY), np.full(count, self.method.margin))
+        return Multipliers(np.zeros((count, k)), np.full(count, FIRST_PENALTY), np.full(count, self.method.margin))
 
-    def _rank(self, point: Point) -> tuple[bool, float]:
+    def _rank(self, point: DescentPoint) -> tuple[bool, float]:
         """Those that meet the constraints first."""
         met = point.violation <= 0
         return not met, point.objective if met else point.violation
 
-    def _told(self, lanes: list[Lane]) -> None:
-        for before, lane in zip(self.earlier, lanes, strict=True):
-            better = self.best is None or self._rank(lane.history[-1]) < self._rank(self.best.history[-1])
-            if better and lane.reason is not Reason.START:
-                self.best = dataclasses.replace(lane, history=_continued(before, lane.history))
+    def _told(self, descent_states: list[DescentState]) -> None:
+        for before, descent_state in zip(self.earlier, descent_states, strict=True):
+            better = self.best is None or self._rank(descent_state.history[-1]) < self._rank(self.best.history[-1])
+            if better and descent_state.reason is not Reason.START:
+                self.best = dataclasses.replace(descent_state, history=_join_histories(before, descent_state.history))
         if self.progress:
-            best = min((lane.history[-1] for lane in lanes), key=lambda p: (not np.isfinite(p.loss), *self._rank(p)))
-            self.progress(Progress(self.round, sum(lane.reason is None for lane in lanes), best))
+            best = min(
+                (descent_state.history[-1] for descent_state in descent_states),
+                key=lambda p: (not np.isfinite(p.loss), *self._rank(p)),
+            )
+            self.progress(
+                TuningProgress(self.round, sum(descent_state.reason is None for descent_state in descent_states), best)
+            )
 
-    def _unusable(self) -> str:
+    def _describe_failure(self) -> str:
         worst = int(self.before.diverged)
         if not worst and np.isinf(self.before.objective):
             return "the objective is infinite there: a run never settles; start from one that does, or take iae"
@@ -132,11 +142,15 @@ class Search:
             else self.refused or f"solver.step = {self.problem.solver.step:g} s"
         )
 
-    def _tuned(self, best: Lane, lanes: list[Lane]) -> Tuned:
-        def start(lane: Lane) -> Start:
-            last = lane.history[-1]
-            return Start(
-                self._values(lane.z), last.objective, last.violation, lane.reason or Reason.LIMIT, lane.history
+    def _build_result(self, best: DescentState, descent_states: list[DescentState]) -> Tuned:
+        def start(descent_state: DescentState) -> StartResult:
+            last = descent_state.history[-1]
+            return StartResult(
+                self._values(descent_state.z),
+                last.objective,
+                last.violation,
+                descent_state.reason or Reason.LIMIT,
+                descent_state.history,
             )
 
         last = best.history[-1]
@@ -152,7 +166,7 @@ class Search:
             met=last.violation <= 0,
             reason=best.reason or Reason.LIMIT,
             history=best.history,
-            starts=[start(lane) for lane in lanes],
+            starts=[start(descent_state) for descent_state in descent_states],
             mode=self.problem.mode,
             diverged=(int(self.before.diverged), int(best.seen.diverged)),
             engine=describe_engine(self.problem.engine),
@@ -162,23 +176,23 @@ class Search:
         return {path: np.asarray(value) for path, value in self.problem.space.values(z).items()}
 
 
-def _violations(lanes: list[Lane]) -> np.ndarray:
-    return np.array([lane.history[-1].violation for lane in lanes])
+def _violations(descent_states: list[DescentState]) -> np.ndarray:
+    return np.array([descent_state.history[-1].violation for descent_state in descent_states])
 
 
-def _raised(m: Multipliers, lanes: list[Lane]) -> Multipliers:
+def _raise_multipliers(m: Multipliers, descent_states: list[DescentState]) -> Multipliers:
     """m <- max(0, m + c (g + d))."""
-    excess = np.stack([lane.seen.excess for lane in lanes]) + m.margin[:, None]
+    excess = np.stack([descent_state.seen.excess for descent_state in descent_states]) + m.margin[:, None]
     return m._replace(values=np.maximum(0.0, m.values + m.penalty[:, None] * np.nan_to_num(excess)))
 
 
-def _harder(m: Multipliers, before: np.ndarray, after: np.ndarray) -> Multipliers:
+def _raise_penalty(m: Multipliers, before: np.ndarray, after: np.ndarray) -> Multipliers:
     """A greater penalty where the violation has not become much smaller."""
-    slow = after > SHRINK * before
-    return m._replace(penalty=np.minimum(np.where(slow, HARDER * m.penalty, m.penalty), HARDEST))
+    slow = after > MAX_VIOLATION_RATIO * before
+    return m._replace(penalty=np.minimum(np.where(slow, PENALTY_GROWTH * m.penalty, m.penalty), MAX_PENALTY))
 
 
-def _continued(before: list[Point], history: list[Point]) -> list[Point]:
+def _join_histories(before: list[DescentPoint], history: list[DescentPoint]) -> list[DescentPoint]:
     """The history of a start over its rounds."""
     if not before:
         return list(history)

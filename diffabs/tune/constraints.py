@@ -12,7 +12,7 @@ from diffabs.design.interior.differentiable import certified_decay
 from diffabs.design.polytopes import Polytope
 from diffabs.design.state_feedback import feedback_gain
 
-DEAD = 1e-9  # |z| of a discrete pole that decays at once
+MIN_POLE_MAGNITUDE = 1e-9  # |z| of a discrete pole that decays at once
 
 
 class Constraint(Protocol):
@@ -64,10 +64,10 @@ class Poles:
 
     def _modes(self, loop: Loop) -> tuple[Any, Any]:
         """Re s and -Re s/|s| of the poles (V, n)."""
-        modes = jnp.linalg.eigvals(_closed(self.system, loop))
+        modes = jnp.linalg.eigvals(_closed_loop_matrices(self.system, loop))
         if self.system.period is not None:
-            alive = jnp.abs(modes) > DEAD  # the rest decays at once
-            modes = jnp.log(jnp.where(alive, modes, DEAD)) / self.system.period
+            alive = jnp.abs(modes) > MIN_POLE_MAGNITUDE  # the rest decays at once
+            modes = jnp.log(jnp.where(alive, modes, MIN_POLE_MAGNITUDE)) / self.system.period
         real = modes.real
         return real, -real / jnp.sqrt(real**2 + modes.imag**2)
 
@@ -89,7 +89,7 @@ class CertifiedDecay:
         return ((self.decay - proved) / max(abs(self.decay), 1.0))[None]
 
 
-def _closed(system: Polytope, loop: Loop) -> Any:
+def _closed_loop_matrices(system: Polytope, loop: Loop) -> Any:
     """A + B K (V, n, n), K the loop's."""
     gain = feedback_gain(loop, system.states)
     return jnp.asarray(system.A) + jnp.asarray(system.B) @ gain[None, :]

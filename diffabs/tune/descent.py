@@ -19,15 +19,15 @@ import numpy as np
 import optax
 
 from diffabs.core.reason import Reason
-from diffabs.tune.problem import Evaluation, Multipliers
+from diffabs.tune.problem import LossEvaluation, Multipliers
 
-ARMIJO, WOLFE = 1e-4, 0.9
-SHORTEST = 1e-10  # of t
-EXPANSION = 4.0
-TRIALS = 12  # of a line search that has found something better, before it is content with that
-JUMPS = 2  # such searches in a row: no point beyond is better, so the loss jumps there and its gradient is no guide
-LONGEST = 2.0  # of a component of u, in units of z: about half of a finite range
-PATIENCE = 3  # accepted steps in a row that gain nothing
+ARMIJO_FRACTION, WOLFE_FRACTION = 1e-4, 0.9
+MIN_STEP_FACTOR = 1e-10  # of t
+STEP_EXPANSION = 4.0
+MAX_TRIALS = 12  # of a line search that has found something better, before it is content with that
+MAX_JUMPS = 2  # such searches in a row: no point beyond is better, so the loss jumps there and its gradient is no guide
+MAX_UPDATE_COMPONENT = 2.0  # of a component of u, in units of z: about half of a finite range
+MAX_IDLE_STEPS = 3  # accepted steps in a row that gain nothing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Stopping:
     iterations: int = 100
 
 
-class Point(NamedTuple):
+class DescentPoint(NamedTuple):
     """A line of a history."""
 
     iteration: int
@@ -51,16 +51,16 @@ class Point(NamedTuple):
     evaluations: int  # so far, rejected ones included
 
 
-class Kept(NamedTuple):
+class FeasiblePoint(NamedTuple):
     """A step that meets every constraint."""
 
     z: np.ndarray
     seen: Any
-    point: Point
+    point: DescentPoint
 
 
 @dataclasses.dataclass
-class Lane:
+class DescentState:
     """One start on its way."""
 
     z: np.ndarray
@@ -78,14 +78,14 @@ class Lane:
     evaluations: int = 1
     iterations: int = 0
     reason: Reason | None = None
-    history: list[Point] = dataclasses.field(default_factory=list)
-    kept: Kept | None = None  # the best step so far that meets every constraint
+    history: list[DescentPoint] = dataclasses.field(default_factory=list)
+    kept: FeasiblePoint | None = None  # the best step so far that meets every constraint
 
     def note(self) -> None:
         """Add the present point to the history, and keep it if it is the best that meets the constraints."""
         worst = float(np.max(self.seen.excess, initial=0.0))
         self.history.append(
-            Point(
+            DescentPoint(
                 self.iterations,
                 float(self.seen.objective),
                 self.loss,
@@ -95,9 +95,9 @@ class Lane:
             )
         )
         if worst <= 0:
-            self.keep(Kept(self.z, self.seen, self.history[-1]))
+            self.keep(FeasiblePoint(self.z, self.seen, self.history[-1]))
 
-    def keep(self, other: Kept | None) -> None:
+    def keep(self, other: FeasiblePoint | None) -> None:
         """The better of two."""
         if other and not (self.kept and self.kept.point.objective <= other.point.objective):
             self.kept = other
@@ -124,7 +124,7 @@ def lbfgs(memory: int = 10) -> Optimiser:
     return Optimiser(optax.with_extra_args_support(chain), True)
 
 
-Evaluate = Callable[[Any, Multipliers], Evaluation]
+Evaluate = Callable[[Any, Multipliers], LossEvaluation]
 
 
 class Descent:
@@ -137,7 +137,7 @@ class Descent:
         steady: Callable[[np.ndarray], np.ndarray],
         optimiser: Optimiser,
         stopping: Stopping,
-        told: Callable[[list[Lane]], None],
+        told: Callable[[list[DescentState]], None],
         interrupted: Callable[[], bool] = lambda: False,
     ):
         """`loss` is that of one start, for optimisers that search on their own; `told` is called with all starts after
@@ -153,126 +153,154 @@ class Descent:
 
         self._update = jax.jit(jax.vmap(update))
 
-    def run(self, starts: np.ndarray, multipliers: Multipliers) -> list[Lane]:
+    def run(self, starts: np.ndarray, multipliers: Multipliers) -> list[DescentState]:
         """Every start to its end."""
         self.multipliers = multipliers
-        first, fine = self._evaluated(starts)
-        lanes = [
-            Lane(z, float(first.loss[i]), first.gradient[i], at(first.seen, i), np.zeros_like(z))
+        first, fine = self._evaluate_at(starts)
+        descent_states = [
+            DescentState(z, float(first.loss[i]), first.gradient[i], slice_start(first.seen, i), np.zeros_like(z))
             for i, z in enumerate(starts)
         ]
-        for lane, ok in zip(lanes, fine, strict=True):
-            lane.reason = self._finished(lane) if ok else Reason.START
-            lane.note()
+        for descent_state, ok in zip(descent_states, fine, strict=True):
+            descent_state.reason = self._finish_reason(descent_state) if ok else Reason.START
+            descent_state.note()
         self.states = self._init(jnp.asarray(starts))
-        self._propose(lanes, [lane.reason is None for lane in lanes])
-        self.told(lanes)
-        while any(lane.reason is None for lane in lanes) and not self.interrupted():
-            self._round(lanes)
-            self.told(lanes)
-        for lane in lanes:
-            lane.reason = lane.reason or Reason.INTERRUPTED
-        return lanes
+        self._propose(descent_states, [descent_state.reason is None for descent_state in descent_states])
+        self.told(descent_states)
+        while any(descent_state.reason is None for descent_state in descent_states) and not self.interrupted():
+            self._try_steps(descent_states)
+            self.told(descent_states)
+        for descent_state in descent_states:
+            descent_state.reason = descent_state.reason or Reason.INTERRUPTED
+        return descent_states
 
-    def _round(self, lanes: list[Lane]) -> None:
-        trials = np.stack([lane.z + lane.t * lane.update for lane in lanes])
-        found, fine = self._evaluated(trials)
+    def _try_steps(self, descent_states: list[DescentState]) -> None:
+        trials = np.stack(
+            [descent_state.z + descent_state.t * descent_state.update for descent_state in descent_states]
+        )
+        found, fine = self._evaluate_at(trials)
         moved = []
-        for i, lane in enumerate(lanes):
-            taken = self._judged(lane, fine[i], trials[i], at(found, i)) if lane.reason is None else None
+        for i, descent_state in enumerate(descent_states):
+            taken = (
+                self._judged(descent_state, fine[i], trials[i], slice_start(found, i))
+                if descent_state.reason is None
+                else None
+            )
             if taken:
-                self._take(lane, *taken)
-            moved.append(taken is not None and lane.reason is None)
-        self._propose(lanes, moved)
+                self._take(descent_state, *taken)
+            moved.append(taken is not None and descent_state.reason is None)
+        self._propose(descent_states, moved)
 
-    def _evaluated(self, z: np.ndarray) -> tuple[Evaluation, np.ndarray]:
+    def _evaluate_at(self, z: np.ndarray) -> tuple[LossEvaluation, np.ndarray]:
         """Evaluation, and which of them may be used."""
         found = jax.device_get(self.evaluate(jnp.asarray(z), self.multipliers))
         fine = np.isfinite(found.loss) & np.isfinite(found.gradient).all(axis=1) & (found.seen.diverged == 0)
         return found, fine & self.steady(z)
 
-    def _judged(self, lane: Lane, fine: bool, z: np.ndarray, found: Evaluation) -> tuple[np.ndarray, Evaluation] | None:
+    def _judged(
+        self, descent_state: DescentState, fine: bool, z: np.ndarray, found: LossEvaluation
+    ) -> tuple[np.ndarray, LossEvaluation] | None:
         """The point to go to; or None, and another step to try."""
-        lane.evaluations += 1
-        lane.trials += 1
-        slope = float(lane.gradient @ lane.update)
-        longest = lane.t * np.max(np.abs(lane.update)) >= LONGEST * (1 - 1e-9)
+        descent_state.evaluations += 1
+        descent_state.trials += 1
+        slope = float(descent_state.gradient @ descent_state.update)
+        longest = descent_state.t * np.max(np.abs(descent_state.update)) >= MAX_UPDATE_COMPONENT * (1 - 1e-9)
         if fine and not self.searches:
             return z, found
-        if not fine or float(found.loss) > lane.loss + ARMIJO * lane.t * slope:
-            lane.high = lane.t
-        elif float(found.gradient @ lane.update) < WOLFE * slope and not longest:
-            lane.low, lane.better = lane.t, (z, found)
+        if not fine or float(found.loss) > descent_state.loss + ARMIJO_FRACTION * descent_state.t * slope:
+            descent_state.high = descent_state.t
+        elif float(found.gradient @ descent_state.update) < WOLFE_FRACTION * slope and not longest:
+            descent_state.low, descent_state.better = descent_state.t, (z, found)
         else:
-            lane.jumps = 0
+            descent_state.jumps = 0
             return z, found
-        if lane.better and lane.trials >= TRIALS:
-            lane.jumps += np.isfinite(lane.high)
-            return lane.better
-        lane.t = _next(lane, float(found.loss) if fine else np.inf, slope)
-        if lane.t < SHORTEST:
-            lane.reason = Reason.STEP
+        if descent_state.better and descent_state.trials >= MAX_TRIALS:
+            descent_state.jumps += np.isfinite(descent_state.high)
+            return descent_state.better
+        descent_state.t = _next_step_factor(descent_state, float(found.loss) if fine else np.inf, slope)
+        if descent_state.t < MIN_STEP_FACTOR:
+            descent_state.reason = Reason.STEP
         return None
 
-    def _take(self, lane: Lane, z: np.ndarray, found: Evaluation) -> None:
-        gained = abs(lane.loss - float(found.loss))
-        lane.idle = lane.idle + 1 if gained <= self.stopping.change * max(abs(lane.loss), 1e-12) else 0
-        lane.z, lane.loss, lane.gradient, lane.seen = z, float(found.loss), found.gradient, found.seen
-        lane.t, lane.low, lane.high, lane.better, lane.trials = 1.0, 0.0, np.inf, None, 0
-        lane.iterations += 1
-        lane.note()
-        lane.reason = self._finished(lane)
+    def _take(self, descent_state: DescentState, z: np.ndarray, found: LossEvaluation) -> None:
+        gained = abs(descent_state.loss - float(found.loss))
+        descent_state.idle = (
+            descent_state.idle + 1 if gained <= self.stopping.change * max(abs(descent_state.loss), 1e-12) else 0
+        )
+        descent_state.z, descent_state.loss, descent_state.gradient, descent_state.seen = (
+            z,
+            float(found.loss),
+            found.gradient,
+            found.seen,
+        )
+        descent_state.t, descent_state.low, descent_state.high, descent_state.better, descent_state.trials = (
+            1.0,
+            0.0,
+            np.inf,
+            None,
+            0,
+        )
+        descent_state.iterations += 1
+        descent_state.note()
+        descent_state.reason = self._finish_reason(descent_state)
 
-    def _finished(self, lane: Lane) -> Reason | None:
-        if np.max(np.abs(lane.gradient)) <= self.stopping.gradient:
+    def _finish_reason(self, descent_state: DescentState) -> Reason | None:
+        if np.max(np.abs(descent_state.gradient)) <= self.stopping.gradient:
             return Reason.GRADIENT
-        if lane.idle >= PATIENCE:
+        if descent_state.idle >= MAX_IDLE_STEPS:
             return Reason.CHANGE
-        if lane.jumps >= JUMPS:
+        if descent_state.jumps >= MAX_JUMPS:
             return Reason.JUMP
-        return Reason.LIMIT if lane.iterations >= self.stopping.iterations else None
+        return Reason.LIMIT if descent_state.iterations >= self.stopping.iterations else None
 
-    def _propose(self, lanes: list[Lane], fresh: list[bool]) -> None:
+    def _propose(self, descent_states: list[DescentState], fresh: list[bool]) -> None:
         """New updates for the starts that have moved; the others keep theirs."""
         if not any(fresh):
             return
-        z, g = (jnp.stack([getattr(lane, name) for lane in lanes]) for name in ("z", "gradient"))
-        loss = jnp.array([lane.loss for lane in lanes])
+        z, g = (
+            jnp.stack([getattr(descent_state, name) for descent_state in descent_states]) for name in ("z", "gradient")
+        )
+        loss = jnp.array([descent_state.loss for descent_state in descent_states])
         g = jnp.where(jnp.isfinite(g), g, 0.0)
         updates, states = self._update(g, self.states, z, loss, self.multipliers)
         updates = np.array(updates)
-        bad = [self.searches and not _descends(u, lane.gradient) for u, lane in zip(updates, lanes, strict=True)]
+        bad = [
+            self.searches and not _is_descent_direction(u, descent_state.gradient)
+            for u, descent_state in zip(updates, descent_states, strict=True)
+        ]
         if any(b and f for b, f in zip(bad, fresh, strict=True)):
             again, restarted = self._update(g, self._init(z), z, loss, self.multipliers)
             updates = np.where(np.array(bad)[:, None], again, updates)
-            states = _chosen(np.array(bad), restarted, states)
-        self.states = _chosen(np.array(fresh), states, self.states)
-        for lane, update, new in zip(lanes, updates, fresh, strict=True):
+            states = _select_by_start(np.array(bad), restarted, states)
+        self.states = _select_by_start(np.array(fresh), states, self.states)
+        for descent_state, update, new in zip(descent_states, updates, fresh, strict=True):
             if new:
-                lane.update = update * min(1.0, LONGEST / max(float(np.max(np.abs(update))), 1e-300))
+                descent_state.update = update * min(
+                    1.0, MAX_UPDATE_COMPONENT / max(float(np.max(np.abs(update))), 1e-300)
+                )
 
 
-def _next(lane: Lane, loss: float, slope: float) -> float:
+def _next_step_factor(descent_state: DescentState, loss: float, slope: float) -> float:
     """The next step of a line search: longer, or between what is too short and what is too long; there the minimum of
     the parabola through what is known, where nothing is known to be too short."""
-    if not np.isfinite(lane.high):
-        return min(EXPANSION * lane.t, LONGEST / float(np.max(np.abs(lane.update))))
-    if lane.low > 0 or not np.isfinite(loss):
-        return 0.5 * (lane.low + lane.high) if lane.low > 0 else 0.25 * lane.high
-    bend = loss - lane.loss - lane.t * slope
-    return lane.t * min(0.5, max(0.1, -slope * lane.t / (2 * bend)))
+    if not np.isfinite(descent_state.high):
+        return min(STEP_EXPANSION * descent_state.t, MAX_UPDATE_COMPONENT / float(np.max(np.abs(descent_state.update))))
+    if descent_state.low > 0 or not np.isfinite(loss):
+        return 0.5 * (descent_state.low + descent_state.high) if descent_state.low > 0 else 0.25 * descent_state.high
+    bend = loss - descent_state.loss - descent_state.t * slope
+    return descent_state.t * min(0.5, max(0.1, -slope * descent_state.t / (2 * bend)))
 
 
-def _descends(update: np.ndarray, gradient: np.ndarray) -> bool:
+def _is_descent_direction(update: np.ndarray, gradient: np.ndarray) -> bool:
     size = np.linalg.norm(update) * np.linalg.norm(gradient)
     return bool(np.isfinite(size) and update @ gradient < -1e-10 * size)
 
 
-def _chosen(which: np.ndarray, a: Any, b: Any) -> Any:
+def _select_by_start(which: np.ndarray, a: Any, b: Any) -> Any:
     """Start by start, a or b."""
     return jax.tree.map(lambda x, y: jnp.where(which.reshape(-1, *[1] * (jnp.ndim(x) - 1)), x, y), a, b)
 
 
-def at(tree: Any, i: int) -> Any:
+def slice_start(tree: Any, i: int) -> Any:
     """Return what is said of one start."""
     return jax.tree.map(lambda x: x[i], tree)

@@ -14,13 +14,13 @@ from diffabs.core.loop import Loop
 from diffabs.core.pytree import arrayed, replace
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.solution import FixedStep, Solver
-from diffabs.tune.problem import built
+from diffabs.tune.problem import build_subject_loop
 
-ROUNDING = 64.0  # precisions: numbers that are equal
+EQUAL_ROUNDING_STEPS = 64.0  # precisions: numbers that are equal
 ADVICE = "a search may end there without a minimum: start it from other values, or hold one of these parameters"
 
 
-def pairs(loop: Loop, solver: Solver) -> Iterator[tuple[str, Any, Any]]:
+def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, Any, Any]]:
     """Yield, for each point of `loop` with a one-sided derivative, its name and the two numbers that are equal there.
 
     The name depends on the parts of the loop alone, so both numbers may be traced."""
@@ -57,16 +57,16 @@ def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, 
 
     def compared(values: Mapping[str, Any]) -> Any:
         """Both numbers of each pair in each run, (2, runs, pairs)."""
-        loop = arrayed(built(replace(subject, values)))
-        both = batch.each(loop, lambda loop, _: [jnp.stack(two) for _, *two in pairs(loop, solver)])
+        loop = arrayed(build_subject_loop(replace(subject, values)))
+        both = batch.each(loop, lambda loop, _: [jnp.stack(two) for _, *two in one_sided_candidates(loop, solver)])
         return jnp.moveaxis(jnp.stack(both, axis=1), 2, 0)
 
-    names = [name for name, *_ in pairs(built(subject), solver)]
+    names = [name for name, *_ in one_sided_candidates(build_subject_loop(subject), solver)]
     if not names:
         return
     values = {path: jnp.asarray(value, float) for path, value in values.items()}
     x, y = np.asarray(compared(values))
-    small = ROUNDING * np.finfo(x.dtype).eps
+    small = EQUAL_ROUNDING_STEPS * np.finfo(x.dtype).eps
     equal = np.isfinite(x) & np.isclose(x, y, rtol=small, atol=0.0)
     if not equal.any():
         return

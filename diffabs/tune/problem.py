@@ -31,9 +31,9 @@ from diffabs.simulate.solution import Run, Solver
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.risk import Aggregate
 
-FEWEST = 64  # lanes from which on their runs take longer than compiling them
-REVERSE = "a kernel has no reverse mode; forward mode, or engine = 'xla'"
-FEW = 6  # parameters up to which forward mode is the cheaper one (benchmarks/bench_gradient.py)
+MAX_QUICK_COMPILE_RUNS = 64  # lanes from which on their runs take longer than compiling them
+NO_REVERSE_MESSAGE = "a kernel has no reverse mode; forward mode, or engine = 'xla'"
+MAX_FORWARD_PARAMETERS = 6  # parameters up to which forward mode is the cheaper one (benchmarks/bench_gradient.py)
 
 
 class Mode(enum.Enum):
@@ -43,7 +43,7 @@ class Mode(enum.Enum):
     REVERSE = "reverse"
 
 
-class Seen(NamedTuple):
+class ObjectiveEvaluation(NamedTuple):
     """What is known at one z: objective J, excesses (k,), how many lanes diverged, the metrics of every lane."""
 
     objective: Any
@@ -52,12 +52,12 @@ class Seen(NamedTuple):
     metrics: dict[str, Any]
 
 
-class Evaluation(NamedTuple):
+class LossEvaluation(NamedTuple):
     """Loss, its gradient (p,), and what was seen; with a leading axis of starts where there are several."""
 
     loss: Any
     gradient: Any
-    seen: Seen
+    seen: ObjectiveEvaluation
 
 
 class Multipliers(NamedTuple):
@@ -68,7 +68,7 @@ class Multipliers(NamedTuple):
     margin: Any = None
 
 
-def built(subject: Any) -> Loop:
+def build_subject_loop(subject: Any) -> Loop:
     """The loop that a part stands for: itself, or what its method `closed()` makes of its parameters."""
     return subject if isinstance(subject, Loop) else subject.closed()
 
@@ -92,10 +92,10 @@ class Problem:
     def runs(self, z: Any) -> Run:
         """All lanes at z, without trajectories."""
         together = True if self.engine == "xla" else None
-        loop = built(self.space.at(self.subject, z))
+        loop = build_subject_loop(self.space.at(self.subject, z))
         return run_batch(loop, self.batch, self.solver, self.measured, together=together, engine=self.engine)
 
-    def by(self, engine: str, mode: Mode | None = None) -> "Problem":
+    def with_engine(self, engine: str, mode: Mode | None = None) -> "Problem":
         """Return the problem whose runs are made by this engine; "auto" is a kernel if it can be one, and tells the log
         once why it is not. Of a kernel the mode is forward, if none is asked for.
 
@@ -104,7 +104,7 @@ class Problem:
             raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}")
         if engine == "xla":
             return self
-        line = REVERSE if mode is Mode.REVERSE else None
+        line = NO_REVERSE_MESSAGE if mode is Mode.REVERSE else None
         found = dataclasses.replace(self, engine="kernel", mode=Mode.FORWARD)
         if engine == "kernel" and line:
             raise EngineError.of(line)
@@ -126,37 +126,39 @@ class Problem:
             return str(EngineError.of(error))
         return None
 
-    def seen(self, z: Any) -> Seen:
+    def seen(self, z: Any) -> ObjectiveEvaluation:
         """Objective and excesses at z."""
         runs = self.runs(z)
         each = sum(weight * runs.metrics[name] for name, weight in self.weights.items())
         each = each if self.batch.weights is None else each * jnp.asarray(self.batch.weights)
-        loop = built(self.space.at(self.subject, z))
+        loop = build_subject_loop(self.space.at(self.subject, z))
         excess = self._excess(loop, runs.metrics)
-        return Seen(self.aggregate(jnp.asarray(each)), excess, jnp.sum(runs.diverged), runs.metrics)
+        return ObjectiveEvaluation(self.aggregate(jnp.asarray(each)), excess, jnp.sum(runs.diverged), runs.metrics)
 
     @functools.cached_property
     def excesses(self) -> int:
         """How many excesses there are."""
         lanes = {name: jax.ShapeDtypeStruct((self.batch.size,), jnp.result_type(float)) for name in self.measured}
         z = self.space.place(self.subject)
-        return jax.eval_shape(lambda metrics: self._excess(built(self.space.at(self.subject, z)), metrics), lanes).size
+        return jax.eval_shape(
+            lambda metrics: self._excess(build_subject_loop(self.space.at(self.subject, z)), metrics), lanes
+        ).size
 
     def _excess(self, loop: Loop, metrics: dict[str, Any]) -> Any:
         excess = [jnp.ravel(c.excess(loop, metrics)) for c in self.constraints]
         return jnp.concatenate(excess) if excess else jnp.zeros(0)
 
-    def loss(self, scale: Any) -> Callable[[Any, Multipliers], tuple[Any, tuple[Any, Seen]]]:
+    def loss(self, scale: Any) -> Callable[[Any, Multipliers], tuple[Any, tuple[Any, ObjectiveEvaluation]]]:
         """(z, multipliers) -> L, and (L, what was seen)."""
 
-        def loss(z: Any, m: Multipliers) -> tuple[Any, tuple[Any, Seen]]:
+        def loss(z: Any, m: Multipliers) -> tuple[Any, tuple[Any, ObjectiveEvaluation]]:
             seen = self.seen(z)
             value = seen.objective / scale + _penalty(seen.excess, m)
             return value, (value, seen)
 
         return loss
 
-    def evaluator(self, scale: float) -> Callable[[Any, Multipliers], Evaluation]:
+    def evaluator(self, scale: float) -> Callable[[Any, Multipliers], LossEvaluation]:
         """(starts, p) and multipliers with a leading axis of starts -> Evaluation; compiled, one call for all, and once
         for every scale."""
         return lambda z, m: self._evaluate(z, m, scale)
@@ -165,27 +167,29 @@ class Problem:
     def _evaluate(self) -> Any:
         derivative = jax.jacfwd if self.mode is Mode.FORWARD else jax.grad
 
-        def evaluate(z: Any, m: Multipliers, scale: Any) -> Evaluation:
+        def evaluate(z: Any, m: Multipliers, scale: Any) -> LossEvaluation:
             gradient, (value, seen) = derivative(self.loss(scale), has_aux=True)(z, m)
-            return Evaluation(value, gradient, seen)
+            return LossEvaluation(value, gradient, seen)
 
-        options = SAME if self.batch.size <= FEWEST else None
+        options = SAME if self.batch.size <= MAX_QUICK_COMPILE_RUNS else None
         return jax.jit(jax.vmap(evaluate, in_axes=(0, 0, None)), compiler_options=options)
 
-    def valuer(self) -> Callable[[Any], Seen]:
+    def objective_evaluator(self) -> Callable[[Any], ObjectiveEvaluation]:
         """(starts, p) -> Seen: without a gradient."""
         return jax.jit(jax.vmap(self.seen))
 
     def refused(self) -> str | None:
         """The first lane of the part as it is that must not be run, and why, in a line; None if all may."""
-        return first_refusal(built(self.subject), self.batch.values, self.solver)
+        return first_refusal(build_subject_loop(self.subject), self.batch.values, self.solver)
 
     def steady(self) -> Callable[[np.ndarray], np.ndarray]:
         """(starts, p) -> whether every lane may be run there (starts,): the parts' rules, and a stable step. Compiled
         once."""
 
         def loops(z: Any) -> Loop:
-            return self.batch.each(strong(built(self.space.at(self.subject, z))), lambda loop, key: strong(loop))
+            return self.batch.each(
+                strong(build_subject_loop(self.space.at(self.subject, z))), lambda loop, key: strong(loop)
+            )
 
         compiled = jax.jit(jax.vmap(loops))
 
@@ -196,9 +200,9 @@ class Problem:
         return accepted
 
 
-def automatic(space: Space) -> Mode:
+def choose_gradient_mode(space: Space) -> Mode:
     """Forward for few parameters, reverse for many."""
-    return Mode.FORWARD if space.size <= FEW else Mode.REVERSE
+    return Mode.FORWARD if space.size <= MAX_FORWARD_PARAMETERS else Mode.REVERSE
 
 
 def _penalty(excess: Any, m: Multipliers) -> Any:

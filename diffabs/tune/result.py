@@ -8,8 +8,8 @@ import optax
 
 from diffabs.core.reason import Reason
 from diffabs.core.summary import Summary
-from diffabs.tune.descent import Point, Stopping
-from diffabs.tune.problem import Mode, built
+from diffabs.tune.descent import DescentPoint, Stopping
+from diffabs.tune.problem import Mode, build_subject_loop
 
 
 class StartError(ValueError):
@@ -40,22 +40,22 @@ class Method:
     memory: int = 10
 
 
-class Progress(NamedTuple):
+class TuningProgress(NamedTuple):
     """What is told on the way: of the best start so far."""
 
     round: int
     starts: int  # that are still on their way
-    point: Point
+    point: DescentPoint
 
 
-class Start(NamedTuple):
+class StartResult(NamedTuple):
     """How a descent went: parameters by path, objective J, greatest excess, why it ended, and its history."""
 
     values: dict[str, Any]
     objective: float
     violation: float
     reason: Reason
-    history: list[Point]
+    history: list[DescentPoint]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -79,8 +79,8 @@ class Tuned:
     metrics: tuple[dict[str, Any], dict[str, Any]]
     met: bool
     reason: Reason
-    history: list[Point]
-    starts: list[Start]
+    history: list[DescentPoint]
+    starts: list[StartResult]
     mode: Mode
     diverged: tuple[int, int]
     engine: dict[str, str]
@@ -88,7 +88,7 @@ class Tuned:
     def table(self) -> Summary:
         """What was found: the free parameters; means of the metrics and the objective, before and after."""
         rows: list[tuple[Any, ...]] = [(name, "", value) for name, value in self.values.items()]
-        rows += [(f"mean {name}", *(_mean(one[name]) for one in self.metrics)) for name in self.metrics[0]]
+        rows += [(f"mean {name}", *(_finite_mean(one[name]) for one in self.metrics)) for name in self.metrics[0]]
         rows.append(("objective", *self.objective))
         lanes = np.size(next(iter(self.metrics[0].values()), ()))
         title = f"Tuned over {lanes} lane{'' if lanes == 1 else 's'}: {self.reason.value}"
@@ -106,7 +106,7 @@ class Tuned:
     @property
     def loop(self) -> Any:
         """The tuned loop."""
-        return built(self.part)
+        return build_subject_loop(self.part)
 
     @property
     def gradient(self) -> float:
@@ -119,7 +119,7 @@ class Tuned:
         return self.history[-1].evaluations
 
 
-def _mean(values: Any) -> float:
+def _finite_mean(values: Any) -> float:
     """Of the lanes that did not diverge; NaN where all did."""
     good = np.asarray(values)[np.isfinite(values)]
     return float(good.mean()) if good.size else float("nan")

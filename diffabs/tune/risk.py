@@ -67,4 +67,4 @@ class Quantile:
         return jnp.quantile(values, self.level)
 
 
-KINDS: dict[str, type] = {"mean": Mean, "smooth-worst": SmoothWorst, "cvar": CVaR, "quantile": Quantile}
+AGGREGATE_TYPES: dict[str, type] = {"mean": Mean, "smooth-worst": SmoothWorst, "cvar": CVaR, "quantile": Quantile}

@@ -15,10 +15,10 @@ from diffabs.simulate.batch import Batch
 from diffabs.simulate.engine import EngineError
 from diffabs.simulate.solution import Solver
 from diffabs.tune import one_sided
-from diffabs.tune.augmented_lagrangian import Search
+from diffabs.tune.augmented_lagrangian import AugmentedLagrangianSearch
 from diffabs.tune.constraints import Constraint
-from diffabs.tune.problem import Mode, Problem, automatic, built
-from diffabs.tune.result import Method, Progress, Tuned
+from diffabs.tune.problem import Mode, Problem, build_subject_loop, choose_gradient_mode
+from diffabs.tune.result import Method, Tuned, TuningProgress
 from diffabs.tune.risk import Aggregate, Mean
 
 
@@ -33,7 +33,7 @@ def tune(
     aggregate: Aggregate | None = None,
     constraints: Sequence[Constraint] = (),
     method: Method | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[TuningProgress], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
     engine: str = "xla",
 ) -> Tuned:
@@ -72,7 +72,7 @@ def tune(
         StartError: a start that diverges, or at which the integration step is not stable, if there is no other.
     """
     method = method or Method()
-    problem = posed(
+    problem = build_problem(
         subject,
         free=free,
         objective=objective,
@@ -86,14 +86,14 @@ def tune(
     )
     one_sided.warn(subject, {path: get(subject, path) for path in free}, problem.batch, solver, "start")
     try:
-        found = Search(problem, method, progress, stopping).result()
+        found = AugmentedLagrangianSearch(problem, method, progress, stopping).result()
     except NoCompiler as error:
         raise EngineError.of(error) from None
     one_sided.warn(subject, found.values, problem.batch, solver, "result")
     return found
 
 
-def posed(
+def build_problem(
     subject: Any,
     *,
     free: Sequence[str] | Mapping[str, Range | None],
@@ -113,7 +113,7 @@ def posed(
 
     Raises ValueError as `tune` does."""
     check(subject)
-    loop = built(subject)
+    loop = build_subject_loop(subject)
     measured = usual(loop.plant) if measured is None else measured
     batch = (over or Batch()).check(loop)
     _check_metrics(objective, measured, constraints)
@@ -127,9 +127,9 @@ def posed(
         batch=batch,
         aggregate=aggregate or Mean(),
         constraints=constraints,
-        mode=mode or automatic(free_space),
+        mode=mode or choose_gradient_mode(free_space),
     )
-    return problem.by(engine, mode)
+    return problem.with_engine(engine, mode)
 
 
 def _check_metrics(objective: Mapping[str, float], measured: Mapping[str, Objective], constraints: Any) -> None:

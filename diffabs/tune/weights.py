@@ -21,7 +21,7 @@ from diffabs.design.interior.differentiable import robust_gain
 from diffabs.design.polytopes import Polytope
 from diffabs.linear.regulator import dlqr, lqr
 
-Gain = Callable[[Any, Any], Any]
+GainDesign = Callable[[Any, Any], Any]
 
 
 @pytree
@@ -33,7 +33,7 @@ class LQWeights:
     log_diagonal: Vector = param(default=(0.0, 0.0), unit="1")
     lower: Vector = param(default=(0.0,), unit="1")
     log_effort: Scalar = param(default=0.0, unit="1")
-    design: Gain = static()
+    design: GainDesign = static()
     path: str = static(default="controller.gain")
 
     def weights(self) -> tuple[Any, Any]:
@@ -49,7 +49,7 @@ class LQWeights:
         return replace(self.loop, {self.path: self.design(*self.weights())[0]})
 
 
-def lq_weights(loop: Loop, Q: Any, R: float, design: Gain, path: str = "controller.gain") -> LQWeights:
+def lq_weights(loop: Loop, Q: Any, R: float, design: GainDesign, path: str = "controller.gain") -> LQWeights:
     """A loop with weights Q (n, n) or a diagonal (n,), positive definite, and R > 0 as its parameters.
 
     Raises:
@@ -70,12 +70,12 @@ def lq_weights(loop: Loop, Q: Any, R: float, design: Gain, path: str = "controll
     )
 
 
-def regulator(model: Any) -> Gain:
+def lqr_gain_design(model: Any) -> GainDesign:
     """The LQ regulator of a linear model (`matrices()`, `period`), in discrete time if the model is."""
     solve, (a, b) = (lqr if model.period is None else dlqr), model.matrices()
     return lambda Q, R: solve(a, b, Q, R).gain
 
 
-def robust(system: Polytope) -> Gain:
+def robust_gain_design(system: Polytope) -> GainDesign:
     """The gain with the least guaranteed cost over a polytope; NaN where there is none: such weights are rejected."""
     return lambda Q, R: robust_gain(system, Q, R)

@@ -27,13 +27,13 @@ from diffabs.objectives import usual
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.solution import Run, Solver
-from diffabs.tune.descent import Descent, Lane, Stopping, lbfgs
-from diffabs.tune.problem import Mode, Multipliers, Problem, automatic
+from diffabs.tune.descent import Descent, DescentState, Stopping, lbfgs
+from diffabs.tune.problem import Mode, Multipliers, Problem, choose_gradient_mode
 from diffabs.tune.risk import Mean
 
-MOST_CORNERS = 64
-SAME = 1e-6  # of a value: no more than a corner's, which an ascent approaches and does not reach
-EDGE = 0.01  # of a range: as near to its ends as an ascent starts; it may end nearer
+MAX_CORNERS = 64
+CORNER_TOLERANCE = 1e-6  # of a value: no more than a corner's, which an ascent approaches and does not reach
+EDGE_SHARE = 0.01  # of a range: as near to its ends as an ascent starts; it may end nearer
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class WorstCase:
 
     def _finder(self) -> str:
         """What found it."""
-        if self.value <= self.corner * (1 + SAME):
+        if self.value <= self.corner * (1 + CORNER_TOLERANCE):
             return f"That is a corner of the box: running its {self.corners} corners finds it."
         if self.value <= self.screened:
             return f"That is one of the points that were run first (worst corner {self.corner:.6g})."
@@ -132,22 +132,24 @@ def worst_case(
             cannot be run.
     """
     check(loop)
-    measured = _measured(loop, metric, measured)
+    measured = _check_objectives(loop, metric, measured)
     middle = replace(loop, {path: 0.5 * (np.asarray(a, float) + np.asarray(b, float)) for path, (a, b) in over.items()})
     free, key = space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
-    corners = _corners(np.array(free.ranges))
-    points = np.concatenate([corners, _drawn(np.array(free.ranges), screen, seed)])
-    lanes = Batch(_at(free, points), None if key is None else np.repeat(key, len(points)))
-    screened = _screened(loop, lanes, solver, measured, engine)
+    corners = _box_corners(np.array(free.ranges))
+    points = np.concatenate([corners, _draw_points(np.array(free.ranges), screen, seed)])
+    lanes = Batch(_values_by_path(free, points), None if key is None else np.repeat(key, len(points)))
+    screened = _run_screening(loop, lanes, solver, measured, engine)
     worst = np.argsort(-np.nan_to_num(screened.metrics[metric], nan=-np.inf))[:starts]
-    problem = Problem(middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), automatic(free))
-    problem = problem.by(engine)
-    lanes = _ascent(problem, points[worst], iterations) if starts else []
-    cost = len(points) + (price or _price(problem)) * sum(lane.evaluations for lane in lanes)
-    return _found(loop, free, metric, bound, points, len(corners), screened, lanes, cost)
+    problem = Problem(
+        middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), choose_gradient_mode(free)
+    )
+    problem = problem.with_engine(engine)
+    lanes = _ascend(problem, points[worst], iterations) if starts else []
+    cost = len(points) + (price or _gradient_price(problem)) * sum(lane.evaluations for lane in lanes)
+    return _build_worst_case(loop, free, metric, bound, points, len(corners), screened, lanes, cost)
 
 
-def _measured(loop: Any, metric: str, measured: Mapping[str, Objective] | None) -> Mapping[str, Objective]:
+def _check_objectives(loop: Any, metric: str, measured: Mapping[str, Objective] | None) -> Mapping[str, Objective]:
     """The objectives, or the usual ones. Raises ValueError where the metric is none of them."""
     found = usual(loop.plant) if measured is None else measured
     if metric not in found:
@@ -155,31 +157,31 @@ def _measured(loop: Any, metric: str, measured: Mapping[str, Objective] | None) 
     return found
 
 
-def _price(problem: Problem) -> float:
+def _gradient_price(problem: Problem) -> float:
     """Rollouts that a gradient costs."""
     return 1 + 1.5 * problem.space.size if problem.mode is Mode.FORWARD else 6.0
 
 
-def _screened(loop: Any, lanes: Batch, solver: Solver, measured: Mapping[str, Objective], engine: str) -> Run:
+def _run_screening(loop: Any, lanes: Batch, solver: Solver, measured: Mapping[str, Objective], engine: str) -> Run:
     """Run every point. Raises ValueError for one that cannot be run."""
     if line := first_refusal(loop, lanes.values, solver):
         raise ValueError(f"the box has points that cannot be run; {line}")
     return jax.device_get(run_batch(loop, lanes, solver, measured, accepted=True, engine=engine))
 
 
-def _corners(ranges: np.ndarray) -> np.ndarray:
+def _box_corners(ranges: np.ndarray) -> np.ndarray:
     """Corners (k, p), the first of them if there are too many."""
-    return np.array(list(itertools.islice(itertools.product(*ranges), MOST_CORNERS)))
+    return np.array(list(itertools.islice(itertools.product(*ranges), MAX_CORNERS)))
 
 
-def _drawn(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
+def _draw_points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
     """Points spread over the box (screen, p)."""
     low, high = ranges.T
     sequence = qmc.Sobol(len(low), rng=np.random.default_rng(seed))
     return low + (high - low) * sequence.random_base2(max(screen - 1, 0).bit_length())[:screen]
 
 
-def _at(free: Space, point: Any) -> dict[str, Any]:
+def _values_by_path(free: Space, point: Any) -> dict[str, Any]:
     """Parameters by path from their numbers in a row, or in the rows of lanes."""
     found, first = {}, 0
     for entry in free.entries:
@@ -189,11 +191,13 @@ def _at(free: Space, point: Any) -> dict[str, Any]:
     return found
 
 
-def _ascent(problem: Problem, points: np.ndarray, iterations: int) -> list[Lane]:
+def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[DescentState]:
     """From these points, a little inside of the box, where they can be left."""
     low, high = np.array(problem.space.ranges).T
-    points = np.clip(points, low + EDGE * (high - low), high - EDGE * (high - low))
-    z = np.stack([problem.space.place(replace(problem.subject, _at(problem.space, point))) for point in points])
+    points = np.clip(points, low + EDGE_SHARE * (high - low), high - EDGE_SHARE * (high - low))
+    z = np.stack(
+        [problem.space.place(replace(problem.subject, _values_by_path(problem.space, point))) for point in points]
+    )
     none = Multipliers(np.zeros((len(z), 0)), np.ones(len(z)))
     first = jax.device_get(problem.evaluator(1.0)(jnp.asarray(z), none)).seen
     scale = max(abs(float(first.objective[0])), 1e-12)
@@ -209,7 +213,7 @@ def _ascent(problem: Problem, points: np.ndarray, iterations: int) -> list[Lane]
     return descent.run(z, none)
 
 
-def _found(
+def _build_worst_case(
     loop: Any,
     free: Space,
     metric: str,
@@ -217,12 +221,16 @@ def _found(
     points: np.ndarray,
     corners: int,
     screened: Run,
-    lanes: list[Lane],
+    lanes: list[DescentState],
     rollouts: float,
 ) -> WorstCase:
     values = np.nan_to_num(screened.metrics[metric], nan=-np.inf)
     i = int(np.argmax(values))
-    place, value, metrics = _at(free, points[i]), float(values[i]), {n: x[i] for n, x in screened.metrics.items()}
+    place, value, metrics = (
+        _values_by_path(free, points[i]),
+        float(values[i]),
+        {n: x[i] for n, x in screened.metrics.items()},
+    )
     for lane in lanes:
         if lane.reason is not Reason.START and -float(lane.seen.objective) > value:
             place, value = free.values(jnp.asarray(lane.z)), -float(lane.seen.objective)
@@ -240,6 +248,6 @@ def _found(
         loop=replace(loop, place),
         rollouts=rollouts,
         bound=bound,
-        diverged=_at(free, points[bad[0]]) if len(bad) else None,
+        diverged=_values_by_path(free, points[bad[0]]) if len(bad) else None,
         reasons=[lane.reason or Reason.LIMIT for lane in lanes],
     )

@@ -15,7 +15,7 @@ import diffabs as d
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import load, loads
 from diffabs.sweep import Results, sweep
-from diffabs.sweep.checking import _chosen, checked, said
+from diffabs.sweep.checking import _choose_samples, accuracy_warnings, check_accuracy
 
 RELAY = """
 plant = "mirrored-rig"
@@ -85,9 +85,9 @@ def test_a_sweep_says_how_accurate_it_is_without_being_asked(file, tmp_path):
     loose = {name for name, one in found["metrics"].items() if one["largest"] > 0.01}
     assert loose  # a relay behind a rate limit, at 2 ms
     assert all(f"{name} by up to " in result.stderr for name in loose)
-    again = checked(study, table, 6)
+    again = check_accuracy(study, table, 6)
     assert again["samples"] == found["samples"]
-    assert checked(study, table, 0) == {**again, "samples": [], "metrics": {}}
+    assert check_accuracy(study, table, 0) == {**again, "samples": [], "metrics": {}}
 
 
 @pytest.mark.slow
@@ -103,7 +103,7 @@ def test_noise_is_the_same_in_a_sweeps_half_steps(tmp_path):
         loads(SCENARIO.replace("samples = 3200", "samples = 64").encode(), "small", "small.toml")
     )
     study = dataclasses.replace(study, objectives={"iae": study.objectives["iae"]})
-    found = checked(study, sweep(study, tmp_path), 16)
+    found = check_accuracy(study, sweep(study, tmp_path), 16)
     assert found["not comparable"] == 0
     assert found["metrics"]["iae"]["largest"] < 1e-3
     loop, _ = study.lane(0)
@@ -115,15 +115,15 @@ def test_lanes_that_are_no_result_are_not_drawn():
     columns = {"sample": np.arange(8), "diverged": np.arange(8) < 3, "refused": np.array([""] * 6 + ["bad"] * 2)}
     study = SimpleNamespace(seed=1)
     table: Any = SimpleNamespace(column=columns.__getitem__)
-    assert _chosen(study, table, 100).tolist() == [3, 4, 5]
+    assert _choose_samples(study, table, 100).tolist() == [3, 4, 5]
     del columns["refused"]
-    assert _chosen(study, table, 100).tolist() == [3, 4, 5, 6, 7]
-    assert len(_chosen(study, table, 2)) == 2
+    assert _choose_samples(study, table, 100).tolist() == [3, 4, 5, 6, 7]
+    assert len(_choose_samples(study, table, 2)) == 2
 
 
 def test_what_is_said():
     nothing = {"metrics": {}, "ended otherwise": 0, "not comparable": 0}
-    assert said(nothing) == []
+    assert accuracy_warnings(nothing) == []
     loose = {
         **nothing,
         "metrics": {
@@ -133,8 +133,8 @@ def test_what_is_said():
         },
     }
     line = "a half step changes iae by up to 3 % (sample 7): "
-    assert said(loose) == [f"{line}shorten solver.step"]
-    assert said({**loose, "solver": {"rtol": 1e-5}}) == [f"{line}lower solver.rtol"]
-    assert said({**loose, "solver": {"rtol": 1e-3}}) == []
-    assert "2 of the lanes" in said({**nothing, "ended otherwise": 2})[0]
-    assert "accuracy unknown" in said({**nothing, "not comparable": 1})[0]
+    assert accuracy_warnings(loose) == [f"{line}shorten solver.step"]
+    assert accuracy_warnings({**loose, "solver": {"rtol": 1e-5}}) == [f"{line}lower solver.rtol"]
+    assert accuracy_warnings({**loose, "solver": {"rtol": 1e-3}}) == []
+    assert "2 of the lanes" in accuracy_warnings({**nothing, "ended otherwise": 2})[0]
+    assert "accuracy unknown" in accuracy_warnings({**nothing, "not comparable": 1})[0]

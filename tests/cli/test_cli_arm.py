@@ -15,9 +15,9 @@ from diffabs.objectives import BALANCE
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import load
 from diffabs.sweep import Space, Study, Uniform
-from diffabs.sweep.engines import missed
+from diffabs.sweep.engines import has_wrong_end
 from diffabs.tune import worst_case
-from diffabs.tune.tuning import posed
+from diffabs.tune.tuning import build_problem
 
 METRICS = {"settling_time", "peak_lean", "peak_arm_angle", "peak_voltage", "peak_torque", "final_norm", "fell"}
 SHORT = ("--set", "solver.duration=0.02")
@@ -142,17 +142,17 @@ def test_certify_disproves_the_gain_for_one_rider():
 @killed_by("sweep/engines.py", "return np.asarray(stopped) != success", "return ~np.asarray(stopped)")
 def test_a_stop_that_is_a_fall_is_not_missed():
     stopped = np.array([True, False])
-    np.testing.assert_array_equal(missed(stopped, stops.Fallen.success), [True, False])
-    np.testing.assert_array_equal(missed(stopped, stops.Standstill.success), [False, True])
+    np.testing.assert_array_equal(has_wrong_end(stopped, stops.Fallen.success), [True, False])
+    np.testing.assert_array_equal(has_wrong_end(stopped, stops.Standstill.success), [False, True])
     study = section_sweep.study(load("arm-hanging", ("sweep.failures={peak_lean=0.3}",)))
-    assert (study.bounded, study.success) == ({"fell": 0.0, "peak_lean": 0.3}, False)
+    assert (study.failure_bounds, study.success) == ({"fell": 0.0, "peak_lean": 0.3}, False)
 
 
 def test_without_objectives_an_arm_is_measured_as_one():
     """Those of braking have no `fell`, and ask an arm for its slip."""
     loop, solver = load("arm-hanging").loop, FixedStep(step=1e-3, duration=0.02)
     free = {"controller.gain": (-1e5, 1e5)}
-    assert posed(loop, free=free, objective={"fell": 1.0}, solver=solver).measured == BALANCE
+    assert build_problem(loop, free=free, objective={"fell": 1.0}, solver=solver).measured == BALANCE
     space = Space({"plant.rider_mass": Uniform(40.0, 100.0)})
     assert Study(loop, space, samples=2, solver=solver).objectives == BALANCE
     with pytest.raises(ValueError, match=r"stop_distance is not measured; there is .*fell"):

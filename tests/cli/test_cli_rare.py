@@ -47,7 +47,9 @@ def test_the_document_is_the_librarys_answer(scenario):
 @pytest.mark.parametrize("runs", cases(["invented", "real"], "real"))
 def test_tables_for_a_person(scenario, runs, monkeypatch):
     if runs == "invented":  # 8.5 m/s^2 from each speed to 25 km/h: nothing is compiled
-        monkeypatch.setattr(failure, "_measured", lambda study, metric, at: (at["initial.speed"] ** 2 - 48.2) / 17)
+        monkeypatch.setattr(
+            failure, "_measure_metric", lambda study, metric, at: (at["initial.speed"] ** 2 - 48.2) / 17
+        )
     text = run("rare", scenario, "stop_distance=2.8", "--samples", 200, "--seed", 5).stdout  # as above: compiled
     assert "stop_distance >= 2.8 m" in text
     assert re.search(rf"probability {NUMBER}, 95 % interval {NUMBER} to {NUMBER}", text)

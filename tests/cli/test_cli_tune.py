@@ -241,7 +241,7 @@ def test_table_for_people(small, invented):
 
 
 def test_how_far_it_is():
-    told = [library.Progress(0, 2, point) for point in HISTORY]
+    told = [library.TuningProgress(0, 2, point) for point in HISTORY]
     assert commands_tune._said([]) == progress.Far("compiling")
     line = "loss 0.75, gradient 0.01, violation 0, 2 evaluations, 2 under way"
     assert commands_tune._said(told) == progress.Far(line, HISTORY[-1].iteration, None, at_most=True)
@@ -317,7 +317,7 @@ def test_packaged_scenarios_can_be_tuned(name, invented):
     run("tune", name, "--set", "tune.decay=0", "--set", "tune.damping=0", "--set", "tune.limits={}")
     loop = invented["loop"]
     names = ("free", "objective", "over", "solver", "measured", "aggregate", "constraints")
-    library.posed(loop, **{name: invented[name] for name in names})
+    library.build_problem(loop, **{name: invented[name] for name in names})
 
 
 # What could not be done
@@ -421,7 +421,7 @@ def endless(invented, monkeypatch):
     told = []
 
     def tune(loop, *, progress, stopping, **what):
-        progress(library.Progress(0, 1, HISTORY[0]))
+        progress(library.TuningProgress(0, 1, HISTORY[0]))
         told.append(True)
         end = time.monotonic() + 60
         while not stopping() and time.monotonic() < end:

@@ -11,7 +11,7 @@ from diffabs.objectives import Effort, TorqueRate, Variation
 from diffabs.scenario import scenario
 from diffabs.scenario.registry import unit_of
 from diffabs.simulate.run import rollout
-from diffabs.sweep.trajectories import keep
+from diffabs.sweep.trajectories import write_trajectories
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
@@ -46,7 +46,7 @@ def test_figure_and_trajectories_of_the_lab_rig(tmp_path, monkeypatch):
     assert not any("N m" in text for text in texts)
     over = 'sweep.over={"plant.road.w4"=[0.3,0.4]}'
     study = section_sweep.study(scenario.load("lab-rig", [*SHORT[1::2], over]))
-    kept = zarr.open_group(keep(study, tmp_path, [0]), mode="r")
+    kept = zarr.open_group(write_trajectories(study, tmp_path, [0]), mode="r")
     assert (kept["control"].attrs["units"], kept["command"].attrs["units"]) == ("1", "1")
 
 

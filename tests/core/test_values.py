@@ -95,7 +95,9 @@ W4 = "{type='normal', mean=0.4, deviation=0.01, low=0.3, high=0.5}"
 DRAWN = f"sweep.over={{'initial.speed_kmh'=[36,72], 'road.w4'={W4}, 'plant.mass'=[5,6]}}"
 
 
-@killed_by("scenario/section_sweep.py", "return distributions.in_si(found, item.scale)", "return found")
+@killed_by(
+    "scenario/section_sweep.py", "return distributions.convert_distribution_to_si(found, item.scale)", "return found"
+)
 @killed_by("scenario/section_sweep.py", "paths=tuple(known[path] for path in paths)", "paths=tuple(paths)")
 def test_a_sweep_is_read_once_into_si_by_path_of_the_loop():
     chosen = load("slip-lmi", [DRAWN, "sweep.design=sobol", "sweep.correlation={paths=['road.w4'], matrix=[[1]]}"])

@@ -84,7 +84,7 @@ class TestTune:
         paths += ["plant.road.c2", "plant.road.c3", "stop.speed"]
         ranges = {path: (0.9 * float(get(LOOP, path)), 1.1 * float(get(LOOP, path))) for path in paths}
         problems = [
-            tune.posed(LOOP, **{**given, "free": ranges}, engine=e, mode=m)
+            tune.build_problem(LOOP, **{**given, "free": ranges}, engine=e, mode=m)
             for e, m in (("kernel", None), ("xla", Mode.REVERSE))
         ]
         z = problems[0].space.place(LOOP)[None]
@@ -92,7 +92,7 @@ class TestTune:
         found, expected = (jax.device_get(problem.evaluator(1.0)(z, none)) for problem in problems)
         np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-7, atol=1e-12)
 
-    @killed_by("tune/problem.py", "REVERSE if mode is Mode.REVERSE else None", "None")
+    @killed_by("tune/problem.py", "NO_REVERSE_MESSAGE if mode is Mode.REVERSE else None", "None")
     def test_in_reverse_mode_is_refused(self):
         method = tune.Method(mode=Mode.REVERSE)
         with pytest.raises(EngineError, match="engine = 'kernel' is not possible: a kernel has no reverse mode"):
@@ -110,14 +110,14 @@ class TestTune:
         with pytest.raises(EngineError, match=NONE):
             tune.tune(LOOP, **TUNED, engine="kernel")
         with caplog.at_level(logging.WARNING, "diffabs"):
-            found = [tune.posed(LOOP, **TUNED, engine="auto") for _ in range(2)]
+            found = [tune.build_problem(LOOP, **TUNED, engine="auto") for _ in range(2)]
         assert [problem.engine for problem in found] == ["xla", "xla"]
         assert len(caplog.records) == 1
         assert NONE in caplog.records[0].getMessage()
 
     @killed_by("kernel/primitives.py", "error.method = error.method or _calling_method(eqn)", "pass")
     def test_of_what_has_no_rule_names_the_part(self):
-        line = tune.posed(DELAYED, **TUNED, engine="kernel").objection()
+        line = tune.build_problem(DELAYED, **TUNED, engine="kernel").objection()
         why = "dynamic_slice: of 1296 entries that differ between lanes (in Delay.tick)"
         assert line == f"engine = 'kernel' is not possible: {why}"
 
@@ -140,7 +140,7 @@ class TestTune:
 
 
 @killed_by("tune/worst.py", "accepted=True, engine=engine)", "accepted=True)")
-@killed_by("tune/worst.py", "    problem = problem.by(engine)\n", "")
+@killed_by("tune/worst.py", "    problem = problem.with_engine(engine)\n", "")
 @pytest.mark.slow
 def test_the_worst_case_is_that_of_xla(monkeypatch):
     """Screened without derivatives and ascended with them, both by a kernel."""
@@ -199,7 +199,7 @@ class TestRare:
     @killed_by("reliability/failure.py", ", engine=study.engine)", ")")
     @pytest.mark.slow
     def test_objection(self, no_compiler):
-        assert reliability.failure.objection(STUDY, "stop_time") == NONE
+        assert reliability.failure.find_metric_objection(STUDY, "stop_time") == NONE
         study = dataclasses.replace(STUDY, engine="kernel")
         with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {NONE}"):
             reliability.failure_probability(study, "stop_time", 0.878)

@@ -12,8 +12,8 @@ from sweeping import manifest
 from diffabs.plot import sweeps as plots
 from diffabs.sweep import Results
 from diffabs.sweep.manifest import Seals
-from diffabs.sweep.seal import encoded as chunk
-from diffabs.sweep.statistics.summary import summary
+from diffabs.sweep.seal import encode_chunk as chunk
+from diffabs.sweep.statistics.summary import summarise_sweep
 from diffabs.sweep.store import Store
 
 N = 1200
@@ -340,7 +340,7 @@ def test_a_number_of_a_list_has_its_own_unit(made):
 
 
 def test_draw_writes_what_there_is(found, tmp_path):
-    paths = plots.draw(found, summary(found), tmp_path, UNITS)
+    paths = plots.draw(found, summarise_sweep(found), tmp_path, UNITS)
     names = ["distributions", "exceedance", "worst", "sensitivity", "failure_map"]
     assert [path.name for path in paths] == [f"{name}.png" for name in names]
     for path in paths:
@@ -375,4 +375,4 @@ def test_odd_sweeps_are_drawn_without_a_warning(made, tmp_path, monkeypatch, kin
     variables, metrics, given, names = ODD[kind]
     monkeypatch.setattr(plots, "save", lambda figure, path: (figure.draw_without_rendering(), path)[1])
     sweep = made(variables, metrics, **given)
-    assert [path.stem for path in plots.draw(sweep, summary(sweep), tmp_path, {})] == names
+    assert [path.stem for path in plots.draw(sweep, summarise_sweep(sweep), tmp_path, {})] == names

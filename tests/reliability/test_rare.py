@@ -8,22 +8,22 @@ from scipy.stats import chi2, norm
 from scipy.stats import t as student_t
 
 from diffabs.reliability.importance_sampling import (
-    Estimate,
-    Importance,
+    CountedScore,
+    ImportanceEstimate,
     Mixture,
-    Runs,
+    ProbabilityEstimate,
     design_points,
-    pays,
-    proposal,
-    student,
+    fit_proposal,
+    is_better_estimate,
+    student_quantile,
 )
 from diffabs.reliability.subset_simulation import (
-    Reason,
-    _advanced,
-    _cov,
-    _estimate,
-    _plan,
+    SubsetReason,
+    _advance_chains,
+    _level_cov,
+    _make_plan,
     _Population,
+    _product_estimate,
     subset_simulation,
 )
 
@@ -98,7 +98,7 @@ class TestKnown:
         assert np.sum(np.abs(np.log(ratios(found, norm.sf(beta)))) <= np.log(1.5)) >= least
         levels = {3.0: 3, 4.75342: 6, 5.19934: 8}[beta]
         assert max(each.evaluations for each in found) <= 2800 + 2520 * (levels - 1) + 2000  # 17400 for 1e-6
-        assert all(each.reason is Reason.REACHED for each in found)
+        assert all(each.reason is SubsetReason.REACHED for each in found)
 
     @pytest.mark.parametrize(
         ("score", "d", "threshold", "truth"),
@@ -161,13 +161,13 @@ class TestSubset:
 
     @killed_by(
         "reliability/subset_simulation.py",
-        "return _estimate(levels, last.family).interval[1] * min(1.0, RULE / starts)",
-        "return min(1.0, RULE / starts)",
+        "return _product_estimate(levels, last.family).interval[1] * min(1.0, RULE_OF_THREE / starts)",
+        "return min(1.0, RULE_OF_THREE / starts)",
     )
     def test_a_plateau_ends_with_a_bound(self):
         flat, cut = (subset_simulation(lambda z, x=x: np.minimum(linear(2)(z), x), 2, 4.0) for x in (-9.0, 3.0))
         for found, levels in [(flat, 1), (cut, 4)]:
-            assert found.reason is Reason.PLATEAU
+            assert found.reason is SubsetReason.PLATEAU
             assert len(found.levels) == levels
             assert (found.probability, found.cov, found.interval[0]) == (0.0, np.inf, 0.0)
             assert len(found.failing) == 0
@@ -176,12 +176,12 @@ class TestSubset:
 
     def test_levels_that_run_out_end_with_a_bound_or_with_what_was_counted(self):
         none = subset_simulation(linear(2), 2, B6, levels=3)
-        assert none.reason is Reason.LEVELS
+        assert none.reason is SubsetReason.LEVELS
         assert len(none.levels) == 3
         assert none.probability == 0.0
         assert 1e-6 < none.interval[1] < 1e-3  # two levels of a tenth, and 3 / 280
         few = subset_simulation(linear(2), 2, norm.isf(4e-4), levels=3, draws=0)
-        assert few.reason is Reason.LEVELS
+        assert few.reason is SubsetReason.LEVELS
         assert few.interval[0] < 4e-4 < few.interval[1]
 
     def test_chains_accept_as_often_as_they_should(self):
@@ -243,10 +243,10 @@ class TestSubset:
         rng = np.random.default_rng(0)
         frozen = np.tile(rng.random(400) < 0.2, (10, 1))
         p = np.mean(frozen)
-        np.testing.assert_allclose(_cov(frozen), np.sqrt((1 - p) / (p * 400)), rtol=1e-9)
+        np.testing.assert_allclose(_level_cov(frozen), np.sqrt((1 - p) / (p * 400)), rtol=1e-9)
         free = rng.random((10, 4000)) < 0.2
-        np.testing.assert_allclose(_cov(free), np.sqrt(0.8 / (0.2 * 40000)), rtol=0.05)
-        assert _cov(np.ones((3, 4), bool)) == 0.0
+        np.testing.assert_allclose(_level_cov(free), np.sqrt(0.8 / (0.2 * 40000)), rtol=0.05)
+        assert _level_cov(np.ones((3, 4), bool)) == 0.0
 
     def test_chains_that_accept_nothing(self):
         """Ten copies of each seed: the variance is that of the seeds alone, and each copy knows its ancestor."""
@@ -261,8 +261,8 @@ class TestSubset:
         np.testing.assert_allclose(found.levels[1].cov, np.sqrt((1 - p) / (p * 280)), rtol=1e-9)
         z = np.random.default_rng(0).standard_normal((100, 2))
         old = _Population(z, z[:, 0], np.arange(100), 1, 1.0, 0.6, 0)
-        runs = Runs(lambda z: np.full(len(z), -9.0), None, 0.1)
-        new = _advanced(runs, old, z[:, 0] > 1, 1.0, _plan(2, 3.0, 100, 0.1, 9, 0), np.random.default_rng(1))
+        runs = CountedScore(lambda z: np.full(len(z), -9.0), None, 0.1)
+        new = _advance_chains(runs, old, z[:, 0] > 1, 1.0, _make_plan(2, 3.0, 100, 0.1, 9, 0), np.random.default_rng(1))
         np.testing.assert_array_equal(new.z, z[new.family])
         assert len(new.z) == 100
         assert len(np.unique(new.family)) == 10
@@ -271,7 +271,7 @@ class TestSubset:
         level = subset_simulation(linear(2), 2, 1.0, draws=0).levels[0]
         levels = [level._replace(cov=0.1, share=0.1), level._replace(cov=0.2, share=0.1)]
         for count, cov in [(1, 0.3), (16, 0.25), (1000, np.sqrt(0.05))]:
-            found = _estimate(levels, np.repeat(np.arange(count), 5))
+            found = _product_estimate(levels, np.repeat(np.arange(count), 5))
             np.testing.assert_allclose((found.probability, found.cov), (0.01, cov), rtol=1e-6)
         middle = np.sqrt(found.interval[0] * found.interval[1])
         np.testing.assert_allclose(middle, 0.01 * np.sqrt(1.05), rtol=1e-9)
@@ -294,11 +294,11 @@ class TestImportance:
     @killed_by("reliability/importance_sampling.py", "np.exp(mixture.log_weight(z)), 0.0)", "1e-6, 0.0)")
     def test_failures_foretell_the_variance(self):
         found = runs(linear(10), 10, B6, 20)
-        foretold = np.array([each.importance.foretold for each in found])
+        foretold = np.array([each.importance.predicted_cov for each in found])
         actual = np.array([each.importance.estimate.cov for each in found])
         assert np.median(np.abs(np.log(actual / foretold))) < 0.2
         np.testing.assert_allclose(np.std(ratios(found, 1e-6)), np.median(actual), rtol=0.5)
-        assert all(each.importance.effective > 100 for each in found)
+        assert all(each.importance.effective_samples > 100 for each in found)
         assert np.all(actual >= foretold)
         assert all(each.note.startswith("importance") and each.probability != each.subset.probability for each in found)
 
@@ -307,23 +307,29 @@ class TestImportance:
         z = rng.standard_normal((400, 5))
         z[:, 0] = np.where(np.arange(400) < 380, 4.5, -4.5) + 0.2 * z[:, 0]
         one = np.array([[4.5, 0, 0, 0, 0]])
-        mixture, moment = proposal(z, np.arange(400), 4e-6, one)
+        mixture, moment = fit_proposal(z, np.arange(400), 4e-6, one)
         assert len(mixture.centres) > 1
         assert moment < np.log(100)
         assert Mixture(one, np.ones(1), np.ones(1)).log_weight(z).max() > np.log(1e6)
 
-    @killed_by("reliability/importance_sampling.py", "return below <= APART", "return True or below <= APART")
+    @killed_by(
+        "reliability/importance_sampling.py",
+        "return below <= MAX_DEVIATIONS_APART",
+        "return True or below <= MAX_DEVIATIONS_APART",
+    )
     def test_one_that_is_far_too_low_is_not_believed(self):
-        subset = Estimate(1e-6, 0.2, (0.6e-6, 1.6e-6))
+        subset = ProbabilityEstimate(1e-6, 0.2, (0.6e-6, 1.6e-6))
         for factor, believed in [(1.0, True), (0.7, True), (0.3, False), (3.0, True)]:
-            made = Importance(Estimate(factor * 1e-6, 0.05, (0, 1)), 400.0, 0.05, np.zeros((1, 2)))
-            assert pays(made, subset) is believed
-        assert not pays(made._replace(estimate=Estimate(1e-6, 0.25, (0, 1))), subset)
-        assert not pays(made._replace(estimate=Estimate(0.0, np.inf, (0, 1))), subset)
+            made = ImportanceEstimate(ProbabilityEstimate(factor * 1e-6, 0.05, (0, 1)), 400.0, 0.05, np.zeros((1, 2)))
+            assert is_better_estimate(made, subset) is believed
+        assert not is_better_estimate(made._replace(estimate=ProbabilityEstimate(1e-6, 0.25, (0, 1))), subset)
+        assert not is_better_estimate(made._replace(estimate=ProbabilityEstimate(0.0, np.inf, (0, 1))), subset)
 
     @pytest.mark.parametrize("degrees", [4, 10, 40, 1e9])
     def test_quantiles_are_those_of_scipy(self, degrees):
-        np.testing.assert_allclose(student(degrees), student_t.ppf(0.975, degrees), rtol=0.02 if degrees < 9 else 2e-3)
+        np.testing.assert_allclose(
+            student_quantile(degrees), student_t.ppf(0.975, degrees), rtol=0.02 if degrees < 9 else 2e-3
+        )
 
 
 def of_linear(d):

@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, stops
-from diffabs.reliability.failure import _gradient, _scores, failure_probability
+from diffabs.reliability.failure import _make_gradient, _run_scores, failure_probability
 from diffabs.reliability.importance_sampling import design_points
 from diffabs.scenario.defaults import braking
 from diffabs.sweep import Normal, Space, Study, Triangular, Uniform
@@ -35,7 +35,7 @@ STUDY = Study(
 @pytest.mark.slow
 def test_scores_are_runs():
     z = np.array([[0.0, 0.0], [-2.0, 1.0], [3.0, -1.0]])
-    found = _scores(STUDY, "stop_distance", z)
+    found = _run_scores(STUDY, "stop_distance", z)
     for i, value in enumerate(found):
         values = {path: column[i] for path, column in SPACE.normal(z).items()}
         distance = {"stop_distance": STUDY.objectives["stop_distance"]}
@@ -43,7 +43,7 @@ def test_scores_are_runs():
         assert value == pytest.approx(float(alone), rel=1e-12)
 
 
-@killed_by("reliability/failure.py", "(above - below) / (2 * STEP)", "(above - below) / (above - below)")
+@killed_by("reliability/failure.py", "(above - below) / (2 * DIFFERENCE_STEP)", "(above - below) / (above - below)")
 @pytest.mark.slow
 @pytest.mark.parametrize("metric", ["stop_distance", pytest.param("max_slip", marks=pytest.mark.slow)])
 def test_slopes_are_differences_of_runs(metric):
@@ -54,10 +54,10 @@ def test_slopes_are_differences_of_runs(metric):
     )
     study = dataclasses.replace(STUDY, space=space, solver=dataclasses.replace(STUDY.solver, kinks=True))
     z = np.array([[0.0, 0.0, 0.3], [-2.0, 1.0, -1.0], [1.0, -1.0, 2.0]])
-    score, slope = _gradient(study, metric)(z)
-    np.testing.assert_allclose(score, _scores(study, metric, z), rtol=1e-10)
+    score, slope = _make_gradient(study, metric)(z)
+    np.testing.assert_allclose(score, _run_scores(study, metric, z), rtol=1e-10)
     for j, offset in enumerate(1e-4 * np.eye(3)):
-        ends = _scores(study, metric, z + offset), _scores(study, metric, z - offset)
+        ends = _run_scores(study, metric, z + offset), _run_scores(study, metric, z - offset)
         difference = (ends[0] - ends[1]) / 2e-4
         # 1e-8 of the curvature, and the rounding of the metric in 1e-4
         np.testing.assert_allclose(slope[:, j], difference, rtol=1e-5, atol=1e-9, err_msg=f"z_{j}")
@@ -67,21 +67,21 @@ def test_slopes_are_differences_of_runs(metric):
 @pytest.mark.slow
 def test_gradients_lead_to_the_design_point_of_a_slippery_road():
     """Where the distance reaches the bound nearest to the mean: at w4 = 0.4 - 0.01 * 4, whatever the mass."""
-    bound = float(_scores(STUDY, "stop_distance", np.array([[-4.0, 0.0]]))[0])
+    bound = float(_run_scores(STUDY, "stop_distance", np.array([[-4.0, 0.0]]))[0])
     found = failure_probability(STUDY, "stop_distance", bound, samples=400, draws=400, gradients=True)
     assert found.interval[0] < norm.cdf(-4.0) < found.interval[1]
     assert found.gradients > 0
     assert found.cost == found.evaluations + 3 * found.gradients
-    points = design_points(_gradient(STUDY, "stop_distance"), found.failing[:8], bound)
+    points = design_points(_make_gradient(STUDY, "stop_distance"), found.failing[:8], bound)
     np.testing.assert_allclose(points[0], [-4.0, 0.0], atol=0.05)
 
 
 @pytest.mark.slow
 def test_the_probability_of_a_slippery_road():
     """Stopping distance falls with w4, so that it exceeds its value at w4 = 0.4 - 0.01 b with probability Phi(-b)."""
-    bound = float(_scores(STUDY, "stop_distance", np.array([[-4.0, 0.0]]))[0])
-    spread = np.ptp(_scores(STUDY, "stop_distance", np.array([[-4.0, -2.0], [-4.0, 2.0]])))
-    steep = np.ptp(_scores(STUDY, "stop_distance", np.array([[-4.1, 0.0], [-3.9, 0.0]])))
+    bound = float(_run_scores(STUDY, "stop_distance", np.array([[-4.0, 0.0]]))[0])
+    spread = np.ptp(_run_scores(STUDY, "stop_distance", np.array([[-4.0, -2.0], [-4.0, 2.0]])))
+    steep = np.ptp(_run_scores(STUDY, "stop_distance", np.array([[-4.1, 0.0], [-3.9, 0.0]])))
     assert spread < 0.03 * steep  # of 0.2 deviations: the mass moves the exponent by a per cent
     found = failure_probability(STUDY, "stop_distance", bound, samples=400, draws=400)
     assert found.interval[0] < norm.cdf(-4.0) < found.interval[1]

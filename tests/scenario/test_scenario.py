@@ -448,11 +448,11 @@ def test_lanes_are_every_combination_with_one_noise():
     assert tuple(batch.keys) == (4,) * 9
 
 
-@pytest.mark.parametrize("kind", risk.KINDS)
+@pytest.mark.parametrize("kind", risk.AGGREGATE_TYPES)
 def test_aggregates_are_those_of_the_library(kind):
     part = load("slip-lmi", [f"tune.aggregate={kind}"]).tune.aggregated()
-    assert type(part) is risk.KINDS[kind]
-    assert vars(part) == vars(risk.KINDS[kind]())
+    assert type(part) is risk.AGGREGATE_TYPES[kind]
+    assert vars(part) == vars(risk.AGGREGATE_TYPES[kind]())
 
 
 def test_slip_cured_is_the_rig_with_what_the_paper_leaves_out():

@@ -27,8 +27,8 @@ from diffabs.simulate import admissible, stable_step
 from diffabs.simulate.result import _is_impossible
 from diffabs.stops import Fallen, SpeedReached
 from diffabs.sweep import Results, sweep
-from diffabs.sweep.statistics.summary import summary
-from diffabs.tune import Method, StartError, posed, tune, worst_case
+from diffabs.sweep.statistics.summary import summarise_sweep
+from diffabs.tune import Method, StartError, build_problem, tune, worst_case
 
 RIG = braking(
     plant=plants.MirroredRig(),
@@ -321,7 +321,7 @@ class TestWhoeverRuns:
         np.testing.assert_array_equal(swept.column("diverged"), below)  # lest somebody's mean over the table take them
         assert swept.diverged().num_rows == 0
         assert not swept.column("stopped")[below].any()
-        found = summary(Results(swept.folder))
+        found = summarise_sweep(Results(swept.folder))
         for name in swept.metrics:
             x = swept.column(name)
             assert np.isnan(x[below]).all()
@@ -374,7 +374,7 @@ class TestWhoeverRuns:
         """Limits may cross on the way: such a point is too far, whatever its loss."""
         limited = replace(RIG, {"controller.torque_min": 0.0, "controller.torque_max": 9.0})
         free = {"controller.torque_min": (-5.0, 20.0), "controller.torque_max": (5.0, 15.0)}
-        problem = posed(limited, free=free, objective={"iae": 1.0}, solver=SOLVER)
+        problem = build_problem(limited, free=free, objective={"iae": 1.0}, solver=SOLVER)
         crossed = replace(limited, {"controller.torque_min": 12.0, "controller.torque_max": 8.0})
         z = np.stack([problem.space.place(part) for part in (limited, crossed)])
         assert problem.steady()(z).tolist() == [True, False]

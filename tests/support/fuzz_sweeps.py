@@ -17,9 +17,9 @@ from sweeping import SCENARIO, described
 from diffabs.cli import sweep as commands_sweep
 from diffabs.scenario import scenario
 from diffabs.sweep import Results, SweepError, sweep
-from diffabs.sweep.engines import Done
-from diffabs.sweep.seal import NAME
-from diffabs.sweep.statistics.summary import summary
+from diffabs.sweep.engines import ComputedChunk
+from diffabs.sweep.seal import CHUNK_NAME_PATTERN
+from diffabs.sweep.statistics.summary import summarise_sweep
 
 TEXT = SCENARIO.replace("samples = 3200", "samples = 290")
 SAMPLE = 7
@@ -29,12 +29,14 @@ class Written:
     """An engine that has the chunks already."""
 
     def __init__(self, folder):
-        self.data = {int(NAME.fullmatch(path.name)[1]): path.read_bytes() for path in (folder / "chunks").iterdir()}
+        self.data = {
+            int(CHUNK_NAME_PATTERN.fullmatch(path.name)[1]): path.read_bytes() for path in (folder / "chunks").iterdir()
+        }
 
     def run(self, study, chunks, stopping):
         for chunk in chunks:
             start, stop = study.bounds(chunk)
-            yield Done(chunk, self.data[chunk], stop - start, 0, 0)
+            yield ComputedChunk(chunk, self.data[chunk], stop - start, 0, 0)
 
 
 class Folders:
@@ -48,7 +50,7 @@ class Folders:
             run("sweep", room / "small.toml", "--out", room / name, "--seed", seed, "--json")
         self.room, self.study, self.engine = room, described(TEXT), Written(room / "out")
         found = Results(room / "out")
-        self.rows, self.digest, self.summary = found.pandas(), found.digest, summary(found)
+        self.rows, self.digest, self.summary = found.pandas(), found.digest, summarise_sweep(found)
         self.loop = commands_sweep.sample(room / "out", SAMPLE)[0].loop
 
     def __call__(self, rng, room):
@@ -96,7 +98,7 @@ class Folders:
         found = Results(folder)
         if not found.complete:
             return "not asked: not complete"
-        assert summary(found) == self.summary, "other statistics"
+        assert summarise_sweep(found) == self.summary, "other statistics"
         return "the same numbers"
 
     def compare(self, folder):
@@ -158,7 +160,7 @@ def bytes_of_a_chunk(rng, folder, _):
 def bytes_of_a_chunk_with_its_name(rng, folder, _):
     """The name is made to fit what is in the file."""
     path = rng.choice(files_of(folder))
-    if not path.is_file() or not NAME.fullmatch(path.name):
+    if not path.is_file() or not CHUNK_NAME_PATTERN.fullmatch(path.name):
         return "nothing"
     data, what = damaged(rng, path.read_bytes())
     path.unlink()

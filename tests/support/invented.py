@@ -3,10 +3,10 @@
 import numpy as np
 
 from diffabs.core.pytree import parameters, replace
-from diffabs.tune import Mode, Point, Reason, Tuned
-from diffabs.tune.result import Start
+from diffabs.tune import DescentPoint, Mode, Reason, Tuned
+from diffabs.tune.result import StartResult
 
-HISTORY = [Point(0, 2.0, 1.0, 0.5, 0.1, 1), Point(1, 1.5, 0.75, 0.01, 0.0, 3)]
+HISTORY = [DescentPoint(0, 2.0, 1.0, 0.5, 0.1, 1), DescentPoint(1, 1.5, 0.75, 0.01, 0.0, 3)]
 
 
 def tuned(loop, **what):
@@ -23,7 +23,7 @@ def tuned(loop, **what):
         True,
         Reason.CHANGE,
         HISTORY,
-        [Start({}, 1.5, 0.0, Reason.CHANGE, HISTORY)],
+        [StartResult({}, 1.5, 0.0, Reason.CHANGE, HISTORY)],
         Mode.FORWARD,
         (0, 0),
         {"name": "xla"},

@@ -10,7 +10,7 @@ import jax
 
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import loads
-from diffabs.sweep.manifest import FORMAT
+from diffabs.sweep.manifest import MANIFEST_FORMAT
 
 
 def rig(start, stop):
@@ -82,7 +82,7 @@ def manifest(samples, chunk, variables=("plant.mass",), objectives=("iae",), **s
     }
     table |= {"solver": {"step": 1e-3, "duration": 1.0}, "space": {**space, "design": {"type": "random"}}}
     table["objectives"] = {name: {} for name in objectives}
-    return {"format": FORMAT, "study": table | study, "versions": {}, "source": {}}
+    return {"format": MANIFEST_FORMAT, "study": table | study, "versions": {}, "source": {}}
 
 
 def chunks(folder):

@@ -207,7 +207,7 @@ def test_a_scheduler_and_two_workers_in_processes_of_their_own(scenario, alone, 
 
 @pytest.mark.slow
 def test_a_scheduler_that_dies_ends_it_with_one_line(scenario, alone, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "TIMEOUT", 60.0)
+    monkeypatch.setattr(cluster, "TIMEOUT_SECONDS", 60.0)
     out = tmp_path / "out"
     with Processes(tmp_path) as processes:
         processes.worker()
@@ -266,7 +266,7 @@ def test_only_who_was_interrupted_and_has_no_worker_waits_for_nobody(threads, st
     """Ctrl-C in a terminal ends the workers, too: sometimes none comes back."""
     looks = iter([False, False, True])
     client, finished = SimpleNamespace(nthreads=lambda: threads), SimpleNamespace(has_ready=lambda: next(looks))
-    assert cluster._somebody_finishes(client, finished, lambda: stopped) is somebody
+    assert cluster._wait_for_chunk(client, finished, lambda: stopped) is somebody
 
 
 # Workers of its own
@@ -283,7 +283,7 @@ def listening():
     return {(c.laddr.ip, c.laddr.port) for c in inside if c.status == psutil.CONN_LISTEN}
 
 
-@killed_by("sweep/cluster.py", 'worker_dashboard_address=f"{LOOPBACK}:0"', 'worker_dashboard_address=":0"')
+@killed_by("sweep/cluster.py", 'worker_dashboard_address=f"{LOOPBACK_ADDRESS}:0"', 'worker_dashboard_address=":0"')
 def test_nobody_else_reaches_scheduler_workers_and_their_pages():
     before = listening()
     with Dask(workers=1)._client() as client:
@@ -318,7 +318,7 @@ def test_a_worker_that_is_killed_while_it_starts_is_one_line(scenario, tmp_path)
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr(cluster, "TIMEOUT", 1.0)
+    monkeypatch.setattr(cluster, "TIMEOUT_SECONDS", 1.0)
 
 
 @pytest.mark.parametrize(
@@ -354,7 +354,7 @@ def test_a_scheduler_that_is_gone_leaves_nothing_behind(study, alone, inside, tm
     assert sweep(study, tmp_path, on=Dask(inside)).digest == alone.digest
 
 
-@killed_by("sweep/cluster.py", "await asyncio.wait_for(call(), TIMEOUT + 1)", "await call()")
+@killed_by("sweep/cluster.py", "await asyncio.wait_for(call(), TIMEOUT_SECONDS + 1)", "await call()")
 def test_what_listens_but_is_no_scheduler(study, tmp_path, impatient):
     """It never says a word; so that nobody waits for ever if we did, it is gone after a while."""
     with socket.create_server(("127.0.0.1", 0)) as mute:
@@ -392,7 +392,7 @@ def without(folder, name):
     return folder
 
 
-@killed_by("sweep/cluster.py", "for line in differences(there, here):", "for line in ():")
+@killed_by("sweep/cluster.py", "for line in describe_differences(there, here):", "for line in ():")
 @pytest.mark.slow
 def test_a_worker_with_other_versions(scenario, tmp_path):
     """Of the package and of JAX; and one that has no diffabs at all."""

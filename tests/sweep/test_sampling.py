@@ -18,7 +18,15 @@ from diffabs.core.values import plain
 from diffabs.scenario.toml import document
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep import variables as space
-from diffabs.sweep.distributions import Categorical, Empirical, LogNormal, Normal, Triangular, Uniform, leaving
+from diffabs.sweep.distributions import (
+    Categorical,
+    Empirical,
+    LogNormal,
+    Normal,
+    Triangular,
+    Uniform,
+    describe_out_of_range,
+)
 from diffabs.sweep.sampling import Corners, Grid, LatinHypercube, Random, Saltelli, Sobol
 from diffabs.sweep.variables import Correlation, Rows, Space
 
@@ -182,8 +190,8 @@ def test_draws_are_distributed_as_scipy_says(design):
 @killed_by("sweep/sampling.py", "numbers = start + jax", "numbers = 0 * start + jax", case="random")
 @killed_by(
     "sweep/sampling.py",
-    "_hypercube(seed, samples, dimension)[start:stop]",
-    "_hypercube(seed, stop - start, dimension)",
+    "_hypercube_points(seed, samples, dimension)[start:stop]",
+    "_hypercube_points(seed, stop - start, dimension)",
     case="latin",
 )
 @pytest.mark.parametrize("case", DESIGNS)
@@ -200,7 +208,7 @@ def test_chunks_make_the_whole_bit_for_bit(case):
         np.testing.assert_array_equal(np.concatenate([part[path] for part in parts]), column)
 
 
-@killed_by("sweep/sampling.py", "_words(_seed(seed)", "_words(_seed(0 * seed)", case="random")
+@killed_by("sweep/sampling.py", "_random_words(_check_seed(seed)", "_random_words(_check_seed(0 * seed)", case="random")
 @pytest.mark.parametrize("case", DESIGNS)
 def test_the_seed_decides(case):
     design, samples = DESIGNS[case]
@@ -221,7 +229,7 @@ def test_random_samples_are_keys_folded_with_their_number():
 @pytest.mark.parametrize("word", [0, 2**32 - 1])
 def test_random_numbers_stay_inside_the_open_interval(monkeypatch, word):
     """The extreme words, which nobody lives to see drawn."""
-    monkeypatch.setattr(sampling, "_words", lambda *_: np.full((1, 2, 2), word, np.uint32))
+    monkeypatch.setattr(sampling, "_random_words", lambda *_: np.full((1, 2, 2), word, np.uint32))
     u = Random().unit(0, 0, 1, 2, 1)
     assert ((u > 0) & (u < 1)).all()
     np.testing.assert_array_equal(np.minimum(u, 1 - u), 2.0**-53)
@@ -232,10 +240,10 @@ def test_random_draws_do_not_depend_on_jaxs_precision_and_compile_once():
     expected = Random().unit(large, 4_000_000_000, 4_000_000_017, 2, large)
     with jax.enable_x64(False):
         np.testing.assert_array_equal(Random().unit(large, 4_000_000_000, 4_000_000_017, 2, large), expected)
-    compiled = sampling._words._cache_size()
+    compiled = sampling._random_words._cache_size()
     Random().unit(3, 17, 34, 2, 100)
     Random().unit(4, 34, 51, 2, 200)
-    assert sampling._words._cache_size() == compiled
+    assert sampling._random_words._cache_size() == compiled
 
 
 @killed_by("sweep/sampling.py", "spawn_key=(stream,)", "spawn_key=(0 * stream,)")
@@ -416,8 +424,8 @@ TABLES = [
 @pytest.mark.parametrize("ours", TABLES, ids=str)
 def test_tables_of_distributions_are_read_back(ours):
     table = plain(ours, brief=True)
-    assert distributions.read(json.loads(json.dumps(table)), "x") == ours
-    assert distributions.read(tomllib.loads(document({"x": table}, {}))["x"], "x") == ours
+    assert distributions.read_distribution(json.loads(json.dumps(table)), "x") == ours
+    assert distributions.read_distribution(tomllib.loads(document({"x": table}, {}))["x"], "x") == ours
 
 
 @pytest.mark.parametrize(
@@ -427,17 +435,17 @@ def test_tables_of_distributions_are_read_back(ours):
 )
 def test_tables_of_designs_are_read_back(ours):
     table = plain(ours, brief=True)
-    assert sampling.read(json.loads(json.dumps(table)), "x") == ours
+    assert sampling.read_sampling_design(json.loads(json.dumps(table)), "x") == ours
     assert tomllib.loads(document({"x": table}, {}))["x"] == table
 
 
 def test_the_table_of_a_space_is_read_back():
     ours = Space(FIVE | {"rows": Rows({"x": np.array([1.0, 2.0])}, np.array([1.0, 3.0]))}, PAIR, Sobol(2))
-    again = space.read(json.loads(json.dumps(ours.table())), "sweep")
+    again = space.read_space(json.loads(json.dumps(ours.table())), "sweep")
     assert again.table() == ours.table()
     for path, column in ours.draw(1, 0, 32, 32).items():
         np.testing.assert_array_equal(again.draw(1, 0, 32, 32)[path], column)
-    assert space.read({"variables": {}}, "sweep").design == Random()
+    assert space.read_space({"variables": {}}, "sweep").design == Random()
 
 
 @pytest.mark.parametrize(
@@ -501,7 +509,7 @@ def test_what_is_wrong_with_a_variable_is_said(ours, lines):
 )
 def test_what_is_wrong_with_a_table_is_said(given, line):
     with pytest.raises(ValueError, match="x") as caught:
-        distributions.read(given, "x")
+        distributions.read_distribution(given, "x")
     assert line in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -524,7 +532,7 @@ def test_what_is_wrong_with_a_table_is_said(given, line):
 )
 def test_what_is_wrong_with_the_table_of_a_design_is_said(given, line):
     with pytest.raises(ValueError, match="x") as caught:
-        sampling.read(given, "x")
+        sampling.read_sampling_design(given, "x")
     assert line in str(caught.value)
 
 
@@ -559,7 +567,7 @@ UNIT = {"type": "uniform", "low": 0, "high": 1}
 )
 def test_what_is_wrong_with_the_table_of_a_space_is_said(given, line):
     with pytest.raises(ValueError, match="x") as caught:
-        space.read(given, "x")
+        space.read_space(given, "x")
     assert line in str(caught.value)
 
 
@@ -694,11 +702,13 @@ def test_a_covariance_that_contradicts_the_deviations_is_refused():
     ids=range(12),
 )
 def test_what_leaves_the_range_of_a_parameter_is_said(ours, spec, line):
-    assert leaving(ours, spec, "sweep.over.m") == (line and f"sweep.over.m = {line}")
-    assert list(Space({"m": ours}).leaving({"m": spec}, "sweep.over.")) == ([f"sweep.over.m = {line}"] if line else [])
+    assert describe_out_of_range(ours, spec, "sweep.over.m") == (line and f"sweep.over.m = {line}")
+    assert list(Space({"m": ours}).describe_out_of_range({"m": spec}, "sweep.over.")) == (
+        [f"sweep.over.m = {line}"] if line else []
+    )
 
 
 def test_rows_that_leave_the_range_of_a_parameter_are_said():
     ours = Space({"r": Rows({"m": [1.0, 7.0], "n": [5.0, 5.0]})})
-    found = list(ours.leaving({"m": Spec("kg", 0, 6), "n": Spec("kg", 0, 6)}, "over."))
+    found = list(ours.describe_out_of_range({"m": Spec("kg", 0, 6), "n": Spec("kg", 0, 6)}, "over."))
     assert found == ["over.r: column m = 1 ... 7 leaves [0, 6] kg"]

@@ -23,8 +23,8 @@ from diffabs import roads
 from diffabs.objectives import Effort
 from diffabs.simulate.run import measure, rollout
 from diffabs.sweep import Categorical, Local, Normal, Results, Space, SweepError, Uniform, sweep
-from diffabs.sweep.seal import contents
-from diffabs.sweep.trajectories import keep
+from diffabs.sweep.seal import tables_digest
+from diffabs.sweep.trajectories import write_trajectories
 
 pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
@@ -306,7 +306,7 @@ def test_the_folder_of_chunks_is_a_data_set(made):
 def test_trajectories_are_those_of_rollout(study, tmp_path):
     import xarray
 
-    data = xarray.open_zarr(keep(study, tmp_path, [7, 3]), consolidated=False)
+    data = xarray.open_zarr(write_trajectories(study, tmp_path, [7, 3]), consolidated=False)
     assert dict(data.sizes) == {"sample": 2, "instant": study.solver.steps + 1}
     assert data["sample"].values.tolist() == [7, 3]
     assert (data["time"].attrs["units"], data["speed"].attrs["units"]) == ("s", "m/s")
@@ -340,7 +340,7 @@ def test_the_command_computes_the_table(by_command, swept):
     assert found.digest == document["digest"]
     assert left_in(folder) == {".lock", "manifest.json", "chunks", "summary.json", "trajectories.zarr"}
     if found.study["dtype"] == "float64":
-        assert contents([found.table().slice(0, 64)]) == contents([swept.table().slice(0, 64)])
+        assert tables_digest([found.table().slice(0, 64)]) == tables_digest([swept.table().slice(0, 64)])
 
 
 def test_a_sample_that_is_simulated_again_is_its_row(by_command):

@@ -21,8 +21,8 @@ from commands import assert_one_error_line, left_in, run
 from sweeping import PATIENCE, SCENARIO, chunks, command, environment, manifest, started, until
 
 from diffabs.sweep import Results
-from diffabs.sweep.manifest import Seals, sealed
-from diffabs.sweep.seal import NAME, encoded
+from diffabs.sweep.manifest import Seals, encode_manifest
+from diffabs.sweep.seal import CHUNK_NAME_PATTERN, encode_chunk
 from diffabs.sweep.store import Store
 
 SHORT = SCENARIO.replace("samples = 3200", "samples = 640")
@@ -114,7 +114,7 @@ def test_killed_again_and_again(longer, tmp_path, kills):
         assert before <= survived[-1] <= there
         for name in survived[-1]:
             data = (folders[-1] / "chunks" / name).read_bytes()
-            assert hashlib.sha256(data).hexdigest().startswith(NAME.fullmatch(name)[2])
+            assert hashlib.sha256(data).hexdigest().startswith(CHUNK_NAME_PATTERN.fullmatch(name)[2])
     assert any(0 < len(names) < len(there) for names in survived)
     for folder in folders:
         assert went_on(longer.scenario, folder)["digest"] == longer.digest
@@ -154,7 +154,7 @@ def test_killed_at_each_step_of_writing(tmp_path):
     """Manifest and two chunks: each is written, flushed (1), renamed (2), and its folder flushed (3)."""
     table, seals = manifest(2, 1), Seals(manifest(2, 1))
     values = {name: np.zeros(1, bool if name in ("stopped", "diverged") else float) for name in seals.columns}
-    data = [encoded({**values, "sample": np.array([chunk])}, seals.of(chunk)).hex() for chunk in range(2)]
+    data = [encode_chunk({**values, "sample": np.array([chunk])}, seals.of(chunk)).hex() for chunk in range(2)]
     words = [sys.executable, "-W", "ignore", "-c", WRITING, tmp_path, json.dumps(table), *data]
     done = subprocess.run(words, capture_output=True, check=True)
     assert [int(line) for line in done.stdout.split()] == [signal.SIGKILL] * 7
@@ -393,7 +393,7 @@ def changed(written, change):
     elif change == "commit":
         there["commit"] = "0123456789ab"
     del there["digest"]
-    return sealed(there).decode()
+    return encode_manifest(there).decode()
 
 
 @pytest.mark.parametrize(

@@ -30,15 +30,15 @@ class TestColumn:
         "function",
         [
             Moments.of,
-            estimates.replicated,
-            estimates.summary,
+            estimates.mean_of_replicates,
+            estimates.summarise_column,
             lambda x: estimates.quantile(x, 0.5),
             lambda x: estimates.cvar(x, 0.5),
             lambda x: Tail.of(x, np.arange(len(x)), 2),
             lambda x: sensitivity.correlations(x[:, None], np.arange(6.0)),
             lambda x: sensitivity.correlations(np.ones((6, 1)), x),
             lambda x: sensitivity.sobol_indices(np.ones(6), np.ones(6), x[None]),
-            lambda x: paired.paired(np.ones(6), x),
+            lambda x: paired.compare_pairs(np.ones(6), x),
         ],
     )
     def test_what_is_not_finite_is_counted(self, function):
@@ -63,7 +63,7 @@ class TestColumn:
         with pytest.raises(ValueError, match="99 replicates are too few"):
             sensitivity.sobol_indices(np.ones(6), np.ones(6), np.ones((2, 6)), confidence=0.99, replicates=99)
         with pytest.raises(ValueError, match="are not pairs"):
-            paired.paired(np.ones(5), np.ones(6))
+            paired.compare_pairs(np.ones(5), np.ones(6))
         with pytest.raises(ValueError, match=r"\(5, 2\) do not fit 6 outputs"):
             sensitivity.correlations(np.ones((5, 2)), np.ones(6))
         with pytest.raises(ValueError, match="do not fit"):
@@ -172,7 +172,7 @@ class TestCVaR:
         x = np.random.default_rng(6).exponential(size=20_000)
         found = {}
         for atoms in (64, 1024, 10**6):
-            monkeypatch.setattr(estimates, "ATOMS", atoms)
+            monkeypatch.setattr(estimates, "MAX_TAIL_ATOMS", atoms)
             found[atoms] = estimates.cvar(x, 0.8, replicates=799)
         half = 1.96 * np.std(np.maximum(x - np.quantile(x, 0.8), 0.0)) / 0.2 / math.sqrt(len(x))
         for atoms in (64, 1024):
@@ -208,7 +208,7 @@ class TestTail:
 class TestSummary:
     def test_is_what_the_functions_say_as_plain_values(self):
         x = np.random.default_rng(10).exponential(size=500)
-        found = estimates.summary(x, 0.9, levels=(0.25, 0.5), tail=0.8)
+        found = estimates.summarise_column(x, 0.9, levels=(0.25, 0.5), tail=0.8)
         assert found == {
             "mean": Moments.of(np.sort(x)).mean(confidence=0.9).table(),
             "deviation": Moments.of(np.sort(x)).deviation(confidence=0.9).table(),
@@ -339,7 +339,7 @@ class TestSobol:
         a, b, ab = outputs(ishigami, 3, 4000, np.random.default_rng(17))
         order = np.argsort(a)
         rows = sensitivity.sobol_indices(a, b, ab)
-        monkeypatch.setattr(sensitivity, "GROUPS", 500)
+        monkeypatch.setattr(sensitivity, "MAX_ROW_GROUPS", 500)
         groups = sensitivity.sobol_indices(a[order], b[order], ab[:, order])
         for one, other in zip(rows.first + rows.total, groups.first + groups.total, strict=True):
             np.testing.assert_allclose(other.value, one.value, rtol=1e-9, atol=1e-12)
@@ -364,7 +364,7 @@ class TestPaired:
 
     @killed_by("sweep/statistics/paired.py", "difference = one - other", "difference = other - one")
     def test_is_scipys_each_by_each(self):
-        found = paired.paired(self.A, self.B, confidence=0.9)
+        found = paired.compare_pairs(self.A, self.B, confidence=0.9)
         theirs = stats.ttest_rel(self.A, self.B).confidence_interval(0.9)
         np.testing.assert_allclose(ends(found.mean), theirs, rtol=1e-10, atol=0)
         assert found.mean.value == pytest.approx(np.mean(self.A) - np.mean(self.B), rel=1e-12)
@@ -386,10 +386,10 @@ class TestPaired:
         random = np.random.default_rng(21)
         a = random.normal(size=100_000)
         b = a + 0.5 * random.normal(size=100_000)
-        assert paired.paired(a, b).reduction == pytest.approx(9.0, rel=0.03)
-        assert paired.paired(a, b).correlation.value == pytest.approx(1 / math.sqrt(1.25), abs=0.003)
-        assert paired.paired(a, a + 0.0).reduction == math.inf
-        assert math.isnan(paired.paired(np.ones(5), np.zeros(5)).reduction)
+        assert paired.compare_pairs(a, b).reduction == pytest.approx(9.0, rel=0.03)
+        assert paired.compare_pairs(a, b).correlation.value == pytest.approx(1 / math.sqrt(1.25), abs=0.003)
+        assert paired.compare_pairs(a, a + 0.0).reduction == math.inf
+        assert math.isnan(paired.compare_pairs(np.ones(5), np.zeros(5)).reduction)
 
 
 def binormal(random, n, rho):
@@ -485,7 +485,7 @@ class TestCoverage:
 
         def draw():
             b = random.exponential(size=400)
-            return paired.paired(b + random.normal(0.2, 0.5, size=400), b)
+            return paired.compare_pairs(b + random.normal(0.2, 0.5, size=400), b)
 
         found = [draw() for _ in range(REPETITIONS)]
         for kind, truth in (("mean", 0.2), ("median", 0.2), ("less", stats.norm.cdf(-0.4))):
@@ -494,5 +494,5 @@ class TestCoverage:
 
     def test_replicated(self):
         random = np.random.default_rng(38)
-        found = coverage(estimates.replicated, lambda: random.normal(3.0, 2.0, size=8), 3.0)
+        found = coverage(estimates.mean_of_replicates, lambda: random.normal(3.0, 2.0, size=8), 3.0)
         assert abs(found - 95) < 2

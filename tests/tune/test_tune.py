@@ -16,9 +16,9 @@ from diffabs import controllers, plants, references
 from diffabs.core.bijectors import Decades, HalfLine, Interval, Line, bijection, space
 from diffabs.scenario.defaults import braking
 from diffabs.tune import CVaR, Mean, Method, Mode, Quantile, Reason, SmoothWorst, Stopping
-from diffabs.tune.augmented_lagrangian import Search
+from diffabs.tune.augmented_lagrangian import AugmentedLagrangianSearch
 from diffabs.tune.descent import Descent, Optimiser, lbfgs
-from diffabs.tune.problem import Evaluation, Multipliers, Seen, _penalty
+from diffabs.tune.problem import LossEvaluation, Multipliers, ObjectiveEvaluation, _penalty
 
 LOOP = braking(
     plant=plants.MirroredRig(),
@@ -133,13 +133,13 @@ def evaluation(function, excess=lambda z: jnp.zeros(0)):
     """The evaluation of a plain function of z with constraints."""
 
     def loss(z, m):
-        seen = Seen(function(z), excess(z), jnp.asarray(0), {})
+        seen = ObjectiveEvaluation(function(z), excess(z), jnp.asarray(0), {})
         value = seen.objective + _penalty(seen.excess, m)
         return value, (value, seen)
 
     def evaluate(z, m):
         gradient, (value, seen) = jax.grad(loss, has_aux=True)(z, m)
-        return Evaluation(value, gradient, seen)
+        return LossEvaluation(value, gradient, seen)
 
     return jax.jit(jax.vmap(evaluate)), lambda z, m: loss(z, m)[0]
 
@@ -176,7 +176,9 @@ class TestDescent:
         np.testing.assert_allclose(lane.z, [1.0, -2.0], rtol=0, atol=1e-4)
 
     @killed_by(
-        "tune/descent.py", "elif float(found.gradient @ lane.update) < WOLFE * slope and not longest:", "elif False:"
+        "tune/descent.py",
+        "elif float(found.gradient @ descent_state.update) < WOLFE_FRACTION * slope and not longest:",
+        "elif False:",
     )
     def test_a_step_that_is_much_too_short_is_not_content_with_little(self):
         """Weak Wolfe conditions, written out here, where the first direction is a thousandth of the way."""
@@ -188,7 +190,7 @@ class TestDescent:
         assert f(lane.z) <= f(start) + 1e-4 * before @ step
         assert after @ step >= 0.9 * (before @ step)
 
-    @killed_by("tune/descent.py", "if lane.jumps >= JUMPS:", "if False:")
+    @killed_by("tune/descent.py", "if descent_state.jumps >= MAX_JUMPS:", "if False:")
     def test_where_the_loss_jumps_it_ends_soon(self):
         """A wall at z0 = 0.3, which the slope points across: twelve trials, twice."""
         (lane,) = descend(lambda z: z[0] + z[1] ** 2 + jnp.where(z[0] < 0.3, 1e3, 0.0), [0.7, 1.0])
@@ -280,10 +282,10 @@ class Constrained:
 
 
 class TestConstraints:
-    @killed_by("tune/augmented_lagrangian.py", "            m = _raised(m, lanes)\n", "")
+    @killed_by("tune/augmented_lagrangian.py", "            m = _raise_multipliers(m, descent_states)\n", "")
     def test_the_multipliers_find_the_constrained_minimum(self):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1], z[0] - 5.0]))
-        found = Search(problem, Method(margin=1e-7, rounds=20), None).result()
+        found = AugmentedLagrangianSearch(problem, Method(margin=1e-7, rounds=20), None).result()
         np.testing.assert_allclose([found.values["x"], found.values["y"]], [2 / 3, 1 / 3], rtol=0, atol=1e-5)
         np.testing.assert_allclose(found.objective[1], 2 / 3, rtol=0, atol=1e-5)
         assert found.met
@@ -295,7 +297,7 @@ class TestConstraints:
         """Multipliers come to a bound from outside; the bound stated, not one beside it, holds where they end. With the
         margin that takes three rounds, aimed at the bound itself nine."""
         problem = Constrained(start, lambda z: jnp.array([1 - z[0] - z[1]]))
-        found = Search(problem, Method(rounds=4), None).result()
+        found = AugmentedLagrangianSearch(problem, Method(rounds=4), None).result()
         assert found.met
         assert found.reason is not Reason.KEPT
         assert found.values["x"] + found.values["y"] >= 1
@@ -306,7 +308,7 @@ class TestConstraints:
         """Two iterations and no multipliers raised: from inside, the penalty alone ends outside of the bound."""
         problem = Constrained([1.0, 1.0], lambda z: jnp.array([1 - z[0] - z[1]]))
         few = Method(rounds=0, stopping=Stopping(iterations=20))
-        found = Search(problem, few, None).result()
+        found = AugmentedLagrangianSearch(problem, few, None).result()
         assert found.met
         assert found.reason is Reason.KEPT
         assert found.values["x"] + found.values["y"] >= 1
@@ -318,20 +320,22 @@ class TestConstraints:
     def test_a_bound_that_leaves_no_room_for_the_margin_can_still_be_met(self):
         """x <= 0 and -x <= 0: only x = 0, where the descent starts."""
         problem = Constrained([0.0, 2.0], lambda z: jnp.array([z[0], -z[0]]))
-        found = Search(problem, Method(), None).result()
+        found = AugmentedLagrangianSearch(problem, Method(), None).result()
         assert found.met
         assert found.values["x"] == 0
 
     def test_it_says_when_they_cannot_be_met(self):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0], z[0] + 1.0]))
-        found = Search(problem, Method(rounds=5), None).result()
+        found = AugmentedLagrangianSearch(problem, Method(rounds=5), None).result()
         assert not found.met
         assert found.violation[1] > 0.9
 
     def test_the_best_of_many_starts_meets_them(self):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))
         told = []
-        found = Search(problem, Method(starts=4, seed=3, margin=1e-6, rounds=20), told.append).result()
+        found = AugmentedLagrangianSearch(
+            problem, Method(starts=4, seed=3, margin=1e-6, rounds=20), told.append
+        ).result()
         assert len(found.starts) == 4
         np.testing.assert_allclose(found.objective[1], 2 / 3, rtol=0, atol=1e-4)
         assert told[-1].starts == 0
@@ -346,7 +350,7 @@ class TestInterruption:
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))
         told = []
         method = Method(starts=3, seed=1, margin=1e-6, rounds=20)
-        found = Search(problem, method, told.append, lambda: len(told) >= after).result()
+        found = AugmentedLagrangianSearch(problem, method, told.append, lambda: len(told) >= after).result()
         assert len(told) == after  # the evaluation in hand is the last
         assert found.reason is Reason.INTERRUPTED
 
@@ -366,12 +370,14 @@ class TestInterruption:
         """The first start meets the constraint from the beginning and is then pulled over its edge."""
         problem = Constrained([0.9, 0.9], lambda z: jnp.array([1 - z[0] - z[1]]))
         told = []
-        found = Search(problem, Method(margin=1e-6), told.append, lambda: told[1:] and told[-1].round == 0).result()
+        found = AugmentedLagrangianSearch(
+            problem, Method(margin=1e-6), told.append, lambda: told[1:] and told[-1].round == 0
+        ).result()
         assert told[-1].point.violation > 1e-3
         assert found.met
         assert 1 - found.values["x"] - found.values["y"] <= 1e-6
 
     def test_without_it_nothing_changes(self):
         problem = Constrained([2.0, 2.0], lambda z: jnp.array([1 - z[0] - z[1]]))
-        found = Search(problem, Method(margin=1e-6, rounds=20), None).result()
+        found = AugmentedLagrangianSearch(problem, Method(margin=1e-6, rounds=20), None).result()
         assert found.reason is not Reason.INTERRUPTED

@@ -26,8 +26,8 @@ from diffabs.simulate.stable_step import stable_step, stable_steps
 from diffabs.stops import SpeedReached
 from diffabs.tune import AtMost, CertifiedDecay, Method, Mode, Poles, Stopping, WorstCase, grid, tune, worst_case
 from diffabs.tune.problem import Multipliers
-from diffabs.tune.tuning import posed
-from diffabs.tune.weights import lq_weights, regulator
+from diffabs.tune.tuning import build_problem
+from diffabs.tune.weights import lq_weights, lqr_gain_design
 
 RIG = braking(
     plant=plants.MirroredRig(),
@@ -53,8 +53,8 @@ def value_and_gradient(problem):
 def test_the_gradient_is_that_of_differences_forward_and_reverse():
     """Objective and both terms of the augmented Lagrangian."""
     ask = {"objective": {"iae": 1.0}, "over": TWO, "solver": SOLVER, "constraints": [AtMost("overshoot", 0.01)]}
-    forward, reverse = (value_and_gradient(posed(RIG, free=GAINS, mode=mode, **ask)) for mode in Mode)
-    z = posed(RIG, free=GAINS, **ask).space.place(RIG)
+    forward, reverse = (value_and_gradient(build_problem(RIG, free=GAINS, mode=mode, **ask)) for mode in Mode)
+    z = build_problem(RIG, free=GAINS, **ask).space.place(RIG)
     found = forward(z)
     assert (found.seen.excess > 0).all()
     np.testing.assert_allclose(found.gradient, reverse(z).gradient, rtol=1e-8)
@@ -70,8 +70,8 @@ def test_the_gradient_is_that_of_differences_forward_and_reverse():
 def test_it_finds_what_nelder_mead_finds_and_stays_where_the_step_is_stable():
     ask = {"objective": {"iae": 1.0, "final_slip_error": 0.1}, "over": TWO, "solver": SOLVER}
     found = tune(RIG, free=GAINS, method=Method(starts=2, stopping=Stopping(iterations=40)), **ask)
-    problem = posed(RIG, free=GAINS, **ask)
-    value, steady = problem.valuer(), problem.steady()
+    problem = build_problem(RIG, free=GAINS, **ask)
+    value, steady = problem.objective_evaluator(), problem.steady()
 
     def objective(z):
         return float(value(jnp.asarray(z)[None]).objective[0]) if steady(z[None])[0] else 1.0
@@ -134,11 +134,11 @@ def test_lanes_in_groups_are_the_lanes_together():
     values = {"initial.speed": speeds}
     ask = {"free": GAINS, "objective": {"stop_distance": 1.0}, "solver": d.FixedStep(5e-4, 0.8)}
     together, apart = (
-        jax.jit(posed(RIG, over=d.Batch(values, durations=t), **ask).seen)(jnp.zeros(2))
+        jax.jit(build_problem(RIG, over=d.Batch(values, durations=t), **ask).seen)(jnp.zeros(2))
         for t in (None, np.array([0.3, 0.8, 0.25, 0.75]))
     )
     np.testing.assert_allclose(apart.metrics["stop_distance"], together.metrics["stop_distance"], rtol=1e-12)
-    weighed = posed(RIG, over=d.Batch(values, weights=1 / speeds), **ask).seen(jnp.zeros(2))
+    weighed = build_problem(RIG, over=d.Batch(values, weights=1 / speeds), **ask).seen(jnp.zeros(2))
     np.testing.assert_allclose(weighed.objective, np.mean(together.metrics["stop_distance"] / speeds), rtol=1e-12)
 
 
@@ -231,7 +231,7 @@ class TestWeights:
     def test_the_gain_is_that_of_the_riccati_equation(self):
         model = SlipModel(speed=20 / 3.6)
         q = np.array([[1e6, 2e3], [2e3, 1e4]])
-        loop = lq_weights(RIG, q, 2.0, regulator(model))
+        loop = lq_weights(RIG, q, 2.0, lqr_gain_design(model))
         np.testing.assert_allclose(loop.weights()[0], q, rtol=1e-12)
         a, b = (np.asarray(x) for x in model.matrices())
         k = -b.T @ solve_continuous_are(a, b, q, np.array([[2.0]])) / 2.0
@@ -239,7 +239,7 @@ class TestWeights:
 
     @pytest.mark.slow
     def test_its_derivative(self):
-        loop = lq_weights(RIG, (1e6, 1e4), 1.0, regulator(SlipModel(speed=20 / 3.6)))
+        loop = lq_weights(RIG, (1e6, 1e4), 1.0, lqr_gain_design(SlipModel(speed=20 / 3.6)))
 
         def gain(x):
             values = {"log_diagonal": x[:2], "lower": x[2:3], "log_effort": x[3]}
@@ -255,7 +255,7 @@ class TestWeights:
     @pytest.mark.parametrize(("q", "r"), [((1.0, 0.0), 1.0), ((1.0, 1.0), 0.0), ([[1.0, 2.0], [2.0, 1.0]], 1.0)])
     def test_refuses_what_has_no_logarithm(self, q, r):
         with pytest.raises(ValueError, match="is not positive definite"):
-            lq_weights(RIG, q, r, regulator(SlipModel()))
+            lq_weights(RIG, q, r, lqr_gain_design(SlipModel()))
 
 
 class TestSpeedScaled:
@@ -300,7 +300,7 @@ class TestSpeedScaled:
 BOX = {"plant.mass": (4.0, 8.0), "plant.road.w4": (0.3, 0.5), "actuator.time_constant": (5e-4, 4e-3)}
 
 
-@killed_by("tune/worst.py", "if self.value <= self.corner * (1 + SAME):", "if False:")
+@killed_by("tune/worst.py", "if self.value <= self.corner * (1 + CORNER_TOLERANCE):", "if False:")
 @pytest.mark.parametrize(
     ("corner", "screened", "words"),
     [

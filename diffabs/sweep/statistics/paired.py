@@ -12,34 +12,34 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from diffabs.sweep.statistics.estimates import Count, Estimate, Moments, column, quantile
+from diffabs.sweep.statistics.estimates import Count, IntervalEstimate, Moments, as_column, quantile
 from diffabs.sweep.statistics.sensitivity import pearson
 
 
-class Paired(NamedTuple):
+class PairedComparison(NamedTuple):
     """Of a - b: mean, median; share of samples where a < b, and how many are equal; correlation of a with b;
     (var a + var b)/var(a - b), infinite for a constant difference, NaN if both are constant."""
 
-    mean: Estimate
-    median: Estimate
-    less: Estimate
+    mean: IntervalEstimate
+    median: IntervalEstimate
+    less: IntervalEstimate
     ties: int
-    correlation: Estimate
+    correlation: IntervalEstimate
     reduction: float
 
 
-def paired(a: Any, b: Any, *, confidence: float = 0.95) -> Paired:
+def compare_pairs(a: Any, b: Any, *, confidence: float = 0.95) -> PairedComparison:
     """From outputs (n,) of two variants, sample by sample.
 
     Raises ValueError for fewer than four samples, for lengths that differ, and for values not finite.
     """
-    one, other = column(a, least=4), column(b)
+    one, other = as_column(a, least=4), as_column(b)
     if one.shape != other.shape:
         raise ValueError(f"{len(one)} and {len(other)} values are not pairs: leave a lane out of both")
     difference = one - other
     apart, together = float(np.var(one) + np.var(other)), float(np.var(difference))
     less = Count(int(np.count_nonzero(one < other)), len(one))
-    return Paired(
+    return PairedComparison(
         mean=Moments.of(difference).mean(confidence=confidence),
         median=quantile(difference, 0.5, confidence=confidence),
         less=less.probability(confidence=confidence),

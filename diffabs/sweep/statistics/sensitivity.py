@@ -27,23 +27,30 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from diffabs.sweep.statistics.estimates import BLOCK, REPLICATES, Estimate, column, outer, upper
+from diffabs.sweep.statistics.estimates import (
+    BOOTSTRAP_REPLICATES,
+    REPLICATES_PER_BLOCK,
+    IntervalEstimate,
+    as_column,
+    percentile_index,
+    upper_level,
+)
 
-GROUPS = 4096  # beyond that many, rows are resampled in random groups of one size: same law, bounded price
+MAX_ROW_GROUPS = 4096  # beyond that many, rows are resampled in random groups of one size: same law, bounded price
 
 
 class Correlations(NamedTuple):
     """One estimate per input."""
 
-    pearson: list[Estimate]
-    spearman: list[Estimate]
+    pearson: list[IntervalEstimate]
+    spearman: list[IntervalEstimate]
 
 
-class Indices(NamedTuple):
+class SobolIndices(NamedTuple):
     """One estimate per input."""
 
-    first: list[Estimate]
-    total: list[Estimate]
+    first: list[IntervalEstimate]
+    total: list[IntervalEstimate]
 
 
 def correlations(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = True) -> Correlations:
@@ -51,7 +58,7 @@ def correlations(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = T
 
     Raises ValueError for fewer than four samples, for lengths that differ, and for values not finite.
     """
-    outputs, inputs = column(y, least=4), np.asarray(x)
+    outputs, inputs = as_column(y, least=4), np.asarray(x)
     if inputs.ndim != 2 or len(inputs) != len(outputs):
         raise ValueError(f"inputs of shape {inputs.shape} do not fit {len(outputs)} outputs")
     ranked = stats.rankdata(outputs)
@@ -62,51 +69,55 @@ def correlations(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = T
     return found
 
 
-def pearson(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = True) -> Estimate:
+def pearson(x: Any, y: Any, *, confidence: float = 0.95, binormal: bool = True) -> IntervalEstimate:
     """Of two columns (n,); otherwise as `correlations`."""
-    one, other = column(x, least=4), column(y)
+    one, other = as_column(x, least=4), as_column(y)
     if one.shape != other.shape:
         raise ValueError(f"{len(one)} and {len(other)} values are not pairs: leave a lane out of both")
-    u, v = _standard(one), _standard(other)
+    u, v = _standardise(one), _standardise(other)
     r = float(np.clip(np.mean(u * v), -1.0, 1.0))
-    return _fisher(r, 1.0 if binormal else _spread(_influence(u, v, r), r), confidence, len(u))
+    return _fisher_interval(r, 1.0 if binormal else _atanh_deviation(_influence(u, v, r), r), confidence, len(u))
 
 
 def sobol_indices(
-    a: Any, b: Any, ab: Any, *, confidence: float = 0.95, replicates: int = REPLICATES, seed: int = 0
-) -> Indices:
+    a: Any, b: Any, ab: Any, *, confidence: float = 0.95, replicates: int = BOOTSTRAP_REPLICATES, seed: int = 0
+) -> SobolIndices:
     """From outputs f(A), f(B) (n,) and f(AB_j) (d, n); NaN without bounds if f is constant.
 
     The same seed, the same intervals. They are those of independent rows: for rows of a low-discrepancy design they are
     too wide. Raises ValueError for fewer than four rows, for shapes that do not fit, for values not finite, and
     for too few replicates.
     """
-    fa, fb, mixed = column(a, least=4), column(b), np.asarray(ab)
+    fa, fb, mixed = as_column(a, least=4), as_column(b), np.asarray(ab)
     if fa.shape != fb.shape or mixed.ndim != 2 or mixed.shape[1] != len(fa):
         raise ValueError(f"outputs of shapes {fa.shape}, {fb.shape} and {mixed.shape} do not fit: (n,), (n,), (d, n)")
-    d, n, place = len(mixed), len(fa), outer(replicates, confidence)
+    d, n, place = len(mixed), len(fa), percentile_index(replicates, confidence)
     random = np.random.default_rng(seed)
-    rows = _grouped(fa, fb, mixed, random)
-    (values,) = _indices(rows.sum(axis=0)[None])
-    sizes = [min(BLOCK, replicates - start) for start in range(0, replicates, BLOCK)]
-    found = np.sort(np.concatenate([_indices(_drawn(size, len(rows), random) @ rows) for size in sizes]), axis=0)
+    rows = _sum_group_features(fa, fb, mixed, random)
+    (values,) = _indices_from_sums(rows.sum(axis=0)[None])
+    sizes = [min(REPLICATES_PER_BLOCK, replicates - start) for start in range(0, replicates, REPLICATES_PER_BLOCK)]
+    found = np.sort(
+        np.concatenate([_indices_from_sums(_resample_groups(size, len(rows), random) @ rows) for size in sizes]), axis=0
+    )
     ends = np.where(np.isnan(found[-1]), [[-math.inf], [math.inf]], found[[place, -1 - place]])
     table = zip(values.tolist(), *ends.tolist(), strict=True)
-    each = [Estimate(value, low, high, confidence, n) for value, low, high in table]
-    return Indices(each[:d], each[d:])
+    each = [IntervalEstimate(value, low, high, confidence, n) for value, low, high in table]
+    return SobolIndices(each[:d], each[d:])
 
 
-def _spearman(x: np.ndarray, y: np.ndarray, confidence: float, binormal: bool) -> Estimate:
+def _spearman(x: np.ndarray, y: np.ndarray, confidence: float, binormal: bool) -> IntervalEstimate:
     """From ranks."""
-    u, v = _standard(x), _standard(y)
+    u, v = _standardise(x), _standardise(y)
     r = float(np.clip(np.mean(u * v), -1.0, 1.0))
     if binormal:
-        return _fisher(r, math.sqrt(1 + r * r / 2), confidence, len(u))
-    others = _ahead(x, v - r * u) / np.std(x) + _ahead(y, u - r * v) / np.std(y)  # what a sample does to others' ranks
-    return _fisher(r, _spread(_influence(u, v, r) + others, r), confidence, len(u))
+        return _fisher_interval(r, math.sqrt(1 + r * r / 2), confidence, len(u))
+    others = _sum_above(x, v - r * u) / np.std(x) + _sum_above(y, u - r * v) / np.std(
+        y
+    )  # what a sample does to others' ranks
+    return _fisher_interval(r, _atanh_deviation(_influence(u, v, r) + others, r), confidence, len(u))
 
 
-def _standard(x: np.ndarray) -> np.ndarray:
+def _standardise(x: np.ndarray) -> np.ndarray:
     return (x - x.mean()) / np.std(x) if np.ptp(x) > 0 else np.full(len(x), np.nan)
 
 
@@ -114,52 +125,52 @@ def _influence(u: np.ndarray, v: np.ndarray, r: float) -> np.ndarray:
     return u * v - r * (u * u + v * v) / 2
 
 
-def _ahead(x: np.ndarray, w: np.ndarray) -> np.ndarray:
+def _sum_above(x: np.ndarray, w: np.ndarray) -> np.ndarray:
     """Sum of w over the samples of greater x, and half of it over those of equal x."""
     _, place = np.unique(x, return_inverse=True)
     sums = np.bincount(place, weights=w)
     return (sums.sum() - np.cumsum(sums) + sums / 2)[place]
 
 
-def _spread(influence: np.ndarray, r: float) -> float:
+def _atanh_deviation(influence: np.ndarray, r: float) -> float:
     """Of sqrt(n) atanh r; zero for columns that determine each other."""
     return float(np.std(influence)) / (1 - r * r) if r * r < 1 else 0.0
 
 
-def _fisher(r: float, spread: float, confidence: float, n: int) -> Estimate:
-    half = float(stats.norm.ppf(upper(confidence))) * spread / math.sqrt(n - 3)
+def _fisher_interval(r: float, spread: float, confidence: float, n: int) -> IntervalEstimate:
+    half = float(stats.norm.ppf(upper_level(confidence))) * spread / math.sqrt(n - 3)
     if math.isnan(r):
-        return Estimate(r, -1.0, 1.0, confidence, n)
+        return IntervalEstimate(r, -1.0, 1.0, confidence, n)
     with np.errstate(divide="ignore"):
         centre = np.arctanh(r)
-    return Estimate(r, float(np.tanh(centre - half)), float(np.tanh(centre + half)), confidence, n)
+    return IntervalEstimate(r, float(np.tanh(centre - half)), float(np.tanh(centre + half)), confidence, n)
 
 
-def _grouped(a: np.ndarray, b: np.ndarray, mixed: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def _sum_group_features(a: np.ndarray, b: np.ndarray, mixed: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Sums of the features of the rows of each group, (groups, 3 + 2 d), rows assigned to groups at random.
 
     Features: 1, a + b, a^2 + b^2, and for each j: b (ab_j - a), (ab_j - a)^2. The overall mean is taken out first: that
     changes no index, and the first-order estimator is least noisy there.
     """
     n = len(a)
-    groups = min(n, GROUPS)
+    groups = min(n, MAX_ROW_GROUPS)
     group = random.permutation(n) % groups if groups < n else np.arange(n)
     mean = (a.mean() + b.mean()) / 2
     a, b = a - mean, b - mean
     sums = [np.bincount(group, one) for one in (np.ones(n), a + b, a * a + b * b)]
     for values in mixed:
-        step = column(values) - mean - a
+        step = as_column(values) - mean - a
         sums += [np.bincount(group, one) for one in (b * step, step * step)]
     return np.stack(sums, axis=1)
 
 
-def _drawn(replicates: int, groups: int, random: np.random.Generator) -> np.ndarray:
+def _resample_groups(replicates: int, groups: int, random: np.random.Generator) -> np.ndarray:
     """How often each group occurs among as many that are drawn, (replicates, groups)."""
     drawn = random.integers(groups, size=(replicates, groups)) + groups * np.arange(replicates)[:, None]
     return np.bincount(drawn.ravel(), minlength=drawn.size).reshape(drawn.shape).astype(float)
 
 
-def _indices(sums: np.ndarray) -> np.ndarray:
+def _indices_from_sums(sums: np.ndarray) -> np.ndarray:
     """First-order, then total indices (replicates, 2 d) from sums of features over the rows (replicates, 3 + 2 d)."""
     n = sums[:, :1]
     mean, square = sums[:, 1:2] / (2 * n), sums[:, 2:3] / (2 * n)

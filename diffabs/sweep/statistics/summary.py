@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 
 from diffabs.sweep.results import Results
-from diffabs.sweep.statistics.estimates import Count, Tail, cvar, quantile, replicated
-from diffabs.sweep.statistics.estimates import summary as summarised
+from diffabs.sweep.statistics.estimates import Count, Tail, cvar, mean_of_replicates, quantile
+from diffabs.sweep.statistics.estimates import summarise_column as summarised
 from diffabs.sweep.statistics.sensitivity import correlations, sobol_indices
 
-LEVELS, TAIL = (0.05, 0.5, 0.95), 0.95
-MOST_CORRELATED = 200_000  # samples from which correlations are computed: the first ones
-WORST = 10
-FEWEST = 4  # samples of which anything is said
-NOTES = {
+QUANTILE_LEVELS, CVAR_LEVEL = (0.05, 0.5, 0.95), 0.95
+MAX_CORRELATED_SAMPLES = 200_000  # samples from which correlations are computed: the first ones
+MAX_LISTED_SAMPLES = 10
+MIN_SAMPLES = 4  # samples of which anything is said
+INTERVAL_NOTES = {
     "random": "independent samples",
     "sobol": "spread between replicates",
     "one sobol": "as of independent samples: too wide for a Sobol' sequence",
@@ -35,41 +35,44 @@ NOTES = {
 }
 
 
-def summary(found: Results, confidence: float = 0.95) -> dict[str, Any]:
+def summarise_sweep(found: Results, confidence: float = 0.95) -> dict[str, Any]:
     """Of the chunks that are there. Lanes that diverged are counted, and in no statistic but the failures; lanes that
     were refused are counted, and in none."""
     accepted = found.accepted
     diverged = found.column("diverged") & accepted
-    view = _View(found, accepted & ~diverged, accepted)
+    view = _RowSelection(found, accepted & ~diverged, accepted)
     kind = found.study["space"]["design"]["type"]
-    note = NOTES["one sobol" if kind == "sobol" and view.replicates == 1 else kind]
+    note = INTERVAL_NOTES["one sobol" if kind == "sobol" and view.replicates == 1 else kind]
     return {
         "samples": len(diverged),
         "complete": found.complete,
-        "diverged": {"count": int(diverged.sum()), "samples": found.column("sample")[diverged][:WORST].tolist()},
-        "refused": _refused(found, accepted),
+        "diverged": {
+            "count": int(diverged.sum()),
+            "samples": found.column("sample")[diverged][:MAX_LISTED_SAMPLES].tolist(),
+        },
+        "refused": _summarise_refused(found, accepted),
         "confidence": confidence,
         "intervals": note,
-        "failures": dict(_failures(found, view, confidence)),
+        "failures": dict(_failure_probabilities(found, view, confidence)),
         "never": {name: never for name in found.metrics if (never := view.never(name))["count"]},
-        "metrics": {name: _metric(view, name, confidence) for name in found.metrics},
-        "sensitivity": _sensitivity(found, view, confidence),
-        "worst": {name: _worst(found, view, name) for name in found.metrics},
+        "metrics": {name: _summarise_metric(view, name, confidence) for name in found.metrics},
+        "sensitivity": _summarise_sensitivity(found, view, confidence),
+        "worst": {name: _worst_samples(found, view, name) for name in found.metrics},
         "digest": found.digest,
     }
 
 
-def _refused(found: Results, accepted: np.ndarray) -> dict[str, Any]:
+def _summarise_refused(found: Results, accepted: np.ndarray) -> dict[str, Any]:
     """How many samples were not run, the first of them, and how often for which reason."""
     reasons, counts = np.unique(found.column("refused")[~accepted].astype(str), return_counts=True)
     return {
         "count": int(np.sum(~accepted)),
-        "samples": found.column("sample")[~accepted][:WORST].tolist(),
+        "samples": found.column("sample")[~accepted][:MAX_LISTED_SAMPLES].tolist(),
         "reasons": dict(zip(reasons.tolist(), counts.tolist(), strict=True)),
     }
 
 
-class _View:
+class _RowSelection:
     """The rows that are in the statistics, and how they are grouped."""
 
     def __init__(self, found: Results, good: np.ndarray, accepted: np.ndarray):
@@ -91,10 +94,10 @@ class _View:
     def never(self, name: str) -> dict[str, Any]:
         """How many runs have an infinite value: they never got to what is measured. They are in no other number."""
         rows = self.good & self.rows & np.isinf(self.found.column(name))
-        return {"count": int(rows.sum()), "samples": self.found.column("sample")[rows][:WORST].tolist()}
+        return {"count": int(rows.sum()), "samples": self.found.column("sample")[rows][:MAX_LISTED_SAMPLES].tolist()}
 
 
-def _failures(found: Results, view: _View, confidence: float) -> Iterator[tuple[str, Any]]:
+def _failure_probabilities(found: Results, view: _RowSelection, confidence: float) -> Iterator[tuple[str, Any]]:
     kinds = found.failures()
     kinds["any"] = np.any(list(kinds.values()), axis=0)
     asked = view.rows & view.accepted
@@ -107,76 +110,77 @@ def _failures(found: Results, view: _View, confidence: float) -> Iterator[tuple[
         if view.replicates > 1 and all(part.any() for part in parts):
             blocks = zip(np.split(failed, view.replicates), parts, strict=True)
             shares = [float(block[part].mean()) for block, part in blocks]
-            one = replicated(shares, confidence=confidence).table() | {"value": count.failures / count.samples}
-        yield name, {"count": count.failures, **_plain(one, view.random)}
+            one = mean_of_replicates(shares, confidence=confidence).table() | {"value": count.failures / count.samples}
+        yield name, {"count": count.failures, **_json_estimate(one, view.random)}
 
 
-def _metric(view: _View, name: str, confidence: float) -> dict[str, Any]:
+def _summarise_metric(view: _RowSelection, name: str, confidence: float) -> dict[str, Any]:
     values = view.column(name)
     values = values[np.isfinite(values)]
-    if len(values) < FEWEST:
+    if len(values) < MIN_SAMPLES:
         return {}
-    found = summarised(values, confidence, LEVELS, TAIL)
+    found = summarised(values, confidence, QUANTILE_LEVELS, CVAR_LEVEL)
     if view.replicates > 1:
         blocks = view.blocks(name)
         kinds: dict[str, Any] = {"mean": np.mean}
-        kinds |= {f"quantile {level:g}": lambda x, level=level: quantile(x, level).value for level in LEVELS}
-        kinds[f"cvar {TAIL:g}"] = lambda x: cvar(x, TAIL, replicates=100).value
+        kinds |= {f"quantile {level:g}": lambda x, level=level: quantile(x, level).value for level in QUANTILE_LEVELS}
+        kinds[f"cvar {CVAR_LEVEL:g}"] = lambda x: cvar(x, CVAR_LEVEL, replicates=100).value
         found |= {
-            k: replicated([float(of(b)) for b in blocks], confidence=confidence).table() for k, of in kinds.items()
+            k: mean_of_replicates([float(of(b)) for b in blocks], confidence=confidence).table()
+            for k, of in kinds.items()
         }
     ends = {"least": float(values.min()), "greatest": float(values.max())}
-    return {**{kind: _plain(one, view.random) for kind, one in found.items()}, **ends}
+    return {**{kind: _json_estimate(one, view.random) for kind, one in found.items()}, **ends}
 
 
-def _sensitivity(found: Results, view: _View, confidence: float) -> dict[str, Any]:
+def _summarise_sensitivity(found: Results, view: _RowSelection, confidence: float) -> dict[str, Any]:
     """By metric and variable: correlations, or for a Saltelli design Sobol' indices."""
     variables = [path for path in found.variables if found.is_number(path)]
     metrics = {name: found.column(name) for name in found.metrics}
     if view.period > 1:
         names = list(found.study["space"]["variables"])
-        return {name: _indices(values, view, names, confidence) for name, values in metrics.items()}
-    rows = np.flatnonzero(view.good)[:MOST_CORRELATED]
-    if not view.random or not variables or len(rows) < FEWEST:
+        return {name: _summarise_indices(values, view, names, confidence) for name, values in metrics.items()}
+    rows = np.flatnonzero(view.good)[:MAX_CORRELATED_SAMPLES]
+    if not view.random or not variables or len(rows) < MIN_SAMPLES:
         return {}
     x = np.stack([found.column(path)[rows] for path in variables], axis=1)
     result = {}
     for name, values in metrics.items():
         y = values[rows]
         known = np.isfinite(y)
-        if known.sum() < FEWEST:
+        if known.sum() < MIN_SAMPLES:
             continue
         both = correlations(x[known], y[known], confidence=confidence, binormal=False)
         result[name] = {
-            path: {"pearson": _plain(p.table(), True), "spearman": _plain(s.table(), True)}
+            path: {"pearson": _json_estimate(p.table(), True), "spearman": _json_estimate(s.table(), True)}
             for path, p, s in zip(variables, *both, strict=True)
         }
     return result
 
 
-def _indices(values: np.ndarray, view: _View, names: list[str], confidence: float) -> dict[str, Any]:
+def _summarise_indices(values: np.ndarray, view: _RowSelection, names: list[str], confidence: float) -> dict[str, Any]:
     """Rows of which a lane diverged, or has an infinite value, are left out whole."""
     whole = len(values) // view.period * view.period
     table, good = values[:whole].reshape(-1, view.period), view.good[:whole] & np.isfinite(values[:whole])
     good = good.reshape(-1, view.period).all(axis=1)
-    if good.sum() < FEWEST:
+    if good.sum() < MIN_SAMPLES:
         return {}
     a, b, *ab = table[good].T
     both = sobol_indices(a, b, np.array(ab), confidence=confidence)
     return {
-        name: {"first": _plain(first.table(), True), "total": _plain(total.table(), True)}
+        name: {"first": _json_estimate(first.table(), True), "total": _json_estimate(total.table(), True)}
         for name, first, total in zip(names, *both, strict=True)
     }
 
 
-def _worst(found: Results, view: _View, name: str) -> list[dict[str, Any]]:
+def _worst_samples(found: Results, view: _RowSelection, name: str) -> list[dict[str, Any]]:
     known = view.good & np.isfinite(found.column(name))
     values, samples = found.column(name)[known], found.column("sample")[known]
-    tail = Tail.of(values, samples, WORST)
+    tail = Tail.of(values, samples, MAX_LISTED_SAMPLES)
     return [{"sample": int(i), "value": float(v)} for i, v in zip(tail.indices, tail.values, strict=True)]
 
 
-def _plain(estimate: dict[str, Any], random: bool) -> dict[str, Any]:
+def _json_estimate(estimate: dict[str, Any], random: bool) -> dict[str, Any]:
     """Ends of an interval that are not finite, or not there, are null."""
     ends = {end: estimate[end] if random and math.isfinite(estimate[end]) else None for end in ("low", "high")}
     value = estimate["value"]
