@@ -40,7 +40,7 @@ BOX = {"plant.mass": (5.3, 6.2), "initial.speed": (5.6, 19.4), "plant.road.w4": 
 
 def rare(engine, size):
     """The probability, its interval, and how many runs it took."""
-    study = section_sweep.study(load("slip-lmi", ["solver.step=1e-3", "solver.duration=4", W4]))
+    study = section_sweep.build_study(load("slip-lmi", ["solver.step=1e-3", "solver.duration=4", W4]))
     study = dataclasses.replace(study, engine=engine)
     found = failure_probability(study, "stop_time", SLOWEST, samples=size or 2800)
     return {"found": found.probability, "interval": [float(x) for x in found.interval], "runs": found.evaluations}

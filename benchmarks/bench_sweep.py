@@ -45,7 +45,7 @@ def child(options):
 
         engine = Dask(workers=count)
     sizes = (f"sweep.samples={options.samples}", f"sweep.chunk={options.chunk}", f'sweep.dtype="{options.dtype}"')
-    study = section_sweep.study(load("slip-lmi", (*CHANGES, *sizes)))
+    study = section_sweep.build_study(load("slip-lmi", (*CHANGES, *sizes)))
     seen, begun = [], time.perf_counter()
     found = sweep(
         study,

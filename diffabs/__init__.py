@@ -2,7 +2,7 @@
 
 from diffabs.core import interrupt as _interrupt
 
-_interrupt.early()  # before JAX, whose import takes seconds
+_interrupt.end_early_on_interrupt()  # before JAX, whose import takes seconds
 
 from diffabs.core.loop import Loop as Loop
 from diffabs.core.pytree import replace as replace

@@ -121,7 +121,7 @@ def against(name: str, attack: Attack, config: Config, told: Callable[[str], Non
     at_rest = float(attack.overshoots(nominal(config.bounds))[0])
     price, logs = searched(attack, config, lambda line: told(f"{name}, {line}"))
     rows, z = excesses(config, logs, at_rest), worst_of(logs, GRADIENTS)
-    record.show(f"{name}: nominal overshoot {100 * at_rest:.2f} %, excess [%] at equal cost", rows)
+    record.print_rows(f"{name}: nominal overshoot {100 * at_rest:.2f} %, excess [%] at equal cost", rows)
     return logs, {
         "nominal overshoot [%]": 100 * at_rest,
         "price of a gradient": price,
@@ -143,7 +143,7 @@ def in_more_dimensions(config: Config, told: Callable[[str], None]) -> list[dict
     logs = {name: SEARCHES[name](attack, searching, price) for name in (GRADIENTS, CMA)}
     marks = tuple(mark for mark in config.marks if mark <= config.finer_budget)
     rows = excesses(dataclasses.replace(config, marks=marks), logs, at_rest)
-    record.show(f"{TUNED}, {bounds.size} numbers, a gradient {price:.1f} runs: excess [%]", rows)
+    record.print_rows(f"{TUNED}, {bounds.size} numbers, a gradient {price:.1f} runs: excess [%]", rows)
     told(f"{bounds.size} numbers")
     return [{"numbers": bounds.size, "price of a gradient": price, **row} for row in rows]
 
@@ -156,7 +156,7 @@ def tuned_against(attack: Attack, config: Config, price: float, told: Callable[[
         fares = judged(dataclasses.replace(attack, loop=loop), config.rounds, config.searching, price)
         rows.append({"rounds": number, **fares})
         told(f"after {number} rounds: fresh adversaries {fares['fresh adversaries, median [%]']:.2f} %")
-    record.show("Tuned against the adversary", rows)
+    record.print_rows("Tuned against the adversary", rows)
     last: Any = loops[-1]
     c, r = last.controller.controller, last.reference
     found = {"gain": np.asarray(c.gain).tolist(), "tracking_time": float(c.antiwindup.tracking_time)}
@@ -181,7 +181,9 @@ def main(config: Config | None = None, progress: Callable[[str], None] | None = 
         for name in names
         if name in (TUNED, "slip-real")
     }
-    record.show("The worst found, integrated by SciPy", [{"controller": name, **row} for name, row in scipy.items()])
+    record.print_rows(
+        "The worst found, integrated by SciPy", [{"controller": name, **row} for name, row in scipy.items()]
+    )
     tuning = (
         tuned_against(attacks[TUNED], config, results[TUNED]["price of a gradient"], told) if TUNED in names else {}
     )

@@ -29,7 +29,7 @@ def cost_figure(found: Mapping[str, Mapping[str, Log]], nominals: Mapping[str, f
         ax.set_xscale("log")
         ax.set_xlim(60, budget)
         ax.set_ylim(bottom=0)
-        plot.label(ax, "cost [runs]", "excess overshoot [%]", name, legend=False)
+        plot.label_axes(ax, "cost [runs]", "excess overshoot [%]", name, legend=False)
         ax.legend(loc="lower right", fontsize=9.5, framealpha=0.9, edgecolor="none")
     for ax in axes[len(found) :]:
         ax.set_visible(False)
@@ -49,9 +49,9 @@ def road_figure(attacks: Mapping[str, Attack], worst: Mapping[str, np.ndarray], 
             style = {"color": plot.COLOURS[1 - i], "ls": plot.DASHES[i], "label": label}
             _drawn(axes[3 * row : 3 * row + 3], attack, {path: np.asarray(x)[0] for path, x in values.items()}, style)
         from_speed = f"{name}: {start['plant.mass'][0]:.2f} kg, {KMH * start['initial.speed'][0]:.0f} km/h"
-        plot.label(axes[3 * row], "distance [m]", "factor of the friction", from_speed)
-        plot.label(axes[3 * row + 1], "time in its 64 ms [ms]", "error of the slip", legend=False)
-        plot.label(axes[3 * row + 2], "time [s]", "slip", legend=False)
+        plot.label_axes(axes[3 * row], "distance [m]", "factor of the friction", from_speed)
+        plot.label_axes(axes[3 * row + 1], "time in its 64 ms [ms]", "error of the slip", legend=False)
+        plot.label_axes(axes[3 * row + 2], "time [s]", "slip", legend=False)
     return figure
 
 

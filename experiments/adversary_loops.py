@@ -59,7 +59,7 @@ def contenders(bounds: Bounds, fixed: Fixed) -> dict[str, Loop]:
     first = ProportionalFeedback(gain=np.asarray(cured.controller.controller.gain, float))
     target = FilteredSlip(slip=fixed.slip, time_constant=cured.reference.time_constant)
     return {
-        "published gain": attacked(bounds, fixed, StateFeedback(gain=np.array(lmi_design.PUBLISHED))),
+        "published gain": attacked(bounds, fixed, StateFeedback(gain=np.array(lmi_design.PUBLISHED_GAIN))),
         "LMI": attacked(bounds, fixed, StateFeedback(gain=np.array(LMI))),
         "first cure": attacked(bounds, fixed, first, target),
         "slip-real": attacked(bounds, fixed, real.controller.controller, real.reference),

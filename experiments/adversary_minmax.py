@@ -20,7 +20,7 @@ from real_rig_judge import Judging, runs
 from real_rig_loops import loop as loop_of_box
 
 from diffabs import Batch, Loop
-from diffabs.tune import CVaR, Method, Mode, Stopping, tune
+from diffabs.tune import CVaR, DerivativeMode, Method, Stopping, tune
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +81,7 @@ def _tuned(loop: Loop, bounds: Bounds, config: Rounds, attack: Attack, lanes: np
         solver=attack.solver(),
         measured={name: MEASURED[name] for name in names},
         aggregate=CVaR(level=config.level),
-        method=Method(mode=Mode.FORWARD, stopping=Stopping(change=1e-4, iterations=config.iterations)),
+        method=Method(mode=DerivativeMode.FORWARD, stopping=Stopping(change=1e-4, iterations=config.iterations)),
     )
     return found.part
 

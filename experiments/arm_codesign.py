@@ -249,7 +249,7 @@ def figure(found: dict[str, dict[str, Any]]) -> Any:
         riders, multiples = zip(*sorted(row["recovered by rider"].items()), strict=True)
         ax.plot(riders, multiples, "o" + plot.DASHES[i], color=plot.COLOURS[i], label=name)
     ax.plot([50.0], [HANGING], "k*", markersize=11, label="the paper's machine with its arm hanging, LQR")
-    plot.label(ax, "rider [kg]", "multiple of (0.5, 0, 0.2) rad")
+    plot.label_axes(ax, "rider [kg]", "multiple of (0.5, 0, 0.2) rad")
     ax.set_ylim(0, 1.6 * max(max(row["recovered by rider"].values()) for row in found.values()))
     return drawn
 
@@ -275,9 +275,9 @@ def main(config: Config | None = None) -> dict[str, Any]:
                     machine = for_one(config, machine, shape)
                     rows.append({"shape": shape, "by": "draws", **described(config, machine)})
                     found[f"{name}, for 50 kg"] = judged(config, machine)
-    record.show("Machines", rows)
+    record.print_rows("Machines", rows)
     seen = ("worst", "50 kg", "undecided beyond, riders", "times the hanging arm, 50 kg", "common P over the riders")
-    record.show(
+    record.print_rows(
         "Tuned by rollouts", [{"machine": name, **{key: one[key] for key in seen}} for name, one in found.items()]
     )
     return record.experiment(config, {"machines": rows, "tuned": found}, {"codesign": figure(found)})

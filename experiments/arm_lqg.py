@@ -105,11 +105,11 @@ def main(config: Config | None = None) -> dict[str, Any]:
         }
         for name, one in found.items()
     ]
-    record.show("Recovered by every seed, hanging arm at 48 V", rows)
+    record.print_rows("Recovered by every seed, hanging arm at 48 V", rows)
     drawn, (ax,) = plot.sheet(title="Hanging arm at 48 V, angles measured at 100 Hz", size=(6.6, 3.8))
     for i, (name, (multiples, shares, _)) in enumerate(found.items()):
         ax.plot(multiples, shares, plot.DASHES[i], color=plot.COLOURS[i], label=name)
-    plot.label(ax, "multiple of (0.5, 0, 0.2) rad", "share of seeds recovered")
+    plot.label_axes(ax, "multiple of (0.5, 0, 0.2) rad", "share of seeds recovered")
     shares = {name: one[1].tolist() for name, one in found.items()}
     return record.experiment(config, {"table": rows, "shares": shares}, {"lqg": drawn})
 

@@ -117,13 +117,15 @@ def figure(maps: dict[str, Basin], axes_of_bound: tuple[float, float]) -> Any:
         1, len(maps), title="Which starts 48 V recover (hanging arm)", size=(4.4, 4.0), sharey=True
     )
     for i, (ax, (name, basin)) in enumerate(zip(axes, maps.items(), strict=True)):
-        plot.region(ax, basin.first.centres, basin.second.centres, basin.outcomes.recovered, basin.outcomes.undecided)
+        plot.shade_region(
+            ax, basin.first.centres, basin.second.centres, basin.outcomes.recovered, basin.outcomes.undecided
+        )
         ends, (theta, phi) = np.array([basin.first.low, basin.first.high]), axes_of_bound
         for sign in (-1, 1):
             ax.plot(ends, phi * (sign - ends / theta), color="black", linewidth=1)
         ax.set_xlim(*ends)
         ax.set_ylim(basin.second.low, basin.second.high)
-        plot.label(ax, "frame theta0 [rad]", "" if i else "rider phi0 [rad]", f"{name}: {100 * basin.share:.1f} %")
+        plot.label_axes(ax, "frame theta0 [rad]", "" if i else "rider phi0 [rad]", f"{name}: {100 * basin.share:.1f} %")
     return drawn
 
 
@@ -145,7 +147,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
         maps[name], row = judged(config, gain)
         rows.append({"weights": name, **row})
     share, lines = possible(config)
-    record.show("Hanging arm at 48 V", rows)
+    record.print_rows("Hanging arm at 48 V", rows)
     weights = {"q": np.exp(2 * np.asarray(found.part.log_diagonal)).tolist(), "R": float(np.exp(found.part.log_effort))}
     results = {
         "table": rows,

@@ -155,7 +155,7 @@ def figure(config: Config, results: dict[str, dict[str, Metrics]], shortest: np.
             ax.plot(above, share, plot.DASHES[j], color=plot.COLOURS[j], label=name)
         ax.set_xlim(0.0, config.farthest)
         ax.set_ylim(0.0, 100.0)
-        plot.label(ax, "above the bound [%]", "share of the roads [%]" if ax is axes[0] else "", sensors)
+        plot.label_axes(ax, "above the bound [%]", "share of the roads [%]" if ax is axes[0] else "", sensors)
     return sheet
 
 
@@ -166,8 +166,10 @@ def main(config: Config | None = None, progress: Callable[[str], None] = lambda 
     for sensors in config.rules:
         said[sensors], results[sensors], own = of_sensors(config, sensors, progress, own)
         count = config.fixed.roads.held_out
-        record.show(f"{sensors}: {count} roads, intervals of {config.fixed.confidence:.0%}", said[sensors]["table"])
-        record.show(f"{sensors}: means above the bound [%] by kind of road", said[sensors]["by road"])
+        record.print_rows(
+            f"{sensors}: {count} roads, intervals of {config.fixed.confidence:.0%}", said[sensors]["table"]
+        )
+        record.print_rows(f"{sensors}: means above the bound [%] by kind of road", said[sensors]["by road"])
     again = {rule: by_cma_es(config.search, config.fixed, EXACT, rule, config.ranges) for rule in config.searched_again}
     shortest = lanes(config.fixed, config.fixed.roads.held_out, config.fixed.roads.seed + 1).bound.distance
     whole = {**said, "bound": of_bounds(config.fixed), "CMA-ES, exact sensors": again}

@@ -13,7 +13,7 @@ from best_slip_fixed import EXACT, Fixed, Lanes, lanes
 from best_slip_rules import Ranges, start
 
 from diffabs import FixedStep, Loop, run_batch
-from diffabs.core.bijectors import space
+from diffabs.core.bijectors import parameter_space
 from diffabs.objectives import LockedTime, StopDistance
 from diffabs.tune import Method, Stopping, Tuned, build_problem, tune
 from diffabs.tune.problem import Problem
@@ -135,7 +135,7 @@ def against_differences(
     agrees with a width to `agreement` of the derivative, or to 1e-5."""
     known = lanes(fixed, search.roads, fixed.roads.seed)
     given = task(search, fixed, sensors, rule, ranges, known)
-    coordinates, solver = space(one, given["free"]), dataclasses.replace(given["solver"], kinks=True)
+    coordinates, solver = parameter_space(one, given["free"]), dataclasses.replace(given["solver"], kinks=True)
     z = np.asarray(coordinates.place(one))
     way = np.random.default_rng(search.seed).normal(size=len(z))
     way /= np.linalg.norm(way)

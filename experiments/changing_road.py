@@ -99,13 +99,13 @@ def main(config: Config | None = None) -> dict[str, Any]:
     values = roads(config)
     found = {name: excess(config, reference, values) for name, reference in RULES.items()}
     rows = [line(name, values, above) for name, above in found.items()]
-    record.show("Distance above the bound, on a road that changes to a slippery one", rows)
+    record.print_rows("Distance above the bound, on a road that changes to a slippery one", rows)
     places: list[dict[str, Any]] = [
         {"place of the peak": p}
         | {name: 100 * float(np.nanmean(above[values["place"] == p])) for name, above in found.items()}
         for p in config.places
     ]
-    record.show("By the slip of the second peak, relative to the first: mean above the bound [%]", places)
+    record.print_rows("By the slip of the second peak, relative to the first: mean above the bound [%]", places)
     return record.experiment(config, {"table": rows, "by place": places}, {})
 
 

@@ -44,7 +44,9 @@ def all_masses(config: Any, loops: Mapping[str, Loop]) -> Any:
             ax.plot(np.asarray(sample.t[0])[shown], slip[shown], color=colours(norm(mass)), linewidth=0.7, alpha=0.7)
         ax.axhline(config.slip, color="black", linewidth=0.8, linestyle=":")
         worst = 100 * float(np.max(run.metrics["overshoot"]))
-        plot.label(ax, "time [s]", "" if i else "slip [1]", f"{name}: {worst:.2g} % overshoot at worst", legend=False)
+        plot.label_axes(
+            ax, "time [s]", "" if i else "slip [1]", f"{name}: {worst:.2g} % overshoot at worst", legend=False
+        )
     axes[0].set_xlim(0, UNTIL)
     axes[0].set_ylim(0, 0.45)
     figure.colorbar(ScalarMappable(norm, colours), ax=axes, label="mass [kg]", pad=0.01)
@@ -69,8 +71,8 @@ def before_and_after(config: Any, those: dict[str, tuple[Loop, str]]) -> Any:
             axes[columns + column].plot(t, sample.control, **style)
         axes[column].axhline(config.slip, color="black", linewidth=0.8, linestyle=":")
         where = f"{mass:g} kg from {speed:g} km/h" + (" (outside the box)" if speed > config.box.speeds[-1] else "")
-        plot.label(axes[column], "", "slip [1]" if column == 0 else "", where, legend=False)
-        plot.label(axes[columns + column], "time [s]", "brake torque [N m]" if column == 0 else "", legend=False)
+        plot.label_axes(axes[column], "", "slip [1]" if column == 0 else "", where, legend=False)
+        plot.label_axes(axes[columns + column], "time [s]", "brake torque [N m]" if column == 0 else "", legend=False)
         for ax in (axes[column], axes[columns + column]):
             ax.set_xlim(0, 0.35)
             ax.locator_params(axis="x", nbins=4)
@@ -87,6 +89,6 @@ def tuning_figure(found: Tuned) -> Any:
     for ax, (name, unit) in zip(axes, {"objective": "IAE [s]", "gradient": "", "violation": ""}.items(), strict=True):
         ax.plot(n, [getattr(p, name) for p in found.history], "o-", markersize=3, color=plot.COLOURS[0])
         if name == "gradient":
-            plot.logarithmic(ax, "y")
-        plot.label(ax, "gradients computed", f"{name} {unit}")
+            plot.make_logarithmic(ax, "y")
+        plot.label_axes(ax, "gradients computed", f"{name} {unit}")
     return figure

@@ -175,10 +175,10 @@ def contenders(config: Config, found: Loop, lmi: tuple[float, float]) -> dict[st
         return loop(config, proportional(config, gain), time_constant, exact=exact), "proportional"
 
     return {
-        "published gain": fixed(lmi_design.PUBLISHED),
+        "published gain": fixed(lmi_design.PUBLISHED_GAIN),
         "LMI, same k1": fixed(lmi_design.SAME_INTEGRAL),
         "LMI, weights of least overshoot": fixed(lmi),
-        "published gain, filter 35 ms": fixed(lmi_design.PUBLISHED, 0.035),
+        "published gain, filter 35 ms": fixed(lmi_design.PUBLISHED_GAIN, 0.035),
         "K = [-121.8, -158.2]": fixed(lmi_design.GENTLE),
         "the cure": (found, "proportional"),
         "the cure, as packaged": (load("slip-cured", integrated=False).loop, "proportional"),
@@ -199,7 +199,7 @@ def judged(config: Config, one: Loop, system: Polytope, batch: Batch) -> tuple[d
     worst = {name: float(np.max(values)) for name, values in runs.metrics.items()}
     row = {
         "overshoot [%]": 100 * worst["overshoot"],
-        "settling [s]": record.reached(worst["settling_time"]),
+        "settling [s]": record.format_time(worst["settling_time"]),
         "locked [s]": worst["locked_time"],
         "max slip": worst["max_slip"],
         "IAE [s]": worst["iae"],
@@ -258,16 +258,16 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
     for name, (one, kind) in those.items():
         row, proofs[name] = judged(config, one, proved[kind], batch)
         rows.append({"controller": name, **row})
-    record.show(
+    record.print_rows(
         f"Worst of {batch.size} masses and speeds, corners included: 0..9.03 N m, lag 1 ms, 1 kHz, tau* of 5.75 kg",
         rows,
     )
     spots = weak(config, those)
-    record.show("Weak spots: worst overshoot [%] over the same box where one thing is wrong", spots)
+    record.print_rows("Weak spots: worst overshoot [%] over the same box where one thing is wrong", spots)
     asked_for = asked(config, found.loop)
     cure = {**summary(config, found, proofs["the cure"]), "torque asked for [N m]": asked_for}
     wanted = [{"starts": name, "least": low, "greatest": high} for name, (low, high) in asked_for.items()]
-    record.show(
+    record.print_rows(
         f"Torque [N m] that the cure asks for; {config.torque[0]:g} to {config.torque[1]:g} is what it gets", wanted
     )
     results = {"table": rows, "weak_spots": spots, "cure": cure}

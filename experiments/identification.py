@@ -23,7 +23,7 @@ from jax.tree_util import Partial
 
 from diffabs import FixedStep, Loop
 from diffabs.controllers import PID, ConstantTorque
-from diffabs.core.pytree import Scalar, Vector, param, pytree, strong
+from diffabs.core.pytree import Scalar, Vector, canonical_dtypes, param, pytree
 from diffabs.identify.fit import Identified, Tolerances
 from diffabs.identify.identification import identify
 from diffabs.identify.residuals import gaussian
@@ -111,7 +111,7 @@ def loops(car: QuarterCar, config: Config) -> dict[str, Loop]:
     stop = Standstill(speed=config.stop)
     found = {"no ABS": braking(plant=car, reference=FixedSlip(), controller=ConstantTorque(torque=90.0), stop=stop)}
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
-        for name, (ki, kd) in slip_estimator.GAINS.items():
+        for name, (ki, kd) in slip_estimator.PID_GAINS.items():
             controller = PID(kp=3893.0, ki=ki, kd=kd, low=0.0, high=90.0)
             found[f"{method} {name}"] = braking(plant=car, reference=reference, controller=controller, stop=stop)
     return found
@@ -120,7 +120,9 @@ def loops(car: QuarterCar, config: Config) -> dict[str, Loop]:
 def tables(car: QuarterCar, config: Config, weights: tuple[float, float]) -> tuple[Loop, Table]:
     """A loop that holds the free parameters, and the published numbers."""
     rows = loops(car, config)
-    values = {name: dict(zip(METRICS, numbers, strict=True)) for name, numbers in slip_estimator.PUBLISHED.items()}
+    values = {
+        name: dict(zip(METRICS, numbers, strict=True)) for name, numbers in slip_estimator.PUBLISHED_STOPS.items()
+    }
     return rows["no ABS"], Table(loops=rows, values=values, sigma=dict(zip(METRICS, weights, strict=True)))
 
 
@@ -178,7 +180,7 @@ def spline(config: Config, found: Identified, means: tuple[float, ...]) -> Ident
     near, far = found.part.plant.road, MagicFormula(**dict(zip("BCDE", means[1:], strict=True)))
     smooth, inertia, peak = Smoothness(config), float(found.values["plant.inertia"]), highest(near.friction)
     known = jnp.array([inertia, highest(lambda s: smooth.curve(near, far, s))])
-    prior = Partial(smooth, strong(near), strong(far), known)
+    prior = Partial(smooth, canonical_dtypes(near), canonical_dtypes(far), known)
     road = Spline(peak=peak, mu=np.ones(len(BELOW) + 1 + len(ABOVE)))
     road = dataclasses.replace(road, mu=np.asarray(jax.vmap(near.friction)(road.slips())))
     loop, table = tables(QuarterCar(inertia=inertia, road=road), config, config.spline_weights)
@@ -234,7 +236,7 @@ def residual_rows(fits: dict[str, Identified]) -> list[dict[str, Any]]:
     table = {name: found.residuals.reshape(-1, 2) for name, found in fits.items()}
     return [
         {"run": row, **{f"{name} [{u}]": float(x[i, j]) for name, x in table.items() for j, u in enumerate(UNITS)}}
-        for i, row in enumerate(slip_estimator.PUBLISHED)
+        for i, row in enumerate(slip_estimator.PUBLISHED_STOPS)
     ]
 
 
@@ -257,19 +259,19 @@ def main(config: Config | None = None) -> dict[str, Any]:
     config, begun = config or Config(), time.perf_counter()
     rows, fits = from_tables(config)
     best, minutes = fits.pop("best"), {}
-    record.show("Magic Formula from Tables 1 and 2", rows)
+    record.print_rows("Magic Formula from Tables 1 and 2", rows)
     shown = {"least squares": best, "rounding": fits["rounding"], "minimax": fits["minimax"]}
     leaves = residual_rows(shown)
-    record.show("What it leaves", leaves)
-    record.show("Covariance scaled by what is left", known(best))
-    record.show("What the tables say least about", directions(best))
+    record.print_rows("What it leaves", leaves)
+    record.print_rows("Covariance scaled by what is left", known(best))
+    record.print_rows("What the tables say least about", directions(best))
     minutes["formula"] = (time.perf_counter() - begun) / 60
     lines, splines, tables = from_splines(config, best)
-    record.show("Splines, checked at 5e-5 s", lines)
+    record.print_rows("Splines, checked at 5e-5 s", lines)
     first = next(iter(splines.values()))
-    record.show("What the tables say least about a spline, without its prior", directions(first))
+    record.print_rows("What the tables say least about a spline, without its prior", directions(first))
     minutes["splines"] = (time.perf_counter() - begun) / 60
-    record.show("Minutes until", [minutes])
+    record.print_rows("Minutes until", [minutes])
     results = {
         "formula": rows,
         "residuals": leaves,

@@ -25,7 +25,7 @@ def draw_curves(config: Any, formula: Identified, splines: dict[str, Identified]
             ax.plot(s, curve, color=plot.COLOURS[i], linewidth=1.4, label=f"spline, {name}")
         ax.plot(s, formula.part.plant.road.friction(s), "--", color="black", linewidth=1.6, label="Magic Formula, all")
         ax.plot(s, jax.vmap(SPLINE_B.friction)(s), "-.", color=plot.GREY, linewidth=1.8, label="spline B, to compare")
-        plot.label(ax, "slip [1]", "friction coefficient [1]", legend=ax is axes[0])
+        plot.label_axes(ax, "slip [1]", "friction coefficient [1]", legend=ax is axes[0])
     axes[0].set_title("dotted: the stated priors", fontsize=11)
     axes[1].set_title("where the runs have been", fontsize=11)
     axes[1].set_xlim(0, 0.3)
@@ -36,7 +36,7 @@ def draw_curves(config: Any, formula: Identified, splines: dict[str, Identified]
 def draw_residuals(config: Any, fits: dict[str, Identified]) -> Any:
     """Differences from the tables by row."""
     figure, axes = plot.sheet(1, 2, title="What the fits leave of Tables 1 and 2", size=(6, 4), sharey=True)
-    rows = list(slip_estimator.PUBLISHED)
+    rows = list(slip_estimator.PUBLISHED_STOPS)
     for j, (ax, unit) in enumerate(zip(axes, UNITS, strict=True)):
         for i, (name, found) in enumerate(fits.items()):
             y = np.arange(len(rows)) + 0.12 * (i - (len(fits) - 1) / 2)
@@ -46,6 +46,8 @@ def draw_residuals(config: Any, fits: dict[str, Identified]) -> Any:
             ax.axvline(sign * config.weights[j], color=plot.GREY, linewidth=1, linestyle="--")
         ax.set_yticks(range(len(rows)), rows)
         quantity = ("stopping time", "stopping distance")[j]
-        plot.label(ax, f"{quantity}, ours - published [{unit}]", "", "grey: rounding; dashed: bound", legend=j == 0)
+        plot.label_axes(
+            ax, f"{quantity}, ours - published [{unit}]", "", "grey: rounding; dashed: bound", legend=j == 0
+        )
     axes[0].invert_yaxis()
     return figure

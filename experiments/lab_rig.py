@@ -58,16 +58,16 @@ def checks(config: Config) -> list[dict[str, Any]]:
     rig = LabRig()
     _, force, _ = rig.contact(LabRigState(0.0, 0.0, 0.0, 0.0))
     rates = rig.derivative(0.0, LabRigState(100.0, 140.0, 3.0, 0.0), 0.6)
-    rows = [record.row("at rest", "normal force", "N", force, reference=config.static_force)]
+    rows = [record.computed_row("at rest", "normal force", "N", force, reference=config.static_force)]
     for name, unit, ours, exact in zip(
         ("wheel", "drum", "brake"), ("rad/s^2", "rad/s^2", "N m/s"), rates[:3], config.derivative, strict=True
     ):
-        rows.append(record.row("at (100, 140, 3), u = 0.6", f"d({name})/dt", unit, ours, reference=exact))
+        rows.append(record.computed_row("at (100, 140, 3), u = 0.6", f"d({name})/dt", unit, ours, reference=exact))
     _, _, asked = rig.contact(LabRigState(0.0, 100.0, 9.0, 0.0))
-    rows.append(record.row("locked, brake 9 N m", "torque carried", "N m", asked))
+    rows.append(record.computed_row("locked, brake 9 N m", "torque carried", "N m", asked))
     for brake in (9.0, 1.0):
         rate = rig.derivative(0.0, LabRigState(0.0, 100.0, brake, 0.0), 1.0).wheel
-        rows.append(record.row(f"locked, brake {brake:g} N m", "d(wheel)/dt", "rad/s^2", rate))
+        rows.append(record.computed_row(f"locked, brake {brake:g} N m", "d(wheel)/dt", "rad/s^2", rate))
     return rows
 
 
@@ -195,8 +195,8 @@ def figures(runs: dict[str, Run], lagging: dict[str, Run]) -> dict[str, Any]:
     braked = list(lagging.items())[1:]  # unlimited torque also drives the wheel, which no brake does
     slips: dict[str, Any] = {name: run.trajectory for name, run in braked}
     return {
-        "open_loop": plot.speeds(chosen, title="Laboratory rig, constant brake command"),
-        "lag": plot.slips(slips, title="Published gain behind the rig's 49 ms brake lag", until=2.0),
+        "open_loop": plot.draw_speeds(chosen, title="Laboratory rig, constant brake command"),
+        "lag": plot.draw_slips(slips, title="Published gain behind the rig's 49 ms brake lag", until=2.0),
     }
 
 
@@ -206,11 +206,11 @@ def main(config: Config | None = None) -> dict[str, Any]:
     checked, runs = checks(config), open_loop(config)
     locks, critical = lock_table(runs), critical_lags(config)
     (lags, lagging), ends = lag_table(config), settles(config)
-    record.show("The laboratory rig: checks", checked)
-    record.show("The laboratory rig from 50 km/h at constant commands", locks)
-    record.show("Longest lag of the brake at which the published gain is stable", critical)
-    record.show("Just below and above it", ends)
-    record.show("Published gain behind a lagging brake, 50 to 5 km/h", lags)
+    record.print_rows("The laboratory rig: checks", checked)
+    record.print_rows("The laboratory rig from 50 km/h at constant commands", locks)
+    record.print_rows("Longest lag of the brake at which the published gain is stable", critical)
+    record.print_rows("Just below and above it", ends)
+    record.print_rows("Published gain behind a lagging brake, 50 to 5 km/h", lags)
     results = {"checks": checked, "open_loop": locks, "critical_lag": critical, "around_it": ends, "lag": lags}
     return record.experiment(config, results, figures(runs, lagging))
 

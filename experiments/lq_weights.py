@@ -163,7 +163,7 @@ def figures(kept: list[dict[str, Any]]) -> dict[str, Any]:
             style = {"ls": plot.DASHES[i % len(plot.DASHES)], "color": plot.COLOURS[i % len(plot.COLOURS)]}
             ax.loglog(n, gap, label=name, drawstyle="steps-post", **style)
         title = f"{row['problem']}: {row['parameters']} parameters"
-        plot.label(ax, "rollouts of the batch", "distance to the best", title)
+        plot.label_axes(ax, "rollouts of the batch", "distance to the best", title)
     for ax in axes[len(kept) :]:
         ax.set_visible(False)
     return {"searches": figure}
@@ -176,14 +176,14 @@ def main(config: Config | None = None, names: tuple[str, ...] = NAMES) -> dict[s
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
         kept, found = compared(config, name)
-        record.write(folder, kept | {"gains": gains(config, {name: found})}, f"{name.replace(' ', '_')}.json")
+        record.write_summary(folder, kept | {"gains": gains(config, {name: found})}, f"{name.replace(' ', '_')}.json")
     files = [folder / f"{name.replace(' ', '_')}.json" for name in NAMES]
     kept = [json.loads(path.read_text(encoding="utf-8")) for path in files if path.exists()]
     rows = [row for one in kept for row in lines(config, one)]
-    record.show("Rollouts of the batch", rows)
+    record.print_rows("Rollouts of the batch", rows)
     end = [row for one in kept for row in one["gains"]]
     if end:
-        record.show("Gains on the rig", end)
+        record.print_rows("Gains on the rig", end)
     results = {"table": rows, "gains": end, "paper_weights_gain": paper(config).tolist()}
     return record.experiment(config, results, figures(kept))
 

@@ -105,11 +105,11 @@ def main(config: Config | None = None) -> dict[str, Any]:
     """Run, print, save; returns the results."""
     config = config or Config()
     rows = front(config)
-    record.show("Stopping distance against control effort, from 100 km/h", rows)
+    record.print_rows("Stopping distance against control effort, from 100 km/h", rows)
     points = np.array([row["effort [N2 m2 s]"] for row in rows]), np.array([row["distance [m]"] for row in rows])
     effort, distance = scattered(config)
     near = distance < 1.1 * points[1].max()
-    figure = tuning.pareto(
+    figure = tuning.draw_pareto(
         {"tuned by gradients": points, "random parameters": (effort[near], distance[near])},
         marks={"published conventional PI": published(config)},
         title="What a shorter stop costs",

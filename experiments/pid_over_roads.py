@@ -246,12 +246,12 @@ def figures(results: dict[str, Any], found: dict[str, Tuned]) -> dict[str, Any]:
             x = np.sort(values)
             ax.plot(x, np.arange(1, len(x) + 1) / len(x), plot.DASHES[j], color=plot.COLOURS[j], label=label)
         ax.set_xlim(1.0, 1.5)
-        plot.label(ax, "distance/shortest possible [1]", "" if i else "share of the roads", name)
+        plot.label_axes(ax, "distance/shortest possible [1]", "" if i else "share of the roads", name)
     history, (ax,) = plot.sheet(title="How the tuning went", size=(6.0, 3.6))
     for i, (name, one) in enumerate(found.items()):
         points = [(p.evaluations, p.objective) for p in one.history]
         ax.plot(*zip(*points, strict=True), "o-", markersize=3, color=plot.COLOURS[i], label=name)
-    plot.label(ax, "gradients computed", "mean distance/shortest possible [1]")
+    plot.label_axes(ax, "gradients computed", "mean distance/shortest possible [1]")
     return {"distances": figure, "tuning": history}
 
 
@@ -273,10 +273,10 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
                 }
         own += [own_road(config, f"{name}, paper's gains", one), own_road(config, f"{name}, tuned", tuned_loop)]
         gains.append({"control": name, **{k: float(v) for k, v in found[name].values.items()}})
-    record.show(f"{config.held_out} roads that the tuning has not seen, {config.confidence:.0%} interval", rows)
-    record.show("The paper's own road (spline B)", own)
+    record.print_rows(f"{config.held_out} roads that the tuning has not seen, {config.confidence:.0%} interval", rows)
+    record.print_rows("The paper's own road (spline B)", own)
     for line in gains:
-        record.show("Tuned", [line])
+        record.print_rows("Tuned", [line])
     how = {
         k: {"reason": f.reason.value, "evaluations": f.evaluations, "objective": f.objective} for k, f in found.items()
     }

@@ -96,11 +96,11 @@ def judged(config: Config, speed: str, name: str, one: Loop) -> dict[str, Any]:
 
 def printed(speed: str, results: dict[str, dict[str, Any]]) -> None:
     """The table, in two: weak spots, and the rest."""
-    record.show(
+    record.print_rows(
         f"Speed {speed}: worst overshoot [%] where one thing is wrong",
         [{"controller": name, **one["weak spots: overshoot [%]"]} for name, one in results.items()],
     )
-    record.show(f"Speed {speed}: the box", [{"controller": name, **row(one)} for name, one in results.items()])
+    record.print_rows(f"Speed {speed}: the box", [{"controller": name, **row(one)} for name, one in results.items()])
 
 
 def row(one: dict[str, Any]) -> dict[str, Any]:
@@ -175,7 +175,7 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
         results[speed] = {"controllers": rows, "beyond the box": maps, "tuning": described(stages[speed])}
         (folder / "controllers").mkdir(parents=True, exist_ok=True)
         for name, one in loops.items():
-            record.write(folder / "controllers", document(one), f"{speed}-{file_name(name)}.json")
+            record.write_summary(folder / "controllers", document(one), f"{speed}-{file_name(name)}.json")
     figures["tuning"] = descents(stages)
     told(f"{time.perf_counter() - begun:.0f} s")
     return record.experiment(config, results | {"seconds": time.perf_counter() - begun}, figures)

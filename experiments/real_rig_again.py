@@ -95,7 +95,7 @@ def main(config: Config | None = None, progress: Any = None) -> dict[str, Any]:
         for name, one in those.items():
             results[speed][name] = judged(config, speed, name, one) | {"proof": proved[name]}
             told(f"{name}: {row(results[speed][name])}")
-        record.show(f"Speed {speed}", [{"controller": name, **row(one)} for name, one in results[speed].items()])
+        record.print_rows(f"Speed {speed}", [{"controller": name, **row(one)} for name, one in results[speed].items()])
     return record.experiment(config, results, {})
 
 

@@ -98,7 +98,7 @@ def map_figure(maps: Maps, speed: str, box: Box) -> Any:
             ax.contour(x, y, np.array(one["locks"], float).T, levels=[0.5], colors="red")
         (x0, x1), (y0, y1) = x_scale * np.array(getattr(box, pair.x)), y_scale * np.array(getattr(box, pair.y))
         ax.add_patch(Rectangle((x0, y0), x1 - x0, y1 - y0, fill=False, edgecolor="white", linewidth=1.5))
-        plot.label(ax, x_label, y_label, legend=False)
+        plot.label_axes(ax, x_label, y_label, legend=False)
     return figure
 
 
@@ -116,7 +116,7 @@ def distributions(ones: dict[str, Loop], speed: str, box: Box, fixed: Fixed, con
     ax.set_yscale("log")
     ax.set_ylim(1 / count, 1)
     ax.set_xlim(0, 120)
-    plot.label(ax, "overshoot [%]", "share of the box that exceeds it")
+    plot.label_axes(ax, "overshoot [%]", "share of the box that exceeds it")
     return figure
 
 
@@ -138,8 +138,8 @@ def traces(ones: dict[str, Loop], speed: str) -> Any:
     for column, title in enumerate(titles):
         axes[column].axhline(0.2, color="black", linewidth=0.8, linestyle=":")
         axes[column].set_ylim(0, 0.6)
-        plot.label(axes[column], "", "slip [1]" if column == 0 else "", title, legend=column == 0)
-        plot.label(axes[len(titles) + column], "time [s]", "torque [N m]" if column == 0 else "", legend=False)
+        plot.label_axes(axes[column], "", "slip [1]" if column == 0 else "", title, legend=column == 0)
+        plot.label_axes(axes[len(titles) + column], "time [s]", "torque [N m]" if column == 0 else "", legend=False)
     return figure
 
 
@@ -159,5 +159,5 @@ def descents(found: dict[str, Any]) -> Any:
                     label=stage if j == 0 else None,
                 )
         ax.set_yscale("log")
-        plot.label(ax, "gradients", "objective", f"speed {speed}")
+        plot.label_axes(ax, "gradients", "objective", f"speed {speed}")
     return figure

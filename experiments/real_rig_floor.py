@@ -22,7 +22,7 @@ from real_rig_box import KMH, KNOWN, Fixed
 from diffabs.core.numerics import larger
 from diffabs.core.protocols import Memory, Sample, Segment
 from diffabs.core.pytree import pytree
-from diffabs.objectives.tracking import held, nothing
+from diffabs.objectives.tracking import held_value, no_integral
 from diffabs.roads import RIG
 
 HELD = 0.25  # s, from which on every controller worth the name holds its target
@@ -60,7 +60,7 @@ class Deviation:
     unit = "1"
     physical = (0.0, math.inf)
 
-    flow, value = nothing, held
+    flow, value = no_integral, held_value
 
     def start(self, sample: Sample) -> Memory:
         """None yet."""

@@ -16,7 +16,7 @@ from scipy.optimize import minimize
 
 from diffabs import Loop, replace
 from diffabs.controllers import PID, BackCalculation, ProportionalFeedback, SlidingMode, StateFeedback
-from diffabs.core.bijectors import space
+from diffabs.core.bijectors import parameter_space
 from diffabs.design import Spec, design
 from diffabs.design.parameter_box import polytope
 from diffabs.design.spec import L2Gain
@@ -74,7 +74,7 @@ Free = dict[str, Any]
 
 def nelder_mead(score: Score, one: Loop, free: Free, config: Others) -> Loop:
     """Nelder and Mead's search in the coordinates of `tune`."""
-    coordinates = space(one, free)
+    coordinates = parameter_space(one, free)
     options = {"maxfev": config.evaluations, "xatol": 1e-4, "fatol": 1e-6}
     found = minimize(
         lambda z: score(_at(one, coordinates, z)), coordinates.place(one), method="Nelder-Mead", options=options
@@ -84,7 +84,7 @@ def nelder_mead(score: Score, one: Loop, free: Free, config: Others) -> Loop:
 
 def cma_es(score: Score, one: Loop, free: Free, config: Others) -> Loop:
     """CMA-ES in the coordinates of `tune`."""
-    coordinates = space(one, free)
+    coordinates = parameter_space(one, free)
     options = {"maxfevals": config.evaluations, "verbose": -9, "seed": config.seed, "verb_log": 0}
     search = cma.CMAEvolutionStrategy(coordinates.place(one), 0.5, options)
     while not search.stop():
@@ -143,7 +143,7 @@ def contenders(
     def feedback(gain: Any) -> Loop:
         return loop(fixed, StateFeedback(gain=np.asarray(gain, float)), speed, estimator=estimator)
 
-    found: dict[str, tuple[Loop, int]] = {"published gain": (feedback(lmi_design.PUBLISHED), 0)}
+    found: dict[str, tuple[Loop, int]] = {"published gain": (feedback(lmi_design.PUBLISHED_GAIN), 0)}
     for name, gains in robust.items():
         score.rollouts = 0
         those = [feedback(gain) for gain in gains]

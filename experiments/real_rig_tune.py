@@ -14,7 +14,7 @@ from diffabs.controllers import BackCalculation, ProportionalFeedback
 from diffabs.objectives import IAE, Overshoot
 from diffabs.references import LimitedSlip
 from diffabs.sensors import SpeedEstimator
-from diffabs.tune import CVaR, Method, Mode, SmoothWorst, Stopping, Tuned, tune
+from diffabs.tune import CVaR, DerivativeMode, Method, SmoothWorst, Stopping, Tuned, tune
 
 MEASURED = {"overshoot": Overshoot(), "iae": IAE(), "deviation": Deviation()}
 ONE_SIDED: Mapping[str, float] = {"overshoot": 1.0, "iae": 1.0}  # 1, 1/s
@@ -117,7 +117,7 @@ def searched(
         solver=FixedStep(step=config.step, duration=float(np.max(over.durations)), kinks=False),
         measured={name: MEASURED[name] for name in stage.weights},
         aggregate=Above(stage.aggregate, floors),
-        method=Method(starts=stage.starts, seed=config.seed, mode=Mode.FORWARD, stopping=stopping),
+        method=Method(starts=stage.starts, seed=config.seed, mode=DerivativeMode.FORWARD, stopping=stopping),
         engine=config.engine,
         progress=lambda p: progress(f"{speed}, {stage.name}: {p.point.evaluations} gradients, {p.point.objective:.5g}"),
     )

@@ -102,7 +102,7 @@ def table(found: dict[str, Design], runs: dict[str, Run]) -> list[dict[str, Any]
                 "decay proved [1/s]": proof.decay_rate,
                 "proved exactly": proof.verified_exactly,
                 "overshoot [%]": 100 * float(metrics["overshoot"]),
-                "settling time [s]": record.reached(metrics["settling_time"]),
+                "settling time [s]": record.format_time(metrics["settling_time"]),
             }
         )
     return rows
@@ -124,8 +124,8 @@ def figures(runs: dict[str, Run], found: dict[str, Design]) -> dict[str, Any]:
     speeds = plot.KMH * answer.certificate.system.nodes  # pyright: ignore[reportAttributeAccessIssue]
     ax.plot(speeds, answer.gain[:, 0, 1], "o-", color=plot.COLOURS[0], label="scheduled")
     ax.axhline(found["cost alone"].gain[0, 1], color=plot.COLOURS[1], linestyle="--", label="one gain for all speeds")
-    plot.label(ax, "speed [km/h]", "k2 [N m]")
-    slips = plot.slips(seen, title="Braking under each specification, 5.3 kg", until=0.15)
+    plot.label_axes(ax, "speed [km/h]", "k2 [N m]")
+    slips = plot.draw_slips(seen, title="Braking under each specification, 5.3 kg", until=0.15)
     return {"slips": slips, "scheduled_gain": figure}
 
 
@@ -135,7 +135,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
     found = designs(config)
     runs = brake(config, found)
     rows = table(found, runs)
-    record.show("Specifications of a robust gain", rows)
+    record.print_rows("Specifications of a robust gain", rows)
     proofs = {name: answer.certificate.summary() for name, answer in found.items()}
     return record.experiment(config, {"table": rows, "certificates": proofs}, figures(runs, found))
 

@@ -93,8 +93,8 @@ def against_reference(config: Config, rows: list[dict[str, Any]]) -> list[dict[s
     table = []
     for name, time, distance in config.reference:
         found = next(r for r in rows if r["controller"] == name and r["period [ms]"] == 1.0 and r["delay [ms]"] == 0.0)
-        table.append(record.row(f"{name}, 1 ms", "time", "s", found["time [s]"], reference=time))
-        table.append(record.row(f"{name}, 1 ms", "distance", "m", found["distance [m]"], reference=distance))
+        table.append(record.computed_row(f"{name}, 1 ms", "time", "s", found["time [s]"], reference=time))
+        table.append(record.computed_row(f"{name}, 1 ms", "distance", "m", found["distance [m]"], reference=distance))
     return table
 
 
@@ -130,11 +130,11 @@ def figures(config: Config, rows: list[dict[str, Any]], runs: dict[str, Run]) ->
             ]
             x, y = ([r[key] for r in chosen] for key in ("period [ms]", "distance [m]"))
             ax.plot(x, y, "o" + plot.DASHES[i], color=plot.COLOURS[i], markersize=4, label=f"delay {delay:g} period")
-        plot.label(ax, "period [ms]", "stopping distance [m]", f"conventional {name}")
+        plot.label_axes(ax, "period [ms]", "stopping distance [m]", f"conventional {name}")
     seen: dict[str, Any] = {name: run.trajectory for name, run in runs.items()}
     return {
         "distance": figure,
-        "speeds": plot.speeds(seen, title="P control, sampled, one period of computing delay"),
+        "speeds": plot.draw_speeds(seen, title="P control, sampled, one period of computing delay"),
     }
 
 
@@ -143,9 +143,9 @@ def main(config: Config | None = None) -> dict[str, Any]:
     config = config or Config()
     rows = sweep(config)
     compared, whole = against_reference(config, rows), all_at_one_kilohertz(config)
-    record.show("Conventional control on a computer, Magic Formula", rows)
-    record.show("At 1 ms, against an independent solution", compared)
-    record.show("Everything at 1 kHz", whole)
+    record.print_rows("Conventional control on a computer, Magic Formula", rows)
+    record.print_rows("At 1 ms, against an independent solution", compared)
+    record.print_rows("Everything at 1 kHz", whole)
     results = {"sweep": rows, "reference": compared, "one_kilohertz": whole}
     return record.experiment(config, results, figures(config, rows, traces(config)))
 

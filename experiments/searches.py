@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from diffabs.tune.problem import Mode, Multipliers, Problem
+from diffabs.tune.problem import DerivativeMode, Multipliers, Problem
 
 FORWARD = 6  # parameters beyond which forward mode is not timed: benchmarks/bench_gradient.py found it slower there
 REJECTED = 1e6  # the value of a run that failed, as the libraries want it
@@ -35,15 +35,15 @@ DIFFERENCE = 1e-7  # in z: forward differences
 Trace = list[tuple[float, float]]  # (rollouts so far, least value)
 
 
-def prices(problem: Problem, repeats: int) -> dict[Mode, float]:
+def prices(problem: Problem, repeats: int) -> dict[DerivativeMode, float]:
     """Median of ratios of times, gradient over value, by mode."""
     z = jnp.asarray(problem.space.place(problem.subject))[None]
     m = Multipliers(jnp.zeros((1, 0)), jnp.ones(1))
-    modes = [mode for mode in Mode if mode is Mode.REVERSE or problem.space.size <= FORWARD]
+    modes = [mode for mode in DerivativeMode if mode is DerivativeMode.REVERSE or problem.space.size <= FORWARD]
     gradients = {mode: dataclasses.replace(problem, mode=mode).evaluator(1.0) for mode in modes}
     value = problem.objective_evaluator()
     jax.block_until_ready([value(z), *(gradient(z, m) for gradient in gradients.values())])
-    ratios: dict[Mode, list[float]] = {mode: [] for mode in modes}
+    ratios: dict[DerivativeMode, list[float]] = {mode: [] for mode in modes}
     for _ in range(repeats):
         for mode, gradient in gradients.items():
             own, other = _time(value, z), _time(gradient, z, m)
@@ -126,7 +126,7 @@ def differences(problem: Problem, budget: int) -> Trace:
     return [*f.trace, (f.count, f.least)]
 
 
-def gradients(problem: Problem, mode: Mode, most: int) -> Trace:
+def gradients(problem: Problem, mode: DerivativeMode, most: int) -> Trace:
     """SciPy's L-BFGS-B on derivatives, to its own end or so many of them; counted in gradients."""
     evaluate, steady = dataclasses.replace(problem, mode=mode).evaluator(1.0), problem.steady()
     none, trace, spent = Multipliers(np.zeros((1, 0)), np.ones(1)), [], 0

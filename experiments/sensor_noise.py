@@ -162,7 +162,7 @@ def figures(config: Config, rows: list[dict[str, Any]], latch: list[dict[str, An
             name = f"robust, {1e3 * t:g} ms, 3 %"
             ax.plot(config.noises, y, "o" + plot.DASHES[i], color=plot.COLOURS[i], markersize=4, label=name)
         ax.set_yscale("log")
-        plot.label(ax, "noise [m/s²]", f"distance, {kind}")
+        plot.label_axes(ax, "noise [m/s²]", f"distance, {kind}")
     axes[1].set_yscale("linear")
     axes[1].set_ylim(42, 52)
     axes[1].set_title("worst of all seeds, robust only", fontsize=11)
@@ -175,14 +175,14 @@ def main(config: Config | None = None) -> dict[str, Any]:
     config = config or Config()
     latch, rows = bare(config), robust(config)
     ranked, bias = best(config, rows), biased(config)
-    record.show(f"The bare latch under noise, {config.seeds} seeds", latch)
-    record.show("The robust estimator: best settings over all noises, seeds and cars", ranked[:6])
+    record.print_rows(f"The bare latch under noise, {config.seeds} seeds", latch)
+    record.print_rows("The robust estimator: best settings over all noises, seeds and cars", ranked[:6])
     unarmed = [r for r in rows if not r["arming [m/s2]"]]
-    record.show("The robust estimator, not armed", unarmed)
+    record.print_rows("The robust estimator, not armed", unarmed)
     chosen = (ranked[0]["time constant [s]"], ranked[0]["threshold [1]"])
     mine = [r for r in rows if (r["time constant [s]"], r["threshold [1]"]) == chosen and r["arming [m/s2]"]]
-    record.show("The best setting", mine)
-    record.show("Accelerometer bias [m/s2]: stopping distance [m], empty where it did not stop", bias)
+    record.print_rows("The best setting", mine)
+    record.print_rows("Accelerometer bias [m/s2]: stopping distance [m], empty where it did not stop", bias)
     results = {"bare": latch, "robust": rows, "ranked": ranked, "bias": bias}
     return record.experiment(config, results, figures(config, rows, latch))
 

@@ -83,7 +83,7 @@ def figure(seen: dict[str, Any]) -> Any:
     sheet, (ax,) = plot.sheet(title="Frozen loops of the box, and the rate that was proved", size=(6.4, 3.8))
     ax.hist(seen["rates"], bins=60, color=plot.COLOURS[0])
     ax.axvline(seen["proof"].decay_rate, color=plot.COLOURS[1], linestyle="--", label="proved, also while it varies")
-    plot.label(ax, "slowest pole's decay rate [1/s]", "loops")
+    plot.label_axes(ax, "slowest pole's decay rate [1/s]", "loops")
     ax.set_xlim(0, None)
     return sheet
 
@@ -93,7 +93,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
     config = config or Config()
     seen = study(config)
     rows = table(seen)
-    record.show("Mass, speed and friction unknown", rows)
+    record.print_rows("Mass, speed and friction unknown", rows)
     return record.experiment(config, {"table": rows, "certificate": seen["proof"].summary()}, {"rates": figure(seen)})
 
 

@@ -96,14 +96,14 @@ def draw_recovery(config: Config, found: list[Identified], traces: Traces) -> An
     t, w = np.asarray(traces.t), np.asarray(traces.columns["wheel_speed"])
     left.plot(t, w, ".", color=plot.COLOURS[5], markersize=2, label="data")
     left.plot(t, w + traces.residuals(found[-1])["wheel_speed"][0], color=plot.COLOURS[1], label="fit")
-    plot.label(left, "time [s]", "wheel speed [m/s]")
+    plot.label_axes(left, "time [s]", "wheel speed [m/s]")
     z = errors(config, found)
     for i in range(z.shape[1]):
         right.plot(np.full(len(z), i) + np.linspace(-0.25, 0.25, len(z)), z[:, i], "o", color=plot.COLOURS[i], ms=4)
     for k in (1, 2, 3):
         right.axhspan(-k, k, color=plot.GREY, alpha=0.1, linewidth=0)
     right.set_xticks(range(5), SHORT)
-    plot.label(right, f"parameter, {len(z)} seeds each", "error [standard deviations]")
+    plot.label_axes(right, f"parameter, {len(z)} seeds each", "error [standard deviations]")
     return figure
 
 
@@ -126,13 +126,13 @@ def main(config: Config | None = None) -> dict[str, Any]:
     config = config or Config()
     found, traces = recovered(config)
     table = coverage(config, found)
-    record.show("Known parameters from a noisy wheel speed", table)
+    record.print_rows("Known parameters from a noisy wheel speed", table)
     spread = [
         {"relative spread": one.spread, "direction": one.shown()} for one in found[0].uncertainty.directions[::-1]
     ]
-    record.show("What the trace says least about", spread)
+    record.print_rows("What the trace says least about", spread)
     noise = float(np.mean([np.sqrt(one.chi2 / one.uncertainty.degrees) for one in found]) * config.noise)
-    record.show("Noise", [{"true [m/s]": config.noise, "left by the fits [m/s]": noise}])
+    record.print_rows("Noise", [{"true [m/s]": config.noise, "left by the fits [m/s]": noise}])
     drawn = {"recovery": draw_recovery(config, found, traces), "correlation": draw_correlation(found[0])}
     return record.experiment(config, {"table": table, "directions": spread, "noise": noise}, drawn)
 

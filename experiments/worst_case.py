@@ -57,7 +57,7 @@ class Config:
 def loops() -> dict[str, Loop]:
     """The cure, and the published gain in its place."""
     cure = load("slip-cured").loop
-    feedback = StateFeedback(gain=np.array(lmi_design.PUBLISHED), torque_min=0.0, torque_max=9.03)
+    feedback = StateFeedback(gain=np.array(lmi_design.PUBLISHED_GAIN), torque_min=0.0, torque_max=9.03)
     sampled = dataclasses.replace(cure.controller, controller=feedback)
     published = dataclasses.replace(cure, controller=sampled, reference=FixedSlip(slip=cure.reference.slip))
     return {"published gain": published, "the cure": cure}
@@ -130,13 +130,13 @@ def figures(config: Config, worst: dict[str, WorstCase], those: dict[str, Loop],
     figure, axes = plot.sheet(2, len(those), title="Nominal and worst case", size=(5.8, 3.1))
     for i, (name, one) in enumerate(those.items()):
         runs = {"nominal": seen(config, one), "worst case found": seen(config, worst[name].loop)}
-        plot.slip_lines(axes[i], {label: run.trajectory for label, run in runs.items()})
+        plot.draw_slip_lines(axes[i], {label: run.trajectory for label, run in runs.items()})
         axes[i].set_xlim(0, 0.5)
-        plot.label(axes[i], "time [s]", "slip [1]", name)
+        plot.label_axes(axes[i], "time [s]", "slip [1]", name)
         ax = axes[len(those) + i]
         ax.hist(100 * random[name]["overshoot"], bins=80, color=plot.COLOURS[5], log=True, label="random samples")
         ax.axvline(100 * worst[name].value, color=plot.COLOURS[1], label="worst found")
-        plot.label(ax, "overshoot [%]", "samples")
+        plot.label_axes(ax, "overshoot [%]", "samples")
     return {"worst_case": figure}
 
 
@@ -168,7 +168,7 @@ def main(config: Config | None = None) -> dict[str, Any]:
                 ],
             }
         )
-    record.show("The worst case in a box of five parameters", rows)
+    record.print_rows("The worst case in a box of five parameters", rows)
     for name, report in reports.items():
         print(f"{name}: {report}")
     at = {name: {k: float(v) for k, v in one.values.items()} for name, one in worst.items()}

@@ -17,8 +17,8 @@ from parts import BLOCKS, PARTS, PLANTS, ROADS, differences, jacobian, leaves, s
 
 from diffabs.core import protocols
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, Tracking
-from diffabs.core.pytree import get, parameters, replace, strong
-from diffabs.core.validity import check
+from diffabs.core.pytree import canonical_dtypes, get, parameters, replace
+from diffabs.core.validity import check_part
 from diffabs.plants import BrakeStart
 
 EVERY = [pytest.param(family, part, id=f"{family}: {name}") for family in PARTS for name, part in PARTS[family].items()]
@@ -82,7 +82,7 @@ def test_leaves(family, part):
 @pytest.mark.parametrize(("family", "part"), EVERY)
 def test_ranges(family, part):
     """Good as it is; NaN and either side of each range are refused, by path, range and unit."""
-    assert check(part) is part
+    assert check_part(part) is part
     for path, spec, old in parameters(part):
         assert spec.unit
         assert spec.low < spec.high
@@ -92,7 +92,7 @@ def test_ranges(family, part):
         for x in bad:
             new = replace(part, {path: np.where(np.arange(np.size(old)).reshape(np.shape(old)) == 0, x, old)})
             with pytest.raises(ValueError, match="is outside") as error:
-                check(new)
+                check_part(new)
             assert str(error.value).startswith(f"{path} = ")
             assert str(error.value).endswith(f"is outside {spec.interval()}")
 
@@ -117,7 +117,10 @@ def test_replace_changes_one_parameter(family, part):
 def test_new_values_do_not_compile_again(family, part):
     """Whether they come as Python floats, NumPy arrays or JAX scalars; and jit gives back what it was given."""
     identity = jax.jit(lambda p: p)
-    same, other = identity(strong(part)), identity(strong(jax.tree.map(lambda x: jnp.asarray(1.5 * x), part)))
+    same, other = (
+        identity(canonical_dtypes(part)),
+        identity(canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(1.5 * x), part))),
+    )
     assert identity._cache_size() == 1
     assert type(same) is type(part)
     for a, b, before in zip(leaves(same), leaves(other), leaves(part), strict=True):
@@ -140,7 +143,7 @@ def road_slopes(road, slip, speed, distance):
 @pytest.mark.parametrize("name", ROADS)
 def test_road(name):
     """mu(0) = 0, odd, bounded, C1 at 0, and finite with its derivatives where curves are in danger of not being."""
-    road = strong(ROADS[name])
+    road = canonical_dtypes(ROADS[name])
     grid = np.linspace(0.0, 1.0, 501)
     constant = np.full_like(grid, 10.0)
     mu, _ = road_slopes(road, grid, constant, constant)
@@ -239,7 +242,7 @@ def test_plant_in_float32(name):
     c1 c2 ~ 60 for these roads. So rates are good to 60 2^-24 ~ 4e-6 of their scale, and some for the products."""
     rng = np.random.default_rng(11)
     for state in plant_states(PLANTS[name], rng.uniform(2, 40, 3), rng.uniform(0.01, 0.9, 3)):
-        arguments = strong((PLANTS[name], state, 0.7))
+        arguments = canonical_dtypes((PLANTS[name], state, 0.7))
         exact, rounded = value(plant_at, arguments), plant_at_jit(jax.tree.map(jnp.float32, arguments))
         assert {x.dtype for x in jax.tree.leaves(rounded)} == {jnp.dtype("float32")}
         np.testing.assert_allclose(ravel_pytree(rounded)[0], exact, rtol=1e-5, atol=1e-5 * np.max(np.abs(exact)))
@@ -306,7 +309,7 @@ def output_for(family, block, slip, target, feedforward, flow):
 @given(st.tuples(finite, finite, finite, finite))
 @settings(deadline=None, max_examples=40, derandomize=True)
 def test_block_output_stays_within_its_limits(family, name, low, numbers):
-    block = strong(BLOCKS[family, name])
+    block = canonical_dtypes(BLOCKS[family, name])
     assert getattr(block, low) <= output_for(family, block, *numbers) <= getattr(block, LIMITS[low])
 
 
@@ -325,5 +328,7 @@ def test_objective(name):
 @killed_by("objectives/tracking.py", "jnp.abs(whole))", "whole)", case="iae")
 @pytest.mark.parametrize("name", ["iae", "itae", "final_slip_error", "settling_time", "quadratic"])
 def test_errors_count_on_either_side(name):
-    found = jax.jit(partial(parts.objective_run, sample_at=parts.mirrored_at))(strong(PARTS["objective"][name]))
+    found = jax.jit(partial(parts.objective_run, sample_at=parts.mirrored_at))(
+        canonical_dtypes(PARTS["objective"][name])
+    )
     np.testing.assert_allclose(found, parts.VALUES[name], rtol=1e-8, atol=1e-9)

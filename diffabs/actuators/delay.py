@@ -22,12 +22,12 @@ from diffabs.core.cubic import Cubic
 from diffabs.core.log import Log
 from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree, static
-from diffabs.core.rules import Rule, array
+from diffabs.core.rules import Rule, as_rule_array
 
-ROUNDING = 1e-6  # relative, of single precision
-WINDOW = 6  # pieces: a step that spans more is cut
-CLOSE = 16.0  # precisions of the time: instants that are one
-SAME = 0.5  # power of the precision: a relative difference that is no jump
+TIME_ROUNDING = 1e-6  # relative, of single precision
+WINDOW_PIECES = 6  # pieces: a step that spans more is cut
+TIME_EPS = 16.0  # precisions of the time: instants that are one
+SMOOTH_CHANGE_SHARE = 0.5  # power of the precision: a relative difference that is no jump
 SPARE, CUTS = 16, 4  # pieces beyond the capacity, and one more for so many steps: for steps that are cut
 
 
@@ -83,7 +83,7 @@ class Delay:
         """Nothing on the way yet: one piece that is 0, until t = 0."""
         zero = 0.0 * jnp.asarray(signal)
         row = _row(Piece(zero - self.time, zero, Cubic(zero, zero, zero, zero), zero))
-        window = jnp.broadcast_to(row, (WINDOW, *row.shape))
+        window = jnp.broadcast_to(row, (WINDOW_PIECES, *row.shape))
         rows = jnp.zeros((self.capacity + self.capacity // CUTS + SPARE, *row.shape), row.dtype)
         ring = Log(rows, zero, row).put(zero, row)
         return Memory((), self._aimed(DelayMemory(ring, window, zero + 1, zero, zero, zero, zero, zero + 1, row)))
@@ -112,7 +112,7 @@ class Delay:
     def record(self, memory: Memory, passage: Passage) -> Memory:
         """Store the step that is over; one without a length is none."""
         m: DelayMemory = memory.held
-        h, free = passage.end - passage.start, _around(m.first + m.count, m.ring.size)
+        h, free = passage.end - passage.start, _ring_place(m.first + m.count, m.ring.size)
         before = Piece.of(jax.lax.stop_gradient(m.newest))
         cubic = Cubic(*passage.values, *(h * rate for rate in passage.rates))
         after = passage.values[0], self.time * passage.rates[0]
@@ -128,10 +128,10 @@ class Delay:
         del signal
         m: DelayMemory = memory.held
         size, over = m.ring.size, self._place(clock.t, m)
-        first, count = _around(m.first + over, size), m.count - over
-        rows = m.ring.read(_around(first.astype(int) + jnp.arange(WINDOW), size))
+        first, count = _ring_place(m.first + over, size), m.count - over
+        rows = m.ring.read(_ring_place(first.astype(int) + jnp.arange(WINDOW_PIECES), size))
         window = jnp.where(count < size, rows, jnp.nan)  # else a piece that is still to come out is overwritten
-        known, none = jnp.minimum(count, WINDOW), jnp.zeros_like(count)
+        known, none = jnp.minimum(count, WINDOW_PIECES), jnp.zeros_like(count)
         new = self._aimed(DelayMemory(m.ring, window, known, none, none, none, first, count, m.newest))
         return memory._replace(held=self._at_once(new, clock.t))
 
@@ -146,12 +146,12 @@ class Delay:
 
     def _place(self, t: Scalar, m: DelayMemory) -> Any:
         """Which piece of the window comes out at time t, up to the next break."""
-        return _count([m.window[i, 1] for i in range(WINDOW)], t - self.time, m.place, m.last)
+        return _count([m.window[i, 1] for i in range(WINDOW_PIECES)], t - self.time, m.place, m.last)
 
     def _aimed(self, m: DelayMemory) -> DelayMemory:
         """With the last piece before the next break, and the time of that."""
         last = m.known - 1
-        for i in reversed(range(1, WINDOW)):
+        for i in reversed(range(1, WINDOW_PIECES)):
             last = jnp.where((i > m.place) & (i < m.known) & (m.window[i, -1] > 0.5), i - 1.0, last)
         breaks = last + 1 < m.known
         until = jnp.where(breaks, _piece(m.window, last + 1).start, _piece(m.window, last).end)
@@ -165,10 +165,10 @@ class Delay:
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
         """The ring holds the delay, to the rounding of single precision."""
-        most, time = (self.capacity - 2) * step, array(self.time)
+        most, time = (self.capacity - 2) * step, as_rule_array(self.time)
         outside = f"outside [{step:g}, {most:g}] s, one step to capacity - 2 steps"
         yield Rule(
-            (step <= time * (1 + ROUNDING)) & (time * (1 - ROUNDING) <= most),
+            (step <= time * (1 + TIME_ROUNDING)) & (time * (1 - TIME_ROUNDING) <= most),
             f"time is {outside}",
             lambda: f"time = {float(self.time):g} s is {outside}",
         )
@@ -193,12 +193,12 @@ def _row(piece: Piece) -> Any:
 def _piece(window: Any, place: Any) -> Piece:
     """The piece at a place. By selections: a slice whose place is computed would take the stages of a step apart."""
     row, place = [window[0, j] for j in range(window.shape[1])], place.astype(int)  # whole numbers have no kinks
-    for i in range(1, WINDOW):
+    for i in range(1, WINDOW_PIECES):
         row = [jnp.where(place >= i, window[i, j], x) for j, x in enumerate(row)]
     return Piece.of(row)
 
 
-def _around(place: Any, size: int) -> Any:
+def _ring_place(place: Any, size: int) -> Any:
     """A place in a ring of this size, for one less than twice as far."""
     return jnp.where(place >= size, place - size, place)
 
@@ -206,13 +206,16 @@ def _around(place: Any, size: int) -> Any:
 def _differ(before: tuple[Any, Any], after: tuple[Any, Any]) -> Any:
     """Whether a command does not go on as a smooth one does: value, and change within the delay, at one instant."""
     size = jnp.abs(before[0]) + jnp.abs(before[1]) + jnp.abs(after[0]) + jnp.abs(after[1])
-    jumps = [jnp.abs(x - y) > jnp.finfo(size.dtype).eps ** SAME * size for x, y in zip(before, after, strict=True)]
+    jumps = [
+        jnp.abs(x - y) > jnp.finfo(size.dtype).eps ** SMOOTH_CHANGE_SHARE * size
+        for x, y in zip(before, after, strict=True)
+    ]
     return jnp.any(jnp.stack(jumps))
 
 
 def _rounding(t: Any) -> Any:
     """By how much two computations of the time t may differ."""
-    return CLOSE * jnp.finfo(jnp.result_type(t)).eps * jax.lax.stop_gradient(t)
+    return TIME_EPS * jnp.finfo(jnp.result_type(t)).eps * jax.lax.stop_gradient(t)
 
 
 # Rules of their own, so that nobody looks for the places where these change: the command does not break there.

@@ -7,7 +7,7 @@ import numpy as np
 from diffabs.core.numerics import clamp, quotient
 from diffabs.core.protocols import Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.core.rules import Rule, ordered
+from diffabs.core.rules import Rule, order_rule
 
 
 @pytree
@@ -31,7 +31,7 @@ class Limits:
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""
-        yield ordered(("low", self.low), ("high", self.high), "{control}")
+        yield order_rule(("low", self.low), ("high", self.high), "{control}")
 
 
 @pytree

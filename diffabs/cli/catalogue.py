@@ -8,17 +8,17 @@ import typer
 from diffabs.cli import console, show, targets
 from diffabs.core import values
 from diffabs.scenario import registry
-from diffabs.scenario.scenario import dump, header, names
+from diffabs.scenario.scenario import dump, names, read_header
 
 PLURALS = {f"{name}s": name for name in ("plant", "road", "controller", "reference", "actuator", "sensor")}
 PLURALS |= {"feedforward": "feedforward", "antiwindup": "antiwindup", "initial": "initial"}
 PLURALS |= {"stops": "stop", "objectives": "objective"}
-FAMILIES = (*PLURALS, "scenarios")
+LISTED_FAMILIES = (*PLURALS, "scenarios")
 
 
 def families_like(incomplete: str) -> list[str]:
     """Completions of a family's name."""
-    return [name for name in FAMILIES if name.startswith(incomplete)]
+    return [name for name in LISTED_FAMILIES if name.startswith(incomplete)]
 
 
 def list_parts(
@@ -31,14 +31,16 @@ def list_parts(
     """List all parts and packaged scenarios.
 
     A part is listed with its parameters, their defaults, units and ranges."""
-    with console.guarded():
-        if family is not None and family not in FAMILIES:
-            raise values.unknown(f"there is no family {values.shown(family)}", family, FAMILIES)
-        result = {name: _listed(name) for name in FAMILIES if family in (None, name)}
+    with console.end_on_errors():
+        if family is not None and family not in LISTED_FAMILIES:
+            raise values.unknown_name_error(
+                f"there is no family {values.format_given(family)}", family, LISTED_FAMILIES
+            )
+        result = {name: _describe_family(name) for name in LISTED_FAMILIES if family in (None, name)}
         if as_json:
             return show.as_json(result)
         for name, members in result.items():
-            show.family(name, members)
+            show.show_family(name, members)
     return None
 
 
@@ -52,23 +54,23 @@ def show_scenario(
     """Print a scenario as TOML with every field.
 
     One's own can start from it."""
-    with console.guarded():
+    with console.end_on_errors():
         targets.check_scenario_file(out)
-        text = dump(console.loaded(scenario, changes, integrated=False))
-        with targets.new_file(out, "--out") as file:
+        text = dump(console.load_scenario(scenario, changes, integrated=False))
+        with targets.new_target_file(out, "--out") as file:
             file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
 
 
-def _listed(plural: str) -> dict[str, Any]:
+def _describe_family(plural: str) -> dict[str, Any]:
     """The members of a family as plain values."""
     if plural == "scenarios":
-        return {name: header(name) for name in names()}
+        return {name: read_header(name) for name in names()}
     family = PLURALS[plural]
     return {
         name: {
-            "summary": registry.summary(part),
+            "summary": registry.part_summary(part),
             **({"unit": registry.unit_of(part)} if family == "objective" else {}),
-            "parameters": registry.described(family, part),
+            "parameters": registry.describe_part(family, part),
         }
-        for name, part in registry.types(family).items()
+        for name, part in registry.family_types(family).items()
     }

@@ -15,12 +15,12 @@ import numpy as np
 
 from diffabs.cli import console
 from diffabs.controllers import ProportionalFeedback
-from diffabs.controllers.sampled import unsampled
+from diffabs.controllers.sampled import inner_controller
 from diffabs.core import provenance
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Plant
 from diffabs.core.pytree import parameters, replace
-from diffabs.core.values import ScenarioError, shown
+from diffabs.core.values import ScenarioError, format_given
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import SlipModel
 from diffabs.plants import BrakeStart
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 FROM_PROOF = ("quadratically_stable", "stable", "verified_exactly", "decay_rate", "damping", "trace_cost",
               "guaranteed_cost", "worst_vertex", "margins", "claims")  # fmt: skip
 FROM_DESIGN = ("lower_bound", "gap", "residual")
-CELLS = 8  # in which a Lyapunov matrix that follows the speed is linear
+SCHEDULE_CELLS = 8  # in which a Lyapunov matrix that follows the speed is linear
 SLIPS, MARGIN = 2001, 1.01  # where friction is asked for its greatest value, and how much more is allowed for
-VERDICTS = {True: "proved", False: "disproved", None: "undecided"}
+VERDICT_WORDS = {True: "proved", False: "disproved", None: "undecided"}
 
 Box = dict[str, tuple[float, float]]
 
 
-class Task(NamedTuple):
+class ProofTask(NamedTuple):
     """A scenario brought to linear systems: the gain in question, the set it is about, the specification."""
 
     chosen: Scenario
@@ -55,7 +55,7 @@ class Task(NamedTuple):
     spec: "Spec"
 
 
-def task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) -> Task:
+def build_proof_task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) -> ProofTask:
     """A scenario's systems and gain, or another gain on them. Raises ScenarioError; ValueError for a loop that has no
     linear model; ModuleNotFoundError without the extra."""
     if weighed and chosen.design.Q is None:
@@ -68,22 +68,22 @@ def task(chosen: Scenario, gain: str | None = None, *, weighed: bool = False) ->
 
     reduced, wanted = reduce_loop(chosen.loop), chosen.design
     states = reduced.model.states
-    values = reduced.gain if gain is None else _gain(gain, states)
+    values = reduced.gain if gain is None else _read_gain(gain, states)
     spec = Spec(Q=wanted.Q, R=wanted.R, decay=wanted.decay, damping=wanted.damping)
     try:
         spec = spec.checked(len(states), 1)
     except ValueError as error:
         raise ScenarioError(f"design.{error}; the states are {', '.join(states)}") from None
     solver.solvers()  # says what is missing before anything is computed
-    reduced, model, over = _followed(chosen.loop, reduced, wanted.box(chosen.loop))
+    reduced, model, over = _follow_speed(chosen.loop, reduced, wanted.box(chosen.loop))
     systems = grid_polytope(model, over) if isinstance(model, BalanceModel) else polytope(model, over)
-    return Task(chosen, reduced, values, model, tuple(model.states), over, systems, spec)
+    return ProofTask(chosen, reduced, values, model, tuple(model.states), over, systems, spec)
 
 
-def _followed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["ReducedLoop", Any, Box]:
+def _follow_speed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["ReducedLoop", Any, Box]:
     """The linear model and its box; where the gain follows the speed, those in which it is one gain, whose proof covers
     every fall of the speed that friction allows."""
-    controller = unsampled(loop.controller)
+    controller = inner_controller(loop.controller)
     if not isinstance(controller, ProportionalFeedback) or not isinstance(reduced.model, SlipModel):
         return reduced, reduced.model, box
     from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
@@ -92,13 +92,13 @@ def _followed(loop: Loop, reduced: "ReducedLoop", box: Box) -> tuple["ReducedLoo
     if model.period is None:
         raise ValueError("controller proportional-feedback: only sampled it can be brought to one gain")
     slowest = box.get("speed", (float(reduced.model.speed),))[0]
-    falls = (0.0, greatest_speed_fall(_hardest(loop.plant, box, slowest), slowest, float(model.period)))
+    falls = (0.0, greatest_speed_fall(_greatest_deceleration(loop.plant, box, slowest), slowest, float(model.period)))
     neglected = tuple(line for line in reduced.neglected if "fall of the speed" not in line)
     over = {f"model.{path}": ends for path, ends in box.items()} | {"fall": falls}
     return reduced._replace(neglected=neglected), model, over
 
 
-def _hardest(plant: Plant, box: Box, speed: float) -> float:
+def _greatest_deceleration(plant: Plant, box: Box, speed: float) -> float:
     """The greatest deceleration [m/s^2] that friction gives at a speed, over the corners of the box."""
     inside = {path.removeprefix("plant."): ends for path, ends in box.items() if path.startswith("plant.")}
 
@@ -110,27 +110,29 @@ def _hardest(plant: Plant, box: Box, speed: float) -> float:
     return MARGIN * max(float(np.max(jax.vmap(partial(deceleration, one))(slips))) for one in plants)
 
 
-def certified(task: Task) -> "Certificate":
+def certify_gain(task: ProofTask) -> "Certificate":
     """What can be proved about the gain, with the fastest decay."""
     from diffabs.design import analysis
 
     return analysis.certify(task.gain, task.polytope, task.spec, fastest=True)
 
 
-def _gain(text: str, states: Sequence[str]) -> np.ndarray:
+def _read_gain(text: str, states: Sequence[str]) -> np.ndarray:
     words = text.strip().removeprefix("[").removesuffix("]").split(",")
     try:
         values = np.array([float(word) for word in words])
     except ValueError:
-        raise ScenarioError(f"--gain {shown(text)}: numbers are needed, as in --gain=-11753,-48") from None
+        raise ScenarioError(f"--gain {format_given(text)}: numbers are needed, as in --gain=-11753,-48") from None
     if not np.isfinite(values).all():
-        raise ScenarioError(f"--gain {shown(text)} is outside (-inf, inf): a gain is finite")
+        raise ScenarioError(f"--gain {format_given(text)} is outside (-inf, inf): a gain is finite")
     if len(values) != len(states):
-        raise ScenarioError(f"--gain {shown(text)} has {len(values)} of {len(states)} numbers: {', '.join(states)}")
+        raise ScenarioError(
+            f"--gain {format_given(text)} has {len(values)} of {len(states)} numbers: {', '.join(states)}"
+        )
     return values
 
 
-class Besides(NamedTuple):
+class FurtherFindings(NamedTuple):
     """What is known of a gain that no common Lyapunov matrix proves: its loops at fixed parameters, and the fall of the
     speed [m/s^2] up to which a Lyapunov matrix that follows the speed proves it; None if that was not asked or does not
     succeed."""
@@ -143,17 +145,17 @@ class Besides(NamedTuple):
         return {"frozen": self.frozen._asdict(), "proved_for_a_speed_falling_by": self.fall}
 
 
-def besides(task: Task, proof: "Certificate") -> Besides | None:
+def find_further(task: ProofTask, proof: "Certificate") -> FurtherFindings | None:
     """What is known besides; None where a common Lyapunov matrix says more."""
     from diffabs.design.frozen import analyse_frozen_loops
 
     if proof.quadratically_stable:
         return None
     loops = analyse_frozen_loops(task.gain, task.model, task.over)
-    return Besides(loops, _following(task) if loops.stable == loops.systems else None)
+    return FurtherFindings(loops, _permitted_fall(task) if loops.stable == loops.systems else None)
 
 
-def _following(task: Task) -> float | None:
+def _permitted_fall(task: ProofTask) -> float | None:
     """The greatest fall of the speed that friction allows, if a Lyapunov matrix piecewise linear in the speed proves
     stability up to it."""
     from diffabs.design import Spec, analysis
@@ -162,26 +164,26 @@ def _following(task: Task) -> float | None:
     low, high = task.over.get("speed", (0.0, 0.0))
     if not 0 < low < high or task.polytope.period is not None:
         return None
-    fall = _hardest(task.chosen.loop.plant, task.over, low)
-    cells = schedule(task.model, task.over, along="speed", nodes=CELLS)
+    fall = _greatest_deceleration(task.chosen.loop.plant, task.over, low)
+    cells = schedule(task.model, task.over, along="speed", nodes=SCHEDULE_CELLS)
     return fall if analysis.certify(task.gain, cells, Spec(rates=(-fall, 0.0))).stable else None
 
 
-def document(
-    task: Task,
+def proof_document(
+    task: ProofTask,
     proof: "Certificate | None" = None,
     out: pathlib.Path | None = None,
     reason: str | None = None,
-    known: Besides | None = None,
+    known: FurtherFindings | None = None,
     **numbers: float | None,
 ) -> dict[str, Any]:
     """The JSON document. Parameters have the names of the linear model, in SI."""
     summary: dict[str, Any] = proof.summary() if proof else {}
     if proof:
-        summary["worst_vertex"] = summary["worst_vertex"] or slowest(proof)
+        summary["worst_vertex"] = summary["worst_vertex"] or slowest_vertex(proof)
     coverage = task.polytope.coverage
     return {
-        **console.about(task.chosen),
+        **console.describe_source(task.chosen),
         "gain": np.ravel(proof.gain).tolist() if proof else None,  # one input: the row is the gain
         "states": list(task.states),
         **{name: summary.get(name) for name in FROM_PROOF},
@@ -203,7 +205,7 @@ def document(
     }
 
 
-def slowest(proof: "Certificate") -> dict[str, Any]:
+def slowest_vertex(proof: "Certificate") -> dict[str, Any]:
     """For a proof that is about all vertices together: the vertex with the slowest pole, as `worst_vertex`."""
     index = int(np.argmax(proof.frozen))
     margin = (0.0 if proof.period is None else 1.0) - proof.frozen[index]
@@ -212,7 +214,7 @@ def slowest(proof: "Certificate") -> dict[str, Any]:
     return {"index": index, "cell": 0, "corner": corner, "claim": "poles", "margin": margin}
 
 
-def unproved(proof: "Certificate", spec: "Spec", known: Besides | None = None) -> str:
+def describe_unproved(proof: "Certificate", spec: "Spec", known: FurtherFindings | None = None) -> str:
     """What was asked for and is not proved, in words, and what is known besides; empty if all is proved."""
     stable, refuted = proof.quadratically_stable, any(proof.proved("infeasible"))
     asked = {
@@ -220,25 +222,25 @@ def unproved(proof: "Certificate", spec: "Spec", known: Besides | None = None) -
         "cost": (spec.Q is not None, "a guaranteed cost", True),
         "damping": (spec.damping > 0, f"damping = {spec.damping:g}", True),
     }
-    found = [] if stable else [f"quadratic stability is {VERDICTS[stable]}"]
+    found = [] if stable else [f"quadratic stability is {VERDICT_WORDS[stable]}"]
     if stable is False:
         found[0] += f": no common Lyapunov matrix exists for the {proof.cells[0].vertices} vertices"
         found[0] += ", so no design by one over these ranges, whatever Q and R, gives this gain"
     else:
         for kind, (wanted, words, still_open) in asked.items():
             if wanted and not any(proof.proved(kind)):
-                found.append(f"{words} is {VERDICTS[None if still_open else False]}")
+                found.append(f"{words} is {VERDICT_WORDS[None if still_open else False]}")
     if not found:
         return ""
     if known and known.frozen.stable == known.frozen.systems:
-        return f"{', '.join(found)}; that is not instability: {stable_besides(known)}"
-    worst = slowest(proof)
+        return f"{', '.join(found)}; that is not instability: {describe_frozen_stability(known)}"
+    worst = slowest_vertex(proof)
     where = ", ".join(f"{name} {value:.6g}" for name, value in (worst["corner"] or {}).items())
     kind = "is unstable even if it is fixed" if worst["margin"] <= 0 else "has the slowest pole"
     return f"{', '.join(found)}; vertex {worst['index']}{f' ({where})' if where else ''} {kind}"
 
 
-def stable_besides(known: Besides) -> str:
+def describe_frozen_stability(known: FurtherFindings) -> str:
     """In words, of a gain whose frozen loops are all stable."""
     loops = known.frozen
     where = ", ".join(f"{name} {value:.6g}" for name, value in loops.at.items())
@@ -253,7 +255,7 @@ def stable_besides(known: Besides) -> str:
 
 
 @contextlib.contextmanager
-def reported() -> Iterator[None]:
+def report_design_errors() -> Iterator[None]:
     """What `diffabs.design` raises, in one line: what is missing or does not fit is bad input."""
     try:
         yield

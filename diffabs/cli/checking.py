@@ -16,13 +16,13 @@ from diffabs.simulate.admissible import MAX_SOLVER_STEPS
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import Adaptive, Run, Solver, describe_solver, refine_solver
 
-SMALL = 1e-6  # of a value: below, nobody asks for its order
+MIN_CHANGE = 1e-6  # of a value: below, nobody asks for its order
 FINEST = 4  # the shortest step is this part of the scenario's
 CLOSER = 16  # times smaller: the error of a step with which a run with adaptive steps is compared
 LOOSE, LEAST = 100, 0.01  # times `rtol`, of a metric or of this, where that is more: a greater change is told
 
 
-def checked(chosen: Scenario, key: Any) -> dict[str, Any]:
+def check_accuracy(chosen: Scenario, key: Any) -> dict[str, Any]:
     """The document, by metric: what a half step changes, absolutely and relative to the value, what a quarter changes
     again, the order, the error, and what single precision changes. Raises ScenarioError for a step too short to be
     shortened."""
@@ -35,7 +35,7 @@ def checked(chosen: Scenario, key: Any) -> dict[str, Any]:
         )
     why = incomparability_reasons(chosen.loop, solver, key)
     found = jax.device_get(estimate_accuracy(chosen.loop, solver, chosen.objectives, key=key))
-    single = {} if needs_key(chosen.loop) else _single(chosen)
+    single = {} if needs_key(chosen.loop) else _run_in_single_precision(chosen)
     metrics = {}
     for name in chosen.objectives:
         one = found.estimates[name]
@@ -43,7 +43,7 @@ def checked(chosen: Scenario, key: Any) -> dict[str, Any]:
         metrics[name] = {
             "value": value,
             "difference": float(one.difference),
-            "relative": _share(float(one.difference), value),
+            "relative": _relative_change(float(one.difference), value),
             "finer difference": float(one.finer),
             "order": float(one.order),
             "converges": bool(one.converges),
@@ -59,7 +59,7 @@ def checked(chosen: Scenario, key: Any) -> dict[str, Any]:
     }
 
 
-def loose(metrics: Mapping[str, Any], solver: Adaptive, again: Callable[[Solver], Run]) -> list[str]:
+def describe_loose_metrics(metrics: Mapping[str, Any], solver: Adaptive, again: Callable[[Solver], Run]) -> list[str]:
     """Return what to tell of a run with adaptive steps: the metrics that a smaller error of a step changes by much more
     than that error. Such a run chatters, or amplifies its errors. `again` makes it with another solver."""
     closer = dataclasses.replace(solver, rtol=solver.rtol / CLOSER)
@@ -73,26 +73,26 @@ def loose(metrics: Mapping[str, Any], solver: Adaptive, again: Callable[[Solver]
     return [f"solver.rtol = {closer.rtol:.2g} changes {', '.join(found)}: {why}"]
 
 
-def said(found: dict[str, Any]) -> list[str]:
+def describe_check(found: dict[str, Any]) -> list[str]:
     """What a reader of the table must know, a line each."""
     lines = [f"accuracy unknown: {why}" for why in found["reasons"]]
     if found["comparable"] and not found["ended alike"]:
         lines.append("accuracy unknown: with a shorter step the run ends in another way")
     rows = found["metrics"].items()
-    loose = [name for name, row in rows if not row["converges"] and row["error"] > SMALL * abs(row["value"])]
+    loose = [name for name, row in rows if not row["converges"] and row["error"] > MIN_CHANGE * abs(row["value"])]
     if found["comparable"] and loose:
         lines.append(f"a shorter step does not bring {', '.join(loose)} any nearer to a value: the error is a guess")
     return lines
 
 
-def _single(chosen: Scenario) -> dict[str, float]:
+def _run_in_single_precision(chosen: Scenario) -> dict[str, float]:
     """The metrics in single precision. Noise is not asked for: other bits are drawn for it."""
     with jax.enable_x64(False):
         loop, objectives = jax.tree.map(lambda x: np.asarray(x, np.float32), (chosen.loop, dict(chosen.objectives)))
         return {name: float(x) for name, x in measure(loop, chosen.solver, objectives).metrics.items()}
 
 
-def _share(difference: float, value: float) -> float:
+def _relative_change(difference: float, value: float) -> float:
     if difference == 0 or math.isnan(difference):
         return abs(difference)
     return abs(difference / value) if value else float("inf")

@@ -8,13 +8,13 @@ import typer
 
 from diffabs.cli import console, show, show_samples
 from diffabs.cli.sweep import warn_of_strays
-from diffabs.core.values import ScenarioError, unknown
+from diffabs.core.values import ScenarioError, unknown_name_error
 
 if TYPE_CHECKING:
     from diffabs.sweep import Results
 
 FEWEST = 4  # samples of which anything is said
-SAME = ("space", "seed", "samples")  # of two studies whose samples are the same
+SHARED_FIELDS = ("space", "seed", "samples")  # of two studies whose samples are the same
 
 
 def compare(
@@ -26,13 +26,13 @@ def compare(
     """Compare two sweeps on common random numbers.
 
     It says what the second does better or worse than the first."""
-    with console.guarded():
+    with console.end_on_errors():
         console.need_extra("sweep")
         from diffabs.sweep import Results
 
         a, b = Results(first), Results(second)
         _check_same(a, b)
-        result = {"first": str(first), "second": str(second), **_compared(a, b, _metrics(a, b, metric))}
+        result = {"first": str(first), "second": str(second), **_compare_metrics(a, b, _common_metrics(a, b, metric))}
         show.as_json(result) if as_json else show_samples.compared(result)
 
 
@@ -44,21 +44,21 @@ def _check_same(a: "Results", b: "Results") -> None:
         warn_of_strays(found)
         if not found.complete:
             raise ScenarioError(f"{found.folder} is not complete; --resume goes on with it")
-    for line in describe_differences({k: a.study[k] for k in SAME}, {k: b.study[k] for k in SAME}):
+    for line in describe_differences({k: a.study[k] for k in SHARED_FIELDS}, {k: b.study[k] for k in SHARED_FIELDS}):
         raise ScenarioError(
             f"the samples are not the same: {line.replace(' there, ', ' in the first, ')} in the second"
         )
 
 
-def _metrics(a: "Results", b: "Results", wanted: list[str] | None) -> list[str]:
+def _common_metrics(a: "Results", b: "Results", wanted: list[str] | None) -> list[str]:
     both = [name for name in a.metrics if name in b.metrics]
     for name in wanted or ():
         if name not in both:
-            raise unknown(f"--metric {name} is not in both", name, both)
+            raise unknown_name_error(f"--metric {name} is not in both", name, both)
     return wanted or both
 
 
-def _compared(a: "Results", b: "Results", metrics: list[str]) -> dict[str, Any]:
+def _compare_metrics(a: "Results", b: "Results", metrics: list[str]) -> dict[str, Any]:
     """Paired statistics of second minus first, over samples that diverged or were refused in neither. A sample that
     never settles in one of them is left out of that metric, and counted."""
     from diffabs.sweep.statistics.estimates import Moments

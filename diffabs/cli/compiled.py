@@ -12,17 +12,17 @@ import jax
 
 from diffabs.core import files, provenance
 
-OFF = "DIFFABS_NO_CACHE"  # if set, nothing is kept
+OFF_VARIABLE = "DIFFABS_NO_CACHE"  # if set, nothing is kept
 WORTH = 0.05  # s of compiling, from which a program is kept
 ROOM = 256 * 2**20  # bytes on disk; beyond, the oldest half goes
-CHOSEN = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")  # by which a user has decided
+USER_VARIABLES = ("JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE")  # by which a user has decided
 
 
-def keep() -> pathlib.Path | None:
+def use_compilation_cache() -> pathlib.Path | None:
     """Return the folder that JAX from now on keeps compiled programs in, or None: without one everything works, and
     compiles. Nothing is said of a folder that cannot be written or of a damaged entry."""
     chosen = jax.config.values.get("jax_compilation_cache_dir")
-    if os.environ.get(OFF) or any(name in os.environ for name in CHOSEN) or chosen:
+    if os.environ.get(OFF_VARIABLE) or any(name in os.environ for name in USER_VARIABLES) or chosen:
         return None
     try:
         folder = _user_folder() / "diffabs" / f"jax-{provenance.processor()}"

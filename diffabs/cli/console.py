@@ -21,13 +21,13 @@ from diffabs.cli import progress
 from diffabs.core import files, interrupt, provenance, stopwatch
 from diffabs.core.values import ScenarioError
 from diffabs.scenario import outside
-from diffabs.scenario.model import model
+from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import Scenario, dump, load, names
 
 T = TypeVar("T")
 
 FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, interrupt.INTERRUPTED, interrupt.TERMINATED
-PATIENCE, AGAIN = progress.PATIENCE, progress.AGAIN
+PATIENCE, SECOND_INTERRUPT_S = progress.PATIENCE, progress.REPEAT_S
 AWAKE = 0.1  # s between looks for Ctrl-C
 LOUD = ("error:", "warning:", "interrupted")  # lines that --quiet does not silence
 CONTINUED = " \\"  # a line of a shell that goes on in the next
@@ -54,13 +54,13 @@ def fields_like(context: typer.Context, incomplete: str) -> list[str]:
         tables = tomllib.loads(dump(load(next(filter(None, words)))))
     except (StopIteration, OSError, ValueError):
         return []
-    return [f"{path}=" for path in _paths(tables) if path.startswith(incomplete)]
+    return [f"{path}=" for path in _field_paths(tables) if path.startswith(incomplete)]
 
 
-def _paths(tables: dict[str, Any], above: str = "") -> Iterator[str]:
+def _field_paths(tables: dict[str, Any], above: str = "") -> Iterator[str]:
     for name, value in tables.items():
         if isinstance(value, dict):
-            yield from _paths(value, f"{above}{name}.")
+            yield from _field_paths(value, f"{above}{name}.")
         else:
             yield f"{above}{name}"
 
@@ -91,33 +91,33 @@ def quieten(wanted: bool) -> None:
     _quiet = wanted
 
 
-def begin(words: Sequence[str]) -> None:
+def note_command(words: Sequence[str]) -> None:
     """Note the words of the command that begins."""
     global _given, _begun
     _given, _begun = tuple(words), time.monotonic()
-    stopwatch.listen()
+    stopwatch.count_compilations()
 
 
-def made() -> dict[str, str | float]:
+def describe_making() -> dict[str, str | float]:
     """Return when, where and by which command a document is made, and how long that took so far [s]."""
-    seconds, compiling = time.monotonic() - _begun, stopwatch.compiled(_begun)
-    return {**provenance.made(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
+    seconds, compiling = time.monotonic() - _begun, stopwatch.compile_time_since(_begun)
+    return {**provenance.describe_making(_given), "seconds": round(seconds, 1), "of it compiling": round(compiling, 1)}
 
 
-def about(chosen: Scenario) -> dict[str, Any]:
+def describe_source(chosen: Scenario) -> dict[str, Any]:
     """Return how every document on a scenario begins: what was asked about, and how the document is made."""
-    return {"scenario": chosen.name, "model": model(chosen), "made": made()}
+    return {"scenario": chosen.name, "model": describe_model(chosen), "made": describe_making()}
 
 
 def say(line: str) -> None:
     """A line for a person, on stderr; on a terminal folded between words."""
     if not _quiet or line.startswith(LOUD):
-        _write("\n".join(_folded(line)))
+        _write("\n".join(_fold_line(line)))
 
 
 def say_command(line: str, words: Sequence[str]) -> None:
     """A line that ends in a command; on a terminal too narrow for both the command has its own lines, to copy."""
-    width, command = _width(), [shlex.quote(word) for word in words]
+    width, command = _terminal_width(), [shlex.quote(word) for word in words]
     if width is None or len(" ".join([line, *command])) <= width:
         say(" ".join([line, *command]))
         return
@@ -137,14 +137,14 @@ def _write(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def _folded(line: str) -> list[str]:
-    width = _width()
+def _fold_line(line: str) -> list[str]:
+    width = _terminal_width()
     if width is None or len(line) <= width:
         return [line]
     return textwrap.wrap(line, width, break_long_words=False, break_on_hyphens=False)
 
 
-def _width() -> int | None:
+def _terminal_width() -> int | None:
     """Columns of the terminal that stderr is; None where it is none."""
     console = Console(stderr=True)
     return console.width if console.is_terminal else None
@@ -156,13 +156,13 @@ def fail(line: str, status: int = BAD_INPUT) -> NoReturn:
     raise typer.Exit(status)
 
 
-def animated() -> bool:
+def is_animated() -> bool:
     """Whether stderr shows a spinner."""
-    return progress.drawable(Console(stderr=True))
+    return progress.can_redraw(Console(stderr=True))
 
 
 @contextlib.contextmanager
-def guarded() -> Iterator[None]:
+def end_on_errors() -> Iterator[None]:
     """Bad input, a full disk, Ctrl-C, and parts from outside that raise or exit end a command with one line and their
     exit status."""
     try:
@@ -179,12 +179,12 @@ def guarded() -> Iterator[None]:
         say("interrupted")
         raise typer.Exit(INTERRUPTED) from None
     except (Exception, SystemExit) as error:
-        if not (line := outside.described(error)):
+        if not (line := outside.describe_outside_error(error)):
             raise
         fail(line)
 
 
-class Ending:
+class EarlyEnd:
     """What Ctrl-C asks of work that can end early and has then something to show: to finish `what` it has in hand. The
     work asks this object whether it shall. The second time Ctrl-C interrupts, and the first, too, while `nothing()` is
     reached yet."""
@@ -205,8 +205,8 @@ class Ending:
         say(f"interrupted: finishing {self.what} (Ctrl-C again: at once)")
 
 
-def waited(
-    work: Callable[[], T], message: str, detail: progress.Detail | None = None, ending: Ending | None = None
+def run_with_progress(
+    work: Callable[[], T], message: str, detail: progress.Detail | None = None, ending: EarlyEnd | None = None
 ) -> T:
     """The result of `work`, with a spinner on a terminal, or a line if it takes long elsewhere. `detail` says how far
     the work is: beside the spinner, or in a line every few seconds.
@@ -226,13 +226,17 @@ def waited(
             errors.append(error)
 
     thread = threading.Thread(target=run, name=WORKER, daemon=True)
-    told = contextlib.nullcontext(lambda: None) if _quiet else progress.shown(message, detail, say, (PATIENCE, AGAIN))
+    told = (
+        contextlib.nullcontext(lambda: None)
+        if _quiet
+        else progress.show_progress(message, detail, say, (PATIENCE, SECOND_INTERRUPT_S))
+    )
     with told as tell:
         thread.start()
         ended = False
         while not ended:
-            if _pressed_while(thread):
-                (ending or Ending("", nothing=lambda: True)).ask()
+            if _wait_for_interrupt(thread):
+                (ending or EarlyEnd("", nothing=lambda: True)).ask()
             ended = not thread.is_alive()
             tell()
     if errors:
@@ -248,18 +252,18 @@ def warnings_in_lines() -> Iterator[None]:
         yield
 
 
-def _pressed_while(thread: threading.Thread) -> bool:
+def _wait_for_interrupt(thread: threading.Thread) -> bool:
     """Wait a moment for a thread. Whether Ctrl-C was pressed; an exception where this is not the command's process."""
     try:
         thread.join(AWAKE)
     except KeyboardInterrupt:
         return True
-    return interrupt.pressed()
+    return interrupt.take_interrupt()
 
 
-def loaded(scenario: str, changes: Sequence[str] | None, *, integrated: bool = True) -> Scenario:
+def load_scenario(scenario: str, changes: Sequence[str] | None, *, integrated: bool = True) -> Scenario:
     """A scenario; says what is allowed in it but hardly meant. Raises ScenarioError."""
-    chosen = waited(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
+    chosen = run_with_progress(lambda: load(scenario, changes or (), integrated=integrated), "checking the scenario")
     for line in chosen.cautions():
         say(f"warning: {line}")
     return chosen
@@ -268,18 +272,18 @@ def loaded(scenario: str, changes: Sequence[str] | None, *, integrated: bool = T
 def leave(status: Any) -> NoReturn:
     """Exit at once where interrupted work still runs: the interpreter would wait for it; what that work has begun to
     write and its processes go with it. Raises SystemExit else."""
-    status = TERMINATED if status == INTERRUPTED and interrupt.terminated() else status
+    status = TERMINATED if status == INTERRUPTED and interrupt.was_terminated() else status
     if any(thread.name == WORKER for thread in threading.enumerate()):
         for child in multiprocessing.active_children():
             child.kill()
-        files.clear()
+        files.remove_unfinished()
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status if isinstance(status, int) else FAILED)
     raise SystemExit(status)
 
 
-def changed(changes: Sequence[str] | None, section: str, **fields: Any) -> list[str]:
+def add_option_overrides(changes: Sequence[str] | None, section: str, **fields: Any) -> list[str]:
     """Return overrides, with those that options of their own say of fields of a section."""
     return [*(changes or ()), *(f"{section}.{name}={value}" for name, value in fields.items() if value is not None)]
 

@@ -27,23 +27,23 @@ def design(
     """Find the gain with the least guaranteed cost.
 
     It is a state feedback for all systems within the ranges of [design], and its cost is proved."""
-    with console.guarded(), certificates.reported():
-        with targets.new_file(out, "--out") as file:
-            task = _task(scenario, changes or (), weighed=True)
+    with console.end_on_errors(), certificates.report_design_errors():
+        with targets.new_target_file(out, "--out") as file:
+            task = _prepare(scenario, changes or (), weighed=True)
             from diffabs.design import synthesis
 
             try:
-                found = console.waited(
+                found = console.run_with_progress(
                     lambda: synthesis.design(task.polytope, task.spec), f"designing for {task.chosen.name}"
                 )
             except synthesis.DesignError as error:
                 if as_json:
-                    show.as_json(certificates.document(task, reason=str(error)))
+                    show.as_json(certificates.proof_document(task, reason=str(error)))
                 console.fail(f"{task.chosen.name}: {error}", console.FAILED)
             if file:
                 found.certificate.save(file)
         numbers = {name: getattr(found, name) for name in (*certificates.FROM_DESIGN, "trace_cost")}
-        _show(certificates.document(task, found.certificate, out, **numbers), task, as_json)
+        _show(certificates.proof_document(task, found.certificate, out, **numbers), task, as_json)
 
 
 def certify(
@@ -58,15 +58,17 @@ def certify(
     """Prove that a gain is stable over the ranges of [design].
 
     The proof, or what stands against it, holds however fast the parameters vary."""
-    with console.guarded(), certificates.reported():
-        with targets.new_file(out, "--out") as file:
-            task = _task(scenario, changes or (), gain)
-            found = console.waited(lambda: certificates.certified(task), f"certifying {task.chosen.name}")
+    with console.end_on_errors(), certificates.report_design_errors():
+        with targets.new_target_file(out, "--out") as file:
+            task = _prepare(scenario, changes or (), gain)
+            found = console.run_with_progress(lambda: certificates.certify_gain(task), f"certifying {task.chosen.name}")
             if file:
                 found.save(file)
-        known = console.waited(lambda: certificates.besides(task, found), "looking at what is known besides")
-        reason = certificates.unproved(found, task.spec, known)
-        _show(certificates.document(task, found, out, reason=reason or None, known=known), task, as_json)
+        known = console.run_with_progress(
+            lambda: certificates.find_further(task, found), "looking at what is known besides"
+        )
+        reason = certificates.describe_unproved(found, task.spec, known)
+        _show(certificates.proof_document(task, found, out, reason=reason or None, known=known), task, as_json)
         if reason:
             console.fail(f"{task.chosen.name}: {reason}", console.FAILED)
 
@@ -83,15 +85,15 @@ def verify(
     The code shares nothing with what made the certificate. Exit status 0 proved, 1 not proved, 2 no certificate."""
     from diffabs.design.verify import verify_file as verified
 
-    with console.guarded():
+    with console.end_on_errors():
         if not 0 < seconds < math.inf:
             console.fail(f"--seconds = {seconds:g} is outside (0, inf) s")
         try:
-            verdicts = console.waited(lambda: verified(file, seconds), f"verifying {file}")
+            verdicts = console.run_with_progress(lambda: verified(file, seconds), f"verifying {file}")
         except ValueError as error:
             console.fail(f"{file}: {' '.join(str(error).split())}")
         proved = bool(verdicts) and not any(verdict.reason for verdict in verdicts)
-        show.verified({
+        show.show_verification({
             "file": str(file),
             "proved": proved,
             "claims": [{**verdict._asdict(), "proved": not verdict.reason} for verdict in verdicts],
@@ -102,19 +104,23 @@ def verify(
             console.fail(f"{file}: not proved: {why or 'the file claims nothing'}", console.FAILED)
 
 
-def _task(
+def _prepare(
     scenario: str, changes: Sequence[str], gain: str | None = None, *, weighed: bool = False
-) -> certificates.Task:
-    chosen = console.loaded(scenario, changes, integrated=False)
-    return console.waited(lambda: certificates.task(chosen, gain, weighed=weighed), "computing the polytope")
+) -> certificates.ProofTask:
+    chosen = console.load_scenario(scenario, changes, integrated=False)
+    return console.run_with_progress(
+        lambda: certificates.build_proof_task(chosen, gain, weighed=weighed), "computing the polytope"
+    )
 
 
-def _show(result: dict[str, Any], task: certificates.Task, as_json: bool) -> None:
+def _show(result: dict[str, Any], task: certificates.ProofTask, as_json: bool) -> None:
     if as_json:
         show.as_json(result)
     else:
         units = {path: spec.unit for path, spec, _ in parameters(task.model)}
-        show.proof(result, f"{task.chosen.name}: u = K x", units, certificates.VERDICTS[result["quadratically_stable"]])
+        show.show_proof(
+            result, f"{task.chosen.name}: u = K x", units, certificates.VERDICT_WORDS[result["quadratically_stable"]]
+        )
     for line in task.reduced.neglected:
         console.say(f"neglected: {line}")
     if not task.reduced.exact:

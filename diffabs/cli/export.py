@@ -15,7 +15,7 @@ from diffabs import __version__
 from diffabs.cli import console, show, targets
 from diffabs.core.provenance import versions
 from diffabs.core.units import units_of
-from diffabs.core.validity import problems
+from diffabs.core.validity import find_problems
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.solution import FixedStep
@@ -61,7 +61,7 @@ def export(
     """Write the sampled controller as code, or the plant as FMU.
 
     The code has the controller's filter, limits, anti-windup, schedule and target."""
-    with console.guarded():
+    with console.end_on_errors():
         from diffabs.export import NotExported
 
         if to is not Form.TABLE and as_json:
@@ -72,33 +72,35 @@ def export(
             console.fail("--float32 and --given are for --to c and --to st")
         if to is Form.FMU and period is not None:
             console.fail("--period is for a controller; --to fmu writes the plant")
-        with targets.new_file(out, "--out") as file:
-            chosen = console.loaded(scenario, changes, integrated=to is Form.FMU)
-            chosen = chosen if period is None else _sampled(chosen, period)
+        with targets.new_target_file(out, "--out") as file:
+            chosen = console.load_scenario(scenario, changes, integrated=to is Form.FMU)
+            chosen = chosen if period is None else _sample_controller(chosen, period)
             try:
                 if to is Form.FMU and file and out:
-                    _fmu(chosen, file, out)
+                    _write_fmu(chosen, file, out)
                     return
                 if to is Form.TABLE:
-                    _table(chosen, file, as_json)
+                    _show_table(chosen, file, as_json)
                     return
-                text = console.waited(lambda: _source(chosen, out, to, single, given), f"tracing {chosen.name}")
+                text = console.run_with_progress(
+                    lambda: _write_source(chosen, out, to, single, given), f"tracing {chosen.name}"
+                )
             except NotExported as error:
-                console.fail(f"{chosen.name}: {_hinted(str(error))}")
+                console.fail(f"{chosen.name}: {_add_hint(str(error))}")
             file.write_text(text, encoding="utf-8") if file else typer.echo(text, nl=False)
         if out and to is Form.ST:
-            console.say(f"st: {out}; FUNCTION_BLOCK {_name(chosen, out)}, to be called once a period")
+            console.say(f"st: {out}; FUNCTION_BLOCK {_function_prefix(chosen, out)}, to be called once a period")
         elif out:
-            console.say(f"c: {out}; try it with: cc -std=c99 -D{_name(chosen, out).upper()}_MAIN {out} -lm")
+            console.say(f"c: {out}; try it with: cc -std=c99 -D{_function_prefix(chosen, out).upper()}_MAIN {out} -lm")
 
 
-def _hinted(line: str) -> str:
+def _add_hint(line: str) -> str:
     """With what the command line can do about it."""
     line = line.replace("give the target from outside", "say --given target")
     return line.replace("give the period at which", "say --period SECONDS, at which")
 
 
-def _sampled(chosen: Scenario, period: float) -> Scenario:
+def _sample_controller(chosen: Scenario, period: float) -> Scenario:
     """The scenario with its controller as it is, sampled. Raises ScenarioError."""
     from diffabs.controllers import Sampled, SampledOnGrid
 
@@ -106,47 +108,49 @@ def _sampled(chosen: Scenario, period: float) -> Scenario:
     if isinstance(inner, Sampled | SampledOnGrid):
         raise ScenarioError("--period: the scenario's controller is sampled; change it with --set controller.period=")
     controller = Sampled(controller=inner, period=period)
-    if lines := list(problems(controller, "controller.", units_of(chosen.loop.plant))):
+    if lines := list(find_problems(controller, "controller.", units_of(chosen.loop.plant))):
         raise ScenarioError("; ".join(lines))
     loop = dataclasses.replace(chosen.loop, controller=controller)
     return dataclasses.replace(chosen, loop=loop)
 
 
-def _name(chosen: Scenario, out: pathlib.Path | None) -> str:
+def _function_prefix(chosen: Scenario, out: pathlib.Path | None) -> str:
     """What functions begin with: the file's name, or the scenario's."""
     name = re.sub(r"[\W_]+", "_", out.stem if out else chosen.name, flags=re.ASCII).strip("_")
     return name if name[:1].isalpha() else f"controller_{name}"
 
 
-def _source(chosen: Scenario, out: pathlib.Path | None, to: Form, single: bool, given: Any) -> str:
-    from diffabs.export import c_source, device, structured_text
+def _write_source(chosen: Scenario, out: pathlib.Path | None, to: Form, single: bool, given: Any) -> str:
+    from diffabs.export import c_source, computer_program, structured_text
 
     step = getattr(chosen.solver, "step", None)
     dtype = np.float32 if single else np.float64
-    found = device(chosen.loop, step=step, dtype=dtype, given_target=given is Given.TARGET)
+    found = computer_program(chosen.loop, step=step, dtype=dtype, given_target=given is Given.TARGET)
     title = f"Scenario {chosen.name}{f': {chosen.title}' if chosen.title else ''}."
     written = structured_text if to is Form.ST else c_source
-    return written(found, _name(chosen, out), [title, f"Written by diffabs {__version__}."])
+    return written(found, _function_prefix(chosen, out), [title, f"Written by diffabs {__version__}."])
 
 
-def _fmu(chosen: Scenario, file: pathlib.Path, out: pathlib.Path) -> None:
+def _write_fmu(chosen: Scenario, file: pathlib.Path, out: pathlib.Path) -> None:
     """The plant, as the scenario integrates it. Raises ScenarioError, NotExported."""
-    from diffabs.export import fmu
+    from diffabs.export import build_fmu
 
     solver = chosen.solver
     if not isinstance(solver, FixedStep):
         raise ScenarioError("solver.type = adaptive: an FMU takes fixed steps, as in --set solver.type=fixed")
-    name, about = _name(chosen, out), chosen.title or chosen.name
+    name, about = _function_prefix(chosen, out), chosen.title or chosen.name
     times = {"step": float(solver.step), "duration": float(solver.duration)}
-    data = console.waited(lambda: fmu(chosen.loop, name, **times, about=about), f"compiling the plant of {chosen.name}")
+    data = console.run_with_progress(
+        lambda: build_fmu(chosen.loop, name, **times, about=about), f"compiling the plant of {chosen.name}"
+    )
     file.write_bytes(data)
     console.say(f"fmu: {out}; FMI 2.0 for co-simulation, input control [{chosen.loop.plant.control_unit}]")
 
 
-def _table(chosen: Scenario, file: pathlib.Path | None, as_json: bool) -> None:
-    from diffabs.export import equations
+def _show_table(chosen: Scenario, file: pathlib.Path | None, as_json: bool) -> None:
+    from diffabs.export import difference_equations
 
-    found = console.waited(lambda: equations(chosen.loop), f"linearising {chosen.name}")
+    found = console.run_with_progress(lambda: difference_equations(chosen.loop), f"linearising {chosen.name}")
     states = [f"x{i + 1}" for i in range(len(found["F"]))]
     columns = [*states, *(f"d {name}" for name in found["inputs"])]
     rows = {f"{x}(k+1)": [*f, *g] for x, f, g in zip(states, found["F"], found["G"], strict=True)}
@@ -157,12 +161,12 @@ def _table(chosen: Scenario, file: pathlib.Path | None, as_json: bool) -> None:
     elif as_json:
         show.as_json({"scenario": chosen.name, **found, "versions": versions()})
     else:
-        _shown(chosen, found["period"], columns, rows)
+        _show_columns(chosen, found["period"], columns, rows)
 
 
-def _shown(chosen: Scenario, period: float, columns: list[str], rows: dict[str, list[float]]) -> None:
+def _show_columns(chosen: Scenario, period: float, columns: list[str], rows: dict[str, list[float]]) -> None:
     table = Table("next", *columns)
     for name, row in rows.items():
         table.add_row(name, *(f"{value:.8g}" for value in row))
-    show.titled(f"{chosen.title or chosen.name}: every {1e3 * period:g} ms, at k", table)
+    show.show_titled_table(f"{chosen.title or chosen.name}: every {1e3 * period:g} ms, at k", table)
     console.say("note: d is the difference from rest on the setpoint, x that of what is remembered; limits do not act")

@@ -14,20 +14,20 @@ import typer
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.core import provenance
 from diffabs.core.pytree import get, parameters
-from diffabs.core.values import ScenarioError, shown, unknown
+from diffabs.core.values import ScenarioError, format_given, unknown_name_error
 from diffabs.scenario import section_tune, toml
-from diffabs.scenario.measurements import Readings, read
-from diffabs.scenario.parameter_paths import flat
+from diffabs.scenario.measurements import Readings, read_measurements
+from diffabs.scenario.parameter_paths import flatten_table
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.solution import Solver
 
 if TYPE_CHECKING:
     from diffabs.identify.fit import Identified
 
-CORRELATED = 0.95
+HIGH_CORRELATION = 0.95
 ROUNDS = 3  # fits, where the noise is estimated from the residuals of the one before
-LEAST = 1e-6  # of a column's spread: less noise than that is not believed
-MOST_ROWS = 20_000  # of a simulated trajectory
+MIN_RELATIVE_NOISE = 1e-6  # of a column's spread: less noise than that is not believed
+MAX_DATA_ROWS = 20_000  # of a simulated trajectory
 DEPENDENT = {"slip", "speed", "wheel_speed"}
 REDUNDANT = (
     "slip, speed and wheel_speed: one follows from the others, and counted as independent they make the standard"
@@ -58,81 +58,85 @@ def identify(
     """Find parameters of a scenario from a measured run.
 
     It says how well the run determines them."""
-    with console.guarded(), certificates.reported():
+    with console.end_on_errors(), certificates.report_design_errors():
         console.need_extra("tune")
         targets.check_scenario_file(out)
-        with targets.new_file(out, "--out") as file:
-            chosen = console.loaded(scenario, changes)
+        with targets.new_target_file(out, "--out") as file:
+            chosen = console.load_scenario(scenario, changes)
             units = chosen.loop.plant.shows.units
-            readings = _readings(data, column, units)
-            noise = _noise(sigma or (), readings, units)
-            ranges = _ranges(free, chosen)
-            found, noise, interrupted = _watched(chosen, readings, ranges, noise)
+            readings = _compared_columns(data, column, units)
+            noise = _read_noise(sigma or (), readings, units)
+            ranges = _read_ranges(free, chosen)
+            found, noise, interrupted = _fit_with_progress(chosen, readings, ranges, noise)
             result = {**_result(chosen, readings, ranges, found, noise), "interrupted": interrupted}
             if interrupted:
-                show.as_json(result) if as_json else show.identified(result)
+                show.as_json(result) if as_json else show.show_identification(result)
                 console.say("interrupted: these are the values so far, not the best ones; no file is written")
                 raise typer.Exit(console.INTERRUPTED)
             if result["undetermined"]:  # inside, so that no file is written
-                show.as_json(result) if as_json else show.identified(result)
+                show.as_json(result) if as_json else show.show_identification(result)
                 missing = "; ".join(row["direction"] for row in result["undetermined"])
                 console.fail(f"{chosen.name}: not identifiable from these data: {missing}", console.FAILED)
             if file:
                 file.write_text(dump(chosen.with_loop(found.part, "identified")), encoding="utf-8")
         result["files"] = {"out": str(out)} if out else {}
-        show.as_json(result) if as_json else show.identified(result)
+        show.as_json(result) if as_json else show.show_identification(result)
 
 
-def _readings(data: pathlib.Path, names: Sequence[str] | None, units: Mapping[str, str]) -> Readings:
+def _compared_columns(data: pathlib.Path, names: Sequence[str] | None, units: Mapping[str, str]) -> Readings:
     """Those columns of a file that are compared."""
-    readings = read(data, units)
+    readings = read_measurements(data, units)
     for name in names or ():
         if name not in readings.columns:
-            raise unknown(f"--column {shown(name)} is not in the data", name, readings.columns)
+            raise unknown_name_error(f"--column {format_given(name)} is not in the data", name, readings.columns)
     columns = {name: readings.columns[name] for name in names or readings.columns}
     if set(columns) >= DEPENDENT:
         console.say(f"note: {REDUNDANT}")
     return Readings(readings.t, columns)
 
 
-def _noise(given: Sequence[str], readings: Readings, units: Mapping[str, str]) -> dict[str, float]:
+def _read_noise(given: Sequence[str], readings: Readings, units: Mapping[str, str]) -> dict[str, float]:
     """Standard deviations by column, in SI."""
     found: dict[str, float] = {}
     for text in given:
         name, equals, number = text.partition("=")
         name = name.strip()
         if not equals:
-            raise ScenarioError(f"--sigma {shown(text)} is not of the form column=number")
+            raise ScenarioError(f"--sigma {format_given(text)} is not of the form column=number")
         if name not in readings.columns:
-            raise unknown(f"--sigma {shown(name)} is not a column of the data", name, readings.columns)
-        value = toml.value(number.strip())
+            raise unknown_name_error(
+                f"--sigma {format_given(name)} is not a column of the data", name, readings.columns
+            )
+        value = toml.parse_value(number.strip())
         unit = "" if units[name] == "1" else f" {units[name]}"
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ScenarioError(f"--sigma {name} = {shown(value)} is no number in (0, inf){unit}")
+            raise ScenarioError(f"--sigma {name} = {format_given(value)} is no number in (0, inf){unit}")
         if not 0 < value < math.inf:
-            raise ScenarioError(f"--sigma {name} = {shown(value)} is outside (0, inf){unit}")
+            raise ScenarioError(f"--sigma {name} = {format_given(value)} is outside (0, inf){unit}")
         found[name] = float(value)
     return found
 
 
-def _ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.Ends | None]:
+def _read_ranges(given: Sequence[str], chosen: Scenario) -> dict[str, section_tune.Ends | None]:
     """Ranges by path; None where they are the declared ones."""
     table = {}
     for text in given:
         path, equals, ends = text.partition("=")
         low, colon, high = ends.partition(":")
         if not path.strip() or (equals and not colon):
-            raise ScenarioError(f"--free {shown(text)} is not of the form path or path=low:high")
-        (path,) = flat({path.strip(): 0.0}, "--free")
+            raise ScenarioError(f"--free {format_given(text)} is not of the form path or path=low:high")
+        (path,) = flatten_table({path.strip(): 0.0}, "--free")
         if path in table:
             raise ScenarioError(f"--free {path} is given twice")
-        table[path] = [toml.value(low.strip()), toml.value(high.strip())] if equals else section_tune.DECLARED
+        table[path] = (
+            [toml.parse_value(low.strip()), toml.parse_value(high.strip())] if equals else section_tune.DECLARED_RANGE
+        )
     found = section_tune.free_ranges(table, chosen.loop, "--free")
     section_tune.check_starts(chosen.loop, found, "--free")
     return found
 
 
-def _watched(
+def _fit_with_progress(
     chosen: Scenario, readings: Readings, ranges: Mapping[str, section_tune.Ends | None], given: Mapping[str, float]
 ) -> tuple["Identified", dict[str, float], bool]:
     """The fit, the standard deviations it was made with, and whether Ctrl-C ended it."""
@@ -141,9 +145,9 @@ def _watched(
     def told(evaluations: int, cost: float) -> None:
         far.append(f"{evaluations} evaluation{'s' if evaluations != 1 else ''}, cost {cost:.6g}")
 
-    ending = console.Ending("the evaluation in hand", nothing=lambda: not far)
-    found, noise = console.waited(
-        lambda: _identified(chosen, readings, ranges, given, told, ending),
+    ending = console.EarlyEnd("the evaluation in hand", nothing=lambda: not far)
+    found, noise = console.run_with_progress(
+        lambda: _fit(chosen, readings, ranges, given, told, ending),
         f"identifying {chosen.name}",
         lambda: far[-1] if far else progress.COMPILING,
         ending,
@@ -151,7 +155,7 @@ def _watched(
     return found, noise, ending.asked
 
 
-def _identified(
+def _fit(
     chosen: Scenario,
     readings: Readings,
     ranges: Mapping[str, section_tune.Ends | None],
@@ -179,7 +183,10 @@ def _identified(
     for _ in range(0 if len(given) == len(columns) else ROUNDS - 1):
         if stopping():
             break
-        noise = {name: given.get(name) or max(_rms(residuals[name]), LEAST * spread[name]) for name in columns}
+        noise = {
+            name: given.get(name) or max(_root_mean_square(residuals[name]), MIN_RELATIVE_NOISE * spread[name])
+            for name in columns
+        }
         found, residuals = fitted(noise, [found.values])
         evaluations += found.evaluations
     return dataclasses.replace(found, evaluations=evaluations), noise
@@ -190,10 +197,10 @@ def _solver(solver: Solver, readings: Readings) -> Solver:
     steps = math.ceil(float(readings.t[-1]) / solver.step) + SPARE
     if steps * solver.step >= solver.duration:
         steps = solver.steps
-    return dataclasses.replace(solver, duration=steps * solver.step, every=max(1, math.ceil(steps / MOST_ROWS)))
+    return dataclasses.replace(solver, duration=steps * solver.step, every=max(1, math.ceil(steps / MAX_DATA_ROWS)))
 
 
-def _rms(values: np.ndarray) -> float:
+def _root_mean_square(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -207,14 +214,14 @@ def _result(
     """The JSON document."""
     known = found.uncertainty
     return {
-        **console.about(chosen),
+        **console.describe_source(chosen),
         "data": {"samples": len(readings.t), "columns": list(readings.columns), "until": float(readings.t[-1])},
-        "values": _values(chosen, ranges, found),
+        "values": _scalar_values(chosen, ranges, found),
         "correlations": [
             {"between": [known.names[i], known.names[j]], "correlation": float(known.correlation[i, j])}
             for i in range(len(known.names))
             for j in range(i)
-            if abs(known.correlation[i, j]) > CORRELATED
+            if abs(known.correlation[i, j]) > HIGH_CORRELATION
         ],
         "undetermined": [
             {"direction": one.shown(), "spread": one.spread, "components": one.components}
@@ -232,7 +239,7 @@ def _result(
     }
 
 
-def _values(
+def _scalar_values(
     chosen: Scenario, ranges: Mapping[str, section_tune.Ends | None], found: "Identified"
 ) -> dict[str, dict[str, Any]]:
     """One for each number: `controller.gain.0` where a parameter is a list."""
@@ -258,7 +265,7 @@ def _residuals(
     return {
         name: {
             "sigma": noise[name],
-            "rms": _rms(values),
+            "rms": _root_mean_square(values),
             "mean": float(np.mean(values)),
             "largest": float(np.max(np.abs(values))),
             "unit": units[name],

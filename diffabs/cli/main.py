@@ -39,7 +39,7 @@ from diffabs.cli import (
     tune,
     usage,
 )
-from diffabs.cli.checking import checked, loose, said
+from diffabs.cli.checking import check_accuracy, describe_check, describe_loose_metrics
 from diffabs.core import interrupt, provenance
 from diffabs.core.pytree import parameters
 from diffabs.objectives import at_limits
@@ -62,8 +62,8 @@ app = typer.Typer(
 )
 
 AT_LIMIT = "at a limit"  # among the objectives of a run; no metric of a scenario has a space in its name
-MOSTLY = 0.5  # of the time, from which a run at a limit is worth a warning
-MOST_ROWS = 20_000  # of a trajectory
+WARNED_LIMIT_SHARE = 0.5  # of the time, from which a run at a limit is worth a warning
+MAX_CSV_ROWS = 20_000  # of a trajectory
 YOUNG = 50_000  # objects between two looks for garbage; 700 by default, and tracing makes many that stay
 
 
@@ -71,13 +71,13 @@ def main() -> NoReturn:
     """The executable: run the command line, and leave."""
     gc.freeze()  # what was imported stays
     gc.set_threshold(YOUNG)
-    interrupt.begin()
+    interrupt.begin_hearing()
     try:
         app()
         status: Any = 0
     except SystemExit as left:
         status = left.code
-    interrupt.finish()
+    interrupt.stop_hearing()
     console.leave(status)
 
 
@@ -95,7 +95,7 @@ def setup(
 ) -> None:
     """Simulate, differentiate, tune and certify controllers for braking wheels and balancing two-wheelers."""
     del version
-    compiled.keep()
+    compiled.use_compilation_cache()
     jax.config.update("jax_enable_x64", True)
 
 
@@ -123,43 +123,45 @@ def simulate(
     ] = False,
 ) -> None:
     """Run a scenario once and show its metrics."""
-    with console.guarded():
+    with console.end_on_errors():
         _check_source(scenario, from_sweep, sample, changes, seed)
         _check_targets({"csv": csv, "mat": mat, "plot": plot})
         kept = bool(csv or mat or plot)
         with contextlib.ExitStack() as files:
-            csv_file = files.enter_context(targets.new_file(csv, "--csv"))
-            mat_file = files.enter_context(targets.new_file(mat, "--mat"))
-            picture = files.enter_context(targets.new_file(plot, "--plot"))
-            chosen, key = _source(scenario, from_sweep, sample, changes, seed)
-            run, limited = console.waited(lambda: _run(chosen, key, keep=kept), f"simulating {chosen.name}")
+            csv_file = files.enter_context(targets.new_target_file(csv, "--csv"))
+            mat_file = files.enter_context(targets.new_target_file(mat, "--mat"))
+            picture = files.enter_context(targets.new_target_file(plot, "--plot"))
+            chosen, key = _load_source(scenario, from_sweep, sample, changes, seed)
+            run, limited = console.run_with_progress(lambda: _run(chosen, key, keep=kept), f"simulating {chosen.name}")
             if csv_file and run.trajectory:
                 show.write_csv(run.trajectory, chosen.loop.plant, csv_file)
             if mat_file:
                 values = {path: value for path, _, value in parameters(chosen.loop)}
                 write_mat(mat_file, run, chosen.loop.plant, parameters=values, scenario=chosen.name)
             if picture:
-                console.waited(lambda: _draw(chosen, run, picture), "drawing")
-            found = console.waited(lambda: checked(chosen, key), "shortening the step") if check else None
-            lines = said(found) if found else _loose(chosen, run, key, kept)
+                console.run_with_progress(lambda: _draw(chosen, run, picture), "drawing")
+            found = (
+                console.run_with_progress(lambda: check_accuracy(chosen, key), "shortening the step") if check else None
+            )
+            lines = describe_check(found) if found else _find_loose_metrics(chosen, run, key, kept)
         result = _result(chosen, run, limited, {"csv": csv, "mat": mat, "plot": plot}) | (
             {"accuracy": found} if found else {}
         )
-        show.as_json(result) if as_json else show.run(result, chosen)
+        show.as_json(result) if as_json else show.show_run(result, chosen)
         if found and not as_json:
-            show.accuracy(found)
+            show.show_accuracy(found)
         for line in lines:
             console.say(f"warning: {line}")
         _judge(chosen, result)
 
 
-def _source(
+def _load_source(
     scenario: str | None, from_sweep: pathlib.Path | None, sample: int | None, changes: Any, seed: int | None
 ) -> tuple[Scenario, Any]:
     """What is run, and the key of its noise."""
     if from_sweep and sample is not None:
-        return console.waited(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
-    chosen = console.loaded(scenario or "", console.changed(changes, "solver", seed=seed))
+        return console.run_with_progress(lambda: sweep.sample(from_sweep, sample), "reading the sweep")
+    chosen = console.load_scenario(scenario or "", console.add_option_overrides(changes, "solver", seed=seed))
     return chosen, chosen.key()
 
 
@@ -185,7 +187,7 @@ def _warnings(chosen: Scenario, run: Run, limited: float) -> Iterator[str]:
     for name in chosen.objectives:
         if math.isinf(run.metrics[name]):
             yield f"{name} is infinite: the run ends before it gets there"
-    if limited > MOSTLY:
+    if limited > WARNED_LIMIT_SHARE:
         limits, unit = at_limits(chosen.loop), chosen.loop.plant.control_unit
         ends = f"{float(limits.low):g} to {float(limits.high):g} {unit}"
         yield f"the control is at a limit ({ends}) for {100 * limited:.0f} % of the run: gains hardly matter there"
@@ -205,7 +207,7 @@ def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
     """Raises typer.Exit for files that cannot be written, or are one and the same."""
     targets.check_picture(wanted["plot"])
     targets.check_mat(wanted["mat"])
-    places = {name: targets.resolved(path, f"--{name}") for name, path in wanted.items() if path}
+    places = {name: targets.resolve_path(path, f"--{name}") for name, path in wanted.items() if path}
     for one, other in itertools.combinations(places, 2):
         if places[one] == places[other]:
             console.fail(f"--{one} and --{other} are the same file, {wanted[one]}")
@@ -214,30 +216,32 @@ def _check_targets(wanted: dict[str, pathlib.Path | None]) -> None:
 def _run(chosen: Scenario, key: Any, keep: bool) -> tuple[Run, float]:
     """Return the run, on the host, and for which share of it the control was at a limit."""
     measured = {**chosen.objectives, AT_LIMIT: at_limits(chosen.loop)}
-    run = jax.device_get(_made(chosen, measured, key, keep=keep))
+    run = jax.device_get(_describe_run(chosen, measured, key, keep=keep))
     return run._replace(metrics={name: run.metrics[name] for name in chosen.objectives}), float(run.metrics[AT_LIMIT])
 
 
-def _made(chosen: Scenario, measured: dict[str, Any], key: Any, *, keep: bool) -> Run:
+def _describe_run(chosen: Scenario, measured: dict[str, Any], key: Any, *, keep: bool) -> Run:
     if not keep:
         return measure(chosen.loop, chosen.solver, measured, key=key)
     steps = chosen.solver.steps
-    every = min(max(chosen.solver.every, math.ceil(steps / MOST_ROWS)), steps)
+    every = min(max(chosen.solver.every, math.ceil(steps / MAX_CSV_ROWS)), steps)
     solver = dataclasses.replace(chosen.solver, every=every)
     return rollout(chosen.loop, solver, measured, key=key)
 
 
-def _loose(chosen: Scenario, run: Run, key: Any, keep: bool) -> list[str]:
+def _find_loose_metrics(chosen: Scenario, run: Run, key: Any, keep: bool) -> list[str]:
     """What a run does not know as well as its solver suggests; `_run` makes it once more, by the same program."""
     solver = chosen.solver
     if not isinstance(solver, Adaptive) or run.diverged:
         return []
-    return loose(run.metrics, solver, lambda other: _run(dataclasses.replace(chosen, solver=other), key, keep)[0])
+    return describe_loose_metrics(
+        run.metrics, solver, lambda other: _run(dataclasses.replace(chosen, solver=other), key, keep)[0]
+    )
 
 
 def _draw(chosen: Scenario, run: Run, picture: pathlib.Path) -> None:
     plant = chosen.loop.plant
-    draw = importlib.import_module("diffabs.plot").of(plant)
+    draw = importlib.import_module("diffabs.plot").figure_for(plant)
     draw(run, title=chosen.title or chosen.name, unit=plant.control_unit).savefig(picture)
 
 
@@ -250,27 +254,27 @@ def _result(chosen: Scenario, run: Run, limited: float, files: dict[str, pathlib
         "at_limit": limited,
         "warnings": list(_warnings(chosen, run, limited)),
         "title": chosen.title,
-        "parts": model.parts(chosen),
-        "parameters": model.numbers(chosen),
+        "parts": model.describe_parts(chosen),
+        "parameters": model.describe_numbers(chosen),
         "solver": {**describe_solver(chosen.solver), "seed": chosen.seed},
         "versions": provenance.versions(),
         "files": {name: str(path) for name, path in files.items() if path},
     }
 
 
-usage.add(app, simulate, "simulate slip-lmi --set plant.mass=6.2 --plot run.png")
-usage.add(app, design.design, "design slip-lmi --set design.decay=80 --out gain.json")
-usage.add(app, design.certify, "certify slip-lmi --gain=-11753,-76.7")
-usage.add(app, design.verify, "verify gain.json")
-usage.add(app, explore.explore, "explore slip-cured --port 8342")
-usage.add(app, margins.margins, "margins slip-cured --at speed=5 --plot loop.png")
-usage.add(app, export.export, "export slip-cured --to c -o controller.c")
-usage.add(app, tune.tune, "tune slip-cured --set reference.time_constant=0.03 --out tuned.toml")
-usage.add(app, identify.identify, "identify slip-lmi --data run.csv --free plant.mass=4:8")
-usage.add(app, sweep.sweep, "sweep slip-lmi --samples 10000 --set solver.step=1e-3 --figures")
-usage.add(app, rare.rare, "rare slip-lmi stop_time=2.2 --set solver.step=1e-3")
-usage.add(app, compare.compare, "compare out/sweep-slip-lmi out/sweep-mine --metric iae")
-usage.add(app, catalogue.list_parts, "list roads", "list")
-usage.add(app, catalogue.show_scenario, "show slip-lmi --set plant.mass=6.2 --out mine.toml", "show")
-usage.add(app, reproduce.reproduce, "reproduce slip-estimator")
-usage.add(app, report.report, "report out -o result.html")
+usage.add_command(app, simulate, "simulate slip-lmi --set plant.mass=6.2 --plot run.png")
+usage.add_command(app, design.design, "design slip-lmi --set design.decay=80 --out gain.json")
+usage.add_command(app, design.certify, "certify slip-lmi --gain=-11753,-76.7")
+usage.add_command(app, design.verify, "verify gain.json")
+usage.add_command(app, explore.explore, "explore slip-cured --port 8342")
+usage.add_command(app, margins.margins, "margins slip-cured --at speed=5 --plot loop.png")
+usage.add_command(app, export.export, "export slip-cured --to c -o controller.c")
+usage.add_command(app, tune.tune, "tune slip-cured --set reference.time_constant=0.03 --out tuned.toml")
+usage.add_command(app, identify.identify, "identify slip-lmi --data run.csv --free plant.mass=4:8")
+usage.add_command(app, sweep.sweep, "sweep slip-lmi --samples 10000 --set solver.step=1e-3 --figures")
+usage.add_command(app, rare.rare, "rare slip-lmi stop_time=2.2 --set solver.step=1e-3")
+usage.add_command(app, compare.compare, "compare out/sweep-slip-lmi out/sweep-mine --metric iae")
+usage.add_command(app, catalogue.list_parts, "list roads", "list")
+usage.add_command(app, catalogue.show_scenario, "show slip-lmi --set plant.mass=6.2 --out mine.toml", "show")
+usage.add_command(app, reproduce.reproduce, "reproduce slip-estimator")
+usage.add_command(app, report.report, "report out -o result.html")

@@ -12,8 +12,8 @@ from rich.table import Table
 from diffabs.cli import console, show, targets
 from diffabs.core import provenance
 from diffabs.core.pytree import Spec, replace
-from diffabs.core.values import ScenarioError, inside, shown
-from diffabs.scenario.parameter_paths import entries, parameters_of
+from diffabs.core.values import ScenarioError, format_given, read_number_in_range
+from diffabs.scenario.parameter_paths import parameters_of, read_entries
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
 
@@ -21,18 +21,18 @@ if TYPE_CHECKING:
     from diffabs.linear.robustness import Band, System
     from diffabs.linear.stability_margins import Margins
 
-UNITS = {
+MARGIN_UNITS = {
     **{"gain_up": "1", "gain_down": "1", "phase": "rad", "delay": "s", "modulus": "1", "sensitivity": "1"},
     **{"complementary": "1", "crossover": "rad/s"},
 }
-NAMES = {
+MARGIN_NAMES = {
     **{"gain_up": "gain may rise to, times", "gain_down": "gain may fall to, times", "phase": "phase margin [deg]"},
     **{"delay": "delay margin [ms]", "modulus": "modulus margin, 1/Ms", "sensitivity": "greatest |S|, Ms"},
     **{"complementary": "greatest |T|, Mt", "crossover": "crossover [rad/s]"},
 }
 SHOWN_IN = {"phase": math.degrees(1), "delay": 1e3}
 MOST_SAMPLES = 10_000
-SHORT = {"speed": "initial.speed", "speed_kmh": "initial.speed_kmh"}
+SHORT_PATHS = {"speed": "initial.speed", "speed_kmh": "initial.speed_kmh"}
 
 
 def margins(
@@ -56,20 +56,20 @@ def margins(
     """Compute stability margins of the linearised loop.
 
     Gain, phase, delay and modulus margin, here and at their worst over [design.over]."""
-    with console.guarded():
+    with console.end_on_errors():
         targets.check_picture(plot)
-        with targets.new_file(plot, "--plot") as picture:
-            chosen = console.loaded(scenario, changes, integrated=False)
-            values, target = _places(chosen, at or ())
-            nominal, found = _found(chosen, values, target, samples)
+        with targets.new_target_file(plot, "--plot") as picture:
+            chosen = console.load_scenario(scenario, changes, integrated=False)
+            values, target = _read_places(chosen, at or ())
+            nominal, found = _find_margins(chosen, values, target, samples)
             if picture:
-                console.waited(lambda: _draw(chosen, nominal, found, picture), "drawing")
+                console.run_with_progress(lambda: _draw(chosen, nominal, found, picture), "drawing")
         result = _document(chosen, nominal, found, values, target, plot)
         show.as_json(result) if as_json else _show(result, chosen, nominal, found)
         _judge(chosen, nominal, found)
 
 
-def _places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, float], float | None]:
+def _read_places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, float], float | None]:
     """The values by path of the loop, in SI, and the target. Raises ScenarioError."""
     table: dict[str, Any] = {}
     for item in given:
@@ -77,18 +77,18 @@ def _places(chosen: Scenario, given: Sequence[str]) -> tuple[dict[str, float], f
         try:
             value = float(text)
         except ValueError:
-            raise ScenarioError(f"--at {shown(item)}: a number is needed, as in --at speed=10") from None
-        path = SHORT.get(path.strip(), path.strip())
+            raise ScenarioError(f"--at {format_given(item)}: a number is needed, as in --at speed=10") from None
+        path = SHORT_PATHS.get(path.strip(), path.strip())
         if path in table:
             raise ScenarioError(f"--at {path} is given twice")
         table[path] = value
     there = {**parameters_of(chosen.loop), "target": (Spec("1"), ())}
-    found = [one.single("have a place") for one in entries(table, "--at", there, "no parameter of this loop")]
-    values = {one.path: inside(one.given, one.spec, one.where) / one.scale for one in found}
+    found = [one.single("have a place") for one in read_entries(table, "--at", there, "no parameter of this loop")]
+    values = {one.path: read_number_in_range(one.given, one.spec, one.where) / one.scale for one in found}
     return values, values.pop("target", None)
 
 
-def _found(
+def _find_margins(
     chosen: Scenario, values: dict[str, float], target: float | None, samples: int
 ) -> tuple["System", "Band | None"]:
     """The loop at these values, and over the ranges that are left. Raises typer.Exit where it is not linear."""
@@ -97,8 +97,10 @@ def _found(
     loop = replace(chosen.loop, values)
     over = {path: ends for path, ends in chosen.design.ranges(chosen.loop).items() if path not in values}
     try:
-        one = console.waited(lambda: band(loop, {}, 0, target).systems[0], f"linearising {chosen.name}")
-        return one, console.waited(lambda: band(loop, over, samples, target), "over the ranges") if over else None
+        one = console.run_with_progress(lambda: band(loop, {}, 0, target).systems[0], f"linearising {chosen.name}")
+        return one, console.run_with_progress(
+            lambda: band(loop, over, samples, target), "over the ranges"
+        ) if over else None
     except ValueError as error:
         console.fail(f"{chosen.name}: {error}", console.FAILED)
 
@@ -110,7 +112,7 @@ def _draw(chosen: Scenario, nominal: "System", found: "Band | None", picture: pa
     frequency.loop_shape(nominal.loop, nominal.margins, others, title=title).savefig(picture)
 
 
-def numbers(found: "Margins") -> dict[str, float]:
+def margin_numbers(found: "Margins") -> dict[str, float]:
     """The margins by their names in the JSON document."""
     low, high = found.gain
     return {
@@ -131,7 +133,7 @@ def _document(
     """For JSON, in SI. Infinity (no limit) is a text, as in an override."""
 
     def plain(one: "System") -> dict[str, Any]:
-        rows = numbers(one.margins).items()
+        rows = margin_numbers(one.margins).items()
         return {"stable": one.margins.stable, **{k: "inf" if v == math.inf else float(v) for k, v in rows}}
 
     worst = found.worst() if found else {}
@@ -142,7 +144,7 @@ def _document(
         "delay_in_the_loop": nominal.loop.delay,
         "order": len(nominal.loop.transfer().A),
         "margins": plain(nominal),
-        "units": UNITS,
+        "units": MARGIN_UNITS,
         "over": {path: list(ends) for path, ends in chosen.design.ranges(chosen.loop).items() if path not in values}
         if found
         else {},
@@ -157,31 +159,35 @@ def _document(
 
 def _show(result: dict[str, Any], chosen: Scenario, nominal: "System", found: "Band | None") -> None:
     """A table of the margins, and where each is worst."""
-    here = numbers(nominal.margins)
+    here = margin_numbers(nominal.margins)
     worst = found.worst() if found else {}
     columns = [f"worst of {len(found.systems)}", "where"] if worst and found else []
     table = Table("margin", "here", *columns)
-    for name, words in NAMES.items():
-        row = [_said(name, here[name])]
+    for name, words in MARGIN_NAMES.items():
+        row = [_format_margin(name, here[name])]
         if columns:
             one = worst.get(name)
-            row += [_said(name, numbers(one.margins)[name]), _where(one.values, chosen)] if one else ["", ""]
+            row += (
+                [_format_margin(name, margin_numbers(one.margins)[name]), _format_place(one.values, chosen)]
+                if one
+                else ["", ""]
+            )
         table.add_row(words, *row)
     when = f"sampled every {1e3 * result['period']:g} ms" if result["period"] else "in continuous time"
     delay = f", {1e3 * result['delay_in_the_loop']:g} ms of delay" if result["delay_in_the_loop"] else ""
-    show.titled(f"{chosen.title or chosen.name}: the linearised loop, {when}{delay}", table)
+    show.show_titled_table(f"{chosen.title or chosen.name}: the linearised loop, {when}{delay}", table)
     if frozen := getattr(chosen.loop.plant, "frozen", ()):
         console.say(f"note: {' and '.join(frozen)} are held where they are; limits do not act")
-    show.files(result)
+    show.show_files(result)
 
 
-def _said(name: str, value: float) -> str:
+def _format_margin(name: str, value: float) -> str:
     if math.isnan(value):
         return "none"
     return "no limit" if value == math.inf else f"{value * SHOWN_IN.get(name, 1.0):.4g}"
 
 
-def _where(values: dict[str, float], chosen: Scenario) -> str:
+def _format_place(values: dict[str, float], chosen: Scenario) -> str:
     units = {path: spec.unit for path, (spec, _) in parameters_of(chosen.loop).items()}
     words = []
     for path, value in values.items():
@@ -195,6 +201,6 @@ def _judge(chosen: Scenario, nominal: "System", found: "Band | None") -> None:
     if not nominal.margins.stable:
         console.fail(f"{chosen.name}: the closed loop is not stable: no margins", console.FAILED)
     if found and found.unstable:
-        first = _where(found.unstable[0].values, chosen)
+        first = _format_place(found.unstable[0].values, chosen)
         count = f"{len(found.unstable)} of {len(found.systems)} systems"
         console.fail(f"{chosen.name}: not stable in {count} of the ranges, as at {first}", console.FAILED)

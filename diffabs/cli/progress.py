@@ -18,7 +18,7 @@ from rich.spinner import Spinner
 from diffabs.core import stopwatch
 
 PATIENCE = 2.0  # s without a sign of life
-AGAIN = 5.0  # s between lines about how far work is
+REPEAT_S = 5.0  # s between lines about how far work is
 FRAMES = 12.5  # per second
 QUIET = 1.0  # s in which nothing is said of time
 NOTED = 0.5  # s of compiling, from which it is
@@ -26,7 +26,7 @@ SPINNER = 2  # columns, with the blank behind it
 COMPILING = "compiling"  # while nothing is reached
 
 
-class Far(NamedTuple):
+class WorkProgress(NamedTuple):
     """How far work is, in words; and where it is known, `done` of `total`, or of as much as it can be (`at_most`)."""
 
     words: str
@@ -35,17 +35,17 @@ class Far(NamedTuple):
     at_most: bool = False
 
 
-Detail = Callable[[], Far | str]
+Detail = Callable[[], WorkProgress | str]
 
 
-def spoken(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """A length of time, in words."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-class Pace:
+class WorkTiming:
     """How long work has taken, and will: since when, and since when something of it was done."""
 
     def __init__(self) -> None:
@@ -53,30 +53,30 @@ class Pace:
         self.begun = time.monotonic()
         self.first: tuple[float, float] | None = None  # when anything was known, and how much was done then
 
-    def said(self, far: Far) -> str:
+    def said(self, far: WorkProgress) -> str:
         """In words, to be put behind those of `far`; nothing at first."""
         now = time.monotonic()
         rest = self.left(far, now)
         if now - self.begun < QUIET:
             return ""
-        parts = [spoken(now - self.begun)]
-        if (compiling := stopwatch.compiled(self.begun)) >= NOTED:
-            parts[0] += f", {spoken(compiling)} of it compiling"
+        parts = [format_duration(now - self.begun)]
+        if (compiling := stopwatch.compile_time_since(self.begun)) >= NOTED:
+            parts[0] += f", {format_duration(compiling)} of it compiling"
         if rest is not None:
-            parts.append(f"{'at most ' if far.at_most else ''}{spoken(rest)} left")
+            parts.append(f"{'at most ' if far.at_most else ''}{format_duration(rest)} left")
         return f"{'; ' if far.words else ' '}{', '.join(parts)}"
 
-    def left(self, far: Far, now: float) -> float | None:
+    def left(self, far: WorkProgress, now: float) -> float | None:
         """How long [s] the rest takes at the pace so far, compiling left out; None where that is not known yet."""
         if far.total is None:
             return None
         self.first = self.first or (now, far.done)
         start, before = self.first
-        spent = now - start - stopwatch.compiled(start)
+        spent = now - start - stopwatch.compile_time_since(start)
         return None if far.done <= before or spent <= 0 else spent * (far.total - far.done) / (far.done - before)
 
 
-def drawable(console: Console) -> bool:
+def can_redraw(console: Console) -> bool:
     """Whether lines can be drawn over: not into a file, nor on a terminal without movements (TERM=dumb)."""
     return console.is_terminal and not console.is_dumb_terminal
 
@@ -85,24 +85,24 @@ class _Picture:
     """A spinner with the words, and a bar below where the total is known."""
 
     def __init__(self, message: str, detail: Detail | None):
-        self.message, self.detail, self.spinner, self.pace = message, detail, Spinner("dots"), Pace()
+        self.message, self.detail, self.spinner, self.pace = message, detail, Spinner("dots"), WorkTiming()
 
-    def far(self) -> tuple[Far, str]:
+    def far(self) -> tuple[WorkProgress, str]:
         """How far it is; and that with the message, without times."""
         far = self.detail() if self.detail else ""
-        far = Far(far) if isinstance(far, str) else far
+        far = WorkProgress(far) if isinstance(far, str) else far
         return far, f"{self.message} ... {far.words}".strip()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """The spinner must be one object, or it would not turn."""
         far, words = self.far()
-        self.spinner.update(text=fitted(words, far.words, self.pace.said(far), options.max_width - SPINNER))
+        self.spinner.update(text=fit_line(words, far.words, self.pace.said(far), options.max_width - SPINNER))
         yield self.spinner
         if far.total and not far.at_most:
             yield ProgressBar(total=far.total, completed=far.done, width=min(60, options.max_width))
 
 
-def fitted(words: str, rest: str, times: str, width: int) -> str:
+def fit_line(words: str, rest: str, times: str, width: int) -> str:
     """Return words and times in one line of a terminal: where they are too long, only the rest of the words, that is
     without the message, and of those as much as there is room for."""
     room = width - len(times)
@@ -112,13 +112,13 @@ def fitted(words: str, rest: str, times: str, width: int) -> str:
 
 
 @contextlib.contextmanager
-def shown(
+def show_progress(
     message: str, detail: Detail | None, tell: Callable[[str], None], timing: tuple[float, float]
 ) -> Iterator[Callable[[], None]]:
     """How far some work is, until the end; the function that is given is to be called often. `tell` writes a line,
     `timing` [s] is when the first one comes where nothing can be drawn, and how often others follow."""
     console, picture = Console(stderr=True), _Picture(message, detail)
-    if drawable(console):
+    if can_redraw(console):
         # Only standard error: what is drawn must not get in between results that go elsewhere.
         with Live(picture, console=console, transient=True, refresh_per_second=FRAMES, redirect_stdout=False):
             yield lambda: None

@@ -12,18 +12,18 @@ from diffabs.cli import console, progress, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.core import provenance
 from diffabs.core.pytree import Spec
-from diffabs.core.values import ScenarioError, number, unknown
+from diffabs.core.values import ScenarioError, read_number, unknown_name_error
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
-from diffabs.scenario.toml import value
+from diffabs.scenario.toml import parse_value
 from diffabs.simulate.engine import describe_engine
 
 if TYPE_CHECKING:
     from diffabs.reliability.subset_simulation import RareEvent, SubsetProgress
     from diffabs.sweep import Study
 
-SHOWN = 5  # failures
+MAX_SHOWN_FAILURES = 5  # failures
 
 
 def rare(
@@ -39,42 +39,46 @@ def rare(
     """Compute the probability that a metric reaches a bound.
 
     The scenario varies as [sweep.over] says. Probabilities of 1e-7 and less can be had."""
-    with console.guarded():
+    with console.end_on_errors():
         console.need_extra("sweep")
-        engines.check(engine)
-        chosen = console.loaded(scenario, console.changed(changes, "sweep", seed=seed))
-        metric, bound = _failure(failure, chosen)
+        engines.check_engine_name(engine)
+        chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "sweep", seed=seed))
+        metric, bound = _read_failure(failure, chosen)
         if samples < 20 or samples % 10:
             console.fail(f"--samples {samples} is no multiple of 10 from 20 on")
-        study = _by_engine(section_sweep.study(chosen), metric, engine)
-        found = _estimated(study, metric, bound, samples, gradients)
+        study = _build_runner(section_sweep.build_study(chosen), metric, engine)
+        found = _estimate(study, metric, bound, samples, gradients)
         result = _document(found, study, chosen, metric, bound)
         show.as_json(result) if as_json else show_samples.rare(result, chosen)
 
 
-def _by_engine(study: "Study", metric: str, engine: str) -> "Study":
+def _build_runner(study: "Study", metric: str, engine: str) -> "Study":
     """Raises ScenarioError for a study that cannot be run."""
     from diffabs.reliability.failure import find_metric_objection
 
     try:
-        return dataclasses.replace(study, engine=engines.decided(engine, lambda: find_metric_objection(study, metric)))
+        return dataclasses.replace(
+            study, engine=engines.choose_engine(engine, lambda: find_metric_objection(study, metric))
+        )
     except ValueError as error:
         raise ScenarioError(str(error)) from None
 
 
-def _failure(text: str, chosen: Scenario) -> tuple[str, float]:
+def _read_failure(text: str, chosen: Scenario) -> tuple[str, float]:
     """A metric and its bound in SI. Raises ScenarioError."""
     metric, equals, bound = text.partition("=")
     if metric not in chosen.objectives:
-        raise unknown(f"{metric} is not measured", metric, chosen.objectives)
+        raise unknown_name_error(f"{metric} is not measured", metric, chosen.objectives)
     if equals:
-        return metric, number(value(bound.strip()), Spec(unit_of(chosen.objectives[metric], chosen.loop.plant)), metric)
+        return metric, read_number(
+            parse_value(bound.strip()), Spec(unit_of(chosen.objectives[metric], chosen.loop.plant)), metric
+        )
     if metric not in chosen.sweep.failures:
         raise ScenarioError(f"{metric} has no bound in [sweep.failures]: say {metric}=BOUND")
     return metric, chosen.sweep.failures[metric]
 
 
-def _estimated(study: "Study", metric: str, bound: float, samples: int, gradients: bool) -> "RareEvent":
+def _estimate(study: "Study", metric: str, bound: float, samples: int, gradients: bool) -> "RareEvent":
     """Raises ScenarioError for what cannot be asked, typer.Exit where too many runs diverge."""
     from diffabs.reliability.failure import failure_probability
     from diffabs.reliability.importance_sampling import DivergenceError
@@ -87,7 +91,7 @@ def _estimated(study: "Study", metric: str, bound: float, samples: int, gradient
         return f"level {len(levels) + 1}, {levels[-1].evaluations:,} runs, {metric} up to {levels[-1].threshold:.4g}"
 
     try:
-        return console.waited(
+        return console.run_with_progress(
             lambda: failure_probability(
                 study, metric, bound, gradients=gradients, samples=samples, seed=study.seed, progress=levels.append
             ),
@@ -97,7 +101,7 @@ def _estimated(study: "Study", metric: str, bound: float, samples: int, gradient
     except KeyboardInterrupt:
         if not levels:
             raise
-        console.say(f"interrupted: {_reached(levels, metric)}, by {levels[-1].evaluations:,} runs; no further")
+        console.say(f"interrupted: {_describe_levels(levels, metric)}, by {levels[-1].evaluations:,} runs; no further")
         raise typer.Exit(console.INTERRUPTED) from None
     except DivergenceError as error:
         console.fail(str(error), console.FAILED)
@@ -105,7 +109,7 @@ def _estimated(study: "Study", metric: str, bound: float, samples: int, gradient
         raise ScenarioError(str(error)) from None
 
 
-def _reached(levels: "list[SubsetProgress]", metric: str) -> str:
+def _describe_levels(levels: "list[SubsetProgress]", metric: str) -> str:
     """What the levels tell that are finished."""
     probability = math.prod(level.share for level in levels)
     return f"{metric} >= {levels[-1].threshold:.4g} has a probability of about {probability:.2g}"
@@ -113,9 +117,9 @@ def _reached(levels: "list[SubsetProgress]", metric: str) -> str:
 
 def _document(found: "RareEvent", study: "Study", chosen: Scenario, metric: str, bound: float) -> dict[str, Any]:
     """As values of JSON; the failures, the most likely first, as values by path in SI."""
-    rows = study.space.normal(found.failing[:SHOWN]) if len(found.failing) else {}
+    rows = study.space.normal(found.failing[:MAX_SHOWN_FAILURES]) if len(found.failing) else {}
     return {
-        **console.about(chosen),
+        **console.describe_source(chosen),
         "metric": metric,
         "bound": bound,
         "unit": unit_of(chosen.objectives[metric], chosen.loop.plant),

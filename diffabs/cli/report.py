@@ -10,7 +10,7 @@ from diffabs.cli import console, targets
 from diffabs.core import files
 from diffabs.core.values import ScenarioError
 
-NAME = "report.html"
+DEFAULT_NAME = "report.html"
 ENDINGS = (".html", ".htm")
 
 
@@ -27,35 +27,35 @@ def report(
     """Make one HTML file of a result.
 
     It has question, answer, figures, tables, certificate, model and provenance."""
-    with console.guarded():
+    with console.end_on_errors():
         console.need_extra("report")
-        target = out or (source / NAME if source.is_dir() else source.with_suffix(".html"))
+        target = out or (source / DEFAULT_NAME if source.is_dir() else source.with_suffix(".html"))
         if target.suffix.lower() not in ENDINGS:
             console.fail(f"--out {target}: the name must end in {' or '.join(ENDINGS)}")
         if not source.exists():
             console.fail(f"{source}: there is no such folder or file")
-        check(target)
-        console.waited(lambda: write([source], target), "writing the report")
+        check_target(target)
+        console.run_with_progress(lambda: write_report_file([source], target), "writing the report")
         console.say(f"report: {target}")
 
 
-def write(sources: Sequence[pathlib.Path], target: pathlib.Path, title: str = "") -> None:
+def write_report_file(sources: Sequence[pathlib.Path], target: pathlib.Path, title: str = "") -> None:
     """Write the report of what folders or files hold, whole or not at all. Raises ScenarioError for one that holds
     nothing of ours, OSError."""
-    from diffabs.report import ReportError, documents
-    from diffabs.report import report as made
+    from diffabs.report import ReportError, find_documents
+    from diffabs.report import build_report as made
 
     try:
-        text = made([one for source in sources for one in documents(source)], title)
+        text = made([one for source in sources for one in find_documents(source)], title)
     except ReportError as error:
         raise ScenarioError(str(error)) from None
-    files.write(target, text.encode())
+    files.write_file(target, text.encode())
 
 
-def check(target: pathlib.Path) -> None:
+def check_target(target: pathlib.Path) -> None:
     """Raises typer.Exit where a file of somebody else's has the name."""
-    from diffabs.report import ours
+    from diffabs.report import is_report
 
-    target = targets.resolved(target, "--out")
-    if target.exists() and not (target.is_file() and ours(target)):
+    target = targets.resolve_path(target, "--out")
+    if target.exists() and not (target.is_file() and is_report(target)):
         console.fail(f"--out {target}: exists and is no earlier report; move it away")

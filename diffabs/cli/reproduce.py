@@ -22,22 +22,22 @@ def reproduce(
     """Reproduce a paper's results.
 
     It makes all figures and summary.json, and says in short what agrees with the paper and what is refuted."""
-    with console.guarded():
+    with console.end_on_errors():
         console.need_matplotlib()
         console.need_extra("report")
         from diffabs.papers import PAPERS, compact
 
         if name != "all" and name not in PAPERS:
-            raise values.unknown(f"there is no paper {values.shown(name)}", name, (*PAPERS, "all"))
+            raise values.unknown_name_error(f"there is no paper {values.format_given(name)}", name, (*PAPERS, "all"))
         results: dict[str, Any] = {}
         try:
             for paper in PAPERS if name == "all" else (name,):
-                with targets.new_folder(out / paper) as folder:
-                    results[paper] = _reproduced(paper, PAPERS[paper], folder)
-                    report.write([folder], folder / report.NAME)
+                with targets.new_target_folder(out / paper) as folder:
+                    results[paper] = _reproduce_with_progress(paper, PAPERS[paper], folder)
+                    report.write_report_file([folder], folder / report.DEFAULT_NAME)
                 if not as_json:
-                    show.paper(compact(results[paper]), out / paper)
-            whole = _whole(out, results) if name == "all" else None
+                    show.show_paper(compact(results[paper]), out / paper)
+            whole = _write_joint_report(out, results) if name == "all" else None
         except KeyboardInterrupt:
             if not results:
                 raise
@@ -49,23 +49,23 @@ def reproduce(
             show.as_json({"out": str(out), "papers": results, "versions": provenance.versions()})
 
 
-def _whole(out: pathlib.Path, results: dict[str, Any]) -> pathlib.Path:
+def _write_joint_report(out: pathlib.Path, results: dict[str, Any]) -> pathlib.Path:
     """The report of several papers in one file."""
-    path = out / report.NAME
-    report.check(path)
-    report.write([out / paper for paper in results], path, f"{len(results)} papers, reproduced")
+    path = out / report.DEFAULT_NAME
+    report.check_target(path)
+    report.write_report_file([out / paper for paper in results], path, f"{len(results)} papers, reproduced")
     return path
 
 
-def _reproduced(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> dict[str, Any]:
+def _reproduce_with_progress(name: str, reproduction: "Reproduction", folder: pathlib.Path) -> dict[str, Any]:
     """The summary of a paper. Its steps are told beside the spinner, or in a line each where there is none."""
-    spins, steps = console.animated(), [progress.COMPILING]
+    spins, steps = console.is_animated(), [progress.COMPILING]
 
     def step(sentence: str) -> None:
         steps.append(sentence.removeprefix(f"{name}: "))
         if not spins:
             console.say(sentence)
 
-    return console.waited(
+    return console.run_with_progress(
         lambda: reproduction(folder, step), f"reproducing {name}", (lambda: steps[-1]) if spins else None
     )

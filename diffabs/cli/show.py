@@ -13,15 +13,15 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from diffabs.cli.console import say
-from diffabs.cli.tables import fitted
-from diffabs.core.loop import signals
-from diffabs.core.summary import number
+from diffabs.cli.tables import fit_table
+from diffabs.core.loop import run_signals
+from diffabs.core.summary import round_for_table
 from diffabs.papers.digest import Digest
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.solution import Trajectory
 
-NEAR = 1e-3  # of its range, from a bound, on which a tuned number then stands
+BOUND_SHARE = 1e-3  # of its range, from a bound, on which a tuned number then stands
 PIPE_WIDTH = 140  # columns of a table that goes to a file
 PROOF = {"decay_rate": "1/s", "damping": "1", "trace_cost": "", "guaranteed_cost": "", "lower_bound": "", "gap": "1"}
 COSTS = (
@@ -32,21 +32,21 @@ COSTS = (
 
 def as_json(value: Any) -> None:
     """One JSON document on stdout; numbers that JSON does not have are null."""
-    typer.echo(json.dumps(finite(value), indent=2, allow_nan=False))
+    typer.echo(json.dumps(replace_infinite(value), indent=2, allow_nan=False))
 
 
-def finite(value: Any) -> Any:
+def replace_infinite(value: Any) -> Any:
     """Numbers that JSON does not have become null."""
     if isinstance(value, dict):
-        return {str(key): finite(item) for key, item in value.items()}
+        return {str(key): replace_infinite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
+        return [replace_infinite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_csv(trajectory: Trajectory, plant: Any, path: pathlib.Path) -> None:
     """The instants up to the end of the run, with units in the header."""
-    columns = {f"{name} [{unit}]": values for name, (unit, values) in signals(trajectory.sample, plant).items()}
+    columns = {f"{name} [{unit}]": values for name, (unit, values) in run_signals(trajectory.sample, plant).items()}
     rows = int(trajectory.running.sum()) + 1  # after the end the last sample is repeated
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write(",".join(columns) + "\n")
@@ -54,18 +54,20 @@ def write_csv(trajectory: Trajectory, plant: Any, path: pathlib.Path) -> None:
             file.write(",".join(f"{value:.12g}" for value in row) + "\n")
 
 
-def run(result: dict[str, Any], chosen: Scenario) -> None:
+def show_run(result: dict[str, Any], chosen: Scenario) -> None:
     """Metrics with their units, and what was written."""
     table = Table("metric", "value", "unit")
     for name, value in result["metrics"].items():
         table.add_row(
-            name, "never" if value == math.inf else number(value), unit_of(chosen.objectives[name], chosen.loop.plant)
+            name,
+            "never" if value == math.inf else round_for_table(value),
+            unit_of(chosen.objectives[name], chosen.loop.plant),
         )
-    titled(chosen.title or chosen.name, table)
-    files(result)
+    show_titled_table(chosen.title or chosen.name, table)
+    show_files(result)
 
 
-def accuracy(found: dict[str, Any]) -> None:
+def show_accuracy(found: dict[str, Any]) -> None:
     """What shorter steps, and single precision, change."""
     table = Table("metric", "half step", "relative", "order", "error", "float32")
     for name, row in found["metrics"].items():
@@ -73,10 +75,10 @@ def accuracy(found: dict[str, Any]) -> None:
         numbers = (row["difference"], row["relative"], row["error"], row["float32 difference"])
         half, relative, error, single = ("" if x is None or math.isnan(x) else f"{x:.1e}" for x in numbers)
         table.add_row(name, half, relative, order, error, single)
-    titled("what a half step changes, at which order, the error that is left at this step; float32", table)
+    show_titled_table("what a half step changes, at which order, the error that is left at this step; float32", table)
 
 
-def family(name: str, members: dict[str, Any]) -> None:
+def show_family(name: str, members: dict[str, Any]) -> None:
     """The members of a family, field by field; or the scenarios."""
     if name == "scenarios":
         table = Table("name", "title", "description")
@@ -88,19 +90,21 @@ def family(name: str, members: dict[str, Any]) -> None:
             member = f"{member} [{about['unit']}]" if about.get("unit") else member
             fields = about["parameters"] or {"": {"default": "", "unit": "", "range": ""}}
             for field, row in fields.items():
-                table.add_row(member, field, brief(row["default"]), row["unit"], row["range"].removesuffix(row["unit"]))
+                table.add_row(
+                    member, field, format_brief(row["default"]), row["unit"], row["range"].removesuffix(row["unit"])
+                )
                 member = ""
             table.add_section()
-    titled(name, table)
+    show_titled_table(name, table)
 
 
-def paper(digest: Digest, folder: pathlib.Path) -> None:
+def show_paper(digest: Digest, folder: pathlib.Path) -> None:
     """The compact result of a paper, and where everything else is."""
-    _console().print(compact(digest))
+    _console().print(show_digest(digest))
     say(f"{digest.figures} figures, summary.json and report.html: {folder}\n")
 
 
-def compact(digest: Digest) -> Group:
+def show_digest(digest: Digest) -> Group:
     """Title, table, how many numbers agree, what is refuted: fits 80 columns."""
     table = Table(box=SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
     for heading, *cells in zip(digest.headings, *digest.lines, strict=True):
@@ -114,12 +118,12 @@ def compact(digest: Digest) -> Group:
     return Group(digest.title, table, *digest.agreement, verdicts)
 
 
-def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict: str) -> None:
+def show_proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict: str) -> None:
     """A gain, what is proved about it, and the vertices for which it is."""
     gains = Table("state", "gain")
     for state, value in zip(result["states"], result["gain"], strict=True):
         gains.add_row(state, f"{value:.8g}")
-    titled(title, gains)
+    show_titled_table(title, gains)
     numbers = Table("quantity", "value", "unit")
     numbers.add_row("common Lyapunov matrix" if result["besides"] else "quadratically stable", verdict, "")
     if known := result["besides"]:
@@ -132,7 +136,7 @@ def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict:
     for name, unit in PROOF.items():
         if result[name] is not None:
             numbers.add_row(name.replace("_", " "), f"{result[name]:.8g}", unit)
-    titled("proof", numbers)
+    show_titled_table("proof", numbers)
     if result["guaranteed_cost"] is not None:
         _console().print(COSTS)
     corners = result["corners"] or [{} for _ in result["poles"]]
@@ -144,10 +148,10 @@ def proof(result: dict[str, Any], title: str, units: Mapping[str, str], verdict:
     covered = (
         result["coverage"] and f"; their hull covers {result['coverage']['checked']} systems checked within the ranges"
     )
-    titled(f"{result['vertices']} vertices{covered or ', the systems on a grid of the ranges'}", vertices)
+    show_titled_table(f"{result['vertices']} vertices{covered or ', the systems on a grid of the ranges'}", vertices)
 
 
-def verified(result: dict[str, Any], json_wanted: bool) -> None:
+def show_verification(result: dict[str, Any], json_wanted: bool) -> None:
     """A line for each claim."""
     if json_wanted:
         return as_json(result)
@@ -158,37 +162,37 @@ def verified(result: dict[str, Any], json_wanted: bool) -> None:
     return None
 
 
-def tuned(result: dict[str, Any], chosen: Scenario) -> None:
+def show_tuning(result: dict[str, Any], chosen: Scenario) -> None:
     """Parameters, metrics and constraints before and after, and how it went."""
     free = Table("parameter", "before", "after", "low", "high", "unit")
     for path, row in result["free"].items():
-        free.add_row(path, *(brief(row[key]) for key in ("before", "after", "low", "high")), row["unit"])
-    titled(f"{chosen.title or chosen.name}: free parameters", free)
+        free.add_row(path, *(format_brief(row[key]) for key in ("before", "after", "low", "high")), row["unit"])
+    show_titled_table(f"{chosen.title or chosen.name}: free parameters", free)
     metrics = Table("metric", "mean before", "mean after", "worst before", "worst after", "unit")
     for name in result["metrics"]["before"]["mean"]:
         numbers = (result["metrics"][when][of][name] for of in ("mean", "worst") for when in ("before", "after"))
-        metrics.add_row(name, *map(brief, numbers), unit_of(chosen.objectives[name], chosen.loop.plant))
-    titled(f"over {result['lanes']} lane{'s' if result['lanes'] > 1 else ''}", metrics)
+        metrics.add_row(name, *map(format_brief, numbers), unit_of(chosen.objectives[name], chosen.loop.plant))
+    show_titled_table(f"over {result['lanes']} lane{'s' if result['lanes'] > 1 else ''}", metrics)
     if result["constraints"]:
         limits = Table("constraint", "bound", "before", "after", "met")
         for row in result["constraints"]:
-            numbers = ("" if row[key] is None else brief(row[key]) for key in ("bound", "before", "after"))
-            limits.add_row(row["name"], *numbers, "yes" if row["met"] else f"NO, {missed(row)}")
-        titled("constraints, worst lane or vertex", limits)
+            numbers = ("" if row[key] is None else format_brief(row[key]) for key in ("bound", "before", "after"))
+            limits.add_row(row["name"], *numbers, "yes" if row["met"] else f"NO, {format_shortfall(row)}")
+        show_titled_table("constraints, worst lane or vertex", limits)
     how = Table("tuning", "")
     for name in ("before", "after"):
-        how.add_row(f"objective {name}", brief(result["objective"][name]))
+        how.add_row(f"objective {name}", format_brief(result["objective"][name]))
     how.add_row("gradients computed", str(result["evaluations"]))
     how.add_row("gradient mode", result["mode"])
     how.add_row("greatest component of the last gradient", f"{result['gradient_norm']:.2g}")
     how.add_row("it ended because", result["reason"])
-    if bounds := list(at_bounds(result["free"])):
+    if bounds := list(numbers_at_bounds(result["free"])):
         how.add_row("it stands on bounds", ", ".join(bounds))
-    titled("", how)
-    files(result)
+    show_titled_table("", how)
+    show_files(result)
 
 
-def missed(row: dict[str, Any]) -> str:
+def format_shortfall(row: dict[str, Any]) -> str:
     """By how much a constraint is not met."""
     if row["missed"] is None:
         return "not known"
@@ -196,41 +200,43 @@ def missed(row: dict[str, Any]) -> str:
     return f"by {row['missed']:.3g}{part}"
 
 
-def identified(result: dict[str, Any]) -> None:
+def show_identification(result: dict[str, Any]) -> None:
     """Values with standard deviations, what hangs together, what the data leave open, and what is left over."""
     values = Table("parameter", "before", "identified", "standard deviation", "unit")
     for name, row in result["values"].items():
-        values.add_row(name, brief(row["before"]), brief(row["value"]), f"{row['deviation']:.3g}", row["unit"])
-    titled(f"{result['scenario']}: identified from {result['data']['samples']} instants", values)
+        values.add_row(
+            name, format_brief(row["before"]), format_brief(row["value"]), f"{row['deviation']:.3g}", row["unit"]
+        )
+    show_titled_table(f"{result['scenario']}: identified from {result['data']['samples']} instants", values)
     left = Table("column", "sigma", "rms", "mean", "largest", "unit")
     for name, row in result["residuals"].items():
         left.add_row(name, *(f"{row[key]:.3g}" for key in ("sigma", "rms", "mean", "largest")), row["unit"])
-    titled("simulated minus measured", left)
+    show_titled_table("simulated minus measured", left)
     for row in result["correlations"]:
         say(f"note: {row['between'][0]} and {row['between'][1]} are correlated by {row['correlation']:.4f}")
     say(f"it ended because {result['reason']}, after {result['evaluations']} evaluations")
-    files(result)
+    show_files(result)
 
 
-def files(result: dict[str, Any]) -> None:
+def show_files(result: dict[str, Any]) -> None:
     """What was written, and where."""
     for name, path in result["files"].items():
         say(f"{name}: {path}")
 
 
-def brief(value: Any) -> str:
+def format_brief(value: Any) -> str:
     """A number to six digits, of a list the first four."""
     if isinstance(value, list):
-        return f"[{', '.join(map(brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
-    return number(value) if isinstance(value, float) else str(value)
+        return f"[{', '.join(map(format_brief, value[:4]))}{', ...' if len(value) > 4 else ''}]"
+    return round_for_table(value) if isinstance(value, float) else str(value)
 
 
-def titled(title: str, table: Table) -> None:
+def show_titled_table(title: str, table: Table) -> None:
     """A table on stdout, below its title."""
     for column in table.columns:
         column.overflow = "fold"  # a pipe has no width: nothing may be cut off
     console = _console()
-    console.print(*([title] if title else []), *fitted(table, console.width), sep="\n")
+    console.print(*([title] if title else []), *fit_table(table, console.width), sep="\n")
 
 
 def _console() -> Console:
@@ -240,12 +246,12 @@ def _console() -> Console:
     return console
 
 
-def at_bounds(free: Mapping[str, Any]) -> Iterator[str]:
+def numbers_at_bounds(free: Mapping[str, Any]) -> Iterator[str]:
     """Yield the tuned numbers that ended within a thousandth of their range of one of its ends, with that end."""
     for path, row in free.items():
         after, low, high = np.broadcast_arrays(*(np.asarray(row[key], float) for key in ("after", "low", "high")))
         for at in np.ndindex(after.shape):
             name = ".".join([path, *map(str, at)])
             for end, what in ((low[at], "lower"), (high[at], "upper")):
-                if abs(after[at] - end) <= NEAR * (high[at] - low[at]) < math.inf:
+                if abs(after[at] - end) <= BOUND_SHARE * (high[at] - low[at]) < math.inf:
                     yield f"{name} ({what}, {end:g})"

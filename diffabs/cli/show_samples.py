@@ -5,7 +5,7 @@ from typing import Any
 from rich.table import Table
 
 from diffabs.cli.console import say
-from diffabs.cli.show import brief, titled
+from diffabs.cli.show import format_brief, show_titled_table
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 
@@ -13,13 +13,17 @@ from diffabs.scenario.scenario import Scenario
 def swept(result: dict[str, Any], chosen: Scenario) -> None:
     """Failures, statistics with intervals, what moves what, the worst samples."""
     percent = f"{100 * result['confidence']:g} % intervals: {result['intervals']}"
-    titled(f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", _failures(result["failures"]))
+    show_titled_table(
+        f"{chosen.title or chosen.name}: {result['samples']} runs; {percent}", _failures(result["failures"])
+    )
     constant = [name for name, row in result["metrics"].items() if row and row["least"] == row["greatest"]]
     moving = {name: row for name, row in result["metrics"].items() if name not in constant}
-    titled("statistics of the lanes that did not diverge; summary.json has all intervals", _statistics(moving, chosen))
+    show_titled_table(
+        "statistics of the lanes that did not diverge; summary.json has all intervals", _statistics(moving, chosen)
+    )
     for name in constant:
         unit = unit_of(chosen.objectives[name], chosen.loop.plant)
-        say(f"{name} is {brief(result['metrics'][name]['mean']['value'])} {unit} in every lane")
+        say(f"{name} is {format_brief(result['metrics'][name]['mean']['value'])} {unit} in every lane")
     for name, row in result["never"].items():
         where = f"{row['count']} runs, the first sample {row['samples'][0]}"
         say(f"warning: {name} is infinite (never) in {where}: they are in no statistic of it")
@@ -33,7 +37,7 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
             moves.add_row(
                 name, *("" if row[p][kind]["value"] is None else f"{row[p][kind]['value']:.3f}" for p in paths)
             )
-        titled({"spearman": "rank correlations", "total": "total Sobol' indices"}[kind], moves)
+        show_titled_table({"spearman": "rank correlations", "total": "total Sobol' indices"}[kind], moves)
     if (refused := result["refused"])["count"]:
         why = "; ".join(f"{reason} ({count})" for reason, count in refused["reasons"].items())
         say(
@@ -45,10 +49,12 @@ def swept(result: dict[str, Any], chosen: Scenario) -> None:
         for name, row in result["accuracy"]["metrics"].items():
             changes.add_row(name, f"{row['median']:.1e}", f"{row['largest']:.1e}", str(row["sample"]))
         count = len(result["accuracy"]["samples"])
-        titled(f"what a half step changes, relative, in {count} lane{'s' if count > 1 else ''} drawn from all", changes)
+        show_titled_table(
+            f"what a half step changes, relative, in {count} lane{'s' if count > 1 else ''} drawn from all", changes
+        )
     for name, rows in result["worst"].items():
         if rows:
-            say(f"greatest {name}: {brief(rows[0]['value'])} in sample {rows[0]['sample']}")
+            say(f"greatest {name}: {format_brief(rows[0]['value'])} in sample {rows[0]['sample']}")
     if "report" in result["files"]:
         say(f"report: {result['files']['report']}")
     say(f"chunks and summary.json: {result['out']}; table {result['digest'][:16]}")
@@ -85,19 +91,21 @@ def rare(result: dict[str, Any], chosen: Scenario) -> None:
     for i, row in enumerate(result["levels"], 1):
         names = ("threshold", "share", "cov", "acceptance")
         levels.add_row(str(i), *(f"{row[name]:.4g}" for name in names), str(row["diverged"]))
-    titled(f"{chosen.title or chosen.name}: {result['metric']} >= {result['bound']:g} {result['unit']}", levels)
+    show_titled_table(
+        f"{chosen.title or chosen.name}: {result['metric']} >= {result['bound']:g} {result['unit']}", levels
+    )
     estimates = Table("estimate", "probability", "low", "high", "coefficient of variation")
     for name in ("subset simulation", "importance sampling"):
         if row := result[name]:
             estimates.add_row(name, *(f"{x:.4g}" for x in (row["probability"], *row["interval"], row["cov"])))
     low, high = result["interval"]
-    titled(f"probability {result['probability']:.3g}, 95 % interval {low:.3g} to {high:.3g}", estimates)
+    show_titled_table(f"probability {result['probability']:.3g}, 95 % interval {low:.3g} to {high:.3g}", estimates)
     count = len(next(iter(result["failures"].values()), ()))
     failures = Table("likeliest failures", *map(str, range(1, count + 1)))
     for path, column in result["failures"].items():
-        failures.add_row(path, *map(brief, column))
+        failures.add_row(path, *map(format_brief, column))
     if result["failures"]:
-        titled("", failures)
+        show_titled_table("", failures)
     say(f"{result['note']}; {result['reason']}")
     say(f"{result['runs']} runs and {result['gradients']} gradients; {result['diverged']} diverged")
 
@@ -107,12 +115,12 @@ def compared(result: dict[str, Any]) -> None:
     table = Table("metric", "first", "second", "second - first", "low", "high", "less in", "variance reduction")
     for name, row in result["metrics"].items():
         less = f"{100 * row['share in which the second is less']['value']:.1f} %"
-        means = (brief(row[key]) for key in ("first", "second"))
-        table.add_row(name, *means, *_estimate(row["difference"]), less, brief(row["variance reduction"]))
+        means = (format_brief(row[key]) for key in ("first", "second"))
+        table.add_row(name, *means, *_estimate(row["difference"]), less, format_brief(row["variance reduction"]))
     out = f", {result['left out']} left out that diverged" if result["left out"] else ""
-    titled(f"{result['second']} against {result['first']}: {result['samples']} common samples{out}", table)
+    show_titled_table(f"{result['second']} against {result['first']}: {result['samples']} common samples{out}", table)
     say("variance reduction: as many times more samples would be needed if the two sweeps did not share them")
 
 
 def _estimate(row: dict[str, Any]) -> list[str]:
-    return ["" if row[key] is None else brief(row[key]) for key in ("value", "low", "high")]
+    return ["" if row[key] is None else format_brief(row[key]) for key in ("value", "low", "high")]

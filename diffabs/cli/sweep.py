@@ -20,7 +20,7 @@ from diffabs.cli import console, progress, report, show, show_samples
 from diffabs.cli import engine as engines
 from diffabs.core import files
 from diffabs.core.pytree import elements
-from diffabs.core.values import ScenarioError, unknown
+from diffabs.core.values import ScenarioError, unknown_name_error
 from diffabs.scenario import section_sweep
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario, dump, loads
@@ -60,14 +60,16 @@ def sweep(
     """Run a scenario for many values, and show statistics.
 
     Values are drawn as [sweep.over] says. Statistics have confidence intervals."""
-    with console.guarded():
+    with console.end_on_errors():
         _check_options(engine, on, scheduler, workers, devices, figures)
         _check_samples(samples)
         if devices:
             jax.config.update("jax_num_cpu_devices", devices)
-        chosen = console.loaded(scenario, console.changed(changes, "sweep", samples=samples, seed=seed))
+        chosen = console.load_scenario(
+            scenario, console.add_option_overrides(changes, "sweep", samples=samples, seed=seed)
+        )
         out = out or pathlib.Path("out") / f"sweep-{chosen.name}"
-        study = _with_engine(section_sweep.study(chosen), engine)
+        study = _with_engine(section_sweep.build_study(chosen), engine)
         kept = _numbers(keep, study.samples)
         for number in kept:
             _check_runnable(study, number)
@@ -77,7 +79,9 @@ def sweep(
             if not found.complete:
                 raise KeyboardInterrupt
             check = chosen.sweep.check
-            result = console.waited(lambda: _result(found, study, out, kept, figures, check), "computing statistics")
+            result = console.run_with_progress(
+                lambda: _result(found, study, out, kept, figures, check), "computing statistics"
+            )
         show.as_json(result) if as_json else show_samples.swept(result, chosen)
         _warn(result["accuracy"])
         _check_any(result, chosen)
@@ -100,7 +104,7 @@ def sample(folder: pathlib.Path, number: int) -> tuple[Scenario, jax.Array]:
     if "scenario" not in source:
         raise SweepError(f"{folder} was not swept from a scenario; Study.lane({number}) is this sample")
     chosen = loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
-    study = section_sweep.study(chosen)
+    study = section_sweep.build_study(chosen)
     swept = {name: value for name, value in manifest["study"].items() if name != "engine"}  # a sample is run by XLA
     for line in describe_differences(swept, study.table(), "study"):
         raise SweepError(f"{folder}: the scenario in its manifest is not what was swept: {line}")
@@ -147,9 +151,9 @@ def _check_options(
     engine: str, on: str, scheduler: str | None, workers: int | None, devices: int | None, figures: bool
 ) -> None:
     console.need_extra("sweep")
-    engines.check(engine)
+    engines.check_engine_name(engine)
     if on not in PLACES:
-        raise unknown(f"--on {on} is unknown", on, PLACES)
+        raise unknown_name_error(f"--on {on} is unknown", on, PLACES)
     if on == "dask":
         console.need_extra("cluster")
     for option, value, needed in (
@@ -195,7 +199,7 @@ def _with_engine(study: "Study", engine: str) -> "Study":
     from diffabs.sweep.runner import find_study_objection
 
     by_kernel = dataclasses.replace(study.check(), engine="kernel")
-    line = console.waited(lambda: find_study_objection(by_kernel), "compiling a kernel")
+    line = console.run_with_progress(lambda: find_study_objection(by_kernel), "compiling a kernel")
     if line and engine == "kernel":
         console.fail(line)
     if line:
@@ -215,8 +219,8 @@ def _computer(name: str, scheduler: str | None, workers: int | None) -> Any:
 
 def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: Callable[[], Any]) -> "Results":
     """Raises KeyboardInterrupt, after the chunks in hand or at once."""
-    far = [progress.Far(progress.COMPILING)]
-    ending = console.Ending("the chunks in hand")
+    far = [progress.WorkProgress(progress.COMPILING)]
+    ending = console.EarlyEnd("the chunks in hand")
 
     def told(at: "Told") -> None:
         if at.damaged and not at.here:
@@ -229,16 +233,16 @@ def _run(study: "Study", chosen: Scenario, out: pathlib.Path, resume: bool, on: 
         source = {"scenario": dump(chosen), "name": chosen.name}
         return run(study, out, resume=resume, on=on(), progress=told, stopping=ending, source=source)
 
-    return console.waited(run, f"sweeping {chosen.name}", lambda: far[0], ending)
+    return console.run_with_progress(run, f"sweeping {chosen.name}", lambda: far[0], ending)
 
 
-def _far(at: "Told") -> progress.Far:
+def _far(at: "Told") -> progress.WorkProgress:
     """How far a sweep is."""
     if not at.here:
-        return progress.Far(f"{at.samples:,} of {at.total:,}, {progress.COMPILING}", at.samples, at.total)
+        return progress.WorkProgress(f"{at.samples:,} of {at.total:,}, {progress.COMPILING}", at.samples, at.total)
     bad = f"{at.failed:,} failed, {at.diverged:,} diverged" + (f", {at.refused:,} refused" if at.refused else "")
     words = f"{at.samples:,} of {at.total:,}: {at.rate:,.0f}/s, {bad}"
-    return progress.Far(words, at.samples, at.total)
+    return progress.WorkProgress(words, at.samples, at.total)
 
 
 def _listed(numbers: tuple[int, ...]) -> str:
@@ -264,20 +268,20 @@ def _result(
         halved = beside.submit(check_accuracy, study, found, check) if check else None
         said = summarise_sweep(found)
     accuracy = halved.result() if halved else None
-    result = {"out": str(out), **said, "accuracy": accuracy, "made": console.made(), "files": {}}
+    result = {"out": str(out), **said, "accuracy": accuracy, "made": console.describe_making(), "files": {}}
     if kept:
         result["files"]["trajectories"] = str(write_trajectories(study, out, kept))
     if figures:
-        from diffabs.plot.sweeps import draw
+        from diffabs.plot.sweeps import draw_sweep
 
         folder = out / FIGURES
         folder.mkdir(exist_ok=True)
         units = {path: spec.unit for path, spec in elements(study.loop).items()}
         units |= {name: unit_of(objective, study.loop.plant) for name, objective in study.objectives.items()}
-        result["files"]["figures"] = [str(path) for path in draw(found, result, folder, units)]
-        result["files"]["report"] = str(out / report.NAME)
-    document = json.dumps(show.finite(result), indent=1, allow_nan=False)
+        result["files"]["figures"] = [str(path) for path in draw_sweep(found, result, folder, units)]
+        result["files"]["report"] = str(out / report.DEFAULT_NAME)
+    document = json.dumps(show.replace_infinite(result), indent=1, allow_nan=False)
     files.write_durably(out / SUMMARY, document.encode())
     if figures:
-        report.write([out], out / report.NAME)
+        report.write_report_file([out], out / report.DEFAULT_NAME)
     return result

@@ -7,7 +7,7 @@ from rich.table import Column, Table
 FRAME, PER_COLUMN = 1, 3  # columns of the frame, and of it and the padding for each column
 
 
-def fitted(table: Table, width: int) -> list[Table]:
+def fit_table(table: Table, width: int) -> list[Table]:
     """The table as one or more, each no wider than `width` where its longest words allow that. The first column, which
     says what a row is about, comes again in each."""
     groups: list[list[Column]] = []
@@ -17,10 +17,10 @@ def fitted(table: Table, width: int) -> list[Table]:
             groups[-1].append(column)
         else:
             groups.append([first, column])
-    return [_laid_out(table, group, width) for group in groups or [[first]]]
+    return [_lay_out(table, group, width) for group in groups or [[first]]]
 
 
-def _laid_out(table: Table, columns: list[Column], width: int) -> Table:
+def _lay_out(table: Table, columns: list[Column], width: int) -> Table:
     """These columns of a table: each as wide as its longest word, and what is left goes to those that need it."""
     new = copy.copy(table)
     new.columns = [copy.copy(column) for column in columns]

@@ -33,7 +33,7 @@ def check_scenario_file(out: pathlib.Path | None) -> None:
         fail(f"--out {out}: the name must end in .toml")
 
 
-def resolved(path: pathlib.Path, option: str) -> pathlib.Path:
+def resolve_path(path: pathlib.Path, option: str) -> pathlib.Path:
     """A path without links. Raises typer.Exit for links that only lead to each other."""
     try:
         with contextlib.suppress(FileNotFoundError):
@@ -46,7 +46,7 @@ def resolved(path: pathlib.Path, option: str) -> pathlib.Path:
 
 
 @contextlib.contextmanager
-def new_file(target: pathlib.Path | None, option: str) -> Iterator[pathlib.Path | None]:
+def new_target_file(target: pathlib.Path | None, option: str) -> Iterator[pathlib.Path | None]:
     """A temporary file beside `target` that takes its place at the end, or vanishes if anything goes wrong; None where
     no file is wanted. Whoever removes it leaves `target` as it was.
 
@@ -55,29 +55,29 @@ def new_file(target: pathlib.Path | None, option: str) -> Iterator[pathlib.Path 
     if target is None:
         yield None
         return
-    target = resolved(target, option)
+    target = resolve_path(target, option)
     if target.exists() and not target.is_file():
         fail(f"{option} {target}: is not a regular file")
-    with _made(files.new_file(target), option, target) as temporary:
+    with _open_target(files.new_file(target), option, target) as temporary:
         yield temporary
 
 
 @contextlib.contextmanager
-def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
+def new_target_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     """A temporary folder beside `target` that takes its place at the end, or vanishes if anything goes wrong.
 
     An older result (it has a summary.json) is replaced; any other content is left alone. Raises typer.Exit where the
     folder cannot be made.
     """
-    target = resolved(target, "--out")
+    target = resolve_path(target, "--out")
     if target.exists() and not (target.is_dir() and (not any(target.iterdir()) or (target / "summary.json").exists())):
         fail(f"--out {target}: exists and is no earlier result; move it away")
-    with _made(files.new_folder(target), "--out", target) as new:
+    with _open_target(files.new_folder(target), "--out", target) as new:
         yield new
 
 
 @contextlib.contextmanager
-def _made(
+def _open_target(
     making: contextlib.AbstractContextManager[pathlib.Path], option: str, target: pathlib.Path
 ) -> Iterator[pathlib.Path]:
     """What is being made. Raises typer.Exit where it cannot be begun."""

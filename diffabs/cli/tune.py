@@ -14,7 +14,7 @@ import typer
 
 from diffabs.cli import certificates, console, progress, show, targets
 from diffabs.cli import engine as engines
-from diffabs.cli.tune_document import Proved, Work, documented
+from diffabs.cli.tune_document import Proved, Work, tuning_document
 from diffabs.core.values import ScenarioError
 from diffabs.scenario.scenario import Scenario, dump
 from diffabs.simulate.admissible import first_refusal
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from diffabs.tune import Tuned, TuningProgress
 
 OF_THE_COMMAND = ("scenario", "model", "made", "versions", "files")  # of a certificate: the tuning says the same
-ROUNDING = 1e-9  # relative: of a decay rate as a factor for one period, with plenty to spare
+BOUND_ROUNDING = 1e-9  # relative: of a decay rate as a factor for one period, with plenty to spare
 
 
 def tune(
@@ -45,20 +45,22 @@ def tune(
     """Tune the free parameters of [tune] by gradients.
 
     It tunes over all runs of [tune] at once."""
-    with console.guarded(), certificates.reported():
+    with console.end_on_errors(), certificates.report_design_errors():
         console.need_extra("tune")
-        engines.check(engine)
+        engines.check_engine_name(engine)
         targets.check_picture(plot)
         targets.check_scenario_file(out)
         with contextlib.ExitStack() as files:
-            out_file = files.enter_context(targets.new_file(out, "--out"))
-            picture = files.enter_context(targets.new_file(plot, "--plot"))
-            chosen = console.loaded(scenario, console.changed(changes, "tune", starts=starts))
-            result, told = _tuned(chosen, engine, out_file, picture)
+            out_file = files.enter_context(targets.new_target_file(out, "--out"))
+            picture = files.enter_context(targets.new_target_file(plot, "--plot"))
+            chosen = console.load_scenario(scenario, console.add_option_overrides(changes, "tune", starts=starts))
+            result, told = _tune_and_document(chosen, engine, out_file, picture)
             if not result["met"]:  # inside, so that no file is written
                 _show(result, told, chosen, as_json)
                 _leave_if_interrupted(result)
-                console.fail(f"{chosen.name}: not met: {_unmet(result)}; {result['reason']}", console.FAILED)
+                console.fail(
+                    f"{chosen.name}: not met: {_unmet_constraints(result)}; {result['reason']}", console.FAILED
+                )
             drawn = plot if picture and picture.exists() else None
         result["files"] = {name: str(path) for name, path in (("out", out), ("plot", drawn)) if path}
         _show(result, told, chosen, as_json)
@@ -68,45 +70,47 @@ def tune(
 def _leave_if_interrupted(result: dict[str, Any]) -> None:
     """Raises typer.Exit: what was shown is the best so far."""
     if result["interrupted"]:
-        met = "" if result["met"] else f"; not met: {_unmet(result)}, so that no file is written"
+        met = "" if result["met"] else f"; not met: {_unmet_constraints(result)}, so that no file is written"
         console.say(f"interrupted: this is the best so far, not a minimum{met}")
         raise typer.Exit(console.INTERRUPTED)
 
 
-def _unmet(result: dict[str, Any]) -> str:
-    return ", ".join(f"{row['name']} {show.missed(row)}" for row in result["constraints"] if not row["met"])
+def _unmet_constraints(result: dict[str, Any]) -> str:
+    return ", ".join(f"{row['name']} {show.format_shortfall(row)}" for row in result["constraints"] if not row["met"])
 
 
 def _show(result: dict[str, Any], told: str, chosen: Scenario, as_json: bool) -> None:
-    show.as_json(result) if as_json else show.tuned(result, chosen)
+    show.as_json(result) if as_json else show.show_tuning(result, chosen)
     console.say(told)
 
 
-def _tuned(
+def _tune_and_document(
     chosen: Scenario, engine: str, out: pathlib.Path | None, picture: pathlib.Path | None
 ) -> tuple[dict[str, Any], str]:
     """The JSON document and a sentence about the certificate. The files are written if all constraints are met. Ctrl-C
     leaves out what is not there yet, once there is something to show."""
-    work = console.waited(lambda: work_of(chosen), "computing the lanes")
-    found, interrupted = _watched(work, engine)
+    work = console.run_with_progress(lambda: build_work(chosen), "computing the lanes")
+    found, interrupted = _tune_with_progress(work, engine)
     after = chosen.with_loop(found.loop, "tuned")
     try:
-        proved = console.waited(lambda: certificate_of(after), "certifying the result")
-        result = console.waited(lambda: documented(work, found, proved), "comparing with what there was before")
+        proved = console.run_with_progress(lambda: certify_result(after), "certifying the result")
+        result = console.run_with_progress(
+            lambda: tuning_document(work, found, proved), "comparing with what there was before"
+        )
     except KeyboardInterrupt:
-        interrupted, proved = True, _unproved("interrupted")
-        result = _without_proof(work, documented(work._replace(task=None), found, proved))
+        interrupted, proved = True, _without_certificate("interrupted")
+        result = _without_proof(work, tuning_document(work._replace(task=None), found, proved))
     if out and result["met"]:
         out.write_text(dump(after), encoding="utf-8")
     if picture and result["met"]:
-        interrupted |= not _finished(lambda: _drawn(work, found, picture), picture)
+        interrupted |= not _draw_until_interrupt(lambda: _draw(work, found, picture), picture)
     return {**result, "interrupted": interrupted}, proved.sentence
 
 
-def _finished(draw: Callable[[], None], picture: pathlib.Path) -> bool:
+def _draw_until_interrupt(draw: Callable[[], None], picture: pathlib.Path) -> bool:
     """Whether a picture could be drawn before Ctrl-C; else there is none."""
     try:
-        console.waited(draw, "drawing")
+        console.run_with_progress(draw, "drawing")
     except KeyboardInterrupt:
         picture.unlink()
         return False
@@ -126,7 +130,7 @@ def _without_proof(work: Work, result: dict[str, Any]) -> dict[str, Any]:
     return result | {"constraints": result["constraints"] + unseen, "met": result["met"] and not unseen}
 
 
-def work_of(chosen: Scenario) -> Work:
+def build_work(chosen: Scenario) -> Work:
     """Raises ScenarioError for what does not fit together."""
     from diffabs.tune import AtMost, CertifiedDecay, Poles
 
@@ -135,7 +139,7 @@ def work_of(chosen: Scenario) -> Work:
     if line := first_refusal(chosen.loop, batch.values, chosen.solver):
         raise ScenarioError(f"tune.over: {line}")
     constraints: dict[str, Any] = {name: AtMost(metric=name, bound=bound) for name, bound in goal.limits.items()}
-    task = certificates.task(chosen) if goal.decay or goal.damping else None
+    task = certificates.build_proof_task(chosen) if goal.decay or goal.damping else None
     if task and goal.decay:
         constraints["certified decay"] = CertifiedDecay(task.polytope, goal.decay)
     if task and goal.damping:
@@ -143,13 +147,13 @@ def work_of(chosen: Scenario) -> Work:
     return Work(chosen, batch, constraints, task)
 
 
-def _watched(work: Work, engine: str) -> tuple["Tuned", bool]:
+def _tune_with_progress(work: Work, engine: str) -> tuple["Tuned", bool]:
     """Tune, and say how far it is; whether Ctrl-C ended it. Raises typer.Exit where no start can be used."""
     from diffabs import tune
     from diffabs.tune import Method, StartError, Stopping
 
     goal, told = work.chosen.tune, list["TuningProgress"]()
-    ending = console.Ending("the evaluation in hand", nothing=lambda: not told)
+    ending = console.EarlyEnd("the evaluation in hand", nothing=lambda: not told)
     method = Method(starts=goal.starts, seed=goal.seed, stopping=Stopping(iterations=goal.iterations))
     posed: dict[str, Any] = {
         "free": goal.free,
@@ -162,49 +166,51 @@ def _watched(work: Work, engine: str) -> tuple["Tuned", bool]:
     }
     loop = work.chosen.loop
     most = None if work.constraints else goal.iterations  # constraints take rounds of as many, nobody knows how many
-    engine = engines.decided(engine, lambda: tune.build_problem(loop, **posed, engine="kernel").objection())
+    engine = engines.choose_engine(engine, lambda: tune.build_problem(loop, **posed, engine="kernel").objection())
 
     def tuned() -> "Tuned":
         told_to = {"method": method, "progress": told.append, "stopping": ending}
         return tune.tune(loop, **posed, **told_to, engine=engine)
 
     try:
-        return console.waited(tuned, f"tuning {work.chosen.name}", lambda: _said(told, most), ending), ending.asked
+        return console.run_with_progress(
+            tuned, f"tuning {work.chosen.name}", lambda: _format_progress(told, most), ending
+        ), ending.asked
     except StartError as error:
         console.fail(f"{work.chosen.name}: no start can be used: {error}", console.FAILED)
     except EngineError as error:
         console.fail(str(error))
 
 
-def _said(told: "list[TuningProgress]", most: int | None = None) -> progress.Far:
+def _format_progress(told: "list[TuningProgress]", most: int | None = None) -> progress.WorkProgress:
     """How far it is, in one line; of so many iterations at most, where that is known."""
     if not told:
-        return progress.Far(progress.COMPILING)
+        return progress.WorkProgress(progress.COMPILING)
     last, total = told[-1], len(told)
     words = (
         f"loss {last.point.loss:.6g}, gradient {last.point.gradient:.2g}, violation {last.point.violation:.2g},"
         f" {total} evaluations, {last.starts} under way"
     )
-    return progress.Far(words, max(one.point.iteration for one in told), most, at_most=True)
+    return progress.WorkProgress(words, max(one.point.iteration for one in told), most, at_most=True)
 
 
-def certificate_of(after: Scenario) -> Proved:
+def certify_result(after: Scenario) -> Proved:
     """A certificate over the ranges of [design], if there can be one, of the decay that is asked for, if that can be
     proved."""
     decay = after.tune.decay
     try:
-        task = certificates.task(after)
-        found = certificates.certified(task)
+        task = certificates.build_proof_task(after)
+        found = certificates.certify_gain(task)
         if (found.decay_rate or 0.0) < decay:  # the search for the fastest ends a little below it
-            asked = certificates.certified(
-                task._replace(spec=dataclasses.replace(task.spec, decay=decay * (1 + ROUNDING)))
+            asked = certificates.certify_gain(
+                task._replace(spec=dataclasses.replace(task.spec, decay=decay * (1 + BOUND_ROUNDING)))
             )
             found = asked if (asked.decay_rate or 0.0) >= decay else found
     except (ModuleNotFoundError, ValueError, np.linalg.LinAlgError) as error:
-        return _unproved(" ".join(str(error).split()))
-    known = certificates.besides(task, found)
-    reason = certificates.unproved(found, task.spec, known) or None
-    document = certificates.document(task, found, reason=reason, known=known)
+        return _without_certificate(" ".join(str(error).split()))
+    known = certificates.find_further(task, found)
+    reason = certificates.describe_unproved(found, task.spec, known) or None
+    document = certificates.proof_document(task, found, reason=reason, known=known)
     document = {key: value for key, value in document.items() if key not in OF_THE_COMMAND}
     rate = document["decay_rate"]
     over = ", ".join(f"{path} {low:.6g} to {high:.6g}" for path, (low, high) in task.over.items())
@@ -212,14 +218,14 @@ def certificate_of(after: Scenario) -> Proved:
     return Proved(document, f"certificate: {said}", task, certified=True)
 
 
-def _unproved(why: str) -> Proved:
+def _without_certificate(why: str) -> Proved:
     return Proved({**dict.fromkeys(certificates.FROM_PROOF), "reason": why}, f"no certificate: {why}")
 
 
-def _drawn(work: Work, found: "Tuned", path: pathlib.Path) -> None:
+def _draw(work: Work, found: "Tuned", path: pathlib.Path) -> None:
     """The history, and the lane that is the worst afterwards, before and after."""
-    from diffabs.plot.style import write
-    from diffabs.plot.tuning import tuning
+    from diffabs.plot.style import write_figure
+    from diffabs.plot.tuning import draw_tuning
 
     chosen, metrics = work.chosen, found.metrics[1]
     worst = int(np.argmax(sum(w * np.asarray(metrics[name]) for name, w in chosen.tune.objective.items())))
@@ -233,5 +239,5 @@ def _drawn(work: Work, found: "Tuned", path: pathlib.Path) -> None:
     runs = {"before": seen(chosen.loop), "after": seen(found.loop)}
     where = ", ".join(f"{name} = {np.asarray(column)[worst]:.4g}" for name, column in work.batch.values.items())
     title = chosen.title or chosen.name
-    figure = tuning(found.history, runs, title=title, lane=where, unit=chosen.loop.plant.control_unit)
-    write(figure, path, path.suffix.lstrip("."))
+    figure = draw_tuning(found.history, runs, title=title, lane=where, unit=chosen.loop.plant.control_unit)
+    write_figure(figure, path, path.suffix.lstrip("."))

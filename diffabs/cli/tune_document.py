@@ -22,7 +22,7 @@ class Work(NamedTuple):
     chosen: Scenario
     batch: "Batch"
     constraints: dict[str, Any]
-    task: certificates.Task | None
+    task: certificates.ProofTask | None
 
 
 class Proved(NamedTuple):
@@ -30,15 +30,15 @@ class Proved(NamedTuple):
 
     document: dict[str, Any]
     sentence: str
-    task: certificates.Task | None = None
+    task: certificates.ProofTask | None = None
     certified: bool = False
 
 
-def documented(work: Work, found: "Tuned", proved: Proved) -> dict[str, Any]:
+def tuning_document(work: Work, found: "Tuned", proved: Proved) -> dict[str, Any]:
     """The whole document, without the files that were written."""
     chosen, goal = work.chosen, work.chosen.tune
     return {
-        **console.about(chosen),
+        **console.describe_source(chosen),
         "lanes": work.batch.size,
         "free": {path: _free(chosen, found, path) for path in goal.free},
         "objective": dict(zip(WHEN, map(float, found.objective), strict=True)),
@@ -83,18 +83,20 @@ def _constraints(work: Work, found: "Tuned", proved: Proved) -> list[dict[str, A
     goal, rows = work.chosen.tune, []
     for name, bound in goal.limits.items():
         before, after = (float(np.max(metrics[name])) for metrics in found.metrics)
-        rows.append(_judged(name, bound, before, after, at_most=True))
+        rows.append(_constraint_row(name, bound, before, after, at_most=True))
     if work.task and goal.decay:
-        before, after = certificates.certified(work.task).decay_rate, proved.document["decay_rate"]
-        rows.append(_judged("certified decay", goal.decay, before, after, at_most=False))
+        before, after = certificates.certify_gain(work.task).decay_rate, proved.document["decay_rate"]
+        rows.append(_constraint_row("certified decay", goal.decay, before, after, at_most=False))
     if work.task and goal.damping:
         before = _damping(work.task, work.chosen.loop)
         after = _damping(proved.task or work.task, found.loop)
-        rows.append(_judged("damping", goal.damping, before, after, at_most=False))
+        rows.append(_constraint_row("damping", goal.damping, before, after, at_most=False))
     return rows
 
 
-def _judged(name: str, bound: float, before: float | None, after: float | None, *, at_most: bool) -> dict[str, Any]:
+def _constraint_row(
+    name: str, bound: float, before: float | None, after: float | None, *, at_most: bool
+) -> dict[str, Any]:
     """A line of the constraints. Met is met, without a tolerance; else `missed` is by how much it is not, or null where
     no number is known."""
     reached = math.nan if after is None else after
@@ -104,7 +106,7 @@ def _judged(name: str, bound: float, before: float | None, after: float | None, 
     return {**row, "met": beyond <= 0, "missed": missed}
 
 
-def _damping(task: certificates.Task, loop: Any) -> float:
+def _damping(task: certificates.ProofTask, loop: Any) -> float:
     """The least of the poles at the vertices."""
     from diffabs.tune import Poles
 

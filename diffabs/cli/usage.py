@@ -12,7 +12,7 @@ import typer
 import typer.core
 
 from diffabs.cli import console
-from diffabs.scenario.registry import know
+from diffabs.scenario.registry import register_parts
 
 # Of the click that this typer brings or needs: the ancestor of all complaints about arguments.
 UsageError: Any = typer.BadParameter.__base__
@@ -28,17 +28,17 @@ class Group(typer.core.TyperGroup):
     def main(self, *args: Any, standalone_mode: bool = True, **more: Any) -> Any:
         """Run a command, and exit if `standalone_mode`."""
         given = more.get("args", args[0] if args else None)
-        console.begin(sys.argv[1:] if given is None else given)
+        console.note_command(sys.argv[1:] if given is None else given)
         try:
             status = super().main(*args, standalone_mode=False, **more)
         except UsageError as error:
-            status = _told(error)
+            status = _format_error(error)
         if standalone_mode:
             sys.exit(status)
         return status
 
 
-def _told(error: Any) -> int:
+def _format_error(error: Any) -> int:
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show()
     else:
@@ -49,14 +49,14 @@ def _told(error: Any) -> int:
     return error.exit_code
 
 
-def add(app: typer.Typer, function: Callable[..., Any], example: str, name: str | None = None) -> None:
+def add_command(app: typer.Typer, function: Callable[..., Any], example: str, name: str | None = None) -> None:
     """Make a function a command: with its example (what follows `diffabs`), with --quiet and --parts."""
 
     @functools.wraps(function)
     def command(*args: Any, quiet: bool, parts: list[str] | None, **given: Any) -> Any:
         console.quieten(quiet)
-        with console.guarded():
-            know(parts or ())
+        with console.end_on_errors():
+            register_parts(parts or ())
         return function(*args, **given)
 
     signature = inspect.signature(function)

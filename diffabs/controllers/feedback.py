@@ -14,7 +14,7 @@ from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree
-from diffabs.core.rules import Rule, ordered
+from diffabs.core.rules import Rule, order_rule
 
 
 @pytree
@@ -56,4 +56,4 @@ class StateFeedback:
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""
-        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}")
+        yield order_rule(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}")

@@ -14,10 +14,10 @@ import numpy as np
 
 from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.controllers.feedback import StateFeedback
-from diffabs.core.numerics import risen, table
+from diffabs.core.numerics import interpolate_shares, interval_shares
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree
-from diffabs.core.rules import Rule, increasing
+from diffabs.core.rules import Rule, increase_rule
 
 
 @pytree
@@ -46,8 +46,8 @@ class ScheduledFeedback:
         shapes = [np.shape(x) for x in (self.speeds, self.integral_gains, self.gains)]
         if len(set(shapes)) != 1:
             raise ValueError(f"speeds, integral_gains and gains have shapes {', '.join(map(str, shapes))}")
-        rise = risen(signal.measured.speed, jnp.asarray(self.speeds))
-        rows = (table(rise, jnp.asarray(gains)) for gains in (self.integral_gains, self.gains))
+        rise = interval_shares(signal.measured.speed, jnp.asarray(self.speeds))
+        rows = (interpolate_shares(rise, jnp.asarray(gains)) for gains in (self.integral_gains, self.gains))
         limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
         return StateFeedback(gain=jnp.stack(list(rows)), **limits, antiwindup=self.antiwindup)
 
@@ -59,7 +59,7 @@ class ScheduledFeedback:
 
     def rules(self) -> Iterator[Rule]:
         """Speeds that increase, limits that do not exclude each other."""
-        yield increasing("speeds", self.speeds, "do not increase", "m/s")
+        yield increase_rule("speeds", self.speeds, "do not increase", "m/s")
         yield from StateFeedback.rules(self)  # pyright: ignore[reportArgumentType]  # has the same limits
 
 

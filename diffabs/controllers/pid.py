@@ -15,7 +15,7 @@ from diffabs.controllers.antiwindup import NoAntiWindup
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import Scalar, param, part, pytree
-from diffabs.core.rules import Rule, ordered
+from diffabs.core.rules import Rule, order_rule
 
 
 class PIDMemory(NamedTuple):
@@ -65,4 +65,4 @@ class PID:
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""
-        yield ordered(("low", self.low), ("high", self.high), "{control}")
+        yield order_rule(("low", self.low), ("high", self.high), "{control}")

@@ -20,11 +20,11 @@ from diffabs.core.blocks import offers
 from diffabs.core.numerics import axpy
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import Scalar, param, part, pytree
-from diffabs.core.rules import Rule, array
+from diffabs.core.rules import Rule, as_rule_array
 from diffabs.core.timing import whole_steps
-from diffabs.core.tracing import leaves_followed
+from diffabs.core.tracing import leaf_dependence
 
-CLOSE = 16.0  # precisions of the time: instants that are one
+PERIOD_EPS = 16.0  # precisions of the time: instants that are one
 
 
 class SampledMemory(NamedTuple):
@@ -49,7 +49,7 @@ class Sampled:
 
     def start(self, signal: Tracking) -> Memory:
         """Output zero until the first sample has been computed."""
-        signal = usable(signal)
+        signal = replace_nan(signal)
         zero = 0.0 * signal.target
         return Memory(held=SampledMemory(self.controller.start(signal), zero, zero, zero, zero))
 
@@ -82,9 +82,9 @@ class Sampled:
         """What `computed` returns, and False; or, where the sample is `lost` or cannot be used, the memory and the
         `last` output as they are, and True."""
         # on numbers, also where there are none: nothing that is not defined for NaN is computed or differentiated
-        before = None if clock.before is None else usable(clock.before)
-        new = self.computed(clock._replace(before=before), memory, usable(signal))
-        read = leaves_followed(lambda signal: self.computed(clock, memory, signal), signal)
+        before = None if clock.before is None else replace_nan(clock.before)
+        new = self.computed(clock._replace(before=before), memory, replace_nan(signal))
+        read = leaf_dependence(lambda signal: self.computed(clock, memory, signal), signal)
         numbers = [x for x, on in zip(jax.tree.leaves(signal), read, strict=True) if on]
         results = [x for x in jax.tree.leaves(new) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
         missing = [jnp.any(jnp.isnan(x)) for x in numbers]
@@ -106,7 +106,7 @@ class Sampled:
     def _until(self, t: Scalar) -> Any:
         """When what is sampled now is applied. A rounding early: an event exactly on an instant of the grid would end
         no step, and the greatest value of a run there would have the derivative of the instant, which does not move."""
-        rounding = CLOSE * jnp.finfo(jnp.result_type(t, self.period)).eps * (t + self.period)
+        rounding = PERIOD_EPS * jnp.finfo(jnp.result_type(t, self.period)).eps * (t + self.period)
         early = jnp.maximum(jnp.minimum(rounding, self.delay), self.delay - (self.period - rounding))
         return t + self.delay - jax.lax.stop_gradient(early)
 
@@ -139,7 +139,7 @@ class Sampled:
         yield whole_steps("period", self.period, step)
 
 
-def usable(signal: Any) -> Any:
+def replace_nan(signal: Any) -> Any:
     """Return a signal with 0 for NaN: a memory that begins on it is finite."""
     return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), 0.0, x), signal)
 
@@ -154,7 +154,7 @@ class _AlwaysWaits(Sampled):
         return jnp.asarray(True)
 
 
-def unsampled(controller: Any) -> Any:
+def inner_controller(controller: Any) -> Any:
     """Return what a computer runs, or a controller that none runs itself."""
     return controller.controller if isinstance(controller, Sampled) else controller
 
@@ -169,7 +169,7 @@ def within_period(controller: Any, delay: Scalar, period: Scalar) -> Iterator[Ru
 def delay_within(delay: Scalar, period: Scalar) -> Rule:
     """Return the rule that a delay [s] does not exceed the period [s]."""
     return Rule(
-        array(delay) <= array(period),
+        as_rule_array(delay) <= as_rule_array(period),
         "delay exceeds the period",
         lambda: f"delay = {delay:g} s exceeds the period of {period:g} s",
     )
@@ -179,7 +179,7 @@ def filter_within(cutoff: Scalar, period: Scalar) -> Rule:
     """Return the rule that forward Euler, d_(k+1) = d_k + period cutoff (e - d_k), is stable: cutoff [rad/s] is below
     2 / period [s]."""
     return Rule(
-        array(cutoff) * array(period) < 2,
+        as_rule_array(cutoff) * as_rule_array(period) < 2,
         "controller.cutoff is too fast for the period",
         lambda: (
             f"controller.cutoff = {cutoff:g} rad/s is outside (0, {2 / period:g}) rad/s: sampled every {period:g} s, a"

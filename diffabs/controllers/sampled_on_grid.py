@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.controllers.pid import PID
-from diffabs.controllers.sampled import CLOSE, Sampled, usable, within_period
+from diffabs.controllers.sampled import PERIOD_EPS, Sampled, replace_nan, within_period
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Block, Clock, Memory, Tracking, no_flow
 from diffabs.core.pytree import Scalar, param, part, pytree
@@ -47,7 +47,7 @@ class SampledOnGrid:
 
     def start(self, signal: Tracking) -> Memory:
         """Output zero until the first sample has been computed."""
-        signal = usable(signal)
+        signal = replace_nan(signal)
         zero = 0.0 * signal.target
         return Memory(held=GridMemory(self.controller.start(signal), zero, zero, zero, zero))
 
@@ -61,7 +61,7 @@ class SampledOnGrid:
         m: GridMemory = memory.held
         now, number = clock.ticks(self.sampling_period)
         inner, output, _ = self.guarded(clock._replace(h=self.sampling_period, k=number), m.inner, m.next, signal)
-        close = CLOSE * jnp.finfo(jnp.result_type(clock.t, clock.h)).eps * (clock.t + self.sampling_period)
+        close = PERIOD_EPS * jnp.finfo(jnp.result_type(clock.t, clock.h)).eps * (clock.t + self.sampling_period)
         over = jax.lax.stop_gradient(jnp.maximum(self.delay - (self.sampling_period - 2 * close), 0.0))
         new = GridMemory(inner, output, m.next, clock.t + self.delay - over, m.applied)
         m = jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m)

@@ -9,7 +9,7 @@ import numpy as np
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, Tracking, no_flow, no_memory
 from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.core.rules import Rule, ordered
+from diffabs.core.rules import Rule, order_rule
 
 
 @pytree
@@ -63,7 +63,7 @@ class Relay:
 
     def rules(self) -> Iterator[Rule]:
         """A release torque below the applied one."""
-        yield ordered(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}", equal=False)
+        yield order_rule(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}", equal=False)
 
 
 @pytree
@@ -94,4 +94,4 @@ class SlidingMode:
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""
-        yield ordered(("low", self.low), ("high", self.high), "{control}")
+        yield order_rule(("low", self.low), ("high", self.high), "{control}")

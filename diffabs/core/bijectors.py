@@ -20,11 +20,11 @@ import numpy as np
 
 from diffabs.core.pytree import Spec, parameters, replace
 
-DECADE = 10.0
-END = 1e-9  # relative: a start this close to an end of its range cannot leave it
+LOGARITHMIC_RATIO = 10.0
+END_SHARE = 1e-9  # relative: a start this close to an end of its range cannot leave it
 
 Range = tuple[Any, Any]
-NEAR = 0.3  # of the spread over a finite range: exp(0.3 * 3.9) is about three
+RANGE_END_SHARE = 0.3  # of the spread over a finite range: exp(0.3 * 3.9) is about three
 T = TypeVar("T")
 
 
@@ -78,7 +78,7 @@ class HalfLine:
 
 
 @dataclasses.dataclass(frozen=True)
-class Line:
+class UnboundedLine:
     """value = start + scale z."""
 
     start: float
@@ -93,7 +93,7 @@ class Line:
         return (value - self.start) / self.scale
 
 
-Bijection = Interval | Decades | HalfLine | Line
+Bijection = Interval | Decades | HalfLine | UnboundedLine
 
 
 def bijection(low: float, high: float, start: float) -> Bijection:
@@ -101,18 +101,18 @@ def bijection(low: float, high: float, start: float) -> Bijection:
     if math.isfinite(low) and math.isfinite(high):
         if low * high > 0:
             near, far = sorted((abs(low), abs(high)))
-            if far / near >= DECADE:
+            if far / near >= LOGARITHMIC_RATIO:
                 return Decades(Interval(math.log(near), math.log(far)), math.copysign(1.0, low))
         return Interval(low, high)
     if math.isfinite(low):
         return HalfLine(low, start - low)
     if math.isfinite(high):
         return HalfLine(high, start - high)
-    return Line(start, max(abs(start), 1.0))
+    return UnboundedLine(start, max(abs(start), 1.0))
 
 
 @dataclasses.dataclass(frozen=True)
-class Entry:
+class FreeParameter:
     """A free parameter: its path, shape, and the map of each of its numbers."""
 
     path: str
@@ -122,10 +122,10 @@ class Entry:
 
 
 @dataclasses.dataclass(frozen=True)
-class Space:
+class FreeSpace:
     """The free parameters of a part, in order; z has shape (size,)."""
 
-    entries: tuple[Entry, ...]
+    entries: tuple[FreeParameter, ...]
 
     @property
     def size(self) -> int:
@@ -168,20 +168,20 @@ class Space:
         within a factor of three of the present value on half lines."""
         u = np.asarray(jax.random.uniform(key, (count, self.size), minval=0.02, maxval=0.98))
         bounded = [isinstance(m, Interval | Decades) for entry in self.entries for m in entry.maps]
-        return (np.log(u) - np.log1p(-u)) * np.where(bounded, 1.0, NEAR)
+        return (np.log(u) - np.log1p(-u)) * np.where(bounded, 1.0, RANGE_END_SHARE)
 
-    def _of(self, part: Any) -> list[tuple[Entry, np.ndarray]]:
+    def _of(self, part: Any) -> list[tuple[FreeParameter, np.ndarray]]:
         there = {path: value for path, _, value in parameters(part)}
         return [(entry, np.asarray(there[entry.path], float)) for entry in self.entries]
 
     @staticmethod
-    def _placed(entry: Entry, value: np.ndarray) -> np.ndarray:
+    def _placed(entry: FreeParameter, value: np.ndarray) -> np.ndarray:
         for x, (low, high) in zip(value.ravel(), entry.ranges, strict=True):
             _check_inside(entry.path, float(x), low, high)
         return np.array([m.place(float(x)) for m, x in zip(entry.maps, value.ravel(), strict=True)])
 
 
-def space(part: Any, free: Sequence[str] | Mapping[str, Range | None]) -> Space:
+def parameter_space(part: Any, free: Sequence[str] | Mapping[str, Range | None]) -> FreeSpace:
     """The space of some parameters of a part, by dotted path; with a range each (numbers, or arrays of the parameter's
     shape), or None for the declared one.
 
@@ -198,10 +198,10 @@ def space(part: Any, free: Sequence[str] | Mapping[str, Range | None]) -> Space:
             raise ValueError(f"{path} is not a parameter; there is {', '.join(there)}")
         if not there[path][0].tunable:
             raise ValueError(f"{path} cannot be tuned: a run does not depend smoothly on it")
-    return Space(tuple(_entry(path, *there[path], ends) for path, ends in given.items()))
+    return FreeSpace(tuple(_entry(path, *there[path], ends) for path, ends in given.items()))
 
 
-def _entry(path: str, spec: Spec, value: np.ndarray, ends: Range | None) -> Entry:
+def _entry(path: str, spec: Spec, value: np.ndarray, ends: Range | None) -> FreeParameter:
     low, high = (np.broadcast_to(np.asarray(x, float), value.shape) for x in ends or (spec.low, spec.high))
     maps = []
     for a, b, x in zip(low.ravel(), high.ravel(), value.ravel(), strict=True):
@@ -212,11 +212,13 @@ def _entry(path: str, spec: Spec, value: np.ndarray, ends: Range | None) -> Entr
             raise ValueError(f"{path}: the range [{a:g}, {b:g}] leaves the declared one, {spec.interval()}")
         _check_inside(path, x, a, b)
         maps.append(bijection(a, b, x))
-    return Entry(path, value.shape, tuple(maps), tuple(zip(low.ravel().tolist(), high.ravel().tolist(), strict=True)))
+    return FreeParameter(
+        path, value.shape, tuple(maps), tuple(zip(low.ravel().tolist(), high.ravel().tolist(), strict=True))
+    )
 
 
 def _check_inside(path: str, value: float, low: float, high: float) -> None:
     ends = [end for end in (low, high) if math.isfinite(end)]
-    room = END * (high - low if len(ends) == 2 else max(1.0, *map(abs, ends), 0.0) if ends else 1.0)
+    room = END_SHARE * (high - low if len(ends) == 2 else max(1.0, *map(abs, ends), 0.0) if ends else 1.0)
     if not low + room <= value <= high - room:
         raise ValueError(f"{path} = {value:g} is not inside ({low:g}, {high:g}): it cannot be moved from there")

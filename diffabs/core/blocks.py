@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from diffabs.core.protocols import Block, Clock, Memory, no_flow, no_memory
 from diffabs.core.pytree import Scalar, part, pytree
-from diffabs.core.timing import steps
+from diffabs.core.timing import steps_in_period
 
 
 class Passage(NamedTuple):
@@ -47,7 +47,7 @@ class Series:
         for block in self.blocks:
             memories.append(block.start(signal))
             signal = block.output(0.0, memories[-1], signal)
-        return _joined(memories)
+        return _join_memories(memories)
 
     def flow(self, t: Scalar, memory: Memory, signal: Any) -> Any:
         """Their rates."""
@@ -75,7 +75,7 @@ class Series:
             after = block.tick(clock._replace(key=key, before=before), m, signal) if offers(block, "tick") else m
             signal, before = block.output(clock.t, after, signal), block.output(clock.t, m, before)
             memories.append(after)
-        return _joined(memories)
+        return _join_memories(memories)
 
     def margins(self, t: Scalar, memory: Memory, signal: Any, rate: Callable[[], Any]) -> tuple[Any, ...]:
         """Those of all blocks, in order."""
@@ -96,13 +96,13 @@ class Series:
                 after, fired = block.event(t, m, signal, fired[:count]), fired[count:]
             memories.append(after)
             signal = block.output(t, m, signal)
-        return _joined(memories)
+        return _join_memories(memories)
 
     def recorded(self, t: Scalar, memory: Memory, signal: Any) -> tuple[Any, ...]:
         """The signals of the blocks that record them, in order."""
         found: tuple[Any, ...] = ()
         for block, m in self._pairs(memory):
-            found += (recorded(block, t, m, signal),) if offers(block, "record") else ()
+            found += (record_signal(block, t, m, signal),) if offers(block, "record") else ()
             signal = block.output(t, m, signal)
         return found
 
@@ -116,7 +116,7 @@ class Series:
                 a, b, da, db = next(each)
                 m = block.record(m, passage._replace(values=(a, b), rates=(da, db)))
             memories.append(m)
-        return _joined(memories)
+        return _join_memories(memories)
 
     def _pairs(self, memory: Memory) -> Any:
         return [(b, Memory(f, h)) for b, f, h in zip(self.blocks, memory.flow, memory.held, strict=True)]
@@ -132,17 +132,17 @@ def next_tick(block: Any, k: Any, h: Scalar) -> Any:
     """Return the number of the first instant after the k-th of a grid of step h [s] at which a block ticks, that of a
     block made of blocks at which one does."""
     ticking = [one for one in getattr(block, "blocks", (block,)) if offers(one, "tick")]
-    lengths = [steps(one.period, h) if hasattr(one, "period") else 1 for one in ticking]
+    lengths = [steps_in_period(one.period, h) if hasattr(one, "period") else 1 for one in ticking]
     return reduce(jnp.minimum, ((k // n + 1) * n for n in lengths))
 
 
-def recorded(block: Any, t: Scalar, memory: Memory, signal: Any) -> Any:
+def record_signal(block: Any, t: Scalar, memory: Memory, signal: Any) -> Any:
     """Return what a block records of its signal: all of it; of blocks in series, the signal of each that records."""
     inner = getattr(block, "recorded", None)
     return inner(t, memory, signal) if inner else signal
 
 
-def _joined(memories: Sequence[Memory]) -> Memory:
+def _join_memories(memories: Sequence[Memory]) -> Memory:
     return Memory(tuple(m.flow for m in memories), tuple(m.held for m in memories))
 
 

@@ -15,17 +15,20 @@ F = TypeVar("F", bound=Callable)
 
 # JAX 0.10: its older emitters make the same numbers as the newer ones in half the time; later JAX has no such option.
 # Of a program's 32 parts, which cores may compile at the same time, each costs: four take a tenth less time.
-SAME: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
-if SAME and "codegen_split_count" not in os.environ.get("XLA_FLAGS", ""):
-    SAME["xla_cpu_parallel_codegen_split_count"] = 4
-QUICK: dict[str, Any] = {**SAME, "xla_backend_optimization_level": 0}  # rounds differently
+SAME_RESULT_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
+if SAME_RESULT_OPTIONS and "codegen_split_count" not in os.environ.get("XLA_FLAGS", ""):
+    SAME_RESULT_OPTIONS["xla_cpu_parallel_codegen_split_count"] = 4
+QUICK_COMPILE_OPTIONS: dict[str, Any] = {
+    **SAME_RESULT_OPTIONS,
+    "xla_backend_optimization_level": 0,
+}  # rounds differently
 
 
 def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | None = None) -> Callable[[F], F]:
     """Return the decorator `jax.jit` for a function that is mostly called with numbers, once for each of its shapes.
 
-    static: names of static arguments, by which they are given, or the number of leading ones. options: of XLA (`SAME`,
-    `QUICK`), which apply where nothing is traced."""
+    static: names of static arguments, by which they are given, or the number of leading ones
+    options: of XLA (`SAME_RESULT_OPTIONS`, `QUICK_COMPILE_OPTIONS`), which apply where nothing is traced"""
     leading, names = (static, ()) if isinstance(static, int) else (0, tuple(static))
     fixed: dict[str, Any] = {"static_argnums": tuple(range(leading)), "static_argnames": names}
 
@@ -35,7 +38,7 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | Non
 
         @functools.wraps(function)
         def call(*args: Any, **more: Any) -> Any:
-            return (plain if traced(args, more) else quick)(*args, **more)
+            return (plain if is_traced(args, more) else quick)(*args, **more)
 
         call._cache_size = lambda: plain._cache_size() + quick._cache_size()  # pyright: ignore
         return call  # pyright: ignore[reportReturnType]
@@ -43,7 +46,7 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | Non
     return decorate
 
 
-def traced(*trees: Any) -> bool:
+def is_traced(*trees: Any) -> bool:
     """Return whether a trace is under way (jit), or these are no numbers yet (also grad, vmap): options are for a whole
     program, and of what is no number nothing can be asked."""
     return isinstance(jax.device_put(0), Tracer) or any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, later_of_larger
 from diffabs.core.pytree import Scalar
 
-NEWTON = 4  # iterations from the secant, before the last: in a long step the cubic is no line
+NEWTON_ITERATIONS = 4  # iterations from the secant, before the last: in a long step the cubic is no line
 
 
 class Cubic(NamedTuple):
@@ -60,14 +60,14 @@ class Cubic(NamedTuple):
         spread = still.start - still.end
         x = clamp(still.start / jnp.where(spread == 0, 1.0, spread), 0.0, 1.0)
         low, high = jnp.zeros_like(x), jnp.ones_like(x)
-        for _ in range(NEWTON):  # a derivative by the root is wrong by as much as the root is
+        for _ in range(NEWTON_ITERATIONS):  # a derivative by the root is wrong by as much as the root is
             value = still(x)
             before = (value < 0) == (still.start < 0)
             low, high = jnp.where(before, x, low), jnp.where(before, high, x)
             newton = x - _quotient(value, still.slope(x))
             x = jnp.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
         x = clamp(x - _quotient(self(x), still.slope(x)), 0.0, 1.0)
-        x = _refined(x, self, still.slope(jax.lax.stop_gradient(x)))
+        x = _refine_zero(x, self, still.slope(jax.lax.stop_gradient(x)))
         changes = ((still.start < 0) != (still.end < 0)) | (still.start == 0)
         return jnp.where(changes, x, 1.0)
 
@@ -79,7 +79,7 @@ class Cubic(NamedTuple):
         square = c2 * c2 - 3.0 * c1 * c3
         bend = jnp.sqrt(jnp.where(inside & (square > 0), square, 1.0)) - c2
         x = clamp(_quotient(c1, bend), 0.0, 1.0)
-        x = _refined(x, self.slope, jnp.where(inside, 2.0 * c2 + 6.0 * c3 * x, 0.0))
+        x = _refine_zero(x, self.slope, jnp.where(inside, 2.0 * c2 + 6.0 * c3 * x, 0.0))
         ends = self._greater_end()
         top = self(x)
         return jnp.where(inside & (top > ends), top, ends)
@@ -98,7 +98,7 @@ class Cubic(NamedTuple):
         return self.start_slope, c2, self.start_slope + self.end_slope - 2.0 * rise
 
 
-def _refined(x: Any, function: Callable[[Any], Any], slope: Any) -> Any:
+def _refine_zero(x: Any, function: Callable[[Any], Any], slope: Any) -> Any:
     """x, with the derivatives of the zero of a function near x: those of a Newton step, whose order is twice that of
     x's."""
     left = function(x)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 
-def lazily(package: str) -> Callable[[str], Any]:
+def lazy_getattr(package: str) -> Callable[[str], Any]:
     """Return the `__getattr__` of a package (PEP 562) that imports for type checkers alone what it exports, each name
     `as` itself. The text of the package is read, so that it says this once."""
 

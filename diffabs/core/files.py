@@ -12,15 +12,15 @@ import tempfile
 from collections.abc import Iterator
 from typing import BinaryIO
 
-WAITING = getattr(os, "O_NONBLOCK", 0)  # opening a pipe that nobody writes to would wait for ever
+NONBLOCKING_FLAG = getattr(os, "O_NONBLOCK", 0)  # opening a pipe that nobody writes to would wait for ever
 
 _unfinished: set[pathlib.Path] = set()
 
 
 @contextlib.contextmanager
-def opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def open_regular(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """A regular file, to be read. Raises OSError for one that cannot be, and for a folder, a pipe or a device."""
-    handle = os.open(path, os.O_RDONLY | WAITING | getattr(os, "O_BINARY", 0))
+    handle = os.open(path, os.O_RDONLY | NONBLOCKING_FLAG | getattr(os, "O_BINARY", 0))
     try:
         if stat.S_ISDIR(os.fstat(handle).st_mode):
             raise OSError(errno.EISDIR, os.strerror(errno.EISDIR), os.fspath(path))
@@ -32,9 +32,9 @@ def opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         os.close(handle)
 
 
-def content(path: str | os.PathLike[str], most: int = sys.maxsize) -> bytes:
+def read_content(path: str | os.PathLike[str], most: int = sys.maxsize) -> bytes:
     """The first `most` bytes of a regular file. Raises OSError, as `opened`."""
-    with opened(path) as file:
+    with open_regular(path) as file:
         return file.read(-1 if most == sys.maxsize else most)
 
 
@@ -52,7 +52,7 @@ def make_room(folder: pathlib.Path, pattern: str, room: int) -> None:
 
 
 @contextlib.contextmanager
-def unfinished(path: pathlib.Path) -> Iterator[pathlib.Path]:
+def temporary_path(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """A file or folder that is gone afterwards, unless it was renamed to its place; also where `clear` has to end what
     a thread still does."""
     _unfinished.add(path)
@@ -72,13 +72,13 @@ def new_file(target: pathlib.Path, temporary: pathlib.Path | None = None) -> Ite
     one process writes; else one that nobody else has. Raises OSError where no file can be made."""
     temporary = temporary or target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     temporary.touch(exist_ok=False)
-    with unfinished(temporary):
+    with temporary_path(temporary):
         yield temporary
         if temporary.exists():
             temporary.replace(target)
 
 
-def write(target: pathlib.Path, data: bytes) -> None:
+def write_file(target: pathlib.Path, data: bytes) -> None:
     """Write a file, whole or not at all. Raises OSError."""
     with new_file(target) as temporary:
         temporary.write_bytes(data)
@@ -125,7 +125,7 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
     """An empty folder beside `target` that takes its place at the end, or vanishes if anything goes wrong. Raises
     OSError where the folder cannot be made or replaced; the old one is then back."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    with unfinished(pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))) as room:
+    with temporary_path(pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))) as room:
         new, old = room / "new", room / "old"
         new.mkdir()
         yield new
@@ -139,7 +139,7 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
             raise
 
 
-def clear() -> None:
+def remove_unfinished() -> None:
     """Remove what is unfinished: for a process that leaves without waiting for its threads."""
     for path in list(_unfinished):
         _remove(path)

@@ -31,7 +31,7 @@ def without_derivative(path: str, x: Any) -> Any:
 
 
 @without_derivative.defjvp
-def _named(path: str, at: Any, moves: Any) -> tuple[Any, Any]:
+def _raise_for_parameter(path: str, at: Any, moves: Any) -> tuple[Any, Any]:
     # JAX asks for this rule only where x has a tangent: one that is known to be zero does not come here.
     del at, moves
     raise ValueError(
@@ -40,18 +40,18 @@ def _named(path: str, at: Any, moves: Any) -> tuple[Any, Any]:
     )
 
 
-def _refused(at: Any, moves: Any, *, why: str) -> Any:
+def _raise_for_second_derivative(at: Any, moves: Any, *, why: str) -> Any:
     del at, moves
     raise ValueError(why)
 
 
-def _batched(at: Any, axes: Any, *, why: str) -> Any:
+def _batch_refusal(at: Any, axes: Any, *, why: str) -> Any:
     return _operation.bind(*at, why=why), axes[0]
 
 
 _operation.def_impl(lambda x, *, why: x)
 _operation.def_abstract_eval(lambda x, *, why: x)
-ad.primitive_jvps[_operation] = _refused
+ad.primitive_jvps[_operation] = _raise_for_second_derivative
 ad.primitive_transposes[_operation] = lambda cotangent, x, *, why: [first_order(cotangent, why)]
-batching.primitive_batchers[_operation] = _batched
+batching.primitive_batchers[_operation] = _batch_refusal
 mlir.register_lowering(_operation, lambda ctx, x, *, why: [x])

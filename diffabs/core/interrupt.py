@@ -16,21 +16,21 @@ import threading
 from typing import Any
 
 INTERRUPTED, TERMINATED = 130, 143  # exit status after Ctrl-C, after SIGTERM
-UNHEARD = 3
+MAX_UNHEARD_PRESSES = 3
 SHOW_CURSOR = b"\x1b[?25h"
-PROGRAMS = ("diffabs", "-m")  # `python -m diffabs` is called -m until the package is imported
+COMMAND_NAMES = ("diffabs", "-m")  # `python -m diffabs` is called -m until the package is imported
 
 _pending = 0
 _terminated = False
 
 
-def early() -> None:
+def end_early_on_interrupt() -> None:
     """If this process is the command `diffabs`, Ctrl-C ends it at once, until `begin()`; a library leaves it alone."""
     if _is_command():
         _answer(_leave)
 
 
-def begin() -> None:
+def begin_hearing() -> None:
     """From now on Ctrl-C and SIGTERM are heard where `pressed()` is asked, if the process does not ignore them."""
     global _pending
     _pending = 0
@@ -39,18 +39,18 @@ def begin() -> None:
         signal.signal(signal.SIGTERM, _terminate)
 
 
-def finish() -> None:
+def stop_hearing() -> None:
     """From now on the process ends, and cannot be interrupted in that."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def terminated() -> bool:
+def was_terminated() -> bool:
     """Whether SIGTERM was among the signals."""
     return _terminated
 
 
-def pressed() -> bool:
+def take_interrupt() -> bool:
     """Whether Ctrl-C was pressed since this was last answered with yes."""
     global _pending
     if not _pending:
@@ -62,7 +62,7 @@ def pressed() -> bool:
 def _is_command() -> bool:
     multiprocessing = sys.modules.get("multiprocessing.process")
     child = multiprocessing is not None and multiprocessing.parent_process() is not None
-    return not child and pathlib.Path(sys.argv[0] if sys.argv else "").name.removesuffix(".exe") in PROGRAMS
+    return not child and pathlib.Path(sys.argv[0] if sys.argv else "").name.removesuffix(".exe") in COMMAND_NAMES
 
 
 def _answer(handler: Any) -> None:
@@ -76,7 +76,7 @@ def _answer(handler: Any) -> None:
 def _press(*_: Any) -> None:
     global _pending
     _pending += 1
-    if _pending >= UNHEARD:
+    if _pending >= MAX_UNHEARD_PRESSES:
         _leave()
 
 

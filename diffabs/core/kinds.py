@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 FEWEST_BITS = 32  # of a float: in 16, the instants of a run are all the same after a second
-LONGEST = 60  # characters of a value in a message
+MAX_SHOWN_LENGTH = 60  # characters of a value in a message
 
 
-def objection(value: Any) -> str:
+def find_value_objection(value: Any) -> str:
     """What keeps a value from being a number of a run, or an array of them, such as `is text`; empty if nothing does.
     Types alone are looked at, so it may be traced."""
     if type(value) is float:
         return ""
     if isinstance(value, list | tuple):
-        return next(filter(None, map(objection, value)), "")
+        return next(filter(None, map(find_value_objection, value)), "")
     if hasattr(value, "dtype"):
         return _of_type(value.dtype)
     if isinstance(value, str | bytes):
@@ -48,17 +48,17 @@ def _of_type(dtype: Any) -> str:
     return next((line for kind, line in kinds.items() if jnp.issubdtype(dtype, kind)), f"is of type {dtype}")
 
 
-def shape(value: Any) -> tuple[int, ...]:
+def value_shape(value: Any) -> tuple[int, ...]:
     """Of an array, a number, or a list of them; it may be traced."""
     if isinstance(value, list | tuple):
-        return (len(value), *(shape(value[0]) if value else ()))
+        return (len(value), *(value_shape(value[0]) if value else ()))
     return np.shape(value)
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """A value as it may stand in a message: on one line, of bounded length."""
     try:
         text = " ".join(str(value).split()) if hasattr(value, "dtype") else repr(value)
     except ValueError:  # a whole number of thousands of digits
         text = "..."
-    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+    return text if len(text) <= MAX_SHOWN_LENGTH else f"{text[: MAX_SHOWN_LENGTH - 3]}..."

@@ -39,32 +39,32 @@ class Log:
         return jnp.where((places == self.place.astype(int))[:, None], self.row, rows) if self.lent else rows
 
 
-def tables(tree: Any) -> list[Any]:
+def log_rows(tree: Any) -> list[Any]:
     """Return the rows of all logs."""
     return [log.rows for log in jax.tree.leaves(tree, is_leaf=_is_log) if _is_log(log)]
 
 
-def lend(tree: Any, rows: list[Any] | None) -> Any:
+def borrow(tree: Any, rows: list[Any] | None) -> Any:
     """Return a tree whose logs have these rows, lent; with None, no rows at all."""
     each = iter(rows or ())
-    return _mapped(lambda log: Log(next(each) if rows else None, log.place, log.row, lent=True), tree)
+    return _map_logs(lambda log: Log(next(each) if rows else None, log.place, log.row, lent=True), tree)
 
 
-def settle(tree: Any, rows: list[Any]) -> Any:
+def commit(tree: Any, rows: list[Any]) -> Any:
     """Return a tree whose logs have these rows, and the row that was put while they were lent."""
     each = iter(rows)
-    return _mapped(lambda log: Log(next(each), log.place, log.row).put(log.place, log.row), tree)
+    return _map_logs(lambda log: Log(next(each), log.place, log.row).put(log.place, log.row), tree)
 
 
-def written(tree: Any) -> list[Any]:
+def write_last_rows(tree: Any) -> list[Any]:
     """Return the rows of all logs with the row that was put last. Who writes what the step before has put, and then
     reads, does so in place; who reads first needs a copy, unless the row depends on what was read."""
-    return tables(settle(tree, tables(tree)))
+    return log_rows(commit(tree, log_rows(tree)))
 
 
 def _is_log(x: Any) -> bool:
     return isinstance(x, Log)
 
 
-def _mapped(change: Any, tree: Any) -> Any:
+def _map_logs(change: Any, tree: Any) -> Any:
     return jax.tree.map(lambda x: change(x) if _is_log(x) else x, tree, is_leaf=_is_log)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.blocks import Direct, NoFeedforward, Passage, next_tick, offers, recorded
+from diffabs.core.blocks import Direct, NoFeedforward, Passage, next_tick, offers, record_signal
 from diffabs.core.protocols import (
     Block,
     Clock,
@@ -96,8 +96,10 @@ class Loop:
         control = self.actuator.output(t, state.actuator, command)
         setpoint = self.reference.setpoint(state.reference)
         sample = Sample(t, y, tracking.target, setpoint, tracking.feedforward, command, control)
-        given = _seen(Signals(sample, measured, tracking, {}))
-        kept = {name: recorded(getattr(self, name), t, getattr(state, name), given[name]) for name in self.recorders}
+        given = _block_inputs(Signals(sample, measured, tracking, {}))
+        kept = {
+            name: record_signal(getattr(self, name), t, getattr(state, name), given[name]) for name in self.recorders
+        }
         return Signals(sample, measured, tracking, kept)
 
     def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[Any, ...]:
@@ -143,8 +145,8 @@ class Loop:
 
     def margins(self, t: Scalar, state: LoopState, signals: Signals, flow: Callable[[], Any]) -> Margins:
         """The stop's margin and those of the blocks; `flow()` is d(state.flow())/dt, for those that need a rate."""
-        rates = cache(lambda: _seen(self.signal_rates(t, state, flow())))
-        seen = _seen(signals)
+        rates = cache(lambda: _block_inputs(self.signal_rates(t, state, flow())))
+        seen = _block_inputs(signals)
 
         def of(name: str) -> tuple[Any, ...]:
             return getattr(self, name).margins(t, getattr(state, name), seen[name], lambda: rates()[name])
@@ -169,7 +171,7 @@ class Loop:
         fired: a bool for each margin, whether it has just fallen through zero
         passed: the step that ends here, for the blocks that record it; none does at the start of a run
         """
-        was, moved = _seen(before), False
+        was, moved = _block_inputs(before), False
 
         def changed(name: str, signal: Any) -> Memory:
             nonlocal state, moved
@@ -215,13 +217,13 @@ def _jumps(one: Any) -> bool:
     return getattr(one, "jumps", False) or any(map(_jumps, parts(one)))
 
 
-def _seen(signals: Signals) -> dict[str, Any]:
+def _block_inputs(signals: Signals) -> dict[str, Any]:
     """What each block is given."""
     sample, measured, tracking, _ = signals
     return {"sensor": sample.output, "reference": measured, "controller": tracking, "actuator": sample.command}
 
 
-def signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, Any]]:
+def run_signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, Any]]:
     """Unit and values of what is kept of a run, by name: time, all that the plant shows, target, command, control."""
     units = plant.shows.units
     shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from diffabs.core.cubic import Cubic
 from diffabs.core.pytree import Scalar
-from diffabs.core.timing import steps
+from diffabs.core.timing import steps_in_period
 
 
 class BrakeOutput(NamedTuple):
@@ -72,7 +72,7 @@ class Clock(NamedTuple):
         """Whether a clock of this period [s] (None: that of the grid) strikes now, and for how many times before."""
         if period is None:
             return jnp.asarray(self.on_grid), self.k
-        n = steps(period, self.h)
+        n = steps_in_period(period, self.h)
         return self.on_grid & (self.k % n == 0), self.k // n
 
 
@@ -166,7 +166,7 @@ class Segment(NamedTuple):
         )
 
 
-def still(sample: Sample, h: Scalar) -> Segment:
+def resting_segment(sample: Sample, h: Scalar) -> Segment:
     """Return a step of length h [s] in which nothing moves."""
     sample = jax.tree.map(jnp.asarray, sample)
     rest = jax.tree.map(jnp.zeros_like, sample)

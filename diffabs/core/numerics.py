@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from diffabs.core.pytree import Scalar
 
-EQUAL = 1024.0  # precisions: two values of a signal at instants that are one to rounding
+EQUAL_EPS = 1024.0  # precisions: two values of a signal at instants that are one to rounding
 
 
 def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
@@ -29,7 +29,7 @@ def later_of_larger(x: Scalar, y: Scalar, falls: Any = False) -> Any:
     """max(x, y) of two values one after the other. Where they are equal to rounding, the slope is that of the later
     one, y: the end of a step without a length moves with the event there, its beginning does not. If the signal `falls`
     from x on, it is that of x: a peak at an event that is a rounding before the grid does not stand on the grid."""
-    rounding = EQUAL * jnp.finfo(jnp.result_type(x, y)).eps * jnp.abs(x)
+    rounding = EQUAL_EPS * jnp.finfo(jnp.result_type(x, y)).eps * jnp.abs(x)
     more = jnp.where(falls, rounding, -rounding)
     return jnp.where(jnp.greater_equal(y, x + more), y, x)
 
@@ -90,14 +90,14 @@ def odd(curve: Callable[[Any], Any], x: Scalar) -> Any:
     return s * curve(s * x)
 
 
-def risen(x: Scalar, nodes: Any) -> Any:
+def interval_shares(x: Scalar, nodes: Any) -> Any:
     """How much of each interval between nodes (n,), which increase, lies below x, from 0 to 1 (n-1,). A `table` is a
     sum over it: no index to look up, which derivatives would have to scatter to."""
     inside = (x - nodes[:-1]) / jnp.diff(nodes)
     return jnp.where(x >= nodes[1:], 1.0, jnp.where(x < nodes[:-1], 0.0, inside))
 
 
-def table(risen: Any, values: Any) -> Any:
+def interpolate_shares(risen: Any, values: Any) -> Any:
     """The values (n,) at the nodes: linear between them, constant beyond."""
     return values[0] + jnp.sum(risen * jnp.diff(values))
 

@@ -7,18 +7,18 @@ import struct
 import zlib
 from collections.abc import Iterator
 
-AXES = "diffabs-axes"  # the keyword of the numbers that a figure shows, as JSON
-BEGINNING = b"\x89PNG\r\n\x1a\n"
-HEADER = len(BEGINNING) + 25  # bytes until after IHDR, which is always the first chunk
+AXES_KEY = "diffabs-axes"  # the keyword of the numbers that a figure shows, as JSON
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_HEADER_BYTES = len(PNG_SIGNATURE) + 25  # bytes until after IHDR, which is always the first chunk
 
 
 def with_text(picture: bytes, key: str, text: str) -> bytes:
     """Return a PNG with a text of ASCII under a keyword; what is no PNG as it is."""
-    if not picture.startswith(BEGINNING):
+    if not picture.startswith(PNG_SIGNATURE):
         return picture
     data = b"tEXt" + key.encode("ascii") + b"\0" + text.encode("ascii")
     chunk = struct.pack(">I", len(data) - 4) + data + struct.pack(">I", zlib.crc32(data))
-    return picture[:HEADER] + chunk + picture[HEADER:]
+    return picture[:PNG_HEADER_BYTES] + chunk + picture[PNG_HEADER_BYTES:]
 
 
 def without_text(picture: bytes, key: str) -> tuple[bytes, str]:
@@ -34,7 +34,7 @@ def without_text(picture: bytes, key: str) -> tuple[bytes, str]:
 
 def _chunks(picture: bytes) -> Iterator[tuple[int, int]]:
     """Where chunks begin and end."""
-    start = len(BEGINNING) if picture.startswith(BEGINNING) else len(picture)
+    start = len(PNG_SIGNATURE) if picture.startswith(PNG_SIGNATURE) else len(picture)
     while start + 12 <= len(picture):
         end = start + 12 + int.from_bytes(picture[start : start + 4], "big")
         if end > len(picture):

@@ -65,7 +65,7 @@ from diffabs.core.messages import Sample as Sample
 from diffabs.core.messages import Segment as Segment
 from diffabs.core.messages import Shown as Shown
 from diffabs.core.messages import Tracking as Tracking
-from diffabs.core.messages import still as still
+from diffabs.core.messages import resting_segment as resting_segment
 from diffabs.core.pytree import Scalar
 
 

@@ -23,7 +23,7 @@ def versions(*packages: str) -> dict[str, str]:
     return {"diffabs": own, **found, "python": platform.python_version()}
 
 
-def origin(*packages: str) -> dict[str, str]:
+def describe_platform(*packages: str) -> dict[str, str]:
     """Return what can change a bit of a result: `versions`, JAX's backend, and the processor."""
     return versions(*packages) | {"backend": jax.default_backend(), "machine": platform.machine()}
 
@@ -38,7 +38,7 @@ def processor() -> str:
     return hashlib.sha256(known.encode()).hexdigest()[:12]
 
 
-def made(words: Sequence[str]) -> dict[str, str | int]:
+def describe_making(words: Sequence[str]) -> dict[str, str | int]:
     """Return when (UTC) and on which kind of machine something is computed, the commit where there is one, and the
     command, of the words after `diffabs`, that computes it again."""
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)

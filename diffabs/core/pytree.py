@@ -23,9 +23,9 @@ from jax.typing import ArrayLike
 
 from diffabs.core import kinds
 from diffabs.core.arrays import as_array
-from diffabs.core.compiling import traced
-from diffabs.core.rules import array
-from diffabs.core.units import Units, in_loop, units_of
+from diffabs.core.compiling import is_traced
+from diffabs.core.rules import as_rule_array
+from diffabs.core.units import Units, resolve_unit, units_of
 
 Scalar = Any  # a float, a NumPy or JAX scalar, a tracer; a batch of them under vmap
 Vector = Any  # the same with one axis
@@ -58,12 +58,12 @@ class Spec:
 
     def around(self, units: Units | None) -> "Spec":
         """The same in a loop, in whose units a relative unit is worked out."""
-        unit = in_loop(self.unit, units)
+        unit = resolve_unit(self.unit, units)
         return self if unit == self.unit else dataclasses.replace(self, unit=unit)
 
     def within(self, value: Any) -> Any:
         """Whether every element lies in the range, also of traced numbers. Written so that NaN does not."""
-        x = array(value)
+        x = as_rule_array(value)
         above = x > self.low if self.open_low else x >= self.low
         below = x < self.high if self.open_high else x <= self.high
         return (above & below & ((abs(x) < math.inf) | self.infinite)).all()
@@ -238,69 +238,69 @@ def _replace(part: Any, names: list[str], value: Any) -> Any:
     return dataclasses.replace(part, **{head: new})  # pyright: ignore[reportArgumentType]  # an instance
 
 
-def arrayed(part: T) -> T:
+def as_arrays(part: T) -> T:
     """The same part with arrays where a parameter is a list or a tuple of numbers."""
     listed = {path: value for path, _, value in parameters(part) if isinstance(value, list | tuple)}
     return replace(part, {path: jnp.asarray(value) for path, value in listed.items()})
 
 
-def strong(tree: T) -> T:
+def canonical_dtypes(tree: T) -> T:
     """Every leaf as a float array of one dtype: that of the arrays among the leaves, else JAX's default float.
 
     Python numbers are weakly typed: mixed with arrays they would cause a second compilation of the same function.
     Raises ValueError for a leaf that is no real number, or a float of fewer than 32 bits.
     """
     leaves, structure = jax.tree.flatten(tree)
-    if any(map(kinds.objection, leaves)):
-        raise ValueError(_unfit(tree))
+    if any(map(kinds.find_value_objection, leaves)):
+        raise ValueError(_first_unfit(tree))
     arrays = {x.dtype for x in leaves if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating)}
     dtype = jnp.result_type(*arrays) if arrays else jnp.result_type(float)
-    if traced(leaves):
+    if is_traced(leaves):
         return structure.unflatten([jnp.asarray(x, dtype) for x in leaves])
     with np.errstate(over="ignore"):  # what single precision cannot hold is infinite
         return structure.unflatten([as_array(x, dtype) for x in leaves])
 
 
-def _unfit(tree: Any) -> str:
+def _first_unfit(tree: Any) -> str:
     """The first leaf that is no number of a run."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
-    path, leaf = next((path, leaf) for path, leaf in leaves if kinds.objection(leaf))
-    return f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.shown(leaf)} {kinds.objection(leaf)}"
+    path, leaf = next((path, leaf) for path, leaf in leaves if kinds.find_value_objection(leaf))
+    return f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.format_value(leaf)} {kinds.find_value_objection(leaf)}"
 
 
-def prepared(part: Any) -> Any:
+def prepare_parts(part: Any) -> Any:
     """The same parts, with everything worked out that does not change during a run: a part that has a method
     `prepared()` is replaced by what it returns. Differentiable; a run does it once, inside its compiled function."""
-    return _rebuilt(part, "prepared")
+    return _rebuild_parts(part, "prepared")
 
 
-def refined(part: Any, times: int) -> Any:
+def refine_parts(part: Any, times: int) -> Any:
     """The same parts for steps that are so many times shorter: a part whose memory is as long as so many steps has a
     method `refined(times)`."""
-    return _rebuilt(part, "refined", times)
+    return _rebuild_parts(part, "refined", times)
 
 
-def differentiated(part: Any, paths: Iterable[str], prefix: str = "") -> Any:
+def prepare_derivatives(part: Any, paths: Iterable[str], prefix: str = "") -> Any:
     """The same parts, where derivatives by the parameters at these paths are asked for: a part that has a method
     `differentiated(names)` is replaced by what it returns for those of its own."""
     if isinstance(part, tuple):
-        return tuple(differentiated(item, paths, f"{prefix}{i}.") for i, item in enumerate(part))
+        return tuple(prepare_derivatives(item, paths, f"{prefix}{i}.") for i, item in enumerate(part))
     if not dataclasses.is_dataclass(part):
         return part
     fields = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
-    inner = {name: differentiated(getattr(part, name), paths, f"{prefix}{name}.") for name in fields}
+    inner = {name: prepare_derivatives(getattr(part, name), paths, f"{prefix}{name}.") for name in fields}
     part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
     own = {path.removeprefix(prefix) for path in paths if path.startswith(prefix)}
     return part.differentiated(own) if hasattr(part, "differentiated") else part
 
 
-def _rebuilt(part: Any, method: str, *args: Any) -> Any:
+def _rebuild_parts(part: Any, method: str, *args: Any) -> Any:
     """The same parts, each that has this method replaced by what it returns; the innermost first."""
     if isinstance(part, tuple):
-        return tuple(_rebuilt(item, method, *args) for item in part)
+        return tuple(_rebuild_parts(item, method, *args) for item in part)
     if not dataclasses.is_dataclass(part):
         return part
     fields = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
-    inner = {name: _rebuilt(getattr(part, name), method, *args) for name in fields}
+    inner = {name: _rebuild_parts(getattr(part, name), method, *args) for name in fields}
     part = dataclasses.replace(part, **inner) if inner else part  # pyright: ignore[reportArgumentType]
     return getattr(part, method)(*args) if hasattr(part, method) else part

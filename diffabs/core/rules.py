@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.units import Units, in_words
+from diffabs.core.units import Units, insert_unit
 
-SHOWN = 8  # numbers of a list in a message
+MAX_SHOWN_NUMBERS = 8  # numbers of a list in a message
 
 
 class Rule(NamedTuple):
@@ -26,32 +26,34 @@ class Rule(NamedTuple):
 
     def under(self, prefix: str, units: Units | None = None) -> "Rule":
         """The same rule, of a part at this place, in a loop with these units."""
-        return Rule(self.holds, prefix + self.broken, lambda: prefix + in_words(self.says(), units))
+        return Rule(self.holds, prefix + self.broken, lambda: prefix + insert_unit(self.says(), units))
 
 
-def array(x: Any) -> Any:
+def as_rule_array(x: Any) -> Any:
     """An array to calculate with: traced numbers as they are, others in float64 whatever JAX's default type is."""
     if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(x)):
         return jnp.asarray(x)
     return np.asarray(x, float)
 
 
-def ordered(low: tuple[str, Any], high: tuple[str, Any], unit: str, *, equal: bool = True) -> Rule:
+def order_rule(low: tuple[str, Any], high: tuple[str, Any], unit: str, *, equal: bool = True) -> Rule:
     """A lower limit that does not exceed the upper one, or lies below it; both (name, value)."""
     (below, a), (above, b) = low, high
     relation = "exceeds" if equal else "is not below"
     return Rule(
-        array(a) <= array(b) if equal else array(a) < array(b),
+        as_rule_array(a) <= as_rule_array(b) if equal else as_rule_array(a) < as_rule_array(b),
         f"{below} {relation} {above}",
         lambda: f"{below} = {a:g} {unit} {relation} {above} = {b:g} {unit}",
     )
 
 
-def increasing(name: str, values: Any, broken: str, unit: str) -> Rule:
+def increase_rule(name: str, values: Any, broken: str, unit: str) -> Rule:
     """Numbers (n,) each of which is greater than the one before."""
-    x = array(values)
+    x = as_rule_array(values)
     return Rule(
         (x[1:] > x[:-1]).all(),
         f"{name} {broken}",
-        lambda: f"{name} = {np.asarray(x).tolist()} {unit} {broken}" if len(x) <= SHOWN else f"{name} {broken}",
+        lambda: (
+            f"{name} = {np.asarray(x).tolist()} {unit} {broken}" if len(x) <= MAX_SHOWN_NUMBERS else f"{name} {broken}"
+        ),
     )

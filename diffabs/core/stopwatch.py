@@ -10,7 +10,7 @@ from typing import Any
 
 import jax.monitoring
 
-TOLD = "/jax/core/compile/"  # how events of JAX begin that are about compiling, tracing included
+COMPILE_EVENT = "/jax/core/compile/"  # how events of JAX begin that are about compiling, tracing included
 
 
 class Stopwatch:
@@ -39,23 +39,23 @@ _compiling = Stopwatch()
 _listening = False
 
 
-def listen() -> None:
+def count_compilations() -> None:
     """Count from now on what JAX compiles."""
     global _listening
     if not _listening:
         _listening = True
-        jax.monitoring.register_event_duration_secs_listener(_told)
+        jax.monitoring.register_event_duration_secs_listener(_add_duration)
 
 
-def _told(event: str, duration_secs: float, **more: Any) -> None:
+def _add_duration(event: str, duration_secs: float, **more: Any) -> None:
     del more
-    if event.startswith(TOLD):
+    if event.startswith(COMPILE_EVENT):
         now = time.monotonic()
         _compiling.add(now - duration_secs, now)
 
 
 @contextlib.contextmanager
-def compiling() -> Iterator[None]:
+def count_as_compiling() -> Iterator[None]:
     """Count what happens within as compiling."""
     start = time.monotonic()
     try:
@@ -64,7 +64,7 @@ def compiling() -> Iterator[None]:
         _compiling.add(start, time.monotonic())
 
 
-def compiled(since: float = 0.0) -> float:
+def compile_time_since(since: float = 0.0) -> float:
     """Return for how long [s] something was compiled from an instant of `time.monotonic` on; what has not ended yet is
     not in it."""
     return _compiling.seconds(since)

@@ -7,23 +7,23 @@ from typing import Any
 
 import numpy as np
 
-NOTHING = 1e-14  # less than this is rounding, of numbers in SI
+ZERO_TOLERANCE = 1e-14  # less than this is rounding, of numbers in SI
 
 
-def number(value: Any, digits: int = 6) -> str:
+def round_for_table(value: Any, digits: int = 6) -> str:
     """Return a number for a table, to so many digits: what is rounding alone is 0."""
     value = float(value)
-    return "0" if abs(value) < NOTHING else f"{value:.{digits}g}"
+    return "0" if abs(value) < ZERO_TOLERANCE else f"{value:.{digits}g}"
 
 
-def cell(value: Any) -> str:
+def format_cell(value: Any) -> str:
     """Return what a table shows of a value: of a list the first four entries."""
     if isinstance(value, str | bool | np.bool_) or value is None:
         return "" if value is None else str(value)
     if np.ndim(value):
         rows = np.asarray(value).reshape(-1)
-        return f"[{', '.join(map(number, rows[:4]))}{', ...' if len(rows) > 4 else ''}]"
-    return str(value) if isinstance(value, int) else number(value)
+        return f"[{', '.join(map(round_for_table, rows[:4]))}{', ...' if len(rows) > 4 else ''}]"
+    return str(value) if isinstance(value, int) else round_for_table(value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Summary:
 
     def __str__(self) -> str:
         """As text."""
-        lines = [list(self.columns), *([cell(value) for value in row] for row in self.rows)] if self.rows else []
+        lines = [list(self.columns), *([format_cell(value) for value in row] for row in self.rows)] if self.rows else []
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         table = [
             "  ".join(word.ljust(width) for word, width in zip(line, widths, strict=True)).rstrip() for line in lines
@@ -58,4 +58,4 @@ class Summary:
 
 
 def _row(values: Sequence[Any]) -> str:
-    return f"<tr>{''.join(f'<td>{html.escape(cell(value))}</td>' for value in values)}</tr>"
+    return f"<tr>{''.join(f'<td>{html.escape(format_cell(value))}</td>' for value in values)}</tr>"

@@ -6,17 +6,17 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.pytree import Scalar
-from diffabs.core.rules import Rule, array
+from diffabs.core.rules import Rule, as_rule_array
 
 
-def steps(period: Scalar, h: Scalar) -> Any:
+def steps_in_period(period: Scalar, h: Scalar) -> Any:
     """How many steps of length h make a period. An integer, so without a derivative."""
     return jnp.maximum(jnp.round(jax.lax.stop_gradient(period / h)), 1).astype(int)
 
 
 def whole_steps(name: str, period: Scalar, step: float) -> Rule:
     """A period is a whole multiple of the step."""
-    count = array(period) / step
+    count = as_rule_array(period) / step
     return Rule(
         (count >= 0.5) & (abs(count - count.round()) <= 1e-6 * count),
         f"{name} is not a multiple of solver.step = {step:g} s",

@@ -12,13 +12,13 @@ from diffabs.core.first_order import first_order
 from diffabs.core.pytree import parameters
 
 
-def asked(tangents: Any) -> frozenset[str]:
+def differentiated_paths(tangents: Any) -> frozenset[str]:
     """Return the paths of a part's parameters by which it is differentiated, from its tangents in a rule with
     `symbolic_zeros`."""
     return frozenset(path for path, _, move in parameters(tangents) if type(move) is not SymbolicZero)
 
 
-def pushed(function: Callable[..., Any], primals: Any, tangents: Any, once: str = "") -> tuple[Any, Any]:
+def jvp_nonzero(function: Callable[..., Any], primals: Any, tangents: Any, once: str = "") -> tuple[Any, Any]:
     """Return function(*primals) and its derivative along tangents, of a rule with `symbolic_zeros`. Only what has a
     tangent is differentiated: zeros worked out would cost as much as any other.
 
@@ -38,7 +38,7 @@ def pushed(function: Callable[..., Any], primals: Any, tangents: Any, once: str 
     return found, first_order(rate, once)
 
 
-def separated(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[Any], Any]]:
+def split_batched(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[Any], Any]]:
     """`make` over a batch, with what does not depend on the batch worked out once: the leaves (n, ...) that do, and a
     function from those of one member to the whole. In a loop over lanes constants then stay numbers, which a processor
     keeps in registers, instead of becoming columns."""
@@ -61,13 +61,13 @@ def separated(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[An
     return jax.vmap(moving)(batch) if any(moves) else [], whole
 
 
-def follows(function: Callable[[Any], Any], signal: Any) -> bool:
+def depends_on_signal(function: Callable[[Any], Any], signal: Any) -> bool:
     """Return whether what a function of a signal returns depends on it, as its program has it; a product with a zero
     that stands there does not."""
-    return any(leaves_followed(function, signal))
+    return any(leaf_dependence(function, signal))
 
 
-def leaves_followed(function: Callable[[Any], Any], signal: Any) -> list[bool]:
+def leaf_dependence(function: Callable[[Any], Any], signal: Any) -> list[bool]:
     """Return for each leaf of a signal whether what a function of it returns depends on the leaf, as in `follows`."""
     program = jax.make_jaxpr(function)(signal).jaxpr
     needed = {atom for atom in program.outvars if not hasattr(atom, "val")}
@@ -77,7 +77,7 @@ def leaves_followed(function: Callable[[Any], Any], signal: Any) -> list[bool]:
     return [atom in needed for atom in program.invars]
 
 
-def moving(function: Callable[[Any, Any], Any], fixed: Any, batch: Any) -> Any:
+def moving_leaves(function: Callable[[Any, Any], Any], fixed: Any, batch: Any) -> Any:
     """Return by which leaves of `batch` (n, ...) function(fixed, batch), of one member, has derivatives: truths, as
     `batch`. What only decides has none."""
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (fixed, batch))

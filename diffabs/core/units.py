@@ -10,8 +10,8 @@ import functools
 import re
 from typing import Any, NamedTuple
 
-RELATIVE = re.compile(r"\b(control|signal)\b")
-FACTOR = re.compile(r"(/?)\s*([^\s/^]+)(?:\^(\d+))?")
+RELATIVE_UNIT = re.compile(r"\b(control|signal)\b")
+UNIT_FACTOR = re.compile(r"(/?)\s*([^\s/^]+)(?:\^(\d+))?")
 
 
 class Units(NamedTuple):
@@ -28,12 +28,12 @@ def units_of(plant: Any) -> Units | None:
 
 
 @functools.lru_cache(maxsize=1024)
-def in_loop(unit: str, units: Units | None) -> str:
+def resolve_unit(unit: str, units: Units | None) -> str:
     """Return a unit with `control` and `signal` worked out: "V s/rad". Without a loop (None) it stays as it is. Units
     of a list's elements are separated by commas."""
-    if units is None or not RELATIVE.search(unit):
+    if units is None or not RELATIVE_UNIT.search(unit):
         return unit
-    return ", ".join(_multiplied(one, units._asdict()) for one in unit.split(", "))
+    return ", ".join(_multiply_units(one, units._asdict()) for one in unit.split(", "))
 
 
 def unit_at(unit: str, place: int, count: int) -> str:
@@ -42,17 +42,17 @@ def unit_at(unit: str, place: int, count: int) -> str:
     return units[place * len(units) // count]
 
 
-def in_words(text: str, units: Units | None) -> str:
+def insert_unit(text: str, units: Units | None) -> str:
     """Return a sentence with the control's unit in the place of ` {control}`, or nothing where that is not known."""
     return text.replace(" {control}", f" {units.control}" if units and units.control != "1" else "")
 
 
-def _multiplied(unit: str, meaning: dict[str, str]) -> str:
+def _multiply_units(unit: str, meaning: dict[str, str]) -> str:
     """A product of powers, in the order in which they first occur; those of negative power behind a slash each."""
     powers: dict[str, int] = {}
-    for slash, name, power in FACTOR.findall(unit):
+    for slash, name, power in UNIT_FACTOR.findall(unit):
         exponent = int(power or 1) * (-1 if slash else 1)
-        for inner_slash, inner, inner_power in FACTOR.findall(meaning.get(name) or name):
+        for inner_slash, inner, inner_power in UNIT_FACTOR.findall(meaning.get(name) or name):
             powers[inner] = powers.get(inner, 0) + exponent * int(inner_power or 1) * (-1 if inner_slash else 1)
     above = [_power(name, n) for name, n in powers.items() if n > 0 and name != "1"]
     below = [f"/{_power(name, -n)}" for name, n in powers.items() if n < 0 and name != "1"]

@@ -11,12 +11,12 @@ import numpy as np
 from diffabs.core import kinds
 from diffabs.core.pytree import Spec, children, parameters
 from diffabs.core.rules import Rule
-from diffabs.core.units import Units, in_words, units_of
+from diffabs.core.units import Units, insert_unit, units_of
 
 T = TypeVar("T")
 
 
-def problems(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[str]:
+def find_problems(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[str]:
     """One line for each field that is out of range, then what the parts themselves object to: the shapes of their
     fields (a method `problems`), and if these are right, the rules between their numbers (`rules`)."""
     found = False
@@ -24,22 +24,22 @@ def problems(part: Any, prefix: str = "", units: Units | None = None) -> Iterato
     for name, field, value in children(part, prefix):
         if field is not None and "spec" in field.metadata:
             spec: Spec = field.metadata["spec"].around(units)
-            if line := _unfit(name, spec, value):
+            if line := _find_unfit(name, spec, value):
                 found = True
                 yield line
             elif not spec.holds(value):
                 found = True
                 yield f"{name} = {_show(value)} is outside {spec.interval()}"
         else:
-            within = list(problems(value, f"{name}.", units))
+            within = list(find_problems(value, f"{name}.", units))
             found |= bool(within)
             yield from within
     if not found:
         shapes = list(part.problems()) if hasattr(part, "problems") else []
-        yield from (prefix + in_words(line, units) for line in shapes or broken(_own(part, "rules")))
+        yield from (prefix + insert_unit(line, units) for line in shapes or find_broken(_own(part, "rules")))
 
 
-def rules(part: Any, prefix: str = "") -> Iterator[Rule]:
+def part_rules(part: Any, prefix: str = "") -> Iterator[Rule]:
     """Every rule of a part and the parts in it, ranges of fields first: `problems` as arrays, for lanes whose values
     differ. The shapes are taken to be right."""
     for name, spec, value in parameters(part, prefix):
@@ -54,7 +54,7 @@ def grid_rules(part: Any, step: float, prefix: str = "") -> Iterator[Rule]:
     yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "grid_rules", step)
 
 
-def broken(rules: Iterable[Rule]) -> Iterator[str]:
+def find_broken(rules: Iterable[Rule]) -> Iterator[str]:
     """A line for each rule of concrete numbers that does not hold."""
     yield from (rule.says() for rule in rules if not bool(rule.holds))
 
@@ -71,32 +71,32 @@ def _below(part: Any, prefix: str, units: Units | None, hook: str, *args: Any) -
     yield from (rule.under(prefix, units) for rule in _own(part, hook, *args))
 
 
-def misshapen(part: Any, prefix: str = "") -> Iterator[str]:
+def find_misshapen(part: Any, prefix: str = "") -> Iterator[str]:
     """One line for each parameter of a single part that is no number, or has another shape than its field. It may be
     traced: values are not looked at."""
     for name, spec, value in parameters(part, prefix):
-        if line := _unfit(name, spec, value):
+        if line := _find_unfit(name, spec, value):
             yield line
-        elif spec.shape is not None and kinds.shape(value) != spec.shape:
-            yield f"{name} = {kinds.shown(value)} has shape {kinds.shape(value)}; it needs {spec.shape}"
+        elif spec.shape is not None and kinds.value_shape(value) != spec.shape:
+            yield f"{name} = {kinds.format_value(value)} has shape {kinds.value_shape(value)}; it needs {spec.shape}"
 
 
-def _unfit(name: str, spec: Spec, value: Any) -> str:
+def _find_unfit(name: str, spec: Spec, value: Any) -> str:
     """A line for what is no number, or empty."""
-    line = kinds.objection(value)
-    return line and f"{name} = {kinds.shown(value)} {line}; a number in {spec.interval()} is needed"
+    line = kinds.find_value_objection(value)
+    return line and f"{name} = {kinds.format_value(value)} {line}; a number in {spec.interval()} is needed"
 
 
-def cautions(part: Any, prefix: str = "") -> Iterator[str]:
+def find_cautions(part: Any, prefix: str = "") -> Iterator[str]:
     """One line for each thing that is allowed but hardly meant: what the parts' methods `cautions` say."""
     for name, field, value in children(part, prefix):
         if field is None or "spec" not in field.metadata:
-            yield from cautions(value, f"{name}.")
+            yield from find_cautions(value, f"{name}.")
     if hasattr(part, "cautions"):
         yield from (prefix + line for line in part.cautions())
 
 
-def check(part: T, prefix: str = "") -> T:
+def check_part(part: T, prefix: str = "") -> T:
     """Return `part` if every parameter is in its range.
 
     prefix: is put before every name in a message, `"plant."`
@@ -104,7 +104,7 @@ def check(part: T, prefix: str = "") -> T:
     Raises:
         ValueError: names every offending field with its value, range and unit. NaN offends.
     """
-    lines = list(problems(part, prefix))
+    lines = list(find_problems(part, prefix))
     if lines:
         raise ValueError("; ".join(lines))
     return part

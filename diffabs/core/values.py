@@ -17,9 +17,9 @@ import numpy as np
 
 from diffabs.core.pytree import Spec
 
-FINITE = Spec("1")
-POSITIVE = Spec("1", low=0.0, open_low=True)
-PLAIN = (str, bool, int, float, type(None))
+FINITE_SPEC = Spec("1")
+POSITIVE_SPEC = Spec("1", low=0.0, open_low=True)
+PLAIN_TYPES = (str, bool, int, float, type(None))
 
 Reader = Callable[[Any, str], Any]
 
@@ -32,18 +32,18 @@ class ScenarioError(ValueError):
         super().__init__(" ".join(message.split()))
 
 
-def kebab(name: str) -> str:
+def kebab_case(name: str) -> str:
     """Return the name in tables: `QuarterCar`, `PID`, `RIG_UNROUNDED` are `quarter-car`, `pid`, `rig-unrounded`."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z]{2})(?=[A-Z][a-z])", "-", name).replace("_", "-").lower()
 
 
-def dotted(path: str, key: str) -> str:
+def dotted_path(path: str, key: str) -> str:
     """Return the path of a key below another path, as it may stand in a message."""
-    key = key if re.fullmatch(r"[\w-]{1,60}", key) else shown(key)
+    key = key if re.fullmatch(r"[\w-]{1,60}", key) else format_given(key)
     return f"{path}.{key}" if path else key
 
 
-def shown(value: Any, most: int = 60) -> str:
+def format_given(value: Any, most: int = 60) -> str:
     """Return a value as it may stand in a message: on one line, of bounded length."""
     if isinstance(value, float) or (isinstance(value, int) and abs(value) < 10**15):
         return f"{value:.15g}" if not isinstance(value, bool) else str(value).lower()
@@ -54,7 +54,7 @@ def shown(value: Any, most: int = 60) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
-def unknown(what: str, name: Any, there: Iterable[str]) -> ScenarioError:
+def unknown_name_error(what: str, name: Any, there: Iterable[str]) -> ScenarioError:
     """Return the error for a name that is not there, with the nearest one that is."""
     there = list(there)
     near = difflib.get_close_matches(str(name).lower(), there, 1, 0.5)
@@ -63,150 +63,150 @@ def unknown(what: str, name: Any, there: Iterable[str]) -> ScenarioError:
 
 
 # Older names of a controller's limits, which scenarios may still use where its own are `low` and `high`.
-FORMER = {"torque_min": "low", "torque_max": "high"}
+FORMER_FIELDS = {"torque_min": "low", "torque_max": "high"}
 
 
-def wrong(path: str, value: Any, needed: str) -> ScenarioError:
+def wrong_kind_error(path: str, value: Any, needed: str) -> ScenarioError:
     """Return the error for a value of the wrong kind."""
     kinds = ((bool, "a boolean"), (str, "text"), ((int, float), "a number"), (list, "a list"), (dict, "a table"))
     kind = next((name for of, name in kinds if isinstance(value, of)), "nothing" if value is None else "a date or time")
-    return ScenarioError(f"{path} = {shown(value)} is {kind}; {needed} is needed")
+    return ScenarioError(f"{path} = {format_given(value)} is {kind}; {needed} is needed")
 
 
-def number(value: Any, spec: Spec, path: str) -> float:
+def read_number(value: Any, spec: Spec, path: str) -> float:
     """Return a number as a float. Raises ScenarioError for anything else; the range is not looked at."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise wrong(path, value, f"a number in {spec.interval()}")
+        raise wrong_kind_error(path, value, f"a number in {spec.interval()}")
     try:
         return float(value)
     except OverflowError:
-        raise ScenarioError(f"{path} = {shown(value)} is too large for a number in {spec.interval()}") from None
+        raise ScenarioError(f"{path} = {format_given(value)} is too large for a number in {spec.interval()}") from None
 
 
-def inside(value: Any, spec: Spec, path: str) -> float:
+def read_number_in_range(value: Any, spec: Spec, path: str) -> float:
     """Return a number as a float. Raises ScenarioError for anything else, or out of range."""
-    found = number(value, spec, path)
+    found = read_number(value, spec, path)
     if not spec.holds(found):
-        raise ScenarioError(f"{path} = {shown(found)} is outside {spec.interval()}")
+        raise ScenarioError(f"{path} = {format_given(found)} is outside {spec.interval()}")
     return found
 
 
-def whole(value: Any, low: int, high: int, path: str) -> int:
+def read_whole(value: Any, low: int, high: int, path: str) -> int:
     """Return a whole number. Raises ScenarioError for anything else, or out of range."""
     if isinstance(value, bool) or not isinstance(value, int):
-        raise wrong(path, value, f"a whole number in [{low}, {high}]")
+        raise wrong_kind_error(path, value, f"a whole number in [{low}, {high}]")
     if not low <= value <= high:
-        raise ScenarioError(f"{path} = {shown(value)} is outside [{low}, {high}]")
+        raise ScenarioError(f"{path} = {format_given(value)} is outside [{low}, {high}]")
     return value
 
 
-def within(low: int, high: int) -> Reader:
+def whole_reader(low: int, high: int) -> Reader:
     """Return the reader of whole numbers in a range."""
-    return lambda given, path: whole(given, low, high, path)
+    return lambda given, path: read_whole(given, low, high, path)
 
 
-def ranged(spec: Spec) -> Reader:
+def range_reader(spec: Spec) -> Reader:
     """Return the reader of numbers in a range."""
-    return lambda given, path: inside(given, spec, path)
+    return lambda given, path: read_number_in_range(given, spec, path)
 
 
-def one_of(*names: str) -> Reader:
+def choice_reader(*names: str) -> Reader:
     """Return the reader of one of these texts."""
 
     def read(given: Any, path: str) -> str:
         if not isinstance(given, str):
-            raise wrong(path, given, f"one of {', '.join(names)}")
+            raise wrong_kind_error(path, given, f"one of {', '.join(names)}")
         if given not in names:
-            raise unknown(f"{path} = {shown(given)} is unknown", given, names)
+            raise unknown_name_error(f"{path} = {format_given(given)} is unknown", given, names)
         return given
 
     return read
 
 
-def listed(item: Reader) -> Reader:
+def list_reader(item: Reader) -> Reader:
     """Return the reader of lists, as tuples, whose items this one reads."""
 
     def read(given: Any, path: str) -> tuple[Any, ...]:
         if not isinstance(given, list | tuple):
-            raise wrong(path, given, "a list")
+            raise wrong_kind_error(path, given, "a list")
         return tuple(item(value, f"{path}.{i}") for i, value in enumerate(given))
 
     return read
 
 
-def table_of(item: Reader, what: str = "") -> Reader:
+def table_reader(item: Reader, what: str = "") -> Reader:
     """Return the reader of tables whose values this one reads, under any names. `what`: they are, for a message."""
 
     def read(given: Any, path: str) -> dict[str, Any]:
         if not isinstance(given, Mapping):
-            raise wrong(path, given, f"a table of {what}" if what else "a table")
-        return {key: item(value, dotted(path, key)) for key, value in given.items()}
+            raise wrong_kind_error(path, given, f"a table of {what}" if what else "a table")
+        return {key: item(value, dotted_path(path, key)) for key, value in given.items()}
 
     return read
 
 
-def as_given(value: Any, path: str) -> Any:
+def read_as_given(value: Any, path: str) -> Any:
     """Return the value itself, whatever it is."""
     del path
     return value
 
 
-def text(given: Any, path: str) -> str:
+def read_text(given: Any, path: str) -> str:
     """Return a text. Raises ScenarioError for anything else."""
     if not isinstance(given, str):
-        raise wrong(path, given, "text")
+        raise wrong_kind_error(path, given, "text")
     return given
 
 
-def printed_line(given: Any, path: str) -> str:
+def read_printable_line(given: Any, path: str) -> str:
     """Return a text that is one printable line. Raises ScenarioError for anything else."""
-    found = text(given, path)
+    found = read_text(given, path)
     if not found.isprintable():
-        raise ScenarioError(f"{path} = {shown(found)} is outside one line of printable characters")
+        raise ScenarioError(f"{path} = {format_given(found)} is outside one line of printable characters")
     return found
 
 
-def printed_lines(given: Any, path: str) -> str:
+def read_printable_lines(given: Any, path: str) -> str:
     """Return a text of printable lines. Raises ScenarioError for anything else."""
-    found = text(given, path)
+    found = read_text(given, path)
     if not all(line.isprintable() for line in found.split("\n")):
-        raise ScenarioError(f"{path} = {shown(found)} is outside lines of printable characters")
+        raise ScenarioError(f"{path} = {format_given(found)} is outside lines of printable characters")
     return found
 
 
-def printable(text: str) -> str:
+def make_printable(text: str) -> str:
     """Return a text as one printable line, with another character for each that is not printable."""
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
-def switch(given: Any, path: str) -> bool:
+def read_switch(given: Any, path: str) -> bool:
     """Return true or false. Raises ScenarioError for anything else."""
     if not isinstance(given, bool):
-        raise wrong(path, given, "true or false")
+        raise wrong_kind_error(path, given, "true or false")
     return given
 
 
-def any_number(given: Any, path: str) -> float:
+def read_any_number(given: Any, path: str) -> float:
     """Return any number, also NaN and infinity, as a float. Raises ScenarioError for anything else."""
-    return number(given, FINITE, path)
+    return read_number(given, FINITE_SPEC, path)
 
 
 def _choice(given: Any, path: str) -> float | str:
-    return given if isinstance(given, str) else any_number(given, path)
+    return given if isinstance(given, str) else read_any_number(given, path)
 
 
-READERS: dict[Any, Reader] = {
-    float: any_number,
-    bool: switch,
-    str: text,
-    tuple[str, ...]: listed(text),
-    tuple[float, ...]: listed(any_number),
-    tuple[float, ...] | None: listed(any_number),
-    tuple[float | str, ...]: listed(_choice),
+READER_BY_TYPE: dict[Any, Reader] = {
+    float: read_any_number,
+    bool: read_switch,
+    str: read_text,
+    tuple[str, ...]: list_reader(read_text),
+    tuple[float, ...]: list_reader(read_any_number),
+    tuple[float, ...] | None: list_reader(read_any_number),
+    tuple[float | str, ...]: list_reader(_choice),
 }
 
 
-def entry(read: Reader, default: Any = dataclasses.MISSING) -> Any:
+def table_field(read: Reader, default: Any = dataclasses.MISSING) -> Any:
     """Return the field of a dataclass that is read so. A default that is a class or a function is called for
     each new one."""
     if isinstance(default, type | types.FunctionType):
@@ -214,7 +214,7 @@ def entry(read: Reader, default: Any = dataclasses.MISSING) -> Any:
     return dataclasses.field(default=default, metadata={"read": read})
 
 
-def read(cls: type, given: Any, path: str, kind: str = "", **readers: Reader) -> Any:
+def read_table(cls: type, given: Any, path: str, kind: str = "", **readers: Reader) -> Any:
     """Return the instance of a dataclass that a table describes.
 
     kind: what it is called in messages, else by its path; readers: of fields whose own need more than the table.
@@ -222,21 +222,21 @@ def read(cls: type, given: Any, path: str, kind: str = "", **readers: Reader) ->
     """
     fields = {field.name: field for field in dataclasses.fields(cls)}
     if not isinstance(given, Mapping):
-        raise wrong(path, given, f"a table of {', '.join(fields)}")
+        raise wrong_kind_error(path, given, f"a table of {', '.join(fields)}")
     values = {}
     for key, item in given.items():
         if key not in fields:
-            raise unknown(f"{dotted(path, key)} is not a field of {kind or path}", key, fields)
-        values[key] = (readers.get(key) or _reader(fields[key]))(item, dotted(path, key))
+            raise unknown_name_error(f"{dotted_path(path, key)} is not a field of {kind or path}", key, fields)
+        values[key] = (readers.get(key) or _reader(fields[key]))(item, dotted_path(path, key))
     for name, field in fields.items():
         if name not in values and field.default is field.default_factory is dataclasses.MISSING:
-            raise ScenarioError(f"{dotted(path, name)} is missing: {kind or path} needs it")
+            raise ScenarioError(f"{dotted_path(path, name)} is missing: {kind or path} needs it")
     return cls(**values)
 
 
 def _reader(field: dataclasses.Field[Any]) -> Reader:
     spec = field.metadata.get("spec")
-    return ranged(spec) if spec else field.metadata.get("read") or READERS[field.type]
+    return range_reader(spec) if spec else field.metadata.get("read") or READER_BY_TYPE[field.type]
 
 
 def read_one(kinds: Mapping[str, type], given: Any, path: str, **readers: Reader) -> Any:
@@ -244,49 +244,51 @@ def read_one(kinds: Mapping[str, type], given: Any, path: str, **readers: Reader
     Raises ScenarioError, as `read`."""
     table = {"type": given} if isinstance(given, str) else given
     if not isinstance(table, Mapping):
-        raise wrong(path, given, f"a table, or the name of a type ({', '.join(kinds)}),")
+        raise wrong_kind_error(path, given, f"a table, or the name of a type ({', '.join(kinds)}),")
     if "type" not in table:
         raise ScenarioError(f"{path}.type is missing; there is {', '.join(kinds)}")
-    kind = one_of(*kinds)(table["type"], f"{path}.type")
-    return read(kinds[kind], {k: v for k, v in table.items() if k != "type"}, path, kind, **readers)
+    kind = choice_reader(*kinds)(table["type"], f"{path}.type")
+    return read_table(kinds[kind], {k: v for k, v in table.items() if k != "type"}, path, kind, **readers)
 
 
-def sound(part: Any, name: str) -> Any:
+def check_sound(part: Any, name: str) -> Any:
     """Return the part. Raises ScenarioError with everything that its method `problems` says of it, under this name."""
     if lines := list(part.problems(name)):
         raise ScenarioError("; ".join(lines))
     return part
 
 
-def plain(value: Any, *, brief: bool = False) -> Any:
+def as_plain(value: Any, *, brief: bool = False) -> Any:
     """Return a value as TOML and JSON have them: parts as tables, with every field or, if `brief`, without those that
     are as by default; numbers of parts at full precision."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {"type": kebab(type(value).__name__), **members(value, brief=brief)}
+        return {"type": kebab_case(type(value).__name__), **plain_fields(value, brief=brief)}
     if isinstance(value, Mapping):
-        return {key: plain(item, brief=brief) for key, item in value.items()}
+        return {key: as_plain(item, brief=brief) for key, item in value.items()}
     if isinstance(value, tuple | list):
-        return [plain(item, brief=brief) for item in value]
-    return value if type(value) in PLAIN else np.asarray(value).tolist()
+        return [as_plain(item, brief=brief) for item in value]
+    return value if type(value) in PLAIN_TYPES else np.asarray(value).tolist()
 
 
-def members(part: Any, *, brief: bool = False) -> dict[str, Any]:
+def plain_fields(part: Any, *, brief: bool = False) -> dict[str, Any]:
     """Return the fields of a dataclass by name, as `plain` values."""
     found = {}
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
-        if brief and field.default is not dataclasses.MISSING and plain(value) == plain(field.default):
+        if brief and field.default is not dataclasses.MISSING and as_plain(value) == as_plain(field.default):
             continue
-        found[field.name] = np.asarray(value, float).tolist() if "spec" in field.metadata else plain(value, brief=brief)
+        found[field.name] = (
+            np.asarray(value, float).tolist() if "spec" in field.metadata else as_plain(value, brief=brief)
+        )
     return found
 
 
-def written(part: Any) -> str:
+def format_table(part: Any) -> str:
     """Return a dataclass as messages have it: `normal(5.75, 0.3, low = 5)`."""
     cells = []
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
         if field.default is dataclasses.MISSING or value != field.default:
-            cell = f"{value:g}" if isinstance(value, int | float) else reprlib.repr(plain(value))
+            cell = f"{value:g}" if isinstance(value, int | float) else reprlib.repr(as_plain(value))
             cells.append(cell if field.default is dataclasses.MISSING else f"{field.name} = {cell}")
-    return f"{kebab(type(part).__name__)}({', '.join(cells)})"
+    return f"{kebab_case(type(part).__name__)}({', '.join(cells)})"

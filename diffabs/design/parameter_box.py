@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from diffabs.core.pytree import parameters, replace
-from diffabs.core.validity import check
+from diffabs.core.validity import check_part
 from diffabs.design.polytopes import MAX_VERTICES, Coverage, Polytope, Schedule
 
 CHUNK = 1024  # systems computed at once
@@ -132,7 +132,7 @@ def check_box_bounds(model: Any, over: Mapping[str, Sequence[float]]) -> tuple[d
         if ends[0] > ends[1]:
             raise ValueError(f"over: {path} = ({ends[0]:g}, {ends[1]:g}) is inverted")
     low, high = ({path: float(ends[i]) for path, ends in over.items()} for i in (0, 1))
-    ends = [check(replace(model, bound), "over: ") for bound in (low, high)]
+    ends = [check_part(replace(model, bound), "over: ") for bound in (low, high)]
     if ends[0].period != ends[1].period:
         raise ValueError("over: the sampling period cannot vary within a polytope")
     return low, high

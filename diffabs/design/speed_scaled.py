@@ -14,7 +14,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.pytree import Scalar, param, part, pytree, strong
+from diffabs.core.pytree import Scalar, canonical_dtypes, param, part, pytree
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.slip_model import Sampling, SlipModel
 
@@ -57,7 +57,7 @@ def greatest_speed_fall(deceleration: float, speed: float, period: float) -> flo
 
 @partial(jax.jit, static_argnames="torques")
 def _matrices(scaled: SpeedScaled, torques: tuple[bool, ...]) -> StateSpace:
-    scaled = strong(scaled)
+    scaled = canonical_dtypes(scaled)
     a, b = scaled.model.matrices()
     torque = jnp.array(torques)
     size = scaled.model.speed / scaled.reference_speed

@@ -27,11 +27,11 @@ from diffabs.controllers import (
     ProportionalFeedback,
     StateFeedback,
 )
-from diffabs.controllers.sampled import Sampled, unsampled
+from diffabs.controllers.sampled import Sampled, inner_controller
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.loop import Loop
-from diffabs.core.units import in_words, units_of
-from diffabs.core.validity import check
+from diffabs.core.units import insert_unit, units_of
+from diffabs.core.validity import check_part
 from diffabs.design.state_feedback_balance import reduce_balance_loop
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.operating_point import OperatingPoint, loop_gain, operating_point
@@ -57,13 +57,13 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
         ValueError: a controller or an actuator that is not linear, a parameter out of its range, a setpoint of 1; a
             loop that does not come to rest.
     """
-    check(loop)
-    if isinstance(unsampled(loop.controller), BalanceFeedback):
+    check_part(loop)
+    if isinstance(inner_controller(loop.controller), BalanceFeedback):
         return ReducedLoop(*reduce_balance_loop(loop))
     if not hasattr(loop.plant, "frozen"):
         return _reduce_at_rest(loop)
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
-    controller = unsampled(loop.controller)
+    controller = inner_controller(loop.controller)
     integral, _, derivative, cutoff = map(float, _gains(controller))
     actuator, by_actuator, exact = _actuator(loop.actuator)
     setpoint = jax.jit(lambda loop: loop.reference.setpoint(loop.start().reference))(loop)
@@ -76,10 +76,10 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
         filter=LowPass(cutoff=cutoff) if derivative else Direct(),
         integral=integral != 0,
     )
-    gain = np.asarray(feedback_gain(loop, check(model).states), float)
+    gain = np.asarray(feedback_gain(loop, check_part(model).states), float)
     units = units_of(loop.plant)
     left_out = (*_controller_omissions(controller), *by_actuator, *_loop_omissions(loop))
-    neglected = tuple(in_words(line, units) for line in left_out)
+    neglected = tuple(insert_unit(line, units) for line in left_out)
     return ReducedLoop(model, gain, exact and isinstance(loop.sensor, Direct | Noise | Bias), neglected)
 
 
@@ -90,7 +90,7 @@ def feedback_gain(loop: Loop, states: Sequence[str]) -> Any:
     Raises:
         ValueError: a controller that is not linear.
     """
-    controller = unsampled(loop.controller)
+    controller = inner_controller(loop.controller)
     if isinstance(controller, BalanceFeedback):
         return jnp.asarray(controller.gain, float)
     if not hasattr(loop.plant, "frozen"):

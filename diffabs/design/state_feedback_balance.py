@@ -7,10 +7,10 @@ import numpy as np
 
 from diffabs.actuators import VoltageLimit
 from diffabs.controllers import BalanceFeedback
-from diffabs.controllers.sampled import Sampled, unsampled
+from diffabs.controllers.sampled import Sampled, inner_controller
 from diffabs.core.blocks import Direct
 from diffabs.core.loop import Loop
-from diffabs.core.validity import check
+from diffabs.core.validity import check_part
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.slip_model import Continuous, Sampling
 
@@ -22,13 +22,13 @@ def reduce_balance_loop(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tup
         ValueError: a controller that is not feedback of the whole state, an actuator with dynamics.
     """
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
-    controller = unsampled(loop.controller)
+    controller = inner_controller(loop.controller)
     if not isinstance(controller, BalanceFeedback):
         raise ValueError(f"controller {type(controller).__name__} is not feedback of the whole state")
     if not isinstance(loop.actuator, Direct | VoltageLimit):
         raise ValueError(f"actuator {type(loop.actuator).__name__} is not known to a linear model of a balance")
     sampling = Sampling(period=float(sampled.period), delay=float(sampled.delay)) if sampled else Continuous()
-    model = check(BalanceModel(plant=loop.plant, sampling=sampling))
+    model = check_part(BalanceModel(plant=loop.plant, sampling=sampling))
     exact = isinstance(loop.sensor, Direct)
     return model, np.asarray(controller.gain, float), exact, tuple(_balance_omissions(loop))
 

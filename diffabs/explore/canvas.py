@@ -18,13 +18,13 @@ class Canvas:
     def change(self, option: dict[str, Any], edit: int = 0) -> None:
         """Change it; `edit` is the browser's number of what a person changed, if this shows it. A change that comes
         before the browser has made the chart waits there."""
-        self.send(encoded(option), edit)
+        self.send(encode_change(option), edit)
 
     def send(self, change: str, edit: int = 0) -> None:
         """Change it by what `encoded` has made, in whatever thread."""
         ui.run_javascript(f"explorer.change({self.element.id}, {change}, {int(edit)})")
 
 
-def encoded(option: dict[str, Any]) -> str:
+def encode_change(option: dict[str, Any]) -> str:
     """Return a change as text."""
     return json.dumps(option, separators=(",", ":"), allow_nan=False)

@@ -9,20 +9,20 @@ from diffabs.explore.curves import Curves, Fan, Panel
 from diffabs.explore.stability import Stability
 
 BLUE, RED, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#767676", "#1F2933"
-COLOURS = (BLUE, RED, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
-DIGITS = 5
+CURVE_COLOURS = (BLUE, RED, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
+CHART_DIGITS = 5
 QUANTITIES = {"rad": "angle", "rad/s": "rate", "km/h": "speed", "N m": "torque", "V": "voltage"}
 AIMS = {"target": "dashed", "setpoint": "dotted", "command": "dashed"}
 OUTER, INNER = "5 to 95 % of the fan", "25 to 75 %"
 BEFORE = "before"
 FONT = "'Inter', 'Roboto', system-ui, sans-serif"
-ROOM = 1.5  # of the control's range, in which its command is shown
+LIMIT_ROOM = 1.5  # of the control's range, in which its command is shown
 TOP, BOTTOM, BETWEEN = 6.0, 7.5, 6.5  # per cent of the height
 
 
-def frame(found: Curves) -> dict[str, Any]:
+def run_chart(found: Curves) -> dict[str, Any]:
     """Return the chart of a run: axes, legends and lines, also those of what is not there yet."""
-    shown, given = found.panels, curves(found)
+    shown, given = found.panels, change_curves(found)
     count = len(shown)
     height = (100 - TOP - BOTTOM - BETWEEN * (count - 1)) / count
     tops = [TOP + i * (height + BETWEEN) for i in range(count)]
@@ -46,41 +46,45 @@ def frame(found: Curves) -> dict[str, Any]:
     }
 
 
-def curves(found: Curves, which: str = "now") -> dict[str, Any]:
+def change_curves(found: Curves, which: str = "now") -> dict[str, Any]:
     """Return the change of the chart that shows a run; `which` is "now" or "before"."""
-    source = {"t": rounded(found.t)}
+    source = {"t": round_for_screen(found.t)}
     for i, panel in enumerate(found.panels):
         lines = panel.lines if which == "now" else panel.lines[:1]
-        source |= {f"{i}.{j}": rounded(line.values) for j, line in enumerate(lines)}
+        source |= {f"{i}.{j}": round_for_screen(line.values) for j, line in enumerate(lines)}
     change: dict[str, Any] = {"dataset": [{"id": which, "source": source}]}
     if which == "now":
         change["yAxis"] = [_limits(panel) for panel in found.panels]
     return change
 
 
-def fan(found: Fan | None) -> dict[str, Any]:
+def change_fan(found: Fan | None) -> dict[str, Any]:
     """Return the change of the chart that shows a fan, or none."""
     if found is None:
-        return nothing("fan")
-    source = {"t": rounded(found.t)}
+        return clear_curves("fan")
+    source = {"t": round_for_screen(found.t)}
     for i, band in enumerate(found.bands):
         low, quarter, _, third, high = band
         steps = (low, quarter - low, third - quarter, high - third)
-        source |= {f"{i}.{j}": rounded(values) for j, values in enumerate(steps)}
+        source |= {f"{i}.{j}": round_for_screen(values) for j, values in enumerate(steps)}
     return {"dataset": [{"id": "fan", "source": source}]}
 
 
-def until(end: float | None) -> dict[str, Any]:
+def change_time_axis(end: float | None) -> dict[str, Any]:
     """Return the change of the chart that shows the time up to an instant [s], or the whole run."""
-    return {"dataZoom": [{"start": 0, "end": 100} if end is None else {"startValue": 0, "endValue": rounded([end])[0]}]}
+    return {
+        "dataZoom": [
+            {"start": 0, "end": 100} if end is None else {"startValue": 0, "endValue": round_for_screen([end])[0]}
+        ]
+    }
 
 
-def nothing(which: str) -> dict[str, Any]:
+def clear_curves(which: str) -> dict[str, Any]:
     """Return the change of the chart that takes curves away."""
     return {"dataset": [{"id": which, "source": {"t": []}}]}
 
 
-def pole_frame() -> dict[str, Any]:
+def pole_chart() -> dict[str, Any]:
     """Return the empty map of poles, in s: the left half plane is where they decay."""
     axis = {
         "type": "value",
@@ -120,17 +124,17 @@ POLE = (
 )
 
 
-def poles(found: Stability | None) -> dict[str, Any]:
+def change_poles(found: Stability | None) -> dict[str, Any]:
     """Return the change of the map that shows the poles of a loop; those of a sampled one as ln(z)/T."""
     here = _points(found.poles, found.period) if found else []
     around = _points(found.corners, found.period) if found else []
     x, y = (np.array([point[i] for point in here + around] or [-1.0]) for i in (0, 1))
-    far = _nice(1.05 * max(float(np.max(np.abs(x))), 1e-3))
-    right = max(0.1 * far, _nice(1.05 * float(x.max())) if x.max() > 0 else 0.0)
-    high = _nice(1.1 * max(float(np.max(np.abs(y))), 0.1 * far))
+    far = _round_up_nicely(1.05 * max(float(np.max(np.abs(x))), 1e-3))
+    right = max(0.1 * far, _round_up_nicely(1.05 * float(x.max())) if x.max() > 0 else 0.0)
+    high = _round_up_nicely(1.1 * max(float(np.max(np.abs(y))), 0.1 * far))
     area = {"data": [[{"xAxis": 0}, {"xAxis": right}]]}
     return {
-        "xAxis": [{"min": -far, "max": right, "interval": _interval(far)}],
+        "xAxis": [{"min": -far, "max": right, "interval": _tick_interval(far)}],
         "yAxis": [{"min": -high, "max": high, "interval": high / 2}],
         "series": [{"id": "corners", "data": around}, {"id": "poles", "data": here, "markArea": area}],
     }
@@ -143,14 +147,14 @@ def _points(values: np.ndarray, period: float | None) -> list[list[float]]:
     return [[float(f"{p.real:.5g}"), float(f"{p.imag:.5g}")] for p in poles]
 
 
-def rounded(values: Any) -> list[float | None]:
+def round_for_screen(values: Any) -> list[float | None]:
     """Return numbers with as many digits as a screen can show; None where there is none."""
     values = np.asarray(values, float)
     finite = np.isfinite(values)
     safe = np.where(finite & (values != 0), values, 1.0)
-    unit = 10.0 ** (np.floor(np.log10(np.abs(safe))) - DIGITS + 1)
+    unit = 10.0 ** (np.floor(np.log10(np.abs(safe))) - CHART_DIGITS + 1)
     near = np.where(finite, np.round(np.where(finite, values, 0.0) / unit) * unit, np.nan)
-    return [None if math.isnan(x) else float(f"{x:.{DIGITS}g}") for x in near.tolist()]
+    return [None if math.isnan(x) else float(f"{x:.{CHART_DIGITS}g}") for x in near.tolist()]
 
 
 def _legend(panel: Panel, i: int, top: float) -> dict[str, Any]:
@@ -179,7 +183,7 @@ def _y(panel: Panel, i: int) -> dict[str, Any]:
     return {
         "type": "value",
         "gridIndex": i,
-        "name": label(panel),
+        "name": axis_label(panel),
         "nameLocation": "middle",
         "nameGap": 48,
         "nameTextStyle": {"fontSize": 12, "color": INK},
@@ -190,7 +194,7 @@ def _y(panel: Panel, i: int) -> dict[str, Any]:
     }
 
 
-def label(panel: Panel) -> str:
+def axis_label(panel: Panel) -> str:
     """Return what an axis says of a panel: the quantity and its unit."""
     signals = [line.name for line in panel.lines if line.name not in AIMS]
     words = signals[0] if len(signals) == 1 and signals[0] != "control" else QUANTITIES.get(panel.unit, signals[0])
@@ -213,7 +217,13 @@ def _series(panel: Panel, i: int) -> list[dict[str, Any]]:
     signals = 0
     for j, line in enumerate(panel.lines):
         dashes = AIMS.get(line.name, "solid")
-        colour = INK if line.name == "setpoint" else RED if line.name in AIMS else COLOURS[signals % len(COLOURS)]
+        colour = (
+            INK
+            if line.name == "setpoint"
+            else RED
+            if line.name in AIMS
+            else CURVE_COLOURS[signals % len(CURVE_COLOURS)]
+        )
         signals += line.name not in AIMS
         style = {"color": colour, "width": 2 if j == 0 else 1.4, "type": dashes}
         look = {"lineStyle": style, "itemStyle": {"color": colour}, "z": 4 if j == 0 else 3}
@@ -229,18 +239,18 @@ def _limits(panel: Panel) -> dict[str, Any]:
     most = float(np.max(np.abs(values))) if values.size else 0.0
     if not most:
         return {"min": -1, "max": 1}
-    nice = _nice(ROOM * most)
+    nice = _round_up_nicely(LIMIT_ROOM * most)
     low, high = -nice if values.min() < 0 else 0, nice if values.max() > 0 else 0
-    return {"min": low, "max": high, "interval": nice / 2 if low and high else _interval(nice)}
+    return {"min": low, "max": high, "interval": nice / 2 if low and high else _tick_interval(nice)}
 
 
-def _interval(end: float) -> float:
-    """How far ticks are apart on an axis from 0 to one of the numbers of `_nice`: three to five of them."""
+def _tick_interval(end: float) -> float:
+    """How far ticks are apart on an axis from 0 to one of the numbers of `_round_up_nicely`: three to five of them."""
     mantissa = float(f"{end:.1e}".partition("e")[0])
     return end / {1.0: 4, 1.5: 3, 2.0: 4, 3.0: 3, 4.0: 4, 5.0: 5, 6.0: 3, 8.0: 4}[mantissa]
 
 
-def _nice(value: float) -> float:
+def _round_up_nicely(value: float) -> float:
     """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten."""
     unit = 10.0 ** math.floor(math.log10(value))
     return next(float(f"{n * unit:.12g}") for n in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if n * unit >= value * (1 - 1e-9))

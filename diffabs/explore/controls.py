@@ -9,11 +9,11 @@ from typing import Any
 from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `explore`
 
 from diffabs.explore.curves import Fan
-from diffabs.explore.knobs import STEPS, Knob, unit_words
-from diffabs.explore.session import AS_GIVEN, FAMILIES, Session
+from diffabs.explore.knobs import SLIDER_STEPS, Knob, unit_words
+from diffabs.explore.session import AS_GIVEN, EXCHANGEABLE_FAMILIES, Session
 from diffabs.scenario.scenario import names
 
-EVERY = 0.016  # s between events of a slider, a frame of the screen
+CHANGE_INTERVAL_S = 0.016  # s between events of a slider, a frame of the screen
 MASS, ROAD = "mass", "road"
 
 Turned = Callable[[str, Any, int], None]
@@ -100,7 +100,7 @@ class Controls:
         source.props(f"{look} data-id=scenario").on_value_change(
             lambda event: self._replaced(partial(self.session.open, event.value))
         )
-        for family in FAMILIES:
+        for family in EXCHANGEABLE_FAMILIES:
             if there := self.session.choices(family):
                 part = ui.select(there, value=self.session.parts[family], label=family).classes("w-full chooser")
                 part.props(f"{look} data-id={family}").on_value_change(
@@ -142,12 +142,12 @@ class Controls:
             self.fields[key] = field
             ui.label(unit_words(knob.spec.unit)).classes("unit")
             if knob.low is not None:
-                slider = ui.slider(min=0, max=STEPS, step=1, value=knob.place_of(value)).props("dense")
+                slider = ui.slider(min=0, max=SLIDER_STEPS, step=1, value=knob.place_of(value)).props("dense")
                 slider.props(f'data-slider="{html.escape(key)}" aria-label="{html.escape(knob.name)}"')
                 slider.on(
                     "update:model-value",
                     lambda event: self._dragged(key, *event.args),
-                    throttle=EVERY,
+                    throttle=CHANGE_INTERVAL_S,
                     js_handler="(place) => emit(place, explorer.edited())",
                 )
                 self.sliders[key] = slider
@@ -157,6 +157,6 @@ class Controls:
 
     def _dragged(self, key: str, place: Any, edit: Any) -> None:
         knob = self.session.knobs.get(key)
-        if knob is None or knob.low is None or not isinstance(place, int | float) or not 0 <= place <= STEPS:
+        if knob is None or knob.low is None or not isinstance(place, int | float) or not 0 <= place <= SLIDER_STEPS:
             return
         self._turned(key, knob.text(knob.value_at(place)), edit if isinstance(edit, int) else 0)

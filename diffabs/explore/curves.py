@@ -8,8 +8,8 @@ import jax
 import numpy as np
 
 from diffabs.core.pytree import get, parameters
-from diffabs.explore.friction import FACTOR
-from diffabs.explore.knobs import is_vehicle, mass
+from diffabs.explore.friction import FACTOR_PATH
+from diffabs.explore.knobs import is_vehicle, mass_path
 from diffabs.linear.robustness import low_discrepancy_points
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
@@ -19,17 +19,17 @@ from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Adaptive, FixedStep, Run, Solver
 
 INSTANTS = 400  # of a curve
-ROUGH = 200  # instants of a fan: the browser lays all of them out again with every redraw
-LONG = 4 * INSTANTS  # steps, from which a draft is quicker
-DRAFT = 1e-3  # relative error of a draft's step
+DRAFT_INSTANTS = 200  # instants of a fan: the browser lays all of them out again with every redraw
+MAX_INSTANTS = 4 * INSTANTS  # steps, from which a draft is quicker
+DRAFT_RTOL = 1e-3  # relative error of a draft's step
 MEMBERS = 200  # of a fan
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-SETTLED = 0.05  # of the greatest distance from the end: what is nearer from some instant on has settled
-AFTER = 1.5  # times the transient is shown where the time axis is fitted to it
-FEWEST = 0.1  # of the members must still run where a fan is drawn
+SETTLED_SHARE = 0.05  # of the greatest distance from the end: what is nearer from some instant on has settled
+TRANSIENT_MULTIPLE = 1.5  # times the transient is shown where the time axis is fitted to it
+MIN_TRANSIENT_SHARE = 0.1  # of the members must still run where a fan is drawn
 
 
-class Line(NamedTuple):
+class Curve(NamedTuple):
     """A curve: its name, and its values as they are shown, NaN where there is none."""
 
     name: str
@@ -40,7 +40,7 @@ class Panel(NamedTuple):
     """Curves of one unit, the first of which has the fan."""
 
     unit: str
-    lines: tuple[Line, ...]
+    lines: tuple[Curve, ...]
 
 
 class Curves(NamedTuple):
@@ -72,7 +72,7 @@ class Spread:
     road: float = 0.2
 
 
-def solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:
+def drawing_solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:
     """Return the scenario's solver, keeping as many instants as are drawn."""
     return dataclasses.replace(chosen.solver, every=max(1, math.ceil(chosen.solver.steps / instants)))
 
@@ -81,37 +81,41 @@ def draft_solver(chosen: Scenario) -> Solver | None:
     """Return a solver that is quicker, to draw by while a value is dragged; None where the scenario's own is quick, or
     a clock in the loop needs its grid."""
     own = chosen.solver
-    if chosen.loop.ticks or not isinstance(own, FixedStep) or own.steps <= LONG:
+    if chosen.loop.ticks or not isinstance(own, FixedStep) or own.steps <= MAX_INSTANTS:
         return None
-    return Adaptive(rtol=DRAFT, duration=own.duration, step=own.duration / INSTANTS)
+    return Adaptive(rtol=DRAFT_RTOL, duration=own.duration, step=own.duration / INSTANTS)
 
 
-def curves(chosen: Scenario, by: Solver | None = None) -> Curves:
+def run_curves(chosen: Scenario, by: Solver | None = None) -> Curves:
     """Return the run of a scenario, by its own solver or another."""
-    run: Run = jax.device_get(rollout(chosen.loop, by or solver(chosen), chosen.objectives, key=chosen.key()))
+    run: Run = jax.device_get(rollout(chosen.loop, by or drawing_solver(chosen), chosen.objectives, key=chosen.key()))
     t, panels = _panels(run, chosen.loop.plant)
     metrics = {name: float(run.metrics[name]) for name in chosen.objectives}
-    return Curves(t, panels, metrics, _ended(chosen, run, t), by is not None)
+    return Curves(t, panels, metrics, _describe_end(chosen, run, t), by is not None)
 
 
-def transient(found: Curves) -> float:
+def transient_end(found: Curves) -> float:
     """Return the end [s] of a time axis that fits the transient: 1.5 times the instant after which the first signal
     stays near its target, or near its last value without a target. A run that does not settle is shown whole."""
     lines = {line.name: line.values for line in found.panels[0].lines}
     signal = found.panels[0].lines[0].values
     target = lines["target"]
     away = np.abs(signal - np.where(np.isfinite(target), target, signal[-1]))
-    far = np.flatnonzero(away > SETTLED * np.max(away, initial=0.0))
+    far = np.flatnonzero(away > SETTLED_SHARE * np.max(away, initial=0.0))
     end = float(found.t[-1])
-    return end if not far.size or far[-1] + 1 >= len(signal) else min(end, AFTER * float(found.t[far[-1] + 1]))
+    return (
+        end
+        if not far.size or far[-1] + 1 >= len(signal)
+        else min(end, TRANSIENT_MULTIPLE * float(found.t[far[-1] + 1]))
+    )
 
 
-def fan(chosen: Scenario, spread: Spread) -> Fan | None:
+def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
     """Return the fan of many runs whose masses and roads differ, all at once; None where neither is there."""
-    values, words = members(chosen, spread)
+    values, words = fan_members(chosen, spread)
     if not values:
         return None
-    by = draft_solver(chosen) or solver(chosen, ROUGH)
+    by = draft_solver(chosen) or drawing_solver(chosen, DRAFT_INSTANTS)
     batch = Batch(values, keys=np.arange(MEMBERS) + chosen.seed)
     run: Run = jax.device_get(run_batch(chosen.loop, batch, by, {}, trajectories=True))
     lost = np.asarray(run.diverged)
@@ -119,16 +123,16 @@ def fan(chosen: Scenario, spread: Spread) -> Fan | None:
     going = np.asarray(run.trajectory.running) & ~lost[:, None]
     t = np.asarray(run.trajectory.sample.t)
     longest = int(np.argmax(going.sum(axis=1)))
-    count = int(np.sum(going.mean(axis=0) >= FEWEST * max(1e-9, going[:, 0].mean())))
-    shown = [_first(panel) for panel in _layout(run, chosen.loop.plant)]
+    count = int(np.sum(going.mean(axis=0) >= MIN_TRANSIENT_SHARE * max(1e-9, going[:, 0].mean())))
+    shown = [_first_signal(panel) for panel in _layout(run, chosen.loop.plant)]
     bands = tuple(_quantiles(np.where(going, values, np.nan)[:, :count]) for values in shown)
     return Fan(t[longest, :count], bands, MEMBERS, int(lost.sum()), words)
 
 
-def members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], str]:
+def fan_members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], str]:
     """Return the values of a fan's members by path, always the same parts of the spread, and what they are in words."""
     there = {path: spec for path, spec, _ in parameters(chosen.loop)}
-    wanted = {mass(chosen): spread.mass, FACTOR: spread.road}
+    wanted = {mass_path(chosen): spread.mass, FACTOR_PATH: spread.road}
     wanted = {path: part for path, part in wanted.items() if path in there and part > 0}
     unit = 2 * low_discrepancy_points(MEMBERS, len(wanted)) - 1
     values, words = {}, []
@@ -137,7 +141,7 @@ def members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], st
         low, high = (here * (1 + sign * part) for sign in (-1, 1))
         middle, half = (low + min(high, spec.high)) / 2, (min(high, spec.high) - low) / 2
         values[path] = middle + half * unit[:, i]
-        name = "friction" if path == FACTOR else path.rpartition(".")[2].replace("_", " ")
+        name = "friction" if path == FACTOR_PATH else path.rpartition(".")[2].replace("_", " ")
         words.append(f"{name} ± {100 * part:g} %")
     return values, ", ".join(words)
 
@@ -153,7 +157,7 @@ def _panels(run: Run, plant: Any) -> tuple[np.ndarray, tuple[Panel, ...]]:
     count = len(trajectory_columns(run, plant)["t"][1])
     assert run.trajectory is not None
     cut = tuple(
-        Panel(panel.unit, tuple(Line(line.name, _finite(line.values[:count])) for line in panel.lines))
+        Panel(panel.unit, tuple(Curve(line.name, _finite(line.values[:count])) for line in panel.lines))
         for panel in _layout(run, plant)
     )
     return np.asarray(run.trajectory.sample.t)[:count], cut
@@ -164,26 +168,26 @@ def _layout(run: Run, plant: Any) -> list[Panel]:
     length, of one run or many."""
     assert run.trajectory is not None
     sample = run.trajectory.sample
-    groups: dict[str, list[Line]] = {}
+    groups: dict[str, list[Curve]] = {}
     for name, unit in type(sample.output).units.items():
         words = name.replace("_", " ")
-        groups.setdefault(unit, []).append(Line(words, np.asarray(getattr(sample.output, name), float)))
+        groups.setdefault(unit, []).append(Curve(words, np.asarray(getattr(sample.output, name), float)))
     units = list(groups)
-    aims = [Line("target", np.asarray(sample.target, float)), Line("setpoint", np.asarray(sample.setpoint, float))]
+    aims = [Curve("target", np.asarray(sample.target, float)), Curve("setpoint", np.asarray(sample.setpoint, float))]
     shown = [Panel(units[0], (*groups[units[0]], *aims))]
     shown += [Panel(unit, tuple(groups[unit])) for unit in units[1:2]]
     shown = [_in_kmh(panel) for panel in shown] if is_vehicle(plant) else shown
-    control = [Line(name, np.asarray(getattr(sample, name), float)) for name in ("control", "command")]
+    control = [Curve(name, np.asarray(getattr(sample, name), float)) for name in ("control", "command")]
     return [*shown, Panel(plant.control_unit, tuple(control))]
 
 
 def _in_kmh(panel: Panel) -> Panel:
     if panel.unit != "m/s":
         return panel
-    return Panel("km/h", tuple(Line(line.name, KMH * line.values) for line in panel.lines))
+    return Panel("km/h", tuple(Curve(line.name, KMH * line.values) for line in panel.lines))
 
 
-def _first(panel: Panel) -> np.ndarray:
+def _first_signal(panel: Panel) -> np.ndarray:
     return panel.lines[0].values
 
 
@@ -191,7 +195,7 @@ def _finite(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(values), values, np.nan)
 
 
-def _ended(chosen: Scenario, run: Run, t: np.ndarray) -> str:
+def _describe_end(chosen: Scenario, run: Run, t: np.ndarray) -> str:
     if run.diverged:
         return "diverged: a number became infinite or impossible, or something switched in every step"
     stop, end = chosen.loop.stop, f"after {float(t[-1]):.4g} s"

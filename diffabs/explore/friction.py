@@ -11,7 +11,7 @@ from diffabs.roads import Scaled
 from diffabs.scenario.scenario import Scenario
 
 ROAD, INNER = "plant.road.", "plant.road.road."
-FACTOR = "plant.road.scale"
+FACTOR_PATH = "plant.road.scale"
 
 
 def with_factor(chosen: Scenario) -> Scenario:
@@ -22,7 +22,7 @@ def with_factor(chosen: Scenario) -> Scenario:
         return chosen
     plant: Any = chosen.loop.plant
     plant = dataclasses.replace(plant, road=Scaled(road=road))
-    return _renamed(chosen, plant, lambda path: INNER + path[len(ROAD) :] if path.startswith(ROAD) else path)
+    return _rename_paths(chosen, plant, lambda path: INNER + path[len(ROAD) :] if path.startswith(ROAD) else path)
 
 
 def without_factor(chosen: Scenario, given: Scenario) -> Scenario:
@@ -33,10 +33,10 @@ def without_factor(chosen: Scenario, given: Scenario) -> Scenario:
         return chosen
     plant: Any = chosen.loop.plant
     plant = dataclasses.replace(plant, road=road.road)
-    return _renamed(chosen, plant, lambda path: ROAD + path[len(INNER) :] if path.startswith(INNER) else path)
+    return _rename_paths(chosen, plant, lambda path: ROAD + path[len(INNER) :] if path.startswith(INNER) else path)
 
 
-def _renamed(chosen: Scenario, plant: Any, name: Callable[[str], str]) -> Scenario:
+def _rename_paths(chosen: Scenario, plant: Any, name: Callable[[str], str]) -> Scenario:
     def keys(table: Mapping[str, Any]) -> dict[str, Any]:
         return {name(path): value for path, value in table.items()}
 

@@ -18,8 +18,8 @@ Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Any]]
 Send = Callable[[Any], Awaitable[None]]
 
-LOOPBACK = "127.0.0.1"
-NAMES = (LOOPBACK, "localhost")
+LOOPBACK_ADDRESS = "127.0.0.1"
+LOOPBACK_NAMES = (LOOPBACK_ADDRESS, "localhost")
 FOREIGN = "diffabs explore answers only its own page"
 STRANGER = "diffabs explore: the token is missing or wrong; open the whole address that the command has printed"
 # Nothing from elsewhere is loaded, whatever a page asks for; scripts in the page are those of the framework.
@@ -35,7 +35,7 @@ class Guard:
 
     def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], port: int, token: str):
         """`port` is that of the explorer; `token` is what its user knows."""
-        self.app, self.hosts = app, {f"{name}:{port}" for name in NAMES}
+        self.app, self.hosts = app, {f"{name}:{port}" for name in LOOPBACK_NAMES}
         self.token, self.cookie = token, f"diffabs-explore-{port}"  # a browser sends a cookie to every port of a host
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from diffabs.explore.page import Page
 
 
-def header(page: "Page") -> None:
+def add_header(page: "Page") -> None:
     """Put it into the element that is open."""
     with ui.element("header"):
         ui.label("diffabs").classes("brand")

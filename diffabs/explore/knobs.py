@@ -9,17 +9,17 @@ import numpy as np
 
 from diffabs.core.pytree import Spec, parameters
 from diffabs.core.units import unit_at
-from diffabs.core.values import inside, wrong
-from diffabs.explore.friction import FACTOR
-from diffabs.scenario.parameter_paths import canonical
+from diffabs.core.values import read_number_in_range, wrong_kind_error
+from diffabs.explore.friction import FACTOR_PATH
+from diffabs.scenario.parameter_paths import canonical_path
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
 
-STEPS = 1000  # of a slider, end to end
-DECADE = 10.0  # a slider over so many times its lower end is logarithmic
-WIDTH = 2.0  # how many times more, and less, than its value a number without a range can be dragged to
-NEARBY = 1.25  # beyond the range of a scenario a slider goes on to so many times its value
-SPEEDS = ("speed", "reference_speed")  # of a vehicle, in km/h
+SLIDER_STEPS = 1000  # of a slider, end to end
+LOGARITHMIC_RATIO = 10.0  # a slider over so many times its lower end is logarithmic
+SLIDER_RATIO = 2.0  # how many times more, and less, than its value a number without a range can be dragged to
+NARROW_RATIO = 1.25  # beyond the range of a scenario a slider goes on to so many times its value
+SPEED_FIELDS = ("speed", "reference_speed")  # of a vehicle, in km/h
 FILTERS = ("time_constant", "cutoff")
 LIMITS = ("torque_min", "torque_max", "low", "high", "reference_speed", "period")  # of a controller, hardly dragged
 MOST_FIRST = 14
@@ -56,27 +56,27 @@ class Knob:
             try:
                 given = float(given.strip())
             except ValueError:
-                raise wrong(self.name, given.strip(), f"a number in {self.spec.interval()}") from None
-        return inside(given, self.spec, self.name) / self.scale
+                raise wrong_kind_error(self.name, given.strip(), f"a number in {self.spec.interval()}") from None
+        return read_number_in_range(given, self.spec, self.name) / self.scale
 
     def text(self, value: float) -> str:
         """Return a value [SI] as it is shown."""
         return f"{value * self.scale:.6g}"
 
     def place_of(self, value: float) -> float:
-        """Return where on the slider, of `STEPS`, a value [SI] is, at an end for what is beyond."""
+        """Return where on the slider, of `SLIDER_STEPS`, a value [SI] is, at an end for what is beyond."""
         if self.low is None or self.high is None or not math.isfinite(value):
             return 0.0
         low, high, at = self._line(self.low), self._line(self.high), value * self.scale
         if self._logarithmic and at * self.low <= 0:
-            return 0.0 if self.low > 0 else float(STEPS)
-        return float(np.clip(STEPS * (self._line(at) - low) / (high - low), 0, STEPS))
+            return 0.0 if self.low > 0 else float(SLIDER_STEPS)
+        return float(np.clip(SLIDER_STEPS * (self._line(at) - low) / (high - low), 0, SLIDER_STEPS))
 
     def value_at(self, place: float) -> float:
         """Return the value [SI] at a place of the slider."""
         assert self.low is not None
         assert self.high is not None
-        part = place / STEPS
+        part = place / SLIDER_STEPS
         if part in (0.0, 1.0):
             return (self.high if part else self.low) / self.scale
         on = self._line(self.low) * (1 - part) + self._line(self.high) * part
@@ -88,7 +88,7 @@ class Knob:
         low, high = self.low, self.high
         if low is None or high is None or low * high <= 0:
             return False
-        return max(abs(low), abs(high)) >= DECADE * min(abs(low), abs(high))
+        return max(abs(low), abs(high)) >= LOGARITHMIC_RATIO * min(abs(low), abs(high))
 
     def _line(self, shown: float) -> float:
         """Where a number lies on the line on which the slider is even."""
@@ -97,7 +97,7 @@ class Knob:
 
 def knobs(chosen: Scenario) -> dict[str, Knob]:
     """Return every number of a scenario's loop by its path."""
-    found = (knob for path, spec, value in parameters(chosen.loop) for knob in _of(chosen, path, spec, value))
+    found = (knob for path, spec, value in parameters(chosen.loop) for knob in _knob(chosen, path, spec, value))
     return {knob.key: knob for knob in found}
 
 
@@ -111,11 +111,11 @@ def unit_words(unit: str) -> str:
     return "" if unit == "1" else unit.replace("^2", "²")
 
 
-def first(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
+def first_knobs(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
     """Return the numbers that are shown at once: mass, speed, friction, what the scenario tunes, filters, gains; then
     what it varies."""
     tune, over = chosen.tune, [*chosen.design.over, *chosen.tune.over, *chosen.sweep.over]
-    paths = [*filter(None, (mass(chosen),)), "initial.speed", FACTOR, *tune.free]
+    paths = [*filter(None, (mass_path(chosen),)), "initial.speed", FACTOR_PATH, *tune.free]
     paths += [knob.path for knob in known.values() if knob.path.rpartition(".")[2] in FILTERS]
     if not any(path.startswith("controller.") for path in tune.free):
         tails = {knob.path: knob.path.rpartition(".")[2] for knob in known.values()}
@@ -127,7 +127,7 @@ def first(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
     return sorted(usable[:MOST_FIRST], key=lambda key: groups.index(known[key].group))
 
 
-def mass(chosen: Scenario) -> str | None:
+def mass_path(chosen: Scenario) -> str | None:
     """Return the path of the mass that differs from one vehicle or rider to the next: one that the scenario varies,
     else the plant's first, else its first moment of inertia; None where there is neither."""
     over = {*chosen.design.over, *chosen.tune.over, *chosen.sweep.over}
@@ -138,13 +138,13 @@ def mass(chosen: Scenario) -> str | None:
     return None
 
 
-def _of(chosen: Scenario, path: str, spec: Spec, value: Any) -> Iterator[Knob]:
+def _knob(chosen: Scenario, path: str, spec: Spec, value: Any) -> Iterator[Knob]:
     tail = path.rpartition(".")[2]
-    scale = KMH if spec.unit == "m/s" and tail in SPEEDS and is_vehicle(chosen.loop.plant) else 1.0
-    name = canonical(path) + ("_kmh" if scale != 1.0 else "")
-    group, _, label = canonical(path).partition(".")
+    scale = KMH if spec.unit == "m/s" and tail in SPEED_FIELDS and is_vehicle(chosen.loop.plant) else 1.0
+    name = canonical_path(path) + ("_kmh" if scale != 1.0 else "")
+    group, _, label = canonical_path(path).partition(".")
     label = label.removeprefix(f"{group}.").replace("_", " ")
-    label = "friction factor" if path == FACTOR else label
+    label = "friction factor" if path == FACTOR_PATH else label
     values = np.asarray(value, float)
     if values.ndim > 1:
         return  # nobody drags the entries of a matrix
@@ -153,12 +153,12 @@ def _of(chosen: Scenario, path: str, spec: Spec, value: Any) -> Iterator[Knob]:
         suffix = "" if at is None else f".{at}"
         unit = "km/h" if scale != 1.0 else unit_at(spec.unit, at or 0, values.size)
         own = dataclasses.replace(spec, unit=unit, low=spec.low * scale, high=spec.high * scale)
-        low, high = _ends(own, float(values[place]) * scale, _given(chosen, path, at, scale))
+        low, high = _slider_ends(own, float(values[place]) * scale, _range_in_scenario(chosen, path, at, scale))
         words = label if at is None else f"{label} {at + 1}"
         yield Knob(path, at, name + suffix, group, words, own, scale, low, high)
 
 
-def _given(chosen: Scenario, path: str, place: int | None, scale: float) -> tuple[float, float] | None:
+def _range_in_scenario(chosen: Scenario, path: str, place: int | None, scale: float) -> tuple[float, float] | None:
     """The range in which the scenario tunes or varies a parameter, as shown."""
     tuned, varied = chosen.tune.free.get(path), chosen.design.over.get(path)
     values = chosen.tune.over.get(path)
@@ -170,14 +170,14 @@ def _given(chosen: Scenario, path: str, place: int | None, scale: float) -> tupl
     return low * scale, high * scale
 
 
-def _ends(spec: Spec, value: float, given: tuple[float, float] | None) -> tuple[float | None, float | None]:
+def _slider_ends(spec: Spec, value: float, given: tuple[float, float] | None) -> tuple[float | None, float | None]:
     """Ends of a slider that has the value inside, and does not leave the range."""
     if not math.isfinite(value):
         return None, None
-    around = sorted((value / WIDTH, value * WIDTH)) if value else [-1.0, 1.0]
+    around = sorted((value / SLIDER_RATIO, value * SLIDER_RATIO)) if value else [-1.0, 1.0]
     if not value and math.isfinite(spec.low) and math.isfinite(spec.high):
         around = [spec.low, spec.high]
-    ends = [*around] if given is None else [*given, value * NEARBY, value / NEARBY]
+    ends = [*around] if given is None else [*given, value * NARROW_RATIO, value / NARROW_RATIO]
     low, high = max(min(ends), spec.low), min(max(ends), spec.high)
     span = high - low
     low = low + 1e-3 * span if spec.open_low and low == spec.low else low

@@ -12,18 +12,18 @@ from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `ex
 
 from diffabs.core.values import ScenarioError
 from diffabs.explore import charts, curves, stability
-from diffabs.explore.canvas import Canvas, encoded
+from diffabs.explore.canvas import Canvas, encode_change
 from diffabs.explore.controls import Controls
-from diffabs.explore.header import header
+from diffabs.explore.header import add_header
 from diffabs.explore.look import SCRIPT, STYLE
-from diffabs.explore.results import Results
+from diffabs.explore.results import ResultsPanel
 from diffabs.explore.saver import Saver
-from diffabs.explore.session import UNKNOWN, Session, Tools, Verdict, objections
+from diffabs.explore.session import NOT_PROVED, ProofVerdict, Session, Tools, objections
 from diffabs.explore.tuner import Tuner
-from diffabs.explore.work import Latest
+from diffabs.explore.work import NewestJobThread
 from diffabs.scenario.scenario import Scenario
 
-QUICK = 0.05  # s that a result may take to be followed while one drags
+QUICK_JOB_S = 0.05  # s that a result may take to be followed while one drags
 TICK = 0.004  # s between two looks whether the curve is there
 REST = 0.15  # s without a change, after which everything is worked out
 PROVING = 0.35  # and after which a proof is looked for
@@ -42,11 +42,11 @@ class Page:
         self.shown: curves.Curves | None = None
         self.objected = 0  # the version that followed a refusal, whose line stays
         self.drawn = 0  # the newest version whose curve was made, or that was refused
-        self.around: stability.Around | None = None  # the corners that were looked at last
+        self.around: stability.CornerLoops | None = None  # the corners that were looked at last
         self.surrounded = False  # whether they belong to what is shown
-        self.drawer, self.thinker = (Latest(thread, self._failed) for _ in range(2))
+        self.drawer, self.thinker = (NewestJobThread(thread, self._failed) for _ in range(2))
         self.controls = Controls(session, self._turned, self._replaced)
-        self.results = Results()
+        self.results = ResultsPanel()
         self.saver = Saver(session, folder)
         self.tuner = Tuner(self, thread)
         self.body: Any = None
@@ -55,7 +55,7 @@ class Page:
     def build(self) -> None:
         """Put everything on the page, and begin to compute."""
         with ui.element("div").classes("explorer") as self.body:
-            header(self)
+            add_header(self)
             with ui.element("main").classes("columns"):
                 with ui.element("section").classes("left"):
                     self.controls.build()
@@ -103,13 +103,13 @@ class Page:
     def pin(self, found: curves.Curves | None) -> None:
         """Keep a run as what there was before, or none."""
         if self.chart is not None:
-            change = charts.curves(found, "before") if found else charts.nothing("before")
+            change = charts.change_curves(found, "before") if found else charts.clear_curves("before")
             self.chart.change(change)
 
     def show_until_settled(self, *, whole: bool) -> None:
         """Fit the time axis to the transient of the run that is shown, or to the whole run."""
         if self.chart is not None and self.shown is not None:
-            self.chart.change(charts.until(None if whole else curves.transient(self.shown)))
+            self.chart.change(charts.change_time_axis(None if whole else curves.transient_end(self.shown)))
 
     def refused(self, error: Exception | None) -> None:
         """Say why something cannot be, or that all is well."""
@@ -176,7 +176,7 @@ class Page:
         self.session.accept(now.loop)
         if self.chart is None:
             with self.place:
-                self.chart = Canvas(charts.frame(found), "fill")
+                self.chart = Canvas(charts.run_chart(found), "fill")
         else:
             self.chart.send(change, edit)
         self.shown = found
@@ -200,7 +200,7 @@ class Page:
     def _show_stability(self, found: stability.Stability | str, version: int, whole: bool) -> None:
         self.results.stability(found, fresh=whole and version == self.version)
 
-    def _show_verdict(self, found: Verdict, version: int) -> None:
+    def _show_verdict(self, found: ProofVerdict, version: int) -> None:
         if version == self.version:
             self.results.verdict(found)
 
@@ -214,27 +214,27 @@ class Page:
         try:
             if key:
                 self.session.judge(key, now)
-            self._send(curves.curves(now, curves.draft_solver(now)), now, version, edit)
+            self._send(curves.run_curves(now, curves.draft_solver(now)), now, version, edit)
         except ScenarioError as error:
             self.later(self._objected, key, error, version)
         finally:
             self.drawn = version
 
     def _send(self, found: curves.Curves, now: Scenario, version: int, edit: int = 0) -> None:
-        self.later(self._show_curves, found, now, encoded(charts.curves(found)), version, edit)
+        self.later(self._show_curves, found, now, encode_change(charts.change_curves(found)), version, edit)
 
     def _think(self, now: Scenario, version: int) -> None:
         """Everything but the curve, which comes first: what is quick while one drags, the rest when one has stopped."""
         if not self._curve_is_there(version):
             return
         steps = {"poles": self._poles, "fan": self._fan}
-        done = [name for name in steps if self.costs.get(name, math.inf) < QUICK]
+        done = [name for name in steps if self.costs.get(name, math.inf) < QUICK_JOB_S]
         for name in done:
             self._timed(name, steps[name], now, version)
         if not self._rested(REST, version):
             return
         if curves.draft_solver(now):
-            self._send(curves.curves(now), now, version)
+            self._send(curves.run_curves(now), now, version)
         for name in steps:
             if name not in done and version == self.version:
                 self._timed(name, steps[name], now, version)
@@ -267,8 +267,8 @@ class Page:
         found: Any
         try:
             if corners:
-                self.around = stability.around(now, self.around)
-            found = stability.stability(now, self.around)
+                self.around = stability.linearise_corners(now, self.around)
+            found = stability.linear_stability(now, self.around)
             self.surrounded = self.around is not None and self.around.of == stability.corners_of(now)
         except Exception as error:  # whatever it is, the card shows it and computes no longer
             found, self.surrounded = _sentence(error), True
@@ -276,15 +276,15 @@ class Page:
         return not isinstance(found, str)
 
     def _fan(self, now: Scenario, version: int) -> bool:
-        found = curves.fan(now, self.session.spread)
-        self.later(self._show_fan, found, encoded(charts.fan(found)))
+        found = curves.run_fan(now, self.session.spread)
+        self.later(self._show_fan, found, encode_change(charts.change_fan(found)))
         return True
 
-    def _proved(self, now: Scenario) -> Verdict:
+    def _proved(self, now: Scenario) -> ProofVerdict:
         try:
             return self.tools.prove(now)
         except Exception as error:  # whatever it is, the card shows it and computes no longer
-            return Verdict(UNKNOWN, _sentence(error))
+            return ProofVerdict(NOT_PROVED, _sentence(error))
 
 
 def _sentence(error: Exception) -> str:

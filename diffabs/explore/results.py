@@ -8,8 +8,8 @@ from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `ex
 from diffabs.explore import charts
 from diffabs.explore.canvas import Canvas
 from diffabs.explore.knobs import unit_words
-from diffabs.explore.session import CERTIFIED, REFUTED, UNDECIDED, Verdict
-from diffabs.explore.stability import Stability, said
+from diffabs.explore.session import CERTIFIED, REFUTED, UNDECIDED, ProofVerdict
+from diffabs.explore.stability import Stability, format_margin
 from diffabs.scenario.registry import unit_of
 from diffabs.scenario.scenario import Scenario
 
@@ -27,16 +27,16 @@ MARGINS = {
 }
 
 
-NOTHING = "-"
-ROUNDING = 1e-12
+NO_VALUE = "-"
+DISPLAY_ROUNDING = 1e-12
 
 
-def measured(value: float) -> str:
+def format_metric(value: float) -> str:
     """Return a metric as it is shown, without digits that are rounding errors."""
-    return NOTHING if math.isnan(value) else "0" if abs(value) < ROUNDING else f"{value:.5g}"
+    return NO_VALUE if math.isnan(value) else "0" if abs(value) < DISPLAY_ROUNDING else f"{value:.5g}"
 
 
-class Results:
+class ResultsPanel:
     """What is known of the loop as it is now; what is being computed is pale, and says so."""
 
     def build(self) -> None:
@@ -81,21 +81,21 @@ class Results:
         """Show what was measured."""
         self.measuring.set_visibility(not fresh)
         for name, value in found.items():
-            self.cells[name].set_text(measured(value))
+            self.cells[name].set_text(format_metric(value))
 
     def stability(self, found: Stability | str, *, fresh: bool) -> None:
         """Show poles and margins, or why there are none."""
         self.solving.set_visibility(not fresh)
         one = None if isinstance(found, str) else found
-        self.map.change(charts.poles(one))
+        self.map.change(charts.change_poles(one))
         self.map.element.set_visibility(one is not None)
         self.none.set_text(found if isinstance(found, str) else self._of_poles(found))
         for name, (here, worst) in self.margin_cells.items():
-            here.set_text(said(name, one.margins[name]) if one else NOTHING)
-            worst.set_text(said(name, one.worst[name]) if one and name in one.worst else NOTHING)
+            here.set_text(format_margin(name, one.margins[name]) if one else NO_VALUE)
+            worst.set_text(format_margin(name, one.worst[name]) if one and name in one.worst else NO_VALUE)
         self.loop.set_text("" if one is None else "stable" if one.stable else "NOT STABLE")
 
-    def verdict(self, found: Verdict) -> None:
+    def verdict(self, found: ProofVerdict) -> None:
         """Show what can be proved."""
         self.proving.set_visibility(False)
         self.verdict_box.classes(replace=f"verdict {found.word}")
@@ -116,7 +116,7 @@ class Results:
             ui.label("poles of the linearised loop")
             self.loop = ui.label("").classes("note").props("data-id=stable")
             self.solving = ui.label("computing …").classes("busy")
-        self.map = Canvas(charts.pole_frame(), "poles", "poles")
+        self.map = Canvas(charts.pole_chart(), "poles", "poles")
         self.none = ui.label("").classes("note").props("data-id=about-poles")
         self.poles_of = ui.label("").classes("note").props("data-id=poles-of")
         table = ui.element("div").classes("grid-table").style("grid-template-columns: 1fr auto auto")
@@ -127,7 +127,7 @@ class Results:
             for name, words in MARGINS.items():
                 ui.label(words)
                 cells = [
-                    ui.label(NOTHING).classes("number").props(f"data-margin={name}{end}") for end in ("", "-worst")
+                    ui.label(NO_VALUE).classes("number").props(f"data-margin={name}{end}") for end in ("", "-worst")
                 ]
                 self.margin_cells[name] = (cells[0], cells[1])
 

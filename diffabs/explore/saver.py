@@ -36,7 +36,7 @@ class Saver:
     def _save(self, dialog: Any) -> None:
         try:
             chosen = self.session.to_save()
-            path = saving.save(chosen, self.folder, str(self.name.value), replacing=bool(self.replacing.value))
+            path = saving.save_scenario(chosen, self.folder, str(self.name.value), replacing=bool(self.replacing.value))
         except ScenarioError as error:
             self.told.set_text(str(error))
             self.told.set_visibility(True)

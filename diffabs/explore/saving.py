@@ -4,13 +4,13 @@ import os
 import pathlib
 
 from diffabs.core import files
-from diffabs.core.values import ScenarioError, shown
+from diffabs.core.values import ScenarioError, format_given
 from diffabs.scenario.scenario import Scenario, dump, loads
 
-LONGEST = 120  # characters of a name
+MAX_NAME_LENGTH = 120  # characters of a name
 
 
-def save(chosen: Scenario, folder: pathlib.Path, name: str, *, replacing: bool = False) -> pathlib.Path:
+def save_scenario(chosen: Scenario, folder: pathlib.Path, name: str, *, replacing: bool = False) -> pathlib.Path:
     """Write a scenario to a file in a folder, whole or not at all, and return its path.
 
     name: of the file; it ends in .toml and leads to no other folder
@@ -18,20 +18,22 @@ def save(chosen: Scenario, folder: pathlib.Path, name: str, *, replacing: bool =
 
     Raises ScenarioError for such a file, a name that is none, a scenario that would not run, a folder that cannot be
     written."""
-    path = folder / _named(name)
+    path = folder / _check_name(name)
     text = dump(chosen).encode()
     loads(text, path.stem, path.name)  # as the command line would
     try:
         if replacing and path.is_file():
-            files.write(path, text)
+            files.write_file(path, text)
         else:
-            with files.unfinished(path.with_name(f".{path.stem}.{os.getpid()}.tmp")) as temporary:
+            with files.temporary_path(path.with_name(f".{path.stem}.{os.getpid()}.tmp")) as temporary:
                 temporary.write_bytes(text)
                 os.link(temporary, path)  # unlike a rename it replaces nothing
     except FileExistsError:
-        raise ScenarioError(f"file = {shown(path.name)} exists: choose another name, or allow to replace it") from None
+        raise ScenarioError(
+            f"file = {format_given(path.name)} exists: choose another name, or allow to replace it"
+        ) from None
     except OSError as error:
-        raise ScenarioError(f"file = {shown(path.name)} cannot be written: {error.strerror}") from None
+        raise ScenarioError(f"file = {format_given(path.name)} cannot be written: {error.strerror}") from None
     return path
 
 
@@ -41,13 +43,13 @@ def free_name(folder: pathlib.Path, stem: str) -> str:
     return next(name for name in names if not (folder / name).exists())
 
 
-def _named(name: str) -> str:
+def _check_name(name: str) -> str:
     name = name.strip()
     plain = name.removesuffix(".toml")
-    if not name.endswith(".toml") or not plain or len(name) > LONGEST:
-        raise ScenarioError(f"file = {shown(name)} is no name of a scenario: such as mine.toml is needed")
+    if not name.endswith(".toml") or not plain or len(name) > MAX_NAME_LENGTH:
+        raise ScenarioError(f"file = {format_given(name)} is no name of a scenario: such as mine.toml is needed")
     if name != pathlib.PurePath(name).name or name.startswith(".") or "\\" in name or not name.isprintable():
         raise ScenarioError(
-            f"file = {shown(name)} leads elsewhere: a name without folders, such as mine.toml, is needed"
+            f"file = {format_given(name)} leads elsewhere: a name without folders, such as mine.toml, is needed"
         )
     return name

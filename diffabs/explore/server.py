@@ -17,20 +17,22 @@ from fastapi import FastAPI  # pyright: ignore[reportMissingImports]
 from nicegui import ui  # pyright: ignore[reportMissingImports]
 
 from diffabs.explore import page
-from diffabs.explore.guard import LOOPBACK, Guard
+from diffabs.explore.guard import LOOPBACK_ADDRESS, Guard
 from diffabs.explore.session import Tools
 
-PATIENCE = 1  # s that open pages may take to say good-bye
-WORKER = "diffabs worker"
-SWITCH = 5e-4  # s that a thread that thinks keeps one that draws from Python; 5e-3 by default, many times for a curve
+SHUTDOWN_S = 1  # s that open pages may take to say good-bye
+WORKER_NAME = "diffabs worker"
+THREAD_SWITCH_S = (
+    5e-4  # s that a thread that thinks keeps one that draws from Python; 5e-3 by default, many times for a curve
+)
 
 
-def listening(port: int) -> socket.socket:
+def listen_on_loopback(port: int) -> socket.socket:
     """Return a socket that listens on loopback at a port, or at any free one for 0. Raises OSError if it is taken."""
     there = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         there.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        there.bind((LOOPBACK, port))
+        there.bind((LOOPBACK_ADDRESS, port))
         there.listen(64)
     except OSError:
         there.close()
@@ -44,7 +46,7 @@ def serve(
     folder: pathlib.Path,
     there: socket.socket,
     *,
-    thread: str = WORKER,
+    thread: str = WORKER_NAME,
     ready: Callable[[str], None] = lambda url: None,
     browser: bool = False,
 ) -> None:
@@ -55,7 +57,7 @@ def serve(
 
     Raises OSError if the server does not start."""
     port, token = there.getsockname()[1], secrets.token_urlsafe(24)
-    url = f"http://{LOOPBACK}:{port}/?token={token}"
+    url = f"http://{LOOPBACK_ADDRESS}:{port}/?token={token}"
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @ui.page("/", title="diffabs explore", favicon="📈")
@@ -65,11 +67,11 @@ def serve(
     ui.run_with(app, show_welcome_message=False, gzip_middleware_factory=None, reconnect_timeout=5.0, tailwind=True)
     guarded: Any = Guard(app, port, token)
     config = uvicorn.Config(
-        guarded, log_level="error", access_log=False, timeout_graceful_shutdown=PATIENCE, lifespan="on", ws="auto"
+        guarded, log_level="error", access_log=False, timeout_graceful_shutdown=SHUTDOWN_S, lifespan="on", ws="auto"
     )
     server = uvicorn.Server(config)
     logging.getLogger("nicegui").setLevel(logging.ERROR)  # a page that is not there is the browser's to tell
-    sys.setswitchinterval(SWITCH)
+    sys.setswitchinterval(THREAD_SWITCH_S)
 
     def announced() -> None:
         while not server.started and not server.should_exit:
@@ -77,16 +79,16 @@ def serve(
         if server.started:
             ready(url)
             if browser:
-                webbrowser.open(leading_to(url, pathlib.Path(private)).as_uri())
+                webbrowser.open(write_redirect_file(url, pathlib.Path(private)).as_uri())
 
     with tempfile.TemporaryDirectory(prefix="diffabs-explore-") as private:
         threading.Thread(target=announced, daemon=True).start()
         server.run(sockets=[there])
     if not server.started:
-        raise OSError(f"no page can be served at http://{LOOPBACK}:{port}/")
+        raise OSError(f"no page can be served at http://{LOOPBACK_ADDRESS}:{port}/")
 
 
-def leading_to(url: str, folder: pathlib.Path) -> pathlib.Path:
+def write_redirect_file(url: str, folder: pathlib.Path) -> pathlib.Path:
     """Return a new file, of its owner only, which leads a browser to an address: the words by which the browser is
     started are seen by everyone on the machine, and the address has the token."""
     path = folder / "explore.html"

@@ -11,8 +11,8 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import Spec, get, replace
-from diffabs.core.validity import problems
-from diffabs.core.values import ScenarioError, inside, unknown, wrong
+from diffabs.core.validity import find_problems
+from diffabs.core.values import ScenarioError, read_number_in_range, unknown_name_error, wrong_kind_error
 from diffabs.explore import friction, knobs, tuning
 from diffabs.explore.curves import Spread
 from diffabs.explore.knobs import Knob
@@ -20,13 +20,13 @@ from diffabs.scenario import registry
 from diffabs.scenario.scenario import Scenario, load
 from diffabs.simulate.admissible import find_mismatches, find_unstable_step
 
-CERTIFIED, REFUTED, UNDECIDED, UNKNOWN = "certified", "refuted", "undecided", "unknown"
+CERTIFIED, REFUTED, UNDECIDED, NOT_PROVED = "certified", "refuted", "undecided", "unknown"
 AS_GIVEN = "as in the scenario"
-FAMILIES = ("road", "controller")
+EXCHANGEABLE_FAMILIES = ("road", "controller")
 PERCENT = Spec("%", low=0.0, high=90.0)
 
 
-class Verdict(NamedTuple):
+class ProofVerdict(NamedTuple):
     """What can be proved of a loop: one of the four words above, and a sentence."""
 
     word: str
@@ -36,8 +36,8 @@ class Verdict(NamedTuple):
 class Tools(NamedTuple):
     """What needs extras: a proof of a scenario; the lanes and constraints of its [tune]."""
 
-    prove: Callable[[Scenario], Verdict]
-    pose: Callable[[Scenario], tuning.Posed]
+    prove: Callable[[Scenario], ProofVerdict]
+    pose: Callable[[Scenario], tuning.TuningTask]
 
 
 class Session:
@@ -67,7 +67,7 @@ class Session:
     def choices(self, family: str) -> list[str]:
         """Return the parts that can be chosen, that of the scenario first; none where the loop has no such part."""
         there = family == "controller" or hasattr(self.given.loop.plant, family)
-        return [AS_GIVEN, *sorted(registry.types(family))] if there else []
+        return [AS_GIVEN, *sorted(registry.family_types(family))] if there else []
 
     def turn(self, key: str, given: Any) -> float:
         """Give a number another value, as it is shown, and return it in SI. Raises ScenarioError that names the field,
@@ -86,7 +86,7 @@ class Session:
         """The same, but only look at the value itself; `judge` takes some milliseconds, and `accept` or `withdraw` must
         follow it."""
         if key not in self.knobs:
-            raise unknown(f"{key!r} is no number of this loop", key, self.knobs)
+            raise unknown_name_error(f"{key!r} is no number of this loop", key, self.knobs)
         value = self.knobs[key].read(given)
         self._put(key, value)
         return value
@@ -114,8 +114,10 @@ class Session:
         try:
             value = float(given)
         except (TypeError, ValueError):
-            raise wrong(f"fan.{name}", given, f"a number in {PERCENT.interval()}") from None
-        self.spread = dataclasses.replace(self.spread, **{name: inside(value, PERCENT, f"fan.{name}") / 100})
+            raise wrong_kind_error(f"fan.{name}", given, f"a number in {PERCENT.interval()}") from None
+        self.spread = dataclasses.replace(
+            self.spread, **{name: read_number_in_range(value, PERCENT, f"fan.{name}") / 100}
+        )
 
     def adopt(self, loop: Loop) -> None:
         """Take over the numbers of another loop of the same parts."""
@@ -149,10 +151,10 @@ class Session:
 
     def _begin(self, source: str, parts: Mapping[str, str], given: Scenario) -> None:
         self.source, self.given = source, given
-        self.parts = dict.fromkeys(FAMILIES, AS_GIVEN) | dict(parts)
+        self.parts = dict.fromkeys(EXCHANGEABLE_FAMILIES, AS_GIVEN) | dict(parts)
         self._base = friction.with_factor(given)
         self.knobs: dict[str, Knob] = knobs.knobs(self._base)
-        self.first = knobs.first(self._base, self.knobs)
+        self.first = knobs.first_knobs(self._base, self.knobs)
         self._values: dict[str, np.ndarray] = {}
         self.accept(self._base.loop)
 
@@ -176,5 +178,5 @@ def _value(value: Any, knob: Knob) -> float:
 
 def objections(chosen: Scenario) -> list[str]:
     """Return why a scenario must not be run, a line each: as a file with these numbers would be refused."""
-    lines = list(problems(chosen.loop)) or list(find_mismatches(chosen.loop, chosen.solver))
+    lines = list(find_problems(chosen.loop)) or list(find_mismatches(chosen.loop, chosen.solver))
     return lines or list(find_unstable_step(chosen.loop, chosen.solver))

@@ -13,7 +13,7 @@ from diffabs.scenario.scenario import Scenario
 
 MOST_RANGES = 3  # whose corners are followed while one drags
 
-NAMES = ("gain_up", "gain_down", "phase", "delay", "modulus")
+MARGIN_KEYS = ("gain_up", "gain_down", "phase", "delay", "modulus")
 
 
 class Stability(NamedTuple):
@@ -37,7 +37,7 @@ class Stability(NamedTuple):
     systems: int
 
 
-class Around(NamedTuple):
+class CornerLoops(NamedTuple):
     """The corners of the ranges of [design.over]. They do not depend on the values that have a range: `of` is what they
     follow from. Poles, the worst margins, how many are not stable, how many there are."""
 
@@ -56,21 +56,21 @@ def corners_of(chosen: Scenario) -> tuple[Any, ...]:
     return kind, tuple(ranges.items()), *(np.asarray(leaf).tobytes() for leaf in leaves)
 
 
-def around(chosen: Scenario, known: Around | None = None) -> Around:
+def linearise_corners(chosen: Scenario, known: CornerLoops | None = None) -> CornerLoops:
     """Return the corners of a scenario: `known` itself where they have not moved."""
     of = corners_of(chosen)
     if known and known.of == of:
         return known
     ranges = chosen.design.ranges(chosen.loop)
     if not 0 < len(ranges) <= MOST_RANGES:
-        return Around(of, np.array([]), {}, 0, 0)
+        return CornerLoops(of, np.array([]), {}, 0, 0)
     over = band(chosen.loop, ranges, 0)
-    worst = {name: numbers(one.margins)[name] for name, one in over.worst().items() if name in NAMES}
+    worst = {name: margin_values(one.margins)[name] for name, one in over.worst().items() if name in MARGIN_KEYS}
     poles = np.concatenate([closed_loop_poles(one.loop.transfer()) for one in over.systems])
-    return Around(of, poles, worst, len(over.unstable), len(over.systems))
+    return CornerLoops(of, poles, worst, len(over.unstable), len(over.systems))
 
 
-def stability(chosen: Scenario, corners: Around | None) -> Stability:
+def linear_stability(chosen: Scenario, corners: CornerLoops | None) -> Stability:
     """Return poles and margins of the linearised loop.
 
     Args:
@@ -81,13 +81,13 @@ def stability(chosen: Scenario, corners: Around | None) -> Stability:
         ValueError: the loop has no linear model
     """
     here = band(chosen.loop, {}, 0).systems[0]
-    corners = corners or Around((), np.array([]), {}, 0, 0)
+    corners = corners or CornerLoops((), np.array([]), {}, 0, 0)
     return Stability(
         here.loop.period,
         here.loop.delay,
         closed_loop_poles(here.loop.transfer()),
         corners.poles,
-        numbers(here.margins),
+        margin_values(here.margins),
         corners.worst,
         here.margins.stable,
         corners.unstable,
@@ -95,14 +95,14 @@ def stability(chosen: Scenario, corners: Around | None) -> Stability:
     )
 
 
-def numbers(found: Margins) -> dict[str, float]:
+def margin_values(found: Margins) -> dict[str, float]:
     """Return the margins by name, in SI; NaN where the loop is not stable."""
     low, high = found.gain
     values = (high, low, found.phase, found.delay, found.modulus)
-    return dict(zip(NAMES, values, strict=True))
+    return dict(zip(MARGIN_KEYS, values, strict=True))
 
 
-def said(name: str, value: float) -> str:
+def format_margin(name: str, value: float) -> str:
     """Return a margin as it is shown, with its unit."""
     if math.isnan(value):
         return "none"

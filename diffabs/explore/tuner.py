@@ -9,15 +9,15 @@ from diffabs.core.values import ScenarioError
 from diffabs.explore import curves, tuning
 from diffabs.explore.canvas import Canvas
 from diffabs.explore.knobs import unit_words
-from diffabs.explore.results import measured
-from diffabs.explore.work import Latest
+from diffabs.explore.results import format_metric
+from diffabs.explore.work import NewestJobThread
 from diffabs.scenario.scenario import Scenario
 
 if TYPE_CHECKING:
     from diffabs.explore.page import Page
 
 Fields = tuple[Any, Any, tuple[str, str]]  # of the low and the high end, and what they said at first
-WIDE = 20  # losses that differ by so much are drawn in decades
+MAX_LABEL_LENGTH = 20  # losses that differ by so much are drawn in decades
 LOSS = {
     "animation": False,
     "grid": {"left": 52, "right": 8, "top": 8, "bottom": 18},
@@ -33,7 +33,7 @@ class Tuner:
     def __init__(self, page: "Page", thread: str):
         """Nothing is on the page yet."""
         self.page = page
-        self.worker = Latest(thread, self._failed)
+        self.worker = NewestJobThread(thread, self._failed)
         self.stopping, self.running = False, False
         self.origin: Scenario | None = None
 
@@ -59,10 +59,10 @@ class Tuner:
             ui.notify("a tuning is under way", type="warning")
             return
         now = self.page.session.scenario()
-        paths, metric = tuning.usual(now)
+        paths, metric = tuning.default_tuning(now)
         with ui.dialog() as dialog, ui.card().style("min-width: 460px").props("data-id=ask-tuning"):
             ui.label("Tune from here").style("font-weight:600; font-size:15px")
-            free = ui.select(tuning.free(now), value=paths, label="free parameters", multiple=True).props(
+            free = ui.select(tuning.tunable_parameters(now), value=paths, label="free parameters", multiple=True).props(
                 "dense outlined"
             )
             free.classes("w-full").props("use-chips data-id=free")
@@ -96,7 +96,7 @@ class Tuner:
                 ui.label(words).classes("head number" if words in ("low", "high") else "head")
             for path in paths:
                 try:
-                    ends = tuning.bounds(now, path, known)
+                    ends = tuning.bounds_on_page(now, path, known)
                 except ScenarioError as error:
                     ui.label(str(error)).style("grid-column: 1 / 5")
                     continue
@@ -122,7 +122,7 @@ class Tuner:
     def _start(self, paths: list[str], metric: str, bounded: dict[str, tuple[Any, Any]]) -> None:
         session = self.page.session
         try:
-            chosen = tuning.goal(session.scenario(), paths, metric, session.knobs, bounded)
+            chosen = tuning.scenario_with_goal(session.scenario(), paths, metric, session.knobs, bounded)
         except ScenarioError as error:
             self.page.refused(error)
             return
@@ -146,9 +146,11 @@ class Tuner:
     # In its thread.
     def _tune(self, chosen: Scenario) -> None:
         posed = self.page.tools.pose(chosen)
-        before = curves.curves(chosen)
-        found = tuning.tuned(chosen, posed, lambda i, loss: self.page.later(self._told, i, loss), lambda: self.stopping)
-        after = curves.curves(found.after)
+        before = curves.run_curves(chosen)
+        found = tuning.tune_scenario(
+            chosen, posed, lambda i, loss: self.page.later(self._told, i, loss), lambda: self.stopping
+        )
+        after = curves.run_curves(found.after)
         self.page.later(self._found, chosen, found, before, after)
 
     def _failed(self, error: Exception) -> None:
@@ -164,7 +166,7 @@ class Tuner:
         self.bar.set_value(min(1.0, len(self.points) / most))
         data = [(i, point) for i, (_, point) in enumerate(self.points)]
         losses = [loss for _, loss in data]
-        wide = min(losses) > 0 and max(losses) > WIDE * min(losses)
+        wide = min(losses) > 0 and max(losses) > MAX_LABEL_LENGTH * min(losses)
         axis = {"type": "log" if wide else "value"}
         self.loss.change({"yAxis": [axis], "series": [{"id": "loss", "data": data}]})
 
@@ -173,7 +175,7 @@ class Tuner:
         self.card.set_visibility(False)
         self.page.refused(error)
 
-    def _found(self, chosen: Scenario, found: tuning.Found, before: curves.Curves, after: curves.Curves) -> None:
+    def _found(self, chosen: Scenario, found: tuning.TuningFound, before: curves.Curves, after: curves.Curves) -> None:
         self.running = False
         if self.origin is None:
             return
@@ -184,7 +186,7 @@ class Tuner:
         self.page.pin(before)
         self.page.redraw()
 
-    def _table(self, chosen: Scenario, found: tuning.Found, before: curves.Curves, after: curves.Curves) -> None:
+    def _table(self, chosen: Scenario, found: tuning.TuningFound, before: curves.Curves, after: curves.Curves) -> None:
         """Before and after: what was free, and what is measured on the run shown."""
         knobs = self.page.session.knobs
         self.card.clear()
@@ -202,7 +204,7 @@ class Tuner:
                     self._line(knobs[key].label, *(knobs[key].text(value) for value in pair))
                 for name in chosen.objectives:
                     pair = (one.metrics[name] for one in (before, after))
-                    self._line(name.replace("_", " "), *map(measured, pair))
+                    self._line(name.replace("_", " "), *map(format_metric, pair))
             with ui.row().classes("gap-2"):
                 ui.button("keep", on_click=self._keep).props("flat dense no-caps size=sm data-id=keep")
                 ui.button("go back", on_click=self._go_back).props("flat dense no-caps size=sm data-id=go-back")

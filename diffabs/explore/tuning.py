@@ -12,14 +12,14 @@ from diffabs.explore.knobs import Knob
 from diffabs.scenario.scenario import Scenario
 
 
-class Posed(NamedTuple):
+class TuningTask(NamedTuple):
     """The lanes of a tuning, and its constraints."""
 
     batch: Any
     constraints: Sequence[Any]
 
 
-class Found(NamedTuple):
+class TuningFound(NamedTuple):
     """What a tuning has found: the scenario, the loss at each iteration, whether the constraints are met, and why it
     ended, in words."""
 
@@ -29,7 +29,7 @@ class Found(NamedTuple):
     reason: str
 
 
-def free(chosen: Scenario) -> list[str]:
+def tunable_parameters(chosen: Scenario) -> list[str]:
     """Return the parameters that can be tuned, by path: those of the scenario first, then those of its controller and
     reference."""
     there = [
@@ -40,13 +40,15 @@ def free(chosen: Scenario) -> list[str]:
     return list(dict.fromkeys([*chosen.tune.free, *there]))
 
 
-def usual(chosen: Scenario) -> tuple[list[str], str]:
+def default_tuning(chosen: Scenario) -> tuple[list[str], str]:
     """Return what is tuned unless one says otherwise: the scenario's own, else the gains; and the metric."""
-    paths = list(chosen.tune.free) or [path for path in free(chosen) if path.startswith("controller.")][:1]
+    paths = (
+        list(chosen.tune.free) or [path for path in tunable_parameters(chosen) if path.startswith("controller.")][:1]
+    )
     return paths, next(iter(chosen.tune.objective or chosen.objectives), "")
 
 
-def bounds(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> dict[str, tuple[float, float]]:
+def bounds_on_page(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> dict[str, tuple[float, float]]:
     """Return the bounds of a free parameter as the page shows them, by the key of each of its numbers: those of [tune],
     else the ends of its sliders. Raises ScenarioError for a parameter without a range."""
     mine = {key: knob for key, knob in known.items() if knob.path == path}
@@ -63,7 +65,7 @@ def bounds(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> dict[str, 
     return {key: (end(knob, 0), end(knob, 1)) for key, knob in mine.items()}
 
 
-def goal(
+def scenario_with_goal(
     chosen: Scenario,
     paths: Sequence[str],
     metric: str,
@@ -93,7 +95,9 @@ def goal(
     return dataclasses.replace(chosen, tune=task)
 
 
-def tuned(chosen: Scenario, posed: Posed, told: Callable[[int, float], None], stopping: Callable[[], bool]) -> Found:
+def tune_scenario(
+    chosen: Scenario, posed: TuningTask, told: Callable[[int, float], None], stopping: Callable[[], bool]
+) -> TuningFound:
     """Return what `diffabs tune` finds for a scenario's [tune]. `told` hears iteration and loss.
 
     Raises ValueError for a start that cannot be left, ModuleNotFoundError without the extra `tune`."""
@@ -114,14 +118,17 @@ def tuned(chosen: Scenario, posed: Posed, told: Callable[[int, float], None], st
         stopping=stopping,
     )
     losses = tuple(float(point.loss) for point in found.history)
-    return Found(dataclasses.replace(chosen, loop=found.loop), losses, found.met, found.reason.value)
+    return TuningFound(dataclasses.replace(chosen, loop=found.loop), losses, found.met, found.reason.value)
 
 
 def _range(
     chosen: Scenario, path: str, known: Mapping[str, Knob], bounded: Mapping[str, tuple[Any, Any]]
 ) -> tuple[Any, Any]:
     """Low and high end of a parameter in SI, in its shape."""
-    ends = {**bounds(chosen, path, known), **{key: ends for key, ends in bounded.items() if known[key].path == path}}
+    ends = {
+        **bounds_on_page(chosen, path, known),
+        **{key: ends for key, ends in bounded.items() if known[key].path == path},
+    }
     read = {key: tuple(known[key].read(end) for end in pair) for key, pair in ends.items()}
     for key, (low, high) in read.items():
         if not low < high:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 Job = Callable[[], None]
 
 
-class Latest:
+class NewestJobThread:
     """Does jobs one after the other, in a thread of its own; one that is still waiting when another comes is dropped,
     so that whoever asks faster than it works is never behind by more than one job."""
 

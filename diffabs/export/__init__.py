@@ -2,9 +2,9 @@
 and the plant as an FMU."""
 
 from diffabs.export.c99 import c_source as c_source
-from diffabs.export.device import Device as Device
+from diffabs.export.device import ComputerProgram as ComputerProgram
 from diffabs.export.device import NotExported as NotExported
-from diffabs.export.device import device as device
-from diffabs.export.difference_equations import equations as equations
-from diffabs.export.mockup import fmu as fmu
+from diffabs.export.device import computer_program as computer_program
+from diffabs.export.difference_equations import difference_equations as difference_equations
+from diffabs.export.mockup import build_fmu as build_fmu
 from diffabs.export.structured_text import structured_text as structured_text

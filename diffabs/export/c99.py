@@ -5,15 +5,15 @@ from collections.abc import Iterator, Sequence
 import jax
 import numpy as np
 
-from diffabs.export.c_words import Words, commented, identifiers, is_name
-from diffabs.export.device import Device, NotExported
+from diffabs.export.c_words import Words, comment_text, identifiers, is_name
+from diffabs.export.device import ComputerProgram, NotExported
 from diffabs.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
 from diffabs.kernel.graph import Node
 from diffabs.kernel.primitives import Unsupported
 from diffabs.kernel.program import live_nodes
 
 
-def c_source(found: Device, name: str, notes: Sequence[str] = ()) -> str:
+def c_source(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
     """Return a device as C99: `NAME_state`, `NAME_input`, `NAME_parameters` with `NAME_defaults`, `NAME_start`,
     `NAME_step`, and the type `NAME_real` of their numbers. Under `#ifdef NAME_MAIN`, with the name in capitals, a main
     for tests reads a line of inputs for each sample and writes the command.
@@ -32,7 +32,7 @@ def c_source(found: Device, name: str, notes: Sequence[str] = ()) -> str:
 
 
 class _Text:
-    def __init__(self, found: Device, name: str, notes: Sequence[str]):
+    def __init__(self, found: ComputerProgram, name: str, notes: Sequence[str]):
         self.device, self.name, self.notes = found, name, notes
         self.real = f"{name}_real"
         self.program = program = Lowered(found)
@@ -57,7 +57,7 @@ class _Text:
         yield f"/* Before the first sample, with what is measured then. */\n{start}\n{{"
         yield from self._body(self.program.begun, ())
         yield "  s->held = false;\n}\n"
-        yield f"/* At each sample: the command [{commented(self.device.control_unit)}]. */\n{step}\n{{"
+        yield f"/* At each sample: the command [{comment_text(self.device.control_unit)}]. */\n{step}\n{{"
         yield from self._body(self.program.stored, [self.program.held])
         yield "  return s->command;\n}\n"
         yield from self._main()
@@ -66,7 +66,7 @@ class _Text:
         delay = f", output it {float(self.device.delay)!r} s after that" if self.device.delay else ""
         yield f"/* {self.name}: the controller, to be called every {float(self.device.period)!r} s{delay}."
         for line in [*self.notes, *map(str, self.device.numbers)]:
-            yield f"   {commented(line)}"
+            yield f"   {comment_text(line)}"
         yield (
             f"   Call {self.name}_start once with the first measurements, then {self.name}_step at every sample,\n"
             f"   the first among them, both with parameters: {self.name}_defaults, or a changed copy.\n"
@@ -82,9 +82,9 @@ class _Text:
         program, real = self.program, self.real
         specs = {name: spec for number in self.device.numbers for name, spec in number.named()}
         inputs, numbers, memory = (self.fields[where] for where in (INPUTS, NUMBERS, MEMORY))
-        read = [f"{real} {inputs[x]}; /* [{commented(self.device.units.get(x, '1'))}] */" for x in program.read]
+        read = [f"{real} {inputs[x]}; /* [{comment_text(self.device.units.get(x, '1'))}] */" for x in program.read]
         yield from self._struct("What is measured at a sample.", "input", read)
-        used = [f"{real} {numbers[x]}; /* {commented(specs[x])} */" for x in program.used]
+        used = [f"{real} {numbers[x]}; /* {comment_text(specs[x])} */" for x in program.used]
         yield from self._struct("What can be changed, also between two samples.", "parameters", used)
         kept = [f"{self.words.type(program.state[x])} {memory[x]};" for x in program.kept]
         held = f"bool {memory['held']}; /* whether the last sample could not be used */"

@@ -11,25 +11,25 @@ import numpy as np
 from diffabs.kernel.graph import Node, is_real
 from diffabs.kernel.primitives import Unsupported
 
-TYPES = {"int64": "int64_t", "uint64": "uint64_t", "int32": "int32_t", "uint32": "uint32_t", "bool": "bool"}
-INFIX = {
+C_TYPES = {"int64": "int64_t", "uint64": "uint64_t", "int32": "int32_t", "uint32": "uint32_t", "bool": "bool"}
+C_INFIX = {
     **{"add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/", "and": "&", "or": "|", "xor": "^"},
     **{"lt": "<", "le": "<=", "eq": "==", "ne": "!=", "shift_left": "<<", "shift_right_logical": ">>"},
 }
-CHOSEN = {"lower": "<", "higher": ">"}
+CLAMP_COMPARISONS = {"lower": "<", "higher": ">"}
 EXTREMES = {"min": "<", "max": ">"}
-FUNCTIONS = {
+C_FUNCTIONS = {
     **{name: name for name in ("exp", "log", "log1p", "expm1", "sin", "cos", "tan", "tanh", "atan", "asin", "acos")},
     **{name: name for name in ("sinh", "cosh", "atan2", "pow", "sqrt", "rint", "floor", "ceil")},
     **{"abs": "fabs", "rem": "fmod"},
 }
-WORDS = (
+C_KEYWORDS_TEXT = (
     "auto break case char const continue default do double else enum extern float for goto if inline int long "
     "register restrict return short signed sizeof static struct switch typedef union unsigned void volatile while "
     "bool true false"
 )
-RESERVED = set(WORDS.split())
-TAKEN = {*FUNCTIONS.values(), "s", "p", "in", "i", "m", "t", "h"}  # which a variable must not hide
+C_KEYWORDS = set(C_KEYWORDS_TEXT.split())
+TAKEN = {*C_FUNCTIONS.values(), "s", "p", "in", "i", "m", "t", "h"}  # which a variable must not hide
 
 
 class Words:
@@ -54,7 +54,7 @@ class Words:
 
     def type(self, node: Node) -> str:
         """Of a number."""
-        return self.real if is_real(node.dtype) else TYPES[node.dtype.name]
+        return self.real if is_real(node.dtype) else C_TYPES[node.dtype.name]
 
     def name(self, node: Node) -> str:
         """What stands for a number: a literal, a variable, a place."""
@@ -63,14 +63,14 @@ class Words:
         if node.op == "input":
             return self.place(*node.attr)
         if node.id not in self._names:
-            self._names[node.id] = fresh(identifier(node.label) or node.op, self._taken)
+            self._names[node.id] = fresh_name(identifier(node.label) or node.op, self._taken)
         return self._names[node.id]
 
     def _literal(self, node: Node) -> str:
         x = node.attr
         if node.dtype.kind == "b":
             return "true" if x else "false"
-        return self.literal(x) if is_real(node.dtype) else f"(({TYPES[node.dtype.name]}){int(x)})"
+        return self.literal(x) if is_real(node.dtype) else f"(({C_TYPES[node.dtype.name]}){int(x)})"
 
     def literal(self, x: Any) -> str:
         """A real number, of NumPy, as it is written."""
@@ -88,15 +88,15 @@ class Words:
         suffix = "f" if self.single else ""
         if node.op == "ne" and node.args[0] is node.args[1]:
             return f"isnan({args[0]}) != 0"
-        if node.op in INFIX:
-            return f"{args[0]} {INFIX[node.op]} {args[1]}"
-        if node.op in CHOSEN:
-            return f"{args[0]} {CHOSEN[node.op]} {args[1]} ? {args[0]} : {args[1]}"
+        if node.op in C_INFIX:
+            return f"{args[0]} {C_INFIX[node.op]} {args[1]}"
+        if node.op in CLAMP_COMPARISONS:
+            return f"{args[0]} {CLAMP_COMPARISONS[node.op]} {args[1]} ? {args[0]} : {args[1]}"
         if node.op in EXTREMES:  # NaN where either is
             a, b = args
             return f"{a} != {a} || {a} {EXTREMES[node.op]} {b} ? {a} : {b}"
-        if node.op in FUNCTIONS and is_real(node.dtype):
-            return f"{FUNCTIONS[node.op]}{suffix}({', '.join(args)})"
+        if node.op in C_FUNCTIONS and is_real(node.dtype):
+            return f"{C_FUNCTIONS[node.op]}{suffix}({', '.join(args)})"
         if node.op == "is_finite":
             return f"isfinite({args[0]}) != 0"
         if node.op == "neg":
@@ -119,23 +119,23 @@ class Words:
 
 def is_name(name: str) -> bool:
     """Return whether C has such a name for a function."""
-    return bool(re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII)) and name not in RESERVED
+    return bool(re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII)) and name not in C_KEYWORDS
 
 
 def identifier(path: str) -> str:
     """Return a path as a name of C; empty where nothing of it can be in one."""
     name = re.sub(r"\W+", "_", path, flags=re.ASCII).strip("_")
     name = f"x{name}" if name[:1].isdigit() else name
-    return f"{name}_" if name in RESERVED else name
+    return f"{name}_" if name in C_KEYWORDS else name
 
 
 def identifiers(paths: Iterable[str]) -> dict[str, str]:
     """Return paths as names of C, each another."""
     taken: set[str] = set()
-    return {path: fresh(identifier(path) or "x", taken) for path in paths}
+    return {path: fresh_name(identifier(path) or "x", taken) for path in paths}
 
 
-def fresh(name: str, taken: set[str]) -> str:
+def fresh_name(name: str, taken: set[str]) -> str:
     """Return a name that is not taken, with a number where it must be; it is taken then."""
     number, new = 2, name
     while new in taken:
@@ -144,7 +144,7 @@ def fresh(name: str, taken: set[str]) -> str:
     return new
 
 
-def commented(text: str) -> str:
+def comment_text(text: str) -> str:
     """Return a text as it may stand in a comment of any language: on one line, of an alphabet in which no comment ends,
     begins or goes on."""
     return re.sub(r"[^A-Za-z0-9 .,:;=+_/()\[\]<>'^%&|-]", "_", " ".join(text.split()))

@@ -17,15 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.controllers import Sampled, SampledOnGrid
-from diffabs.controllers.sampled import usable
+from diffabs.controllers.sampled import replace_nan
 from diffabs.core.blocks import offers
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
-from diffabs.core.pytree import Spec, arrayed, parameters, prepared, strong
-from diffabs.core.tracing import follows, leaves_followed
+from diffabs.core.pytree import Spec, as_arrays, canonical_dtypes, parameters, prepare_parts
+from diffabs.core.tracing import depends_on_signal, leaf_dependence
 from diffabs.simulate.rk4 import rk4_step
 
-MOST_STEPS = 64  # of the simulation in a period, for a target that moves by itself
+MAX_STEPS_PER_SAMPLE = 64  # of the simulation in a period, for a target that moves by itself
 
 
 class NotExported(ValueError):
@@ -56,7 +56,7 @@ class Parts(NamedTuple):
     reference: Any = ()
 
 
-class Number(NamedTuple):
+class DeviceParameter(NamedTuple):
     """A parameter of a part: its path in the loop, value (...), and what it may be."""
 
     path: str
@@ -78,7 +78,7 @@ class Number(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Device:
+class ComputerProgram:
     """What a computer works out, as functions to trace. start(parts, input) -> state, before the first sample. At each
     sample step(parts, state, input) -> (controller's memory, samples, command, whether they are held because the sample
     cannot be used), and then `moves` times move(parts, state, i) -> reference's memory, i = 0, 1, ...
@@ -99,10 +99,12 @@ class Device:
     period: float
     delay: float
     control_unit: str
-    numbers: tuple[Number, ...]
+    numbers: tuple[DeviceParameter, ...]
 
 
-def device(loop: Loop, *, step: float | None = None, dtype: Any = np.float64, given_target: bool = False) -> Device:
+def computer_program(
+    loop: Loop, *, step: float | None = None, dtype: Any = np.float64, given_target: bool = False
+) -> ComputerProgram:
     """Return the computer's part of a loop whose controller is `Sampled`.
 
     step: of the simulation [s], which a target that moves by itself is advanced by; by default the period
@@ -111,16 +113,16 @@ def device(loop: Loop, *, step: float | None = None, dtype: Any = np.float64, gi
         NotExported: a controller in continuous time; a reference that follows what is measured, unless the target is
             given.
     """
-    loop = sampled(loop)
+    loop = with_sampled_controller(loop)
     controller: Any = loop.controller
     with jax.enable_x64(True):
-        typed: Loop = jax.tree.map(lambda x: jnp.asarray(x, dtype), strong(arrayed(loop)))
+        typed: Loop = jax.tree.map(lambda x: jnp.asarray(x, dtype), canonical_dtypes(as_arrays(loop)))
         computer: Any = typed.controller
         parts = Parts(computer.controller, typed.feedforward, () if given_target else typed.reference)
-        typed = prepared(typed)
-        shapes = jax.eval_shape(lambda: _given(typed, given_target))
+        typed = prepare_parts(typed)
+        shapes = jax.eval_shape(lambda: _start_input(typed, given_target))
         if not given_target:
-            _check_reference(typed, _given(typed, False).measured)
+            _check_reference(typed, _start_input(typed, False).measured)
         count = _steps(float(controller.period), step)
         work = _Work(typed, count, given_target, shapes)
         state = jax.eval_shape(work.start, parts, shapes)
@@ -128,14 +130,14 @@ def device(loop: Loop, *, step: float | None = None, dtype: Any = np.float64, gi
     if given_target:
         units["target"] = units[loop.plant.shows._fields[0]]
     moves = count if jax.tree.leaves(state.reference.flow) else 0
-    return Device(
+    return ComputerProgram(
         work.start, work.step, work.move, moves, units, shapes, state, parts, np.dtype(dtype), float(controller.period),
         float(controller.delay), loop.plant.control_unit,
         tuple(_numbers(loop, typed, shapes, given_target)),
     )  # fmt: skip
 
 
-def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Iterator[Number]:
+def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Iterator[DeviceParameter]:
     """The parameters of what the computer works out."""
     measured = given.measured
 
@@ -145,13 +147,13 @@ def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Itera
     families = ["controller", "feedforward", *(() if given_target else ("reference",))]
     with jax.enable_x64(True):
         measured = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), measured)
-        families += ["plant"] if follows(ahead, typed.plant) else []
+        families += ["plant"] if depends_on_signal(ahead, typed.plant) else []
     for path, spec, value in parameters(loop):
         if path.partition(".")[0] in families:
-            yield Number(path, np.asarray(value, float), spec)
+            yield DeviceParameter(path, np.asarray(value, float), spec)
 
 
-def sampled(loop: Loop) -> Loop:
+def with_sampled_controller(loop: Loop) -> Loop:
     """Return the loop with its controller as `Sampled`; `SampledOnGrid` is the same on a computer.
 
     Raises:
@@ -167,7 +169,7 @@ def sampled(loop: Loop) -> Loop:
     return dataclasses.replace(loop, controller=controller)
 
 
-def _given(loop: Loop, target: bool) -> Input:
+def _start_input(loop: Loop, target: bool) -> Input:
     """The input at the loop's start."""
     state = loop.start()
     measured = loop.sensor.output(0.0, state.sensor, loop.plant.output(state.plant))
@@ -176,8 +178,10 @@ def _given(loop: Loop, target: bool) -> Input:
 
 def _steps(period: float, step: float | None) -> int:
     count = round(period / step) if step else 1
-    if count > MOST_STEPS:
-        raise NotExported(f"the period of {period:g} s is {count} steps of the solver; {MOST_STEPS} are the most")
+    if count > MAX_STEPS_PER_SAMPLE:
+        raise NotExported(
+            f"the period of {period:g} s is {count} steps of the solver; {MAX_STEPS_PER_SAMPLE} are the most"
+        )
     return max(count, 1)
 
 
@@ -185,7 +189,7 @@ def _check_reference(loop: Loop, measured: Any) -> None:
     """Raises NotExported for a target that depends on what is measured, or changes at instants."""
     reference, name = loop.reference, type(loop.reference).__name__
     memory = reference.start(measured)
-    moves = follows(lambda y: (reference.flow(0.0, memory, y), reference.output(0.0, memory, y)), measured)
+    moves = depends_on_signal(lambda y: (reference.flow(0.0, memory, y), reference.output(0.0, memory, y)), measured)
     if offers(reference) or moves:
         raise NotExported(f"reference {name} follows what is measured between samples: give the target from outside")
 
@@ -200,7 +204,7 @@ class _Work:
 
     def start(self, parts: Parts, given: Input) -> State:
         """The memories at the first sample."""
-        loop, given = self._with(parts), usable(given)
+        loop, given = self._with(parts), replace_nan(given)
         reference = Memory() if self.given_target else loop.reference.start(given.measured)
         tracking, _ = self._tracking(loop, reference, given, 0.0)
         zero = jnp.zeros_like(tracking.target)
@@ -228,9 +232,9 @@ class _Work:
 
     def _with(self, parts: Parts) -> Any:
         """The loop with these parts in it."""
-        controller = dataclasses.replace(self.sampled, controller=prepared(parts.controller))
-        loop = dataclasses.replace(self.loop, controller=controller, feedforward=prepared(parts.feedforward))
-        return loop if self.given_target else dataclasses.replace(loop, reference=prepared(parts.reference))
+        controller = dataclasses.replace(self.sampled, controller=prepare_parts(parts.controller))
+        loop = dataclasses.replace(self.loop, controller=controller, feedforward=prepare_parts(parts.feedforward))
+        return loop if self.given_target else dataclasses.replace(loop, reference=prepare_parts(parts.reference))
 
     def _time(self, state: State) -> Any:
         """Of the sample [s]."""
@@ -239,9 +243,9 @@ class _Work:
 
     def _tracking(self, loop: Loop, reference: Memory, given: Input, t: Any) -> tuple[Tracking, Any]:
         """What the controller is given, and whether the feed-forward would be made of a NaN."""
-        measured = usable(given.measured)
+        measured = replace_nan(given.measured)
         if self.given_target:
-            target, setpoint = given.target, usable(given.target)
+            target, setpoint = given.target, replace_nan(given.target)
         else:
             target = loop.reference.output(t, reference, measured)
             setpoint = loop.reference.setpoint(reference)
@@ -249,6 +253,6 @@ class _Work:
         def ahead(measured: Any) -> Any:
             return loop.feedforward.input(loop.plant, measured, setpoint)
 
-        followed = zip(jax.tree.leaves(given.measured), leaves_followed(ahead, measured), strict=True)
+        followed = zip(jax.tree.leaves(given.measured), leaf_dependence(ahead, measured), strict=True)
         lost = reduce(jnp.logical_or, [jnp.isnan(x) for x, on in followed if on], False)
         return Tracking(target, given.measured, ahead(measured)), lost

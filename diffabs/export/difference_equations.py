@@ -5,25 +5,25 @@ from typing import Any
 import numpy as np
 
 from diffabs.core.loop import Loop
-from diffabs.export.device import NotExported, sampled
+from diffabs.export.device import NotExported, with_sampled_controller
 from diffabs.linear.opened_loop import open_loop
 
-ROUNDING = 1e-12  # relative to the greatest coefficient of a matrix: less is none
+ENTRY_ROUNDING = 1e-12  # relative to the greatest coefficient of a matrix: less is none
 
 
-def equations(loop: Loop, target: Any = None) -> dict[str, Any]:
+def difference_equations(loop: Loop, target: Any = None) -> dict[str, Any]:
     """Return the linear controller at rest on the setpoint: x(k+1) = F x(k) + G y(k), u(k) = H x(k) + J y(k), all
     of them differences from rest; by name F (n, n), G (n, m), H (n,), J (m,), the names of y, and the period [s].
 
     Raises:
         NotExported: a controller in continuous time, or a loop without a linear model.
     """
-    loop = sampled(loop)
+    loop = with_sampled_controller(loop)
     try:
         found = open_loop(loop, target).controller
     except ValueError as error:
         raise NotExported(str(error)) from None
-    found = found._replace(**{name: _cleaned(getattr(found, name)) for name in "ABCD"})
+    found = found._replace(**{name: _round_entries(getattr(found, name)) for name in "ABCD"})
     names = ["target", *loop.plant.shows._fields, "feedforward"]
     used = (np.abs(found.B).max(axis=0, initial=0) > 0) | (np.abs(found.D[0]) > 0)
     kept = [i for i, one in enumerate(used) if one]
@@ -33,5 +33,5 @@ def equations(loop: Loop, target: Any = None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _cleaned(matrix: Any) -> np.ndarray:
-    return np.where(np.abs(matrix) > ROUNDING * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)
+def _round_entries(matrix: Any) -> np.ndarray:
+    return np.where(np.abs(matrix) > ENTRY_ROUNDING * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)

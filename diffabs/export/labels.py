@@ -14,7 +14,7 @@ import jax
 from diffabs.kernel.graph import Graph, Node, UpdateLevel
 
 PACKAGE = pathlib.Path(__file__).parents[1]
-CARRIERS = (pathlib.Path(jax.__file__).parent, *(PACKAGE / name for name in ("core", "kernel", "export")))
+INTERNAL_PATHS = (pathlib.Path(jax.__file__).parent, *(PACKAGE / name for name in ("core", "kernel", "export")))
 ANONYMOUS = ("<lambda>", "<listcomp>", "<genexpr>", "<module>")
 
 
@@ -40,20 +40,20 @@ class Labelled(Graph):
         return node
 
 
-def label(eqn: Any) -> str:
+def source_label(eqn: Any) -> str:
     """Return what the source calls the result of an operation; empty where that cannot be told."""
     traceback = getattr(getattr(eqn, "source_info", None), "traceback", None)
     for frame in getattr(traceback, "frames", ()):
         place = pathlib.Path(frame.file_name)
         function = frame.function_name.rpartition(".")[2]
-        if any(folder in place.parents for folder in CARRIERS) or function in ANONYMOUS:
+        if any(folder in place.parents for folder in INTERNAL_PATHS) or function in ANONYMOUS:
             continue
-        return (_assigned(frame.file_name).get(frame.line_num) or function).strip("_")
+        return (_assigned_variables(frame.file_name).get(frame.line_num) or function).strip("_")
     return ""
 
 
 @functools.cache
-def _assigned(file: str) -> dict[int, str]:
+def _assigned_variables(file: str) -> dict[int, str]:
     """The variables that the statements of a file assign, by the number of each of their lines."""
     try:
         tree = ast.parse(pathlib.Path(file).read_bytes())

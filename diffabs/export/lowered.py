@@ -9,8 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from diffabs.export.device import Device
-from diffabs.export.labels import Labelled, label
+from diffabs.export.device import ComputerProgram
+from diffabs.export.labels import Labelled, source_label
 from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel
 from diffabs.kernel.primitives import constant_array, lower_jaxpr
 from diffabs.kernel.program import RULE_MODULES, live_nodes
@@ -28,25 +28,25 @@ class Lowered:
 
     Raises Unsupported for an operation that has no rule."""
 
-    def __init__(self, found: Device):
+    def __init__(self, found: ComputerProgram):
         """Trace start, step and move."""
         self.device = found
         graph = Labelled()
-        self.inputs = named(found.input, graph, INPUTS, lambda path: path.removeprefix("measured."))
-        self.numbers = named(found.parts, graph, NUMBERS, lambda path: path.removeprefix("controller."))
-        self.state = named(found.state, graph, MEMORY, _flat)
+        self.inputs = number_leaves(found.input, graph, INPUTS, lambda path: path.removeprefix("measured."))
+        self.numbers = number_leaves(found.parts, graph, NUMBERS, lambda path: path.removeprefix("controller."))
+        self.state = number_leaves(found.state, graph, MEMORY, _short_path)
         self.values = dict(zip(self.numbers, _numbers_of(found.parts), strict=True))
-        given, parts = filled(found.input, self.inputs), filled(found.parts, self.numbers)
-        started = outputs(graph, lambda both: found.start(*both), (found.parts, found.input), [*parts, *given])
-        held = filled(found.state, self.state)
+        given, parts = fill_shapes(found.input, self.inputs), fill_shapes(found.parts, self.numbers)
+        started = trace_outputs(graph, lambda both: found.start(*both), (found.parts, found.input), [*parts, *given])
+        held = fill_shapes(found.state, self.state)
         shapes = (found.parts, found.state, found.input)
-        *after, self.held = outputs(graph, lambda all: found.step(*all), shapes, [*parts, *held, *given])
+        *after, self.held = trace_outputs(graph, lambda all: found.step(*all), shapes, [*parts, *held, *given])
         self.place = graph.input(np.int64, UpdateLevel.UNIFORM, ("", "i"))
         moved: list[Node] = []
         if found.moves:
             place, count = np.full((), self.place, object), jax.ShapeDtypeStruct((), np.int64)
             shapes = (found.parts, found.state, count)
-            moved = outputs(graph, lambda all: found.move(*all), shapes, [*parts, *held, place])
+            moved = trace_outputs(graph, lambda all: found.move(*all), shapes, [*parts, *held, place])
         moving = dict(zip([*self.state][len(after) :], moved, strict=bool(moved)))
         self.after = dict(zip(self.state, after, strict=False)) | moving
         self.command = self.after["command"]
@@ -73,7 +73,7 @@ class Lowered:
         return [name for name in self.state if name in kept]
 
 
-def named(shape: Any, graph: Graph, where: str, flat: Any) -> dict[str, Node]:
+def number_leaves(shape: Any, graph: Graph, where: str, flat: Any) -> dict[str, Node]:
     """Return a number for each entry of a pytree of shapes, by its path."""
     found: dict[str, Node] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(shape):
@@ -84,7 +84,7 @@ def named(shape: Any, graph: Graph, where: str, flat: Any) -> dict[str, Node]:
     return found
 
 
-def filled(shape: Any, nodes: dict[str, Node]) -> list[Array]:
+def fill_shapes(shape: Any, nodes: dict[str, Node]) -> list[Array]:
     """Return the numbers as arrays of the shapes of a pytree's leaves."""
     left, arrays = iter(nodes.values()), []
     for leaf in jax.tree.leaves(shape):
@@ -95,10 +95,10 @@ def filled(shape: Any, nodes: dict[str, Node]) -> list[Array]:
     return arrays
 
 
-def outputs(graph: Labelled, function: Any, shape: Any, inputs: list[Array]) -> list[Node]:
+def trace_outputs(graph: Labelled, function: Any, shape: Any, inputs: list[Array]) -> list[Node]:
     """Return what a function returns, number by number; what it closes over is known."""
     closed = jax.make_jaxpr(function)(shape)
-    graph.labels = {id(eqn): label(eqn) for eqn in closed.jaxpr.eqns}
+    graph.labels = {id(eqn): source_label(eqn) for eqn in closed.jaxpr.eqns}
     constants = [constant_array(graph, np.asarray(x)) for x in closed.consts]
     return [node for array in lower_jaxpr(graph, closed.jaxpr, constants, inputs) for node in array.flat]
 
@@ -108,6 +108,6 @@ def _numbers_of(parts: Any) -> list[float]:
     return [float(x) for leaf in jax.tree.leaves(parts) for x in np.asarray(leaf, float).flat]
 
 
-def _flat(path: str) -> str:
+def _short_path(path: str) -> str:
     """A path in the memory without what says nothing to a reader."""
     return re.sub(r"\.(flow|held)(?=\.|$)", "", path)

@@ -18,14 +18,14 @@ from typing import Any
 from xml.etree import ElementTree as xml
 
 from diffabs.core.loop import Loop
-from diffabs.core.values import printable
+from diffabs.core.values import make_printable
 from diffabs.export.c_words import is_name
 from diffabs.export.device import NotExported
-from diffabs.export.plant_c import PlantSource, Variable, plant_source
+from diffabs.export.plant_c import FmuVariable, PlantSource, plant_source
 from diffabs.kernel.compilers import NoCompiler, find_compiler
 
-FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-fPIC")
-LONGEST = 600  # s
+FMU_COMPILER_FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-fPIC")
+COMPILE_TIMEOUT_S = 600  # s
 LONG_AGO = (1980, 1, 1, 0, 0, 0)  # of every file in the archive: the same plant is the same bytes
 SYSTEMS = {"linux": ("linux", "so"), "darwin": ("darwin", "dylib"), "win32": ("win", "dll")}
 CAUSES = {
@@ -35,7 +35,7 @@ CAUSES = {
 }
 
 
-def fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str = "") -> bytes:
+def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str = "") -> bytes:
     """Return the plant of a loop as the bytes of an FMU: its control is the input, what it shows are the outputs, and
     every number of plant and start is a parameter that the importing tool may set.
 
@@ -46,7 +46,7 @@ def fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str
     """
     if not is_name(name):
         raise NotExported(f"{name!r} is no name that C has for a function: letters, digits and _")
-    about = printable(about)
+    about = make_printable(about)
     plant = plant_source(loop)
     guid = str(uuid.UUID(hashlib.sha256(f"{plant} {name} {step} {about}".encode()).hexdigest()[:32]))
     source = _source(plant, guid, step)
@@ -55,7 +55,7 @@ def fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str
     content = {
         "modelDescription.xml": _description(plant, name, guid, step, duration, about),
         f"sources/{name}.c": source.encode(),
-        f"binaries/{folder}/{name}.{ending}": _compiled(source),
+        f"binaries/{folder}/{name}.{ending}": _compile_library(source),
     }
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
@@ -86,14 +86,14 @@ def _number(value: float) -> str:
     return {"inf": "INFINITY", "-inf": "-INFINITY", "nan": "NAN"}.get(str(value), repr(value))
 
 
-def _compiled(source: str) -> bytes:
+def _compile_library(source: str) -> bytes:
     """A library of this machine. Raises NotExported."""
     with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
         text, result = pathlib.Path(folder) / "fmu.c", pathlib.Path(folder) / "fmu.lib"
         text.write_text(source, encoding="utf-8")
         try:
-            command = [*find_compiler().command, *FLAGS, str(text), "-o", str(result), "-lm"]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST)
+            command = [*find_compiler().command, *FMU_COMPILER_FLAGS, str(text), "-o", str(result), "-lm"]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=COMPILE_TIMEOUT_S)
         except (NoCompiler, OSError, subprocess.TimeoutExpired) as error:
             raise NotExported(f"an FMU needs a C compiler: {' '.join(str(error).split())}") from None
         if done.returncode or not result.is_file():
@@ -116,7 +116,7 @@ def _description(plant: PlantSource, name: str, guid: str, step: float, duration
     if units:
         definitions = xml.SubElement(root, "UnitDefinitions")
         for unit in units:
-            xml.SubElement(definitions, "Unit", {"name": printable(unit)})
+            xml.SubElement(definitions, "Unit", {"name": make_printable(unit)})
     xml.SubElement(root, "DefaultExperiment", {"startTime": "0.0", "stopTime": repr(duration), "stepSize": repr(step)})
     variables = xml.SubElement(root, "ModelVariables")
     for reference, one in enumerate(plant.variables):
@@ -127,7 +127,7 @@ def _description(plant: PlantSource, name: str, guid: str, step: float, duration
     return xml.tostring(root, encoding="UTF-8", xml_declaration=True)
 
 
-def _variable(parent: Any, one: Variable, reference: int) -> None:
+def _variable(parent: Any, one: FmuVariable, reference: int) -> None:
     scalar = xml.SubElement(parent, "ScalarVariable", {
         "name": one.name, "valueReference": str(reference), **CAUSES[one.role],
     })  # fmt: skip
@@ -135,11 +135,11 @@ def _variable(parent: Any, one: Variable, reference: int) -> None:
     limits = {"min": one.low, "max": one.high} if one.role == "parameter" else {}
     shown = {name: repr(limit) for name, limit in limits.items() if abs(limit) < sys.float_info.max}
     xml.SubElement(
-        scalar, "Real", {**shown, **start, **({} if one.unit in ("", "1") else {"unit": printable(one.unit)})}
+        scalar, "Real", {**shown, **start, **({} if one.unit in ("", "1") else {"unit": make_printable(one.unit)})}
     )
 
 
-def _unknowns(structure: Any, variables: Sequence[Variable]) -> None:
+def _unknowns(structure: Any, variables: Sequence[FmuVariable]) -> None:
     """The outputs, which are of the state alone; before the start, of the parameters."""
     outputs = [k for k, one in enumerate(variables, 1) if one.role == "output"]
     for tag in ("Outputs", "InitialUnknowns"):

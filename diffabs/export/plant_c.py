@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import Spec, parameters, prepared, strong
+from diffabs.core.pytree import Spec, canonical_dtypes, parameters, prepare_parts
 from diffabs.export.c_words import Words
 from diffabs.export.device import NotExported
 from diffabs.export.labels import Labelled
-from diffabs.export.lowered import filled, named, outputs
+from diffabs.export.lowered import fill_shapes, number_leaves, trace_outputs
 from diffabs.kernel.graph import Node, UpdateLevel, is_real
 from diffabs.kernel.primitives import Unsupported
 from diffabs.kernel.program import live_nodes
@@ -25,7 +25,7 @@ from diffabs.simulate.rk4 import rk4_step
 CONTROL = "control"
 
 
-class Variable(NamedTuple):
+class FmuVariable(NamedTuple):
     """A number that is seen from outside: what is shown ("output"), the control ("input"), or a parameter, with its
     value before anything is set; its unit, and the least and the greatest value that it may be set to."""
 
@@ -42,7 +42,7 @@ class PlantSource(NamedTuple):
     variables, in their order, and `x` of so many states; the text lacks the struct."""
 
     text: str
-    variables: tuple[Variable, ...]
+    variables: tuple[FmuVariable, ...]
     states: int
 
 
@@ -53,7 +53,7 @@ def plant_source(loop: Loop) -> PlantSource:
         NotExported: an operation that has no translation, or a state that is no real number.
     """
     with jax.enable_x64(True):
-        typed = jax.tree.map(lambda x: jnp.asarray(x, float), strong((loop.plant, loop.initial)))
+        typed = jax.tree.map(lambda x: jnp.asarray(x, float), canonical_dtypes((loop.plant, loop.initial)))
         variables = _variables(loop)
         try:
             written = _Written(typed, variables)
@@ -63,11 +63,11 @@ def plant_source(loop: Loop) -> PlantSource:
     return PlantSource(f"{text}\n", variables, written.states)
 
 
-def _variables(loop: Loop) -> tuple[Variable, ...]:
+def _variables(loop: Loop) -> tuple[FmuVariable, ...]:
     """Outputs, the control, the parameters of plant and start, number by number."""
     plant = loop.plant
-    found = [Variable(name, "output", 0.0, plant.shows.units[name]) for name in plant.shows._fields]
-    found.append(Variable(CONTROL, "input", 0.0, plant.control_unit))
+    found = [FmuVariable(name, "output", 0.0, plant.shows.units[name]) for name in plant.shows._fields]
+    found.append(FmuVariable(CONTROL, "input", 0.0, plant.control_unit))
     for where, part in (("plant", plant), ("initial", loop.initial)):
         for path, spec, value in parameters(part):
             numbers = np.asarray(value, float)
@@ -75,7 +75,7 @@ def _variables(loop: Loop) -> tuple[Variable, ...]:
             for k, at in enumerate(np.ndindex(numbers.shape)):
                 unit = units[min(k, len(units) - 1)]
                 name = ".".join([where, path, *map(str, at)])
-                found.append(Variable(name, "parameter", float(numbers[at]), unit, *_limits(spec)))
+                found.append(FmuVariable(name, "parameter", float(numbers[at]), unit, *_limits(spec)))
     return tuple(found)
 
 
@@ -91,7 +91,7 @@ def _limits(spec: Spec) -> tuple[float, float]:
 
 
 class _Written:
-    def __init__(self, typed: tuple[Any, Any], variables: Sequence[Variable]):
+    def __init__(self, typed: tuple[Any, Any], variables: Sequence[FmuVariable]):
         self.places = {one.name: k for k, one in enumerate(variables)}
         self.words = Words("double", self._place)
         graph = Labelled()
@@ -99,11 +99,13 @@ class _Written:
         given = [
             number
             for where, part in (("plant", plant), ("initial", initial))
-            for number in filled(part, named(part, graph, "v", lambda path, where=where: f"{where}.{path}"))
+            for number in fill_shapes(
+                part, number_leaves(part, graph, "v", lambda path, where=where: f"{where}.{path}")
+            )
         ]
         own = given[: len(jax.tree.leaves(plant))]
-        state = jax.eval_shape(lambda both: prepared(both[0]).start(both[1]), typed)
-        held = filled(state, named(state, graph, "x", str))
+        state = jax.eval_shape(lambda both: prepare_parts(both[0]).start(both[1]), typed)
+        held = fill_shapes(state, number_leaves(state, graph, "x", str))
         if any(not is_real(leaf.dtype) for leaf in jax.tree.leaves(state)):
             raise NotExported(f"plant {type(plant).__name__} has a state that is no real number")
         self.order = {node.attr[1]: k for k, node in enumerate(node for array in held for node in array.flat)}
@@ -113,10 +115,10 @@ class _Written:
             np.full((), graph.input(np.float64, UpdateLevel.UNIFORM, place), object)
             for place in (("v", CONTROL), ("", "t"), ("", "h"))
         )
-        self.begun = outputs(graph, lambda both: prepared(both[0]).start(both[1]), typed, given)
+        self.begun = trace_outputs(graph, lambda both: prepare_parts(both[0]).start(both[1]), typed, given)
         moving, shown = (plant, state, one, one, one), (plant, state)
-        self.moved = outputs(graph, lambda all: _moved(*all), moving, [*own, *held, control, time, length])
-        self.shown = outputs(graph, lambda both: prepared(both[0]).output(both[1]), shown, [*own, *held])
+        self.moved = trace_outputs(graph, lambda all: _moved(*all), moving, [*own, *held, control, time, length])
+        self.shown = trace_outputs(graph, lambda both: prepare_parts(both[0]).output(both[1]), shown, [*own, *held])
 
     def _place(self, where: str, path: str) -> str:
         return f"m->v[{self.places[path]}]" if where == "v" else f"m->x[{self.order[path]}]" if where == "x" else path
@@ -140,5 +142,5 @@ class _Written:
 
 def _moved(plant: Any, state: Any, control: Any, t: Any, h: Any) -> Any:
     """The state after a step in which the control is held, as `FixedStep` makes it."""
-    plant = prepared(plant)
+    plant = prepare_parts(plant)
     return plant.project(rk4_step(lambda t, x: plant.derivative(t, x, control), t, state, h))

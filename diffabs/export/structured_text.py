@@ -11,18 +11,18 @@ from collections.abc import Iterator, Sequence
 import jax
 import numpy as np
 
-from diffabs.export.c_words import commented
-from diffabs.export.device import Device, NotExported
+from diffabs.export.c_words import comment_text
+from diffabs.export.device import ComputerProgram, NotExported
 from diffabs.export.lowered import INPUTS, MEMORY, NUMBERS, Lowered
 from diffabs.kernel.graph import Node, is_real
 from diffabs.kernel.primitives import Unsupported
 from diffabs.kernel.program import live_nodes
 
 INTEGERS = {"int64": "LINT", "uint64": "ULINT", "int32": "DINT", "uint32": "UDINT"}
-INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/"}
+ST_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/", "quotient": "/"}
 COMPARED = {"lt": "<", "le": "<=", "eq": "=", "ne": "<>"}
 LOGICAL = {"and": "AND", "or": "OR", "xor": "XOR"}
-FUNCTIONS = {
+ST_FUNCTIONS = {
     **{"exp": "EXP", "log": "LN", "sin": "SIN", "cos": "COS", "tan": "TAN", "atan": "ATAN", "asin": "ASIN"},
     **{"acos": "ACOS", "sqrt": "SQRT", "abs": "ABS", "pow": "EXPT", "atan2": "ATAN2"},
 }
@@ -32,7 +32,7 @@ HYPERBOLIC = {
     "tanh": "{1} - {2} / (EXP({2} * {0}) + {1})",
 }
 LINE = 110  # columns of a list of variables
-WORDS = (
+ST_KEYWORDS_TEXT = (
     "abs acos action and any array asin at atan atan2 begin bool by byte case configuration constant cos date "
     "dint do dt dword else elsif end exit exp expt extends false final for from function function_block global if "
     "in int interface interval jmp ld len limit lint ln log lreal lt ltime lword max method min mod move mux "
@@ -41,11 +41,11 @@ WORDS = (
     "step string struct super tan task then this time to transition true trunc type udint uint ulint until using "
     "usint var while with word wstring write xor le ge gt eq ne add sub mul div r s n p l d sd ds sl"
 )
-RESERVED = set(WORDS.split())
+ST_KEYWORDS = set(ST_KEYWORDS_TEXT.split())
 OWN = {"command", "held", "reset", "started", "i"}  # names of the block itself
 
 
-def structured_text(found: Device, name: str, notes: Sequence[str] = ()) -> str:
+def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
     """Return a device as a FUNCTION_BLOCK with an input for each measurement and `reset`, the parameters as variables,
     and the outputs `command` and `held`; it is to be called once a period, and begins with its first call or where
     `reset` is true.
@@ -54,7 +54,7 @@ def structured_text(found: Device, name: str, notes: Sequence[str] = ()) -> str:
     Raises:
         NotExported: an operation that has no translation.
     """
-    if not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in RESERVED:
+    if not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in ST_KEYWORDS:
         raise NotExported(f"{name!r} is no name that Structured Text has for a block: letters, digits and single _")
     with jax.enable_x64(True):
         try:
@@ -65,7 +65,7 @@ def structured_text(found: Device, name: str, notes: Sequence[str] = ()) -> str:
 
 
 class _Block:
-    def __init__(self, found: Device, name: str, notes: Sequence[str]):
+    def __init__(self, found: ComputerProgram, name: str, notes: Sequence[str]):
         self.device, self.name, self.notes = found, name, notes
         self.program = program = Lowered(found)
         self.real = "REAL" if found.dtype == np.float32 else "LREAL"
@@ -85,9 +85,9 @@ class _Block:
         yield f"FUNCTION_BLOCK {self.name}"
         yield "VAR_INPUT"
         for path in program.read:
-            yield f"  {self.names[INPUTS, path]} : {self.real}; (* [{commented(units.get(path, '1'))}] *)"
+            yield f"  {self.names[INPUTS, path]} : {self.real}; (* [{comment_text(units.get(path, '1'))}] *)"
         yield "  reset : BOOL; (* begin anew, with what is measured now *)\nEND_VAR"
-        yield f"VAR_OUTPUT\n  command : {self.real}; (* [{commented(self.device.control_unit)}] *)"
+        yield f"VAR_OUTPUT\n  command : {self.real}; (* [{comment_text(self.device.control_unit)}] *)"
         yield "  held : BOOL; (* whether the last sample could not be used: memory and command stay *)\nEND_VAR"
         if program.used:
             yield from ["VAR (* parameters *)", *self._parameters(), "END_VAR"]
@@ -106,7 +106,7 @@ class _Block:
         specs = {name: spec for number in self.device.numbers for name, spec in number.named()}
         for path in self.program.used:
             value = self._real(self.program.values[path]).strip("()")
-            yield f"  {self.names[NUMBERS, path]} : {self.real} := {value}; (* {commented(specs[path])} *)"
+            yield f"  {self.names[NUMBERS, path]} : {self.real} := {value}; (* {comment_text(specs[path])} *)"
 
     def _head(self) -> Iterator[str]:
         delay = f", its command to be output {self.device.delay:g} s after that" if self.device.delay else ""
@@ -117,7 +117,7 @@ class _Block:
             "A sample with a NaN, or that leads to one, is not used: memory and command stay, and held is TRUE.",
             "Nothing is global: two instances are two controllers.",
         ]
-        text = "\n   ".join(map(commented, lines))
+        text = "\n   ".join(map(comment_text, lines))
         yield f"(* {text} *)"
 
     def _declared(self) -> Iterator[str]:
@@ -216,8 +216,8 @@ class _Block:
     def _expression(self, node: Node) -> str:
         args, op = [self._value(x) for x in node.args], node.op
         boolean = node.args[0].dtype.kind == "b"
-        if op in INFIX or (op in COMPARED and not (boolean and op in ("lt", "le"))):
-            return f"{args[0]} {(INFIX | COMPARED)[op]} {args[1]}"
+        if op in ST_INFIX or (op in COMPARED and not (boolean and op in ("lt", "le"))):
+            return f"{args[0]} {(ST_INFIX | COMPARED)[op]} {args[1]}"
         if op in LOGICAL and boolean:
             return f"{args[0]} {LOGICAL[op]} {args[1]}"
         if op == "not" and boolean:
@@ -246,8 +246,8 @@ class _Block:
     def _function(self, node: Node, args: list[str]) -> str:
         """Of the standard's functions, and what is made of them."""
         op = node.op
-        if op == "abs" or (op in FUNCTIONS and is_real(node.dtype)):
-            return f"{FUNCTIONS[op]}({', '.join(args)})"
+        if op == "abs" or (op in ST_FUNCTIONS and is_real(node.dtype)):
+            return f"{ST_FUNCTIONS[op]}({', '.join(args)})"
         if op in HYPERBOLIC:
             return HYPERBOLIC[op].format(args[0], "1.0", "2.0")
         whole = f"LINT_TO_{self.real}({self.real}_TO_LINT({args[0]}))"  # the nearest, and of two the even one
@@ -280,7 +280,7 @@ def _scientific(x: float) -> str:
 def _fresh(path: str, taken: set[str]) -> str:
     """A name that the language has, that no other is, whatever the case; which is then taken."""
     name = re.sub(r"[\W_]+", "_", path, flags=re.ASCII).strip("_")
-    name = f"x_{name}".strip("_") if name.lower() in RESERVED or not name[:1].isalpha() else name
+    name = f"x_{name}".strip("_") if name.lower() in ST_KEYWORDS or not name[:1].isalpha() else name
     number, fresh = 2, name
     while fresh.lower() in taken:
         number, fresh = number + 1, f"{name}_{number}"

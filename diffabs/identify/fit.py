@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import least_squares
 
-from diffabs.core.bijectors import Range, Space, space
-from diffabs.core.pytree import replace, strong
+from diffabs.core.bijectors import FreeSpace, Range, parameter_space
+from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.reason import Reason
-from diffabs.core.summary import Summary, number
-from diffabs.core.validity import check
+from diffabs.core.summary import Summary, round_for_table
+from diffabs.core.validity import check_part
 from diffabs.identify.residuals import FitProblem, Prior, ResidualEvaluation, Residuals, as_partial
 from diffabs.identify.uncertainty import Uncertainty, uncertainty
 
@@ -70,7 +70,9 @@ class Identified:
         """What was found: parameters before and after, with their standard deviations."""
         deviations = self.uncertainty.deviations
         rows = tuple((name, self.start.get(name), value, deviations.get(name)) for name, value in self.values.items())
-        title = f"Identified from {len(self.residuals)} residuals, chi2 = {number(self.chi2)}: {self.reason.value}"
+        title = (
+            f"Identified from {len(self.residuals)} residuals, chi2 = {round_for_table(self.chi2)}: {self.reason.value}"
+        )
         return Summary(title, ("parameter", "before", "identified", "standard deviation"), rows)
 
     def __repr__(self) -> str:
@@ -117,9 +119,9 @@ def fit(
         ValueError: a path or range that does not fit, sigma <= 0, norm < 2, fewer residuals than parameters without a
             prior, a prior without sigma, no start at which the residuals are finite.
     """
-    part = strong(check(part))
-    where = space(part, free)
-    points = [where.place(check(replace(part, dict(start)))) for start in starts] or [where.place(part)]
+    part = canonical_dtypes(check_part(part))
+    where = parameter_space(part, free)
+    points = [where.place(check_part(replace(part, dict(start)))) for start in starts] or [where.place(part)]
     problem = FitProblem(where, part, residuals, data, as_partial(prior), norm, usable)
     n, k = problem.shapes()
     _check_fit(where.size, n, k, sigma, norm, absolute)
@@ -258,7 +260,7 @@ def _accepted_evaluation(problem: FitProblem, z: np.ndarray) -> ResidualEvaluati
 
 
 def _parameter_uncertainty(
-    free: Space, z: np.ndarray, seen: ResidualEvaluation, sigma: np.ndarray, estimated: bool
+    free: FreeSpace, z: np.ndarray, seen: ResidualEvaluation, sigma: np.ndarray, estimated: bool
 ) -> Uncertainty:
     """In the parameters themselves: dr/dp = dr/dz / (dp/dz), since each parameter has its own z. One that has arrived
     at the end of its range (dp/dz = 0) is not determined."""
@@ -272,9 +274,9 @@ def _parameter_uncertainty(
     return uncertainty(free.names, size, data, prior, scale or float(np.finfo(float).tiny))
 
 
-def _maps(free: Space) -> list[Any]:
+def _maps(free: FreeSpace) -> list[Any]:
     return [m for entry in free.entries for m in entry.maps]
 
 
-def _values_by_path(free: Space, z: np.ndarray) -> dict[str, Any]:
+def _values_by_path(free: FreeSpace, z: np.ndarray) -> dict[str, Any]:
     return {path: np.asarray(value) for path, value in free.values(jnp.asarray(z)).items()}

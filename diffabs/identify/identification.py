@@ -13,8 +13,8 @@ import jax
 
 from diffabs.core.bijectors import Range
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import replace, strong
-from diffabs.core.validity import check
+from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.validity import check_part
 from diffabs.identify.data import Comparison, Data
 from diffabs.identify.fit import Identified, Tolerances, fit
 from diffabs.identify.residuals import Prior
@@ -49,7 +49,7 @@ def identify(
     Raises:
         ValueError: what `fit` and the data object to; a run that must not be run at the start.
     """
-    check(loop)
+    check_part(loop)
     comparison = data.against(loop, list(free), solver)
     _check_starts(loop, starts or ({},), comparison, solver)
     return fit(
@@ -73,11 +73,13 @@ def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], comparison: C
     """Raises ValueError for a start from which a run must not be run, with the longest step that may."""
     for start in starts:
         if why := _describe_refusal(first := replace(loop, dict(start)), comparison, solver):
-            most = min(float(stable_steps(strong(batch)).min()) for batch in comparison.loops(first))
+            most = min(float(stable_steps(canonical_dtypes(batch)).min()) for batch in comparison.loops(first))
             raise ValueError(f"{why} at the start; at most {most:.2g} s is" if most < solver.step else why)
 
 
 def _describe_refusal(loop: Any, comparison: Comparison, solver: Solver) -> str | None:
     """Why the first run that must not be run must not."""
-    asked = (batch_admissibility(None, jax.device_get(strong(batch)), solver) for batch in comparison.loops(loop))
+    asked = (
+        batch_admissibility(None, jax.device_get(canonical_dtypes(batch)), solver) for batch in comparison.loops(loop)
+    )
     return next((next(filter(None, found.texts)) for found in asked if found.number), None)

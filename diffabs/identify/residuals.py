@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
 
-from diffabs.core.bijectors import Space
+from diffabs.core.bijectors import FreeSpace
 from diffabs.core.pytree import get
 
 Residuals = Callable[..., Any]  # (part, *data) -> (n,)
@@ -65,7 +65,7 @@ class ResidualEvaluation(NamedTuple):
 
 @partial(jax.jit, static_argnames=("free", "residuals"))
 def _evaluate_residuals(
-    free: Space, residuals: Residuals, prior: Prior, part: Any, data: Any, z: Any
+    free: FreeSpace, residuals: Residuals, prior: Prior, part: Any, data: Any, z: Any
 ) -> ResidualEvaluation:
     """Compiled once for equal functions, spaces and structures."""
 
@@ -82,7 +82,7 @@ def _evaluate_residuals(
 class FitProblem:
     """Remembers the last point, since SciPy asks for value and Jacobian one after the other."""
 
-    space: Space
+    space: FreeSpace
     part: Any
     residuals: Residuals
     data: tuple[Any, ...]

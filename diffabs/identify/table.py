@@ -10,8 +10,8 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import get, parameters, replace, strong
-from diffabs.core.validity import check
+from diffabs.core.pytree import canonical_dtypes, get, parameters, replace
+from diffabs.core.validity import check_part
 from diffabs.identify.data import Comparison, check_positive
 from diffabs.objectives import BRAKING
 from diffabs.simulate.batch import Batch, group_by_structure, stack_loops
@@ -46,7 +46,7 @@ class Table:
         groups = group_by_structure(loops)
         order = [list(self.values)[i] for places in groups for i in places]
         lanes = (stack_loops([loops[i] for i in places]) for places in groups)
-        batches = [(strong(one), batch.values) for one, batch in lanes]
+        batches = [(canonical_dtypes(one), batch.values) for one, batch in lanes]
         metrics = list(dict.fromkeys(metric for _, metric in self.labels))
         place = np.array([(order.index(row), metrics.index(metric)) for row, metric in self.labels])
         target = np.array([self.values[row][metric] for row, metric in self.labels])
@@ -60,7 +60,7 @@ class Table:
         for row, line in self.values.items():
             if row not in self.loops:
                 raise ValueError(f"row {row}: no loop; there is {', '.join(self.loops)}")
-            check(self.loops[row], f"{row}: ")
+            check_part(self.loops[row], f"{row}: ")
             there = {path for path, _, _ in parameters(self.loops[row])}
             for path in free:
                 if path not in there or np.shape(get(self.loops[row], path)) != np.shape(get(loop, path)):

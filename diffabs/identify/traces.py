@@ -11,7 +11,7 @@ import numpy as np
 
 from diffabs.core.loop import Loop
 from diffabs.core.numerics import clamp, ratio
-from diffabs.core.pytree import strong
+from diffabs.core.pytree import canonical_dtypes
 from diffabs.identify.data import Comparison, check_positive
 from diffabs.identify.fit import Identified
 from diffabs.simulate.batch import Batch
@@ -63,7 +63,7 @@ class Traces:
             simulated,
             (over, np.asarray(self.t, float), kept, target),
             sigma,
-            lambda part: [Batch(over).each(strong(part), lambda loop, key: loop)],
+            lambda part: [Batch(over).each(canonical_dtypes(part), lambda loop, key: loop)],
         )
 
     def residuals(self, found: Identified) -> dict[str, np.ndarray]:
@@ -114,7 +114,9 @@ class Traces:
 
 def _output_names(loop: Loop) -> tuple[str, ...]:
     """What the plant shows of itself."""
-    return jax.eval_shape(lambda loop: loop.plant.output(loop.plant.start(loop.initial)), strong(loop))._fields
+    return jax.eval_shape(
+        lambda loop: loop.plant.output(loop.plant.start(loop.initial)), canonical_dtypes(loop)
+    )._fields
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +127,7 @@ class _TraceResiduals:
     fields: tuple[str, ...]
 
     def __call__(self, loop: Any, over: Any, t: Any, kept: Any, target: Any) -> Any:
-        seen = Batch(over).each(strong(loop), lambda one, key: self._columns(one, t))
+        seen = Batch(over).each(canonical_dtypes(loop), lambda one, key: self._columns(one, t))
         return jnp.swapaxes(seen, 0, 1).ravel()[kept] - target
 
     def _columns(self, loop: Any, t: Any) -> Any:

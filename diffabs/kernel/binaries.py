@@ -53,7 +53,7 @@ def find_library(made_of: str, suffix: str) -> pathlib.Path | None:
     """
     for path in sorted(make_cache_folder().glob(f"{made_of}-*{suffix}")):
         try:
-            content = files.content(path)
+            content = files.read_content(path)
         except FileNotFoundError:  # another process has removed it
             continue
         if _file_name(made_of, content, suffix) == path.name:

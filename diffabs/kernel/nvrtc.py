@@ -35,7 +35,7 @@ def build_cubin(text: str, architecture: str) -> pathlib.Path:
             return path
         code, log = _compile_cubin(text, architecture, headers)
         path = binaries.write_library(digest, ".cubin", code)
-        files.write(path.with_suffix(".log"), log.encode())
+        files.write_file(path.with_suffix(".log"), log.encode())
         return path
     except OSError as error:
         raise NoCompiler(f"no kernel in {binaries.cache_folder()}: {error.strerror or error}") from None

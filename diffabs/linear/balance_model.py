@@ -9,7 +9,7 @@ from typing import Any
 import jax
 
 from diffabs.core.protocols import Plant
-from diffabs.core.pytree import part, pytree, strong
+from diffabs.core.pytree import canonical_dtypes, part, pytree
 from diffabs.linear.linearization import StateSpace, linearize
 from diffabs.linear.slip_model import Continuous, Sampling, SlipModel
 from diffabs.linear.zero_order_hold import discretise_held_input
@@ -43,8 +43,8 @@ class BalanceModel:
 
 @jax.jit
 def _matrices(model: BalanceModel) -> StateSpace:
-    model = strong(model)
-    rest: Any = model.plant.start(strong(BalanceStart()))
+    model = canonical_dtypes(model)
+    rest: Any = model.plant.start(canonical_dtypes(BalanceStart()))
     a, b = linearize(model.plant, rest, 0.0)
     system = StateSpace(a, b.reshape(len(a), 1))
     if not isinstance(model.sampling, Sampling):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.controllers import ObserverFeedback, Sampled
-from diffabs.controllers.balance import MEASURED, STATES
+from diffabs.controllers.balance import MEASURED_NAMES, STATE_NAMES
 from diffabs.core.protocols import Plant
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.lyapunov import as_float_arrays
@@ -21,7 +21,7 @@ from diffabs.linear.regulator import dlqr
 from diffabs.linear.riccati import dare
 from diffabs.linear.slip_model import Sampling
 
-SELECTION = np.eye(len(STATES))[[STATES.index(name) for name in MEASURED]]  # C: theta and psi
+SELECTION = np.eye(len(STATE_NAMES))[[STATE_NAMES.index(name) for name in MEASURED_NAMES]]  # C: theta and psi
 
 
 class Filter(NamedTuple):

@@ -16,8 +16,8 @@ from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 
 from diffabs.core.protocols import Plant
-from diffabs.core.pytree import strong
-from diffabs.plants.wheel import FROZEN
+from diffabs.core.pytree import canonical_dtypes
+from diffabs.plants.wheel import FROZEN_OUTPUTS
 
 REMAINING_STATE_ITERATIONS = (
     10  # iterations for the rest of the remaining states; one is enough where their equation is linear
@@ -48,7 +48,7 @@ def linearize(plant: Plant, state: Any, control: Any) -> StateSpace:
 
 
 def tracking_dynamics(
-    plant: Plant, state: Any, control: Any, tracked: Sequence[str] = ("slip",), frozen: Sequence[str] = FROZEN
+    plant: Plant, state: Any, control: Any, tracked: Sequence[str] = ("slip",), frozen: Sequence[str] = FROZEN_OUTPUTS
 ) -> StateSpace:
     """The linear dynamics of outputs `tracked` and of the remaining states, with the outputs `frozen` held.
 
@@ -61,7 +61,7 @@ def tracking_dynamics(
         ValueError: the outputs and the remaining states are no coordinates: too many, too few, or dependent (this last
             only outside of jit; inside, the matrices are not finite).
     """
-    plant, state, control = strong((plant, state, control))
+    plant, state, control = canonical_dtypes((plant, state, control))
     flow, x, u = as_vectors(plant, state, control)
     unravel = ravel_pytree(state)[1]
     kept = independent_components(plant, state, (*tracked, *frozen))
@@ -80,7 +80,7 @@ def tracking_dynamics(
 
 def as_vectors(plant: Plant, state: Any, control: Any) -> Any:
     """Return f(x, u) on vectors, and the vectors x and u."""
-    plant, state, control = strong((plant, state, control))
+    plant, state, control = canonical_dtypes((plant, state, control))
     (x, unravel), (u, unravel_control) = ravel_pytree(state), ravel_pytree(control)
 
     def flow(x: Any, u: Any) -> Any:

@@ -22,8 +22,8 @@ from diffabs.controllers import Sampled
 from diffabs.core.blocks import Direct, Series, offers
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Clock, Memory, Tracking
-from diffabs.core.pytree import strong
-from diffabs.core.tracing import follows
+from diffabs.core.pytree import canonical_dtypes
+from diffabs.core.tracing import depends_on_signal
 from diffabs.linear.linearization import StateSpace, independent_components
 from diffabs.linear.operating_point import MAX_REST_RESIDUE, find_root
 from diffabs.linear.transfer import WHOLE_PERIOD_TOLERANCE, Transfer
@@ -110,7 +110,7 @@ def _check_continuous(loop: Loop) -> None:
 def _ticks_use_signal(block: Any, signal: Any) -> bool:
     """Whether a block's ticks look at its signal; noise does not."""
     memory, clock = block.start(signal), Clock(0.0, 1e-3, 1, jax.random.key(0))
-    return follows(lambda signal: block.tick(clock, memory, signal).held, signal)
+    return depends_on_signal(lambda signal: block.tick(clock, memory, signal).held, signal)
 
 
 class _SurroundingStates(NamedTuple):
@@ -137,7 +137,7 @@ def _start_output_and_setpoint(loop: Loop) -> tuple[Any, Any]:
 
 @jax.jit
 def _linearize_halves(loop: Loop, setpoint: Any) -> _LinearHalves:
-    loop, setpoint = strong((loop, setpoint))
+    loop, setpoint = canonical_dtypes((loop, setpoint))
     around, free, residue = _find_rest(loop, setpoint)
     z, command = free[:-1], free[-1]
     signal, as_signal = ravel_pytree(around.signal(z))

@@ -18,7 +18,7 @@ from jax.flatten_util import ravel_pytree
 from diffabs.core.blocks import Direct, NoFeedforward
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Block, Feedforward, Memory, Plant, Reference, Tracking
-from diffabs.core.pytree import part, pytree, static, strong
+from diffabs.core.pytree import canonical_dtypes, part, pytree, static
 from diffabs.linear.linearization import StateSpace
 from diffabs.stops import NoStop
 
@@ -131,7 +131,7 @@ def _start(loop: Loop) -> _IntegratedStates:
 
 def _names(loop: Loop) -> list[str]:
     names = []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(jax.eval_shape(_start, strong(loop))):
+    for path, leaf in jax.tree_util.tree_leaves_with_path(jax.eval_shape(_start, canonical_dtypes(loop))):
         block, *inner = (str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path)
         name = ".".join(inner if block == "plant" and inner else [block, *inner])
         names += [".".join([name, *map(str, at)]) for at in np.ndindex(leaf.shape)] if leaf.shape else [name]
@@ -171,7 +171,7 @@ class _VectorLoop(NamedTuple):
 
 @jax.jit
 def _linearize_at_rest(model: OperatingPoint) -> LinearLoop:
-    loop = strong(model).loop
+    loop = canonical_dtypes(model).loop
     setpoint = loop.reference.setpoint(loop.start().reference)
     z, unravel = ravel_pytree(_start(loop))
     one = _VectorLoop(loop, setpoint, unravel)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from diffabs.core.compiling import SAME, compile_once
+from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.linear.riccati import care, dare
 from diffabs.linear.weights import as_weight_matrix
 
@@ -66,14 +66,14 @@ def dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any = None) -> Regulator:
     return _solve_dlqr(A, B, Q, R, S)
 
 
-@compile_once(options=SAME)
+@compile_once(options=SAME_RESULT_OPTIONS)
 def _solve_lqr(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
     found = care(A, B, Q, R, S)
     turned = jnp.asarray(B).T @ found.P + (0.0 if S is None else jnp.asarray(S).T)
     return Regulator(-jnp.linalg.solve(jnp.asarray(R, found.P.dtype), turned), *found)
 
 
-@compile_once(options=SAME)
+@compile_once(options=SAME_RESULT_OPTIONS)
 def _solve_dlqr(A: Any, B: Any, Q: Any, R: Any, S: Any) -> Regulator:
     found = dare(A, B, Q, R, S)
     b = jnp.asarray(B)

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.compiling import SAME, compile_once
+from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.lyapunov import discrete_lyapunov as _discrete_lyapunov
 from diffabs.linear.lyapunov import lyapunov as _lyapunov
@@ -81,7 +81,7 @@ def _riccati(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Ricc
     return _solve_compiled(solution, A, B, Q, R, S)
 
 
-@compile_once(static=1, options=SAME)
+@compile_once(static=1, options=SAME_RESULT_OPTIONS)
 def _solve_compiled(solution: Callable, A: Any, B: Any, Q: Any, R: Any, S: Any) -> Riccati:
     P, residual = solution(A, B, (Q + Q.T) / 2, (R + R.T) / 2, S)
     return Riccati(P, residual, jnp.all(jnp.isfinite(P)))

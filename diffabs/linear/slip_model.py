@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from diffabs.actuators import Lag
 from diffabs.core.blocks import Direct
 from diffabs.core.protocols import Plant
-from diffabs.core.pytree import Scalar, param, part, pytree, static, strong
+from diffabs.core.pytree import Scalar, canonical_dtypes, param, part, pytree, static
 from diffabs.linear.linearization import (
     REMAINING_STATE_ITERATIONS,
     StateSpace,
@@ -24,7 +24,7 @@ from diffabs.linear.linearization import (
 )
 from diffabs.linear.zero_order_hold import discretise_held_input
 from diffabs.plants import BrakeStart, MirroredRig
-from diffabs.plants.wheel import FROZEN
+from diffabs.plants.wheel import FROZEN_OUTPUTS
 
 
 @pytree
@@ -81,7 +81,7 @@ class SlipModel:
         self._check_supported()
         start = jax.eval_shape(self.plant.start, BrakeStart(speed=self.speed, slip=self.slip))
         paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(start)]
-        used = used_leaves(self.plant, start, ("slip", *FROZEN))
+        used = used_leaves(self.plant, start, ("slip", *FROZEN_OUTPUTS))
         kept = [jax.tree_util.keystr(p, simple=True) for p, u in zip(paths, used, strict=True) if not u]
         return (
             *(["integral of slip error"] if self.integral else []),
@@ -105,7 +105,7 @@ class SlipModel:
         """State and control of the linearisation: the slip is held, what remains is at rest, the speed falls."""
         start = self.plant.start(BrakeStart(speed=self.speed, slip=self.slip))
         control = self.plant.holding(self.plant.output(start), self.slip)
-        kept = independent_components(self.plant, start, ("slip", *FROZEN))
+        kept = independent_components(self.plant, start, ("slip", *FROZEN_OUTPUTS))
         if not len(kept):
             return start, control
         flow, x, u = as_vectors(self.plant, start, control)
@@ -152,7 +152,7 @@ class SlipModel:
 
 @jax.jit
 def _matrices(model: SlipModel) -> StateSpace:
-    model = strong(model)
+    model = canonical_dtypes(model)
     return model.with_memory(model.controlled_system())
 
 

@@ -52,7 +52,7 @@ BALANCE = {
 TRACKING = {"overshoot": Overshoot(), "settling_time": SettlingTime(), "iae": IAE(), "final_error": FinalError()}
 
 
-def usual(plant: Plant) -> dict[str, Objective]:
+def default_objectives(plant: Plant) -> dict[str, Objective]:
     """Return the objectives, by name, of a run where none are named: what the plant says itself (`usual_objectives`),
     else how well its first signal follows the setpoint."""
     own = getattr(plant, "usual_objectives", None)

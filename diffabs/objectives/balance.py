@@ -9,15 +9,15 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, larger, later_of_larger, sign
 from diffabs.core.protocols import BalanceOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, pytree
-from diffabs.objectives.tracking import FinalError, held, integral, nothing, unchanged
+from diffabs.objectives.tracking import FinalError, held_value, integral_value, keep_memory, no_integral
 
-RATES = ("theta_rate", "psi_rate", "phi_rate")
-ANGLES = ("theta", "psi", "phi")
+RATE_NAMES = ("theta_rate", "psi_rate", "phi_rate")
+ANGLE_NAMES = ("theta", "psi", "phi")
 
 
 def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Any:
     """|x|, with a finite slope at 0."""
-    square = sum(w * getattr(output, name) ** 2 for w, name in zip(weights, ANGLES + RATES, strict=True))
+    square = sum(w * getattr(output, name) ** 2 for w, name in zip(weights, ANGLE_NAMES + RATE_NAMES, strict=True))
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
@@ -30,7 +30,7 @@ class Fell:
     failure = 0.0  # a fall
     physical = (0.0, 1.0)
 
-    start, flow, update = FinalError.start, nothing, unchanged
+    start, flow, update = FinalError.start, no_integral, keep_memory
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Whether the stop was reached."""
@@ -45,7 +45,7 @@ class FinalNorm:
     unit = "1"
     physical = (0.0, math.inf)
 
-    start, flow, update = Fell.start, nothing, unchanged
+    start, flow, update = Fell.start, no_integral, keep_memory
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Of the last sample."""
@@ -53,7 +53,7 @@ class FinalNorm:
         return _norm(ending.sample.output)
 
 
-def _greatest(name: str) -> tuple[Any, Any, Any, Any]:
+def _greatest_angle(name: str) -> tuple[Any, Any, Any, Any]:
     """start, flow, update and value of the greatest |angle|, from the cubic of every step."""
 
     def start(self: Any, sample: Sample) -> Memory:
@@ -68,7 +68,7 @@ def _greatest(name: str) -> tuple[Any, Any, Any, Any]:
         falls = jnp.where(angle.start >= 0, angle.falls, angle.times(-1.0).falls)
         return later_of_larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()), falls)
 
-    return start, nothing, update, held
+    return start, no_integral, update, held_value
 
 
 @pytree
@@ -78,7 +78,7 @@ class PeakLean:
     unit = "rad"
     physical = (0.0, math.inf)
 
-    start, flow, update, value = _greatest("theta")
+    start, flow, update, value = _greatest_angle("theta")
 
 
 @pytree
@@ -88,10 +88,10 @@ class PeakArmAngle:
     unit = "rad"
     physical = (0.0, math.inf)
 
-    start, flow, update, value = _greatest("psi")
+    start, flow, update, value = _greatest_angle("psi")
 
 
-def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
+def _greatest_size(size: Any) -> tuple[Any, Any, Any, Any]:
     """start, flow, update and value of the greatest size(sample): at either end of every step, and between where the
     step would end on a limit. Where it would not, a cubic leaves limits."""
 
@@ -109,7 +109,7 @@ def _peak(size: Any) -> tuple[Any, Any, Any, Any]:
             ends, falls = jnp.where(segment.smooth, cubic.greatest(), ends), segment.smooth & cubic.falls
         return later_of_larger(memory.held, ends, falls)
 
-    return start, nothing, update, held
+    return start, no_integral, update, held_value
 
 
 @pytree
@@ -119,7 +119,7 @@ class PeakVoltage:
     unit = "V"
     physical = (0.0, math.inf)
 
-    start, flow, update, value = _peak(lambda sample: jnp.abs(sample.control))
+    start, flow, update, value = _greatest_size(lambda sample: jnp.abs(sample.control))
 
 
 def motor_torque(sample: Sample) -> Any:
@@ -135,7 +135,7 @@ class PeakTorque:
     unit = "N m"
     physical = (0.0, math.inf)
 
-    start, flow, update, value = _peak(lambda sample: jnp.abs(motor_torque(sample)))
+    start, flow, update, value = _greatest_size(lambda sample: jnp.abs(motor_torque(sample)))
 
 
 @pytree
@@ -151,7 +151,7 @@ class SoftLoss:
     radius: Scalar = param(default=0.1, unit="1", above=0.0)
     softness: Scalar = param(default=0.3, unit="1", above=0.0)
 
-    start, flow, update = Fell.start, nothing, unchanged
+    start, flow, update = Fell.start, no_integral, keep_memory
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """A sigmoid of log |x|."""
@@ -170,7 +170,7 @@ class RestTime:
 
     band: Scalar = param(default=0.01, unit="rad", above=0.0)
 
-    flow = nothing
+    flow = no_integral
 
     def start(self, sample: Sample) -> Memory:
         """At rest from the start."""
@@ -179,7 +179,7 @@ class RestTime:
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """The last of the angles' entries into the band, roots of the cubics of the step."""
         entered = memory.held
-        for name in ANGLES:
+        for name in ANGLE_NAMES:
             angle = segment.output(lambda output, name=name: getattr(output, name))
             beyond = angle.times(sign(jax.lax.stop_gradient(angle.start))).minus(self.band)
             entry = segment.start.t + segment.h * beyond.root()
@@ -188,7 +188,7 @@ class RestTime:
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """The last entry; infinite if an angle of the last sample is outside."""
-        angles = jnp.stack([jnp.abs(getattr(ending.sample.output, name)) for name in ANGLES])
+        angles = jnp.stack([jnp.abs(getattr(ending.sample.output, name)) for name in ANGLE_NAMES])
         return jnp.where(jnp.all(angles <= self.band), memory.held, self.unreached)
 
 
@@ -202,7 +202,7 @@ class BalanceCost:
     q: Vector = param(default=(1.0,) * 6, unit="1, s^2", low=0.0)
     r: Scalar = param(default=0.0, unit="rad^2/V^2", low=0.0)
 
-    update, value = unchanged, integral
+    update, value = keep_memory, integral_value
 
     def start(self, sample: Sample) -> Memory:
         """Zero."""
@@ -211,5 +211,7 @@ class BalanceCost:
     def flow(self, memory: Memory, sample: Sample) -> Scalar:
         """The integrand."""
         del memory
-        squares = [w * getattr(sample.output, name) ** 2 for w, name in zip(self.q, ANGLES + RATES, strict=True)]
+        squares = [
+            w * getattr(sample.output, name) ** 2 for w, name in zip(self.q, ANGLE_NAMES + RATE_NAMES, strict=True)
+        ]
         return sum(squares[1:], squares[0]) + self.r * sample.control**2

@@ -9,7 +9,15 @@ import jax.numpy as jnp
 from diffabs.core.numerics import larger
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.objectives.tracking import FinalError, from_zero, held, held_from_zero, integral, nothing, unchanged
+from diffabs.objectives.tracking import (
+    FinalError,
+    held_value,
+    integral_value,
+    keep_memory,
+    no_integral,
+    start_held,
+    start_integral,
+)
 
 
 @pytree
@@ -19,7 +27,7 @@ class StopTime:
     unit = "s"
     physical = (0.0, math.inf)
 
-    start, flow, update = FinalError.start, nothing, unchanged
+    start, flow, update = FinalError.start, no_integral, keep_memory
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Time of the last sample and what is left."""
@@ -34,7 +42,7 @@ class StopDistance:
     unit = "m"
     physical = (0.0, math.inf)
 
-    start, flow, update = FinalError.start, nothing, unchanged
+    start, flow, update = FinalError.start, no_integral, keep_memory
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Distance of the last sample and what is left."""
@@ -52,7 +60,7 @@ class LockedTime:
 
     threshold: Scalar = param(default=0.99, unit="1", above=0.0, below=1.0)
 
-    start, flow, value = held_from_zero, nothing, held
+    start, flow, value = start_held, no_integral, held_value
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Add the part of the step above the threshold."""
@@ -69,7 +77,7 @@ class Effort:
     unit = "control^2 s"
     physical = (0.0, math.inf)
 
-    start, update, value = from_zero, unchanged, integral
+    start, update, value = start_integral, keep_memory, integral_value
 
     def flow(self, memory: Memory, sample: Sample) -> Scalar:
         """u^2."""
@@ -93,7 +101,7 @@ class Variation:
     unit = "control"
     physical = (0.0, math.inf)
 
-    flow = nothing
+    flow = no_integral
 
     def start(self, sample: Sample) -> Memory:
         """From the first torque."""
@@ -128,7 +136,7 @@ class TorqueRate:
     unit = "control/s"
     physical = (0.0, math.inf)
 
-    start, flow, value = Variation.start, nothing, Variation.value
+    start, flow, value = Variation.start, no_integral, Variation.value
 
     def update(self, memory: Memory, segment: Segment) -> Varied:
         """The jump before the step, and the rates at its ends."""

@@ -16,41 +16,41 @@ from diffabs.core.cubic import Cubic
 from diffabs.core.numerics import larger, later_of_larger, sign, smaller
 from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, parts, pytree
-from diffabs.core.rules import Rule, ordered
+from diffabs.core.rules import Rule, order_rule
 
-LEAST = 0.01  # of the first signal, of which an overshoot is a fraction
+MIN_SETPOINT = 0.01  # of the first signal, of which an overshoot is a fraction
 
 
-def nothing(self: Any, memory: Memory, sample: Sample) -> Any:
+def no_integral(self: Any, memory: Memory, sample: Sample) -> Any:
     """`flow` of an objective without an integral."""
     del self, memory, sample
     return ()
 
 
-def unchanged(self: Any, memory: Memory, segment: Segment) -> Any:
+def keep_memory(self: Any, memory: Memory, segment: Segment) -> Any:
     """`update` of an objective that is only an integral."""
     del self, segment
     return memory.held
 
 
-def integral(self: Any, memory: Memory, ending: Ending) -> Scalar:
+def integral_value(self: Any, memory: Memory, ending: Ending) -> Scalar:
     """`value` of an objective that is only an integral."""
     del self, ending
     return memory.flow
 
 
-def from_zero(self: Any, sample: Sample) -> Memory:
+def start_integral(self: Any, sample: Sample) -> Memory:
     """`start` of an objective that is only an integral."""
     del self
     return Memory(flow=0.0 * sample.output[0])
 
 
-def error(sample: Sample) -> Scalar:
+def tracking_error(sample: Sample) -> Scalar:
     """The first signal - setpoint."""
     return sample.output[0] - sample.setpoint
 
 
-def highest(output: Any) -> float:
+def highest_signal(output: Any) -> float:
     """The greatest value that the first signal can have; infinite where the output does not say."""
     return getattr(output, "highest", math.inf)
 
@@ -60,20 +60,20 @@ def _side(sample: Sample) -> Any:
     return jnp.where(sample.setpoint < 0, -1.0, 1.0)
 
 
-def absolute(cubic: Cubic, integral: Callable[[Any], Any]) -> Any:
+def absolute_integral(cubic: Cubic, integral: Callable[[Any], Any]) -> Any:
     """The integral of |p| over [0, 1], where `integral(x)` is that of p, or of p times something positive, to x."""
     whole = integral(1.0)
     left = integral(cubic.root())
     return jnp.where(cubic.start * cubic.end < 0, jnp.abs(left) + jnp.abs(whole - left), jnp.abs(whole))
 
 
-def held(self: Any, memory: Memory, ending: Ending) -> Scalar:
+def held_value(self: Any, memory: Memory, ending: Ending) -> Scalar:
     """`value` of an objective that is what it remembers."""
     del self, ending
     return memory.held
 
 
-def held_from_zero(self: Any, sample: Sample) -> Memory:
+def start_held(self: Any, sample: Sample) -> Memory:
     """`start` of an objective that adds up what it sees."""
     del self
     return Memory(held=0.0 * sample.output[0])
@@ -86,12 +86,12 @@ class IAE:
     unit = "signal s"
     physical = (0.0, math.inf)
 
-    start, flow, value = held_from_zero, nothing, held
+    start, flow, value = start_held, no_integral, held_value
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Add |e| over the step."""
         e = segment.error()
-        return memory.held + segment.h * absolute(e, e.integral)
+        return memory.held + segment.h * absolute_integral(e, e.integral)
 
 
 @pytree
@@ -101,12 +101,12 @@ class ITAE:
     unit = "signal s^2"
     physical = (0.0, math.inf)
 
-    start, flow, value = held_from_zero, nothing, held
+    start, flow, value = start_held, no_integral, held_value
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Add t |e| over the step."""
         e, t, h = segment.error(), segment.start.t, segment.h
-        return memory.held + h * absolute(e, lambda x: t * e.integral(x) + h * e.moment(x))
+        return memory.held + h * absolute_integral(e, lambda x: t * e.integral(x) + h * e.moment(x))
 
 
 class Sided(NamedTuple):
@@ -123,7 +123,7 @@ class MaxSlip:
     unit = "1"
     physical = (-1.0, 1.0)
 
-    flow, value = nothing, held
+    flow, value = no_integral, held_value
 
     def start(self, sample: Sample) -> Memory:
         """The first slip."""
@@ -144,7 +144,7 @@ class Overshoot:
     unit = "1"
     physical = (0.0, math.inf)
 
-    flow = nothing
+    flow = no_integral
 
     def start(self, sample: Sample) -> Memory:
         """The first value, and the side on which it shall not go too far."""
@@ -155,16 +155,16 @@ class Overshoot:
         """The greatest of the step, from its cubic."""
         side, greatest = memory.held
         signal = segment.output().times(side)
-        value = smaller(signal.greatest(), highest(segment.end.output))
+        value = smaller(signal.greatest(), highest_signal(segment.end.output))
         return Sided(side, later_of_larger(greatest, value, signal.falls))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Overshoot."""
         side, greatest = memory.held
         setpoint = side * ending.sample.setpoint
-        usual = setpoint >= LEAST
-        fraction = greatest / jnp.where(usual, setpoint, LEAST) - 1
-        excess = jnp.where(usual, fraction, (greatest - setpoint) / LEAST)
+        usual = setpoint >= MIN_SETPOINT
+        fraction = greatest / jnp.where(usual, setpoint, MIN_SETPOINT) - 1
+        excess = jnp.where(usual, fraction, (greatest - setpoint) / MIN_SETPOINT)
         return jnp.where(excess > 0, excess, 0.0)
 
 
@@ -192,7 +192,7 @@ class SettlingTime:
     share: Scalar = param(default=0.02, unit="1", low=0.0, below=1.0)
     band: Scalar = param(default=0.0, unit="signal", low=0.0)
 
-    flow = nothing
+    flow = no_integral
 
     def start(self, sample: Sample) -> Memory:
         """Settled from the start."""
@@ -209,7 +209,7 @@ class SettlingTime:
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """The last entry; infinite if the last sample is outside."""
         last = ending.sample
-        outside = jnp.abs(error(last)) > self._width(last, memory.held.first)
+        outside = jnp.abs(tracking_error(last)) > self._width(last, memory.held.first)
         return jnp.where(outside, self.unreached, memory.held.entered)
 
     def _width(self, seen: Any, first: Scalar) -> Any:
@@ -233,7 +233,7 @@ class ShareAtLimit:
     low: Scalar = param(default=-math.inf, unit="control", infinite=True)
     high: Scalar = param(default=math.inf, unit="control", infinite=True)
 
-    start, flow = held_from_zero, nothing
+    start, flow = start_held, no_integral
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
         """Add the step, or half of it."""
@@ -247,7 +247,7 @@ class ShareAtLimit:
 
     def rules(self) -> Iterator[Rule]:
         """Limits that do not exclude each other."""
-        yield ordered(("low", self.low), ("high", self.high), "{control}")
+        yield order_rule(("low", self.low), ("high", self.high), "{control}")
 
 
 def at_limits(loop: Any) -> ShareAtLimit:
@@ -281,7 +281,7 @@ class FinalError:
     unit = "signal"
     physical = (0.0, math.inf)
 
-    flow, update = nothing, unchanged
+    flow, update = no_integral, keep_memory
 
     def start(self, sample: Sample) -> Memory:
         """Nothing to remember."""
@@ -291,7 +291,7 @@ class FinalError:
     def value(self, memory: Memory, ending: Ending) -> Scalar:
         """Final error."""
         del memory
-        return jnp.abs(error(ending.sample))
+        return jnp.abs(tracking_error(ending.sample))
 
 
 class Quadratic(NamedTuple):
@@ -315,7 +315,7 @@ class QuadraticCost:
     q: Vector = param(default=(1.0, 1.0), unit="1", low=0.0)
     r: Scalar = param(default=1.0, unit="1", above=0.0)
 
-    update = unchanged
+    update = keep_memory
 
     def start(self, sample: Sample) -> Memory:
         """Zero."""
@@ -323,7 +323,7 @@ class QuadraticCost:
 
     def flow(self, memory: Memory, sample: Sample) -> Quadratic:
         """e, and the integrand."""
-        x1, x2, u = memory.flow.error, error(sample), sample.control - sample.feedforward
+        x1, x2, u = memory.flow.error, tracking_error(sample), sample.control - sample.feedforward
         return Quadratic(x2, self.q[0] * x1**2 + self.q[1] * x2**2 + self.r * u**2)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:

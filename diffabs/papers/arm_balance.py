@@ -34,9 +34,9 @@ from diffabs.simulate.solution import Adaptive, FixedStep, Run, describe_solver
 
 TITLE = "Fumita: a two-wheeler balanced by an arm"
 SOLVER = FixedStep(step=1e-3, duration=10.0)
-LONG = Adaptive(rtol=1e-6, duration=600.0)  # of what is counted: a run ends when it is decided
+LONG_SOLVER = Adaptive(rtol=1e-6, duration=600.0)  # of what is counted: a run ends when it is decided
 FINE = FixedStep(step=1e-5, duration=0.1, every=10)  # where 14 kV meet the arm
-START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # of Fig. 3
+PAPER_START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # of Fig. 3
 HANGING = ArmBalance(arm_length=-0.5)
 WEIGHTS, EFFORT = (1.0, 100.0, 1.0, 1.0, 1.0, 1.0), 0.01  # of the LQR for the hanging arm
 # From experiments/arm_weights.py: weights tuned by gradients for the largest region of attraction at 48 V.
@@ -50,7 +50,7 @@ BOX = Cells(-0.1, 0.1, 100)  # of a map [rad]
 POLES = (-108.06522648, -2.79102448, 0.29783666, 2.78790563)
 ZERO = 2.6759
 PEAKS = (4.37, 479.0)  # of Fig. 3 with the LQR Q = I, R = 1: arm [rad], voltage [V]
-LARGEST = {24.0: 0.046, 48.0: 0.080, 100.0: 0.116}  # multiples recovered by the hanging arm
+PUBLISHED_MULTIPLES = {24.0: 0.046, 48.0: 0.080, 100.0: 0.116}  # multiples recovered by the hanging arm
 HANGING_PEAKS = (0.03987, 0.58744)  # rad, from 0.06 of the start
 SPONG = (-246.48129, -98.690342, -106.464047, -50.138071)  # -K
 
@@ -81,20 +81,26 @@ CLAIMS = (
         lambda unlimited, limited: unlimited == limited == 1.0,
     ),
 )
-SHOWN = ("fell", "bound", "recovered", "share", "peak_voltage")  # first words of the quantities of the digest's table
+SHOWN_QUANTITIES = (
+    "fell",
+    "bound",
+    "recovered",
+    "share",
+    "peak_voltage",
+)  # first words of the quantities of the digest's table
 
 
-def model(plant: Any) -> StateSpace:
+def upright_model(plant: Any) -> StateSpace:
     """A, B about upright."""
     return BalanceModel(plant=plant).matrices()
 
 
-def regulated(plant: Any, weights: Any = (1.0,) * 6, effort: float = 1.0) -> np.ndarray:
+def lqr_gain(plant: Any, weights: Any = (1.0,) * 6, effort: float = 1.0) -> np.ndarray:
     """LQR gain K, u = K x."""
-    return np.asarray(lqr(*model(plant), np.diag(weights), effort * np.eye(1)).gain[0])
+    return np.asarray(lqr(*upright_model(plant), np.diag(weights), effort * np.eye(1)).gain[0])
 
 
-def loop(plant: Any, gain: Any, start: Any = START, voltage: float = 48.0) -> Loop:
+def loop(plant: Any, gain: Any, start: Any = PAPER_START, voltage: float = 48.0) -> Loop:
     """The closed loop from a start (6,)."""
     return dataclasses.replace(
         replace(balancing(), {"actuator.voltage_max": voltage}),
@@ -106,13 +112,13 @@ def loop(plant: Any, gain: Any, start: Any = START, voltage: float = 48.0) -> Lo
 
 def runs() -> dict[str, Run]:
     """Fig. 3, the same in the correct model, and the hanging arm."""
-    upright, hanging = regulated(ArmBalance()), regulated(HANGING, WEIGHTS, EFFORT)
+    upright, hanging = lqr_gain(ArmBalance()), lqr_gain(HANGING, WEIGHTS, EFFORT)
     cases = {
-        "printed": loop(PrintedArm(), regulated(PrintedArm()), voltage=1e6),
+        "printed": loop(PrintedArm(), lqr_gain(PrintedArm()), voltage=1e6),
         "correct, no limit": loop(ArmBalance(), upright, voltage=1e9),
         "correct, 48 V": loop(ArmBalance(), upright),
-        "hanging": loop(HANGING, hanging, 0.06 * START),
-        "hanging, tuned": loop(HANGING, TUNED, 0.08 * START),
+        "hanging": loop(HANGING, hanging, 0.06 * PAPER_START),
+        "hanging, tuned": loop(HANGING, TUNED, 0.08 * PAPER_START),
     }
     solvers = {"correct, no limit": FINE}
     return {
@@ -120,22 +126,27 @@ def runs() -> dict[str, Run]:
     }
 
 
-def multiples(one: Loop, rows: Mapping[str, Any]) -> list[Reach]:
+def recovered_multiples(one: Loop, rows: Mapping[str, Any]) -> list[Reach]:
     """Of each of several values of a parameter, (path, values), the largest of MULTIPLES that is recovered."""
-    direction = {"initial.theta": START[0], "initial.phi": START[2]}
-    return largest_recovered_multiples(one, rows, direction, MULTIPLES, LONG)
+    direction = {"initial.theta": PAPER_START[0], "initial.phi": PAPER_START[2]}
+    return largest_recovered_multiples(one, rows, direction, MULTIPLES, LONG_SOLVER)
 
 
-def bounds(plant: ArmBalance, riders: Any) -> np.ndarray:
+def largest_possible_multiples(plant: ArmBalance, riders: Any) -> np.ndarray:
     """The largest multiple of the start that any control at 48 V recovers, for each rider, in the linear model."""
-    return np.array([min(mode_bounds(*model(replace(plant, {"rider_mass": m})), START, 48.0).values()) for m in riders])
+    return np.array(
+        [
+            min(mode_bounds(*upright_model(replace(plant, {"rider_mass": m})), PAPER_START, 48.0).values())
+            for m in riders
+        ]
+    )
 
 
 def heaviest(plant: ArmBalance, gain: np.ndarray, low: float = 50.0, high: float = 200.0) -> float:
     """Mass of the heaviest rider [kg] whom a gain holds upright, in the linear model, by halving; `low` is held."""
     while high - low > 1e-3:
         mass = (low + high) / 2
-        a, b = model(replace(plant, {"rider_mass": mass}))
+        a, b = upright_model(replace(plant, {"rider_mass": mass}))
         held = np.linalg.eigvals(np.asarray(a + b @ gain[None])).real.max() < 0
         low, high = (mass, high) if held else (low, mass)
     return low
@@ -143,16 +154,16 @@ def heaviest(plant: ArmBalance, gain: np.ndarray, low: float = 50.0, high: float
 
 def maps(progress: Callable[[str], None]) -> dict[str, Basin]:
     """Regions of attraction at 48 V."""
-    gains, found = {"LQR": regulated(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": TUNED}, {}
+    gains, found = {"LQR": lqr_gain(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": TUNED}, {}
     for name, gain in gains.items():
         progress(f"arm-balance: {BOX.number**2} starts, {name}")
-        found[name] = region_of_attraction(loop(HANGING, gain), BOX, BOX, LONG)
+        found[name] = region_of_attraction(loop(HANGING, gain), BOX, BOX, LONG_SOLVER)
     return found
 
 
-def robust(progress: Callable[[str], None]) -> dict[str, Any]:
+def robust_gains(progress: Callable[[str], None]) -> dict[str, Any]:
     """Gains over riders of 40 to 100 kg: LQR of one rider, LMI of all, tuned."""
-    gains = {"LQR for 50 kg": regulated(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": np.array(TUNED)}
+    gains = {"LQR for 50 kg": lqr_gain(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": np.array(TUNED)}
     progress("arm-balance: a gain for 40 to 100 kg")
     try:
         from diffabs.design import Spec, design
@@ -166,44 +177,58 @@ def robust(progress: Callable[[str], None]) -> dict[str, Any]:
     found = {}
     for name, gain in gains.items():
         progress(f"arm-balance: {len(RIDERS)} riders, {name}")
-        found[name] = gain, multiples(loop(HANGING, gain), {"plant.rider_mass": RIDERS})
+        found[name] = gain, recovered_multiples(loop(HANGING, gain), {"plant.rider_mass": RIDERS})
     return found
 
 
 def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[dict[str, Any]]:
     """Ours against the independent numbers."""
-    a, b = model(ArmBalance())
+    a, b = upright_model(ArmBalance())
     poles = np.sort_complex(np.linalg.eigvals(np.asarray(a)))
     real = poles[np.abs(poles.imag) < 1e-9].real
     rows = [
-        record.row("correct model", "real pole", "1/s", ours, reference=known)
+        record.computed_row("correct model", "real pole", "1/s", ours, reference=known)
         for ours, known in zip(real, POLES, strict=True)
     ]
     zero = np.max(np.real(transmission_zeros(a, b, np.eye(6)[0])))
-    rows.append(record.row("correct model", "unstable zero of theta", "1/s", zero, reference=ZERO))
-    rows.append(record.row("correct model", "bound, multiple at 48 V", "1", bounds(ArmBalance(), [50.0])[0]))
-    rows.append(record.row("hanging arm", "bound, multiple at 48 V", "1", bounds(HANGING, [50.0])[0]))
+    rows.append(record.computed_row("correct model", "unstable zero of theta", "1/s", zero, reference=ZERO))
+    rows.append(
+        record.computed_row(
+            "correct model", "bound, multiple at 48 V", "1", largest_possible_multiples(ArmBalance(), [50.0])[0]
+        )
+    )
+    rows.append(
+        record.computed_row(
+            "hanging arm", "bound, multiple at 48 V", "1", largest_possible_multiples(HANGING, [50.0])[0]
+        )
+    )
     for name, known, unit in (("peak_arm_angle", PEAKS[0], "rad"), ("peak_voltage", PEAKS[1], "V")):
-        rows.append(record.row("printed model, Fig. 3", name, unit, seen["printed"].metrics[name], reference=known))
+        rows.append(
+            record.computed_row("printed model, Fig. 3", name, unit, seen["printed"].metrics[name], reference=known)
+        )
     for name, known in zip(("peak_lean", "peak_arm_angle"), HANGING_PEAKS, strict=True):
-        rows.append(record.row("hanging arm, 0.06 of it", name, "rad", seen["hanging"].metrics[name], reference=known))
+        rows.append(
+            record.computed_row("hanging arm, 0.06 of it", name, "rad", seen["hanging"].metrics[name], reference=known)
+        )
     for name in ("correct, no limit", "correct, 48 V", "hanging", "hanging, tuned"):
-        rows.append(record.row(name, "fell", "1", seen[name].metrics["fell"]))
-    known = regulated(HANGING, WEIGHTS, EFFORT)
-    rows.append(record.row("hanging arm, LQR", "heaviest rider held", "kg", heaviest(HANGING, known)))
-    found = multiples(loop(HANGING, known), {"actuator.voltage_max": np.array(VOLTAGES)})
+        rows.append(record.computed_row(name, "fell", "1", seen[name].metrics["fell"]))
+    known = lqr_gain(HANGING, WEIGHTS, EFFORT)
+    rows.append(record.computed_row("hanging arm, LQR", "heaviest rider held", "kg", heaviest(HANGING, known)))
+    found = recovered_multiples(loop(HANGING, known), {"actuator.voltage_max": np.array(VOLTAGES)})
     for voltage, reach in zip(VOLTAGES, found, strict=True):
         words = f"recovered multiple at {voltage:g} V"
-        rows.append(record.row("hanging arm, LQR", words, "1", reach.multiple, reference=LARGEST[voltage]))
+        rows.append(
+            record.computed_row("hanging arm, LQR", words, "1", reach.multiple, reference=PUBLISHED_MULTIPLES[voltage])
+        )
     for name, basin in basins.items():
-        rows.append(record.row(f"map, {name}", "share by area", "1", basin.share))
-        rows.append(record.row(f"map, {name}", "share undecided", "1", basin.undecided))
-    a, b = (np.asarray(x) for x in model(ACROBOT))
+        rows.append(record.computed_row(f"map, {name}", "share by area", "1", basin.share))
+        rows.append(record.computed_row(f"map, {name}", "share undecided", "1", basin.undecided))
+    a, b = (np.asarray(x) for x in upright_model(ACROBOT))
     part = [0, 1, 3, 4]
     gain = lqr(a[np.ix_(part, part)], b[part], np.eye(4), np.eye(1)).gain[0]
     names = ("theta", "psi", "theta'", "psi'")
     rows += [
-        record.row("Acrobot, LQR", f"-K of {name}", "", -k, published=f)
+        record.computed_row("Acrobot, LQR", f"-K of {name}", "", -k, published=f)
         for name, k, f in zip(names, gain, SPONG, strict=True)
     ]
     return rows
@@ -215,7 +240,7 @@ def compact(summary: Mapping[str, Any]) -> Digest:
     lines = []
     for row in rows:
         nothing = row["quantity"] == "share undecided" and row["ours"] == 0
-        if (first := re.split(r"\W", row["quantity"])[0]) in SHOWN and not nothing:
+        if (first := re.split(r"\W", row["quantity"])[0]) in SHOWN_QUANTITIES and not nothing:
             quantity = row["quantity"] if row["unit"] == "1" else f"{row['quantity']} [{row['unit']}]"
             number = ("no", "yes")[int(row["ours"])] if first == "fell" else f"{row['ours']:.4g}"
             lines.append((row["name"], quantity, number, "" if row["reference"] is None else f"{row['reference']:.4g}"))
@@ -230,18 +255,18 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
     progress("arm-balance: Fig. 3, printed and correct equations")
     seen = runs()
     basins = maps(progress)
-    over_riders = robust(progress)
+    over_riders = robust_gains(progress)
     progress(f"arm-balance: starts recovered at {', '.join(f'{volts:g}' for volts in VOLTAGES)} V")
     rows = table(seen, basins)
     progress("arm-balance: figures")
-    limit = bounds(HANGING, RIDERS)
-    drawn = arm_figures.figures(seen, basins, RIDERS, over_riders, limit, START, model(HANGING))
+    limit = largest_possible_multiples(HANGING, RIDERS)
+    drawn = arm_figures.figures(seen, basins, RIDERS, over_riders, limit, PAPER_START, upright_model(HANGING))
     summary = {
         "paper": "arm-balance",
         "title": TITLE,
         "rows": rows,
-        "judged": arm_equations.judged(ArmBalance()),
-        "figures": record.saved(drawn, folder),
+        "judged": arm_equations.judge_equations(ArmBalance()),
+        "figures": record.save_figures(drawn, folder),
         "notes": NOTES,
         "gains": {name: np.asarray(gain).tolist() for name, (gain, _) in over_riders.items()},
         "riders": {
@@ -253,8 +278,8 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
             name: [float(m) for m, reach in zip(RIDERS, reaches, strict=True) if reach.undecided]
             for name, (_, reaches) in over_riders.items()
         },
-        "solver": record.solver(SOLVER, counted=describe_solver(LONG)),
-        "made": provenance.made(("reproduce", "arm-balance")),
-        "versions": record.origin(),
+        "solver": record.solver_settings(SOLVER, counted=describe_solver(LONG_SOLVER)),
+        "made": provenance.describe_making(("reproduce", "arm-balance")),
+        "versions": record.origin_of_numbers(),
     }
-    return record.write(folder, summary)
+    return record.write_summary(folder, summary)

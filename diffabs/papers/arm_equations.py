@@ -52,13 +52,13 @@ def lagrangian(p: ArmBalance, q: Any, v: Any) -> Any:
     return kinetic(p, q, v) - p.gravity * (heights + p.rider_mass * p.rider_height * jnp.cos(t1 - t3))
 
 
-def derived(energy: Energy, p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
+def euler_lagrange(energy: Energy, p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
     """d/dt(dL/dv) - dL/dq (3,), by automatic differentiation."""
     by_rate = jax.grad(energy, 2)
     return jax.jvp(lambda q, v: by_rate(p, q, v), (q, v), (v, a))[1] - jax.grad(energy, 1)(p, q, v)
 
 
-def printed(p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
+def printed_equations(p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
     """Left sides of eqs. (8), (9), (10) (3,)."""
     (t1, t2, t3), (v1, v2, v3) = q, v
     sin2, sin3 = jnp.sin(t2), jnp.sin(t3)
@@ -80,22 +80,24 @@ def printed(p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
 def gravity_stiffness(p: ArmBalance) -> np.ndarray:
     """d(left sides of (8)-(10))/dq at rest (3, 3) [N m/rad]: symmetric for any potential."""
     zero = jnp.zeros(3)
-    return np.asarray(jax.jacfwd(lambda q: printed(p, q, zero, zero))(zero))
+    return np.asarray(jax.jacfwd(lambda q: printed_equations(p, q, zero, zero))(zero))
 
 
-def judged(p: ArmBalance) -> list[dict[str, Any]]:
+def judge_equations(p: ArmBalance) -> list[dict[str, Any]]:
     """A row for each number."""
     upright = np.asarray(potentials(p, jnp.zeros(3)))
     height = p.arm_mass * p.gravity * (p.mount_height + p.arm_length)
-    rows = [record.row("eq. (4), everything upright", "potential energy", "J", upright[1], reference=height)]
+    rows = [record.computed_row("eq. (4), everything upright", "potential energy", "J", upright[1], reference=height)]
     stiffness = gravity_stiffness(p)
     for i, name in ((1, "arm"), (2, "rider")):
         of_frame = f"gravity of eq. ({8 + i}) by the frame less that of (8) by the {name}"
-        rows.append(record.row(of_frame, "asymmetry", "N m/rad", stiffness[i, 0] - stiffness[0, i], reference=0.0))
+        rows.append(
+            record.computed_row(of_frame, "asymmetry", "N m/rad", stiffness[i, 0] - stiffness[0, i], reference=0.0)
+        )
     for name, half in RODS.items():
         mass, inertia = getattr(p, f"{name}_mass"), getattr(p, f"{name}_inertia")
         rod = mass * (2 * getattr(p, half)) ** 2 / 12
-        rows.append(record.row(f"a uniform rod as the {name}", "inertia", "kg m^2", rod, published=inertia))
-    rows.append(record.row("motor, stalled at 48 V", "torque", "N m", p.torque_constant * 48.0 / p.resistance))
-    rows.append(record.row("motor, most at 48 V", "mechanical power", "W", 48.0**2 / (4 * p.resistance)))
+        rows.append(record.computed_row(f"a uniform rod as the {name}", "inertia", "kg m^2", rod, published=inertia))
+    rows.append(record.computed_row("motor, stalled at 48 V", "torque", "N m", p.torque_constant * 48.0 / p.resistance))
+    rows.append(record.computed_row("motor, most at 48 V", "mechanical power", "W", 48.0**2 / (4 * p.resistance)))
     return rows

@@ -23,7 +23,9 @@ def figures(
     """By file name."""
     return {
         "fig3_printed_and_correct": _claim(seen),
-        "hanging_arm": plot.balance(seen["hanging"], title="Hanging arm at 48 V, from 0.06 of the start of Fig. 3"),
+        "hanging_arm": plot.draw_balance(
+            seen["hanging"], title="Hanging arm at 48 V, from 0.06 of the start of Fig. 3"
+        ),
         "attraction_48V": _maps(basins, start, hanging),
         "riders": _riders(riders, over_riders, limit),
     }
@@ -39,8 +41,8 @@ def _claim(seen: Mapping[str, Run]) -> Any:
     for i, (ax, (name, title)) in enumerate(zip(axes, titles.items(), strict=True)):
         trajectory = seen[name].trajectory
         assert trajectory is not None
-        plot.angle_lines(ax, trajectory)
-        plot.label(ax, "time [s]", "angle [rad]", title, legend=i == 0)
+        plot.draw_angle_lines(ax, trajectory)
+        plot.label_axes(ax, "time [s]", "angle [rad]", title, legend=i == 0)
         ax.set_xlim(0, 6.0 if i == 0 else float(trajectory.sample.t[-1]) * 1.05)
     return figure
 
@@ -53,7 +55,9 @@ def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
     shades, undecided = [], any(basin.undecided for basin in basins.values())
     for i, (ax, (name, basin)) in enumerate(zip(axes, basins.items(), strict=True)):
         outcomes = basin.outcomes
-        shades = plot.region(ax, basin.first.centres, basin.second.centres, outcomes.recovered, outcomes.undecided)
+        shades = plot.shade_region(
+            ax, basin.first.centres, basin.second.centres, outcomes.recovered, outcomes.undecided
+        )
         ends = np.array([basin.first.low, basin.first.high])
         for sign in (-1, 1):
             words = "no control beyond (linear)" if sign > 0 else None
@@ -64,7 +68,7 @@ def _maps(basins: Mapping[str, Basin], start: np.ndarray, hanging: Any) -> Any:
         ax.locator_params(axis="x", nbins=5)
         title = f"{name}: {100 * basin.share:.1f} % of the box"
         title += f", {100 * basin.undecided:.1f} % undecided" if basin.undecided else ""
-        plot.label(ax, "frame theta0 [rad]", "" if i else "rider phi0 [rad]", title, legend=False)
+        plot.label_axes(ax, "frame theta0 [rad]", "" if i else "rider phi0 [rad]", title, legend=False)
     lines, words = axes[0].get_legend_handles_labels()
     named = dict(zip(("recovered", "undecided", "falls"), shades, strict=True))
     named = {name: shade for name, shade in named.items() if undecided or name != "undecided"}
@@ -82,6 +86,6 @@ def _riders(riders: np.ndarray, found: Mapping[str, tuple[Any, list[Reach]]], li
         least = [(m, reach.multiple) for m, reach in zip(riders, reaches, strict=True) if reach.undecided]
         if least:
             ax.plot(*zip(*least, strict=True), "^", color=plot.COLOURS[i], label="at least")
-    plot.label(ax, "rider [kg]", "recovered multiple of (0.5, 0, 0.2) rad")
+    plot.label_axes(ax, "rider [kg]", "recovered multiple of (0.5, 0, 0.2) rad")
     ax.set_ylim(0, None)
     return figure

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from decimal import Decimal
 from typing import Any, NamedTuple
 
-CLOSE = 1e-3  # relative
+RELATIVE_TOLERANCE = 1e-3  # relative
 Row = Mapping[str, Any]
 
 
@@ -49,23 +49,23 @@ def digest(
         title=summary["title"].split(" (")[0],
         headings=headings,
         lines=lines,
-        agreement=[text for text in (published(*printed), computed(independent)) if text],
+        agreement=[text for text in (count_published(*printed), count_computed(independent)) if text],
         verdicts=[found for claim in claims if (found := verdict(summary["rows"], claim))],
         figures=len(summary["figures"]),
     )
 
 
-def ours(rows: Iterable[Row], name: str, quantity: str) -> float | None:
+def our_number(rows: Iterable[Row], name: str, quantity: str) -> float | None:
     """Our number in a row of the record; None where there is no such row."""
     return next((row["ours"] for row in rows if (row["name"], row["quantity"]) == (name, quantity)), None)
 
 
-def reproduced(row: Row) -> bool:
+def is_reproduced(row: Row) -> bool:
     """Whether ours rounds to the printed digits: those that the row was judged by, or those of the number itself."""
-    return row["matches"] if "matches" in row else rounds(row["ours"], row["published"])
+    return row["matches"] if "matches" in row else rounds_to(row["ours"], row["published"])
 
 
-def rounds(number: float, given: float) -> bool:
+def rounds_to(number: float, given: float) -> bool:
     """Whether a number rounds to one that is given with so many decimals."""
     return round(number, decimals(given)) == given
 
@@ -76,22 +76,22 @@ def decimals(given: float) -> int:
     return max(0, -int(exponent))
 
 
-def close(row: Row) -> bool:
+def is_close(row: Row) -> bool:
     """Whether ours agrees with an independent number. Without decimals, rounding would let 0.4 be 0."""
     known, gap = row["reference"], abs(row["difference"])
-    return gap <= CLOSE * abs(known) or (decimals(known) > 0 and rounds(row["ours"], known))
+    return gap <= RELATIVE_TOLERANCE * abs(known) or (decimals(known) > 0 and rounds_to(row["ours"], known))
 
 
-def published(where: str, rows: Sequence[Row]) -> str:
+def count_published(where: str, rows: Sequence[Row]) -> str:
     """How many of these published numbers are reproduced, which are not, and by what rule."""
     if not rows:
         return f"The paper prints no number to compare with: {where}."
-    return _share(rows, reproduced, f"published numbers reproduced ({where}: to the printed digit)")
+    return _share(rows, is_reproduced, f"published numbers reproduced ({where}: to the printed digit)")
 
 
-def computed(rows: Sequence[Row]) -> str:
+def count_computed(rows: Sequence[Row]) -> str:
     """How many of these independent numbers are reproduced, and which are not."""
-    return _share(rows, close, "independent numbers reproduced (to 0.1 % or the decimals given)")
+    return _share(rows, is_close, "independent numbers reproduced (to 0.1 % or the decimals given)")
 
 
 def _share(rows: Sequence[Row], agrees: Callable[[Row], bool], words: str) -> str:
@@ -102,7 +102,7 @@ def _share(rows: Sequence[Row], agrees: Callable[[Row], bool], words: str) -> st
 
 def verdict(rows: Sequence[Row], claim: Refuted) -> tuple[str, str] | None:
     """ "refuted" or "holds", and the claim with the numbers why; None where the record does not have them."""
-    values = [ours(rows, *place) for place in claim.evidence]
+    values = [our_number(rows, *place) for place in claim.evidence]
     if None in values:
         return None
     word = "refuted" if claim.false(*values) else "holds"

@@ -15,13 +15,13 @@ from diffabs.roads import peak
 from diffabs.simulate.solution import Run
 
 KMH = 3.6
-LATE = 0.45  # s, after which the torque has been built up in every run
-SLOW = 20 / KMH  # m/s, for "even when the vehicle is slow"
+LATE_TIME = 0.45  # s, after which the torque has been built up in every run
+SLOW_SPEED = 20 / KMH  # m/s, for "even when the vehicle is slow"
 CONTROLLERS = ("P", "PD", "PI", "PID")
-METHODS = ("conventional", "proposed")
+COMPARED_METHODS = ("conventional", "proposed")
 
 
-def seen(run: Run) -> dict[str, np.ndarray]:
+def run_columns(run: Run) -> dict[str, np.ndarray]:
     """Columns of a trajectory while it ran: time, torque, and what the plant shows."""
     if run.trajectory is None:
         raise ValueError("a run without a trajectory, as `measure` returns it: use `rollout`")
@@ -34,12 +34,12 @@ def seen(run: Run) -> dict[str, np.ndarray]:
 
 def variation(run: Run) -> float:
     """Total variation of the torque between the samples that were kept [N m]."""
-    return float(np.sum(np.abs(np.diff(seen(run)["torque"]))))
+    return float(np.sum(np.abs(np.diff(run_columns(run)["torque"]))))
 
 
-def jerk(run: Run, after: float = LATE) -> float:
+def jerk(run: Run, after: float = LATE_TIME) -> float:
     """Greatest |da/dt| of the vehicle between samples later than `after` [m/s^3]."""
-    one = seen(run)
+    one = run_columns(run)
     t = one["t"]
     rates = np.abs(np.diff(one["deceleration"]) / np.diff(t))
     return float(np.max(rates[t[:-1] >= after]))
@@ -47,27 +47,27 @@ def jerk(run: Run, after: float = LATE) -> float:
 
 def rebounds(run: Run, begin: float = 0.3, end: float = 1.0) -> int:
     """How often the wheel changes between slowing down and speeding up in this time."""
-    one = seen(run)
+    one = run_columns(run)
     rate = np.diff(one["wheel_speed"])[(one["t"][:-1] >= begin) & (one["t"][:-1] < end)]
     return int(np.sum(np.diff(np.sign(rate)) != 0))
 
 
 def slow_deceleration(run: Run) -> float:
-    """Mean deceleration from `SLOW` down to the last sample, over the distance [m/s^2]."""
-    one = seen(run)
-    slow = one["speed"] <= SLOW
+    """Mean deceleration from `SLOW_SPEED` down to the last sample, over the distance [m/s^2]."""
+    one = run_columns(run)
+    slow = one["speed"] <= SLOW_SPEED
     v, x = one["speed"][slow], one["distance"][slow]
     return float((v[0] ** 2 - v[-1] ** 2) / (2 * (x[-1] - x[0])))
 
 
-def gained(slower: Run, faster: Run) -> tuple[float, float]:
-    """What one run brakes shorter than another, and the part of it that is gained below `SLOW` [m].
+def braking_gain(slower: Run, faster: Run) -> tuple[float, float]:
+    """What one run brakes shorter than another, and the part of it that is gained below `SLOW_SPEED` [m].
 
     Distance is the integral of v dv/a(v), which tells at what speeds it is gained."""
-    one, other = seen(slower), seen(faster)
+    one, other = run_columns(slower), run_columns(faster)
     v = np.linspace(one["speed"][-1], one["speed"][1], 20_001)  # at the very first there is no friction yet
     shorter = v * (1 / _at(v, one) - 1 / _at(v, other))
-    return float(np.trapezoid(shorter, v)), float(np.trapezoid(np.where(v <= SLOW, shorter, 0.0), v))
+    return float(np.trapezoid(shorter, v)), float(np.trapezoid(np.where(v <= SLOW_SPEED, shorter, 0.0), v))
 
 
 def _at(v: np.ndarray, one: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -75,21 +75,23 @@ def _at(v: np.ndarray, one: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.interp(v, one["speed"][::-1], one["deceleration"][::-1])
 
 
-def judged(runs: Mapping[str, Run], roads: Mapping[str, Any]) -> list[dict[str, Any]]:
+def judge_estimator_claims(runs: Mapping[str, Run], roads: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A row for each number, of the runs of Tables 1 and 2 on one car, and of the friction curves by name."""
     rows = []
-    for name in (f"{method} {controller}" for method in METHODS for controller in CONTROLLERS):
-        rows.append(record.row(name, "variation of the torque", "N m", variation(runs[name])))
-        rows.append(record.row(name, f"largest jerk after {LATE:g} s", "m/s^3", jerk(runs[name])))
-        rows.append(record.row(name, "turns of the wheel's speed, 0.3 to 1 s", "1", rebounds(runs[name])))
-    for method in METHODS:
+    for name in (f"{method} {controller}" for method in COMPARED_METHODS for controller in CONTROLLERS):
+        rows.append(record.computed_row(name, "variation of the torque", "N m", variation(runs[name])))
+        rows.append(record.computed_row(name, f"largest jerk after {LATE_TIME:g} s", "m/s^3", jerk(runs[name])))
+        rows.append(record.computed_row(name, "turns of the wheel's speed, 0.3 to 1 s", "1", rebounds(runs[name])))
+    for method in COMPARED_METHODS:
         distances = [float(runs[f"{method} {controller}"].metrics["stop_distance"]) for controller in CONTROLLERS]
-        rows.append(record.row(method, "distance, between the four controllers", "m", np.ptp(distances)))
+        rows.append(record.computed_row(method, "distance, between the four controllers", "m", np.ptp(distances)))
         name = f"{method} PI"
-        rows.append(record.row(name, "deceleration below 20 km/h", "m/s^2", slow_deceleration(runs[name])))
-    whole, slow = gained(runs["conventional PI"], runs["proposed PI"])
-    rows.append(record.row("proposed PI", "shorter than conventional", "m", whole))
-    rows.append(record.row("proposed PI", "of that below 20 km/h", "m", slow))
+        rows.append(record.computed_row(name, "deceleration below 20 km/h", "m/s^2", slow_deceleration(runs[name])))
+    whole, slow = braking_gain(runs["conventional PI"], runs["proposed PI"])
+    rows.append(record.computed_row("proposed PI", "shorter than conventional", "m", whole))
+    rows.append(record.computed_row("proposed PI", "of that below 20 km/h", "m", slow))
     for name, road in roads.items():
-        rows.append(record.row(f"friction curve, {name}", "slip of greatest friction", "1", jax.jit(peak)(road).slip))
+        rows.append(
+            record.computed_row(f"friction curve, {name}", "slip of greatest friction", "1", jax.jit(peak)(road).slip)
+        )
     return rows

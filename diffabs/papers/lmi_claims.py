@@ -8,13 +8,13 @@ from scipy.linalg import solve_continuous_are, solve_continuous_lyapunov
 
 from diffabs.design import Polytope
 from diffabs.papers import record
-from diffabs.papers.lmi_design import K1, OVER, PUBLISHED
+from diffabs.papers.lmi_design import DESIGN_BOX, K1, PUBLISHED_GAIN
 from diffabs.plants import GRAVITY, LabRig
 
 CAR, PERSON, RIG = 1000.0, 60.0, 5.0  # kg
 
 
-def scaled(people: int) -> float:
+def scaled_mass(people: int) -> float:
     """The rig's mass with so many people, in proportion to a car of a tonne as 5 kg [kg]."""
     return RIG + people * PERSON * RIG / CAR
 
@@ -52,8 +52,8 @@ def optimum(A: np.ndarray, B: np.ndarray, weights: tuple[float, float]) -> tuple
 def holding_mass(system: Polytope, gain: Any) -> float:
     """The greatest mass [kg] at which a gain is stable: alpha, eq. (17), is affine in the mass, and the loop is stable
     while alpha < beta |k2|."""
-    low, high = OVER["plant.mass"]
-    speed = OVER["speed"][1]
+    low, high = DESIGN_BOX["plant.mass"]
+    speed = DESIGN_BOX["speed"][1]
     (a, b), (c, _) = (corner(system, mass, speed) for mass in (low, high))
     slope = (c[1, 1] - a[1, 1]) / (high - low)
     return float(low + (-gain[1] * b[1, 0] - a[1, 1]) / slope)
@@ -62,31 +62,39 @@ def holding_mass(system: Polytope, gain: Any) -> float:
 def nearest_speed(system: Polytope) -> float:
     """The speed [m/s] whose LQ gain is the published one, with no weight on the slip error: alpha/beta does not depend
     on the speed and omega_2/beta is in proportion to it."""
-    low = OVER["speed"][0]
-    A, B = corner(system, OVER["plant.mass"][0], low)
+    low = DESIGN_BOX["speed"][0]
+    A, B = corner(system, DESIGN_BOX["plant.mass"][0], low)
     ratio = A[1, 1] / B[1, 0]
-    k = -PUBLISHED[1]
+    k = -PUBLISHED_GAIN[1]
     return float(low * ((k - ratio) ** 2 - ratio**2) * B[1, 0] / (2 * K1))
 
 
-def judged(system: Polytope, gains: dict[tuple[float, float], np.ndarray]) -> list[dict[str, Any]]:
+def judge_lmi_claims(system: Polytope, gains: dict[tuple[float, float], np.ndarray]) -> list[dict[str, Any]]:
     """A row for each number; `gains`: those of the inequalities by their weights."""
-    (light, heavy), (slow, fast) = OVER["plant.mass"], OVER["speed"]
-    rows = [record.row(f"a car with {n} of 60 kg", "mass of the rig", "kg", scaled(n)) for n in (1, 4)]
+    (light, heavy), (slow, fast) = DESIGN_BOX["plant.mass"], DESIGN_BOX["speed"]
+    rows = [record.computed_row(f"a car with {n} of 60 kg", "mass of the rig", "kg", scaled_mass(n)) for n in (1, 4)]
     names = ("the rig's lower wheel, 2 J2/r2^2", "weight on the rig's wheels at rest")
-    rows += [record.row(name, "mass", "kg", mass) for name, mass in zip(names, rig_masses(), strict=True)]
+    rows += [record.computed_row(name, "mass", "kg", mass) for name, mass in zip(names, rig_masses(), strict=True)]
     for weights, gain in gains.items():
         name = f"LMI, Q = diag({weights[0]:.6g}, {weights[1]:g})"
         costs = [cost(*corner(system, mass, fast), gain, weights) for mass in (light, heavy)]
-        rows.append(record.row(name, "cost at 6.2 kg over that at 5.3 kg, less 1", "1", costs[1] / costs[0] - 1))
-        rows.append(record.row(name, "stable up to a mass of", "kg", holding_mass(system, gain)))
+        rows.append(
+            record.computed_row(name, "cost at 6.2 kg over that at 5.3 kg, less 1", "1", costs[1] / costs[0] - 1)
+        )
+        rows.append(record.computed_row(name, "stable up to a mass of", "kg", holding_mass(system, gain)))
     weights = (K1**2, 1.0)
     alone = optimum(*corner(system, light, slow), (K1**2, 0.0))[0]
-    rows.append(record.row("LQ at 5 km/h alone, Q = diag(11753^2, 0)", "k2", "N m", alone[1], published=PUBLISHED[1]))
+    rows.append(
+        record.computed_row(
+            "LQ at 5 km/h alone, Q = diag(11753^2, 0)", "k2", "N m", alone[1], published=PUBLISHED_GAIN[1]
+        )
+    )
     speed = 3.6 * nearest_speed(system)
-    rows.append(record.row("speed whose LQ gain is the published one", "speed", "km/h", speed))
+    rows.append(record.computed_row("speed whose LQ gain is the published one", "speed", "km/h", speed))
     for name, at in (("5 km/h", slow), ("50 km/h", fast)):
         A, B = corner(system, light, at)
-        excess = cost(A, B, PUBLISHED, weights) / optimum(A, B, weights)[1] - 1
-        rows.append(record.row(f"published gain at {name}, Q = diag(11753^2, 1)", "cost above the least", "1", excess))
+        excess = cost(A, B, PUBLISHED_GAIN, weights) / optimum(A, B, weights)[1] - 1
+        rows.append(
+            record.computed_row(f"published gain at {name}, Q = diag(11753^2, 1)", "cost above the least", "1", excess)
+        )
     return rows

@@ -19,16 +19,16 @@ from diffabs.plants import MirroredRig
 from diffabs.simulate.solution import Run
 
 K1 = 11753.0
-PUBLISHED = (-K1, -48.0)
+PUBLISHED_GAIN = (-K1, -48.0)
 SAME_INTEGRAL = (-11752.95, -158.170)  # of the LMI with Q = diag(K1^2, 1)
 GENTLE = (-121.8, -158.2)
 KMH = 3.6
-OVER = {"plant.mass": (5.3, 6.2), "speed": (5 / KMH, 50 / KMH)}
-BRAKING = (-7.9, 0.0)  # m/s^2; no road friction slows the rig faster than 2 g 0.4
-CELLS = 8
+DESIGN_BOX = {"plant.mass": (5.3, 6.2), "speed": (5 / KMH, 50 / KMH)}
+DECELERATION_RANGE = (-7.9, 0.0)  # m/s^2; no road friction slows the rig faster than 2 g 0.4
+SPEED_CELLS = 8
 
 # Computed without this package, by several solvers: weights, then gain and trace Z.
-REFERENCE = {
+REFERENCE_GAINS = {
     (K1**2, 1.0): ((-11752.95, -158.170), 1847633.09),
     (1e6, 1e4): ((-999.73, -111.072), 110129.870),
     (1.0, 1.0): ((-0.833855, -2.599026), 4.58876617),
@@ -66,7 +66,7 @@ CLAIMS = (
         "eqs. (30)-(32) give its gain",
         "no Q, R do; they need |k2| > {1:.2f}",
         [("K = [-11753, -48], 5..50 km/h", "common Lyapunov matrix"), ("k1 = -11753", "least |k2| with a common one")],
-        lambda common, least: common == 0.0 and least > -PUBLISHED[1],
+        lambda common, least: common == 0.0 and least > -PUBLISHED_GAIN[1],
     ),
     Refuted(
         "eq. (31) has the rig's vertices",
@@ -89,19 +89,19 @@ class Designed:
     def __init__(self) -> None:
         """The polytope, the gains for the reference weights, and the verdicts."""
         model = SlipModel(plant=MirroredRig(), slip=0.2)
-        self.system = polytope(model, OVER)
-        self.designs = {weights: design(self.system, Spec(Q=weights, R=1.0)) for weights in REFERENCE}
-        self.printed = {weights: design(_printed(self.system), Spec(Q=weights, R=1.0)) for weights in REFERENCE}
+        self.system = polytope(model, DESIGN_BOX)
+        self.designs = {weights: design(self.system, Spec(Q=weights, R=1.0)) for weights in REFERENCE_GAINS}
+        self.printed = {weights: design(_printed(self.system), Spec(Q=weights, R=1.0)) for weights in REFERENCE_GAINS}
         gains = {k2: (-K1, k2) for k2 in (-48.0, -76.6, -76.7, SAME_INTEGRAL[1])}
         self.verdicts = {k2: certify(gain, self.system, fastest=True) for k2, gain in gains.items()}
-        cells = schedule(model, OVER, along="speed", nodes=CELLS)
-        self.varying = certify(PUBLISHED, cells, Spec(rates=BRAKING, decay=5.0))
+        cells = schedule(model, DESIGN_BOX, along="speed", nodes=SPEED_CELLS)
+        self.varying = certify(PUBLISHED_GAIN, cells, Spec(rates=DECELERATION_RANGE, decay=5.0))
 
 
 def _printed(system: Polytope) -> Polytope:
     """Eq. (31): blocks 3 and 4 have B of the other speed."""
     speeds = np.array([corner["speed"] for corner in system.corners])
-    heavy = np.array([corner["plant.mass"] == OVER["plant.mass"][1] for corner in system.corners])
+    heavy = np.array([corner["plant.mass"] == DESIGN_BOX["plant.mass"][1] for corner in system.corners])
     low = speeds == speeds.min()
     other = {(mass, slow): i for i, (mass, slow) in enumerate(zip(heavy, low, strict=True))}
     # (heavy, fast) and (light, slow) are right; (heavy, slow) gets B of the high speed, (light, fast) of the low one
@@ -114,36 +114,42 @@ def _printed(system: Polytope) -> Polytope:
 def table(found: Designed, braked: Mapping[str, Run]) -> list[dict[str, Any]]:
     """Gains and costs, verdicts, poles, overshoots."""
     rows = []
-    for weights, (gain, trace) in REFERENCE.items():
+    for weights, (gain, trace) in REFERENCE_GAINS.items():
         name = f"LMI, Q = diag({weights[0]:.6g}, {weights[1]:g})"
         ours = found.designs[weights]
-        rows.append(record.row(name, "trace Z", "1", ours.trace_cost, reference=trace))
+        rows.append(record.computed_row(name, "trace Z", "1", ours.trace_cost, reference=trace))
         for i, unit in enumerate(("N m/s", "N m")):
-            rows.append(record.row(name, f"k{i + 1}", unit, ours.gain[0, i], reference=gain[i]))
+            rows.append(record.computed_row(name, f"k{i + 1}", unit, ours.gain[0, i], reference=gain[i]))
         printed = found.printed[weights]
-        rows.append(record.row(f"{name}, (31) as printed", "trace Z", "1", printed.trace_cost))
-        rows.append(record.row(f"{name}, (31) as printed", "k2", "N m", printed.gain[0, 1]))
+        rows.append(record.computed_row(f"{name}, (31) as printed", "trace Z", "1", printed.trace_cost))
+        rows.append(record.computed_row(f"{name}, (31) as printed", "k2", "N m", printed.gain[0, 1]))
         holds = _truth(certify(printed.gain, found.system))
-        rows.append(record.row(f"{name}, (31) as printed", "proved at the true vertices", "1", holds))
+        rows.append(record.computed_row(f"{name}, (31) as printed", "proved at the true vertices", "1", holds))
     for k2, proof in found.verdicts.items():
         stable = {-48.0: 0.0, -76.6: 0.0, -76.7: 1.0, SAME_INTEGRAL[1]: 1.0}[k2]
         name = f"K = [-11753, {k2:g}], 5..50 km/h"
-        rows.append(record.row(name, "common Lyapunov matrix", "1", _truth(proof), reference=stable))
+        rows.append(record.computed_row(name, "common Lyapunov matrix", "1", _truth(proof), reference=stable))
     rows.append(
-        record.row("published gain, speed cannot jump", "proved stable", "1", bool(found.varying.stable), reference=1.0)
-    )
-    rows.append(
-        record.row(
-            "k1 = -11753", "least |k2| with a common one", "N m", threshold(found.system), reference=REFERENCE_THRESHOLD
+        record.computed_row(
+            "published gain, speed cannot jump", "proved stable", "1", bool(found.varying.stable), reference=1.0
         )
     )
-    pole = slowest(found.system, PUBLISHED)
+    rows.append(
+        record.computed_row(
+            "k1 = -11753",
+            "least |k2| with a common one",
+            "N m",
+            stability_threshold(found.system),
+            reference=REFERENCE_THRESHOLD,
+        )
+    )
+    pole = slowest_pole(found.system, PUBLISHED_GAIN)
     for quantity, unit, ours, exact in zip(
         ("pole, real part", "pole, imaginary part", "damping"), ("1/s", "rad/s", "1"), pole, REFERENCE_POLE, strict=True
     ):
-        rows.append(record.row("published gain at 50 km/h, 5.3 kg", quantity, unit, ours, reference=exact))
+        rows.append(record.computed_row("published gain at 50 km/h, 5.3 kg", quantity, unit, ours, reference=exact))
     for name, exact in REFERENCE_OVERSHOOT.items():
-        rows.append(record.row(name, "overshoot", "1", braked[name].metrics["overshoot"], reference=exact))
+        rows.append(record.computed_row(name, "overshoot", "1", braked[name].metrics["overshoot"], reference=exact))
     return rows
 
 
@@ -154,14 +160,14 @@ def _truth(proof: Certificate) -> float:
     return float(proof.quadratically_stable)
 
 
-def threshold(system: Polytope) -> float:
+def stability_threshold(system: Polytope) -> float:
     """The least |k2| [N m] at k1 = -11753 for which a common Lyapunov matrix exists, in closed form."""
     omega_beta = 1 / system.B[:, 1, 0]  # omega_2/beta, so that the closed form reads in these alone
     alpha_beta = system.A[:, 1, 1] * omega_beta
     return float(np.max(alpha_beta) + np.sqrt(K1) * np.ptp(np.sqrt(omega_beta)))
 
 
-def slowest(system: Polytope, gain: tuple[float, float]) -> tuple[float, float, float]:
+def slowest_pole(system: Polytope, gain: tuple[float, float]) -> tuple[float, float, float]:
     """Real and imaginary part of the pole at 50 km/h and 5.3 kg, and its damping."""
     i = int(np.argmin([corner["plant.mass"] - corner["speed"] for corner in system.corners]))
     pole = np.linalg.eigvals(system.closed(gain)[i])
@@ -169,7 +175,7 @@ def slowest(system: Polytope, gain: tuple[float, float]) -> tuple[float, float, 
     return float(np.real(pole)), float(np.imag(pole)), float(-np.real(pole) / abs(pole))
 
 
-def summary(found: Designed) -> dict[str, Any]:
+def design_summary(found: Designed) -> dict[str, Any]:
     """For `summary.json`."""
 
     def one(answer: Design) -> dict[str, Any]:
@@ -192,15 +198,17 @@ def summary(found: Designed) -> dict[str, Any]:
 
 def figures(found: Designed, braked: Mapping[str, Run]) -> dict[str, Any]:
     """Poles and damping against speed, and trajectories, for the gains that explain the overshoot."""
-    gains = {"published": PUBLISHED, "LMI, same k1": SAME_INTEGRAL, "K = [-121.8, -158.2]": GENTLE}
-    speeds = np.geomspace(*OVER["speed"], 200)
+    gains = {"published": PUBLISHED_GAIN, "LMI, same k1": SAME_INTEGRAL, "K = [-121.8, -158.2]": GENTLE}
+    speeds = np.geomspace(*DESIGN_BOX["speed"], 200)
     i = int(np.argmin([corner["plant.mass"] - corner["speed"] for corner in found.system.corners]))
-    slower = np.stack([np.ones_like(speeds), OVER["speed"][1] / speeds], -1)[..., None]  # eqs. (16), (21): 1/omega_2
+    slower = np.stack([np.ones_like(speeds), DESIGN_BOX["speed"][1] / speeds], -1)[
+        ..., None
+    ]  # eqs. (16), (21): 1/omega_2
     loci = {name: np.linalg.eigvals(slower * found.system.closed(gain)[i]) for name, gain in gains.items()}
     return {
         "gain_poles": _poles(loci, speeds),
         "gain_damping": _damping(loci, speeds),
-        "gain_trajectories": plot.slips(
+        "gain_trajectories": plot.draw_slips(
             {name: run.trajectory for name, run in braked.items() if run.trajectory is not None},
             title="Four ways to 0.2: 5.3 kg, torque unlimited",
             until=0.25,
@@ -218,7 +226,7 @@ def _poles(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Any:
             drawn = ax.scatter(np.real(poles[:, j]), np.imag(poles[:, j]), c=plot.KMH * speeds, s=9, cmap="viridis")
         ax.axhline(0, color=plot.GREY, linewidth=0.8)
         ax.locator_params(axis="x", nbins=5)
-        plot.label(ax, "real part [1/s]", "imaginary part [rad/s]" if ax is axes[0] else "", name)
+        plot.label_axes(ax, "real part [1/s]", "imaginary part [rad/s]" if ax is axes[0] else "", name)
     figure.colorbar(drawn, ax=axes, label="speed [km/h]")
     return figure
 
@@ -228,6 +236,6 @@ def _damping(loci: Mapping[str, np.ndarray], speeds: np.ndarray) -> Any:
     for i, (name, poles) in enumerate(loci.items()):
         damping = np.min(-np.real(poles) / np.abs(poles), axis=1)
         ax.plot(plot.KMH * speeds, damping, plot.DASHES[i], color=plot.COLOURS[i], label=name)
-    plot.label(ax, "speed [km/h]", "damping [1]")
+    plot.label_axes(ax, "speed [km/h]", "damping [1]")
     ax.set_ylim(0, 1.05)
     return figure

@@ -23,7 +23,7 @@ def lane(run: Run, i: int) -> Run:
     return jax.tree.map(lambda x: np.asarray(x[i]), run)
 
 
-def row(
+def computed_row(
     name: str, quantity: str, unit: str, ours: Any, *, published: float | None = None, reference: float | None = None
 ) -> dict[str, Any]:
     """A line of a table, with the paper's number, or one that was computed independently, or neither."""
@@ -33,42 +33,42 @@ def row(
     return {**line, "published": published, "reference": reference, "difference": difference}
 
 
-def printed(name: str, quantity: str, unit: str, ours: Any, published: float, digits: int = 2) -> dict[str, Any]:
+def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float, digits: int = 2) -> dict[str, Any]:
     """A line of a table whose published number has so many decimals; `matches` if ours rounds to it."""
-    line = row(name, quantity, unit, ours, published=published)
+    line = computed_row(name, quantity, unit, ours, published=published)
     return {**line, "matches": round(line["ours"], digits) == round(published, digits)}
 
 
-def reached(time: Any) -> float | str:
+def format_time(time: Any) -> float | str:
     """Return a time [s] as a summary has it: "never" where it is infinite."""
     return "never" if math.isinf(float(time)) else float(time)
 
 
-def solver(step: FixedStep, **more: Any) -> dict[str, Any]:
+def solver_settings(step: FixedStep, **more: Any) -> dict[str, Any]:
     """How it was integrated."""
     dtype = str(jnp.result_type(float))
     return {"method": "RK4, fixed step", "step": step.step, "duration": step.duration, "dtype": dtype, **more}
 
 
-def origin() -> dict[str, str]:
+def origin_of_numbers() -> dict[str, str]:
     """Of everything that can change a number, and the commit where there is one."""
-    return provenance.origin("jaxlib", "numpy", "matplotlib") | provenance.commit()
+    return provenance.describe_platform("jaxlib", "numpy", "matplotlib") | provenance.commit()
 
 
-def write(folder: pathlib.Path, summary: dict[str, Any], name: str = "summary.json") -> dict[str, Any]:
+def write_summary(folder: pathlib.Path, summary: dict[str, Any], name: str = "summary.json") -> dict[str, Any]:
     """Write a summary, whole or not at all, and return it as a reader would get it. Raises ValueError for a number
     that is not finite."""
     text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False)
-    files.write(folder / name, f"{text}\n".encode())
+    files.write_file(folder / name, f"{text}\n".encode())
     return json.loads(text)
 
 
-def saved(figures: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
+def save_figures(figures: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
     """Write figures into a folder, and return the names of their files."""
-    return [plot.save(figure, folder / f"{name}.png").name for name, figure in figures.items()]
+    return [plot.save_figure(figure, folder / f"{name}.png").name for name, figure in figures.items()]
 
 
-def show(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
+def print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print rows of equal keys as a table; floats with five significant digits or four decimals."""
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
@@ -92,6 +92,6 @@ def experiment(config: Any, results: Mapping[str, Any], figures: Mapping[str, An
     what was written."""
     folder = pathlib.Path(config.out)
     folder.mkdir(parents=True, exist_ok=True)
-    names = saved(figures, folder)
-    whole = {"config": dataclasses.asdict(config), **results, "figures": names, "versions": origin()}
-    return write(folder, whole, "results.json")
+    names = save_figures(figures, folder)
+    whole = {"config": dataclasses.asdict(config), **results, "figures": names, "versions": origin_of_numbers()}
+    return write_summary(folder, whole, "results.json")

@@ -34,10 +34,10 @@ SOLVER = FixedStep(step=5e-5, duration=3.6, every=20)
 COARSE = FixedStep(step=1e-4, duration=7.2, every=20)  # as many steps, so that it does not compile again
 LITERAL = (FixedStep(step=1e-4, duration=10.0, every=100), FixedStep(step=1e-3, duration=100.0, every=100))
 CARS = {"spline B": QuarterCar(), "Magic Formula": QuarterCar(inertia=1.0539, road=MagicFormula())}
-METHODS = ("conventional", "proposed")
-GAINS = {"P": (0.0, 0.0), "PI": (5000.0, 0.0), "PD": (0.0, 5.67), "PID": (5000.0, 5.67)}  # kI, kD
+PAPER_METHODS = ("conventional", "proposed")
+PID_GAINS = {"P": (0.0, 0.0), "PI": (5000.0, 0.0), "PD": (0.0, 5.67), "PID": (5000.0, 5.67)}  # kI, kD
 
-PUBLISHED = {  # stopping time [s] and distance [m] of Tables 1 and 2; "no ABS" stands in both
+PUBLISHED_STOPS = {  # stopping time [s] and distance [m] of Tables 1 and 2; "no ABS" stands in both
     "no ABS": (3.46, 46.50),
     "conventional P": (3.11, 43.85),
     "conventional PI": (3.20, 44.90),
@@ -73,7 +73,7 @@ NOTES = [
 ]
 
 
-class Results(NamedTuple):
+class EstimatorResults(NamedTuple):
     """Runs by row of the tables for each friction curve, the first curve's at the coarse step, the literal
     estimator's."""
 
@@ -93,10 +93,10 @@ def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
     runs = {"no ABS": jax.tree.map(np.asarray, locked)}
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
         lanes = stack_loops(
-            [loop(car, reference, PID(kp=3893.0, ki=ki, kd=kd, low=0.0, high=90.0)) for ki, kd in GAINS.values()]
+            [loop(car, reference, PID(kp=3893.0, ki=ki, kd=kd, low=0.0, high=90.0)) for ki, kd in PID_GAINS.values()]
         )
         done = run_batch(*lanes, solver, BRAKING, trajectories=True, accepted=True)
-        runs |= {f"{method} {name}": record.lane(done, i) for i, name in enumerate(GAINS)}
+        runs |= {f"{method} {name}": record.lane(done, i) for i, name in enumerate(PID_GAINS)}
     return runs
 
 
@@ -106,7 +106,7 @@ def run_literal() -> list[Run]:
     return [jax.tree.map(np.asarray, rollout(printed, solver, BRAKING)) for solver in LITERAL]
 
 
-def compute(progress: Callable[[str], None]) -> Results:
+def run_all(progress: Callable[[str], None]) -> EstimatorResults:
     """Every run that the tables and figures need."""
     runs = {}
     for name, car in CARS.items():
@@ -115,22 +115,22 @@ def compute(progress: Callable[[str], None]) -> Results:
     progress("slip-estimator: the same at twice the step")
     coarse = run(CARS["spline B"], COARSE)
     progress("slip-estimator: the estimator as printed")
-    return Results(runs, coarse, run_literal())
+    return EstimatorResults(runs, coarse, run_literal())
 
 
 def table(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     """The twenty numbers of Tables 1 and 2. The row without control stands in both and is counted twice."""
     rows = []
     for number, method in ((1, "conventional"), (2, "proposed")):
-        for name in ("no ABS", *(f"{method} {controller}" for controller in GAINS)):
-            time, distance = PUBLISHED[name]
+        for name in ("no ABS", *(f"{method} {controller}" for controller in PID_GAINS)):
+            time, distance = PUBLISHED_STOPS[name]
             metrics, label = runs[name].metrics, f"Table {number}: {name}"
-            rows.append(record.printed(label, "stopping time", "s", metrics["stop_time"], time))
-            rows.append(record.printed(label, "stopping distance", "m", metrics["stop_distance"], distance))
+            rows.append(record.printed_row(label, "stopping time", "s", metrics["stop_time"], time))
+            rows.append(record.printed_row(label, "stopping distance", "m", metrics["stop_distance"], distance))
     return rows
 
 
-def worst(rows: list[dict[str, Any]], quantity: str) -> float:
+def worst_difference(rows: list[dict[str, Any]], quantity: str) -> float:
     """Largest difference from a published number."""
     return max(abs(row["difference"]) for row in rows if row["quantity"] == quantity)
 
@@ -142,7 +142,7 @@ def locked_time(run: Run) -> float:
     return float(run.metrics["stop_time"] - sample.t[still])
 
 
-def bounds(car: QuarterCar, locked: Run) -> dict[str, float]:
+def shortest_distances(car: QuarterCar, locked: Run) -> dict[str, float]:
     """Shortest distances [m]: at the greatest friction from the start; and with full torque up to that slip first."""
     best = jax.jit(peak)(car.road)
     y = _seen(locked).sample.output
@@ -153,71 +153,81 @@ def bounds(car: QuarterCar, locked: Run) -> dict[str, float]:
     return {"unlimited": y.speed[0] ** 2 / length, "90 N m": distance + speed**2 / length}
 
 
-def extra_rows(results: Results) -> list[dict[str, Any]]:
+def extra_rows(results: EstimatorResults) -> list[dict[str, Any]]:
     """The Magic Formula's distance from the tables, the lock, the literal estimator, the bounds."""
     spline, magic = results.runs.values()
     rows = [{**row, "name": f"{row['name']} (Magic Formula)"} for row in table(magic)]
     for quantity, unit in (("stopping time", "s"), ("stopping distance", "m")):
-        rows.append(record.row("Magic Formula, worst of twenty", quantity, unit, worst(table(magic), quantity)))
+        rows.append(
+            record.computed_row(
+                "Magic Formula, worst of twenty", quantity, unit, worst_difference(table(magic), quantity)
+            )
+        )
     for solver, literal in zip(LITERAL, results.literal, strict=True):
         name, sample = f"estimator as printed, step {solver.step:g} s, after 10 s", _seen(literal).sample
         for quantity, unit in (("distance", "m"), ("speed", "m/s")):
             value = np.interp(10.0, sample.t, getattr(sample.output, quantity))
-            rows.append(record.row(name, quantity, unit, value))
+            rows.append(record.computed_row(name, quantity, unit, value))
     locked = locked_time(spline["no ABS"])
-    rows.append(record.row("no ABS, from lock to stop", "time", "s", locked, published=LOCKED_PUBLISHED))
-    for name, length in bounds(CARS["spline B"], spline["no ABS"]).items():
-        rows.append(record.row(f"bound, torque {name}", "distance", "m", length, reference=BOUNDS[name]))
+    rows.append(record.computed_row("no ABS, from lock to stop", "time", "s", locked, published=LOCKED_PUBLISHED))
+    for name, length in shortest_distances(CARS["spline B"], spline["no ABS"]).items():
+        rows.append(record.computed_row(f"bound, torque {name}", "distance", "m", length, reference=BOUNDS[name]))
     return rows
 
 
-def figures(results: Results) -> dict[str, Any]:
+def figures(results: EstimatorResults) -> dict[str, Any]:
     """The figures, by file name."""
     runs = results.runs["spline B"]
     seen = {name: _seen(one) for name, one in runs.items()}
-    drawn = {"fig1_no_abs": plot.speeds({"": seen["no ABS"]}, title="Fig. 1: full brake without anti-lock control")}
+    drawn = {
+        "fig1_no_abs": plot.draw_speeds({"": seen["no ABS"]}, title="Fig. 1: full brake without anti-lock control")
+    }
     for number, controller in ((7, "PID"), (8, "PD"), (9, "PI"), (10, "P")):
-        pair = {f"({x}) {name}": seen[f"{name} {controller}"] for x, name in zip("ab", METHODS, strict=True)}
-        drawn[f"fig{number}_{controller.lower()}"] = plot.speeds(pair, title=f"Fig. {number}: {controller} control")
-    both = {name: seen[f"{name} PI"] for name in METHODS}
+        pair = {f"({x}) {name}": seen[f"{name} {controller}"] for x, name in zip("ab", PAPER_METHODS, strict=True)}
+        drawn[f"fig{number}_{controller.lower()}"] = plot.draw_speeds(
+            pair, title=f"Fig. {number}: {controller} control"
+        )
+    both = {name: seen[f"{name} PI"] for name in PAPER_METHODS}
     single = [{f"({x}) {name}": one} for x, (name, one) in zip("ab", both.items(), strict=True)]
-    drawn["fig11_positions_pi"] = plot.positions(single, title="Fig. 11: position, PI control")
+    drawn["fig11_positions_pi"] = plot.draw_positions(single, title="Fig. 11: position, PI control")
     title = "Fig. 12: comparison of the positions, PI control"
-    drawn["fig12_comparison"] = plot.positions([both], zoom=(2.0, 3.3), title=title)
+    drawn["fig12_comparison"] = plot.draw_positions([both], zoom=(2.0, 3.3), title=title)
     printed = {"as printed, P": _seen(results.literal[0]), "as a latch, P": seen["proposed P"]}
     title = "The estimator read literally does not brake"
-    drawn["literal_estimator"] = plot.speeds(printed, title=title)
+    drawn["literal_estimator"] = plot.draw_speeds(printed, title=title)
     roads = {f"{name} (identified)": car.road for name, car in CARS.items()}
     best = jax.jit(peak)(CARS["spline B"].road)
     at = float(jax.jit(CARS["spline B"].road.friction)(0.2))
     marks = {"peak of spline B": (float(best.slip), float(best.mu)), "conventional target, slip 0.2": (0.2, at)}
     title = "Friction curves identified from Tables 1 and 2\n(the paper's own is unknown)"
-    drawn["friction_curves"] = plot.friction(roads, marks=marks, title=title)
+    drawn["friction_curves"] = plot.draw_friction(roads, marks=marks, title=title)
     return drawn
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str, Any]:
     """Write figures and `summary.json` into the folder; returns the summary."""
-    results = compute(progress)
+    results = run_all(progress)
     progress("slip-estimator: figures")
-    names = record.saved(figures(results), folder)
+    names = record.save_figures(figures(results), folder)
     rows = table(results.runs["spline B"])
     summary = {
         "paper": "slip-estimator",
         "title": TITLE,
         "rows": rows + extra_rows(results),
         "matches": {"of": len(rows), "to the printed digit": sum(row["matches"] for row in rows)},
-        "judged": estimator_claims.judged(results.runs["spline B"], {name: car.road for name, car in CARS.items()}),
+        "judged": estimator_claims.judge_estimator_claims(
+            results.runs["spline B"], {name: car.road for name, car in CARS.items()}
+        ),
         "figures": names,
         "notes": [*NOTES, _step_note(results)],
-        "solver": record.solver(SOLVER, speed_at_which_integration_ends=0.05),
-        "made": provenance.made(("reproduce", "slip-estimator")),
-        "versions": record.origin(),
+        "solver": record.solver_settings(SOLVER, speed_at_which_integration_ends=0.05),
+        "made": provenance.describe_making(("reproduce", "slip-estimator")),
+        "versions": record.origin_of_numbers(),
     }
-    return record.write(folder, summary)
+    return record.write_summary(folder, summary)
 
 
-def _step_note(results: Results) -> str:
+def _step_note(results: EstimatorResults) -> str:
     fine, coarse = results.runs["spline B"], results.coarse
     gaps = [
         max(abs(float(fine[name].metrics[m] - coarse[name].metrics[m])) for name in fine)
@@ -234,7 +244,7 @@ CLAIMS = (
         "the estimator as printed brakes",
         "it rolls {0:.0f} m in 10 s, a latch brakes",
         [("estimator as printed, step 0.0001 s, after 10 s", "distance")],
-        lambda distance: distance > max(metres for _, metres in PUBLISHED.values()),
+        lambda distance: distance > max(metres for _, metres in PUBLISHED_STOPS.values()),
     ),
     Refuted(
         "without control the wheel is locked for about 1.4 s",
@@ -253,7 +263,7 @@ def compact(summary: Mapping[str, Any]) -> Digest:
     lines = [
         (name, *(f"{by_place[name, column][key]:.{2 if key == 'published' else 3}f}"
                  for column in columns for key in ("published", "ours")))
-        for name in PUBLISHED
+        for name in PUBLISHED_STOPS
     ]  # fmt: skip
     independent = [row for row in rows if row["reference"] is not None]
     headings = ("", "time, paper [s]", "ours", "distance, paper [m]", "ours")

@@ -30,8 +30,8 @@ from diffabs.simulate.solution import FixedStep, Run, Trajectory
 from diffabs.stops import SpeedReached
 
 TITLE = "Maeda and Sugiura: robust LQ control of an anti-lock brake (mirrored rig, 50 to 5 km/h)"
-STEP = 2e-5  # s; at the torque limits 5e-5 leaves more than 1e-6
-SOLVER = FixedStep(step=STEP, duration=3.4, every=50)
+STEP_S = 2e-5  # s; at the torque limits 5e-5 leaves more than 1e-6
+SOLVER = FixedStep(step=STEP_S, duration=3.4, every=50)
 HALVING_STEPS = 27_000  # as many at every step length, so that one compilation serves all
 HALVINGS = tuple(4e-3 / 2**i for i in range(7))  # s
 FILTER = 0.035  # s, time constant of the reference filter
@@ -45,7 +45,7 @@ class Case:
     mass: float
     torque_min: float = -math.inf
     torque_max: float = math.inf
-    gain: tuple[float, float] = lmi_design.PUBLISHED
+    gain: tuple[float, float] = lmi_design.PUBLISHED_GAIN
     inertia_factor: float = 0.5
     slip: float = 0.0
 
@@ -60,7 +60,7 @@ CASES = (
     Case("5.3 kg, from slip 0.1", 5.3, slip=0.1),
 )
 
-GAINS = (
+GAIN_CASES = (
     Case("LMI, same k1", 5.3, gain=lmi_design.SAME_INTEGRAL),
     Case("K = [-121.8, -158.2]", 5.3, gain=lmi_design.GENTLE),
 )
@@ -72,8 +72,8 @@ CONVERGENCE = {  # expected order, and the step lengths above rounding and below
 }
 
 # Computed without this package: SciPy, DOP853 at rtol 3e-14; limits, band crossings and the stop located as events.
-QUANTITIES = ("max_slip", "settling_time", "stop_time", "stop_distance", "iae")
-REFERENCE = {
+COMPARED_QUANTITIES = ("max_slip", "settling_time", "stop_time", "stop_distance", "iae")
+REFERENCE_RUNS = {
     CASES[0].name: (0.308331266209, 0.122692335, 1.611940500246, 12.326404879818, 0.005443262785),
     CASES[1].name: (0.308331266209, 0.207179477, 1.612151887713, 12.329176746377, 0.009330471226),
     CASES[2].name: (0.363764049836, 0.351674178, 1.615305429266, 12.370506753293, 0.022963399145),
@@ -83,7 +83,7 @@ REFERENCE_CAR = {CASES[4].name: (3.221814333307, 24.624170444040), CASES[5].name
 REFERENCE_PEAK = (0.187542005875, 0.395794085737)
 REFERENCE_MU = {0.2: 0.39575220833898, 1.0: 0.399595428169}
 Errors = dict[str, dict[str, list[float]]]  # by case and quantity, one for each step length
-UNITS = {"max_slip": "1", "settling_time": "s", "stop_time": "s", "stop_distance": "m", "iae": "s"}
+QUANTITY_UNITS = {"max_slip": "1", "settling_time": "s", "stop_time": "s", "stop_distance": "m", "iae": "s"}
 
 NOTES = [
     "The paper reports this experiment in words only: the slip overshoots, then follows 0.2. Both are so here.",
@@ -119,7 +119,7 @@ def loop(case: Case, reference: Any = None) -> Loop:
 
 def run() -> dict[str, Run]:
     """Every case, by name."""
-    cases = CASES + GAINS
+    cases = CASES + GAIN_CASES
     done = run_batch(*stack_loops([loop(case) for case in cases]), SOLVER, BRAKING, trajectories=True, accepted=True)
     return {case.name: record.lane(done, i) for i, case in enumerate(cases)}
 
@@ -130,7 +130,7 @@ def run_filtered() -> Run:
     return jax.tree.map(np.asarray, rollout(loop(CASES[0], filtered), SOLVER, BRAKING))
 
 
-def convergence(fine: Mapping[str, Run]) -> Errors:
+def convergence_errors(fine: Mapping[str, Run]) -> Errors:
     """Relative errors against a finer run at each step length, by case and quantity."""
     lanes = stack_loops([loop(case) for case in CONVERGENCE])
     solvers = [FixedStep(step=step, duration=step * HALVING_STEPS) for step in HALVINGS]
@@ -144,7 +144,7 @@ def convergence(fine: Mapping[str, Run]) -> Errors:
     return {case.name: {name: errors(i, case.name, name) for name in names} for i, case in enumerate(CONVERGENCE)}
 
 
-def order(errors: list[float], points: slice) -> float:
+def convergence_order(errors: list[float], points: slice) -> float:
     """Slope of log error over log step, through some of the points."""
     return float(np.polyfit(np.log(HALVINGS[points]), np.log(errors[points]), 1)[0])
 
@@ -152,12 +152,20 @@ def order(errors: list[float], points: slice) -> float:
 def table(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
     """The braking table, then the car's inertia, then the overshoot."""
     rows = []
-    for name, expected in REFERENCE.items():
-        for quantity, exact in zip(QUANTITIES, expected, strict=True):
-            rows.append(record.row(name, quantity, UNITS[quantity], runs[name].metrics[quantity], reference=exact))
+    for name, expected in REFERENCE_RUNS.items():
+        for quantity, exact in zip(COMPARED_QUANTITIES, expected, strict=True):
+            rows.append(
+                record.computed_row(
+                    name, quantity, QUANTITY_UNITS[quantity], runs[name].metrics[quantity], reference=exact
+                )
+            )
     for name, expected in REFERENCE_CAR.items():
         for quantity, exact in zip(("stop_time", "stop_distance"), expected, strict=True):
-            rows.append(record.row(name, quantity, UNITS[quantity], runs[name].metrics[quantity], reference=exact))
+            rows.append(
+                record.computed_row(
+                    name, quantity, QUANTITY_UNITS[quantity], runs[name].metrics[quantity], reference=exact
+                )
+            )
     return rows
 
 
@@ -165,16 +173,18 @@ def extra_rows(filtered: Run, errors: Errors) -> list[dict[str, Any]]:
     """The cure, the friction curve, and the measured order of convergence."""
     found = jax.jit(peak)(RIG)
     rows = [
-        record.row("reference filter, 35 ms", "overshoot", "1", filtered.metrics["overshoot"], reference=0.0),
-        record.row("friction curve, local peak", "slip", "1", found.slip, reference=REFERENCE_PEAK[0]),
-        record.row("friction curve, local peak", "mu", "1", found.mu, reference=REFERENCE_PEAK[1]),
+        record.computed_row("reference filter, 35 ms", "overshoot", "1", filtered.metrics["overshoot"], reference=0.0),
+        record.computed_row("friction curve, local peak", "slip", "1", found.slip, reference=REFERENCE_PEAK[0]),
+        record.computed_row("friction curve, local peak", "mu", "1", found.mu, reference=REFERENCE_PEAK[1]),
     ]
     for slip, exact in REFERENCE_MU.items():
-        rows.append(record.row(f"friction curve at {slip:g}", "mu", "1", RIG.friction(slip), reference=exact))
+        rows.append(record.computed_row(f"friction curve at {slip:g}", "mu", "1", RIG.friction(slip), reference=exact))
     for case, (expected, points) in CONVERGENCE.items():
         for quantity in ("stop_time", "stop_distance"):
-            found = order(errors[case.name][quantity], points)
-            rows.append(record.row(f"order of the step: {case.name}", quantity, "1", found, reference=expected))
+            found = convergence_order(errors[case.name][quantity], points)
+            rows.append(
+                record.computed_row(f"order of the step: {case.name}", quantity, "1", found, reference=expected)
+            )
     return rows
 
 
@@ -184,15 +194,15 @@ def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> dict[str,
     drawn = {}
     for case, number in ((CASES[0], 4), (CASES[3], 6)):
         name, mass = case.name, f"{case.mass:g} kg"
-        drawn[f"fig{number}_slip_{case.mass:g}kg"] = plot.slips(
+        drawn[f"fig{number}_slip_{case.mass:g}kg"] = plot.draw_slips(
             {"slip": seen[name]}, title=f"Fig. {number}: slip, {mass}"
         )
         title = f"Fig. {number + 1}: vehicle and wheel speed, {mass}"
-        drawn[f"fig{number + 1}_speeds_{case.mass:g}kg"] = plot.speeds({"": seen[name]}, title=title)
+        drawn[f"fig{number + 1}_speeds_{case.mass:g}kg"] = plot.draw_speeds({"": seen[name]}, title=title)
     drawn["torque_limits"] = _torque_limits({case.name: seen[case.name] for case in CASES[:3]})
     both = {"reference 0.2 at once": seen[CASES[0].name], "reference filtered, 35 ms": filtered.trajectory}
-    drawn["reference_filter"] = plot.slips(both, title="The cure for the overshoot, same gain, 5.3 kg", until=0.4)
-    drawn["friction_curve"] = plot.friction(
+    drawn["reference_filter"] = plot.draw_slips(both, title="The cure for the overshoot, same gain, 5.3 kg", until=0.4)
+    drawn["friction_curve"] = plot.draw_friction(
         {"eq. (13)": RIG},
         marks={
             "local peak, slip 0.18754": REFERENCE_PEAK,
@@ -202,22 +212,22 @@ def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> dict[str,
         zoom=(0.15, 0.25, 0.3952, 0.3960),
         title="0.2 is not the slip of greatest friction",
     )
-    drawn["convergence"] = plot.convergence(errors, HALVINGS, orders=(4, 3, 2), title="Error over step length")
+    drawn["convergence"] = plot.draw_convergence(errors, HALVINGS, orders=(4, 3, 2), title="Error over step length")
     return drawn
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str, Any]:
     """Write figures and `summary.json` into the folder; returns the summary."""
-    progress(f"slip-lmi: braking {len(CASES)} cases at {STEP:g} s")
+    progress(f"slip-lmi: braking {len(CASES)} cases at {STEP_S:g} s")
     runs = run()
     progress("slip-lmi: the same with a filtered reference")
     filtered = run_filtered()
     progress(f"slip-lmi: convergence over {len(HALVINGS)} step lengths")
-    errors = convergence(runs)
+    errors = convergence_errors(runs)
     progress("slip-lmi: robust gains and their proofs")
     rows, pictures, more = _designed(runs, filtered)
     progress("slip-lmi: figures")
-    names = record.saved({**figures(runs, filtered, errors), **pictures}, folder)
+    names = record.save_figures({**figures(runs, filtered, errors), **pictures}, folder)
     summary = {
         "paper": "slip-lmi",
         "title": TITLE,
@@ -226,19 +236,19 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
         "notes": NOTES + more["notes"],
         "design": more["design"],
         "judged": more["judged"],
-        "solver": record.solver(SOLVER),
+        "solver": record.solver_settings(SOLVER),
         "convergence": {"steps": HALVINGS, "relative_error": errors},
-        "made": provenance.made(("reproduce", "slip-lmi")),
-        "versions": record.origin(),
+        "made": provenance.describe_making(("reproduce", "slip-lmi")),
+        "versions": record.origin_of_numbers(),
     }
-    return record.write(folder, summary)
+    return record.write_summary(folder, summary)
 
 
 def compact(summary: Mapping[str, Any]) -> Digest:
     """The braking runs, and how far the worst of each is from the independent solution."""
     rows, columns = summary["rows"], ("max_slip", "settling_time", "stop_time", "stop_distance")
     lines = []
-    for name in (*REFERENCE, *REFERENCE_CAR):
+    for name in (*REFERENCE_RUNS, *REFERENCE_CAR):
         found = {row["quantity"]: row for row in rows if row["name"] == name}
         cells = (f"{found[column]['ours']:.4f}" if column in found else "" for column in columns)
         worst = max(abs(row["difference"] / row["reference"]) for row in found.values())
@@ -255,20 +265,20 @@ def _designed(runs: Mapping[str, Run], filtered: Run) -> tuple[list[dict[str, An
         found = lmi_design.Designed()
     except ModuleNotFoundError as error:
         return [], {}, {"notes": [f"Section 4, the design, is left out: {error}"], "design": None, "judged": []}
-    shown = {"published": runs[CASES[0].name], **{case.name: runs[case.name] for case in GAINS}}
+    shown = {"published": runs[CASES[0].name], **{case.name: runs[case.name] for case in GAIN_CASES}}
     shown["published, reference filtered"] = filtered
     gains = {weights: answer.gain[0] for weights, answer in found.designs.items()}
-    judged = lmi_claims.judged(found.system, gains)
-    more = {"notes": lmi_design.NOTES, "design": lmi_design.summary(found), "judged": judged}
+    judged = lmi_claims.judge_lmi_claims(found.system, gains)
+    more = {"notes": lmi_design.NOTES, "design": lmi_design.design_summary(found), "judged": judged}
     return lmi_design.table(found, runs), lmi_design.figures(found, shown), more
 
 
 def _torque_limits(runs: Mapping[str, Trajectory]) -> Any:
     figure, (top, bottom) = plot.sheet(2, 1, title="What torque limits do: windup", size=(6.8, 2.7), sharex=True)
-    plot.slip_lines(top, runs)
-    plot.label(top, "", "slip [1]")
+    plot.draw_slip_lines(top, runs)
+    plot.label_axes(top, "", "slip [1]")
     for i, (name, seen) in enumerate(runs.items()):
         bottom.plot(seen.sample.t, seen.sample.control, plot.DASHES[i], color=plot.COLOURS[i], label=name)
-    plot.label(bottom, "time [s]", "brake torque [N m]", legend=False)
+    plot.label_axes(bottom, "time [s]", "brake torque [N m]", legend=False)
     bottom.set_xlim(0, 0.5)
     return figure

@@ -15,16 +15,16 @@ import jax.numpy as jnp
 
 from diffabs.core.protocols import BalanceOutput, BrakeOutput, Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, param, part, pytree, static
-from diffabs.objectives.tracking import nothing
+from diffabs.objectives.tracking import no_integral
 
 FORGIVEN = 0.01  # of the energy of the start, in the whole run
-ROUNDING = 1e-6  # of it in a step, 1e-5 of the distance: single precision
-WITHIN = 2.0  # of the work, and of the way, that the ends of a step show
+SPEED_ROUNDING = 1e-6  # of it in a step, 1e-5 of the distance: single precision
+MAX_STEP_RATIO = 2.0  # of the work, and of the way, that the ends of a step show
 SWING = 4.0  # of the decelerations at both ends: a slip may pass the friction's peak within the step
-LITTLE = 10.0  # m/s^2, and 1e-3 of the speed, that are no alarm at all
+MIN_STEP_ENERGY = 10.0  # m/s^2, and 1e-3 of the speed, that are no alarm at all
 
 
-def _driving(before: Any, after: Any) -> Any:
+def _driving_power(before: Any, after: Any) -> Any:
     """The greatest value at either end, 0 where both are negative."""
     return jnp.maximum(jnp.maximum(before, after), 0.0)
 
@@ -52,25 +52,25 @@ class BrakeAudit:
     scale: Scalar = param(unit="J", above=0.0)
     commanded: bool = static(default=False)
 
-    start, flow, value = _zero, nothing, _excess
+    start, flow, value = _zero, no_integral, _excess
 
     def update(self, memory: Memory, segment: Segment) -> Any:
         """Add what a step gained without work; infinite for a step that no car makes."""
         before, sample, h = jax.lax.stop_gradient((segment.start, segment.end, segment.h))
         a, b = before.output, sample.output
-        drive = 0.0 if self.commanded else _driving(-before.control, -sample.control)
-        work = WITHIN * h * drive * jnp.maximum(a.wheel_speed, b.wheel_speed) / self.radius
+        drive = 0.0 if self.commanded else _driving_power(-before.control, -sample.control)
+        work = MAX_STEP_RATIO * h * drive * jnp.maximum(a.wheel_speed, b.wheel_speed) / self.radius
         gain = 0.5 * (self.car * (b.speed**2 - a.speed**2) + self.wheel * (b.wheel_speed**2 - a.wheel_speed**2)) - work
-        return memory.held + jnp.where(_leaps(a, b, h), jnp.inf, jnp.maximum(gain - ROUNDING * self.scale, 0.0))
+        return memory.held + jnp.where(_leaps(a, b, h), jnp.inf, jnp.maximum(gain - SPEED_ROUNDING * self.scale, 0.0))
 
 
 def _leaps(a: BrakeOutput, b: BrakeOutput, h: Scalar) -> Any:
     """Whether no car goes from a to b in h: backwards, farther than its speed lets it, or with more deceleration than
     friction gives."""
     top = jnp.maximum(a.speed, b.speed)
-    way = 0.5 * WITHIN * h * top  # give or take as much
-    far = jnp.abs(b.distance - a.distance - way) > way + 10 * ROUNDING * (1.0 + jnp.abs(b.distance))
-    friction = SWING * (jnp.abs(a.deceleration) + jnp.abs(b.deceleration)) + LITTLE
+    way = 0.5 * MAX_STEP_RATIO * h * top  # give or take as much
+    far = jnp.abs(b.distance - a.distance - way) > way + 10 * SPEED_ROUNDING * (1.0 + jnp.abs(b.distance))
+    friction = SWING * (jnp.abs(a.deceleration) + jnp.abs(b.deceleration)) + MIN_STEP_ENERGY
     return far | (jnp.abs(b.speed - a.speed) > h * friction + 1e-3 * top)
 
 
@@ -83,15 +83,15 @@ class BalanceAudit:
     first: Scalar = param(unit="J")
     scale: Scalar = param(unit="J", above=0.0)
 
-    start, flow = _zero, nothing
+    start, flow = _zero, no_integral
 
     def update(self, memory: Memory, segment: Segment) -> Any:
         """Add the work that the motor may have done: of torques and rates in the same direction."""
         before, sample, h = jax.lax.stop_gradient((segment.start, segment.end, segment.h))
         w0, w1 = before.output.psi_rate, sample.output.psi_rate
         t0, t1 = self.plant.torque(w0, before.control), self.plant.torque(w1, sample.control)
-        return memory.held + WITHIN * h * (
-            _driving(t0, t1) * _driving(w0, w1) + _driving(-t0, -t1) * _driving(-w0, -w1)
+        return memory.held + MAX_STEP_RATIO * h * (
+            _driving_power(t0, t1) * _driving_power(w0, w1) + _driving_power(-t0, -t1) * _driving_power(-w0, -w1)
         )
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:

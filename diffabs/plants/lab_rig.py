@@ -28,9 +28,18 @@ from jax.tree_util import Partial
 from diffabs.core.numerics import clamp, larger, quotient, smaller
 from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import Scalar, param, part, pytree
-from diffabs.core.rules import Rule, array
+from diffabs.core.rules import Rule, as_rule_array
 from diffabs.plants.audit import BrakeAudit
-from diffabs.plants.wheel import FROZEN, BrakeStart, forward, halted, probes, slip_ratio, usual_objectives, usual_parts
+from diffabs.plants.wheel import (
+    FROZEN_OUTPUTS,
+    BrakeStart,
+    forward_speed,
+    halt_at_zero,
+    probes,
+    slip_ratio,
+    usual_objectives,
+    usual_parts,
+)
 from diffabs.roads import RIG
 from diffabs.roads.sign import stays_below
 
@@ -69,7 +78,7 @@ class LabRig:
 
     shows = BrakeOutput
     control_unit = "1"  # a command, where other plants take a torque in N m
-    frozen = FROZEN
+    frozen = FROZEN_OUTPUTS
 
     usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
@@ -91,8 +100,8 @@ class LabRig:
         brake = larger(self.brake_gain * u + self.brake_offset, 0.0)  # a brake does not drive
         target = jnp.where(u >= self.brake_threshold, brake, 0.0)
         return LabRigState(
-            halted(state.wheel, wheel),
-            halted(state.drum, drum),
+            halt_at_zero(state.wheel, wheel),
+            halt_at_zero(state.drum, drum),
             self.brake_rate * (target - state.brake),
             self.drum_radius * state.drum,
         )
@@ -114,7 +123,7 @@ class LabRig:
 
     def project(self, state: LabRigState) -> LabRigState:
         """Neither wheel turns backwards."""
-        return LabRigState(forward(state.wheel), forward(state.drum), state.brake, state.distance)
+        return LabRigState(forward_speed(state.wheel), forward_speed(state.drum), state.brake, state.distance)
 
     def output(self, state: LabRigState) -> BrakeOutput:
         """Slip, rim speeds, deceleration of the road wheel's rim, distance."""
@@ -148,7 +157,7 @@ class LabRig:
     def rules(self) -> Iterator[Rule]:
         """A lever that does not lock itself where the run begins: mu < tan(phi)."""
         friction = Partial(type(self.road).friction, self.road, speed=0.0, distance=0.0)
-        angle = array(self.lever_angle)
+        angle = as_rule_array(self.lever_angle)
         limit = jnp.tan(angle) if isinstance(angle, jax.Array) else np.tan(angle)
         yield stays_below(friction, limit, "tan(lever_angle)", "the lever locks itself").under("road.")
 

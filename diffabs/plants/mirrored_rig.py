@@ -16,11 +16,11 @@ from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import (
-    FROZEN,
+    FROZEN_OUTPUTS,
     GRAVITY,
     BrakeStart,
-    forward,
-    halted,
+    forward_speed,
+    halt_at_zero,
     probes,
     slip_ratio,
     usual_objectives,
@@ -51,7 +51,7 @@ class MirroredRig:
 
     shows = BrakeOutput
     control_unit = "N m"
-    frozen = FROZEN
+    frozen = FROZEN_OUTPUTS
 
     usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
@@ -67,11 +67,11 @@ class MirroredRig:
         push = self.inertia_factor * self.mass * y.deceleration  # Fn mu [N]
         wheel = quotient(push * self.wheel_radius - control, self.wheel_inertia)
         body = -quotient(y.deceleration, self.body_radius)
-        return RigState(halted(state.wheel, wheel), halted(state.body, body), y.speed)
+        return RigState(halt_at_zero(state.wheel, wheel), halt_at_zero(state.body, body), y.speed)
 
     def project(self, state: RigState) -> RigState:
         """Neither wheel turns backwards."""
-        return RigState(forward(state.wheel), forward(state.body), state.distance)
+        return RigState(forward_speed(state.wheel), forward_speed(state.body), state.distance)
 
     def output(self, state: RigState) -> BrakeOutput:
         """Slip, rim speeds, deceleration mu g/c of the body's rim, distance."""

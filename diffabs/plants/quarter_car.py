@@ -14,11 +14,11 @@ from diffabs.core.protocols import BrakeOutput, Road
 from diffabs.core.pytree import Scalar, param, part, pytree
 from diffabs.plants.audit import BrakeAudit
 from diffabs.plants.wheel import (
-    FROZEN,
+    FROZEN_OUTPUTS,
     GRAVITY,
     BrakeStart,
-    forward,
-    halted,
+    forward_speed,
+    halt_at_zero,
     probes,
     slip_ratio,
     usual_objectives,
@@ -47,7 +47,7 @@ class QuarterCar:
 
     shows = BrakeOutput
     control_unit = "N m"
-    frozen = FROZEN
+    frozen = FROZEN_OUTPUTS
 
     usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
@@ -61,11 +61,11 @@ class QuarterCar:
         del t
         mu = self.output(state).deceleration / GRAVITY
         spin = quotient(self.radius * mu * self.mass * GRAVITY - control, self.inertia)
-        return QuarterCarState(halted(state.speed, -mu * GRAVITY), halted(state.spin, spin), state.speed)
+        return QuarterCarState(halt_at_zero(state.speed, -mu * GRAVITY), halt_at_zero(state.spin, spin), state.speed)
 
     def project(self, state: QuarterCarState) -> QuarterCarState:
         """Neither car nor wheel moves backwards."""
-        return QuarterCarState(forward(state.speed), forward(state.spin), state.distance)
+        return QuarterCarState(forward_speed(state.speed), forward_speed(state.spin), state.distance)
 
     def output(self, state: QuarterCarState) -> BrakeOutput:
         """Slip, speeds, deceleration mu g, distance."""

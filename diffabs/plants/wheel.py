@@ -12,11 +12,11 @@ from diffabs.objectives import BRAKING
 from diffabs.references import FixedSlip
 from diffabs.stops import Standstill
 
-SPEEDS = 6  # between start and stop, in geometric progression: the ends decide
-OFFSETS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)  # slip below and above the setpoint
-SLIPS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # where a run may pass
+PROBED_SPEEDS = 6  # between start and stop, in geometric progression: the ends decide
+PROBED_OFFSETS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)  # slip below and above the setpoint
+PROBED_SLIPS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # where a run may pass
 
-FROZEN = ("speed", "distance")  # outputs that a linear model of the slip holds
+FROZEN_OUTPUTS = ("speed", "distance")  # outputs that a linear model of the slip holds
 GRAVITY = 9.81  # m/s^2, the value behind every number of the papers
 
 
@@ -36,13 +36,13 @@ def slip_ratio(speed: Scalar, wheel_speed: Scalar, crawl: Scalar) -> Any:
     return quotient(speed - wheel_speed, larger(larger(speed, wheel_speed), crawl))
 
 
-def halted(speed: Scalar, rate: Scalar) -> Any:
+def halt_at_zero(speed: Scalar, rate: Scalar) -> Any:
     """The rate of a speed that cannot become negative: at standstill only what speeds up acts. Brake friction balances
     the rest, as dry friction does."""
     return jnp.where(jnp.greater(speed, 0), rate, larger(rate, 0.0))
 
 
-def forward(speed: Scalar) -> Any:
+def forward_speed(speed: Scalar) -> Any:
     """The speed, or 0 where a step went past standstill."""
     return jnp.where(jnp.greater(speed, 0), speed, 0.0)
 
@@ -69,8 +69,8 @@ def probes(self: Any, initial: BrakeStart, setpoint: Scalar, stop: Any) -> Brake
     """Return where the loop may be stiffest, (k,) starts: at speeds down to the stop, at slips close to the setpoint,
     where the controller is not at a limit, and all over the friction curve, which is steepest near 0."""
     del self
-    near = jnp.concatenate([setpoint - jnp.array(OFFSETS), setpoint + jnp.array(OFFSETS)])
-    slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(SLIPS)])
-    speeds = jnp.geomspace(initial.speed, stop.speed, SPEEDS)
+    near = jnp.concatenate([setpoint - jnp.array(PROBED_OFFSETS), setpoint + jnp.array(PROBED_OFFSETS)])
+    slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(PROBED_SLIPS)])
+    speeds = jnp.geomspace(initial.speed, stop.speed, PROBED_SPEEDS)
     speed, slip = jnp.meshgrid(speeds, slips, indexing="ij")
     return jax.tree.map(jnp.ravel, BrakeStart(speed=speed, slip=slip))

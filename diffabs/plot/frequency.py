@@ -8,9 +8,9 @@ import numpy as np
 from diffabs.linear.opened_loop import OpenLoop
 from diffabs.linear.robustness import frequencies
 from diffabs.linear.stability_margins import Margins
-from diffabs.plot.style import COLOURS, GREY, label, logarithmic, sheet
+from diffabs.plot.style import COLOURS, GREY, label_axes, make_logarithmic, sheet
 
-FAR = 3.0  # how far from 0 the Nyquist plot looks
+MAX_NYQUIST_RADIUS = 3.0  # how far from 0 the Nyquist plot looks
 LIGHT = 0.25
 LEAST_DB = -80.0
 
@@ -25,22 +25,22 @@ def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *,
     figure, (magnitude, nyquist, phase, closed) = sheet(2, 2, title=title, size=(5.6, 3.4))
     main, around = _response(loop, w), np.array([_response(one, w) for one in band])
     for ax in (magnitude, phase, closed):
-        logarithmic(ax, "x")
+        make_logarithmic(ax, "x")
         ax.set_xlim(w[0], w[-1])
-    _banded(magnitude, w, _db(main), _db(around), COLOURS[0], "L")
+    _draw_band(magnitude, w, _db(main), _db(around), COLOURS[0], "L")
     magnitude.axhline(0, color=GREY, linewidth=0.8)
     magnitude.set_ylim(max(magnitude.get_ylim()[0], LEAST_DB), None)
-    label(magnitude, "", "|L| [dB]", legend=False)
-    _banded(phase, w, _degrees(main), np.array([_degrees(one) for one in around]), COLOURS[0], "L")
+    label_axes(magnitude, "", "|L| [dB]", legend=False)
+    _draw_band(phase, w, _degrees(main), np.array([_degrees(one) for one in around]), COLOURS[0], "L")
     phase.axhline(-180, color=GREY, linewidth=0.8)
-    label(phase, "frequency [rad/s]", "phase of L [degrees]", legend=False)
+    label_axes(phase, "frequency [rad/s]", "phase of L [degrees]", legend=False)
     _nyquist(nyquist, main, around, found)
     for values, colour, name in ((1 / (1 + main), COLOURS[1], "S"), (main / (1 + main), COLOURS[2], "T")):
         others = 1 / (1 + around) if name == "S" else around / (1 + around)
-        _banded(closed, w, _db(values), _db(others), colour, name)
+        _draw_band(closed, w, _db(values), _db(others), colour, name)
     closed.axhline(0, color=GREY, linewidth=0.8)
     closed.set_ylim(max(closed.get_ylim()[0], LEAST_DB / 2), None)
-    label(closed, "frequency [rad/s]", "sensitivities [dB]")
+    label_axes(closed, "frequency [rad/s]", "sensitivities [dB]")
     if np.isfinite(found.crossover):
         for ax in (magnitude, phase):
             ax.axvline(found.crossover, color=GREY, linewidth=0.8, linestyle=":")
@@ -63,7 +63,7 @@ def _degrees(values: np.ndarray) -> np.ndarray:
     return np.degrees(angles - 2 * np.pi * np.ceil(near / (2 * np.pi)))
 
 
-def _banded(ax: Any, w: np.ndarray, main: np.ndarray, around: np.ndarray, colour: str, name: str) -> None:
+def _draw_band(ax: Any, w: np.ndarray, main: np.ndarray, around: np.ndarray, colour: str, name: str) -> None:
     """A curve, and what lies between the least and the greatest of others."""
     if len(around):
         ax.fill_between(w, around.min(axis=0), around.max(axis=0), color=colour, alpha=LIGHT, linewidth=0)
@@ -80,7 +80,7 @@ def _nyquist(ax: Any, main: Any, around: Any, found: Margins) -> None:
         turn = np.linspace(0, 2 * np.pi, 181)
         circle = -1 + found.modulus * np.exp(1j * turn)
         ax.plot(circle.real, circle.imag, "--", color=COLOURS[1], linewidth=1, label=f"1/Ms = {found.modulus:.3g}")
-    ax.set_xlim(-FAR, FAR - 1)
-    ax.set_ylim(-FAR + 0.5, FAR - 0.5)
+    ax.set_xlim(-MAX_NYQUIST_RADIUS, MAX_NYQUIST_RADIUS - 1)
+    ax.set_ylim(-MAX_NYQUIST_RADIUS + 0.5, MAX_NYQUIST_RADIUS - 0.5)
     ax.set_aspect("equal", adjustable="box")
-    label(ax, "Re L", "Im L")
+    label_axes(ax, "Re L", "Im L")

@@ -17,16 +17,16 @@ from diffabs.plot.style import (
     Figure,
     ListedColormap,
     Patch,
-    controlled,
-    label,
-    logarithmic,
+    control_label,
+    label_axes,
+    make_logarithmic,
     sheet,
-    spaced,
+    spaced_name,
 )
 from diffabs.simulate.solution import Run, Trajectory
 
 
-def braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
+def draw_braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
     """A run at a glance: slip with target and setpoint, speeds, control in its `unit`, deceleration. Raises ValueError
     for a run without a trajectory, as `measure` returns it."""
     seen = _trajectory(run)
@@ -35,34 +35,34 @@ def braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
     top.plot(t, sample.output.slip, color=COLOURS[0], label="slip")
     top.plot(t, sample.target, "--", color=COLOURS[1], label="target")
     top.plot(t, sample.setpoint, ":", color="black", label="setpoint")
-    label(top, "", "slip [1]")
+    label_axes(top, "", "slip [1]")
     _speeds(speed, seen)
-    label(speed, "", "speed [km/h]")
+    label_axes(speed, "", "speed [km/h]")
     _control(torque, seen, unit)
     brake.plot(t, sample.output.deceleration, color=COLOURS[0])
-    label(brake, "time [s]", "deceleration [m/s²]")
+    label_axes(brake, "time [s]", "deceleration [m/s²]")
     return figure
 
 
-def balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
+def draw_balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
     """A run of a two-wheeler at a glance: angles, rates, control in its `unit`, torque. Raises ValueError for a run
     without a trajectory, as `measure` returns it."""
     seen = _trajectory(run)
     figure, (angles, rates, voltage, torque) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
     t, sample = np.asarray(seen.sample.t), seen.sample
-    angle_lines(angles, seen)
-    label(angles, "", "angle [rad]")
-    angle_lines(rates, seen, "_rate")
-    label(rates, "", "rate [rad/s]", legend=False)
+    draw_angle_lines(angles, seen)
+    label_axes(angles, "", "angle [rad]")
+    draw_angle_lines(rates, seen, "_rate")
+    label_axes(rates, "", "rate [rad/s]", legend=False)
     _control(voltage, seen, unit)
     most = np.max(np.abs(sample.control))
     voltage.set_ylim(-1.5 * most - 1e-9, 1.5 * most + 1e-9)  # a command far beyond the supply says no more
     torque.plot(t, motor_torque(sample), color=COLOURS[0])
-    label(torque, "time [s]", "motor torque [N m]")
+    label_axes(torque, "time [s]", "motor torque [N m]")
     return figure
 
 
-def signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
+def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
     """A run of whatever plant at a glance: its signals, a panel for each unit, the first with target and setpoint; and
     control in its `unit`. Raises ValueError for a run without a trajectory, as `measure` returns it."""
     seen = _trajectory(run)
@@ -73,13 +73,13 @@ def signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
     figure, axes = sheet(-(-(len(groups) + 1) // 2), 2, title=title, size=(5.6, 3.0), sharex=True)
     for ax, (of_signal, names) in zip(axes, groups.items(), strict=False):
         for i, name in enumerate(names):
-            ax.plot(t, getattr(sample.output, name), DASHES[i % 7], color=COLOURS[i % 7], label=spaced(name))
+            ax.plot(t, getattr(sample.output, name), DASHES[i % 7], color=COLOURS[i % 7], label=spaced_name(name))
         if ax is axes[0]:
             ax.plot(t, sample.target, "--", color=GREY, label="target")
             ax.plot(t, sample.setpoint, ":", color="black", label="setpoint")
         alone = len(names) == 1
-        words = f"{spaced(names[0])} " if alone else ""
-        label(ax, "", f"{words}[{of_signal}]", legend=ax is axes[0] or not alone)
+        words = f"{spaced_name(names[0])} " if alone else ""
+        label_axes(ax, "", f"{words}[{of_signal}]", legend=ax is axes[0] or not alone)
     count = len(groups) + 1
     _control(axes[count - 1], seen, unit)
     for ax in axes[count:]:
@@ -95,28 +95,28 @@ def _control(ax: Axes, seen: Trajectory, unit: str) -> None:
     t, sample = np.asarray(seen.sample.t), seen.sample
     ax.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
     ax.plot(t, sample.control, color=COLOURS[0], label="control")
-    label(ax, "time [s]", controlled(unit))
+    label_axes(ax, "time [s]", control_label(unit))
 
 
-FIGURES = {  # of runs, by the signals that they draw
-    frozenset(("slip", "speed", "wheel_speed", "deceleration")): braking,
-    frozenset(("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate", "constant", "emf")): balance,
+FIGURE_BY_SIGNALS = {  # of runs, by the signals that they draw
+    frozenset(("slip", "speed", "wheel_speed", "deceleration")): draw_braking,
+    frozenset(("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate", "constant", "emf")): draw_balance,
 }
 
 
-def of(plant: Plant) -> Callable[..., Figure]:
+def figure_for(plant: Plant) -> Callable[..., Figure]:
     """Return the figure of one run that suits a plant: the one that draws just such signals, else that of any."""
-    return next((figure for drawn, figure in FIGURES.items() if drawn <= {*plant.shows.units}), signals)
+    return next((figure for drawn, figure in FIGURE_BY_SIGNALS.items() if drawn <= {*plant.shows.units}), draw_signals)
 
 
-def angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
+def draw_angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
     """Draw frame, arm and rider into an axes; their rates with the suffix `_rate`."""
     for i, (name, words) in enumerate({"theta": "frame", "psi": "arm", "phi": "rider"}.items()):
         values = getattr(seen.sample.output, name + suffix)
         ax.plot(np.asarray(seen.sample.t), values, DASHES[i], color=COLOURS[i], label=f"{words} {name}")
 
 
-def region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> list[Patch]:
+def shade_region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> list[Patch]:
     """Shade the cells of a grid, given their centres, first axis to the right: those whose value is true, those that
     are `unknown`, and the rest. Return a patch of each shade, in this order, for a legend."""
     shades = (COLOURS[0], "#9A9A9A", "#F3E3D7")
@@ -126,16 +126,16 @@ def region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) 
     return [Patch(color=shade) for shade in shades]
 
 
-def slips(runs: Mapping[str, Trajectory], *, title: str = "", until: float | None = None) -> Figure:
+def draw_slips(runs: Mapping[str, Trajectory], *, title: str = "", until: float | None = None) -> Figure:
     """Slip over time, one curve per run, and the setpoint of the first."""
     figure, (ax,) = sheet(title=title, size=(6.4, 3.8))
-    slip_lines(ax, runs)
-    label(ax, "time [s]", "slip [1]")
+    draw_slip_lines(ax, runs)
+    label_axes(ax, "time [s]", "slip [1]")
     ax.set_xlim(0, until)
     return figure
 
 
-def slip_lines(ax: Axes, runs: Mapping[str, Trajectory]) -> None:
+def draw_slip_lines(ax: Axes, runs: Mapping[str, Trajectory]) -> None:
     """Draw slips and the setpoint of the first run into an axes."""
     for i, (name, seen) in enumerate(runs.items()):
         ax.plot(np.asarray(seen.sample.t), seen.sample.output.slip, DASHES[i], color=COLOURS[i], label=name)
@@ -143,13 +143,13 @@ def slip_lines(ax: Axes, runs: Mapping[str, Trajectory]) -> None:
     ax.plot(np.asarray(first.t), first.setpoint, color="black", linewidth=0.9, linestyle=":", label="setpoint")
 
 
-def speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
+def draw_speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
     """Vehicle and wheel speed over time, one panel per run, side by side."""
     figure, axes = sheet(1, len(runs), title=title, size=(5.2 if len(runs) > 1 else 6.4, 3.6), sharex=True, sharey=True)
     for i, (ax, (name, seen)) in enumerate(zip(axes, runs.items(), strict=True)):
         _speeds(ax, seen)
         words = f"{name}: {float(seen.sample.t[-1]):.2f} s" if name else ""
-        label(ax, "time [s]", "" if i else "speed [km/h]", words)
+        label_axes(ax, "time [s]", "" if i else "speed [km/h]", words)
         ax.set_xlim(0, None)
     axes[0].set_ylim(min(axes[0].get_ylim()[0], 0.0), None)  # below 0 where a locked wheel's line would hide the axis
     return figure
@@ -161,7 +161,7 @@ def _speeds(ax: Axes, seen: Trajectory) -> None:
     ax.plot(t, KMH * np.asarray(y.speed), color=COLOURS[0], linewidth=1.6, label="vehicle")
 
 
-def positions(
+def draw_positions(
     panels: Sequence[Mapping[str, Trajectory]], *, title: str = "", zoom: tuple[float, float] | None = None
 ) -> Figure:
     """Position over time, one panel per group of runs; with `zoom`, one more panel that shows the last group over these
@@ -174,7 +174,7 @@ def positions(
             t, x = np.asarray(seen.sample.t), np.asarray(seen.sample.output.distance)
             ax.plot(t, x, DASHES[j], color=COLOURS[j], label=None if single else f"{name}: {x[-1]:.2f} m")
             ax.plot(t[-1:], x[-1:], "o", color=COLOURS[j], markersize=4.5)
-        label(ax, "time [s]", "" if i else "position [m]", next(iter(runs)) if single else "")
+        label_axes(ax, "time [s]", "" if i else "position [m]", next(iter(runs)) if single else "")
         ax.set_xlim(0, None)
     if zoom:
         ends = [np.interp(zoom, seen.sample.t, seen.sample.output.distance) for seen in panels[-1].values()]
@@ -184,7 +184,7 @@ def positions(
     return figure
 
 
-def friction(
+def draw_friction(
     roads: Mapping[str, Road],
     *,
     marks: Mapping[str, tuple[float, float]] | None = None,
@@ -203,14 +203,14 @@ def friction(
         for i, (name, (x, y)) in enumerate((marks or {}).items()):
             if limits[0] <= x <= limits[1]:
                 ax.plot([x], [y], "osD^v"[i % 5], color=COLOURS[(i + len(roads)) % 7], markersize=7, label=name)
-        label(ax, "slip [1]", "friction coefficient [1]")
+        label_axes(ax, "slip [1]", "friction coefficient [1]")
     if zoom:
         axes[-1].set_xlim(*zoom[:2])
         axes[-1].set_ylim(*zoom[2:])
     return figure
 
 
-def convergence(
+def draw_convergence(
     panels: Mapping[str, Mapping[str, Any]], steps: Sequence[float], *, orders: Sequence[int], title: str = ""
 ) -> Figure:
     """Error over step length in logarithmic axes, one panel per case, with a guide line for each order."""
@@ -218,13 +218,13 @@ def convergence(
     h = np.asarray(steps)
     for i, (ax, order, (name, curves)) in enumerate(zip(axes, orders, panels.items(), strict=True)):
         for j, (quantity, errors) in enumerate(curves.items()):
-            words = "IAE" if quantity == "iae" else spaced(quantity)
+            words = "IAE" if quantity == "iae" else spaced_name(quantity)
             ax.loglog(h, errors, "o" + DASHES[j], color=COLOURS[j], markersize=4.5, label=words)
         top = 3.0 * np.max([np.max(e) for e in curves.values()])
         ax.loglog(h, top * (h / h.max()) ** order, color=GREY, linewidth=0.9, label=f"slope {order}")
-        logarithmic(ax, "x")
-        logarithmic(ax, "y")
-        label(ax, "step [s]", "" if i else "relative error [1]", name, legend=False)
+        make_logarithmic(ax, "x")
+        make_logarithmic(ax, "y")
+        label_axes(ax, "step [s]", "" if i else "relative error [1]", name, legend=False)
         ax.legend(fontsize=9, loc="lower right", framealpha=0.9, edgecolor="none")
     return figure
 

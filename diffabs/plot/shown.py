@@ -10,11 +10,11 @@ from matplotlib.patches import StepPatch
 
 from diffabs.plot.style import Axes, Figure
 
-DIGITS = 6
-MOST = 1000  # points of a curve or cloud; more are thinned out evenly, with both ends
+AXES_DIGITS = 6
+MAX_SERIES_POINTS = 1000  # points of a curve or cloud; more are thinned out evenly, with both ends
 
 
-def shown(figure: Figure) -> list[dict[str, Any]]:
+def describe_axes(figure: Figure) -> list[dict[str, Any]]:
     """Return the axes of a figure that was drawn: their `box` (left, top, right, bottom, as shares of the figure),
     ends, whether each is logarithmic, names, and `series` of points in the axes' units. Axes with another scale are
     left out, and areas."""
@@ -57,10 +57,10 @@ def _points(name: Any, colour: Any, x: Any, y: Any) -> Iterator[dict[str, Any]]:
     x, y = (np.ma.filled(np.ma.asarray(values, float), np.nan).ravel() for values in (x, y))
     there = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(there):
-        some = there[np.unique(np.linspace(0, len(there) - 1, min(MOST, len(there))).round().astype(int))]
+        some = there[np.unique(np.linspace(0, len(there) - 1, min(MAX_SERIES_POINTS, len(there))).round().astype(int))]
         name = "" if str(name).startswith("_") else str(name)
         yield {"name": name, "colour": to_hex(colour), "x": _short(x[some]), "y": _short(y[some])}
 
 
 def _short(values: Any) -> list[float]:
-    return [float(f"{value:.{DIGITS}g}") for value in values]
+    return [float(f"{value:.{AXES_DIGITS}g}") for value in values]

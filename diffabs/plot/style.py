@@ -32,7 +32,7 @@ KMH = 3.6  # km/h per m/s
 DPI = 150
 FEW_DECADES, PLAIN = 2.0, 4  # fewer have labels between them; powers of ten that are written out
 RAISED = str.maketrans("-0123456789", "\u207b\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079")
-TITLE = 9  # characters per inch, with room to spare
+TITLE_SIZE = 9  # characters per inch, with room to spare
 
 
 class Sheet(Figure):
@@ -58,13 +58,13 @@ def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float
         ax.grid(color="#DDDDDD", linewidth=0.7)
         ax.set_axisbelow(True)
     if title:
-        width = int(TITLE * size[0] * columns)
+        width = int(TITLE_SIZE * size[0] * columns)
         lines = "\n".join(textwrap.fill(line, width, max_lines=4) for line in title.splitlines())
         figure.suptitle(lines, fontsize=12.5, fontweight="bold")
     return figure, axes
 
 
-def label(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> None:
+def label_axes(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> None:
     """Name the axes, with units, and show the legend if there is something in it."""
     ax.set_xlabel(x, fontsize=11)
     ax.set_ylabel(y, fontsize=11)
@@ -74,7 +74,7 @@ def label(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> 
         ax.legend(fontsize=9.5, framealpha=0.9, edgecolor="none")
 
 
-def logarithmic(ax: Axes, axis: str) -> None:
+def make_logarithmic(ax: Axes, axis: str) -> None:
     """Make an axis, "x" or "y", logarithmic, with as many labels as have room: over less than two decades 1, 2 and 5
     of each, as plain numbers, over more the decades."""
     (ax.set_xscale if axis == "x" else ax.set_yscale)("log")
@@ -111,36 +111,36 @@ class _Powers(Formatter):
         return f"{head}10{str(power).translate(RAISED)}"
 
 
-def save(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
     """Write a figure in the format of the path's suffix, atomically: readers see the old file or the whole new one. A
     PNG has the numbers that it shows in it (`plot.shown`)."""
     path = pathlib.Path(path)
     with files.new_file(path) as temporary:
-        write(figure, temporary, path.suffix.lstrip(".") or "png")
+        write_figure(figure, temporary, path.suffix.lstrip(".") or "png")
     return path
 
 
-def write(figure: Figure, path: pathlib.Path, kind: str) -> None:
+def write_figure(figure: Figure, path: pathlib.Path, kind: str) -> None:
     """Write a figure in a format."""
     from diffabs.plot import shown
 
     figure.savefig(path, format=kind, dpi=DPI)
     if kind == "png":  # drawing has set the places of the axes
-        text = json.dumps(shown.shown(figure), separators=(",", ":"), allow_nan=False)
-        path.write_bytes(pictures.with_text(path.read_bytes(), pictures.AXES, text))
+        text = json.dumps(shown.describe_axes(figure), separators=(",", ":"), allow_nan=False)
+        path.write_bytes(pictures.with_text(path.read_bytes(), pictures.AXES_KEY, text))
 
 
-def controlled(unit: str) -> str:
+def control_label(unit: str) -> str:
     """What an axis says of a plant's control in this unit."""
     return {"N m": "brake torque [N m]", "V": "voltage [V]"}.get(unit, f"control [{unit}]")
 
 
-def named(output: Any) -> str:
+def signal_label(output: Any) -> str:
     """Return what an axis says of the first signal of an output."""
     name, unit = next(iter(output.units.items()))
-    return f"{spaced(name)} [{unit}]"
+    return f"{spaced_name(name)} [{unit}]"
 
 
-def spaced(name: str) -> str:
+def spaced_name(name: str) -> str:
     """Return what an axis says of a signal or a metric."""
     return name.replace("_", " ")

@@ -9,13 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.plot.style import COLOURS, GREY, Axes, Figure, label, logarithmic, save, sheet
-from diffabs.plot.sweep_view import Variable, View, cells
+from diffabs.plot.style import COLOURS, GREY, Axes, Figure, label_axes, make_logarithmic, save_figure, sheet
+from diffabs.plot.sweep_view import AxisVariable, SweepView, assign_cells
 from diffabs.sweep.engines import describe_wrong_end
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics.estimates import Count, Tail
 
-FAR = 2.0  # widths between the outer quantiles: what lies further outside would press a histogram together
+MAX_BOUND_DISTANCE = (
+    2.0  # widths between the outer quantiles: what lies further outside would press a histogram together
+)
 LEVELS = 32  # of an exceedance curve along the share, as many along its logarithm, and as many runs one by one
 POINTS = 5000  # of a scatter
 FEW = 10  # failures, or runs without, that are too few to tell which variables matter
@@ -23,28 +25,28 @@ ROW = 0.055  # of the axes' height, for a line of text beside them
 ABOVE = dict(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False, fontsize=9, handlelength=1.5)
 
 
-def draw(found: Results, document: Any, folder: pathlib.Path, units: Mapping[str, str]) -> list[pathlib.Path]:
+def draw_sweep(found: Results, document: Any, folder: pathlib.Path, units: Mapping[str, str]) -> list[pathlib.Path]:
     """Write every figure that has something in it as PNG.
 
     document: of `diffabs.sweep.statistics.summary.summarise_sweep`."""
     figures = {
-        "distributions": distributions(found, units),
-        "exceedance": exceedance(found, units, document["confidence"]),
-        "worst": worst(found, units),
-        "sensitivity": sensitivity(found, document),
-        "failure_map": failure_map(found, units),
+        "distributions": draw_distributions(found, units),
+        "exceedance": draw_exceedance(found, units, document["confidence"]),
+        "worst": draw_worst(found, units),
+        "sensitivity": draw_sensitivity(found, document),
+        "failure_map": draw_failure_map(found, units),
     }
-    return [save(figure, folder / f"{name}.png") for name, figure in figures.items() if figure]
+    return [save_figure(figure, folder / f"{name}.png") for name, figure in figures.items() if figure]
 
 
-def distributions(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
+def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """A histogram of each metric, with its median and two quantiles. None where no metric varies."""
-    view = View(found, units)
+    view = SweepView(found, units)
     figure, axes = _panels(view.varying, view.title("distributions of", view.rows))
     for ax, name in zip(axes, view.varying, strict=True):
         values = found.column(name)[view.known(name, view.rows)]
         low, middle, high = np.quantile(values, (0.05, 0.5, 0.95))
-        far = FAR * (high - low) or np.inf
+        far = MAX_BOUND_DISTANCE * (high - low) or np.inf
         ends = max(values.min(), low - far), min(values.max(), high + far)
         counts, edges = np.histogram(values, min(60, max(8, int(len(values) ** 0.5))), ends)
         ax.stairs(counts, edges, fill=True, color=COLOURS[0], alpha=0.5)
@@ -54,39 +56,39 @@ def distributions(found: Results, units: Mapping[str, str] = {}) -> Figure | Non
         ax.set_xlim(_limits(ax, *ends, view.bounds.get(name)))
         beyond = len(values) - counts.sum()
         outside = f" ({beyond} more outside)" if beyond else ""
-        label(ax, view.named(name), f"runs{outside}{view.never(name)}", legend=False)
+        label_axes(ax, view.named(name), f"runs{outside}{view.never(name)}", legend=False)
         ax.legend(**ABOVE)
     return figure
 
 
-def exceedance(found: Results, units: Mapping[str, str] = {}, confidence: float = 0.95) -> Figure | None:
+def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: float = 0.95) -> Figure | None:
     """The share of runs beyond each value, with pointwise intervals of Clopper and Pearson unless nothing is random.
     None where no metric varies."""
-    view = View(found, units)
+    view = SweepView(found, units)
     band = f"{100 * confidence:g} % band" + ("" if view.design == "random" else " (as if independent)")
     figure, axes = _panels(view.varying, view.title("how often a value is exceeded in", view.rows))
     for ax, name in zip(axes, view.varying, strict=True):
         values = np.sort(found.column(name)[view.known(name, view.rows)])
         n, limits = len(values), _limits(ax, values[0], values[-1], view.bounds.get(name))
-        x, counts = _exceeding(values, *limits)
+        x, counts = _exceedance_corners(values, *limits)
         ax.plot(x, counts / n, color=COLOURS[0], label=f"runs{view.never(name)}")
         if view.design not in ("grid", "corners"):
             known = [Count(int(k), n).probability(confidence=confidence) for k in counts]
             ends = [one.low for one in known], [one.high for one in known]
             ax.fill_between(x, *ends, color=COLOURS[0], alpha=0.25, linewidth=0, label=band)
-        logarithmic(ax, "y")
+        make_logarithmic(ax, "y")
         ax.set_xlim(limits)
         ax.set_ylim(0.3 / n, 1.5)
-        label(ax, view.named(name), "share beyond [1]", legend=False)
+        label_axes(ax, view.named(name), "share beyond [1]", legend=False)
         ax.legend(**ABOVE)
     return figure
 
 
-def worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -> Figure | None:
+def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -> Figure | None:
     """The runs over the two variables, numbers first, that move a metric most; the worst with their sample numbers. The
     metric is the first that has a bound of failure and varies, or else the first that varies. With one variable, the
     metric over it. None where nothing varies."""
-    view = View(found, units)
+    view = SweepView(found, units)
     metric = view.leading
     good = view.known(metric, view.good)
     paths = view.influential(good, found.column(metric)[good], numbers_first=True) if metric else []
@@ -111,10 +113,10 @@ def worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -> Fig
     return figure
 
 
-def sensitivity(found: Results, document: Mapping[str, Any]) -> Figure | None:
+def draw_sensitivity(found: Results, document: Mapping[str, Any]) -> Figure | None:
     """Bars with intervals for each metric: rank correlations, or Sobol' indices for a Saltelli design. None where the
     document has none."""
-    view = View(found)
+    view = SweepView(found)
     sobol = view.design == "saltelli"
     kinds, what = (("first", "total"), "Sobol indices") if sobol else (("spearman",), "rank correlations")
     table = {name: rows for name in view.varying if (rows := document["sensitivity"].get(name))}
@@ -129,17 +131,17 @@ def sensitivity(found: Results, document: Mapping[str, Any]) -> Figure | None:
         ax.set_yticks(range(len(most)), most)
         ax.set_ylim(len(most) - 0.4, -0.6)
         ax.set_xlim(*((None, None) if sobol else (-1.05, 1.05)))
-        label(ax, "share of the variance [1]" if sobol else "rank correlation [1]", "", name, legend=False)
+        label_axes(ax, "share of the variance [1]" if sobol else "rank correlation [1]", "", name, legend=False)
     if figure and sobol:
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 
-def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
+def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
     """The share of failed runs in cells of the two variables that move it most, or that move the metric of `worst` most
     if too few failed, or did not; cells without a run are grey. Where none failed the colour is the greatest value of
     that metric in a cell. None where no variable varies, or nothing failed and no metric varies."""
-    view = View(found, units)
+    view = SweepView(found, units)
     failed = found.failed()[every := view.accepted]
     if not (failed.any() or view.leading):
         return None
@@ -149,7 +151,7 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
         result = found.column(view.leading)[rows]
     if not (ones := [view.variable(path, every) for path in view.influential(rows, result)]):
         return None
-    places, edges = zip(*(cells(one, len(ones)) for one in ones), strict=True)
+    places, edges = zip(*(assign_cells(one, len(ones)) for one in ones), strict=True)
     shape = [len(edge) - 1 for edge in edges]
     cell = np.ravel_multi_index(places, shape)
     lanes, bad = (np.bincount(cell, w, np.prod(shape)).reshape(shape[0], -1) for w in (None, failed))
@@ -158,7 +160,7 @@ def failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
         table, words = bad / np.maximum(lanes, 1), "share of failed runs [1]"
         colours = {"cmap": "Oranges", "vmin": 0, "vmax": np.max(table)}
     else:
-        table, words = _greatest(cell, found.column(view.leading)[every], lanes), _bounded(view)
+        table, words = _greatest(cell, found.column(view.leading)[every], lanes), _draw_bound(view)
         colours = {"cmap": "viridis"}
     mesh = ax.pcolormesh(*[*edges, [0, 1]][:2], np.ma.masked_where(lanes == 0, table).T, **colours)
     figure.colorbar(mesh, ax=ax, label=words)
@@ -177,13 +179,13 @@ def _greatest(cell: Any, values: np.ndarray, lanes: np.ndarray) -> np.ndarray:
     return table.reshape(lanes.shape)
 
 
-def _bounded(view: View) -> str:
+def _draw_bound(view: SweepView) -> str:
     """What the colour is where nothing failed."""
     bound = view.bounds.get(view.leading)
     return f"greatest {view.named(view.leading)}" + ("" if bound is None else f", fails beyond {bound:g}")
 
 
-def _exceeding(ordered: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+def _exceedance_corners(ordered: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
     """Corners of 1 - F from low to high: values, each twice, and how many reach it and are greater. Of many, some."""
     n = len(ordered)
     some = [np.arange(1, min(n, LEVELS) + 1), np.geomspace(1, n, LEVELS), np.linspace(1, n, LEVELS)]
@@ -239,8 +241,8 @@ def _panels(names: Sequence[str], title: str, size: tuple[float, float] = (5.0, 
     return figure, axes[: len(names)]
 
 
-def _name_axes(ax: Axes, ones: Sequence[Variable], upward: str = "") -> None:
-    label(ax, ones[0].label, ones[1].label if ones[1:] else upward, legend=False)
+def _name_axes(ax: Axes, ones: Sequence[AxisVariable], upward: str = "") -> None:
+    label_axes(ax, ones[0].label, ones[1].label if ones[1:] else upward, legend=False)
     for axis, one in zip((ax.xaxis, ax.yaxis), ones, strict=False):
         if one.names:
             axis.set_ticks(range(len(one.names)), one.names)

@@ -5,15 +5,26 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.plot.style import COLOURS, DASHES, GREY, Axes, Figure, controlled, label, logarithmic, named, sheet
+from diffabs.plot.style import (
+    COLOURS,
+    DASHES,
+    GREY,
+    Axes,
+    Figure,
+    control_label,
+    label_axes,
+    make_logarithmic,
+    sheet,
+    signal_label,
+)
 from diffabs.simulate.solution import Trajectory
 
 MARKS = "osD^v"
-DECADES = 5.0  # an objective that falls by less is easier to read on a linear axis
-SETTLED = 1.5  # how much longer than the transient a panel is
+MAX_DECADES = 5.0  # an objective that falls by less is easier to read on a linear axis
+SETTLED_MULTIPLE = 1.5  # how much longer than the transient a panel is
 
 
-def history(points: Sequence[Any], *, title: str = "") -> Figure:
+def draw_history(points: Sequence[Any], *, title: str = "") -> Figure:
     """Objective and gradient over the gradients computed. `points` have `evaluations`, `objective`, `gradient` and
     `violation`."""
     figure, axes = sheet(1, 2, title=title, size=(5.2, 3.4))
@@ -22,7 +33,7 @@ def history(points: Sequence[Any], *, title: str = "") -> Figure:
     return figure
 
 
-def tuning(
+def draw_tuning(
     points: Sequence[Any], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "", unit: str = "N m"
 ) -> Figure:
     """History above, the runs of one lane below, their control in its `unit`: all that `diffabs tune` draws."""
@@ -33,7 +44,7 @@ def tuning(
     return figure
 
 
-def pareto(
+def draw_pareto(
     fronts: Mapping[str, tuple[Any, Any]],
     *,
     marks: Mapping[str, tuple[float, float]] | None = None,
@@ -46,16 +57,16 @@ def pareto(
     figure, (ax,) = sheet(title=title, size=(6.2, 4.0))
     for i, (name, (across, up)) in enumerate(fronts.items()):
         across, up = np.asarray(across, float), np.asarray(up, float)
-        best = front(across, up)
+        best = pareto_front(across, up)
         ax.plot(across, up, "o", color=COLOURS[i], alpha=0.25, markersize=4)
         ax.plot(across[best], up[best], "o-", color=COLOURS[i], markersize=5, label=name)
     for i, (name, point) in enumerate((marks or {}).items()):
         ax.plot([point[0]], [point[1]], MARKS[i % 5], color=COLOURS[(i + len(fronts)) % 7], markersize=8, label=name)
-    label(ax, x, y)
+    label_axes(ax, x, y)
     return figure
 
 
-def front(x: Any, y: Any) -> np.ndarray:
+def pareto_front(x: Any, y: Any) -> np.ndarray:
     """Indices of the points of which no other is smaller in both, along x. NaN is never among them."""
     x, y = np.asarray(x, float), np.asarray(y, float)
     order = [i for i in np.lexsort((y, x)) if np.isfinite([x[i], y[i]]).all()]
@@ -67,7 +78,7 @@ def front(x: Any, y: Any) -> np.ndarray:
     return np.array(kept, int)
 
 
-def worst_case(
+def draw_worst_case(
     nominal: Trajectory, worst: Trajectory, parameters: Mapping[str, Any], *, metric: str = "", title: str = ""
 ) -> Figure:
     """The nominal run against the worst one found, with the parameters of the latter; `metric` says of what it is the
@@ -81,7 +92,7 @@ def worst_case(
         distance, speed = np.asarray(seen.sample.output.distance), np.asarray(seen.sample.output.speed)
         axes[2].plot(distance, 3.6 * speed, DASHES[i], color=COLOURS[i], label=f"{name}: {distance[-1]:.2f} m")
         axes[2].plot(distance[-1:], 3.6 * speed[-1:], "o", color=COLOURS[i], markersize=4.5)
-    label(axes[2], "distance [m]", "speed [km/h]")
+    label_axes(axes[2], "distance [m]", "speed [km/h]")
     return figure
 
 
@@ -90,8 +101,8 @@ def _objective(ax: Axes, points: Sequence[Any]) -> None:
     n, values = [p.evaluations for p in points], np.array([p.objective for p in points])
     ax.plot(n, values, "o-", markersize=3.5, color=COLOURS[0], label="objective")
     known = values[np.isfinite(values)]
-    if len(known) and known.min() > 0 and known.max() > DECADES * known.min():
-        logarithmic(ax, "y")
+    if len(known) and known.min() > 0 and known.max() > MAX_DECADES * known.min():
+        make_logarithmic(ax, "y")
     violation = np.array([p.violation for p in points])
     if np.any(violation > 0):
         other = ax.twinx()
@@ -99,13 +110,13 @@ def _objective(ax: Axes, points: Sequence[Any]) -> None:
         other.plot(n, violation, "--", color=COLOURS[1], linewidth=1.2)
         other.set_ylabel("greatest violation [of its bound]", fontsize=10, color=COLOURS[1])
         other.set_ylim(0, None)
-    label(ax, "gradients computed", "objective", legend=False)
+    label_axes(ax, "gradients computed", "objective", legend=False)
 
 
 def _gradient(ax: Axes, points: Sequence[Any]) -> None:
     ax.plot([p.evaluations for p in points], [p.gradient for p in points], "o-", markersize=3.5, color=COLOURS[2])
-    logarithmic(ax, "y")
-    label(ax, "gradients computed", "gradient, greatest component")
+    make_logarithmic(ax, "y")
+    label_axes(ax, "gradients computed", "gradient, greatest component")
 
 
 def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str = "", unit: str = "N m") -> None:
@@ -116,14 +127,14 @@ def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str =
         torque.plot(t, seen.sample.control, DASHES[i], color=COLOURS[i], label=name, linewidth=1.2)
     first = next(iter(runs.values())).sample
     slip.plot(np.asarray(first.t), first.setpoint, color=GREY, linewidth=0.9, linestyle=":", label="setpoint")
-    label(slip, "time [s]", named(first.output), title)
-    label(torque, "time [s]", controlled(unit), legend=False)
+    label_axes(slip, "time [s]", signal_label(first.output), title)
+    label_axes(torque, "time [s]", control_label(unit), legend=False)
     for ax in (slip, torque):
-        ax.set_xlim(0, _until(runs))
+        ax.set_xlim(0, _arrival_time(runs))
         ax.locator_params(axis="x", nbins=6)
 
 
-def _until(runs: Mapping[str, Trajectory]) -> float:
+def _arrival_time(runs: Mapping[str, Trajectory]) -> float:
     """Long enough to see every run arrive within 2 % of its end, or the whole where one does not."""
     ends = []
     for seen in runs.values():
@@ -131,7 +142,7 @@ def _until(runs: Mapping[str, Trajectory]) -> float:
         away = np.flatnonzero(np.abs(slip - np.asarray(seen.sample.setpoint)) > 0.02 * np.max(np.abs(slip)))
         ends.append(float(t[away[-1]]) if len(away) else 0.0)
     whole = max(float(np.asarray(seen.sample.t)[-1]) for seen in runs.values())
-    return min(whole, SETTLED * max(ends)) or whole
+    return min(whole, SETTLED_MULTIPLE * max(ends)) or whole
 
 
 def _short(value: Any) -> str:

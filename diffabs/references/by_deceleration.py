@@ -13,10 +13,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.numerics import risen, table
+from diffabs.core.numerics import interpolate_shares, interval_shares
 from diffabs.core.protocols import BrakeOutput, Memory
 from diffabs.core.pytree import Scalar, Vector, param, pytree
-from diffabs.core.rules import Rule, increasing
+from diffabs.core.rules import Rule, increase_rule
 
 
 @pytree
@@ -46,7 +46,7 @@ class SlipByDeceleration:
         nodes, slips = jnp.asarray(self.decelerations), jnp.asarray(self.slips)
         if nodes.shape != slips.shape:
             raise ValueError(f"decelerations and slips have shapes {nodes.shape} and {slips.shape}")
-        return table(risen(memory.flow, nodes), slips)
+        return interpolate_shares(interval_shares(memory.flow, nodes), slips)
 
     def problems(self) -> Iterator[str]:
         """Lists of different lengths, or empty ones."""
@@ -56,4 +56,4 @@ class SlipByDeceleration:
 
     def rules(self) -> Iterator[Rule]:
         """Decelerations that increase."""
-        yield increasing("decelerations", self.decelerations, "do not increase", "m/s^2")
+        yield increase_rule("decelerations", self.decelerations, "do not increase", "m/s^2")

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, larger
 from diffabs.core.protocols import BrakeOutput, Memory
 from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.core.rules import Rule, ordered
+from diffabs.core.rules import Rule, order_rule
 
 
 class SeekingMemory(NamedTuple):
@@ -84,8 +84,8 @@ class ExtremumSeeking:
 
     def rules(self) -> Iterator[Rule]:
         """A first slip within limits that do not exclude each other."""
-        yield ordered(("least_slip", self.least_slip), ("slip", self.slip), "1")
-        yield ordered(("slip", self.slip), ("greatest_slip", self.greatest_slip), "1")
+        yield order_rule(("least_slip", self.least_slip), ("slip", self.slip), "1")
+        yield order_rule(("slip", self.slip), ("greatest_slip", self.greatest_slip), "1")
 
     def _climb(self, m: SeekingMemory) -> Any:
         e = self.elasticity(Memory(flow=m))

@@ -21,8 +21,8 @@ from diffabs.core.pytree import Scalar, param, pytree
 
 # A later maximum counts only if it exceeds the greatest by this fraction: a controller that holds the best slip keeps
 # the deceleration at its maximum to rounding, and comparisons of equal numbers would then decide on derivatives.
-MARGIN = 1e-6
-LEAST = 1e-3  # m/s^2, of a maximum: that of a wheel that still rolls, before the torque comes, is rounding
+SLIP_MARGIN = 1e-6
+MIN_DECELERATION = 1e-3  # m/s^2, of a maximum: that of a wheel that still rolls, before the torque comes, is rounding
 
 
 class PeakMemory(NamedTuple):
@@ -40,9 +40,9 @@ def _size(signal: BrakeOutput) -> Any:
     return jnp.abs(signal.deceleration)
 
 
-def _fresh(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMemory:
+def _fresh_memory(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMemory:
     zero = 0.0 * deceleration
-    return PeakMemory(zero, zero + LEAST, slip, target + zero)
+    return PeakMemory(zero, zero + MIN_DECELERATION, slip, target + zero)
 
 
 @pytree
@@ -58,7 +58,7 @@ class PeakLiteral:
     def start(self, signal: BrakeOutput) -> Memory:
         """Maximum so far: the first sample."""
         size = _size(signal)
-        return Memory(held=_fresh(self.slip, size, signal.slip)._replace(greatest=size))
+        return Memory(held=_fresh_memory(self.slip, size, signal.slip)._replace(greatest=size))
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
         """Target slip [1]."""
@@ -95,18 +95,18 @@ class PeakLatch:
 
     def start(self, signal: BrakeOutput) -> Memory:
         """No maximum yet."""
-        return Memory(held=_fresh(self.slip, _size(signal), signal.slip))
+        return Memory(held=_fresh_memory(self.slip, _size(signal), signal.slip))
 
     def margins(self, t: Scalar, memory: Memory, signal: BrakeOutput, rate: Callable[[], BrakeOutput]) -> tuple[Any]:
         """d|a|/dt where |a| is greater than ever, else its size."""
         del t
         m: PeakMemory = memory.held
-        return (_falling(_rate(_size, signal, rate()), _size(signal), m),)
+        return (_falling_rate(_rate(_size, signal, rate()), _size(signal), m),)
 
     def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[Any]) -> Memory:
         """Latch at a maximum greater than all before."""
         del t
-        m: PeakMemory = _recorded(memory.held, fired[0], _size(signal), signal.slip)
+        m: PeakMemory = _record_peak(memory.held, fired[0], _size(signal), signal.slip)
         latched = jnp.where(fired[0], 1.0, m.latched)
         return Memory(held=m._replace(latched=latched, target=jnp.where(fired[0], signal.slip, m.target)))
 
@@ -135,7 +135,7 @@ class PeakRobust:
     def start(self, signal: BrakeOutput) -> Memory:
         """Filters at the first sample."""
         flow = FilterMemory(signal.deceleration, signal.slip)
-        return Memory(flow, _fresh(self.slip, *flow))
+        return Memory(flow, _fresh_memory(self.slip, *flow))
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> FilterMemory:
         """First-order low-pass of both signals."""
@@ -154,13 +154,13 @@ class PeakRobust:
         level = a - (1 - self.threshold) * m.greatest
         waits = (m.latched < 0.5) & (m.greatest > self.arming)
         moving = self.flow(t, memory, signal).deceleration
-        return _falling(moving, a, m), jnp.where(waits, level, jnp.abs(level))
+        return _falling_rate(moving, a, m), jnp.where(waits, level, jnp.abs(level))
 
     def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[Any, Any]) -> Memory:
         """Record the maximum; latch at the threshold below it; follow a later, greater one."""
         del t, signal
         a, s = memory.flow
-        m: PeakMemory = _recorded(memory.held, fired[0], a, s)
+        m: PeakMemory = _record_peak(memory.held, fired[0], a, s)
         moves = fired[1] | (fired[0] & (m.latched > 0.5))
         latched = jnp.where(fired[1], 1.0, m.latched)
         return Memory(memory.flow, m._replace(latched=latched, target=jnp.where(moves, m.slip, m.target)))
@@ -170,11 +170,11 @@ def _rate(size: Callable[[BrakeOutput], Any], signal: BrakeOutput, rate: BrakeOu
     return jax.jvp(size, (signal,), (rate,))[1]
 
 
-def _falling(rate: Scalar, deceleration: Scalar, m: PeakMemory) -> Any:
+def _falling_rate(rate: Scalar, deceleration: Scalar, m: PeakMemory) -> Any:
     """The rate where the deceleration is greater than ever, else the size of the rate: a margin that falls through zero
     at a new maximum only."""
-    return jnp.where(deceleration > (1 + MARGIN) * m.greatest, rate, jnp.abs(rate))
+    return jnp.where(deceleration > (1 + SLIP_MARGIN) * m.greatest, rate, jnp.abs(rate))
 
 
-def _recorded(m: PeakMemory, new: Any, deceleration: Scalar, slip: Scalar) -> PeakMemory:
+def _record_peak(m: PeakMemory, new: Any, deceleration: Scalar, slip: Scalar) -> PeakMemory:
     return m._replace(greatest=jnp.where(new, deceleration, m.greatest), slip=jnp.where(new, slip, m.slip))

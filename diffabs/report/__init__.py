@@ -8,6 +8,6 @@ writing     sections as HTML, by the template beside it
 
 from diffabs.report.documents import Document as Document
 from diffabs.report.documents import ReportError as ReportError
-from diffabs.report.documents import documents as documents
-from diffabs.report.writing import ours as ours
-from diffabs.report.writing import report as report
+from diffabs.report.documents import find_documents as find_documents
+from diffabs.report.writing import build_report as build_report
+from diffabs.report.writing import is_report as is_report

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 from diffabs.core import files
 from diffabs.papers import PAPERS
 
-LARGEST = 2**27  # bytes of a document
+MAX_DOCUMENT_BYTES = 2**27  # bytes of a document
 SUMMARY, MANIFEST = "summary.json", "manifest.json"
-KINDS = {  # the keys that only this kind has
+KEYS_BY_KIND = {  # the keys that only this kind has
     "reproduce": ("paper", "rows", "figures"),
     "sweep": ("digest", "sensitivity", "failures"),
     "rare": ("levels", "probability", "bound"),
@@ -22,7 +22,7 @@ KINDS = {  # the keys that only this kind has
     "design": ("gain", "states", "over", "poles"),
     "certificate": ("format", "system", "claims"),
 }
-READ = "reproduce, sweep, rare, tune, identify, design and certify write"
+READABLE_DOCUMENTS = "reproduce, sweep, rare, tune, identify, design and certify write"
 
 
 class ReportError(ValueError):
@@ -42,7 +42,7 @@ class Document(NamedTuple):
         return self.path.parent
 
 
-def documents(source: pathlib.Path) -> list[Document]:
+def find_documents(source: pathlib.Path) -> list[Document]:
     """Return the documents of a file, or of a folder: those in it, and the results in folders of their own below it.
 
     Raises:
@@ -52,39 +52,39 @@ def documents(source: pathlib.Path) -> list[Document]:
     if not source.exists():
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(source))
     if not source.is_dir():
-        return list(_of(source, named=True))
-    below = sorted(source.glob(f"*/{SUMMARY}"), key=_place)
-    found = {one.path: one for path in [*sorted(source.glob("*.json")), *below] for one in _of(path)}
+        return list(_documents_of_file(source, named=True))
+    below = sorted(source.glob(f"*/{SUMMARY}"), key=_sort_key)
+    found = {one.path: one for path in [*sorted(source.glob("*.json")), *below] for one in _documents_of_file(path)}
     if found:
         return list(found.values())
     if (source / MANIFEST).is_file():
         raise ReportError(f"{source}: the sweep has no {SUMMARY} yet; diffabs sweep ... --resume goes on with it")
-    raise ReportError(f"{source}: holds nothing that {READ}")
+    raise ReportError(f"{source}: holds nothing that {READABLE_DOCUMENTS}")
 
 
-def _place(path: pathlib.Path) -> tuple[int, str]:
+def _sort_key(path: pathlib.Path) -> tuple[int, str]:
     """The papers come first, in the order in which they are reproduced."""
     name = path.parent.name
     return [*PAPERS, name].index(name), name
 
 
-def _of(path: pathlib.Path, named: bool = False) -> Iterator[Document]:
+def _documents_of_file(path: pathlib.Path, named: bool = False) -> Iterator[Document]:
     """The documents of a file; where a person has named it there must be one."""
     try:
-        content = json.loads(files.content(path, LARGEST), parse_int=_whole)
+        content = json.loads(files.read_content(path, MAX_DOCUMENT_BYTES), parse_int=_read_integer)
     except OverflowError as error:
         raise ReportError(f"{path}: {error}") from None
     except (ValueError, RecursionError):
         if named:
-            raise ReportError(f"{path}: is no JSON document that {READ}") from None
+            raise ReportError(f"{path}: is no JSON document that {READABLE_DOCUMENTS}") from None
         return
     found = list(_inside(content, path))
     if named and not found:
-        raise ReportError(f"{path}: is no document that {READ}")
+        raise ReportError(f"{path}: is no document that {READABLE_DOCUMENTS}")
     yield from found
 
 
-def _whole(text: str) -> int:
+def _read_integer(text: str) -> int:
     """Return a whole number of JSON. Raises OverflowError for one that no float can be."""
     value = int(text)
     if abs(value) > sys.float_info.max:
@@ -100,7 +100,7 @@ def _inside(content: Any, path: pathlib.Path) -> Iterator[Document]:
         for name, paper in content["papers"].items():
             yield from _inside(paper, pathlib.Path(content["out"]) / name / SUMMARY)
         return
-    for kind, keys in KINDS.items():
+    for kind, keys in KEYS_BY_KIND.items():
         if all(key in content for key in keys):
             yield Document(kind, content, _home(kind, content, path))
             return

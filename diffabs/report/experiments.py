@@ -6,15 +6,25 @@ from typing import Any
 
 from diffabs.papers import MODULES, compact
 from diffabs.report.documents import Document
-from diffabs.report.page import VERDICTS, Figure, Section, Table, Verdict, command, image, model_tables, origin
-from diffabs.scenario.model import model
+from diffabs.report.page import (
+    VERDICT_NAMES,
+    Figure,
+    ReportTable,
+    ReportVerdict,
+    Section,
+    describe_origin,
+    embed_image,
+    model_tables,
+    original_command,
+)
+from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import load
 
 COLUMNS = {"name": "what", "quantity": "quantity", "unit": "unit", "ours": "ours", "published": "published",
            "reference": "independent", "difference": "difference"}  # fmt: skip
 
 
-def paper(document: Document) -> Section:
+def paper_section(document: Document) -> Section:
     """Return the section of a paper."""
     content = document.content
     name = content["paper"]
@@ -26,38 +36,38 @@ def paper(document: Document) -> Section:
         question="Are the numbers, figures and claims of this paper true? Its experiments are computed anew, and"
         " compared with what it prints and with independent solutions.",
         answer=list(found.agreement),
-        verdicts=[Verdict(*verdict) for verdict in found.verdicts],
-        model=model_tables(model(load(name, integrated=False))),
+        verdicts=[ReportVerdict(*verdict) for verdict in found.verdicts],
+        model=model_tables(describe_model(load(name, integrated=False))),
         model_note=f"The packaged scenario {name}; the first column of the tables says what a row changes.",
-        figures=figures(content["figures"], document.folder),
-        tables=[Table("In short", found.headings, found.lines), *_tables(content)],
+        figures=existing_figures(content["figures"], document.folder),
+        tables=[ReportTable("In short", found.headings, found.lines), *_tables(content)],
         certificate=_certificates(content.get("design")),
         certificate_tables=_designs(content.get("design")),
         notes=list(content["notes"]),
-        provenance=origin(content, **{f"solver, {name}": value for name, value in content["solver"].items()}),
-        again=command(content, f"diffabs reproduce {name}"),
+        provenance=describe_origin(content, **{f"solver, {name}": value for name, value in content["solver"].items()}),
+        again=original_command(content, f"diffabs reproduce {name}"),
     )
 
 
-def figures(names: Any, folder: pathlib.Path) -> list[Figure]:
+def existing_figures(names: Any, folder: pathlib.Path) -> list[Figure]:
     """Return those pictures of a folder that are there; names that lead out of it are none."""
-    found = [image(folder / name) for name in names if pathlib.PurePath(name).name == name]
+    found = [embed_image(folder / name) for name in names if pathlib.PurePath(name).name == name]
     return [figure for figure in found if figure]
 
 
-def _tables(content: Mapping[str, Any]) -> list[Table]:
+def _tables(content: Mapping[str, Any]) -> list[ReportTable]:
     titles = {"rows": "Every number", "judged": "What the paper prints of its machine"}
     return [
-        Table(title, tuple(COLUMNS.values()), [[row.get(key) for key in COLUMNS] for row in content[part]])
+        ReportTable(title, tuple(COLUMNS.values()), [[row.get(key) for key in COLUMNS] for row in content[part]])
         for part, title in titles.items()
         if content.get(part)
     ]
 
 
-def _certificates(design: Mapping[str, Any] | None) -> list[Verdict]:
+def _certificates(design: Mapping[str, Any] | None) -> list[ReportVerdict]:
     designs = (design or {}).get("designs") or []
     return [
-        Verdict(VERDICTS[one["certificate"]["quadratically_stable"]],
+        ReportVerdict(VERDICT_NAMES[one["certificate"]["quadratically_stable"]],
                 f"u = K x with K = {one['gain']} is quadratically stable over the vertices"
                 f"{', verified in exact arithmetic' if one['certificate']['verified_exactly'] else ''}")
         for one in designs
@@ -65,7 +75,7 @@ def _certificates(design: Mapping[str, Any] | None) -> list[Verdict]:
     ]  # fmt: skip
 
 
-def _designs(design: Mapping[str, Any] | None) -> list[Table]:
+def _designs(design: Mapping[str, Any] | None) -> list[ReportTable]:
     designs = (design or {}).get("designs") or []
     rows = [
         [one["Q"], one["R"], one["gain"], one["certificate"]["decay_rate"], one["certificate"]["guaranteed_cost"]]
@@ -73,4 +83,4 @@ def _designs(design: Mapping[str, Any] | None) -> list[Table]:
         if one.get("certificate")
     ]
     headings = ("Q", "R", "gain", "decay rate [1/s]", "guaranteed cost")
-    return [Table("Designs", headings, rows)] if rows else []
+    return [ReportTable("Designs", headings, rows)] if rows else []

@@ -9,25 +9,25 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from diffabs.core import files, pictures
-from diffabs.core.summary import number
+from diffabs.core.summary import round_for_table
 
 IMAGES = {".png": "image/png", ".svg": "image/svg+xml"}
 LARGEST_IMAGE = 2**25  # bytes
 LARGEST_AXES = 2**21  # characters of the numbers that a picture shows
 ENDS = ("box", "x", "y", "log")  # numbers of axes
-SHOWN = 8  # entries of a list
-UNKNOWN = "not known: the document does not say"
-VERDICTS = {True: "proved", False: "disproved", None: "undecided"}
+MAX_SHOWN_ENTRIES = 8  # entries of a list
+UNKNOWN_ORIGIN = "not known: the document does not say"
+VERDICT_NAMES = {True: "proved", False: "disproved", None: "undecided"}
 
 
-class Number(NamedTuple):
+class ShownNumber(NamedTuple):
     """A number as a reader sees it, and all its digits."""
 
     shown: str
     exact: str
 
 
-class Table(NamedTuple):
+class ReportTable(NamedTuple):
     """Cells are texts, numbers, lists of numbers, truth values, or None for nothing."""
 
     title: str
@@ -46,7 +46,7 @@ class Figure(NamedTuple):
     axes: str = ""
 
 
-class Verdict(NamedTuple):
+class ReportVerdict(NamedTuple):
     """A word, and the sentence it is about."""
 
     word: str
@@ -61,45 +61,45 @@ class Section:
     title: str
     question: str
     answer: list[str] = dataclasses.field(default_factory=list)
-    verdicts: list[Verdict] = dataclasses.field(default_factory=list)
-    model: list[Table] = dataclasses.field(default_factory=list)
+    verdicts: list[ReportVerdict] = dataclasses.field(default_factory=list)
+    model: list[ReportTable] = dataclasses.field(default_factory=list)
     model_note: str = ""
     figures: list[Figure] = dataclasses.field(default_factory=list)
     figures_note: str = ""
-    tables: list[Table] = dataclasses.field(default_factory=list)
-    certificate: list[Verdict] = dataclasses.field(default_factory=list)
-    certificate_tables: list[Table] = dataclasses.field(default_factory=list)
+    tables: list[ReportTable] = dataclasses.field(default_factory=list)
+    certificate: list[ReportVerdict] = dataclasses.field(default_factory=list)
+    certificate_tables: list[ReportTable] = dataclasses.field(default_factory=list)
     notes: list[str] = dataclasses.field(default_factory=list)
     provenance: list[tuple[str, Any]] = dataclasses.field(default_factory=list)
     again: list[str] = dataclasses.field(default_factory=list)
 
 
-def numbers(value: Any) -> list[Number | str]:
+def shown_numbers(value: Any) -> list[ShownNumber | str]:
     """Return what a cell shows: a text, or numbers; of a long list, or one of lists, the first entries."""
     if value is None:
         return [""]
     if isinstance(value, bool):
         return ["yes" if value else "no"]
     if isinstance(value, int):
-        return [Number(f"{value:,}" if abs(value) >= 10_000 else str(value), str(value))]
+        return [ShownNumber(f"{value:,}" if abs(value) >= 10_000 else str(value), str(value))]
     if isinstance(value, float):
-        return [Number(number(value) if math.isfinite(value) else str(value), repr(value))]
+        return [ShownNumber(round_for_table(value) if math.isfinite(value) else str(value), repr(value))]
     if isinstance(value, list | tuple):
-        shown = [one for entry in value[:SHOWN] for one in numbers(entry)]
-        return [*shown, *([f"... ({len(value)})"] if len(value) > SHOWN else [])]
+        shown = [one for entry in value[:MAX_SHOWN_ENTRIES] for one in shown_numbers(entry)]
+        return [*shown, *([f"... ({len(value)})"] if len(value) > MAX_SHOWN_ENTRIES else [])]
     return [str(value)]
 
 
-def image(path: pathlib.Path, caption: str = "") -> Figure | None:
+def embed_image(path: pathlib.Path, caption: str = "") -> Figure | None:
     """Return a picture with its bytes in it; None for a file that is none, or cannot be read."""
     kind = IMAGES.get(path.suffix.lower())
     try:
-        data = files.content(path, LARGEST_IMAGE + 1) if kind else b""
+        data = files.read_content(path, LARGEST_IMAGE + 1) if kind else b""
     except (OSError, ValueError):
         return None
     if not data or len(data) > LARGEST_IMAGE:
         return None
-    data, axes = pictures.without_text(data, pictures.AXES)
+    data, axes = pictures.without_text(data, pictures.AXES_KEY)
     text = base64.b64encode(data).decode()
     return Figure(caption or path.stem.replace("_", " "), f"data:{kind};base64,{text}", axes=_axes(axes))
 
@@ -124,50 +124,58 @@ def _finite(values: Any) -> bool:
     return isinstance(values, list) and all(isinstance(x, int | float) and math.isfinite(x) for x in values)
 
 
-def model_tables(model: Mapping[str, Any] | None) -> list[Table]:
+def model_tables(model: Mapping[str, Any] | None) -> list[ReportTable]:
     """Return the parts and the parameters of `scenario.model`."""
     if not model:
         return []
-    more = {path: said({**about, "type": None}) for path, about in model["parts"].items()}
+    more = {path: format_pairs({**about, "type": None}) for path, about in model["parts"].items()}
     also = any(more.values())
     parts = [[path, about["type"], *([more[path]] if also else [])] for path, about in model["parts"].items()]
-    rows = [[path, row["value"], unit(row["unit"])] for path, row in model["parameters"].items()]
+    rows = [[path, row["value"], table_unit(row["unit"])] for path, row in model["parameters"].items()]
     solver = [[name, value] for name, value in (model.get("solver") or {}).items()]
     return [
-        Table("Parts", ("part", "type", *(["also"] if also else [])), parts),
-        Table("Parameters", ("parameter", "value", "unit"), rows, "in SI"),
-        *([Table("Integration", ("setting", "value"), solver)] if solver else []),
+        ReportTable("Parts", ("part", "type", *(["also"] if also else [])), parts),
+        ReportTable("Parameters", ("parameter", "value", "unit"), rows, "in SI"),
+        *([ReportTable("Integration", ("setting", "value"), solver)] if solver else []),
     ]
 
 
-def unit(text: str | None) -> str:
+def table_unit(text: str | None) -> str:
     """Return a unit for a table: what has none has the unit 1."""
     return "" if text is None else "1" if text == "" else text
 
 
-def origin(content: Mapping[str, Any], **more: Any) -> list[tuple[str, Any]]:
+def describe_origin(content: Mapping[str, Any], **more: Any) -> list[tuple[str, Any]]:
     """Return where a document comes from: date, commit, machine, versions, and seeds or other `more`."""
     made = {name: value for name, value in (content.get("made") or {}).items() if name != "command"}
     versions = {f"version of {name}": value for name, value in (content.get("versions") or {}).items()}
     for name in ("commit", "machine", "backend"):  # what older documents have among the versions
         if value := versions.pop(f"version of {name}", None):
             made.setdefault(name, value)
-    rows = {"date": UNKNOWN, **made, **{name: value for name, value in more.items() if value is not None}, **versions}
-    return [(name.replace("_", " "), said(value) if isinstance(value, dict) else value) for name, value in rows.items()]
+    rows = {
+        "date": UNKNOWN_ORIGIN,
+        **made,
+        **{name: value for name, value in more.items() if value is not None},
+        **versions,
+    }
+    return [
+        (name.replace("_", " "), format_pairs(value) if isinstance(value, dict) else value)
+        for name, value in rows.items()
+    ]
 
 
-def said(values: Mapping[str, Any]) -> str:
+def format_pairs(values: Mapping[str, Any]) -> str:
     """Return names with their values in a line; what is None has none."""
     return ", ".join(f"{name} {value}" for name, value in values.items() if value is not None)
 
 
-def command(content: Mapping[str, Any], otherwise: str = "") -> list[str]:
+def original_command(content: Mapping[str, Any], otherwise: str = "") -> list[str]:
     """Return the command that a document was made by, or another that does the same; none where none is known."""
     line = (content.get("made") or {}).get("command") or otherwise
     return [str(line)] if line else []
 
 
-def listed(words: Iterable[Any]) -> str:
+def join_words(words: Iterable[Any]) -> str:
     """Return words in a sentence."""
     words = list(map(str, words))
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}" if words else "nothing"

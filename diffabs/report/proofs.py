@@ -5,9 +5,20 @@ from typing import Any
 
 from diffabs.design.verify import verify_file
 from diffabs.report.documents import Document
-from diffabs.report.page import UNKNOWN, VERDICTS, Section, Table, Verdict, command, listed, model_tables, origin, unit
+from diffabs.report.page import (
+    UNKNOWN_ORIGIN,
+    VERDICT_NAMES,
+    ReportTable,
+    ReportVerdict,
+    Section,
+    describe_origin,
+    join_words,
+    model_tables,
+    original_command,
+    table_unit,
+)
 
-NUMBERS = {
+PROOF_UNITS = {
     "decay_rate": "1/s",
     "damping": "1",
     "trace_cost": "1",
@@ -17,11 +28,11 @@ NUMBERS = {
 }
 
 
-def design(document: Document) -> Section:
+def design_section(document: Document) -> Section:
     """Return the section of a design, or of a gain that was looked at."""
     content = document.content
     units = content.get("units") or {}
-    ranges = listed(
+    ranges = join_words(
         f"{path} {low:.6g} to {high:.6g}{_unit(units.get(path))}" for path, (low, high) in content["over"].items()
     )
     designed = content["lower_bound"] is not None
@@ -32,47 +43,49 @@ def design(document: Document) -> Section:
         question=f"{question}, over {ranges}?",
         answer=[content["reason"]] if content["reason"] else [],
         model=model_tables(content.get("model")),
-        model_note="" if content.get("model") else UNKNOWN,
-        tables=[Table("Gain", ("state", "gain"), [*zip(content["states"], content["gain"] or (), strict=False)])],
-        certificate=verdicts(content),
-        certificate_tables=tables(content, content),
+        model_note="" if content.get("model") else UNKNOWN_ORIGIN,
+        tables=[ReportTable("Gain", ("state", "gain"), [*zip(content["states"], content["gain"] or (), strict=False)])],
+        certificate=proof_verdicts(content),
+        certificate_tables=proof_tables(content, content),
         notes=_notes(content),
-        provenance=origin(content),
-        again=[*command(content), *(f"diffabs verify {path}" for path in content["files"].values())],
+        provenance=describe_origin(content),
+        again=[*original_command(content), *(f"diffabs verify {path}" for path in content["files"].values())],
     )  # fmt: skip
 
 
-def verdicts(proof: Mapping[str, Any]) -> list[Verdict]:
+def proof_verdicts(proof: Mapping[str, Any]) -> list[ReportVerdict]:
     """Return what is proved, disproved or left open, in words; that there is no certificate, and why, else."""
     if proof.get("gain") is None:
-        return [Verdict("no certificate", proof.get("reason") or "none was asked for")]
+        return [ReportVerdict("no certificate", proof.get("reason") or "none was asked for")]
     exactly = ", verified in exact arithmetic" if proof["verified_exactly"] else ""
     stable = proof["quadratically_stable"]
-    found = [Verdict(VERDICTS[stable], f"one Lyapunov matrix for all {proof['vertices']} vertices, however fast the"
-                     f" parameters vary{exactly}")]  # fmt: skip
-    found += [Verdict("proved" if one["proved"] else "not proved", f"{one['kind']}{_value(one['kind'], proof)}")
+    about = f"one Lyapunov matrix for all {proof['vertices']} vertices, however fast the parameters vary{exactly}"
+    found = [ReportVerdict(VERDICT_NAMES[stable], about)]
+    found += [ReportVerdict("proved" if one["proved"] else "not proved", f"{one['kind']}{_value(one['kind'], proof)}")
               for one in proof["claims"] or []]  # fmt: skip
     if proof.get("reason"):
-        found.append(Verdict("note", proof["reason"]))
+        found.append(ReportVerdict("note", proof["reason"]))
     return found
 
 
 def _value(kind: str, proof: Mapping[str, Any]) -> str:
     key = {"decay": "decay_rate", "cost": "guaranteed_cost"}.get(kind, kind)
     value = proof.get(key)
-    return "" if value is None else f": {value:.8g}{_unit(NUMBERS.get(key))}"
+    return "" if value is None else f": {value:.8g}{_unit(PROOF_UNITS.get(key))}"
 
 
 def _unit(text: str | None) -> str:
     return "" if text in (None, "", "1") else f" {text}"
 
 
-def tables(proof: Mapping[str, Any], content: Mapping[str, Any]) -> list[Table]:
+def proof_tables(proof: Mapping[str, Any], content: Mapping[str, Any]) -> list[ReportTable]:
     """Return the numbers of a certificate, and its vertices with their poles."""
     if proof.get("gain") is None:
         return []
     units = proof.get("units") or content.get("units") or {}
-    numbers = [[name.replace("_", " "), proof[name], of] for name, of in NUMBERS.items() if proof.get(name) is not None]
+    numbers = [
+        [name.replace("_", " "), proof[name], of] for name, of in PROOF_UNITS.items() if proof.get(name) is not None
+    ]
     poles = proof["poles"] or []
     corners = proof["corners"] or [{} for _ in poles]
     names = list(corners[0]) if corners else []
@@ -81,9 +94,9 @@ def tables(proof: Mapping[str, Any], content: Mapping[str, Any]) -> list[Table]:
         [i, *(corner.get(name) for name in names), one]
         for i, (corner, one) in enumerate(zip(corners, poles, strict=False))
     ]
-    heads = [f"{name} [{unit(units[name])}]" if name in units else name for name in names]
-    return [Table("What is proved, in numbers", ("quantity", "value", "unit"), numbers),
-            Table(f"{proof['vertices']} vertices", ("vertex", *heads, pole), rows)]  # fmt: skip
+    heads = [f"{name} [{table_unit(units[name])}]" if name in units else name for name in names]
+    return [ReportTable("What is proved, in numbers", ("quantity", "value", "unit"), numbers),
+            ReportTable(f"{proof['vertices']} vertices", ("vertex", *heads, pole), rows)]  # fmt: skip
 
 
 def _notes(content: Mapping[str, Any]) -> list[str]:
@@ -93,7 +106,7 @@ def _notes(content: Mapping[str, Any]) -> list[str]:
     return notes
 
 
-def certificate(document: Document) -> Section:
+def certificate_section(document: Document) -> Section:
     """Return the section of a saved certificate, which is proved again now."""
     content = document.content
     proved = verify_file(document.path)
@@ -106,10 +119,12 @@ def certificate(document: Document) -> Section:
         question="Does the saved certificate prove what it claims? It is proved again, in fractions, by code that"
         " shares nothing with what made it.",
         answer=[f"{sum(not one.reason for one in proved)} of {len(proved)} claims are proved."],
-        model=[Table("Vertices", ("vertex", *names), [[i, *row.values()] for i, row in enumerate(corners)], "in SI")],
-        tables=[Table("Gain", tuple(states), content["gain"])],
-        certificate=[Verdict("not proved" if one.reason else "proved",
+        model=[
+            ReportTable("Vertices", ("vertex", *names), [[i, *row.values()] for i, row in enumerate(corners)], "in SI")
+        ],
+        tables=[ReportTable("Gain", tuple(states), content["gain"])],
+        certificate=[ReportVerdict("not proved" if one.reason else "proved",
                              f"{one.kind}: {one.says}{one.reason and f' ({one.reason})'}") for one in proved],
-        provenance=origin(content),
+        provenance=describe_origin(content),
         again=[f"diffabs verify {document.path}"],
     )  # fmt: skip

@@ -6,22 +6,22 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from diffabs.core import files
-from diffabs.report.documents import LARGEST, MANIFEST, Document
+from diffabs.report.documents import MANIFEST, MAX_DOCUMENT_BYTES, Document
 from diffabs.report.page import (
-    UNKNOWN,
+    UNKNOWN_ORIGIN,
     Figure,
+    ReportTable,
+    ReportVerdict,
     Section,
-    Table,
-    Verdict,
-    command,
-    image,
-    listed,
+    describe_origin,
+    embed_image,
+    format_pairs,
+    join_words,
     model_tables,
-    origin,
-    said,
-    unit,
+    original_command,
+    table_unit,
 )
-from diffabs.scenario.model import model
+from diffabs.scenario.model import describe_model
 from diffabs.scenario.scenario import ScenarioError, loads
 
 FIGURES, UNDRAWN = "figures", "None were drawn: diffabs sweep ... --figures draws them."
@@ -32,11 +32,11 @@ CAPTIONS = {
     "sensitivity": "What moves what, with intervals",
     "worst": "The worst runs among all",
 }
-WORST = 3  # samples of a metric
+MAX_WORST_RUNS = 3  # samples of a metric
 INTERVAL = ("value", "low", "high")
 
 
-def sweep(document: Document) -> Section:
+def sweep_section(document: Document) -> Section:
     """Return the section of a sweep."""
     content, manifest = document.content, _manifest(document.folder)
     study, source, units = manifest["study"], manifest["source"], manifest.get("units") or {}
@@ -45,26 +45,26 @@ def sweep(document: Document) -> Section:
     percent = f"{100 * content['confidence']:g} %"
     return Section(
         title=f"Sweep of {source.get('name') or document.folder.name}",
-        question=f"How do {listed(content['metrics'])} spread while {listed(varied)} vary, and how probable is a"
-        " failure?",
-        answer=[_failing(content, percent)],
+        question=f"How do {join_words(content['metrics'])} spread while {join_words(varied)} vary, and how probable"
+        " is a failure?",
+        answer=[_failure_tables(content, percent)],
         model=[*model_tables(found), _space(study["space"], units)],
         model_note=note,
         figures=_figures(document.folder),
         figures_note="" if (document.folder / FIGURES).is_dir() else UNDRAWN,
         tables=list(_tables(content, units, percent)),
         notes=list(_notes(content)),
-        provenance=origin(
+        provenance=describe_origin(
             {"versions": manifest.get("versions"), "made": {**content.get("made", {}), **_commit(manifest)}},
             seed=study["seed"], samples=study["samples"], numbers=study["dtype"],
-            engine=said(study.get("engine") or {}) or "xla", digest=content["digest"],
+            engine=format_pairs(study.get("engine") or {}) or "xla", digest=content["digest"],
         ),
-        again=[*command(content), *_sample(content, document.folder)],
+        again=[*original_command(content), *_sample(content, document.folder)],
     )  # fmt: skip
 
 
 def _manifest(folder: pathlib.Path) -> dict[str, Any]:
-    return json.loads(files.content(folder / MANIFEST, LARGEST))
+    return json.loads(files.read_content(folder / MANIFEST, MAX_DOCUMENT_BYTES))
 
 
 def _commit(manifest: Mapping[str, Any]) -> dict[str, Any]:
@@ -77,23 +77,26 @@ def _scenario_model(source: Mapping[str, Any], folder: pathlib.Path) -> tuple[di
     if "scenario" not in source:
         return None, "Swept from Python, not from a scenario: the model is in the script that did it."
     try:
-        return model(loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)), ""
+        return describe_model(
+            loads(source["scenario"].encode(), source.get("name", ""), f"{folder}", integrated=False)
+        ), ""
     except ScenarioError as error:
         return None, f"The scenario in the manifest cannot be read here: {error}"
 
 
-def _space(space: Mapping[str, Any], units: Mapping[str, str]) -> Table:
+def _space(space: Mapping[str, Any], units: Mapping[str, str]) -> ReportTable:
     """What varies, and how."""
     variables = space["variables"]
     keys = list(dict.fromkeys(key for one in variables.values() for key in one if key != "type"))
     rows = [
-        [path, one["type"], *(one.get(key) for key in keys), unit(units.get(path))] for path, one in variables.items()
+        [path, one["type"], *(one.get(key) for key in keys), table_unit(units.get(path))]
+        for path, one in variables.items()
     ]
     design = ", ".join(map(str, space["design"].values()))
-    return Table("What varies", ("parameter", "distribution", *keys, "unit"), rows, f"sampling: {design}")
+    return ReportTable("What varies", ("parameter", "distribution", *keys, "unit"), rows, f"sampling: {design}")
 
 
-def _failing(content: Mapping[str, Any], percent: str) -> str:
+def _failure_tables(content: Mapping[str, Any], percent: str) -> str:
     one = content["failures"].get("any")
     lost = content["diverged"]["count"]
     line = f"{content['samples']:,} runs; {lost:,} diverged, {content['refused']['count']:,} were refused."
@@ -105,21 +108,25 @@ def _failing(content: Mapping[str, Any], percent: str) -> str:
 
 def _figures(folder: pathlib.Path) -> list[Figure]:
     return [
-        figure for path in sorted((folder / FIGURES).glob("*")) if (figure := image(path, CAPTIONS.get(path.stem, "")))
+        figure
+        for path in sorted((folder / FIGURES).glob("*"))
+        if (figure := embed_image(path, CAPTIONS.get(path.stem, "")))
     ]
 
 
-def _tables(content: Mapping[str, Any], units: Mapping[str, str], percent: str) -> Iterator[Table]:
+def _tables(content: Mapping[str, Any], units: Mapping[str, str], percent: str) -> Iterator[ReportTable]:
     bounds = (f"low ({percent})", f"high ({percent})")
     failures = [[name, row["count"], *(row[key] for key in INTERVAL)] for name, row in content["failures"].items()]
-    yield Table("Failures", ("failure", "runs", "probability", *bounds), failures, f"intervals: {content['intervals']}")
+    yield ReportTable(
+        "Failures", ("failure", "runs", "probability", *bounds), failures, f"intervals: {content['intervals']}"
+    )
     rows = [
-        [name, unit(units.get(name)), kind, *(estimate[key] for key in INTERVAL)]
+        [name, table_unit(units.get(name)), kind, *(estimate[key] for key in INTERVAL)]
         for name, row in content["metrics"].items()
         for kind, estimate in (row or {}).items()
         if isinstance(estimate, dict)
     ]
-    yield Table("Statistics of the runs that did not diverge", ("metric", "unit", "", "value", *bounds), rows)
+    yield ReportTable("Statistics of the runs that did not diverge", ("metric", "unit", "", "value", *bounds), rows)
     moved = [
         [name, path, kind, *(estimate[key] for key in INTERVAL)]
         for name, row in content["sensitivity"].items()
@@ -128,24 +135,24 @@ def _tables(content: Mapping[str, Any], units: Mapping[str, str], percent: str) 
         if estimate["value"] is not None
     ]
     if moved:
-        yield Table("What moves what", ("metric", "parameter", "measure", "value", *bounds), moved)
+        yield ReportTable("What moves what", ("metric", "parameter", "measure", "value", *bounds), moved)
     worst = [
-        [name, unit(units.get(name)), row["value"], row["sample"]]
+        [name, table_unit(units.get(name)), row["value"], row["sample"]]
         for name, rows in content["worst"].items()
-        for row in rows[:WORST]
+        for row in rows[:MAX_WORST_RUNS]
     ]
-    yield Table("The greatest values", ("metric", "unit", "value", "sample"), worst)
+    yield ReportTable("The greatest values", ("metric", "unit", "value", "sample"), worst)
     if (accuracy := content.get("accuracy")) and accuracy.get("metrics"):
         rows = [[name, row["median"], row["largest"], row["sample"]] for name, row in accuracy["metrics"].items()]
         title = f"What a half step changes, relative, in {len(accuracy['samples'])} runs drawn from all"
-        yield Table(title, ("metric", "median", "largest", "in sample"), rows)
+        yield ReportTable(title, ("metric", "median", "largest", "in sample"), rows)
 
 
 def _notes(content: Mapping[str, Any]) -> Iterator[str]:
     for reason, count in (content["refused"].get("reasons") or {}).items():
         yield f"{count} samples were refused, and are in no number here: {reason}"
     if content["diverged"]["count"]:
-        yield f"Diverged samples: {listed(content['diverged']['samples'][:20])}."
+        yield f"Diverged samples: {join_words(content['diverged']['samples'][:20])}."
 
 
 def _sample(content: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
@@ -153,7 +160,7 @@ def _sample(content: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
     return [] if worst is None else [f"diffabs simulate --from-sweep {folder} --sample {worst}"]
 
 
-def rare(document: Document) -> Section:
+def rare_section(document: Document) -> Section:
     """Return the section of a small probability."""
     content = document.content
     low, high = content["interval"]
@@ -173,17 +180,19 @@ def rare(document: Document) -> Section:
         title=f"A rare failure of {content['scenario']}",
         question=f"How probable is {failure}, while what [sweep.over] names varies?",
         answer=[f"{content['probability']:.3g}, 95 % interval {low:.3g} to {high:.3g}."],
-        verdicts=[Verdict("ended", content["reason"])],
+        verdicts=[ReportVerdict("ended", content["reason"])],
         model=model_tables(content.get("model")),
-        model_note="" if content.get("model") else UNKNOWN,
+        model_note="" if content.get("model") else UNKNOWN_ORIGIN,
         tables=[
-            Table("Estimates", ("by", "probability", "low (95 %)", "high (95 %)", "coefficient of variation"),
+            ReportTable("Estimates", ("by", "probability", "low (95 %)", "high (95 %)", "coefficient of variation"),
                   estimates),
-            Table("Levels", ("level", f"at least [{content['unit']}]", "share", "coefficient of variation",
+            ReportTable("Levels", ("level", f"at least [{content['unit']}]", "share", "coefficient of variation",
                              "accepted", "diverged"), levels),
-            Table("The likeliest failures", ("parameter", *map(str, range(1, most + 1))), failing, "in SI"),
+            ReportTable("The likeliest failures", ("parameter", *map(str, range(1, most + 1))), failing, "in SI"),
         ],
         notes=[content["note"]] if content["note"] else [],
-        provenance=origin(content, seed=content["seed"], runs=content["runs"], engine=said(content["engine"])),
-        again=command(content),
+        provenance=describe_origin(
+            content, seed=content["seed"], runs=content["runs"], engine=format_pairs(content["engine"])
+        ),
+        again=original_command(content),
     )  # fmt: skip

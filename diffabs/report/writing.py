@@ -9,22 +9,22 @@ from collections.abc import Callable, Sequence
 from diffabs import __version__
 from diffabs.report import experiments, findings, proofs, studies
 from diffabs.report.documents import Document, ReportError
-from diffabs.report.page import Section, numbers
+from diffabs.report.page import Section, shown_numbers
 
 MARK = b'<meta name="generator" content="diffabs report'  # what a report begins with
-BEGINNING = 1024  # bytes in which it is
-SECTIONS: dict[str, Callable[[Document], Section]] = {
-    "reproduce": experiments.paper,
-    "sweep": studies.sweep,
-    "rare": studies.rare,
-    "tune": findings.tune,
-    "identify": findings.identify,
-    "design": proofs.design,
-    "certificate": proofs.certificate,
+MARK_WITHIN_BYTES = 1024  # bytes in which it is
+SECTION_BY_KIND: dict[str, Callable[[Document], Section]] = {
+    "reproduce": experiments.paper_section,
+    "sweep": studies.sweep_section,
+    "rare": studies.rare_section,
+    "tune": findings.tuning_section,
+    "identify": findings.identification_section,
+    "design": proofs.design_section,
+    "certificate": proofs.certificate_section,
 }
 
 
-def report(found: Sequence[Document], title: str = "") -> str:
+def build_report(found: Sequence[Document], title: str = "") -> str:
     """Return a report of these documents as HTML, a section each.
 
     title: of the whole; by default that of the only section
@@ -38,15 +38,19 @@ def report(found: Sequence[Document], title: str = "") -> str:
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters["numbers"] = numbers
+    environment.filters["numbers"] = shown_numbers
     whole = title or (sections[0].title if len(sections) == 1 else f"{len(sections)} results")
     looked = any(figure.axes for section in sections for figure in section.figures)
     return environment.from_string(text).render(
-        title=whole, sections=sections, version=__version__, script=script if looked else "", checksum=checksum(script)
+        title=whole,
+        sections=sections,
+        version=__version__,
+        script=script if looked else "",
+        checksum=script_checksum(script),
     )
 
 
-def checksum(script: str) -> str:
+def script_checksum(script: str) -> str:
     """Return how a content security policy names a script."""
     return f"sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}"
 
@@ -57,13 +61,13 @@ def _content(name: str) -> str:
 
 def _section(document: Document) -> Section:
     try:
-        return SECTIONS[document.kind](document)
+        return SECTION_BY_KIND[document.kind](document)
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OSError) as error:
         said = " ".join(f"{type(error).__name__} {error}".split())
         raise ReportError(f"{document.path}: is no whole document of {document.kind}: {said}") from None
 
 
-def ours(path: pathlib.Path) -> bool:
+def is_report(path: pathlib.Path) -> bool:
     """Return whether a file is a report of this package, which another may replace."""
     with path.open("rb") as file:
-        return MARK in file.read(BEGINNING)
+        return MARK in file.read(MARK_WITHIN_BYTES)

@@ -19,7 +19,7 @@ from diffabs.core.protocols import Road
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree
 from diffabs.roads.burckhardt import DRY_ASPHALT
 
-FIRST, LAST = 2, 1  # intervals before 0 and beyond the last factor, from where on the spline is constant
+FIRST_NODE, LAST = 2, 1  # intervals before 0 and beyond the last factor, from where on the spline is constant
 
 
 @pytree
@@ -43,12 +43,12 @@ class ScaledAlong:
     def factor(self, distance: Scalar) -> Any:
         """f [1] at a distance [m]."""
         c = jnp.asarray(self.factors)
-        ends = jnp.ones(FIRST + LAST)
+        ends = jnp.ones(FIRST_NODE + LAST)
         padded = jnp.concatenate([c[0] * ends, c, c[-1] * ends])
-        place = clamp(distance / self.spacing, -1.0 * FIRST, 1.0 * (c.size - 1 + FIRST))
+        place = clamp(distance / self.spacing, -1.0 * FIRST_NODE, 1.0 * (c.size - 1 + FIRST_NODE))
         whole = jax.lax.stop_gradient(jnp.floor(place))
         t = place - whole
-        near = jax.lax.dynamic_slice_in_dim(padded, whole.astype(int) + FIRST, 4)
+        near = jax.lax.dynamic_slice_in_dim(padded, whole.astype(int) + FIRST_NODE, 4)
         a, b = 1 - t, t * t * t
         weights = (a * a * a, 4 + 3 * t * t * (t - 2), 4 + 3 * a * a * (a - 2), b)
         return sum(w * near[i] for i, w in enumerate(weights)) / 6

@@ -9,7 +9,7 @@ import numpy as np
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Road
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree
-from diffabs.core.rules import Rule, increasing
+from diffabs.core.rules import Rule, increase_rule
 from diffabs.roads.burckhardt import DRY_ASPHALT, SNOW
 
 
@@ -68,4 +68,4 @@ class Patches:
 
     def rules(self) -> Iterator[Rule]:
         """Edges that increase."""
-        yield increasing("edges", self.edges, "is not increasing", "m")
+        yield increase_rule("edges", self.edges, "is not increasing", "m")

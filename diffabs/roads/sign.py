@@ -8,7 +8,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.tree_util import Partial
 
-from diffabs.core.compiling import QUICK, compile_once
+from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
 from diffabs.core.rules import Rule
 
 SLIPS = np.linspace(0.05, 1.0, 20)  # below them a fitted polynomial may dip under 0 by a millionth, as the rig's does
@@ -42,7 +42,7 @@ def _at_slips(friction: Partial) -> Any:
     return mu if isinstance(mu, Tracer) else np.asarray(mu)
 
 
-@compile_once(options=QUICK)
+@compile_once(options=QUICK_COMPILE_OPTIONS)
 def _along(friction: Partial, slips: Any) -> Any:
     """Return the friction at these slips. Compiled as one: each operation by itself costs as much as all of them."""
     return jax.vmap(friction)(slips)

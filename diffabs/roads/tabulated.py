@@ -14,7 +14,7 @@ import numpy as np
 
 from diffabs.core.numerics import odd, ratio, searchsorted
 from diffabs.core.pytree import Scalar, Vector, param, pytree
-from diffabs.core.rules import Rule, array, increasing
+from diffabs.core.rules import Rule, as_rule_array, increase_rule
 
 KNOTS = (  # of the identified spline: slip and friction
     (0, 0.02108, 0.04215, 0.06323, 0.08431, 0.09696, 0.10539, 0.12039, 0.14539,
@@ -65,8 +65,8 @@ class Tabulated:
 
     def rules(self) -> Iterator[Rule]:
         """Knots that increase from (0, 0) to slip 1."""
-        x, y = array(self.slip), array(self.mu)
-        yield increasing("slip", self.slip, "is not increasing", "1")
+        x, y = as_rule_array(self.slip), as_rule_array(self.mu)
+        yield increase_rule("slip", self.slip, "is not increasing", "1")
         yield Rule(
             (x[0] == 0) & (y[0] == 0) & (x[-1] == 1),
             "the knots do not run from (0, 0) to slip 1",

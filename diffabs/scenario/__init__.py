@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from diffabs.core.exports import lazily
+from diffabs.core.exports import lazy_getattr
 
 if TYPE_CHECKING:
     from diffabs.scenario.scenario import Scenario as Scenario
@@ -12,4 +12,4 @@ if TYPE_CHECKING:
     from diffabs.scenario.scenario import loads as loads
     from diffabs.scenario.scenario import names as names
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazy_getattr(__name__)

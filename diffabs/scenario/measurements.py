@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from diffabs.core import files
-from diffabs.core.values import ScenarioError, shown, unknown
+from diffabs.core.values import ScenarioError, format_given, unknown_name_error
 
-LARGEST = 100_000_000  # bytes
-TIME = "t [s]"
+MAX_FILE_BYTES = 100_000_000  # bytes
+TIME_COLUMN = "t [s]"
 IGNORED = ("target [", "command [", "control [")  # what is simulated but not measured
 
 
@@ -23,15 +23,15 @@ class Readings(NamedTuple):
     columns: dict[str, np.ndarray]
 
 
-def read(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
+def read_measurements(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
     """The readings in a file, of signals with these units by name. Raises ScenarioError, one line, with the line of the
     file, for whatever is wrong."""
     try:
-        raw = files.content(path, LARGEST + 1)
+        raw = files.read_content(path, MAX_FILE_BYTES + 1)
     except OSError as error:
         raise ScenarioError(f"--data {path}: cannot be read, {error.strerror}") from None
-    if len(raw) > LARGEST:
-        raise ScenarioError(f"--data {path}: is larger than {LARGEST} bytes")
+    if len(raw) > MAX_FILE_BYTES:
+        raise ScenarioError(f"--data {path}: is larger than {MAX_FILE_BYTES} bytes")
     try:
         rows = list(csv.reader(raw.decode("utf-8-sig").splitlines()))
     except (UnicodeDecodeError, csv.Error):
@@ -42,7 +42,7 @@ def read(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
     if not len(numbers):
         raise ScenarioError(f"--data {path}: has a header and no numbers")
     lines = [i for i, row in enumerate(rows[1:], 2) if row]
-    t = numbers[:, header.index(TIME)]
+    t = numbers[:, header.index(TIME_COLUMN)]
     late = np.flatnonzero(np.diff(t) <= 0)
     if t[0] < 0 or len(late):
         line, before = (lines[late[0] + 1], t[late[0]]) if len(late) else (lines[0], 0.0)
@@ -54,15 +54,17 @@ def read(path: pathlib.Path, units: Mapping[str, str]) -> Readings:
 def _names(header: Sequence[str], path: pathlib.Path, units: Mapping[str, str]) -> dict[int, str]:
     """The columns that are compared, by their numbers."""
     headers = {f"{name} [{unit}]": name for name, unit in units.items()}
-    there = ", ".join((TIME, *headers))
-    if TIME not in header:
-        what = f"line 1 is no header with {TIME}" if header else "is empty"
+    there = ", ".join((TIME_COLUMN, *headers))
+    if TIME_COLUMN not in header:
+        what = f"line 1 is no header with {TIME_COLUMN}" if header else "is empty"
         raise ScenarioError(f"--data {path}: {what}; there is {there}")
     for name in header:
         if header.count(name) > 1:
-            raise ScenarioError(f"--data {path}: column {shown(name)} is there twice")
-        if name != TIME and name not in headers and not name.startswith(IGNORED):
-            raise unknown(f"--data {path}: column {shown(name)} is unknown", name, (TIME, *headers))
+            raise ScenarioError(f"--data {path}: column {format_given(name)} is there twice")
+        if name != TIME_COLUMN and name not in headers and not name.startswith(IGNORED):
+            raise unknown_name_error(
+                f"--data {path}: column {format_given(name)} is unknown", name, (TIME_COLUMN, *headers)
+            )
     names = {i: headers[name] for i, name in enumerate(header) if name in headers}
     if not names:
         raise ScenarioError(f"--data {path}: no column was measured; there is {', '.join(headers)}")
@@ -78,7 +80,7 @@ def _numbers(row: Sequence[str], line: int, header: Sequence[str], path: pathlib
             found.append(float(cell))
         except ValueError:
             raise ScenarioError(
-                f"--data {path}, line {line}: {name} = {shown(cell)} is text; a number is needed"
+                f"--data {path}, line {line}: {name} = {format_given(cell)} is text; a number is needed"
             ) from None
         if not math.isfinite(found[-1]):
             raise ScenarioError(f"--data {path}, line {line}: {name} = {cell.strip()} is outside (-inf, inf)")

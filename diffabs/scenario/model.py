@@ -12,28 +12,28 @@ from diffabs.scenario.scenario import Scenario
 from diffabs.simulate.solution import describe_solver
 
 
-def model(chosen: Scenario) -> dict[str, Any]:
+def describe_model(chosen: Scenario) -> dict[str, Any]:
     """Return title and description, the parts by path, every parameter with its unit, how it is integrated, and the
     units of the metrics by name."""
     return {
         "title": chosen.title,
         "description": chosen.description,
-        "parts": parts(chosen),
-        "parameters": numbers(chosen),
+        "parts": describe_parts(chosen),
+        "parameters": describe_numbers(chosen),
         "solver": {**describe_solver(chosen.solver), "seed": chosen.seed},
         "metrics": {name: registry.unit_of(one, chosen.loop.plant) for name, one in chosen.objectives.items()},
     }
 
 
-def parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
+def describe_parts(chosen: Scenario) -> dict[str, dict[str, Any]]:
     """Return every part by its path: its type, and what it has beside parameters."""
-    found = dict(registry.choices(chosen.loop))
+    found = dict(registry.part_choices(chosen.loop))
     for name, one in chosen.objectives.items():
-        found |= registry.choices(one, f"objective.{name}")
+        found |= registry.part_choices(one, f"objective.{name}")
     return found
 
 
-def numbers(chosen: Scenario) -> dict[str, dict[str, Any]]:
+def describe_numbers(chosen: Scenario) -> dict[str, dict[str, Any]]:
     """Return value and unit of every number by its path, in SI; what JSON has no number for is a text that an override
     understands."""
 

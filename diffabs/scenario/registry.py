@@ -19,15 +19,26 @@ from diffabs import actuators, controllers, objectives, plants, references, road
 from diffabs.core import blocks, protocols
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import Spec
-from diffabs.core.units import Units, in_loop, units_of
-from diffabs.core.values import FORMER, ScenarioError, dotted, inside, kebab, number, shown, unknown, whole, wrong
+from diffabs.core.units import Units, resolve_unit, units_of
+from diffabs.core.values import (
+    FORMER_FIELDS,
+    ScenarioError,
+    dotted_path,
+    format_given,
+    kebab_case,
+    read_number,
+    read_number_in_range,
+    read_whole,
+    unknown_name_error,
+    wrong_kind_error,
+)
 from diffabs.scenario import outside
 from diffabs.scenario.defaults import braking
 
 KMH = 3.6  # km/h in a m/s
-DEEPEST = 16  # parts inside parts; more is a mistake, and Python's stack is finite
-LARGEST = 10_000_000  # of a whole number that shapes arrays
-USUAL = units_of(braking().plant)  # in which parts are listed that are in no loop
+MAX_DEPTH = 16  # parts inside parts; more is a mistake, and Python's stack is finite
+MAX_FILE_BYTES = 10_000_000  # of a whole number that shapes arrays
+DEFAULT_UNITS = units_of(braking().plant)  # in which parts are listed that are in no loop
 
 
 def _methods(cls: type) -> frozenset[str]:
@@ -50,40 +61,40 @@ FAMILIES: dict[str, tuple[tuple[ModuleType, ...], frozenset[str]]] = {
 }
 
 
-def types(family: str) -> Mapping[str, Any]:
+def family_types(family: str) -> Mapping[str, Any]:
     """The parts of a family by name, with their defaults: one of each class, and the named constants; also those from
     outside. Raises ScenarioError for a module of those that does not import, or that takes a name twice."""
     try:
-        modules = outside.modules()
+        modules = outside.registered_modules()
     except ValueError as error:
         raise ScenarioError(str(error)) from None
-    return {**_packaged(family), **_added(family, modules)}
+    return {**_packaged_parts(family), **_outside_parts(family, modules)}
 
 
-def know(names: Iterable[str]) -> None:
+def register_parts(names: Iterable[str]) -> None:
     """Find the parts of these modules, too, from now on. Raises ScenarioError for a module that does not import, has no
     parts, or takes a name twice."""
     try:
-        outside.know(names)
+        outside.register_modules(names)
     except ValueError as error:
         raise ScenarioError(str(error)) from None
-    there = {id(item) for family in FAMILIES for item in types(family).values()}
-    for module in outside.modules():
+    there = {id(item) for family in FAMILIES for item in family_types(family).values()}
+    for module in outside.registered_modules():
         if module.__name__ in names and not there & {id(part) for part in _parts_of(module).values()}:
             raise ScenarioError(f"--parts {module.__name__}: there is no part in this module")
 
 
 @cache
-def _added(family: str, modules: tuple[ModuleType, ...]) -> Mapping[str, Any]:
+def _outside_parts(family: str, modules: tuple[ModuleType, ...]) -> Mapping[str, Any]:
     """Parts from outside by name. Raises ScenarioError."""
     found: dict[str, Any] = {}
     for module in modules:
         for exported, part in _parts_of(module).items():
-            name = kebab(exported)
+            name = kebab_case(exported)
             if family not in _families_of(type(part)):
                 continue
-            if name in _packaged(family) or name in found:
-                whose = "diffabs" if name in _packaged(family) else "another module"
+            if name in _packaged_parts(family) or name in found:
+                whose = "diffabs" if name in _packaged_parts(family) else "another module"
                 raise ScenarioError(f"parts of {module.__name__}: there is a {family} {name} already, of {whose}")
             found[name] = part
     return found
@@ -93,7 +104,7 @@ def _added(family: str, modules: tuple[ModuleType, ...]) -> Mapping[str, Any]:
 def _parts_of(module: ModuleType) -> Mapping[str, Any]:
     """An instance of every part that a module exports. Raises ScenarioError for a field without default."""
     try:
-        return {name: item() if isinstance(item, type) else item for name, item in outside.exports(module)}
+        return {name: item() if isinstance(item, type) else item for name, item in outside.exported_parts(module)}
     except TypeError as error:
         raise ScenarioError(f"parts of {module.__name__}: {error}: every field needs a default") from None
 
@@ -109,21 +120,21 @@ def _families_of(cls: type) -> set[str]:
 
 
 @cache
-def _packaged(family: str) -> Mapping[str, Any]:
+def _packaged_parts(family: str) -> Mapping[str, Any]:
     """The parts of diffabs itself."""
     modules, contract = FAMILIES[family]
     found = {}
     for exported, item in ((n, x) for module in modules for n, x in vars(module).items()):
         cls = item if isinstance(item, type) else type(item)
         if dataclasses.is_dataclass(cls) and (contract <= _methods(cls) if contract else not _methods(cls)):
-            found[kebab(exported)] = item() if isinstance(item, type) else item
+            found[kebab_case(exported)] = item() if isinstance(item, type) else item
     return found
 
 
 def name_of(family: str, part: Any) -> str:
     """The name of a named constant, else that of the part's class."""
-    named = (name for name, item in types(family).items() if item is part)
-    return next(named, kebab(type(part).__name__))
+    named = (name for name, item in family_types(family).items() if item is part)
+    return next(named, kebab_case(type(part).__name__))
 
 
 def family_of(field: str, enclosing: str) -> str:
@@ -138,71 +149,71 @@ def type_name(given: Any) -> Any:
 
 def inner_fields(family: str, name: str) -> list[str]:
     """The fields of a part that hold one part of its own family: the controller that `sampled` runs."""
-    part = types(family)[name]
+    part = family_types(family)[name]
     own = [field.name for field in dataclasses.fields(part) if "part" in field.metadata]
     return [field for field in own if family_of(field, "") == family and not isinstance(getattr(part, field), tuple)]
 
 
-def summary(part: Any) -> str:
+def part_summary(part: Any) -> str:
     """The first paragraph of a part's docstring, on one line."""
     return " ".join((inspect.getdoc(type(part)) or "").split("\n\n")[0].split())
 
 
 def unit_of(objective: Any, plant: Any = None) -> str:
     """The unit of what an objective measures on a plant, without one on the usual; empty where it does not say."""
-    return in_loop(getattr(objective, "unit", ""), units_of(plant) or USUAL)
+    return resolve_unit(getattr(objective, "unit", ""), units_of(plant) or DEFAULT_UNITS)
 
 
-def build(family: str, given: Any, default: Any, path: str, units: Units | None = None) -> Any:
+def build_part(family: str, given: Any, default: Any, path: str, units: Units | None = None) -> Any:
     """The part that a table, or the bare name of a type, describes.
 
     A table without `type` describes `default` with some fields changed; default None means that a type is needed.
     `units` are those of the loop, for messages.
     Raises ScenarioError; ranges are left to `diffabs.check`.
     """
-    there = types(family)
+    there = family_types(family)
     table = {"type": given} if isinstance(given, str) else given
     if not isinstance(table, dict):
-        raise wrong(path, given, f"a table, or the name of a type ({', '.join(there)}),")
+        raise wrong_kind_error(path, given, f"a table, or the name of a type ({', '.join(there)}),")
     name = table.get("type")
     if name is None and default is None:
-        raise unknown(f"{path}.type is missing", path.rpartition(".")[2].replace("_", "-"), there)
+        raise unknown_name_error(f"{path}.type is missing", path.rpartition(".")[2].replace("_", "-"), there)
     if name is not None and not isinstance(name, str):
-        raise wrong(f"{path}.type", name, f"one of {', '.join(there)}")
+        raise wrong_kind_error(f"{path}.type", name, f"one of {', '.join(there)}")
     if name is not None and name not in there:
-        raise unknown(f"{path}.type = {shown(name)} is unknown", name, there)
+        raise unknown_name_error(f"{path}.type = {format_given(name)} is unknown", name, there)
     template = default if name is None else there[name]
-    return filled(template, {k: v for k, v in table.items() if k != "type"}, family, path, units)
+    return fill_part(template, {k: v for k, v in table.items() if k != "type"}, family, path, units)
 
 
-def filled(template: Any, table: dict[str, Any], family: str, path: str, units: Units | None = None) -> Any:
+def fill_part(template: Any, table: dict[str, Any], family: str, path: str, units: Units | None = None) -> Any:
     """A copy of a part with the fields of a table. Raises ScenarioError for an unknown field or a wrong type."""
-    if path.count(".") > DEEPEST:
-        raise ScenarioError(f"{shown(path)}: parts are nested more than {DEEPEST} deep")
+    if path.count(".") > MAX_DEPTH:
+        raise ScenarioError(f"{format_given(path)}: parts are nested more than {MAX_DEPTH} deep")
     fields = {field.name: field for field in dataclasses.fields(template)}
     edge = {f"{n}_kmh": f for n, f in fields.items() if "spec" in f.metadata and f.metadata["spec"].unit == "m/s"}
     values = {}
     for key, given in table.items():
-        where = joined(path, key)
-        if family == "controller" and key not in fields and FORMER.get(key) in fields:
-            key = FORMER[key]
+        where = join_path(path, key)
+        if family == "controller" and key not in fields and FORMER_FIELDS.get(key) in fields:
+            key = FORMER_FIELDS[key]
         if key not in fields and key not in edge:
             whose = f"a field of {name_of(family, template)}" if path else "a section"
-            if path and (inner := _inside(template, key)):
+            if path and (inner := _find_inner_field(template, key)):
                 raise ScenarioError(f"{where} is not {whose}; did you mean {path}.{inner}?")
-            raise unknown(f"{where} is not {whose}", key, fields if path else (*fields, *OTHERS))
+            raise unknown_name_error(f"{where} is not {whose}", key, fields if path else (*fields, *OTHER_SECTIONS))
         field = fields[key] if key in fields else edge[key]
         if field.name in values:
             how = "in m/s and in km/h" if field.metadata["spec"].unit == "m/s" else "by its former name, too"
-            raise ScenarioError(f"{joined(path, field.name)} is given twice, {how}")
+            raise ScenarioError(f"{join_path(path, field.name)} is given twice, {how}")
         if key in edge:
-            values[field.name] = inside(given, in_kmh(field.metadata["spec"]), where) / KMH
+            values[field.name] = read_number_in_range(given, in_kmh(field.metadata["spec"]), where) / KMH
         else:
             values[field.name] = _value(given, field, getattr(template, key), (family, where), units)
     return dataclasses.replace(template, **values) if values else template
 
 
-def _inside(part: Any, key: str) -> str:
+def _find_inner_field(part: Any, key: str) -> str:
     """Return the path of a field of this name in a part inside this one; empty without one."""
     pending = [("", part)]
     while pending:
@@ -216,28 +227,28 @@ def _inside(part: Any, key: str) -> str:
     return ""
 
 
-def loop_of(sections: dict[str, Any]) -> Loop:
+def build_loop(sections: dict[str, Any]) -> Loop:
     """The loop of the sections of a scenario; what is left out is as the plant says that it usually is, or is missing.
     Raises ScenarioError."""
-    plant = filled(braking(), {"plant": sections["plant"]}, "", "").plant if "plant" in sections else braking().plant
+    plant = fill_part(braking(), {"plant": sections["plant"]}, "", "").plant if "plant" in sections else braking().plant
     own, units = getattr(plant, "usual_parts", dict), units_of(plant)
     parts = {"plant": plant, **own()}
     needed = [f.name for f in dataclasses.fields(Loop) if dataclasses.MISSING is f.default is f.default_factory]
     for family in (name for name in needed if name not in parts):
         if family not in sections:
-            there = f"there is {', '.join(types(family))}"
+            there = f"there is {', '.join(family_types(family))}"
             raise ScenarioError(f"{family} is missing: plant {name_of('plant', plant)} has no usual one; {there}")
-        parts[family] = build(family, sections[family], None, family, units)
-    return filled(Loop(**parts), sections, "", "", units)
+        parts[family] = build_part(family, sections[family], None, family, units)
+    return fill_part(Loop(**parts), sections, "", "", units)
 
 
 # What a scenario has besides the fields of a loop.
-OTHERS = ("road", "solver", "objective", "design", "tune", "sweep", "title", "description")
+OTHER_SECTIONS = ("road", "solver", "objective", "design", "tune", "sweep", "title", "description")
 
 
-def joined(path: str, key: str) -> str:
+def join_path(path: str, key: str) -> str:
     """A dotted path; the road of the plant has a section of its own."""
-    return "road" if (path, key) == ("plant", "road") else dotted(path, key)
+    return "road" if (path, key) == ("plant", "road") else dotted_path(path, key)
 
 
 def _value(given: Any, field: dataclasses.Field[Any], default: Any, place: tuple[str, str], units: Units | None) -> Any:
@@ -246,34 +257,34 @@ def _value(given: Any, field: dataclasses.Field[Any], default: Any, place: tuple
         inner = family_of(field.name, family)
         if isinstance(default, tuple):
             return _parts(inner, given, default, path, units)
-        return build(inner, given, default, path, units)
+        return build_part(inner, given, default, path, units)
     if "static" in field.metadata:
         if isinstance(default, int) and not isinstance(default, bool):
-            return whole(given, 1, LARGEST, path)
+            return read_whole(given, 1, MAX_FILE_BYTES, path)
         if type(given) is not type(default):
-            raise wrong(path, given, f"a value like {shown(default)}")
+            raise wrong_kind_error(path, given, f"a value like {format_given(default)}")
         return given
     spec: Spec = field.metadata["spec"].around(units)
     if np.ndim(default) == 0:
-        return number(given, spec, path)
+        return read_number(given, spec, path)
     if not isinstance(given, list):
-        raise wrong(path, given, f"a list of numbers in {spec.interval()}")
-    return np.array([number(item, spec, f"{path}.{i}") for i, item in enumerate(given)], float)
+        raise wrong_kind_error(path, given, f"a list of numbers in {spec.interval()}")
+    return np.array([read_number(item, spec, f"{path}.{i}") for i, item in enumerate(given)], float)
 
 
 def _parts(family: str, given: Any, default: tuple[Any, ...], path: str, units: Units | None) -> tuple[Any, ...]:
     """A list of parts; or a table by number, which changes some of the default ones, or adds the next."""
     if isinstance(given, list) and given:
-        return tuple(build(family, item, None, f"{path}.{i}", units) for i, item in enumerate(given))
+        return tuple(build_part(family, item, None, f"{path}.{i}", units) for i, item in enumerate(given))
     if not isinstance(given, dict):
-        raise wrong(path, given, "a list of parts")
+        raise wrong_kind_error(path, given, "a list of parts")
     parts = list(default)
     for key, item in given.items():
         if key not in map(str, range(len(parts) + 1)):
-            raise unknown(f"{joined(path, key)} is not there", key, map(str, range(len(parts))))
+            raise unknown_name_error(f"{join_path(path, key)} is not there", key, map(str, range(len(parts))))
         place = int(key)
         old = parts[place] if place < len(parts) else None
-        parts[place : place + 1] = [build(family, item, old, f"{path}.{key}", units)]
+        parts[place : place + 1] = [build_part(family, item, old, f"{path}.{key}", units)]
     return tuple(parts)
 
 
@@ -282,18 +293,24 @@ def in_kmh(spec: Spec) -> Spec:
     return dataclasses.replace(spec, unit="km/h", low=spec.low * KMH, high=spec.high * KMH)
 
 
-def described(family: str, part: Any) -> dict[str, dict[str, Any]]:
+def describe_part(family: str, part: Any) -> dict[str, dict[str, Any]]:
     """A part's fields: default, unit and range of each, as plain values. A default that is a part is its name."""
     rows = {}
     for field in dataclasses.fields(part):
         value, spec = getattr(part, field.name), field.metadata.get("spec")
-        spec = spec and spec.around(USUAL)
+        spec = spec and spec.around(DEFAULT_UNITS)
         if "part" in field.metadata:
             inner = family_of(field.name, family)
             names = [name_of(inner, item) for item in value] if isinstance(value, tuple) else name_of(inner, value)
             rows[field.name] = {"default": names, "unit": "", "range": f"any {inner}", "low": None, "high": None}
         elif spec is None:
-            rows[field.name] = {"default": value, "unit": "", "range": f"[1, {LARGEST}]", "low": 1, "high": LARGEST}
+            rows[field.name] = {
+                "default": value,
+                "unit": "",
+                "range": f"[1, {MAX_FILE_BYTES}]",
+                "low": 1,
+                "high": MAX_FILE_BYTES,
+            }
         else:
             ends = {"low": spec.low, "high": spec.high}
             ends = {name: end if math.isfinite(end) else None for name, end in ends.items()}
@@ -302,16 +319,16 @@ def described(family: str, part: Any) -> dict[str, dict[str, Any]]:
     return rows
 
 
-def choices(part: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+def part_choices(part: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
     """Every part below this one by its path: its type, and its fields that are no parameters."""
     if isinstance(part, tuple):
         for i, item in enumerate(part):
-            yield from choices(item, f"{path}.{i}")
+            yield from part_choices(item, f"{path}.{i}")
         return
     fields = dataclasses.fields(part)
     if path:
         fixed = {field.name: getattr(part, field.name) for field in fields if "static" in field.metadata}
-        yield path, {"type": kebab(type(part).__name__), **fixed}
+        yield path, {"type": kebab_case(type(part).__name__), **fixed}
     for field in fields:
         if "part" in field.metadata:
-            yield from choices(getattr(part, field.name), f"{path}.{field.name}" if path else field.name)
+            yield from part_choices(getattr(part, field.name), f"{path}.{field.name}" if path else field.name)

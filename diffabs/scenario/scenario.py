@@ -26,20 +26,38 @@ from diffabs.core import files
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.units import units_of
-from diffabs.core.validity import cautions, problems
-from diffabs.core.values import FORMER, plain, printable, printed_line, printed_lines, shown, unknown, wrong
+from diffabs.core.validity import find_cautions, find_problems
+from diffabs.core.values import (
+    FORMER_FIELDS,
+    as_plain,
+    format_given,
+    make_printable,
+    read_printable_line,
+    read_printable_lines,
+    unknown_name_error,
+    wrong_kind_error,
+)
 from diffabs.core.values import ScenarioError as ScenarioError
-from diffabs.objectives import BRAKING, usual
+from diffabs.objectives import BRAKING, default_objectives
 from diffabs.scenario import parameter_paths, section_design, section_solver, section_sweep, section_tune, toml
-from diffabs.scenario.compatibility import misfits
+from diffabs.scenario.compatibility import find_misfits
 from diffabs.scenario.defaults import braking
-from diffabs.scenario.registry import FAMILIES, OTHERS, build, inner_fields, joined, loop_of, type_name, types
+from diffabs.scenario.registry import (
+    FAMILIES,
+    OTHER_SECTIONS,
+    build_loop,
+    build_part,
+    family_types,
+    inner_fields,
+    join_path,
+    type_name,
+)
 from diffabs.simulate.admissible import find_mismatches, find_unstable_step
 from diffabs.simulate.solution import Adaptive, Solver
 
-LARGEST_FILE = 1_000_000  # bytes
-LONGEST_PATH = 4096  # characters of it in a message
-TEXTS = {"title": printed_line, "description": printed_lines}
+MAX_SCENARIO_BYTES = 1_000_000  # bytes
+MAX_PATH_LENGTH = 4096  # characters of it in a message
+TEXTS = {"title": read_printable_line, "description": read_printable_lines}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,9 +72,9 @@ class Scenario:
     solver: Solver = dataclasses.field(default_factory=Adaptive)
     objectives: Mapping[str, Objective] = dataclasses.field(default_factory=lambda: dict(BRAKING))
     seed: int = 0
-    design: section_design.Task = dataclasses.field(default_factory=section_design.Task)
+    design: section_design.DesignTask = dataclasses.field(default_factory=section_design.DesignTask)
     tune: section_tune.Goal = dataclasses.field(default_factory=section_tune.Goal)
-    sweep: section_sweep.Variation = dataclasses.field(default_factory=section_sweep.Variation)
+    sweep: section_sweep.SweepSection = dataclasses.field(default_factory=section_sweep.SweepSection)
 
     def key(self) -> jax.Array:
         """The random key of a run, `jax.random.key(seed)`."""
@@ -71,7 +89,7 @@ class Scenario:
 
     def cautions(self) -> list[str]:
         """What is allowed but hardly meant, a line each."""
-        return list(cautions(self.loop))
+        return list(find_cautions(self.loop))
 
 
 def names() -> list[str]:
@@ -80,9 +98,9 @@ def names() -> list[str]:
     return sorted(file.name.removesuffix(".toml") for file in folder.iterdir() if file.name.endswith(".toml"))
 
 
-def header(name_or_path: str | pathlib.Path) -> dict[str, str]:
+def read_header(name_or_path: str | pathlib.Path) -> dict[str, str]:
     """Title and description of a scenario, without building it. Raises ScenarioError."""
-    table = _parsed(_read(name_or_path)[1], str(name_or_path))
+    table = _parse(_read(name_or_path)[1], str(name_or_path))
     return {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
 
 
@@ -119,23 +137,23 @@ def loads(
     overrides, integrated: as in `load`
 
     Raises ScenarioError, as `load`."""
-    table = _parsed(raw, origin)
+    table = _parse(raw, origin)
     before = {family: type_name(table.get(family)) for family in FAMILIES}
     for override in overrides:
         _override(table, override)
     _refuse(_without_inner(before, table))
     if overrides:
-        table |= _titled(name, overrides)
-    scenario = _assembled(name, table, folder)
+        table |= _retitle(name, overrides)
+    scenario = _assemble(name, table, folder)
     asked = (scenario.loop, scenario.solver)
     _refuse(find_mismatches(*asked), find_unstable_step(*asked) if integrated else ())
     return scenario
 
 
-def _titled(name: str, overrides: Sequence[str]) -> dict[str, Any]:
+def _retitle(name: str, overrides: Sequence[str]) -> dict[str, Any]:
     """Title and description of what is no longer what the file says, but for what the overrides say themselves."""
     said = {override.partition("=")[0].strip() for override in overrides}
-    new = {"title": printable(f"{name} with {', '.join(overrides)}"), "description": ""}
+    new = {"title": make_printable(f"{name} with {', '.join(overrides)}"), "description": ""}
     return {key: text for key, text in new.items() if key not in said}
 
 
@@ -144,7 +162,7 @@ def _without_inner(before: Mapping[str, Any], table: Mapping[str, Any]) -> Itera
     scenario's own part would silently become the default one."""
     for family, old in before.items():
         name, given = type_name(table.get(family)), table.get(family)
-        if name in (None, old) or name not in types(family):
+        if name in (None, old) or name not in family_types(family):
             continue
         for field in inner_fields(family, name):
             inner = given.get(field) if isinstance(given, dict) else None
@@ -161,28 +179,28 @@ def _refuse(*objections: Iterable[str]) -> None:
 
 
 def _read(name_or_path: str | pathlib.Path) -> tuple[str, bytes]:
-    path, quoted = pathlib.Path(name_or_path), shown(str(name_or_path), LONGEST_PATH)
+    path, quoted = pathlib.Path(name_or_path), format_given(str(name_or_path), MAX_PATH_LENGTH)
     if str(name_or_path) in names():
         file = importlib.resources.files("diffabs") / "scenarios" / f"{name_or_path}.toml"
         return str(name_or_path), file.read_bytes()
     try:
         if len(path.parts) == 1 and not path.suffix and not path.exists():
-            raise unknown(f"no scenario and no file is called {quoted}", str(path), names())
-        raw = files.content(path, LARGEST_FILE + 1)
+            raise unknown_name_error(f"no scenario and no file is called {quoted}", str(path), names())
+        raw = files.read_content(path, MAX_SCENARIO_BYTES + 1)
     except (OSError, ValueError) as error:
         if isinstance(error, ScenarioError):
             raise
         why = getattr(error, "strerror", None) or str(error)
         raise ScenarioError(f"cannot read scenario {quoted}: {why}") from None
-    if len(raw) > LARGEST_FILE:
-        raise ScenarioError(f"{quoted} is larger than {LARGEST_FILE} bytes; it is no scenario")
-    return printable(path.stem), raw
+    if len(raw) > MAX_SCENARIO_BYTES:
+        raise ScenarioError(f"{quoted} is larger than {MAX_SCENARIO_BYTES} bytes; it is no scenario")
+    return make_printable(path.stem), raw
 
 
-def _parsed(raw: bytes, origin: str) -> dict[str, Any]:
-    quoted = shown(origin, LONGEST_PATH)
+def _parse(raw: bytes, origin: str) -> dict[str, Any]:
+    quoted = format_given(origin, MAX_PATH_LENGTH)
     try:
-        return parameter_paths.lifted(toml.parsed(raw.decode()))
+        return parameter_paths.to_canonical_form(toml.parse_toml(raw.decode()))
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         raise ScenarioError(f"{quoted} is not UTF-8 text (at line {line})") from None
@@ -196,21 +214,23 @@ def _override(table: dict[str, Any], override: str) -> None:
     path, equals, text = override.partition("=")
     keys = path.strip().split(".")
     if not equals or not all(keys):
-        raise ScenarioError(f"override {shown(override)} is not of the form section.field=value")
+        raise ScenarioError(f"override {format_given(override)} is not of the form section.field=value")
     if len(keys) > toml.MOST_LEVELS:
-        raise ScenarioError(f"override {shown(override)} is nested more than {toml.MOST_LEVELS} deep")
+        raise ScenarioError(f"override {format_given(override)} is nested more than {toml.MOST_LEVELS} deep")
     if any("\ud800" <= letter <= "\udfff" for letter in override):
-        raise ScenarioError(f"override {shown(override)} is not UTF-8 text")
+        raise ScenarioError(f"override {format_given(override)} is not UTF-8 text")
     if keys[:2] == ["plant", "road"]:
         keys = keys[1:]
-    keys = parameter_paths.joined_keys(keys)
+    keys = parameter_paths.join_path_keys(keys)
     node: Any = table
     for i, key in enumerate(keys[:-1]):
         place = _place(node, key, ".".join(keys[:i]))
         child = node[place] if isinstance(node, list) else node.get(place, {})
         child = {"type": child} if isinstance(child, str) else child
         if not isinstance(child, dict | list):
-            raise ScenarioError(f"{'.'.join(keys[: i + 1])} = {shown(child)} has no field {shown(keys[i + 1])}")
+            raise ScenarioError(
+                f"{'.'.join(keys[: i + 1])} = {format_given(child)} has no field {format_given(keys[i + 1])}"
+            )
         node[place] = child
         node = child
     place = _place(node, keys[-1], ".".join(keys[:-1]))
@@ -218,15 +238,15 @@ def _override(table: dict[str, Any], override: str) -> None:
         other = place.removesuffix("_kmh") if place.endswith("_kmh") else f"{place}_kmh"
         node.pop(other, None)
         if keys[0] == "controller":  # an override replaces the same limit under its other name
-            node.pop({**FORMER, **{new: old for old, new in FORMER.items()}}.get(place), None)
+            node.pop({**FORMER_FIELDS, **{new: old for old, new in FORMER_FIELDS.items()}}.get(place), None)
     try:
-        node[place] = toml.value(text.strip())
+        node[place] = toml.parse_value(text.strip())
     except ScenarioError as error:
-        raise ScenarioError(f"override {shown(override)}: {error}") from None
-    parameter_paths.lifted(table)
+        raise ScenarioError(f"override {format_given(override)}: {error}") from None
+    parameter_paths.to_canonical_form(table)
     new = node[place]
     if isinstance(new, str) or (isinstance(new, dict) and "type" in new):
-        parameter_paths.forget(table, ".".join(keys))
+        parameter_paths.forget_replaced_part(table, ".".join(keys))
 
 
 def _place(node: Any, key: str, path: str) -> Any:
@@ -234,29 +254,29 @@ def _place(node: Any, key: str, path: str) -> Any:
         return key
     there = [str(i) for i in range(len(node))]
     if key not in there:
-        raise unknown(f"{path}.{key} is not there", key, there)
+        raise unknown_name_error(f"{path}.{key} is not there", key, there)
     return int(key)
 
 
-def _assembled(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenario:
+def _assemble(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenario:
     texts = {key: read(table.get(key, ""), key) for key, read in TEXTS.items()}
-    sections = {key: value for key, value in table.items() if key not in OTHERS}
+    sections = {key: value for key, value in table.items() if key not in OTHER_SECTIONS}
     if "road" in table:
         plant = sections.get("plant", {})
         plant = {"type": plant} if isinstance(plant, str) else plant
         sections["plant"] = {**plant, "road": table["road"]} if isinstance(plant, dict) else plant
-    solver, seed = section_solver.read(table.get("solver", {}))
+    solver, seed = section_solver.read_solver_section(table.get("solver", {}))
     given = table.get("objective", {})
     if not isinstance(given, dict):
-        raise wrong("objective", given, "a table of objectives")
-    loop = loop_of(sections)
-    report = usual(loop.plant)
+        raise wrong_kind_error("objective", given, "a table of objectives")
+    loop = build_loop(sections)
+    report = default_objectives(loop.plant)
     measured = {}
     for key, value in given.items():
-        place = joined("objective", printed_line(key, "a name in objective"))
-        measured[key] = build("objective", value, report.get(key), place, units_of(loop.plant))
+        place = join_path("objective", read_printable_line(key, "a name in objective"))
+        measured[key] = build_part("objective", value, report.get(key), place, units_of(loop.plant))
     objectives = {**report, **measured}
-    _refuse(_wrong_values(loop, objectives), misfits(loop, objectives))  # before what is said of their parameters
+    _refuse(_wrong_values(loop, objectives), find_misfits(loop, objectives))  # before what is said of their parameters
     return Scenario(
         name=name,
         **texts,
@@ -264,25 +284,25 @@ def _assembled(name: str, table: dict[str, Any], folder: pathlib.Path) -> Scenar
         solver=solver,
         objectives=objectives,
         seed=seed,
-        design=section_design.read(table.get("design", {}), loop),
-        tune=section_tune.read(table.get("tune", {}), loop, objectives),
-        sweep=section_sweep.read(table.get("sweep", {}), loop, objectives, folder),
+        design=section_design.read_design_section(table.get("design", {}), loop),
+        tune=section_tune.read_tune_section(table.get("tune", {}), loop, objectives),
+        sweep=section_sweep.read_sweep_section(table.get("sweep", {}), loop, objectives, folder),
     )
 
 
 def _wrong_values(loop: Loop, objectives: Mapping[str, Objective]) -> Iterator[str]:
     """What the parts object to."""
-    yield from problems(loop)
+    yield from find_problems(loop)
     for name, objective in objectives.items():
-        yield from problems(objective, f"{joined('objective', name)}.", units_of(loop.plant))
+        yield from find_problems(objective, f"{join_path('objective', name)}.", units_of(loop.plant))
 
 
 def dump(scenario: Scenario) -> str:
     """Return TOML that loads back to the same scenario; every field is written, numbers at full precision."""
-    sections = {field.name: plain(getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)}
+    sections = {field.name: as_plain(getattr(scenario.loop, field.name)) for field in dataclasses.fields(Loop)}
     if "road" in sections["plant"]:
         sections["road"] = sections["plant"].pop("road")
-    sections["solver"] = section_solver.table(scenario.solver, scenario.seed)
-    sections["objective"] = plain(scenario.objectives)
+    sections["solver"] = section_solver.write_solver_section(scenario.solver, scenario.seed)
+    sections["objective"] = as_plain(scenario.objectives)
     sections |= {name: getattr(scenario, name).table() for name in ("design", "tune", "sweep")}
-    return toml.document({key: getattr(scenario, key) for key in TEXTS}, sections)
+    return toml.write_toml({key: getattr(scenario, key) for key in TEXTS}, sections)

@@ -20,10 +20,20 @@ from diffabs.controllers import Sampled
 from diffabs.core.blocks import Series
 from diffabs.core.loop import Loop
 from diffabs.core.pytree import Spec, parameters
-from diffabs.core.values import ScenarioError, as_given, entry, members, number, ranged, shown, table_of, wrong
-from diffabs.core.values import read as read_table
+from diffabs.core.values import (
+    ScenarioError,
+    format_given,
+    plain_fields,
+    range_reader,
+    read_as_given,
+    read_number,
+    table_field,
+    table_reader,
+    wrong_kind_error,
+)
+from diffabs.core.values import read_table as read_table
 from diffabs.linear.slip_model import SlipModel
-from diffabs.scenario.parameter_paths import entries
+from diffabs.scenario.parameter_paths import read_entries
 
 ENTRY = Spec("1")
 
@@ -35,12 +45,12 @@ def _weight(given: Any, path: str) -> Any:
     from diffabs.linear.weights import as_weight_matrix
 
     if not isinstance(given, list | int | float) or isinstance(given, bool):
-        raise wrong(path, given, "a number, a diagonal or a matrix")
+        raise wrong_kind_error(path, given, "a number, a diagonal or a matrix")
     if given == []:
         raise ScenarioError(f"{path} = [] is empty")
     rows = given if isinstance(given, list) and any(isinstance(row, list) for row in given) else ()
     if not all(isinstance(row, list) and len(row) == len(rows) for row in rows):
-        raise ScenarioError(f"{path} = {shown(given)} is not square: {len(rows)} rows need as many numbers each")
+        raise ScenarioError(f"{path} = {format_given(given)} is not square: {len(rows)} rows need as many numbers each")
     value = _numbers(given, path)
     try:
         as_weight_matrix(path, value, len(np.atleast_1d(value)), definite=path == "design.R")
@@ -51,25 +61,25 @@ def _weight(given: Any, path: str) -> Any:
 
 def _numbers(given: Any, path: str) -> Any:
     if not isinstance(given, list):
-        return number(given, ENTRY, path)
+        return read_number(given, ENTRY, path)
     return tuple(_numbers(item, f"{path}.{i}") for i, item in enumerate(given))
 
 
 @dataclasses.dataclass(frozen=True)
-class Task:
+class DesignTask:
     """What a gain is asked for: weights (tuples of their rows, or of a diagonal) or None, decay [1/s], damping, and the
     ranges given, in SI, by path of the loop."""
 
-    Q: Any = entry(_weight, None)
-    R: Any = entry(_weight, None)
-    decay: float = entry(ranged(Spec("1/s", low=0.0)), 0.0)
-    damping: float = entry(ranged(Spec("1", low=0.0, high=1.0, open_high=True)), 0.0)
+    Q: Any = table_field(_weight, None)
+    R: Any = table_field(_weight, None)
+    decay: float = table_field(range_reader(Spec("1/s", low=0.0)), 0.0)
+    damping: float = table_field(range_reader(Spec("1", low=0.0, high=1.0, open_high=True)), 0.0)
     over: Mapping[str, Range] = dataclasses.field(default_factory=dict)
 
     def box(self, loop: Loop) -> dict[str, Range]:
         """The ranges by path of the loop's linear model, that of the speed between the loop's start and its stop if
         none was given."""
-        known = _known(loop)
+        known = _rangeable_parameters(loop)
         return {known[path].model: ends for path, ends in self._with_speed(loop).items()}
 
     def ranges(self, loop: Loop) -> dict[str, Range]:
@@ -87,7 +97,7 @@ class Task:
 
     def table(self) -> dict[str, Any]:
         """As values of TOML."""
-        return {name: value for name, value in members(self).items() if value is not None}
+        return {name: value for name, value in plain_fields(self).items() if value is not None}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,9 +109,9 @@ class _Parameter:
     shape: tuple[int, ...] = ()
 
 
-def read(table: Any, loop: Loop) -> Task:
+def read_design_section(table: Any, loop: Loop) -> DesignTask:
     """The task of a section. Raises ScenarioError, one line, for whatever is wrong with it."""
-    task: Task = read_table(Task, table, "design", over=lambda given, path: _over(given, path, loop))
+    task: DesignTask = read_table(DesignTask, table, "design", over=lambda given, path: _over(given, path, loop))
     for there, missing in (("Q", "R"), ("R", "Q")):
         if getattr(task, there) is not None and getattr(task, missing) is None:
             raise ScenarioError(f"design.{missing} is missing: with design.{there}, a cost needs both")
@@ -109,13 +119,13 @@ def read(table: Any, loop: Loop) -> Task:
 
 
 def _over(given: Any, path: str, loop: Loop) -> dict[str, Range]:
-    table = table_of(as_given, "ranges")(given, path)
-    there = {name: (parameter.spec, parameter.shape) for name, parameter in _known(loop).items()}
-    found = entries(table, path, there, "nothing that the linear model of this loop depends on")
+    table = table_reader(read_as_given, "ranges")(given, path)
+    there = {name: (parameter.spec, parameter.shape) for name, parameter in _rangeable_parameters(loop).items()}
+    found = read_entries(table, path, there, "nothing that the linear model of this loop depends on")
     return {item.path: item.single("have a range").range() for item in found}
 
 
-def _known(loop: Loop) -> dict[str, _Parameter]:
+def _rangeable_parameters(loop: Loop) -> dict[str, _Parameter]:
     """What can have a range, by path of the loop. The model's names for the rest of the loop are `reduction`'s."""
     if not hasattr(loop.plant, "frozen"):
         return {path: _Parameter(path, spec, np.shape(x)) for path, spec, x in parameters(loop.plant, "plant.")}
@@ -128,11 +138,11 @@ def _known(loop: Loop) -> dict[str, _Parameter]:
         actuators = {f"actuator.blocks.{i}.": block for i, block in enumerate(loop.actuator.blocks)}
     for prefix, block in actuators.items():
         if isinstance(block, Lag | RateLimit):
-            found |= _one(block, prefix, "time_constant", "actuator.time_constant")
+            found |= _parameter(block, prefix, "time_constant", "actuator.time_constant")
     if isinstance(loop.controller, Sampled):
-        found |= _one(loop.controller, "controller.", "delay", "sampling.delay")
+        found |= _parameter(loop.controller, "controller.", "delay", "sampling.delay")
     return found
 
 
-def _one(part: Any, prefix: str, name: str, model: str) -> dict[str, _Parameter]:
+def _parameter(part: Any, prefix: str, name: str, model: str) -> dict[str, _Parameter]:
     return {path: _Parameter(model, spec) for path, spec, _ in parameters(part, prefix) if path == prefix + name}

@@ -31,29 +31,29 @@ from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get
 from diffabs.core.values import (
     ScenarioError,
-    as_given,
-    entry,
-    members,
-    one_of,
-    plain,
-    shown,
-    table_of,
-    text,
-    unknown,
-    within,
-    wrong,
+    as_plain,
+    choice_reader,
+    format_given,
+    plain_fields,
+    read_as_given,
+    read_text,
+    table_field,
+    table_reader,
+    unknown_name_error,
+    whole_reader,
+    wrong_kind_error,
 )
-from diffabs.core.values import read as read_table
-from diffabs.scenario.parameter_paths import Entry, canonical, entries, flat
-from diffabs.scenario.registry import FAMILIES, build, family_of, unit_of
-from diffabs.scenario.section_tune import metrics
+from diffabs.core.values import read_table as read_table
+from diffabs.scenario.parameter_paths import ParameterEntry, canonical_path, flatten_table, read_entries
+from diffabs.scenario.registry import FAMILIES, build_part, family_of, unit_of
+from diffabs.scenario.section_tune import metric_reader
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.variables import Correlation, Space, read_correlation
 
 if TYPE_CHECKING:
     from diffabs.sweep import Study
 
-SAMPLES = 1000  # where the design does not say how many there are
+DEFAULT_SAMPLES = 1000  # where the design does not say how many there are
 PARTS = {field.name for field in dataclasses.fields(Loop)} | {"road"}
 
 
@@ -67,45 +67,47 @@ class Choice:
 
 
 @dataclasses.dataclass(frozen=True)
-class Variation:
+class SweepSection:
     """What varies, in SI. `over`: distributions, and choices of parts, by path of the loop."""
 
-    samples: int = entry(within(0, sampling.MAX_UINT32), 0)
-    seed: int = entry(within(0, sampling.MAX_UINT32), 0)
-    chunk: int = entry(within(1, 2**20), 4096)
-    check: int = entry(within(0, 4096), 16)
-    dtype: str = entry(one_of("float64", "float32"), "float64")
-    design: sampling.SamplingDesign = entry(sampling.read_sampling_design, sampling.Random)
+    samples: int = table_field(whole_reader(0, sampling.MAX_UINT32), 0)
+    seed: int = table_field(whole_reader(0, sampling.MAX_UINT32), 0)
+    chunk: int = table_field(whole_reader(1, 2**20), 4096)
+    check: int = table_field(whole_reader(0, 4096), 16)
+    dtype: str = table_field(choice_reader("float64", "float32"), "float64")
+    design: sampling.SamplingDesign = table_field(sampling.read_sampling_design, sampling.Random)
     over: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     correlation: Correlation | None = None
     failures: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def table(self) -> dict[str, Any]:
         """As values of TOML, what is usual in short."""
-        design = plain(self.design, brief=True)
+        design = as_plain(self.design, brief=True)
         given = {"design": design["type"] if len(design) == 1 else design}
-        given["over"] = {path: _written(item) for path, item in self.over.items()}
-        given["correlation"] = members(self.correlation) if self.correlation else {}
-        return members(dataclasses.replace(self, over={}, correlation=None)) | given
+        given["over"] = {path: _format_item(item) for path, item in self.over.items()}
+        given["correlation"] = plain_fields(self.correlation) if self.correlation else {}
+        return plain_fields(dataclasses.replace(self, over={}, correlation=None)) | given
 
 
-def _written(item: Any) -> Any:
+def _format_item(item: Any) -> Any:
     """A distribution, or a choice of parts, as it is given."""
     if isinstance(item, distributions.Uniform):
         return [item.low, item.high]
-    return item.given if isinstance(item, Choice) else plain(item, brief=True)
+    return item.given if isinstance(item, Choice) else as_plain(item, brief=True)
 
 
-def read(table: Any, loop: Loop, objectives: Mapping[str, Objective], folder: pathlib.Path) -> Variation:
+def read_sweep_section(
+    table: Any, loop: Loop, objectives: Mapping[str, Objective], folder: pathlib.Path
+) -> SweepSection:
     """The section. Files are read now, and their names are relative to `folder`: what was read no longer depends on
     them. Raises ScenarioError, one line, for whatever is wrong with it."""
-    plan: Variation = read_table(
-        Variation,
+    plan: SweepSection = read_table(
+        SweepSection,
         table,
         "sweep",
-        over=lambda given, path: _over(flat(table_of(as_given)(given, path), path), loop, folder),
+        over=lambda given, path: _over(flatten_table(table_reader(read_as_given)(given, path), path), loop, folder),
         correlation=lambda given, path: read_correlation(given, path) if given != {} else None,
-        failures=metrics(objectives, "bounds by metric", lambda one: unit_of(one, loop.plant)),
+        failures=metric_reader(objectives, "bounds by metric", lambda one: unit_of(one, loop.plant)),
     )
     correlation = plan.correlation and _in_loop(plan.correlation, plan.over)
     return dataclasses.replace(plan, correlation=correlation)
@@ -115,7 +117,7 @@ def _over(given: Mapping[str, Any], loop: Loop, folder: pathlib.Path) -> dict[st
     """Distributions and choices by path of the loop, in the order given."""
     there = {path: (spec, ()) for path, spec in elements(loop).items()}
     numbers = {path: item for path, item in given.items() if path not in PARTS}
-    known = entries(numbers, "sweep.over", there, "not a parameter of this loop")
+    known = read_entries(numbers, "sweep.over", there, "not a parameter of this loop")
     found = {}
     for key, value in given.items():
         if key in PARTS:
@@ -127,15 +129,17 @@ def _over(given: Mapping[str, Any], loop: Loop, folder: pathlib.Path) -> dict[st
     return found
 
 
-def _distribution(item: Entry, folder: pathlib.Path) -> Any:
+def _distribution(item: ParameterEntry, folder: pathlib.Path) -> Any:
     """In SI; a pair of numbers is uniform."""
     given = item.given
     if isinstance(given, list):
         if len(given) != 2:
-            raise ScenarioError(f"{item.where} = {shown(given)} is no pair [low, high], and no table with a type")
+            raise ScenarioError(
+                f"{item.where} = {format_given(given)} is no pair [low, high], and no table with a type"
+            )
         given = {"type": "uniform", "low": given[0], "high": given[1]}
     if not isinstance(given, dict):
-        raise wrong(item.where, given, "a pair [low, high] or a table with a type")
+        raise wrong_kind_error(item.where, given, "a pair [low, high] or a table with a type")
     found = distributions.read_distribution(_with_numbers(given, item.where, folder), item.where)
     if line := distributions.describe_out_of_range(found, item.spec, item.where):
         raise ScenarioError(line)
@@ -149,8 +153,8 @@ def _with_numbers(given: Mapping[str, Any], where: str, folder: pathlib.Path) ->
     if "values" in given:
         raise ScenarioError(f"{where} has values and a file; one of them is needed")
     if "column" not in given:
-        raise ScenarioError(f"{where}.column is missing: which one of {shown(given['file'])}?")
-    file, column = (text(given[key], f"{where}.{key}") for key in ("file", "column"))
+        raise ScenarioError(f"{where}.column is missing: which one of {format_given(given['file'])}?")
+    file, column = (read_text(given[key], f"{where}.{key}") for key in ("file", "column"))
     try:
         from diffabs.sweep import sample_files
     except ImportError:
@@ -167,29 +171,29 @@ def _choice(key: str, given: Any, default: Any) -> Choice:
     where = f"sweep.over.{key}"
     table = {"choices": given} if isinstance(given, list) else given
     if not isinstance(table, dict) or not isinstance(table.get("choices"), list) or not table["choices"]:
-        raise wrong(where, given, "a list of parts, or a table of choices and weights,")
+        raise wrong_kind_error(where, given, "a list of parts, or a table of choices and weights,")
     names = [item if isinstance(item, str) else f"{i}" for i, item in enumerate(table["choices"])]
     drawn = distributions.read_distribution({**table, "type": "categorical", "choices": names}, where)
     family = key if key in FAMILIES else family_of(key, key)
     items = enumerate(zip(names, table["choices"], strict=True))
-    return Choice(given, drawn, {name: build(family, item, default, f"{where}.{i}") for i, (name, item) in items})
+    return Choice(given, drawn, {name: build_part(family, item, default, f"{where}.{i}") for i, (name, item) in items})
 
 
 def _in_loop(correlation: Correlation, over: Iterable[str]) -> Correlation:
     """The same with paths of the loop, however they were written."""
-    known = {canonical(path): path for path in over}
-    paths = [canonical(path).removesuffix("_kmh") for path in correlation.paths]
+    known = {canonical_path(path): path for path in over}
+    paths = [canonical_path(path).removesuffix("_kmh") for path in correlation.paths]
     for path, given in zip(paths, correlation.paths, strict=True):
         if path not in known:
-            raise unknown(f"sweep.correlation.paths: {shown(given)} does not vary", given, known)
+            raise unknown_name_error(f"sweep.correlation.paths: {format_given(given)} does not vary", given, known)
     return dataclasses.replace(correlation, paths=tuple(known[path] for path in paths))
 
 
-def study(chosen: Any) -> "Study":
+def build_study(chosen: Any) -> "Study":
     """The sweep of a scenario. Raises ScenarioError."""
     from diffabs.sweep import Study
 
-    plan: Variation = chosen.sweep
+    plan: SweepSection = chosen.sweep
     if not plan.over:
         raise ScenarioError('sweep.over is empty: say what varies, as in [sweep.over] "plant.mass" = [5.3, 6.2]')
     choices = {path: item for path, item in plan.over.items() if isinstance(item, Choice)}
@@ -199,7 +203,7 @@ def study(chosen: Any) -> "Study":
         return Study(
             loop=chosen.loop,
             space=space,
-            samples=plan.samples or _counted(space),
+            samples=plan.samples or _natural_count(space),
             solver=chosen.solver,
             objectives=chosen.objectives,
             seed=plan.seed,
@@ -212,6 +216,6 @@ def study(chosen: Any) -> "Study":
         raise ScenarioError(str(error)) from None
 
 
-def _counted(space: Space) -> int:
+def _natural_count(space: Space) -> int:
     """As many samples as the design has by itself."""
-    return space.check() if isinstance(space.design, sampling.Corners | sampling.Grid) else SAMPLES
+    return space.check() if isinstance(space.design, sampling.Corners | sampling.Grid) else DEFAULT_SAMPLES

@@ -35,32 +35,35 @@ from diffabs.core.pytree import Spec, parameters
 from diffabs.core.values import (
     Reader,
     ScenarioError,
-    as_given,
-    dotted,
-    entry,
-    inside,
-    members,
-    plain,
-    ranged,
+    as_plain,
+    dotted_path,
+    plain_fields,
+    range_reader,
+    read_as_given,
+    read_number_in_range,
     read_one,
-    table_of,
-    unknown,
-    within,
+    table_field,
+    table_reader,
+    unknown_name_error,
+    whole_reader,
 )
-from diffabs.core.values import read as read_table
-from diffabs.scenario.parameter_paths import Ends, Entry, canonical, entries, parameters_of
+from diffabs.core.values import read_table as read_table
+from diffabs.scenario.parameter_paths import Ends, ParameterEntry, canonical_path, parameters_of, read_entries
 from diffabs.scenario.registry import unit_of
 from diffabs.simulate.batch import Batch, grid, latin
 from diffabs.tune import risk
 
-DECLARED = "declared"
+DECLARED_RANGE = "declared"
 MOST_LANES = 100_000
 
 
 def _aggregate(given: Any, path: str) -> dict[str, Any]:
     """Type and fields."""
     part = read_one(risk.AGGREGATE_TYPES, given, path)
-    return {"type": next(name for name, kind in risk.AGGREGATE_TYPES.items() if type(part) is kind), **members(part)}
+    return {
+        "type": next(name for name, kind in risk.AGGREGATE_TYPES.items() if type(part) is kind),
+        **plain_fields(part),
+    }
 
 
 def _mean() -> dict[str, Any]:
@@ -72,22 +75,22 @@ class Goal:
     """What is tuned, in SI. `free`: ranges by path, None the declared one; `objective`: weights by metric; `over`:
     values by path; `aggregate`: its type and fields; `limits`: greatest values by metric."""
 
-    starts: int = entry(within(1, 1000), 1)
-    seed: int = entry(within(0, 2**32 - 1), 0)
-    iterations: int = entry(within(1, 100_000), 60)
-    samples: int = entry(within(0, MOST_LANES), 0)
-    decay: float = entry(ranged(Spec("1/s", low=0.0)), 0.0)
-    damping: float = entry(ranged(Spec("1", low=0.0, high=1.0, open_high=True)), 0.0)
+    starts: int = table_field(whole_reader(1, 1000), 1)
+    seed: int = table_field(whole_reader(0, 2**32 - 1), 0)
+    iterations: int = table_field(whole_reader(1, 100_000), 60)
+    samples: int = table_field(whole_reader(0, MOST_LANES), 0)
+    decay: float = table_field(range_reader(Spec("1/s", low=0.0)), 0.0)
+    damping: float = table_field(range_reader(Spec("1", low=0.0, high=1.0, open_high=True)), 0.0)
     free: Mapping[str, Ends | None] = dataclasses.field(default_factory=dict)
     objective: Mapping[str, float] = dataclasses.field(default_factory=dict)
     over: Mapping[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
-    aggregate: Mapping[str, Any] = entry(_aggregate, _mean)
+    aggregate: Mapping[str, Any] = table_field(_aggregate, _mean)
     limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def table(self) -> dict[str, Any]:
         """As values of TOML."""
-        free = {path: DECLARED if ends is None else plain(ends) for path, ends in self.free.items()}
-        return members(self) | {"free": free}
+        free = {path: DECLARED_RANGE if ends is None else as_plain(ends) for path, ends in self.free.items()}
+        return plain_fields(self) | {"free": free}
 
     def check(self, loop: Loop) -> "Goal":
         """What only matters once a loop is tuned. Raises ScenarioError: nothing free, no objective, a start at an end
@@ -119,16 +122,16 @@ class Goal:
         return read_one(risk.AGGREGATE_TYPES, self.aggregate, "tune.aggregate")
 
 
-def read(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
+def read_tune_section(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
     """The goal of a section. Raises ScenarioError, one line, for whatever is wrong with it."""
     goal: Goal = read_table(
         Goal,
         table,
         "tune",
-        free=lambda given, path: free_ranges(table_of(as_given, "ranges")(given, path), loop, path),
-        over=lambda given, path: _over(table_of(as_given, "values")(given, path), loop),
-        objective=metrics(objectives, "weights of metrics"),
-        limits=metrics(objectives, "greatest values of metrics", lambda one: unit_of(one, loop.plant)),
+        free=lambda given, path: free_ranges(table_reader(read_as_given, "ranges")(given, path), loop, path),
+        over=lambda given, path: _over(table_reader(read_as_given, "values")(given, path), loop),
+        objective=metric_reader(objectives, "weights of metrics"),
+        limits=metric_reader(objectives, "greatest values of metrics", lambda one: unit_of(one, loop.plant)),
     )
     lanes = math.prod(map(len, goal.over.values()))
     if lanes > MOST_LANES and not goal.samples:
@@ -136,20 +139,25 @@ def read(table: Any, loop: Loop, objectives: Mapping[str, Objective]) -> Goal:
     return goal
 
 
-def metrics(objectives: Mapping[str, Objective], what: str, unit: Callable[[Objective], str] = lambda _: "1") -> Reader:
+def metric_reader(
+    objectives: Mapping[str, Objective], what: str, unit: Callable[[Objective], str] = lambda _: "1"
+) -> Reader:
     """Return the reader of a table of numbers by metric, in these units."""
 
     def read(given: Any, path: str) -> dict[str, float]:
-        for name in table_of(as_given, what)(given, path):
+        for name in table_reader(read_as_given, what)(given, path):
             if name not in objectives:
-                raise unknown(f"{dotted(path, name)} is not measured", name, objectives)
-        return {name: inside(x, Spec(unit(objectives[name])), dotted(path, name)) for name, x in given.items()}
+                raise unknown_name_error(f"{dotted_path(path, name)} is not measured", name, objectives)
+        return {
+            name: read_number_in_range(x, Spec(unit(objectives[name])), dotted_path(path, name))
+            for name, x in given.items()
+        }
 
     return read
 
 
-def _entries(table: dict[str, Any], section: str, loop: Loop) -> Iterable[Entry]:
-    return entries(table, section, parameters_of(loop), "not a parameter of this loop")
+def _entries(table: dict[str, Any], section: str, loop: Loop) -> Iterable[ParameterEntry]:
+    return read_entries(table, section, parameters_of(loop), "not a parameter of this loop")
 
 
 def free_ranges(table: dict[str, Any], loop: Loop, section: str) -> dict[str, Ends | None]:
@@ -158,7 +166,7 @@ def free_ranges(table: dict[str, Any], loop: Loop, section: str) -> dict[str, En
     for item in _entries(table, section, loop):
         if not item.spec.tunable:
             raise ScenarioError(f"{item.where} cannot be tuned: a run does not depend smoothly on it")
-        found[item.path] = None if item.given == DECLARED else item.range(f', or "{DECLARED}",')
+        found[item.path] = None if item.given == DECLARED_RANGE else item.range(f', or "{DECLARED_RANGE}",')
     return found
 
 
@@ -168,17 +176,17 @@ def _over(table: dict[str, Any], loop: Loop) -> dict[str, tuple[float, ...]]:
 
 def check_starts(loop: Loop, free: Mapping[str, Ends | None], section: str) -> None:
     """Raises ScenarioError for a value of the loop at an end of its range or outside: it could not be moved."""
-    lines = [line for path, ends in free.items() for line in _stuck(loop, path, ends, section)]
+    lines = [line for path, ends in free.items() for line in _at_range_end(loop, path, ends, section)]
     if lines:
         raise ScenarioError("; ".join(lines))
 
 
-def _stuck(loop: Loop, path: str, ends: Ends | None, section: str) -> Iterator[str]:
+def _at_range_end(loop: Loop, path: str, ends: Ends | None, section: str) -> Iterator[str]:
     spec, value = next((spec, value) for name, spec, value in parameters(loop) if name == path)
     low, high = ends or (spec.low, spec.high)
     low, high, value = np.broadcast_arrays(low, high, np.asarray(value, float))
     for at in np.ndindex(value.shape):
         inside = dataclasses.replace(spec, low=low[at], high=high[at], open_low=True, open_high=True)
         if not inside.holds(value[at]):
-            name = ".".join([canonical(path), *map(str, at)])
+            name = ".".join([canonical_path(path), *map(str, at)])
             yield f"{name} = {value[at]:g} is outside {inside.interval()}, its range in {section}"

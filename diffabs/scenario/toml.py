@@ -5,13 +5,13 @@ import re
 import tomllib
 from typing import Any
 
-from diffabs.core.values import ScenarioError, shown
+from diffabs.core.values import ScenarioError, format_given
 
 MOST_LEVELS = 50  # of tables and lists; no scenario has a tenth of that
-LARGEST = 2**63  # of a whole number, as TOML has it
+MAX_INTEGER = 2**63  # of a whole number, as TOML has it
 
 
-def parsed(text: str) -> dict[str, Any]:
+def parse_toml(text: str) -> dict[str, Any]:
     """The table that a text is. Raises ValueError for what is no TOML, and ScenarioError for values nested too deeply
     and for whole numbers of more than 64 bits, which no message could show."""
     try:
@@ -27,19 +27,19 @@ def _refuse_extremes(table: dict[str, Any]) -> None:
     while pending:
         where, level, item = pending.pop()
         if level > MOST_LEVELS:
-            raise ScenarioError(f"{shown(where.split('.')[0])} is nested more than {MOST_LEVELS} deep")
+            raise ScenarioError(f"{format_given(where.split('.')[0])} is nested more than {MOST_LEVELS} deep")
         if isinstance(item, dict | list):
             inside = item.items() if isinstance(item, dict) else enumerate(item)
             pending += [(f"{where}.{key}", level + 1, each) for key, each in inside]
-        elif isinstance(item, int) and not -LARGEST <= item < LARGEST:
-            raise ScenarioError(f"{shown(where)} is a whole number outside [-2^63, 2^63)")
+        elif isinstance(item, int) and not -MAX_INTEGER <= item < MAX_INTEGER:
+            raise ScenarioError(f"{format_given(where)} is a whole number outside [-2^63, 2^63)")
 
 
-def value(text: str) -> Any:
+def parse_value(text: str) -> Any:
     """The value that a text on the command line means. Raises ScenarioError, as `parsed`."""
     for candidate in (f"v = {text}", f"v = [{text}]"):
         try:
-            read = parsed(candidate)
+            read = parse_toml(candidate)
         except ScenarioError as error:
             raise ScenarioError(str(error).replace('"v"', "its value").replace("its values are", "is")) from None
         except ValueError:
@@ -50,23 +50,23 @@ def value(text: str) -> Any:
     return text
 
 
-def document(top: dict[str, Any], sections: dict[str, dict[str, Any]]) -> str:
+def write_toml(top: dict[str, Any], sections: dict[str, dict[str, Any]]) -> str:
     """The text of a file with these values, and these sections below them."""
-    lines = [f"{_key(key)} = {_written(value)}" for key, value in top.items()]
+    lines = [f"{_write_key(key)} = {_write_value(value)}" for key, value in top.items()]
     for name, values in sections.items():
-        lines += ["", f"[{name}]", *(f"{_key(key)} = {_written(value)}" for key, value in values.items())]
+        lines += ["", f"[{name}]", *(f"{_write_key(key)} = {_write_value(value)}" for key, value in values.items())]
     return "\n".join(lines) + "\n"
 
 
-def _written(value: Any) -> str:
+def _write_value(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, list):
-        return f"[{', '.join(map(_written, value))}]"
+        return f"[{', '.join(map(_write_value, value))}]"
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{_key(key)} = {_written(item)}' for key, item in value.items())}}}"
+        return f"{{{', '.join(f'{_write_key(key)} = {_write_value(item)}' for key, item in value.items())}}}"
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
-def _key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _written(key)
+def _write_key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else _write_value(key)

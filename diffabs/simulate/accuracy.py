@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from diffabs.core.blocks import offers
 from diffabs.core.loop import BLOCKS, Loop
 from diffabs.core.protocols import Clock, Memory, Objective
-from diffabs.core.pytree import refined
+from diffabs.core.pytree import refine_parts
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import Run, Solver, refine_solver
 
@@ -72,7 +72,7 @@ def measure_finer(
     loop: Loop, solver: Solver, objectives: Mapping[str, Objective], times: int, *, key: Any = None
 ) -> Run:
     """What `measure` returns with steps that are `times` shorter, over the same whole steps."""
-    return measure(refined(loop, times), refine_solver(solver, times), objectives, key=key)
+    return measure(refine_parts(loop, times), refine_solver(solver, times), objectives, key=key)
 
 
 def runs_end_alike(*runs: Run) -> Any:

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.blocks import Passage
-from diffabs.core.log import lend, tables, written
+from diffabs.core.log import borrow, log_rows, write_last_rows
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.modes import ComparisonAnswers, Mode, find_contradicted
 from diffabs.core.protocols import Clock, Memory, Segment, Shown
@@ -79,7 +79,7 @@ def init_carry(loop: Loop, objectives: Objectives, control: StepSizeControl, key
     """Return the carry at t = 0."""
     zero, none = jnp.asarray(0), 0.0 * control.h
     state, accumulators = start_state(loop, objectives, Clock(none, control.h, zero, key))
-    state, logs = lend(state, None), tables(state)
+    state, logs = borrow(state, None), log_rows(state)
     error_limited = jnp.minimum(INITIAL_STEP_S, control.h * control.steps) + none
     system = build_dynamics(loop, objectives, none, state, accumulators, kinks=True)
     point = _evaluate_point(system, control, none, state, accumulators, error_limited, UNCONSTRAINED)
@@ -91,7 +91,7 @@ def init_carry(loop: Loop, objectives: Objectives, control: StepSizeControl, key
     search = init_search(control.h)
     past = HermiteStep(point.t, state, point.rate[0], point.t, state.flow(), point.rate[0]) if control.keeps else ()
     lengths = (error_limited, length, ends, limit, scale, length)
-    point = point._replace(state=lend(state, logs))
+    point = point._replace(state=borrow(state, logs))
     return cast_floats(
         AdaptiveCarry(
             point, zero, none, *lengths, search, zero, zero, past, zero, 1.0 + none, jnp.asarray(False), zero, status
@@ -105,8 +105,8 @@ def step(
 ) -> AdaptiveCarry:
     """Return the carry after one try of a step; the same if the run is over, or has come to instant `until`."""
     active = carry.running if until is None else is_before(control, carry, until)
-    logs = written(carry.point.state)
-    carry = carry._replace(point=carry.point._replace(state=lend(carry.point.state, None)))
+    logs = write_last_rows(carry.point.state)
+    carry = carry._replace(point=carry.point._replace(state=borrow(carry.point.state, None)))
     system = build_dynamics(loop, objectives, carry.point.t, carry.point.state, carry.point.accumulators, kinks=True)
     strike = control.next_strike(loop, carry.k)
     end = jnp.where(carry.ends, strike * control.h, carry.point.t + carry.length)
@@ -130,7 +130,7 @@ def step(
         after = after._replace(**kept)
     else:
         after = select(active, after, carry)
-    return after._replace(point=after.point._replace(state=lend(after.point.state, logs)))
+    return after._replace(point=after.point._replace(state=borrow(after.point.state, logs)))
 
 
 def _next_carry(
@@ -277,8 +277,8 @@ def commit_step(
     loop, point = system.loop, here.point
     if not loop.changes:
         return point
-    lent, step = lend(point.state, logs), build_passages(begun, point)
-    state = lend(loop.change(clock, lent, here.signals, point.margins, fired, step), None)
+    lent, step = borrow(point.state, logs), build_passages(begun, point)
+    state = borrow(loop.change(clock, lent, here.signals, point.margins, fired, step), None)
     if not loop.ticks:
         return point._replace(state=state)
     return _evaluate_point(system, control, point.t, state, point.accumulators, error_limited, mode)

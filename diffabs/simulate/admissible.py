@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.arrays import as_array
-from diffabs.core.compiling import QUICK, compile_once, traced
+from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once, is_traced
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import replace, strong
+from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.core.rules import Rule
-from diffabs.core.validity import broken, grid_rules, rules
-from diffabs.core.validity import check as check_parts
+from diffabs.core.validity import check_part as check_parts
+from diffabs.core.validity import find_broken, grid_rules, part_rules
 from diffabs.simulate.solution import Adaptive, Solver
 from diffabs.simulate.stable_step import is_step_stable, stable_step
 
@@ -69,7 +69,11 @@ def check(part: T, solver: Solver | None = None) -> T:
 def find_impossible_values(loop: Loop, step: float) -> list[str]:
     """A line for each value of a loop that no run may have, alone or on a grid of this step [s]."""
     begun = _start_rule(loop)
-    return list(broken(rules(loop))) or ([] if begun.holds else [begun.says()]) or list(broken(grid_rules(loop, step)))
+    return (
+        list(find_broken(part_rules(loop)))
+        or ([] if begun.holds else [begun.says()])
+        or list(find_broken(grid_rules(loop, step)))
+    )
 
 
 def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
@@ -78,7 +82,7 @@ def find_mismatches(loop: Loop, solver: Solver) -> Iterator[str]:
     if not begun.holds:
         yield begun.says()
         return
-    yield from find_solver_faults(solver) or broken(grid_rules(loop, solver.step))
+    yield from find_solver_faults(solver) or find_broken(grid_rules(loop, solver.step))
 
 
 def find_solver_faults(solver: Solver) -> list[str]:
@@ -142,7 +146,9 @@ def first_refusal(loop: Loop, values: Mapping[str, Any], solver: Solver) -> str 
     """The first refused lane and why, in a line with its numbers; None if all lanes are accepted. Without values the
     loop is the lane."""
     if not values:
-        lines = [*broken(rules(loop)), *find_mismatches(loop, solver)] or list(find_unstable_step(loop, solver))
+        lines = [*find_broken(part_rules(loop)), *find_mismatches(loop, solver)] or list(
+            find_unstable_step(loop, solver)
+        )
         return "; ".join(lines) or None
     found = batch_admissibility(loop, values, solver)
     if not found.number:
@@ -163,7 +169,7 @@ def _lane(loop: Loop | None, values: Any) -> Loop:
 
 def _rules(loop: Loop, step: float) -> Iterator[Rule]:
     """Everything but the stability, in the order of `check`."""
-    yield from rules(loop)
+    yield from part_rules(loop)
     yield _start_rule(loop)
     yield from grid_rules(loop, step)
 
@@ -173,13 +179,13 @@ def _codes(loop: Loop | None, values: Any, *, step: float) -> Any:
     """The number of the first broken rule of each lane, from 1; 0 for none (lanes,)."""
 
     def code(values: Any) -> Any:
-        holds = jnp.stack([jnp.asarray(rule.holds) for rule in _rules(strong(_lane(loop, values)), step)])
+        holds = jnp.stack([jnp.asarray(rule.holds) for rule in _rules(canonical_dtypes(_lane(loop, values)), step)])
         return jnp.where(jnp.all(holds), 0, 1 + jnp.argmin(holds))
 
     return jax.vmap(code)(values)
 
 
-@compile_once(options=QUICK)
+@compile_once(options=QUICK_COMPILE_OPTIONS)
 def _margin(plant: Any, initial: Any, stop: Any) -> jax.Array:
     """The margin of the stop at the start. Compiled as one: each operation by itself costs as much as all of them."""
     return stop.margin(plant.output(plant.start(initial)))
@@ -188,8 +194,10 @@ def _margin(plant: Any, initial: Any, stop: Any) -> jax.Array:
 def _start_rule(loop: Loop) -> Rule:
     """A run starts on this side of its stop."""
     after = ": the run would end before it starts"
-    margin = _margin(*strong((loop.plant, loop.initial, loop.stop)))  # a number of Python raises OverflowError
-    margin = margin if traced(margin) else np.asarray(margin)
+    margin = _margin(
+        *canonical_dtypes((loop.plant, loop.initial, loop.stop))
+    )  # a number of Python raises OverflowError
+    margin = margin if is_traced(margin) else np.asarray(margin)
     start, end = (getattr(part, "speed", None) for part in (loop.initial, loop.stop))
     if start is None or end is None:
         line = f"initial is at the stop or beyond{after}"

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.blocks import Passage
-from diffabs.core.log import lend
+from diffabs.core.log import borrow
 from diffabs.core.loop import Loop, LoopState, Margins, Signals
 from diffabs.core.modes import Mode, ModeBits, find_contradicted, single_bit
 from diffabs.core.protocols import Clock, Memory, Sample, Segment, Shown
@@ -134,7 +134,7 @@ def commit_step(
     logs: the rows of the blocks' logs, which the state is without (`core.log`)"""
     t, state, accumulators, signals, rate, margins, _, mode, passed = here
     if system.loop.changes:
-        state = lend(system.loop.change(clock, lend(state, logs), signals, margins, fired, passed), None)
+        state = borrow(system.loop.change(clock, borrow(state, logs), signals, margins, fired, passed), None)
     if not system.loop.ticks:
         return FixedStepPoint(t, state, accumulators, signals.sample, rate, margins, mode)
     return _evaluate_point(system, t, state, accumulators, mode_after_changes(system, mode, one.which, one.lands))

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.compiling import traced
+from diffabs.core.compiling import is_traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import arrayed, get, parameters, replace
+from diffabs.core.pytree import as_arrays, get, parameters, replace
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.engine import check_process, run_with_engine
 from diffabs.simulate.packed import EarlyEnd, run_packed
@@ -168,7 +168,7 @@ def _dispatch_batch(
     columns = {path: jnp.asarray(x) if isinstance(x, list | tuple) else x for path, x in batch.values.items()}
     batch = dataclasses.replace(batch, values=columns)
     refuse(replace(loop, {path: column[0] for path, column in batch.values.items()}), solver, objectives)
-    live = traced(loop, dict(batch.values), dict(objectives))
+    live = is_traced(loop, dict(batch.values), dict(objectives))
     if accepted is None:
         asked = bool(batch.values) and not live
         accepted = (
@@ -232,7 +232,7 @@ def _mark_refused(run: Run, accepted: Any) -> Run:
 def group_by_structure(loops: Sequence[Any]) -> list[list[int]]:
     """Return the places of those loops that can be lanes of one batch: of equal structure and shapes."""
     groups: dict[Any, list[int]] = {}
-    for place, loop in enumerate(map(arrayed, loops)):
+    for place, loop in enumerate(map(as_arrays, loops)):
         groups.setdefault((jax.tree.structure(loop), *map(np.shape, jax.tree.leaves(loop))), []).append(place)
     return list(groups.values())
 

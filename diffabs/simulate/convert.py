@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from diffabs.core.summary import Summary, number
+from diffabs.core.summary import Summary, round_for_table
 
 NUMBER_TYPES = (jax.Array, np.ndarray, np.generic, float, int, bool)
 DEFAULT_CONTROL_UNIT = "control"  # the unit of the control where no plant says it
@@ -29,7 +29,7 @@ def summarise_run(run: Any) -> Summary:
     if shape:
         return _summarise_runs(run, int(np.prod(shape)))
     seen = f"; a trajectory of {len(run.trajectory.running)} instants" if kept else ""
-    end = f"at t = {number(run.ending.sample.t)} s"
+    end = f"at t = {round_for_table(run.ending.sample.t)} s"
     how = "diverged" if run.diverged else f"reached its stop {end}" if run.stopped else f"ended {end}"
     rows = tuple((name, value) for name, value in run.metrics.items())
     return Summary(f"Run that {how}{seen}", ("metric", "value"), rows)
@@ -98,7 +98,7 @@ def to_figure(run: Any, plant: Any = None, title: str = "") -> Any:
     plot: Any = importlib.import_module("diffabs.plot")
     shown = SimpleNamespace(shows=type(run.ending.sample.output))
     unit = plant.control_unit if plant is not None else None
-    return plot.of(shown)(run, title=title, **({"unit": unit} if unit else {}))
+    return plot.figure_for(shown)(run, title=title, **({"unit": unit} if unit else {}))
 
 
 def _attributes(run: Any) -> Mapping[str, Any]:

@@ -4,7 +4,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
-from diffabs.core.loop import signals
+from diffabs.core.loop import run_signals
 from diffabs.core.protocols import Plant
 from diffabs.simulate.solution import Run
 
@@ -15,7 +15,7 @@ def write_mat(path: pathlib.Path, run: Run, plant: Plant, **more: Any) -> None:
     from scipy.io import savemat
 
     assert run.trajectory is not None
-    kept = signals(run.trajectory.sample, plant)
+    kept = run_signals(run.trajectory.sample, plant)
     rows = int(run.trajectory.running.sum()) + 1  # after the end the last sample is repeated
     content: dict[str, Any] = {name: values[:rows] for name, (_, values) in kept.items()}
     content["units"] = {name: unit for name, (unit, _) in kept.items()}

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from diffabs.core.arrays import as_array
-from diffabs.core.compiling import traced
-from diffabs.core.log import lend
+from diffabs.core.compiling import is_traced
+from diffabs.core.log import borrow
 from diffabs.core.loop import Loop
 from diffabs.simulate import adaptive, stepper
 from diffabs.simulate.checkpoint import any_lane
@@ -109,7 +109,7 @@ class AdaptiveStepping(StepSizeControl):
         """Return what is seen at this instant of the grid, which lies within the last step."""
         now, t = carry.point, instant * self.h
         inside = (t < now.t) & (carry.last_step.until > carry.last_step.t)
-        t, state = select(inside, (t, carry.last_step.at(t)), (now.t, lend(now.state, None)))
+        t, state = select(inside, (t, carry.last_step.at(t)), (now.t, borrow(now.state, None)))
         return observe(loop, t, state, carry.running | inside)
 
     def with_trajectory(self) -> "AdaptiveStepping":
@@ -128,7 +128,7 @@ class AdaptiveStepping(StepSizeControl):
 
 def build_stepping(solver: Solver, dtype: Any) -> FixedStepping | AdaptiveStepping:
     """Return what chooses the steps of a solver, its numbers of this type."""
-    number = jnp.asarray if traced() else as_array
+    number = jnp.asarray if is_traced() else as_array
     h, steps = number(float(solver.step), dtype), jax.device_put(solver.steps)  # `asarray` would compile a program
     if isinstance(solver, Adaptive):
         return AdaptiveStepping(h, steps, number(float(_clip_rtol(np.asarray(solver.rtol, dtype))), dtype))

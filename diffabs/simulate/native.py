@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
-from diffabs.core.compiling import traced
+from diffabs.core.compiling import is_traced
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import differentiated, strong
-from diffabs.core.tracing import asked, moving, pushed
+from diffabs.core.pytree import canonical_dtypes, prepare_derivatives
+from diffabs.core.tracing import differentiated_paths, jvp_nonzero, moving_leaves
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.kernel.launch import run_lanes
 from diffabs.kernel.primitives import Unsupported
@@ -47,7 +47,7 @@ def run_native(
     Raises Unsupported for a step that cannot be translated, NoCompiler where there is none, ValueError for what
     `measure` objects to."""
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
-    values = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
+    values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     values = {**values, **forbid_derivatives(loop, values)}
     count = len(accepted)
     enough = jax.tree.map(jnp.asarray, enough)
@@ -57,7 +57,7 @@ def run_native(
     def made(mine: Any) -> Run:
         given = loop, mine[0], dict(objectives), method, *mine[1:], enough
         return (
-            _run_differentiable(given) if traced(given) else _run(*given)
+            _run_differentiable(given) if is_traced(given) else _run(*given)
         )  # a rule for derivatives takes longer than a short run
 
     if count <= MAX_LANES_PER_LAUNCH:
@@ -80,11 +80,11 @@ def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
 
     moves, (given_loop, _, measured, method, *_) = tangents[0], primals[0]
     refuse_derivative(given_loop, measured, method)
-    paths = asked(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
+    paths = differentiated_paths(moves[0]) | {path for path, move in moves[1].items() if type(move) is not SymbolicZero}
 
     def run(given: Any) -> Run:
         loop, values, objectives, method, *rest = given
-        loop = differentiated(loop, paths)
+        loop = prepare_derivatives(loop, paths)
         method = (
             LaggedReplayStepping(method.for_replay())
             if isinstance(method, AdaptiveStepping)
@@ -92,7 +92,7 @@ def _rule(primals: Any, tangents: Any) -> tuple[Run, Run]:
         )
         return _run(loop, values, objectives, method, *rest)
 
-    return pushed(run, primals, tangents)
+    return jvp_nonzero(run, primals, tangents)
 
 
 _run_differentiable.defjvp(_rule, symbolic_zeros=True)
@@ -132,7 +132,7 @@ def _run(
         begins,
         steps=STEPS_PER_BLOCK,
         rounds=1 if enough is None else STEPS_PER_EXCHANGE // STEPS_PER_BLOCK,
-        wanted=moving(judged, leaves, begins),
+        wanted=moving_leaves(judged, leaves, begins),
     )
     return jax.vmap(judged)(leaves, carry)
 
@@ -155,10 +155,10 @@ def kernel_objection(
 
     Raises ValueError for what `measure` objects to, RuntimeError in a process that was forked after JAX had started."""
     check_process()
-    if traced(loop, dict(values), dict(objectives)):
+    if is_traced(loop, dict(values), dict(objectives)):
         return "this is traced; ask with numbers"
     checked, measured, method = prepare_arguments(loop, solver, objectives)
-    columns = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
+    columns = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     count = len(next(iter(columns.values())))
     keys = jax.vmap(jax.random.key)(jnp.arange(count))
     try:

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import replace, strong
-from diffabs.core.tracing import separated
+from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.tracing import split_batched
 from diffabs.simulate.condition import RunStatus
 from diffabs.simulate.drivers import STEPS_PER_BLOCK, Carry
 from diffabs.simulate.result import finish_run, prepare
@@ -50,7 +50,7 @@ def run_packed(
 
     Raises ValueError for what `measure` objects to."""
     loop, objectives, method = prepare_arguments(loop, solver, objectives)
-    values = strong(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
+    values = canonical_dtypes(jax.tree.map(lambda x: jnp.asarray(x, method.h.dtype), dict(values)))
     values = {**values, **forbid_derivatives(loop, values)}
     return _run(loop, values, objectives, method, keys, accepted, enough, width=LANES_AT_ONCE)
 
@@ -60,7 +60,7 @@ def split_by_lane(
 ) -> tuple[Any, Callable[[Any], tuple[Any, Any]]]:
     """Return what is a lane's own of the loops with these values (lanes, ...), and a function from that of one lane to
     its loop, prepared, and what is measured."""
-    leaves, whole = separated(lambda v: prepare(replace(loop, v)), values)
+    leaves, whole = split_batched(lambda v: prepare(replace(loop, v)), values)
 
     def built(mine: Any) -> tuple[Loop, dict[str, Objective]]:
         one, audit = whole(mine)

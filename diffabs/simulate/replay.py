@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core.blocks import Passage
-from diffabs.core.log import lend, tables, written
+from diffabs.core.log import borrow, log_rows, write_last_rows
 from diffabs.core.loop import Loop, LoopState, Margins
 from diffabs.core.modes import Mode, ModeBits
 from diffabs.core.numerics import axpy
@@ -195,7 +195,7 @@ def start_replay(loop: Loop, objectives: Objectives, stepping: AdaptiveStepping,
     zero = 0.0 * stepping.h
     state, accumulators = start_state(loop, objectives, Clock(zero, stepping.h, 0, key))
     return cast_floats(
-        ReplayState(zero, zero, lend(state, tables(state)), accumulators, jnp.asarray(0)), stepping.h.dtype
+        ReplayState(zero, zero, borrow(state, log_rows(state)), accumulators, jnp.asarray(0)), stepping.h.dtype
     )
 
 
@@ -203,10 +203,10 @@ def replay_attempt(
     loop: Loop, objectives: Objectives, stepping: AdaptiveStepping, key: Any, place: ReplayState, one: StepLog
 ) -> tuple[ReplayState, Any]:
     """Return where a try leads, if it led on; its `HermiteStep`, where they are kept."""
-    logs, place = written(place.state), place._replace(state=lend(place.state, None))
+    logs, place = write_last_rows(place.state), place._replace(state=borrow(place.state, None))
     new, span = _step(loop, objectives, stepping, key, place, one, logs)
     place = select(one.moved, new, place)
-    return place._replace(state=lend(place.state, logs)), span
+    return place._replace(state=borrow(place.state, logs)), span
 
 
 def _step(
@@ -256,8 +256,8 @@ def _step(
     if loop.changes:
         ends = (begin.seen.signals.recorded, begin.recorded), (end.seen.signals.recorded, end.recorded)
         step = build_passages(*(RecordedSignals(*both) for both in zip((place.t, t), ends, strict=True)))
-        clock, state = Clock(t, stepping.h, one.k, key, strikes), lend(state, logs)
-        state = lend(_commit_changes(system, clock, state, end.seen.margins, one.triggered, step), None)
+        clock, state = Clock(t, stepping.h, one.k, key, strikes), borrow(state, logs)
+        state = borrow(_commit_changes(system, clock, state, end.seen.margins, one.triggered, step), None)
     return ReplayState(t, shift, state, accumulators, one.k), span
 
 

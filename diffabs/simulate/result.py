@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from diffabs.core.loop import Loop, LoopState
 from diffabs.core.protocols import Ending, Objective
-from diffabs.core.pytree import prepared
+from diffabs.core.pytree import prepare_parts
 from diffabs.simulate.condition import RunStatus
 from diffabs.simulate.solution import Run, Trajectory
 
@@ -20,7 +20,7 @@ AUDIT_METRIC = ""  # the name of a plant's audit among the objectives; no metric
 
 def prepare(loop: Loop) -> tuple[Loop, dict[str, Objective]]:
     """The loop with everything worked out that does not change during a run, and what its plant watches it by."""
-    loop = prepared(loop)
+    loop = prepare_parts(loop)
     audit = getattr(loop.plant, "audit", None)
     return loop, {AUDIT_METRIC: audit(loop.initial)} if audit else {}
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from diffabs.core.numerics import axpy
 from diffabs.core.pytree import Scalar
-from diffabs.core.tracing import pushed
+from diffabs.core.tracing import jvp_nonzero
 from diffabs.simulate.checkpoint import rematerialise
 
 X = TypeVar("X")
@@ -65,7 +65,7 @@ def _scan(f: Any, t: Any, x: Any, rate: Any, h: Any, constants: Any) -> Any:
 
 
 def _rule(f: Any, primals: Any, tangents: Any) -> tuple[Any, Any]:
-    return pushed(lambda *step: _scan(f, *step), primals, tangents)
+    return jvp_nonzero(lambda *step: _scan(f, *step), primals, tangents)
 
 
 _step.defjvp(_rule, symbolic_zeros=True)

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 
 from diffabs.core import kinds
-from diffabs.core.compiling import SAME, compile_once, traced
+from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once, is_traced
 from diffabs.core.first_order import without_derivative
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import arrayed, differentiated, parameters, replace, strong
-from diffabs.core.tracing import asked, pushed
-from diffabs.core.validity import broken, misshapen, rules
+from diffabs.core.pytree import as_arrays, canonical_dtypes, parameters, prepare_derivatives, replace
+from diffabs.core.tracing import differentiated_paths, jvp_nonzero
+from diffabs.core.validity import find_broken, find_misshapen, part_rules
 from diffabs.objectives import Variation
 from diffabs.simulate.admissible import find_impossible_values
 from diffabs.simulate.drivers import (
@@ -108,8 +108,8 @@ def _truncate_trajectory(trajectory: Any, count: int) -> Any:
 def prepare_arguments(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> tuple[Loop, Any, Any]:
     """Loop, objectives, and what chooses the steps, of one data type. Raises ValueError."""
     refuse(loop, solver, objectives)
-    loop, objectives = strong((arrayed(loop), {name: arrayed(part) for name, part in objectives.items()}))
-    if traced(loop):
+    loop, objectives = canonical_dtypes((as_arrays(loop), {name: as_arrays(part) for name, part in objectives.items()}))
+    if is_traced(loop):
         loop = replace(loop, forbid_derivatives(loop, {path: value for path, _, value in parameters(loop)}))
     return loop, objectives, build_stepping(solver, jax.tree.leaves(loop)[0].dtype)
 
@@ -123,14 +123,13 @@ def forbid_derivatives(loop: Loop, values: Mapping[str, Any]) -> dict[str, Any]:
 
 def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
     """Raise ValueError for what is no run, whatever its numbers are."""
-    lines = [*_find_solver_faults(solver), *misshapen(loop)]
+    lines = [*_find_solver_faults(solver), *find_misshapen(loop)]
     for name, part in objectives.items():
         if all(callable(getattr(part, method, None)) for method in OBJECTIVE_METHODS):
-            lines += misshapen(part, f"objectives.{name}.")
+            lines += find_misshapen(part, f"objectives.{name}.")
         else:
-            lines.append(
-                f"objectives.{name} = {kinds.shown(part)} is no objective: it needs {', '.join(OBJECTIVE_METHODS)}"
-            )
+            needed = ", ".join(OBJECTIVE_METHODS)
+            lines.append(f"objectives.{name} = {kinds.format_value(part)} is no objective: it needs {needed}")
     if lines:
         raise ValueError("; ".join(lines))
 
@@ -138,10 +137,12 @@ def refuse(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> N
 def refuse_values(loop: Loop, solver: Solver, objectives: Mapping[str, Objective]) -> None:
     """Raise ValueError for what is no run, or has concrete parameters that no run may have."""
     refuse(loop, solver, objectives)
-    if traced(loop, dict(objectives)):
+    if is_traced(loop, dict(objectives)):
         return
     lines = find_impossible_values(loop, solver.step)
-    lines += [line for name, part in objectives.items() for line in broken(rules(part, f"objectives.{name}."))]
+    lines += [
+        line for name, part in objectives.items() for line in find_broken(part_rules(part, f"objectives.{name}."))
+    ]
     if lines:
         raise ValueError("; ".join(lines))
 
@@ -160,8 +161,10 @@ def _find_solver_faults(solver: Solver) -> Iterator[str]:
 
 def _find_number_fault(solver: Solver, name: str) -> str:
     value = getattr(solver, name)
-    if line := kinds.objection(value) or (kinds.shape(value) and f"has shape {kinds.shape(value)}"):
-        return f"= {kinds.shown(value)} {line}; a number is needed"
+    if line := kinds.find_value_objection(value) or (
+        kinds.value_shape(value) and f"has shape {kinds.value_shape(value)}"
+    ):
+        return f"= {kinds.format_value(value)} {line}; a number is needed"
     if not 0 < value < math.inf:
         return f"= {value} is not positive and finite"
     return f"= {value} is no whole number" if name == "every" and value != int(value) else ""
@@ -177,12 +180,12 @@ def _run_differentiable(places: RunCapacity, run: Any) -> Run:
 def _rule(places: RunCapacity, primals: Any, tangents: Any) -> tuple[Any, Any]:
     loop, objectives, method, _ = primals[0]
     refuse_derivative(loop, objectives, method)
-    paths = asked(tangents[0][0])
+    paths = differentiated_paths(tangents[0][0])
 
     def reversible(run: Any) -> Run:
-        return _run_reversible(differentiated(run[0], paths), *run[1:], places=places)
+        return _run_reversible(prepare_derivatives(run[0], paths), *run[1:], places=places)
 
-    return pushed(reversible, primals, tangents, once=_second_derivative_objection(loop, method))
+    return jvp_nonzero(reversible, primals, tangents, once=_second_derivative_objection(loop, method))
 
 
 def refuse_derivative(loop: Loop, objectives: Mapping[str, Objective], method: Any) -> None:
@@ -209,7 +212,7 @@ def _second_derivative_objection(loop: Loop, method: Any) -> str:
 _run_differentiable.defjvp(_rule, symbolic_zeros=True)
 
 
-@compile_once(static=("places",), options=SAME)
+@compile_once(static=("places",), options=SAME_RESULT_OPTIONS)
 def _run(loop: Loop, objectives: dict[str, Objective], method: Any, key: Any, every: Any, *, places: int) -> Run:
     """For values: `places` for a trajectory, 0 without."""
     loop, objectives, stepped = _prepare_run(loop, objectives, method, key)

@@ -19,11 +19,11 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.compiling import SAME, compile_once
+from diffabs.core.compiling import SAME_RESULT_OPTIONS, compile_once
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Memory, Reference
-from diffabs.core.pytree import Scalar, part, pytree, replace, strong
-from diffabs.core.tracing import separated
+from diffabs.core.pytree import Scalar, canonical_dtypes, part, pytree, replace
+from diffabs.core.tracing import split_batched
 
 BOUND_SQUARINGS = 4  # k = 16: within 3 % of the radius for the loops of the papers
 LANES_PER_CHUNK = 256  # lanes whose matrices stay in a processor's cache
@@ -35,7 +35,7 @@ RADII = np.linspace(1e-3, 3.5, 3500)  # the stability region of RK4 lies within 
 
 def stable_step(loop: Loop) -> float:
     """Largest step [s] at which RK4 damps every damped mode of the loop, between its initial speed and its stop."""
-    return float(_largest_stable_steps(np.asarray(_jacobian(strong(loop)))[None])[0])
+    return float(_largest_stable_steps(np.asarray(_jacobian(canonical_dtypes(loop)))[None])[0])
 
 
 def stable_steps(loops: Loop) -> np.ndarray:
@@ -88,11 +88,11 @@ def _is_known_stable(loop: Any, values: Any, step: float, squarings: int | None)
 
 @jax.jit
 def _build_loops(loop: Any, values: Any) -> Loop:
-    return strong(jax.vmap(_lane(loop))(values))
+    return canonical_dtypes(jax.vmap(_lane(loop))(values))
 
 
 def _lane(loop: Any) -> Callable[[Any], Loop]:
-    return lambda values: strong(values if loop is None else replace(loop, values))
+    return lambda values: canonical_dtypes(values if loop is None else replace(loop, values))
 
 
 @partial(jax.jit, static_argnames="squarings")
@@ -105,7 +105,7 @@ def _bounds(loop: Any, values: Any, *, squarings: int) -> jax.Array:
 
     one = matrices(jax.tree.map(lambda x: x[0], values))
     balance = _balance(one)
-    if not separated(matrices, values)[0]:  # no lane has other matrices than the first
+    if not split_batched(matrices, values)[0]:  # no lane has other matrices than the first
         return jnp.full(count, _power_norm_bound(one, balance, squarings))
     places = jnp.minimum(
         jnp.arange(-(-count // LANES_PER_CHUNK) * LANES_PER_CHUNK), count - 1
@@ -201,10 +201,10 @@ def _map_over_probes(function: Callable[[Loop], Any], loop: Loop) -> Any:
     return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
 
-_jacobian = compile_once(options=SAME)(_jacobians_of)
+_jacobian = compile_once(options=SAME_RESULT_OPTIONS)(_jacobians_of)
 
 
-@compile_once(options=SAME)
+@compile_once(options=SAME_RESULT_OPTIONS)
 def _jacobians(loops: Loop) -> jax.Array:
     return jax.vmap(_jacobians_of)(loops)
 

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from diffabs.core.log import lend, settle, tables
+from diffabs.core.log import borrow, commit, log_rows
 from diffabs.core.loop import Loop, Margins
 from diffabs.core.protocols import Clock
 from diffabs.simulate.advance import (
@@ -127,8 +127,8 @@ def step(
     kinks: whether comparisons are located, as derivatives need it
     refines: whether the moment of an event has second derivatives; its value is the same"""
     active = carry.running if until is None else carry.running & (carry.k < until)
-    logs = tables(carry.point.state)
-    carry = carry._replace(point=carry.point._replace(state=lend(carry.point.state, None)))
+    logs = log_rows(carry.point.state)
+    carry = carry._replace(point=carry.point._replace(state=borrow(carry.point.state, None)))
     to_grid, landing, refreshing = (
         carry.status == one for one in (RunStatus.RUNNING, RunStatus.LANDING, RunStatus.REFRESHING)
     )
@@ -161,7 +161,7 @@ def step(
     )
     status = jnp.where(lost, RunStatus.DIVERGED, status).astype(carry.status.dtype)
     point = select(verdict.taken, point, carry.point)
-    point = point._replace(state=settle(point.state, logs))
+    point = point._replace(state=commit(point.state, logs))
     return FixedStepCarry(point, k, length, search, extra, since, unrestricted, status)
 
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from diffabs.core.exports import lazily
+from diffabs.core.exports import lazy_getattr
 
 if TYPE_CHECKING:
     from diffabs.sweep.discrete import Categorical as Categorical
@@ -27,4 +27,4 @@ if TYPE_CHECKING:
     from diffabs.sweep.variables import Correlation as Correlation
     from diffabs.sweep.variables import Space as Space
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazy_getattr(__name__)

@@ -96,7 +96,7 @@ def _start_workers(workers: int) -> Iterator[Any]:
     Raises SweepError where they do not start."""
     with contextlib.ExitStack() as opened:
         scratch = pathlib.Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="diffabs-dask-")))
-        opened.enter_context(files.unfinished(scratch))
+        opened.enter_context(files.temporary_path(scratch))
         try:
             cluster = LocalCluster(
                 n_workers=workers,
@@ -151,7 +151,9 @@ def _check_workers(client: Client, engine: str) -> None:
 
 def _result_versions(engine: str) -> dict[str, str]:
     """What can change a bit of the results, here: versions; of a kernel, the compiler and the processor."""
-    return provenance.origin(*DECISIVE_PACKAGES) | (launch.describe_kernel_build() if engine == "kernel" else {})
+    return provenance.describe_platform(*DECISIVE_PACKAGES) | (
+        launch.describe_kernel_build() if engine == "kernel" else {}
+    )
 
 
 def _compute_chunks(

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffabs.core.pytree import Spec
-from diffabs.core.values import FINITE, POSITIVE, any_number, as_given, entry, listed, plain, table_of
+from diffabs.core.values import (
+    FINITE_SPEC,
+    POSITIVE_SPEC,
+    as_plain,
+    list_reader,
+    read_any_number,
+    read_as_given,
+    table_field,
+    table_reader,
+)
 
 
 def choose_indices(u: ArrayLike, count: int, weights: Sequence[float] | None = None) -> np.ndarray:
@@ -38,7 +47,7 @@ def _weight_problems(weights: Sequence[float] | None, count: int, name: str, eac
     if len(weights) != count:
         yield f"{name}: weights are {len(weights)}; there are {count} to weigh"
     if not each.holds(np.asarray(weights, float)):
-        yield f"{name}: weights = {reprlib.repr(plain(weights))} are not all in {each.interval()}"
+        yield f"{name}: weights = {reprlib.repr(as_plain(weights))} are not all in {each.interval()}"
     elif not np.sum(weights) > 0:
         yield f"{name}: weights have sum {np.sum(weights):g}"
 
@@ -90,9 +99,9 @@ class Categorical(_Discrete):
             yield f"{name}: choices are empty"
         if len(numbers) not in (0, len(self.choices)):
             yield f"{name}: choices = {reprlib.repr(list(self.choices))} mix numbers and texts"
-        if not FINITE.holds(np.array(numbers, float)):
-            yield f"{name}: choices = {reprlib.repr(list(self.choices))} are not all in {FINITE.interval()}"
-        yield from _weight_problems(self.weights, len(self.choices), name, POSITIVE)
+        if not FINITE_SPEC.holds(np.array(numbers, float)):
+            yield f"{name}: choices = {reprlib.repr(list(self.choices))} are not all in {FINITE_SPEC.interval()}"
+        yield from _weight_problems(self.weights, len(self.choices), name, POSITIVE_SPEC)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,12 +123,15 @@ class Empirical(_Discrete):
     def problems(self, name: str) -> Iterator[str]:
         if not len(self.values):
             yield f"{name}: values are empty"
-        if not FINITE.holds(np.array(self.values, float)):
-            yield f"{name}: values = {reprlib.repr(list(self.values))} are not all in {FINITE.interval()}"
+        if not FINITE_SPEC.holds(np.array(self.values, float)):
+            yield f"{name}: values = {reprlib.repr(list(self.values))} are not all in {FINITE_SPEC.interval()}"
 
 
 def _read_columns(given: Any, where: str) -> dict[str, np.ndarray]:
-    return {path: np.array(column) for path, column in table_of(listed(as_given), "lists")(given, where).items()}
+    return {
+        path: np.array(column)
+        for path, column in table_reader(list_reader(read_as_given), "lists")(given, where).items()
+    }
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -127,8 +139,8 @@ class Rows(_Discrete):
     """Whole rows of a table, each as likely or by its weight: the joint distribution of its columns, which are
     parameters by path. One uniform picks a row."""
 
-    columns: Mapping[str, Any] = entry(_read_columns)
-    weights: Any = entry(listed(any_number), None)
+    columns: Mapping[str, Any] = table_field(_read_columns)
+    weights: Any = table_field(list_reader(read_any_number), None)
 
     @property
     def size(self) -> int:

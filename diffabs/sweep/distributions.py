@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from diffabs.core.pytree import Spec, param
-from diffabs.core.values import kebab, read_one, sound, written
+from diffabs.core.values import check_sound, format_table, kebab_case, read_one
 from diffabs.sweep.discrete import Categorical as Categorical
 from diffabs.sweep.discrete import Empirical as Empirical
 
@@ -121,7 +121,7 @@ class Normal(_Continuous):
 
     def _consistency_problems(self, name: str) -> Iterator[str]:
         if self.left() < MIN_TRUNCATED_PROBABILITY:
-            yield f"{name}: {written(self)} has nothing between its limits"
+            yield f"{name}: {format_table(self)} has nothing between its limits"
 
     def left(self) -> float:
         """The probability, without the limits, of what lies between them."""
@@ -153,7 +153,7 @@ class LogNormal(_Continuous):
 
     def _consistency_problems(self, name: str) -> Iterator[str]:
         if self._logarithm().left() < MIN_TRUNCATED_PROBABILITY:
-            yield f"{name}: {written(self)} has nothing between its limits"
+            yield f"{name}: {format_table(self)} has nothing between its limits"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -177,14 +177,14 @@ class Triangular(_Continuous):
 
 
 DISTRIBUTION_TYPES = {
-    kebab(cls.__name__): cls for cls in (Uniform, Normal, LogNormal, Triangular, Categorical, Empirical)
+    kebab_case(cls.__name__): cls for cls in (Uniform, Normal, LogNormal, Triangular, Categorical, Empirical)
 }
 
 
 def read_distribution(given: Any, where: str, kinds: Mapping[str, type] = DISTRIBUTION_TYPES) -> Any:
     """The distribution of a table. Raises ScenarioError, one line, for an unknown type, a missing or unknown field, a
     value that is not a number, and for whatever the distribution itself objects to."""
-    return sound(read_one(kinds, given, where), where)
+    return check_sound(read_one(kinds, given, where), where)
 
 
 def convert_distribution_to_si(distribution: Any, scale: float) -> Any:
@@ -206,11 +206,11 @@ def support_interval(distribution: Distribution) -> Spec:
 def describe_out_of_range(distribution: Distribution, spec: Spec, name: str) -> str | None:
     """A line if a parameter that is distributed so can leave its range, else None."""
     if isinstance(distribution, Categorical) and distribution.textual():
-        return f"{name} = {written(distribution)} is text; a number in {spec.interval()} is needed"
+        return f"{name} = {format_table(distribution)} is text; a number in {spec.interval()} is needed"
     own = support_interval(distribution)
     below = own.low < spec.low or (own.low == spec.low and spec.open_low and not own.open_low)
     above = own.high > spec.high or (own.high == spec.high and spec.open_high and not own.open_high)
     if not (below or above):
         return None
     hint = "; truncate it with low and high" if isinstance(distribution, Normal | LogNormal) else ""
-    return f"{name} = {written(distribution)} reaches {own.interval()}, outside {spec.interval()}{hint}"
+    return f"{name} = {format_table(distribution)} reaches {own.interval()}, outside {spec.interval()}{hint}"

@@ -20,21 +20,21 @@ from typing import Any
 from diffabs.core import files, provenance
 from diffabs.core.pytree import Spec
 from diffabs.core.values import (
-    FINITE,
+    FINITE_SPEC,
     ScenarioError,
-    as_given,
-    entry,
-    one_of,
-    ranged,
-    read,
+    choice_reader,
+    format_given,
+    range_reader,
+    read_as_given,
     read_one,
-    shown,
-    switch,
-    table_of,
-    text,
-    unknown,
-    within,
-    wrong,
+    read_switch,
+    read_table,
+    read_text,
+    table_field,
+    table_reader,
+    unknown_name_error,
+    whole_reader,
+    wrong_kind_error,
 )
 from diffabs.sweep import variables
 from diffabs.sweep.seal import Seal, SweepError, json_digest
@@ -53,7 +53,11 @@ EARLIER_FORMAT_MESSAGE = "written by an earlier diffabs: read its chunks with pa
 
 def describe_owner(study: Study) -> dict[str, Any]:
     """What owns the chunks of a study, computed here and now."""
-    return {"format": MANIFEST_FORMAT, "study": study.table(), "versions": provenance.origin(*DECISIVE_PACKAGES)}
+    return {
+        "format": MANIFEST_FORMAT,
+        "study": study.table(),
+        "versions": provenance.describe_platform(*DECISIVE_PACKAGES),
+    }
 
 
 class Seals:
@@ -83,7 +87,7 @@ def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
     """The manifest, without its digest. Raises SweepError, one line, if there is none, or it is not as it was written,
     or something in it cannot be."""
     try:
-        raw = files.content(pathlib.Path(folder) / MANIFEST_NAME, MAX_MANIFEST_BYTES)
+        raw = files.read_content(pathlib.Path(folder) / MANIFEST_NAME, MAX_MANIFEST_BYTES)
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise SweepError(f"{folder} is no sweep: {MANIFEST_NAME}: {why}") from None
@@ -96,15 +100,15 @@ def read_manifest(folder: pathlib.Path) -> dict[str, Any]:
 
 def _check_manifest(given: Any) -> dict[str, Any]:
     if not isinstance(given, dict):
-        raise wrong("it", given, "a table")
+        raise wrong_kind_error("it", given, "a table")
     if given.get("format") in EARLIER_FORMATS:
         raise ValueError(EARLIER_FORMAT_MESSAGE)
     if given.get("format") != MANIFEST_FORMAT:
-        raise wrong("format", given.get("format"), str(MANIFEST_FORMAT))
+        raise wrong_kind_error("format", given.get("format"), str(MANIFEST_FORMAT))
     manifest = {name: value for name, value in given.items() if name != "digest"}
     if given.get("digest") != json_digest(manifest):
         raise ValueError("it was changed after it was written: its digest is another one")
-    _check_study(read(_Manifest, manifest, "", "a manifest"))
+    _check_study(read_table(_Manifest, manifest, "", "a manifest"))
     return manifest
 
 
@@ -113,7 +117,7 @@ def _check_study(manifest: "_Manifest") -> None:
     study = manifest.study
     for name in study.failures:
         if name not in study.objectives:
-            raise unknown(f"study.failures.{shown(name)} is not measured", name, study.objectives)
+            raise unknown_name_error(f"study.failures.{format_given(name)} is not measured", name, study.objectives)
     study.space.check(study.samples)
     for name in {"sample", *FLAG_COLUMNS, *study.space.paths} & study.objectives.keys():
         raise ScenarioError(f"study.objectives.{name}: another column of the table has this name")
@@ -121,21 +125,21 @@ def _check_study(manifest: "_Manifest") -> None:
 
 def _read_utf8(given: Any, path: str) -> str:
     try:
-        text(given, path).encode()
+        read_text(given, path).encode()
     except UnicodeEncodeError:
-        raise wrong(path, given, "text without surrogates") from None
+        raise wrong_kind_error(path, given, "text without surrogates") from None
     return given
 
 
 @dataclasses.dataclass(frozen=True)
 class _Solver:
-    step: float = entry(ranged(POSITIVE_SECONDS))
-    duration: float = entry(ranged(POSITIVE_SECONDS))
+    step: float = table_field(range_reader(POSITIVE_SECONDS))
+    duration: float = table_field(range_reader(POSITIVE_SECONDS))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Adaptive(_Solver):
-    rtol: float = entry(ranged(FINITE))
+    rtol: float = table_field(range_reader(FINITE_SPEC))
 
 
 def _read_solver(given: Any, path: str) -> _Solver:
@@ -147,25 +151,25 @@ def _read_solver(given: Any, path: str) -> _Solver:
 class _Study:
     """What must be of a study (`Study.table`) for its results to be read; the parts are for the reader of the file."""
 
-    samples: int = entry(within(*RANGES["samples"]))
-    seed: int = entry(within(*RANGES["seed"]))
-    chunk: int = entry(within(*RANGES["chunk"]))
-    dtype: str = entry(one_of(*DTYPES))
-    failures: Mapping[str, float] = entry(table_of(ranged(FINITE)))
-    success: bool = entry(switch)
-    solver: _Solver = entry(_read_solver)
-    space: Space = entry(variables.read_space)
-    loop: Mapping[str, Any] = entry(table_of(as_given))
-    parts: Mapping[str, Any] = entry(table_of(table_of(as_given)))
-    objectives: Mapping[str, Any] = entry(table_of(as_given))
-    engine: Mapping[str, str] = entry(table_of(text), dict)  # none is XLA
+    samples: int = table_field(whole_reader(*RANGES["samples"]))
+    seed: int = table_field(whole_reader(*RANGES["seed"]))
+    chunk: int = table_field(whole_reader(*RANGES["chunk"]))
+    dtype: str = table_field(choice_reader(*DTYPES))
+    failures: Mapping[str, float] = table_field(table_reader(range_reader(FINITE_SPEC)))
+    success: bool = table_field(read_switch)
+    solver: _Solver = table_field(_read_solver)
+    space: Space = table_field(variables.read_space)
+    loop: Mapping[str, Any] = table_field(table_reader(read_as_given))
+    parts: Mapping[str, Any] = table_field(table_reader(table_reader(read_as_given)))
+    objectives: Mapping[str, Any] = table_field(table_reader(read_as_given))
+    engine: Mapping[str, str] = table_field(table_reader(read_text), dict)  # none is XLA
 
 
 @dataclasses.dataclass(frozen=True)
 class _Manifest:
-    format: int = entry(as_given)
-    study: _Study = entry(partial(read, _Study))
-    versions: Mapping[str, str] = entry(table_of(text))
-    source: Mapping[str, str] = entry(table_of(_read_utf8))
-    commit: str = entry(text, "")
-    units: Mapping[str, str] = entry(table_of(text), dict)
+    format: int = table_field(read_as_given)
+    study: _Study = table_field(partial(read_table, _Study))
+    versions: Mapping[str, str] = table_field(table_reader(read_text))
+    source: Mapping[str, str] = table_field(table_reader(_read_utf8))
+    commit: str = table_field(read_text, "")
+    units: Mapping[str, str] = table_field(table_reader(read_text), dict)

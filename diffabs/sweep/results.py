@@ -105,7 +105,7 @@ class Results:
         path = self.files[chunk]
         state = _file_identity(path)
         if state is not None and self._seen.get(chunk) == state:
-            with files.opened(path) as file:
+            with files.open_regular(path) as file:
                 yield pq.ParquetFile(file)
             return
         found = seal.verify_chunk(read_chunk(path), path, self._seals.of(chunk))

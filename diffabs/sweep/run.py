@@ -140,6 +140,6 @@ class _ProgressCounter:
 
     def tell(self) -> None:
         if self.told:
-            seconds = time.monotonic() - self.begun - stopwatch.compiled(self.begun)
+            seconds = time.monotonic() - self.begun - stopwatch.compile_time_since(self.begun)
             counts = (self.before + self.here, self.total, self.here, seconds, self.failed, self.diverged)
             self.told(SweepProgress(*counts, self.damaged, self.refused))

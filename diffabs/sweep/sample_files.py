@@ -8,7 +8,7 @@ import pyarrow.csv as pc
 import pyarrow.parquet as pq
 
 from diffabs.core import files
-from diffabs.core.values import unknown
+from diffabs.core.values import unknown_name_error
 
 TABLE_READERS = {".csv": pc.read_csv, ".parquet": pq.read_table}
 
@@ -19,14 +19,14 @@ def read_column(path: pathlib.Path, column: str) -> np.ndarray:
     if path.suffix.lower() not in TABLE_READERS:
         raise ValueError(f"{path} is neither {' nor '.join(TABLE_READERS)}")
     try:
-        with files.opened(path) as file:
+        with files.open_regular(path) as file:
             table = TABLE_READERS[path.suffix.lower()](file)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or str(error).splitlines()[0]}") from None
     except pa.ArrowException as error:
         raise ValueError(f"{path} is no {path.suffix[1:]} file: {str(error).splitlines()[0]}") from None
     if column not in table.column_names:
-        raise unknown(f"{path} has no column {column}", column, table.column_names)
+        raise unknown_name_error(f"{path} has no column {column}", column, table.column_names)
     return _parse_numbers(table.column(column), f"{path}, column {column}")
 
 

@@ -14,7 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.values import any_number, entry, kebab, listed, read_one, sound, table_of, whole, within, written
+from diffabs.core.values import (
+    check_sound,
+    format_table,
+    kebab_case,
+    list_reader,
+    read_any_number,
+    read_one,
+    read_whole,
+    table_field,
+    table_reader,
+    whole_reader,
+)
 from diffabs.sweep.distributions import support_interval
 
 MAX_UINT32 = 2**32 - 1  # samples, whose numbers have 32 bits in JAX's keys and in the sequences; and the greatest seed
@@ -69,7 +80,7 @@ class Sobol(SamplingDesign):
     replicates: how many, scrambled independently: the spread of their means tells the error. Each is balanced only if
         it has a power of two of samples (Owen 2020, arXiv:2008.08051)"""
 
-    replicates: int = entry(within(1, MAX_UINT32), 1)
+    replicates: int = table_field(whole_reader(1, MAX_UINT32), 1)
 
     def unit(self, seed: int, start: int, stop: int, dimension: int, samples: int) -> np.ndarray:
         block = samples // self.replicates
@@ -129,11 +140,19 @@ def _hypercube_points(seed: int, samples: int, dimension: int) -> np.ndarray:
 
 
 def _read_level(given: Any, where: str) -> Any:
-    return listed(any_number)(given, where) if isinstance(given, list | tuple) else whole(given, 2, MAX_UINT32, where)
+    return (
+        list_reader(read_any_number)(given, where)
+        if isinstance(given, list | tuple)
+        else read_whole(given, 2, MAX_UINT32, where)
+    )
 
 
 def _read_levels(given: Any, where: str) -> Any:
-    return table_of(_read_level)(given, where) if isinstance(given, Mapping) else whole(given, 2, MAX_UINT32, where)
+    return (
+        table_reader(_read_level)(given, where)
+        if isinstance(given, Mapping)
+        else read_whole(given, 2, MAX_UINT32, where)
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,7 +162,7 @@ class Grid(SamplingDesign):
     levels: of every variable, or of each by name: how many, which are equally spaced in u from 0 to 1, or a tuple of u.
         What is drawn from a list, `Categorical` and `Rows`, has a level for each of its items unless it is given u."""
 
-    levels: int | Mapping[str, int | tuple[float, ...]] = entry(_read_levels)
+    levels: int | Mapping[str, int | tuple[float, ...]] = table_field(_read_levels)
 
     def over(self, variables: Mapping[str, Any]) -> "Grid":
         """The same with the levels u of each of these variables, in their order."""
@@ -224,12 +243,12 @@ class Saltelli(SamplingDesign):
         return _check_multiple(_check_samples(samples), len(variables) + 2, "the number of variables plus 2")
 
 
-DESIGN_TYPES = {kebab(cls.__name__): cls for cls in (Random, Sobol, LatinHypercube, Grid, Corners, Saltelli)}
+DESIGN_TYPES = {kebab_case(cls.__name__): cls for cls in (Random, Sobol, LatinHypercube, Grid, Corners, Saltelli)}
 
 
 def read_sampling_design(given: Any, where: str) -> SamplingDesign:
     """The design of a table, or of the bare name of a type. Raises ScenarioError, in one line."""
-    return sound(read_one(DESIGN_TYPES, given, where), where)
+    return check_sound(read_one(DESIGN_TYPES, given, where), where)
 
 
 def _check_seed(seed: int) -> np.uint32:
@@ -267,4 +286,5 @@ def _check_exact_count(count: int, samples: int | None, what: str) -> int:
 def _support_problems(name: str, path: str, variable: Any, design: str) -> Iterator[str]:
     own = support_interval(variable)
     if own.open_low or own.open_high:
-        yield f"{name}: {path} = {written(variable)} reaches {own.interval()}; {design} needs a finite, closed support"
+        reached = f"{name}: {path} = {format_table(variable)} reaches {own.interval()}"
+        yield f"{reached}; {design} needs a finite, closed support"

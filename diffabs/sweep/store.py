@@ -132,7 +132,7 @@ def check_owner(folder: pathlib.Path, manifest: Mapping[str, Any], sample: int) 
 def read_chunk(path: pathlib.Path) -> bytes:
     """The bytes of a chunk's file. Raises SweepError for what is no file or cannot be read."""
     try:
-        return files.content(path)
+        return files.read_content(path)
     except OSError as error:
         raise SweepError(f"{path} cannot be read: {error.strerror}; move it away") from None
 

@@ -15,11 +15,11 @@ import numpy as np
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import elements, get, parameters, replace
-from diffabs.core.units import in_loop, units_of
-from diffabs.core.validity import problems
-from diffabs.core.values import plain, unknown
+from diffabs.core.units import resolve_unit, units_of
+from diffabs.core.validity import find_problems
+from diffabs.core.values import as_plain, unknown_name_error
 from diffabs.kernel import launch
-from diffabs.objectives import usual
+from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import find_solver_faults
 from diffabs.simulate.solution import Solver, describe_solver
 from diffabs.sweep.discrete import Categorical
@@ -63,7 +63,7 @@ class Study:
     def __post_init__(self) -> None:
         """Without objectives, those usual for what the plant shows."""
         if not self.objectives:
-            object.__setattr__(self, "objectives", usual(self.loop.plant))
+            object.__setattr__(self, "objectives", default_objectives(self.loop.plant))
 
     @property
     def success(self) -> bool:
@@ -75,7 +75,7 @@ class Study:
         loop = units_of(self.loop.plant)
         declared = {path: spec.unit for path, spec, _ in parameters(self.loop, units=loop)}
         varied = {path: declared[path] for path in self.space.paths if path in declared}
-        measured = {name: in_loop(getattr(one, "unit", ""), loop) for name, one in self.objectives.items()}
+        measured = {name: resolve_unit(getattr(one, "unit", ""), loop) for name, one in self.objectives.items()}
         return {**varied, **{name: unit for name, unit in measured.items() if unit}}
 
     @property
@@ -96,7 +96,7 @@ class Study:
 
     def check(self) -> "Study":
         """Raises ValueError, in one line, for everything that is wrong."""
-        lines = [*self._number_problems(), *self._variable_problems()] or list(problems(self.loop))
+        lines = [*self._number_problems(), *self._variable_problems()] or list(find_problems(self.loop))
         if lines:
             raise ValueError("; ".join(dict.fromkeys(lines)))
         return self
@@ -129,9 +129,9 @@ class Study:
                     **own,
                     "solver": describe_solver(self.solver),
                     "space": self.space.table(),
-                    "loop": plain(self.loop),
-                    "parts": plain(self.parts),
-                    "objectives": plain(self.objectives),
+                    "loop": as_plain(self.loop),
+                    "parts": as_plain(self.parts),
+                    "objectives": as_plain(self.objectives),
                 }
             )
         )
@@ -156,7 +156,7 @@ class Study:
             yield f"objectives.{name}: another column of the table has this name"
         for name, bound in self.failures.items():
             if name not in self.objectives:
-                yield str(unknown(f"failures.{name} is not measured", name, self.objectives))
+                yield str(unknown_name_error(f"failures.{name} is not measured", name, self.objectives))
             elif not np.isfinite(bound):
                 yield f"failures.{name} = {bound} is not a finite number"
 
@@ -168,7 +168,7 @@ class Study:
             if path in self.parts:
                 yield from _part_problems(path, self.space.variables.get(path), self.parts[path], self.loop)
             elif path not in known:
-                yield str(unknown(f"{path} is not a parameter of this loop", path, known))
+                yield str(unknown_name_error(f"{path} is not a parameter of this loop", path, known))
         yield from (f"parts.{path} has no distribution" for path in self.parts if path not in self.space.paths)
         if not wrong:
             yield from self.space.describe_out_of_range(known)
@@ -190,7 +190,7 @@ def _part_problems(path: str, distribution: Any, choices: Mapping[str, Any], loo
         if missing:
             yield f"{path}: no part is called {', '.join(missing)}; there is {', '.join(choices)}"
     for name, part in choices.items():
-        yield from problems(part, f"{path} {name}: ")
+        yield from find_problems(part, f"{path} {name}: ")
 
 
 def numeric_values(values: Mapping[str, Any]) -> dict[str, Any]:

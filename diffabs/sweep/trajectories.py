@@ -12,7 +12,7 @@ import numpy as np
 import zarr
 
 from diffabs.core import files
-from diffabs.core.loop import signals
+from diffabs.core.loop import run_signals
 from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Trajectory
 from diffabs.sweep.study import Study, precision
@@ -26,7 +26,7 @@ def write_trajectories(study: Study, folder: str | pathlib.Path, samples: Sequen
 
     Raises ValueError for a sample that is not in the sweep."""
     path = pathlib.Path(folder) / TRAJECTORIES_NAME
-    seen = [signals(rerun_sample(study, i).sample, study.loop.plant) for i in samples]
+    seen = [run_signals(rerun_sample(study, i).sample, study.loop.plant) for i in samples]
     with files.new_folder(path) as folder:
         group = zarr.open_group(folder, mode="w")
         numbers = {"sample": ("", np.asarray(samples, np.int64))}

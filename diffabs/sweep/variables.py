@@ -8,7 +8,16 @@ import numpy as np
 
 from diffabs.core import values
 from diffabs.core.pytree import Spec
-from diffabs.core.values import any_number, entry, kebab, listed, members, plain, sound, table_of
+from diffabs.core.values import (
+    as_plain,
+    check_sound,
+    kebab_case,
+    list_reader,
+    plain_fields,
+    read_any_number,
+    table_field,
+    table_reader,
+)
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep.discrete import Rows as Rows
 from diffabs.sweep.distributions import Distribution, Normal, describe_out_of_range
@@ -26,7 +35,7 @@ class Correlation:
     paths: variables; those not named are independent"""
 
     paths: tuple[str, ...]
-    matrix: Any = entry(listed(listed(any_number)))
+    matrix: Any = table_field(list_reader(list_reader(read_any_number)))
 
     @staticmethod
     def from_covariance(
@@ -84,7 +93,7 @@ class Correlation:
 
 def read_correlation(given: Any, where: str) -> Correlation:
     """The correlation of a table. Raises ScenarioError."""
-    return sound(values.read(Correlation, given, where), where)
+    return check_sound(values.read_table(Correlation, given, where), where)
 
 
 def _read_variable(given: Any, where: str) -> Any:
@@ -96,9 +105,9 @@ class Space:
     """The variables of a sweep, in the order of the columns of its design. Those whose value is a `Distribution` are
     parameters, by path; `Rows` hold several and may have any name."""
 
-    variables: Mapping[str, Distribution | Rows] = entry(table_of(_read_variable))
-    correlation: Correlation | None = entry(read_correlation, None)
-    design: SamplingDesign = entry(sampling.read_sampling_design, Random)
+    variables: Mapping[str, Distribution | Rows] = table_field(table_reader(_read_variable))
+    correlation: Correlation | None = table_field(read_correlation, None)
+    design: SamplingDesign = table_field(sampling.read_sampling_design, Random)
 
     @property
     def dimension(self) -> int:
@@ -161,7 +170,7 @@ class Space:
         if self.correlation:
             yield from self.correlation.problems("correlation", self.variables)
             if not isinstance(self.design, Random | Sobol | LatinHypercube):
-                yield f"correlation: a {kebab(type(self.design).__name__)} design needs independent variables"
+                yield f"correlation: a {kebab_case(type(self.design).__name__)} design needs independent variables"
 
     def describe_out_of_range(self, specs: Mapping[str, Spec], prefix: str = "") -> Iterator[str]:
         """A line for each parameter with one of these specs that can leave its range."""
@@ -176,15 +185,15 @@ class Space:
 
     def table(self) -> dict[str, Any]:
         """As values of TOML, which `read` reads."""
-        correlation = {"correlation": members(self.correlation)} if self.correlation else {}
-        variables = {name: plain(item, brief=True) for name, item in self.variables.items()}
-        return {"variables": variables, **correlation, "design": plain(self.design, brief=True)}
+        correlation = {"correlation": plain_fields(self.correlation)} if self.correlation else {}
+        variables = {name: as_plain(item, brief=True) for name, item in self.variables.items()}
+        return {"variables": variables, **correlation, "design": as_plain(self.design, brief=True)}
 
 
 def read_space(given: Any, where: str) -> Space:
     """The space of a table with `variables`, and maybe `correlation` and `design`. Raises ScenarioError, in one line,
     for whatever is wrong with one of them; `Space.check` says what is wrong with them together."""
-    return values.read(Space, given, where)
+    return values.read_table(Space, given, where)
 
 
 def _variable_paths(name: str, item: Any) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from diffabs.core.exports import lazily
+from diffabs.core.exports import lazy_getattr
 
 if TYPE_CHECKING:
     from diffabs.core.reason import Reason as Reason
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from diffabs.tune.constraints import Poles as Poles
     from diffabs.tune.descent import DescentPoint as DescentPoint
     from diffabs.tune.descent import Stopping as Stopping
-    from diffabs.tune.problem import Mode as Mode
+    from diffabs.tune.problem import DerivativeMode as DerivativeMode
     from diffabs.tune.result import Method as Method
     from diffabs.tune.result import StartError as StartError
     from diffabs.tune.result import Tuned as Tuned
@@ -27,4 +27,4 @@ if TYPE_CHECKING:
     from diffabs.tune.worst import WorstCase as WorstCase
     from diffabs.tune.worst import worst_case as worst_case
 
-__getattr__ = lazily(__name__)
+__getattr__ = lazy_getattr(__name__)

@@ -11,7 +11,7 @@ import numpy as np
 from diffabs.actuators import Delay
 from diffabs.controllers import ConstantInput, NoFeedforward, Relay, SampledOnGrid, SlidingMode
 from diffabs.core.loop import Loop
-from diffabs.core.pytree import arrayed, replace
+from diffabs.core.pytree import as_arrays, replace
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.solution import FixedStep, Solver
 from diffabs.tune.problem import build_subject_loop
@@ -57,7 +57,7 @@ def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, 
 
     def compared(values: Mapping[str, Any]) -> Any:
         """Both numbers of each pair in each run, (2, runs, pairs)."""
-        loop = arrayed(build_subject_loop(replace(subject, values)))
+        loop = as_arrays(build_subject_loop(replace(subject, values)))
         both = batch.each(loop, lambda loop, _: [jnp.stack(two) for _, *two in one_sided_candidates(loop, solver)])
         return jnp.moveaxis(jnp.stack(both, axis=1), 2, 0)
 

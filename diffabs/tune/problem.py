@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from diffabs.core.bijectors import Space
-from diffabs.core.compiling import SAME
+from diffabs.core.bijectors import FreeSpace
+from diffabs.core.compiling import SAME_RESULT_OPTIONS
 from diffabs.core.loop import Loop
 from diffabs.core.protocols import Objective
-from diffabs.core.pytree import strong
+from diffabs.core.pytree import canonical_dtypes
 from diffabs.kernel.compilers import NoCompiler
 from diffabs.simulate.admissible import batch_admissibility, first_refusal
 from diffabs.simulate.batch import Batch, run_batch
@@ -36,7 +36,7 @@ NO_REVERSE_MESSAGE = "a kernel has no reverse mode; forward mode, or engine = 'x
 MAX_FORWARD_PARAMETERS = 6  # parameters up to which forward mode is the cheaper one (benchmarks/bench_gradient.py)
 
 
-class Mode(enum.Enum):
+class DerivativeMode(enum.Enum):
     """How a gradient is computed: one rollout with a tangent per parameter, or a checkpointed backward pass."""
 
     FORWARD = "forward"
@@ -79,14 +79,14 @@ class Problem:
     `closed()`, whose parameters may then be anything that a loop can be computed from (LQ weights, say)."""
 
     subject: Any
-    space: Space
+    space: FreeSpace
     solver: Solver
     measured: Mapping[str, Objective]
     weights: Mapping[str, float]
     batch: Batch
     aggregate: Aggregate
     constraints: Sequence[Constraint]
-    mode: Mode
+    mode: DerivativeMode
     engine: str = "xla"
 
     def runs(self, z: Any) -> Run:
@@ -95,7 +95,7 @@ class Problem:
         loop = build_subject_loop(self.space.at(self.subject, z))
         return run_batch(loop, self.batch, self.solver, self.measured, together=together, engine=self.engine)
 
-    def with_engine(self, engine: str, mode: Mode | None = None) -> "Problem":
+    def with_engine(self, engine: str, mode: DerivativeMode | None = None) -> "Problem":
         """Return the problem whose runs are made by this engine; "auto" is a kernel if it can be one, and tells the log
         once why it is not. Of a kernel the mode is forward, if none is asked for.
 
@@ -104,8 +104,8 @@ class Problem:
             raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}")
         if engine == "xla":
             return self
-        line = NO_REVERSE_MESSAGE if mode is Mode.REVERSE else None
-        found = dataclasses.replace(self, engine="kernel", mode=Mode.FORWARD)
+        line = NO_REVERSE_MESSAGE if mode is DerivativeMode.REVERSE else None
+        found = dataclasses.replace(self, engine="kernel", mode=DerivativeMode.FORWARD)
         if engine == "kernel" and line:
             raise EngineError.of(line)
         if engine == "auto" and (line := line or found.objection()):
@@ -165,13 +165,13 @@ class Problem:
 
     @functools.cached_property
     def _evaluate(self) -> Any:
-        derivative = jax.jacfwd if self.mode is Mode.FORWARD else jax.grad
+        derivative = jax.jacfwd if self.mode is DerivativeMode.FORWARD else jax.grad
 
         def evaluate(z: Any, m: Multipliers, scale: Any) -> LossEvaluation:
             gradient, (value, seen) = derivative(self.loss(scale), has_aux=True)(z, m)
             return LossEvaluation(value, gradient, seen)
 
-        options = SAME if self.batch.size <= MAX_QUICK_COMPILE_RUNS else None
+        options = SAME_RESULT_OPTIONS if self.batch.size <= MAX_QUICK_COMPILE_RUNS else None
         return jax.jit(jax.vmap(evaluate, in_axes=(0, 0, None)), compiler_options=options)
 
     def objective_evaluator(self) -> Callable[[Any], ObjectiveEvaluation]:
@@ -188,7 +188,8 @@ class Problem:
 
         def loops(z: Any) -> Loop:
             return self.batch.each(
-                strong(build_subject_loop(self.space.at(self.subject, z))), lambda loop, key: strong(loop)
+                canonical_dtypes(build_subject_loop(self.space.at(self.subject, z))),
+                lambda loop, key: canonical_dtypes(loop),
             )
 
         compiled = jax.jit(jax.vmap(loops))
@@ -200,9 +201,9 @@ class Problem:
         return accepted
 
 
-def choose_gradient_mode(space: Space) -> Mode:
+def choose_gradient_mode(space: FreeSpace) -> DerivativeMode:
     """Forward for few parameters, reverse for many."""
-    return Mode.FORWARD if space.size <= MAX_FORWARD_PARAMETERS else Mode.REVERSE
+    return DerivativeMode.FORWARD if space.size <= MAX_FORWARD_PARAMETERS else DerivativeMode.REVERSE
 
 
 def _penalty(excess: Any, m: Multipliers) -> Any:

@@ -9,7 +9,7 @@ import optax
 from diffabs.core.reason import Reason
 from diffabs.core.summary import Summary
 from diffabs.tune.descent import DescentPoint, Stopping
-from diffabs.tune.problem import Mode, build_subject_loop
+from diffabs.tune.problem import DerivativeMode, build_subject_loop
 
 
 class StartError(ValueError):
@@ -33,7 +33,7 @@ class Method:
     optimiser: optax.GradientTransformation | None = None
     starts: int = 1
     seed: int = 0
-    mode: Mode | None = None
+    mode: DerivativeMode | None = None
     stopping: Stopping = dataclasses.field(default_factory=Stopping)
     rounds: int = 12
     margin: float = 1e-3
@@ -81,7 +81,7 @@ class Tuned:
     reason: Reason
     history: list[DescentPoint]
     starts: list[StartResult]
-    mode: Mode
+    mode: DerivativeMode
     diverged: tuple[int, int]
     engine: dict[str, str]
 

@@ -5,19 +5,19 @@ from typing import Any
 
 import numpy as np
 
-from diffabs.core.bijectors import Range, space
+from diffabs.core.bijectors import Range, parameter_space
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import get
-from diffabs.core.validity import check
+from diffabs.core.validity import check_part
 from diffabs.kernel.compilers import NoCompiler
-from diffabs.objectives import usual
+from diffabs.objectives import default_objectives
 from diffabs.simulate.batch import Batch
 from diffabs.simulate.engine import EngineError
 from diffabs.simulate.solution import Solver
 from diffabs.tune import one_sided
 from diffabs.tune.augmented_lagrangian import AugmentedLagrangianSearch
 from diffabs.tune.constraints import Constraint
-from diffabs.tune.problem import Mode, Problem, build_subject_loop, choose_gradient_mode
+from diffabs.tune.problem import DerivativeMode, Problem, build_subject_loop, choose_gradient_mode
 from diffabs.tune.result import Method, Tuned, TuningProgress
 from diffabs.tune.risk import Aggregate, Mean
 
@@ -103,7 +103,7 @@ def build_problem(
     measured: Mapping[str, Objective] | None = None,
     aggregate: Aggregate | None = None,
     constraints: Sequence[Constraint] = (),
-    mode: Mode | None = None,
+    mode: DerivativeMode | None = None,
     engine: str = "xla",
 ) -> Problem:
     """Return the problem that `tune` solves, for those who bring their own search.
@@ -112,12 +112,12 @@ def build_problem(
     mode: of differentiation, forward or reverse; None is the cheaper one
 
     Raises ValueError as `tune` does."""
-    check(subject)
+    check_part(subject)
     loop = build_subject_loop(subject)
-    measured = usual(loop.plant) if measured is None else measured
+    measured = default_objectives(loop.plant) if measured is None else measured
     batch = (over or Batch()).check(loop)
     _check_metrics(objective, measured, constraints)
-    free_space = space(subject, free)
+    free_space = parameter_space(subject, free)
     problem = Problem(
         subject=subject,
         space=free_space,

@@ -18,17 +18,17 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
-from diffabs.core.bijectors import Range, Space, space
+from diffabs.core.bijectors import FreeSpace, Range, parameter_space
 from diffabs.core.protocols import Objective
 from diffabs.core.pytree import replace
 from diffabs.core.reason import Reason
-from diffabs.core.validity import check
-from diffabs.objectives import usual
+from diffabs.core.validity import check_part
+from diffabs.objectives import default_objectives
 from diffabs.simulate.admissible import first_refusal
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.solution import Run, Solver
 from diffabs.tune.descent import Descent, DescentState, Stopping, lbfgs
-from diffabs.tune.problem import Mode, Multipliers, Problem, choose_gradient_mode
+from diffabs.tune.problem import DerivativeMode, Multipliers, Problem, choose_gradient_mode
 from diffabs.tune.risk import Mean
 
 MAX_CORNERS = 64
@@ -131,10 +131,10 @@ def worst_case(
         ValueError: a path or range that does not fit, an unknown metric, a corner or another point of the box that
             cannot be run.
     """
-    check(loop)
+    check_part(loop)
     measured = _check_objectives(loop, metric, measured)
     middle = replace(loop, {path: 0.5 * (np.asarray(a, float) + np.asarray(b, float)) for path, (a, b) in over.items()})
-    free, key = space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
+    free, key = parameter_space(middle, over), None if seed_of_noise is None else (seed_of_noise,)
     corners = _box_corners(np.array(free.ranges))
     points = np.concatenate([corners, _draw_points(np.array(free.ranges), screen, seed)])
     lanes = Batch(_values_by_path(free, points), None if key is None else np.repeat(key, len(points)))
@@ -151,7 +151,7 @@ def worst_case(
 
 def _check_objectives(loop: Any, metric: str, measured: Mapping[str, Objective] | None) -> Mapping[str, Objective]:
     """The objectives, or the usual ones. Raises ValueError where the metric is none of them."""
-    found = usual(loop.plant) if measured is None else measured
+    found = default_objectives(loop.plant) if measured is None else measured
     if metric not in found:
         raise ValueError(f"{metric} is not measured; there is {', '.join(found)}")
     return found
@@ -159,7 +159,7 @@ def _check_objectives(loop: Any, metric: str, measured: Mapping[str, Objective] 
 
 def _gradient_price(problem: Problem) -> float:
     """Rollouts that a gradient costs."""
-    return 1 + 1.5 * problem.space.size if problem.mode is Mode.FORWARD else 6.0
+    return 1 + 1.5 * problem.space.size if problem.mode is DerivativeMode.FORWARD else 6.0
 
 
 def _run_screening(loop: Any, lanes: Batch, solver: Solver, measured: Mapping[str, Objective], engine: str) -> Run:
@@ -181,7 +181,7 @@ def _draw_points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
     return low + (high - low) * sequence.random_base2(max(screen - 1, 0).bit_length())[:screen]
 
 
-def _values_by_path(free: Space, point: Any) -> dict[str, Any]:
+def _values_by_path(free: FreeSpace, point: Any) -> dict[str, Any]:
     """Parameters by path from their numbers in a row, or in the rows of lanes."""
     found, first = {}, 0
     for entry in free.entries:
@@ -215,7 +215,7 @@ def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[Desce
 
 def _build_worst_case(
     loop: Any,
-    free: Space,
+    free: FreeSpace,
     metric: str,
     bound: float | None,
     points: np.ndarray,

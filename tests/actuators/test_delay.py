@@ -19,7 +19,7 @@ from diffabs.actuators import Delay, Lag, Limits
 from diffabs.controllers import ConstantTorque, Relay, Sampled
 from diffabs.core.blocks import Passage, Series
 from diffabs.core.protocols import Clock, Memory, no_flow
-from diffabs.core.pytree import param, pytree, strong
+from diffabs.core.pytree import canonical_dtypes, param, pytree
 from diffabs.objectives import TorqueRate
 from diffabs.simulate.dynamics import build_dynamics
 from diffabs.simulate.stepper import init_carry
@@ -338,12 +338,12 @@ def test_a_lag_behind_a_delay():
 
 @killed_by(
     "actuators/delay.py",
-    "return _count([m.window[i, 1] for i in range(WINDOW)], t - self.time, m.place, m.last)",
+    "return _count([m.window[i, 1] for i in range(WINDOW_PIECES)], t - self.time, m.place, m.last)",
     "return jnp.clip(jnp.sum(t - self.time >= m.window[:, 1]).astype(m.last.dtype), m.place, m.last)",
 )
 def test_nobody_looks_for_the_ends_of_smooth_pieces():
     """A step spans two of them, and compares, but what it compares does not count as a kink."""
-    there = strong(loop(Says(read=lambda t: jnp.sin(40.0 * t)), Delay(time=3.3e-3, capacity=16)))
+    there = canonical_dtypes(loop(Says(read=lambda t: jnp.sin(40.0 * t)), Delay(time=3.3e-3, capacity=16)))
     kinks = []
 
     def traced():

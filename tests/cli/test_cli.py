@@ -64,7 +64,7 @@ def whole(tmp_path_factory, runs):
         def draw(run, *, title="", unit=""):
             return Figure(f"{title}: {bool(run.stopped)}")
 
-        plot = types.SimpleNamespace(of=lambda plant: draw)
+        plot = types.SimpleNamespace(figure_for=lambda plant: draw)
         patch.setitem(sys.modules, "diffabs.plot", plot)
         result = run("simulate", "slip-lmi", "--json", "--csv", folder / "a.csv", "--plot", folder / "a.png")
     return folder, json.loads(result.stdout)
@@ -125,7 +125,7 @@ def test_figure_and_nothing_else_is_left(whole):
 
 
 def test_a_long_trajectory_is_thinned(tmp_path, monkeypatch):
-    monkeypatch.setattr(main, "MOST_ROWS", 5)
+    monkeypatch.setattr(main, "MAX_CSV_ROWS", 5)
     (tmp_path / "a.csv").write_text("old")
     os.link(tmp_path / "a.csv", tmp_path / "reader.csv")  # stands for someone who has the old file open
     run("simulate", "slip-lmi", *SHORT, "--csv", tmp_path / "a.csv")
@@ -248,7 +248,7 @@ def test_failure_at_the_end_leaves_old_files_as_they_were(tmp_path, monkeypatch,
     def full(run, **_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(of=lambda plant: full))
+    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(figure_for=lambda plant: full))
     (tmp_path / "a.csv").write_text("old")
     files = ("--csv", tmp_path / "a.csv", "--plot", tmp_path / "a.png")
     result = run("simulate", "slip-lmi", *files, status=1)
@@ -278,12 +278,12 @@ def test_json_says_all_that_it_ran_with(whole):
 @pytest.mark.parametrize("name", scenario.names())
 def test_parts_and_parameters_of_the_json_make_the_same_loop(name):
     chosen = scenario.load(name, integrated=False)
-    parts = [f"{path}={{type='{row['type']}'}}" for path, row in model.parts(chosen).items()]
-    fixed = [f"{p}.{k}={v}" for p, row in model.parts(chosen).items() for k, v in row.items() if k != "type"]
-    numbers = model.numbers(chosen)
+    parts = [f"{path}={{type='{row['type']}'}}" for path, row in model.describe_parts(chosen).items()]
+    fixed = [f"{p}.{k}={v}" for p, row in model.describe_parts(chosen).items() for k, v in row.items() if k != "type"]
+    numbers = model.describe_numbers(chosen)
     values = [f"{path}={json.dumps(row['value'])}".replace('"', "") for path, row in numbers.items()]
     again = scenario.loads(b"", name, name, [*parts, *fixed, *values], integrated=False)
-    assert model.numbers(again) == numbers
+    assert model.describe_numbers(again) == numbers
 
 
 def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
@@ -294,7 +294,7 @@ def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
         titles.append(title)
         return Figure(title)
 
-    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(of=lambda plant: draw))
+    monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(figure_for=lambda plant: draw))
     monkeypatch.setattr(main, "_run", lambda chosen, key, keep: runs[0])
     gain = ("--set", "controller.gain=-4000,-40")
     tables = [run("simulate", "slip-lmi", *more, "--plot", tmp_path / "a.png").stdout for more in ((), gain)]

@@ -75,7 +75,7 @@ def test_a_sweep_says_how_accurate_it_is_without_being_asked(file, tmp_path):
     result = run("sweep", path, "--out", out, "--json")
     found = json.loads(result.stdout)["accuracy"]
     assert json.loads((out / "summary.json").read_text())["accuracy"] == found
-    study, table = section_sweep.study(load(path)), Results(out)
+    study, table = section_sweep.build_study(load(path)), Results(out)
     assert len(found["samples"]) == 6
     row = found["metrics"]["overshoot"]
     loop, key = study.lane(row["sample"])
@@ -99,7 +99,7 @@ def test_a_sweep_is_not_checked_where_that_is_turned_off(file, tmp_path):
 @pytest.mark.slow
 def test_noise_is_the_same_in_a_sweeps_half_steps(tmp_path):
     """Of the noisy sweep of the tests: the half step changes a hundredth of what other noise does."""
-    study = section_sweep.study(
+    study = section_sweep.build_study(
         loads(SCENARIO.replace("samples = 3200", "samples = 64").encode(), "small", "small.toml")
     )
     study = dataclasses.replace(study, objectives={"iae": study.objectives["iae"]})

@@ -144,7 +144,7 @@ def test_a_stop_that_is_a_fall_is_not_missed():
     stopped = np.array([True, False])
     np.testing.assert_array_equal(has_wrong_end(stopped, stops.Fallen.success), [True, False])
     np.testing.assert_array_equal(has_wrong_end(stopped, stops.Standstill.success), [False, True])
-    study = section_sweep.study(load("arm-hanging", ("sweep.failures={peak_lean=0.3}",)))
+    study = section_sweep.build_study(load("arm-hanging", ("sweep.failures={peak_lean=0.3}",)))
     assert (study.failure_bounds, study.success) == ({"fell": 0.0, "peak_lean": 0.3}, False)
 
 

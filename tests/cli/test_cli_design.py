@@ -175,7 +175,7 @@ def infeasible(monkeypatch):
 
 @killed_by(
     "cli/design.py",
-    "                    show.as_json(certificates.document(task, reason=str(error)))\n",
+    "                    show.as_json(certificates.proof_document(task, reason=str(error)))\n",
     "                    pass\n",
 )
 def test_no_gain_could_not_be_done(tmp_path, infeasible):

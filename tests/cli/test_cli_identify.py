@@ -16,7 +16,7 @@ from diffabs.cli import identify as commands_identify
 from diffabs.core.protocols import BrakeOutput
 from diffabs.identify.fit import Identified
 from diffabs.identify.uncertainty import uncertainty
-from diffabs.scenario.measurements import read
+from diffabs.scenario.measurements import read_measurements
 from diffabs.scenario.scenario import ScenarioError, load
 from diffabs.simulate import admissible
 from diffabs.simulate.solution import FixedStep
@@ -78,7 +78,7 @@ def small(file):
 
 
 def test_readings_are_what_is_in_the_file(csv):
-    t, columns = read(csv("\ufeff" + HEADER, *ROWS, ""), UNITS)
+    t, columns = read_measurements(csv("\ufeff" + HEADER, *ROWS, ""), UNITS)
     assert t.tolist() == [0, 0.1, 0.3]
     assert list(columns) == ["wheel_speed", "slip"]
     assert columns["wheel_speed"].tolist() == [13.8, 12.9, 11.0]
@@ -87,7 +87,7 @@ def test_readings_are_what_is_in_the_file(csv):
 
 def test_readings_are_what_simulate_writes(small, tmp_path):
     run("simulate", small, "--csv", tmp_path / "run.csv", "--set", "solver.duration=0.02")
-    t, columns = read(tmp_path / "run.csv", UNITS)
+    t, columns = read_measurements(tmp_path / "run.csv", UNITS)
     np.testing.assert_allclose(t, 1e-3 * np.arange(21), rtol=1e-11, atol=1e-15)
     assert list(columns) == ["slip", "speed", "wheel_speed", "deceleration", "distance"]
     np.testing.assert_allclose(columns["slip"], 1 - columns["wheel_speed"] / columns["speed"], rtol=0, atol=1e-10)
@@ -118,7 +118,7 @@ def test_a_bad_file_is_one_line(csv, lines, needed):
     path = csv(*lines) if lines else csv("")
     path.write_text(path.read_text() if lines else "")
     with pytest.raises(ScenarioError) as caught:
-        read(path, UNITS)
+        read_measurements(path, UNITS)
     assert needed in str(caught.value)
     assert str(caught.value).startswith(f"--data {path}")
     assert "\n" not in str(caught.value)
@@ -127,7 +127,7 @@ def test_a_bad_file_is_one_line(csv, lines, needed):
 def test_a_file_that_is_not_text(tmp_path):
     (tmp_path / "run.csv").write_bytes(b"t [s],slip [1]\n\xff\xfe\n")
     with pytest.raises(ScenarioError, match="is not a CSV file of UTF-8 text"):
-        read(tmp_path / "run.csv", UNITS)
+        read_measurements(tmp_path / "run.csv", UNITS)
 
 
 def test_a_file_that_is_not_there(small, tmp_path):
@@ -173,7 +173,9 @@ def test_the_arguments_reach_the_fit(small, csv, invented):
     assert asked["solver"].duration == pytest.approx(0.302)
 
 
-@killed_by("cli/identify.py", "max(_rms(residuals[name]), LEAST * spread[name])", "spread[name]")
+@killed_by(
+    "cli/identify.py", "max(_root_mean_square(residuals[name]), MIN_RELATIVE_NOISE * spread[name])", "spread[name]"
+)
 def test_noise_that_is_not_known_is_taken_from_the_residuals(small, csv, invented):
     document = json.loads(run("identify", small, "--data", csv(HEADER, *ROWS), *FREE, "--json").stdout)
     first, *others = (asked["data"].sigma for asked in invented)
@@ -231,7 +233,7 @@ def test_table_for_people(small, csv, invented):
 def test_what_simulate_wrote_is_found_again(small, tmp_path):
     truth = ("--set", "plant.mass=6.0", "--set", "road.w4=0.38")
     run("simulate", small, "--csv", tmp_path / "run.csv", *truth)
-    t, columns = read(tmp_path / "run.csv", UNITS)
+    t, columns = read_measurements(tmp_path / "run.csv", UNITS)
     noisy = columns["wheel_speed"] + np.random.default_rng(5).normal(0.0, 0.02, len(t))
     lines = (f"{x},{w}" for x, w in zip(t, noisy, strict=True))
     (tmp_path / "noisy.csv").write_text("\n".join(["t [s],wheel_speed [m/s]", *lines]))
@@ -328,7 +330,7 @@ def test_without_the_extra(small, csv, monkeypatch):
 
 
 def test_a_trajectory_is_as_long_as_the_data_and_fits_into_memory(small, csv):
-    solver, readings = load(small).solver, read(csv(HEADER, *ROWS), UNITS)
+    solver, readings = load(small).solver, read_measurements(csv(HEADER, *ROWS), UNITS)
     assert commands_identify._solver(solver, readings).steps == 302
     long = commands_identify._solver(FixedStep(1e-6, 1.0), readings)
     assert long.steps == 300_002

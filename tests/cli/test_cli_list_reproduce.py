@@ -22,7 +22,7 @@ def test_list_knows_every_part():
     document = json.loads(run("list", "--json").stdout)
     assert set(document) == {*catalogue.PLURALS, "scenarios"}
     for plural, family in catalogue.PLURALS.items():
-        assert set(document[plural]) == set(registry.types(family))
+        assert set(document[plural]) == set(registry.family_types(family))
     mass = document["plants"]["quarter-car"]["parameters"]["mass"]
     assert mass == {"default": 15.0, "unit": "kg", "range": "(0, inf) kg", "low": 0.0, "high": None}
     assert document["plants"]["quarter-car"]["parameters"]["road"]["default"] == "spline-b"
@@ -81,7 +81,7 @@ def papers(monkeypatch):
     importlib.import_module("diffabs.report")  # before its papers are replaced
     found = {"slip-lmi": good, "slip-estimator": good}
     monkeypatch.setattr(
-        report, "write", lambda sources, target, title="": target.write_text(f"report of {len(sources)}")
+        report, "write_report_file", lambda sources, target, title="": target.write_text(f"report of {len(sources)}")
     )
     monkeypatch.setitem(sys.modules, "diffabs.papers", types.SimpleNamespace(PAPERS=found, compact=compact))
     return found, interrupted
@@ -113,8 +113,8 @@ def test_on_a_terminal_the_spinner_says_which_step(papers, tmp_path, monkeypatch
         shown.append(f"{message} ... {detail()}")
         return result
 
-    monkeypatch.setattr(console, "animated", lambda: True)
-    monkeypatch.setattr(console, "waited", waited)
+    monkeypatch.setattr(console, "is_animated", lambda: True)
+    monkeypatch.setattr(console, "run_with_progress", waited)
     result = run("reproduce", "slip-lmi", "--out", tmp_path)
     assert shown == ["reproducing slip-lmi ... drawing"]
     assert "drawing" not in result.stderr

@@ -29,7 +29,7 @@ from diffabs.design.sdp import solver
 from diffabs.scenario.scenario import load
 from diffabs.simulate import admissible
 from diffabs.simulate.run import measure
-from diffabs.tune import Mode, Reason, StartError, Tuned
+from diffabs.tune import DerivativeMode, Reason, StartError, Tuned
 
 SMALL = f"""title = "small"{rig(50.0, 48.0)}
 [solver]
@@ -67,13 +67,13 @@ def quick():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(console, "PATIENCE", math.inf)
         patch.setattr(admissible, "stable_step", lambda loop: np.inf)
-        patch.setitem(sys.modules, "diffabs.plot.tuning", types.SimpleNamespace(tuning=drawn))
+        patch.setitem(sys.modules, "diffabs.plot.tuning", types.SimpleNamespace(draw_tuning=drawn))
         yield
 
 
 @pytest.mark.filterwarnings("default")
 def test_a_warning_of_the_library_is_a_line(capsys):
-    console.waited(lambda: warnings.warn("of two\nlines", stacklevel=1), "warning")
+    console.run_with_progress(lambda: warnings.warn("of two\nlines", stacklevel=1), "warning")
     assert capsys.readouterr().err == "warning: of two lines\n"
 
 
@@ -100,7 +100,7 @@ def unproved(monkeypatch):
     def none(chosen):
         raise ValueError("no proof was asked for")
 
-    monkeypatch.setattr(certificates, "task", none)
+    monkeypatch.setattr(certificates, "build_proof_task", none)
 
 
 @pytest.fixture
@@ -133,9 +133,9 @@ def tuned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tuned")
     (folder / "small.toml").write_text(SMALL)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(certificates, "task", lambda chosen: pytest.fail("asked for a proof too early"))
+        patch.setattr(certificates, "build_proof_task", lambda chosen: pytest.fail("asked for a proof too early"))
         patch.setattr(
-            commands_tune, "certificate_of", lambda after: commands_tune.Proved({"decay_rate": None}, "no proof")
+            commands_tune, "certify_result", lambda after: commands_tune.Proved({"decay_rate": None}, "no proof")
         )
         out = ("--out", folder / "out.toml", "--plot", folder / "a.png")
         result = run("tune", folder / "small.toml", "--json", *out)
@@ -242,15 +242,17 @@ def test_table_for_people(small, invented):
 
 def test_how_far_it_is():
     told = [library.TuningProgress(0, 2, point) for point in HISTORY]
-    assert commands_tune._said([]) == progress.Far("compiling")
+    assert commands_tune._format_progress([]) == progress.WorkProgress("compiling")
     line = "loss 0.75, gradient 0.01, violation 0, 2 evaluations, 2 under way"
-    assert commands_tune._said(told) == progress.Far(line, HISTORY[-1].iteration, None, at_most=True)
-    assert commands_tune._said(told, 30).total == 30
+    assert commands_tune._format_progress(told) == progress.WorkProgress(
+        line, HISTORY[-1].iteration, None, at_most=True
+    )
+    assert commands_tune._format_progress(told, 30).total == 30
 
 
 def test_progress_is_told_again_when_it_changes(monkeypatch, capsys):
     monkeypatch.setattr(console, "PATIENCE", 0.0)
-    monkeypatch.setattr(console, "AGAIN", 0.0)
+    monkeypatch.setattr(console, "SECOND_INTERRUPT_S", 0.0)
     monkeypatch.setattr(progress, "QUIET", math.inf)  # no seconds, which depend on the machine's load
     steps = iter(["one", "one", "two", "two"])
     told = threading.Event()
@@ -258,7 +260,7 @@ def test_progress_is_told_again_when_it_changes(monkeypatch, capsys):
     def detail():
         return next(steps, None) or (told.set(), "two")[1]
 
-    console.waited(lambda: told.wait(60.0), "working", detail)
+    console.run_with_progress(lambda: told.wait(60.0), "working", detail)
     assert capsys.readouterr().err == "working ... one\nworking ... two\n"
 
 
@@ -281,7 +283,18 @@ def test_without_the_design_extra_there_is_no_certificate(small, invented, monke
 def fake(loop, what):
     metrics = {name: np.zeros(what["over"].size) for name in what["measured"]}
     return Tuned(
-        *(loop, {}, (1.0, 1.0), (0.0, 0.0), (metrics, metrics), True, Reason.GRADIENT, HISTORY, [], Mode.FORWARD),
+        *(
+            loop,
+            {},
+            (1.0, 1.0),
+            (0.0, 0.0),
+            (metrics, metrics),
+            True,
+            Reason.GRADIENT,
+            HISTORY,
+            [],
+            DerivativeMode.FORWARD,
+        ),
         *((0, 0), {"name": "xla"}),
     )
 
@@ -355,9 +368,9 @@ def test_met_is_met_without_a_tolerance(small, invented, bound, met):
 
 
 def test_a_limit_on_what_is_no_number_is_not_met():
-    judged = tune_document._judged("overshoot", 0.2, 0.3, math.nan, at_most=True)
+    judged = tune_document._constraint_row("overshoot", 0.2, 0.3, math.nan, at_most=True)
     assert (judged["met"], judged["missed"]) == (False, None)
-    judged = tune_document._judged("certified decay", 5.0, None, None, at_most=False)
+    judged = tune_document._constraint_row("certified decay", 5.0, None, None, at_most=False)
     assert (judged["met"], judged["missed"]) == (False, None)
 
 
@@ -380,7 +393,7 @@ def test_what_the_packaged_cure_says_is_met_is_met(tmp_path, changes):
         assert row["after"] <= row["bound"] if row["name"] == "overshoot" else row["after"] >= row["bound"]
         assert row["missed"] == 0.0
     after = load(tmp_path / "c.toml")
-    asked = certificates.task(after)
+    asked = certificates.build_proof_task(after)
     z = np.linalg.eigvals(asked.polytope.closed(asked.gain)).astype(complex)
     poles = np.log(z[np.abs(z) > 1e-9]) / asked.polytope.period  # the rest decays at once
     assert (-poles.real / np.abs(poles)).min() >= after.tune.damping
@@ -430,7 +443,7 @@ def endless(invented, monkeypatch):
 
     found = library.tune
     monkeypatch.setattr(library, "tune", tune)
-    monkeypatch.setattr(interrupt, "pressed", lambda: bool(told) and bool(told.pop()))
+    monkeypatch.setattr(interrupt, "take_interrupt", lambda: bool(told) and bool(told.pop()))
 
 
 def test_interrupted_it_shows_and_writes_the_best_so_far(small, endless, tmp_path):
@@ -461,7 +474,7 @@ def test_interrupted_while_it_certifies_it_shows_what_was_found(small, invented,
     def interrupted(_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands_tune, "certificate_of", interrupted)
+    monkeypatch.setattr(commands_tune, "certify_result", interrupted)
     document = json.loads(run("tune", small, "--json", "--out", tmp_path / "out.toml", status=130).stdout)
     assert (document["interrupted"], document["met"]) == (True, True)
     assert document["certificate"]["reason"] == "interrupted"
@@ -472,7 +485,7 @@ def test_interrupted_while_it_draws_there_is_no_picture(small, invented, tmp_pat
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands_tune, "_drawn", interrupted)
+    monkeypatch.setattr(commands_tune, "_draw", interrupted)
     files = ("--out", tmp_path / "out.toml", "--plot", tmp_path / "a.png")
     document = json.loads(run("tune", small, "--json", *files, status=130).stdout)
     assert document["files"] == {"out": str(tmp_path / "out.toml")}

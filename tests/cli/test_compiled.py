@@ -15,7 +15,12 @@ from diffabs.cli import compiled
 def user(tmp_path, monkeypatch):
     """A user who has decided nothing, and the home."""
     before = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
-    for name in (*compiled.CHOSEN, compiled.OFF, "XDG_CACHE_HOME", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
+    for name in (
+        *compiled.USER_VARIABLES,
+        compiled.OFF_VARIABLE,
+        "XDG_CACHE_HOME",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+    ):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(sys, "platform", "linux")
@@ -40,7 +45,7 @@ def test_where_each_system_wants_it(user, monkeypatch, system, variable, folder)
     monkeypatch.setattr(sys, "platform", system)
     if variable:
         monkeypatch.setenv(variable, str(user / "given"))
-    found = compiled.keep()
+    found = compiled.use_compilation_cache()
     assert found.parent == user / folder / "diffabs"
     assert found.is_dir()
     assert jax.config.jax_compilation_cache_dir == str(found)
@@ -49,44 +54,48 @@ def test_where_each_system_wants_it(user, monkeypatch, system, variable, folder)
 
 def test_a_relative_folder_is_none(user, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "here")
-    assert compiled.keep().parent == user / ".cache" / "diffabs"
+    assert compiled.use_compilation_cache().parent == user / ".cache" / "diffabs"
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [(compiled.OFF, "1"), ("JAX_COMPILATION_CACHE_DIR", "elsewhere"), ("JAX_ENABLE_COMPILATION_CACHE", "false")],
+    [
+        (compiled.OFF_VARIABLE, "1"),
+        ("JAX_COMPILATION_CACHE_DIR", "elsewhere"),
+        ("JAX_ENABLE_COMPILATION_CACHE", "false"),
+    ],
 )
 def test_who_has_decided_is_asked_no_more(user, monkeypatch, name, value):
     monkeypatch.setenv(name, value)
-    assert compiled.keep() is None
+    assert compiled.use_compilation_cache() is None
     assert jax.config.jax_compilation_cache_dir is None
     assert not list(user.iterdir())
 
 
 def test_a_folder_of_jaxs_own_stays(user):
     jax.config.update("jax_compilation_cache_dir", "mine")
-    assert compiled.keep() is None
+    assert compiled.use_compilation_cache() is None
     assert jax.config.jax_compilation_cache_dir == "mine"
 
 
 def test_a_folder_that_cannot_be_made_is_no_cache(user):
     (user / ".cache").write_text("a file")
-    assert compiled.keep() is None
+    assert compiled.use_compilation_cache() is None
     assert jax.config.jax_compilation_cache_dir is None
 
 
 def test_a_folder_that_cannot_be_written_is_no_cache(user, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
-    assert compiled.keep() is None
+    assert compiled.use_compilation_cache() is None
     assert jax.config.jax_compilation_cache_dir is None
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="Windows has no such modes")
 def test_a_folder_that_others_may_write_to_is_no_cache(user, caplog):
-    folder = compiled.keep()
+    folder = compiled.use_compilation_cache()
     folder.chmod(0o777)
     jax.config.update("jax_compilation_cache_dir", None)
-    assert compiled.keep() is None
+    assert compiled.use_compilation_cache() is None
     assert jax.config.jax_compilation_cache_dir is None
     assert [record.message for record in caplog.records] == [
         f"{folder}: nothing is kept there, because other users may write to it"
@@ -94,18 +103,18 @@ def test_a_folder_that_others_may_write_to_is_no_cache(user, caplog):
 
 
 def test_the_oldest_half_goes_where_there_is_too_much(user, monkeypatch):
-    folder = compiled.keep()
+    folder = compiled.use_compilation_cache()
     for i in range(4):
         path = folder / f"{i}-cache"
         path.write_bytes(bytes(10))
         os.utime(path, (i, i))
     monkeypatch.setattr(compiled, "ROOM", 40)
     jax.config.update("jax_compilation_cache_dir", None)
-    assert compiled.keep() == folder
+    assert compiled.use_compilation_cache() == folder
     assert len(list(folder.iterdir())) == 4
     monkeypatch.setattr(compiled, "ROOM", 39)
     jax.config.update("jax_compilation_cache_dir", None)
-    assert compiled.keep() == folder
+    assert compiled.use_compilation_cache() == folder
     assert {path.name for path in folder.iterdir()} == {"2-cache", "3-cache"}
 
 

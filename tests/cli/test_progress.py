@@ -10,7 +10,7 @@ import pytest
 from mutants import killed_by
 
 from diffabs.cli import console, progress
-from diffabs.cli.progress import Far, Pace
+from diffabs.cli.progress import WorkProgress, WorkTiming
 from diffabs.core import stopwatch
 
 
@@ -34,10 +34,10 @@ def test_spans_that_overlap_count_once():
     assert watch.seconds(since=20.0) == 0.0
 
 
-@killed_by("core/stopwatch.py", "if event.startswith(TOLD):", "if False:")
+@killed_by("core/stopwatch.py", "if event.startswith(COMPILE_EVENT):", "if False:")
 def test_what_jax_compiles_is_counted():
-    stopwatch.listen()
-    stopwatch.listen()  # once is enough
+    stopwatch.count_compilations()
+    stopwatch.count_compilations()  # once is enough
     begun = time.monotonic()
 
     def long(x):
@@ -46,52 +46,52 @@ def test_what_jax_compiles_is_counted():
         return x
 
     jax.jit(long)(jnp.ones((4, 4))).block_until_ready()
-    took = stopwatch.compiled(begun)
+    took = stopwatch.compile_time_since(begun)
     assert 0.0 < took <= time.monotonic() - begun
-    before, begun_again = stopwatch.compiled(begun), time.monotonic()
-    with stopwatch.compiling():
+    before, begun_again = stopwatch.compile_time_since(begun), time.monotonic()
+    with stopwatch.count_as_compiling():
         time.sleep(0.05)
     most = time.monotonic() - begun_again  # more than asked for where the machine is busy
-    assert 0.049 <= stopwatch.compiled(begun) - before <= most
+    assert 0.049 <= stopwatch.compile_time_since(begun) - before <= most
 
 
-@killed_by("cli/progress.py", "spent = now - start - stopwatch.compiled(start)", "spent = now - start")
+@killed_by("cli/progress.py", "spent = now - start - stopwatch.compile_time_since(start)", "spent = now - start")
 def test_what_is_left_does_not_count_compiling(clock):
     """30 s, of which 20 were compiling, for a tenth of the work: the rest takes 90 s, not 270."""
     now, watch = clock
-    pace = Pace()
-    assert pace.said(Far("compiling", 0, 100)) == ""
+    pace = WorkTiming()
+    assert pace.said(WorkProgress("compiling", 0, 100)) == ""
     now[0] = 130.0
     watch.add(105.0, 125.0)
-    assert pace.said(Far("ten", 10, 100)) == "; 30 s, 20 s of it compiling, 1 min 30 s left"
-    assert pace.said(Far("", 10, 100, at_most=True)).endswith(", at most 1 min 30 s left")
-    assert pace.said(Far("")) == " 30 s, 20 s of it compiling"
+    assert pace.said(WorkProgress("ten", 10, 100)) == "; 30 s, 20 s of it compiling, 1 min 30 s left"
+    assert pace.said(WorkProgress("", 10, 100, at_most=True)).endswith(", at most 1 min 30 s left")
+    assert pace.said(WorkProgress("")) == " 30 s, 20 s of it compiling"
 
 
 @killed_by("cli/progress.py", "self.first = self.first or (now, far.done)", "self.first = self.first or (now, 0.0)")
 def test_what_was_there_before_is_no_pace(clock):
     """A sweep that goes on: 50 of 100 were there; 10 more took 10 s."""
     now, _ = clock
-    pace = Pace()
-    pace.said(Far("", 50, 100))
+    pace = WorkTiming()
+    pace.said(WorkProgress("", 50, 100))
     now[0] = 101.5
-    assert pace.said(Far("fifty", 50, 100)) == "; 2 s"
+    assert pace.said(WorkProgress("fifty", 50, 100)) == "; 2 s"
     now[0] = 110.0
-    assert pace.said(Far("sixty", 60, 100)) == "; 10 s, 40 s left"
+    assert pace.said(WorkProgress("sixty", 60, 100)) == "; 10 s, 40 s left"
 
 
 @pytest.mark.parametrize(
     ("seconds", "words"), [(0.4, "0 s"), (59.6, "1 min 0 s"), (3700.0, "1 h 1 min"), (61.0, "1 min 1 s")]
 )
 def test_a_time_in_words(seconds, words):
-    assert progress.spoken(seconds) == words
+    assert progress.format_duration(seconds) == words
 
 
 @killed_by("cli/progress.py", "if told != (told := words):", "if True:")
 def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
     """Where nothing can be drawn over, in lines; those that only differ in time are not told again."""
     monkeypatch.setattr(console, "PATIENCE", 1.0)
-    monkeypatch.setattr(console, "AGAIN", 0.1)
+    monkeypatch.setattr(console, "SECOND_INTERRUPT_S", 0.1)
     begun, later = time.monotonic(), threading.Event()
     asked = []
 
@@ -100,17 +100,17 @@ def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
         later.set() if sum(asked) == 2 else None  # the first has been told by then
         return "somewhere"
 
-    console.waited(lambda: later.wait(60.0), "working", detail)
+    console.run_with_progress(lambda: later.wait(60.0), "working", detail)
     said = capsys.readouterr().err
     assert re.fullmatch(r"working ... somewhere; \d+ s(, \d+ s of it compiling)?\n", said), said
 
 
 @killed_by("cli/console.py", '"of it compiling": round(compiling, 1)', '"of it compiling": 0.0')
 def test_documents_say_how_long_they_took():
-    console.begin(["list", "roads"])
-    with stopwatch.compiling():
+    console.note_command(["list", "roads"])
+    with stopwatch.count_as_compiling():
         time.sleep(0.2)
-    made = console.made()
+    made = console.describe_making()
     assert made["command"] == "diffabs list roads"
     assert 0.1 <= made["of it compiling"] <= made["seconds"] <= 300.0
 
@@ -129,6 +129,6 @@ def test_documents_say_how_long_they_took():
     ],
 )
 def test_a_status_has_one_line(width, line):
-    found = progress.fitted("reproducing x ... nine runs on snow", "nine runs on snow", "; 9 s left", width)
+    found = progress.fit_line("reproducing x ... nine runs on snow", "nine runs on snow", "; 9 s left", width)
     assert found == line
     assert len(found) <= max(width, len("…; 9 s left"))

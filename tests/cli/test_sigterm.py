@@ -69,21 +69,21 @@ from diffabs.cli import console
 from diffabs.core import files, interrupt
 
 def work():
-    with files.unfinished(pathlib.Path(sys.argv[1]) / "half.tmp") as path:
+    with files.temporary_path(pathlib.Path(sys.argv[1]) / "half.tmp") as path:
         path.mkdir()
         (path / "data").write_text("half")
         print("begun", flush=True, file=sys.__stdout__)  # stdout itself is not of a command's work
         time.sleep(100)
 
-interrupt.begin()
+interrupt.begin_hearing()
 try:
-    console.waited(work, "working")
+    console.run_with_progress(work, "working")
 except KeyboardInterrupt:
     console.leave(console.INTERRUPTED)
 """
 
 
-@killed_by("cli/console.py", "        files.clear()\n", "")
+@killed_by("cli/console.py", "        files.remove_unfinished()\n", "")
 def test_what_a_thread_was_writing_goes_with_it(tmp_path):
     with started(sys.executable, "-c", LEAVING, str(tmp_path)) as process:
         assert process.stdout.readline() == "begun\n"

@@ -206,29 +206,29 @@ def signals():
 
 
 def test_a_library_leaves_control_c_alone(signals):
-    interrupt.early()
+    interrupt.end_early_on_interrupt()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_what_is_to_be_ignored_stays_ignored(signals):
     """As a shell has it for what runs behind it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    interrupt.begin()
+    interrupt.begin_hearing()
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
 def test_a_press_interrupts_where_work_is_waited_for(signals):
     """Not where the signal finds the program, which may be anywhere."""
-    interrupt.begin()
+    interrupt.begin_hearing()
     signal.raise_signal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
-        console.waited(lambda: time.sleep(5), "working")
-    assert not interrupt.pressed()
+        console.run_with_progress(lambda: time.sleep(5), "working")
+    assert not interrupt.take_interrupt()
 
 
 def test_work_that_can_end_early_is_asked_first(signals, capsys):
-    interrupt.begin()
-    ending = console.Ending("this")
+    interrupt.begin_hearing()
+    ending = console.EarlyEnd("this")
 
     def work():
         interrupt._press()
@@ -237,18 +237,20 @@ def test_work_that_can_end_early_is_asked_first(signals, capsys):
             time.sleep(0.01)
         return "what there is"
 
-    assert console.waited(work, "working", ending=ending) == "what there is"
+    assert console.run_with_progress(work, "working", ending=ending) == "what there is"
     assert "interrupted: finishing this (Ctrl-C again: at once)" in capsys.readouterr().err
     interrupt._press()
     with pytest.raises(KeyboardInterrupt):
-        console.waited(lambda: time.sleep(5), "working", ending=ending)
+        console.run_with_progress(lambda: time.sleep(5), "working", ending=ending)
 
 
 def test_nothing_to_show_is_not_waited_for(signals):
-    interrupt.begin()
+    interrupt.begin_hearing()
     interrupt._press()
     with pytest.raises(KeyboardInterrupt):
-        console.waited(lambda: time.sleep(5), "working", ending=console.Ending("this", nothing=lambda: True))
+        console.run_with_progress(
+            lambda: time.sleep(5), "working", ending=console.EarlyEnd("this", nothing=lambda: True)
+        )
 
 
 def printed(*tables):
@@ -270,7 +272,7 @@ def test_tables_fit_and_keep_their_words(seed):
     rows = [[" ".join(word() for _ in range(rng.randint(0, 4))) for _ in names] for _ in range(4)]
     for row in rows:
         table.add_row(*row)
-    text = printed(*tables.fitted(table, COLUMNS))
+    text = printed(*tables.fit_table(table, COLUMNS))
     assert max(map(len, text.splitlines())) <= COLUMNS
     assert words(text) == {word for row in [names, *rows] for cell in row for word in cell.split()}
 
@@ -278,11 +280,11 @@ def test_tables_fit_and_keep_their_words(seed):
 def test_a_table_that_fits_is_as_it_was():
     table = Table("metric", "value", "unit")
     table.add_row("stop_distance", "12.3264", "m")
-    assert printed(*tables.fitted(table, COLUMNS)) == printed(table)
+    assert printed(*tables.fit_table(table, COLUMNS)) == printed(table)
 
 
 def test_lines_are_folded_between_words_and_commands_can_be_copied(monkeypatch, capsys):
-    monkeypatch.setattr(console, "_width", lambda: 40)
+    monkeypatch.setattr(console, "_terminal_width", lambda: 40)
     line = "error: a line that is far too long for such a narrow terminal, controller.controller.gain"
     console.say(line)
     told = capsys.readouterr().err

@@ -359,7 +359,7 @@ def two_maxima(t):
     return seen(0.1 + t, deceleration=values[i] + (values[i + 1] - values[i]) * x * x * (3 - 2 * x))
 
 
-@killed_by("references/peak_slip.py", "zero + LEAST, slip", "zero, slip")
+@killed_by("references/peak_slip.py", "zero + MIN_DECELERATION, slip", "zero, slip")
 def test_latch_waits_for_the_brake():
     """A wheel that rolls shows a deceleration of some 1e-5 m/s^2 in single precision, up and down; then the brake."""
 

@@ -14,8 +14,8 @@ from mutants import killed_by
 
 import diffabs as d
 from diffabs import controllers, objectives, plants, roads, stops
-from diffabs.core.pytree import strong
-from diffabs.core.validity import check
+from diffabs.core.pytree import canonical_dtypes
+from diffabs.core.validity import check_part
 from diffabs.scenario.defaults import braking
 
 SOLVER = d.FixedStep(1e-3, 0.25)
@@ -61,12 +61,12 @@ KINDS = {
 def test_what_is_no_number_is_refused_by_name(kind):
     value, message = KINDS[kind]
     loop = d.replace(RIG, {"plant.mass": value})
-    for use in (check, iae):
+    for use in (check_part, iae):
         with pytest.raises(ValueError, match=re.escape(message)):
             use(loop)
     if kind not in ("nothing", "part", "text in a list"):  # which are no leaf, or other leaves
         with pytest.raises(ValueError, match=re.escape(message.partition(";")[0])):
-            strong(loop)
+            canonical_dtypes(loop)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_what_is_no_number_is_refused_by_name(kind):
 )
 def test_every_kind_of_number_is_that_number(value):
     """In double precision; a JAX array of single precision asks for a run in it."""
-    found = iae(check(d.replace(RIG, {"plant.mass": value})))
+    found = iae(check_part(d.replace(RIG, {"plant.mass": value})))
     assert found == iae(d.replace(RIG, {"plant.mass": 5.0}))
     assert found.dtype == jnp.float64
 
@@ -84,7 +84,7 @@ def test_a_list_is_an_array():
     assert listed == tupled == iae(d.replace(RIG, {"controller.gain": np.array([-9e3, -40.0])}))
 
 
-@killed_by("core/validity.py", "kinds.shape(value) != spec.shape", "False")
+@killed_by("core/validity.py", "kinds.value_shape(value) != spec.shape", "False")
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [

@@ -10,8 +10,8 @@ from mutants import killed_by
 
 import diffabs
 from diffabs.core.arrays import as_array
-from diffabs.core.pytree import get, param, parameters, part, prepared, pytree, replace, static, strong
-from diffabs.core.validity import check, problems
+from diffabs.core.pytree import canonical_dtypes, get, param, parameters, part, prepare_parts, pytree, replace, static
+from diffabs.core.validity import check_part, find_problems
 from diffabs.roads import DRY_ASPHALT, SPLINE_B, MagicFormula, Patches, Scaled
 
 
@@ -74,16 +74,16 @@ def test_static_field_compiles_again_and_a_value_does_not():
         traces.append(spring.turns)
         return 2 * spring.stiffness
 
-    assert double(strong(Spring())) == 4.0
-    assert double(strong(Spring(stiffness=3.0))) == 6.0
-    assert double(strong(Spring(turns=4))) == 4.0
+    assert double(canonical_dtypes(Spring())) == 4.0
+    assert double(canonical_dtypes(Spring(stiffness=3.0))) == 6.0
+    assert double(canonical_dtypes(Spring(turns=4))) == 4.0
     assert traces == [3, 4]
 
 
 def test_check_names_every_offender_with_value_range_and_unit():
     bad = Pair(springs=(Spring(stiffness=0.0), Spring(damping=1.0)), limit=np.nan)
     with pytest.raises(ValueError, match="outside") as error:
-        check(bad, "pair.")
+        check_part(bad, "pair.")
     assert str(error.value).split("; ") == [
         "pair.springs.0.stiffness = 0 is outside (0, inf) N/m",
         "pair.springs.1.damping = 1 is outside [0, 1)",
@@ -94,20 +94,20 @@ def test_check_names_every_offender_with_value_range_and_unit():
 @killed_by("core/pytree.py", " & ((abs(x) < math.inf) | self.infinite)", "")
 def test_check_returns_the_part_and_allows_declared_infinities():
     pair = Pair()
-    assert check(pair) is pair
-    assert list(problems(Pair(limit=-np.inf))) == []
-    assert list(problems(Spring(stiffness=np.inf))) == ["stiffness = inf is outside (0, inf) N/m"]
+    assert check_part(pair) is pair
+    assert list(find_problems(Pair(limit=-np.inf))) == []
+    assert list(find_problems(Spring(stiffness=np.inf))) == ["stiffness = inf is outside (0, inf) N/m"]
 
 
 def test_check_sees_one_bad_element_of_an_array():
     with pytest.raises(ValueError, match=r"rest = \[ ?0\. nan\] is outside \(-inf, inf\) m"):
-        check(Spring(rest=np.array([0.0, np.nan])))
+        check_part(Spring(rest=np.array([0.0, np.nan])))
 
 
 def test_own_problems_have_the_path_and_wait_for_the_ranges():
     same = np.array([1.0, 1.0])
-    assert list(problems(Pair(springs=(Spring(rest=same),)))) == ["springs.0.rest has two equal lengths"]
-    assert list(problems(Spring(rest=same, damping=2.0))) == ["damping = 2 is outside [0, 1)"]
+    assert list(find_problems(Pair(springs=(Spring(rest=same),)))) == ["springs.0.rest has two equal lengths"]
+    assert list(find_problems(Spring(rest=same, damping=2.0))) == ["damping = 2 is outside [0, 1)"]
 
 
 def test_parameters_in_order_of_declaration():
@@ -159,14 +159,14 @@ def test_strong_makes_one_dtype():
         ({"a": jnp.ones(2, jnp.float32), "b": jnp.float64(2.0)}, jnp.float64),
         ({"a": 1.0, "k": jnp.arange(3)}, jnp.float64),
     ):
-        leaves = jax.tree.leaves(strong(tree))
+        leaves = jax.tree.leaves(canonical_dtypes(tree))
         assert [x.dtype for x in leaves] == [dtype] * len(leaves)
         assert not any(x.weak_type for x in leaves)
 
 
 def test_strong_saves_a_compilation():
     """A Python float and an array are two types to jit. With `strong` they are one."""
-    for prepare, count in ((lambda tree: tree, 2), (strong, 1)):
+    for prepare, count in ((lambda tree: tree, 2), (canonical_dtypes, 1)):
         double = jax.jit(lambda spring: 2 * spring.stiffness)
         double(prepare(Spring()))
         double(prepare(Spring(stiffness=jnp.asarray(3.0))))
@@ -175,12 +175,12 @@ def test_strong_saves_a_compilation():
 
 def test_prepared_reaches_nested_parts_and_keeps_the_rest():
     loop = diffabs.braking(plant=diffabs.braking().plant)
-    road = prepared(replace(loop, {"plant.road": Patches(roads=(Scaled(road=SPLINE_B, scale=0.7), DRY_ASPHALT))}))
+    road = prepare_parts(replace(loop, {"plant.road": Patches(roads=(Scaled(road=SPLINE_B, scale=0.7), DRY_ASPHALT))}))
     inner = road.plant.road.roads[0]
     assert type(inner.road).__name__ == "PiecewiseCubic"
     assert inner.scale == 0.7
     assert road.plant.road.roads[1].c1 == DRY_ASPHALT.c1
-    assert prepared(()) == ()
+    assert prepare_parts(()) == ()
 
 
 def test_prepared_is_differentiable():
@@ -188,7 +188,7 @@ def test_prepared_is_differentiable():
 
     def mu(value):
         road = dataclasses.replace(SPLINE_B, mu=jnp.asarray(SPLINE_B.mu).at[4].set(value))
-        return prepared(road).friction(SPLINE_B.slip[4])
+        return prepare_parts(road).friction(SPLINE_B.slip[4])
 
     np.testing.assert_allclose(jax.jit(jax.grad(mu))(0.96331), 1.0, rtol=1e-12, atol=0)
 
@@ -222,12 +222,12 @@ def test_leaves_have_the_names_of_the_fields():
 @killed_by("core/arrays.py", "_number(float(x), math.copysign(1.0, x), ", "_number(float(x), 1.0, ")
 def test_an_array_is_made_once_of_each_number():
     """Of each type, and of 0 and -0, which are equal; within jit none is kept."""
-    first, second = (strong([0.0, -0.0, 1.5]) for _ in range(2))
+    first, second = (canonical_dtypes([0.0, -0.0, 1.5]) for _ in range(2))
     assert all(a is b for a, b in zip(first, second, strict=True))
     assert np.signbit(first).tolist() == [False, True, False]
-    assert strong([1.5, jnp.float32(2.0)])[0].dtype == np.float32
-    jax.jit(lambda: strong([7.25]))()
-    assert not isinstance(strong([7.25])[0], jax.core.Tracer)
+    assert canonical_dtypes([1.5, jnp.float32(2.0)])[0].dtype == np.float32
+    jax.jit(lambda: canonical_dtypes([7.25]))()
+    assert not isinstance(canonical_dtypes([7.25])[0], jax.core.Tracer)
 
 
 def test_an_array_of_a_number_has_the_precision_of_now():

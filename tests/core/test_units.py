@@ -45,7 +45,7 @@ def test_figure_and_trajectories_of_the_lab_rig(tmp_path, monkeypatch):
     assert "control [1]" in texts
     assert not any("N m" in text for text in texts)
     over = 'sweep.over={"plant.road.w4"=[0.3,0.4]}'
-    study = section_sweep.study(scenario.load("lab-rig", [*SHORT[1::2], over]))
+    study = section_sweep.build_study(scenario.load("lab-rig", [*SHORT[1::2], over]))
     kept = zarr.open_group(write_trajectories(study, tmp_path, [0]), mode="r")
     assert (kept["control"].attrs["units"], kept["command"].attrs["units"]) == ("1", "1")
 
@@ -59,5 +59,5 @@ def test_what_is_measured_of_a_control_has_its_unit():
 
 def test_the_usual_figure_is_of_a_torque():
     chosen = scenario.load("slip-lmi", SHORT[1::2])
-    texts = {text.get_text() for text in plot.braking(rollout(chosen.loop, chosen.solver)).findobj(Text)}
+    texts = {text.get_text() for text in plot.draw_braking(rollout(chosen.loop, chosen.solver)).findobj(Text)}
     assert "brake torque [N m]" in texts

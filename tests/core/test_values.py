@@ -11,9 +11,18 @@ from mutants import killed_by
 from project import ROOT
 
 from diffabs.core import files, provenance, values
-from diffabs.core.exports import lazily
+from diffabs.core.exports import lazy_getattr
 from diffabs.core.pytree import Spec
-from diffabs.core.values import ScenarioError, entry, inside, one_of, plain, ranged, table_of, within
+from diffabs.core.values import (
+    ScenarioError,
+    as_plain,
+    choice_reader,
+    range_reader,
+    read_number_in_range,
+    table_field,
+    table_reader,
+    whole_reader,
+)
 from diffabs.roads import Burckhardt
 from diffabs.scenario.scenario import dump, load, loads
 from diffabs.sweep.distributions import Normal, Uniform
@@ -22,22 +31,22 @@ from diffabs.sweep.sampling import Sobol
 
 @dataclasses.dataclass(frozen=True)
 class Cup:
-    volume: float = entry(ranged(Spec("l", low=0.0, open_low=True)))
-    handles: int = entry(within(0, 2), 1)
-    glaze: str = entry(one_of("matt", "shiny"), "matt")
-    marks: Any = entry(table_of(values.text, "texts"), dict)
+    volume: float = table_field(range_reader(Spec("l", low=0.0, open_low=True)))
+    handles: int = table_field(whole_reader(0, 2), 1)
+    glaze: str = table_field(choice_reader("matt", "shiny"), "matt")
+    marks: Any = table_field(table_reader(values.read_text, "texts"), dict)
 
 
 def test_a_table_becomes_a_dataclass():
     given = {"volume": 1, "glaze": "shiny", "marks": {"maker": "x"}}
-    assert values.read(Cup, given, "cup") == Cup(1.0, 1, "shiny", {"maker": "x"})
+    assert values.read_table(Cup, given, "cup") == Cup(1.0, 1, "shiny", {"maker": "x"})
     assert values.read_one({"cup": Cup}, {"type": "cup", **given}, "x") == Cup(1.0, 1, "shiny", {"maker": "x"})
 
 
 @killed_by(
     "core/values.py",
-    '            raise unknown(f"{dotted(path, key)} is not a field',
-    '            continue\n            raise unknown(f"{dotted(path, key)} is not a field',
+    '            raise unknown_name_error(f"{dotted_path(path, key)} is not a field',
+    '            continue\n            raise unknown_name_error(f"{dotted_path(path, key)} is not a field',
 )
 @pytest.mark.parametrize(
     ("given", "line"),
@@ -61,7 +70,7 @@ def test_a_table_becomes_a_dataclass():
 )
 def test_what_is_wrong_is_one_line(given, line):
     with pytest.raises(ScenarioError) as caught:
-        values.read(Cup, given, "cup")
+        values.read_table(Cup, given, "cup")
     assert str(caught.value).startswith(line)
     assert "\n" not in str(caught.value)
 
@@ -75,20 +84,22 @@ def test_a_type_that_is_not_there():
 
 def test_nan_is_in_no_range():
     with pytest.raises(ScenarioError, match=r"x = nan is outside \[0, 1\]"):
-        inside(float("nan"), Spec("1", 0.0, 1.0), "x")
+        read_number_in_range(float("nan"), Spec("1", 0.0, 1.0), "x")
 
 
 @killed_by(
-    "core/values.py", "return value if type(value) in PLAIN else", "return value if isinstance(value, PLAIN) else"
+    "core/values.py",
+    "return value if type(value) in PLAIN_TYPES else",
+    "return value if isinstance(value, PLAIN_TYPES) else",
 )
 def test_parts_are_written_whole_and_the_rest_in_short_if_wanted():
-    assert plain(Burckhardt(c1=np.float32(0.5), c2=30, c3=0.25)) == {
+    assert as_plain(Burckhardt(c1=np.float32(0.5), c2=30, c3=0.25)) == {
         "type": "burckhardt", **{"c1": 0.5, "c2": 30.0, "c3": 0.25, "c4": Burckhardt().c4}
     }  # fmt: skip
-    assert plain({"m": (Normal(1.0, 2.0, low=0.0), np.float64(3.0))}, brief=True) == {
+    assert as_plain({"m": (Normal(1.0, 2.0, low=0.0), np.float64(3.0))}, brief=True) == {
         "m": [{"type": "normal", "mean": 1.0, "deviation": 2.0, "low": 0.0}, 3.0]
     }
-    assert type(plain(np.float64(3.0))) is float  # the text of a NumPy number is no TOML
+    assert type(as_plain(np.float64(3.0))) is float  # the text of a NumPy number is no TOML
 
 
 W4 = "{type='normal', mean=0.4, deviation=0.01, low=0.3, high=0.5}"
@@ -119,7 +130,7 @@ def test_a_distribution_that_cannot_be_is_refused_when_the_scenario_is_read():
 
 
 def test_packages_export_what_they_say_and_no_more():
-    export = lazily("diffabs.roads")
+    export = lazy_getattr("diffabs.roads")
     assert export("Burckhardt") is Burckhardt
     with pytest.raises(AttributeError, match="has no attribute 'Burkhardt'"):
         export("Burkhardt")
@@ -134,7 +145,7 @@ def test_a_file_is_the_old_one_or_the_whole_new_one(tmp_path):
     path = tmp_path / "a.txt"
     mask = os.umask(0o027)
     try:
-        files.write(path, b"old")
+        files.write_file(path, b"old")
     finally:
         os.umask(mask)
     assert path.stat().st_mode & 0o777 == 0o640

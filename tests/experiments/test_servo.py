@@ -21,8 +21,8 @@ from project import ROOT
 from diffabs import FixedStep, Loop, measure, replace, rollout
 from diffabs.controllers import PID, Clamping, Sampled
 from diffabs.core.pytree import parameters
-from diffabs.core.units import Units, in_loop
-from diffabs.core.validity import check
+from diffabs.core.units import Units, resolve_unit
+from diffabs.core.validity import check_part
 from diffabs.linear.operating_point import operating_point
 from diffabs.linear.regulator import lqr
 from diffabs.objectives import IAE, ITAE, FinalError, Overshoot, SettlingTime
@@ -47,13 +47,13 @@ def forgotten(monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(outside, "_named", {})
     yield
-    outside.installed.cache_clear()
+    outside.installed_modules.cache_clear()
 
 
 @pytest.fixture
 def servo():
     """The module."""
-    outside.know(["dc_servo"])
+    outside.register_modules(["dc_servo"])
     return importlib.import_module("dc_servo")
 
 
@@ -84,7 +84,7 @@ def by_hand(motor, gains):
 @killed_by(
     "objectives/tracking.py", "jnp.where(sample.setpoint < 0, -1.0, 1.0)", "jnp.where(sample.setpoint < 0, 1.0, 1.0)"
 )
-@killed_by("objectives/tracking.py", 'getattr(output, "highest", math.inf)', 'getattr(output, "highest", 1.0)')
+@killed_by("objectives/tracking.py", 'getattr(output, "highest", math.inf)', 'getattr(output, "highest_signal", 1.0)')
 def test_the_linear_servo_follows_its_closed_form(servo):
     """exp(A t) with the closed loop written by hand, at every instant; and what is measured, from that curve."""
     loop, gains = linear(servo)
@@ -200,10 +200,10 @@ def test_units_are_those_of_the_loop(servo):
     ]
     assert [registry.unit_of(o, QuarterCar()) for o in (IAE(), FinalError())] == ["s", "1"]
     with pytest.raises(ValueError, match=r"controller.kp = -1 is outside \[0, inf\) V/rad$"):
-        check(replace(loop, {"controller.kp": -1.0}))
+        check_part(replace(loop, {"controller.kp": -1.0}))
     with pytest.raises(ValueError, match=r"low = 5 V exceeds high = 2 V$"):
-        check(replace(loop, {"controller.low": 5.0, "controller.high": 2.0}))
-    assert in_loop("control^2 s/signal", Units("N m/A", "m/s^2")) == "N^2 m s^3/A^2"
+        check_part(replace(loop, {"controller.low": 5.0, "controller.high": 2.0}))
+    assert resolve_unit("control^2 s/signal", Units("N m/A", "m/s^2")) == "N^2 m s^3/A^2"
 
 
 @killed_by("simulate/stable_step.py", "for one in (loop, arrived)", "for one in (loop,)")
@@ -241,10 +241,10 @@ def test_a_scenario_never_imports_code():
     assert 'plant.type = "dc-motor" is unknown' in result.stderr
     with pytest.raises(ScenarioError, match="parts is not a section"):
         loads(b'parts = ["dc_servo"]\n', "mine", "mine")
-    assert "dc-motor" not in registry.types("plant")
+    assert "dc-motor" not in registry.family_types("plant")
 
 
-@killed_by("scenario/registry.py", "if name in _packaged(family) or name in found:", "if name in found:")
+@killed_by("scenario/registry.py", "if name in _packaged_parts(family) or name in found:", "if name in found:")
 @pytest.mark.parametrize(
     ("module", "text", "line"),
     [
@@ -325,7 +325,7 @@ def test_a_part_that_prints_does_not_spoil_the_document(tmp_path, monkeypatch, c
     assert "called" in result.stderr
 
 
-@killed_by("scenario/outside.py", "entry_points(group=GROUP)", 'entry_points(group="other")')
+@killed_by("scenario/outside.py", "entry_points(group=ENTRY_POINT_GROUP)", 'entry_points(group="other")')
 def test_an_installed_module_is_known_by_its_entry_point(tmp_path, monkeypatch):
     shutil.copy(HERE / "dc_servo.py", tmp_path / "dc_servo_installed.py")
     folder = tmp_path / "dc_servo_installed-0.1.0.dist-info"
@@ -333,7 +333,7 @@ def test_an_installed_module_is_known_by_its_entry_point(tmp_path, monkeypatch):
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: dc-servo-installed\nVersion: 0.1.0\n")
     (folder / "entry_points.txt").write_text("[diffabs.parts]\nservo = dc_servo_installed\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    outside.installed.cache_clear()
+    outside.installed_modules.cache_clear()
     listed = json.loads(run("list", "--json").stdout)
     assert listed["plants"]["dc-motor"]["parameters"]["inertia"]["unit"] == "kg m^2"
     assert listed["objectives"]["peak-current"]["unit"] == "A"
@@ -341,12 +341,12 @@ def test_an_installed_module_is_known_by_its_entry_point(tmp_path, monkeypatch):
     assert load(HERE / "servo.toml").loop.plant.control_unit == "V"
     (tmp_path / "dc_servo_installed.py").write_text("1 / 0")
     sys.modules.pop("dc_servo_installed")
-    outside.installed.cache_clear()
+    outside.installed_modules.cache_clear()
     assert_one_error_line(result := run("list", status=2))
     assert "entry point servo of diffabs.parts: cannot be imported" in result.stderr
 
 
-@killed_by("cli/usage.py", "know(parts or ())", "know(())")
+@killed_by("cli/usage.py", "register_parts(parts or ())", "register_parts(())")
 def test_simulate_prints_writes_and_draws(tmp_path, monkeypatch):
     from matplotlib.figure import Figure
     from matplotlib.text import Text

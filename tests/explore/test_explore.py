@@ -19,11 +19,11 @@ from diffabs.cli import console
 from diffabs.core.pytree import get, parameters, replace
 from diffabs.core.values import ScenarioError
 from diffabs.explore import charts, curves, friction, saving, stability, tuning
-from diffabs.explore.curves import Curves, Fan, Line, Panel, Spread
+from diffabs.explore.curves import Curve, Curves, Fan, Panel, Spread
 from diffabs.explore.guard import STRANGER, Guard
-from diffabs.explore.knobs import STEPS, is_vehicle
+from diffabs.explore.knobs import SLIDER_STEPS, is_vehicle
 from diffabs.explore.session import AS_GIVEN, Session
-from diffabs.explore.work import Latest
+from diffabs.explore.work import NewestJobThread
 from diffabs.linear import margins, open_loop
 from diffabs.linear.stability_margins import closed_loop_poles
 from diffabs.linear.transfer import Transfer
@@ -90,28 +90,28 @@ def test_every_packaged_scenario_opens_with_what_one_drags(name):
         assert knob.spec.holds(knob.high)
 
 
-@killed_by("explore/knobs.py", "part = place / STEPS\n", "part = min(1.0, place / STEPS + 1e-3)\n")
+@killed_by("explore/knobs.py", "part = place / SLIDER_STEPS\n", "part = min(1.0, place / SLIDER_STEPS + 1e-3)\n")
 @pytest.mark.parametrize("name", ["slip-cured", "arm-hanging"])
 def test_places_of_a_slider_are_values(name):
     found = Session(name)
     for key in found.first:
         knob = found.knobs[key]
-        for end, place in ((knob.low, 0), (knob.high, STEPS)):
+        for end, place in ((knob.low, 0), (knob.high, SLIDER_STEPS)):
             assert knob.value_at(place) * knob.scale == pytest.approx(end, rel=1e-12, abs=1e-300)
         for place in (1, 250, 500, 999):
             assert knob.place_of(knob.value_at(place)) == pytest.approx(place, abs=0.51)
 
 
-@killed_by("explore/knobs.py", ">= DECADE * min(abs(low), abs(high))", "< 0")
+@killed_by("explore/knobs.py", ">= LOGARITHMIC_RATIO * min(abs(low), abs(high))", "< 0")
 def test_a_slider_over_decades_is_even_in_the_logarithm(session):
     knob = session.knobs["controller.gain.0"]  # from -1e5 to -300
     middle = -np.sqrt(knob.low * knob.high)
-    assert knob.value_at(STEPS / 2) == pytest.approx(middle, rel=1e-4)
+    assert knob.value_at(SLIDER_STEPS / 2) == pytest.approx(middle, rel=1e-4)
 
 
 @killed_by(
     "explore/knobs.py",
-    "return inside(given, self.spec, self.name) / self.scale",
+    "return read_number_in_range(given, self.spec, self.name) / self.scale",
     "return float(given) / self.scale",
     case="plant.mass--3-plant.mass = -3 is outside (0, inf) kg",
 )
@@ -212,9 +212,9 @@ def test_a_friction_factor_comes_and_goes_without_a_trace(name):
     with_one = friction.with_factor(given)
     assert dump(friction.without_factor(with_one, given)) == dump(given)
     if hasattr(given.loop.plant, "road"):
-        slippery = dataclasses.replace(with_one, loop=replace(with_one.loop, {friction.FACTOR: 0.5}))
+        slippery = dataclasses.replace(with_one, loop=replace(with_one.loop, {friction.FACTOR_PATH: 0.5}))
         again = friction.without_factor(slippery, given)
-        assert float(get(again.loop, friction.FACTOR)) == 0.5
+        assert float(get(again.loop, friction.FACTOR_PATH)) == 0.5
         assert {path.replace("plant.road.road.", "plant.road.") for path in again.sweep.over} == {*given.sweep.over}
         there = {path for path, _, _ in parameters(again.loop)}
         assert {*again.sweep.over, *again.design.over, *again.tune.free, *again.tune.over} <= there
@@ -226,8 +226,8 @@ def test_a_friction_factor_comes_and_goes_without_a_trace(name):
 def test_the_command_line_runs_what_was_saved_to_the_same_numbers(session, tmp_path, turned):
     for key, value in turned.items():
         session.turn(key, value)
-    shown = curves.curves(session.scenario())
-    path = saving.save(session.to_save(), tmp_path, "explored.toml")
+    shown = curves.run_curves(session.scenario())
+    path = saving.save_scenario(session.to_save(), tmp_path, "explored.toml")
     metrics = json.loads(run("simulate", path, "--json").stdout)["metrics"]
     assert metrics == pytest.approx(shown.metrics, rel=1e-12, abs=1e-14)
     assert ("scaled" in path.read_text()) == ("plant.road.scale" in turned)
@@ -240,7 +240,7 @@ def test_the_command_line_runs_what_was_saved_to_the_same_numbers(session, tmp_p
 def test_a_name_that_leads_elsewhere_is_refused(session, tmp_path, name):
     (tmp_path / "in").mkdir()
     with pytest.raises(ScenarioError, match="file = "):
-        saving.save(session.to_save(), tmp_path / "in", name)
+        saving.save_scenario(session.to_save(), tmp_path / "in", name)
     assert left_in(tmp_path / "in") == set()
     assert left_in(tmp_path) <= {"in", "mine.toml"}  # the scenario itself
 
@@ -251,10 +251,10 @@ def test_a_file_is_only_replaced_when_that_is_said(session, tmp_path):
     folder.mkdir()
     (folder / "mine.toml").write_text("mine")
     with pytest.raises(ScenarioError, match=r'file = "mine.toml" exists'):
-        saving.save(session.to_save(), folder, "mine.toml")
+        saving.save_scenario(session.to_save(), folder, "mine.toml")
     assert (folder / "mine.toml").read_text() == "mine"
     assert saving.free_name(folder, "mine") == "mine-2.toml"
-    saving.save(session.to_save(), folder, "mine.toml", replacing=True)
+    saving.save_scenario(session.to_save(), folder, "mine.toml", replacing=True)
     assert load(folder / "mine.toml").loop.plant.mass == session.given.loop.plant.mass
     assert left_in(folder) == {"mine.toml"}
 
@@ -268,16 +268,16 @@ def test_a_file_is_only_replaced_when_that_is_said(session, tmp_path):
 def test_a_fan_has_the_quantiles_of_its_runs(session, monkeypatch):
     monkeypatch.setattr(curves, "MEMBERS", 5)
     chosen, spread = session.scenario(), Spread(mass=0.1, road=0.3)
-    found = curves.fan(chosen, spread)
-    values, words = curves.members(chosen, spread)
+    found = curves.run_fan(chosen, spread)
+    values, words = curves.fan_members(chosen, spread)
     assert words == "mass ± 10 %, friction ± 30 %"
-    by = curves.solver(chosen, curves.ROUGH)
+    by = curves.drawing_solver(chosen, curves.DRAFT_INSTANTS)
     each = [replace(chosen.loop, {path: column[i] for path, column in values.items()}) for i in range(5)]
     slips = [np.asarray(rollout(loop, by).trajectory.sample.output.slip) for loop in each]
     early = slice(0, 50)  # all of them still run
     expected = np.quantile([slip[early] for slip in slips], curves.QUANTILES, axis=0)
     np.testing.assert_allclose(found.bands[0][:, early], expected, rtol=1e-9, atol=1e-12)
-    for path, part in ((friction.FACTOR, 0.3), ("plant.mass", 0.1)):
+    for path, part in ((friction.FACTOR_PATH, 0.3), ("plant.mass", 0.1)):
         here = float(get(chosen.loop, path))
         assert np.all(np.abs(values[path] / here - 1) <= part)
         assert np.ptp(values[path]) > part * here
@@ -286,7 +286,7 @@ def test_a_fan_has_the_quantiles_of_its_runs(session, monkeypatch):
 @killed_by("explore/curves.py", "KMH * line.values", "line.values")
 @pytest.mark.slow
 def test_a_draft_is_the_run_to_what_can_be_seen(session):
-    exact, draft = (curves.curves(session.scenario(), by) for by in (None, curves.Adaptive(rtol=1e-3, step=2.5e-3)))
+    exact, draft = (curves.run_curves(session.scenario(), by) for by in (None, curves.Adaptive(rtol=1e-3, step=2.5e-3)))
     assert (exact.draft, draft.draft) == (False, True)
     ends = np.interp(draft.t[:-1], exact.t, exact.panels[0].lines[0].values)
     assert np.max(np.abs(ends - draft.panels[0].lines[0].values[:-1])) < 2e-3
@@ -319,7 +319,10 @@ def test_poles_of_a_closed_loop_are_those_of_its_polynomial():
 )
 def test_margins_are_those_of_the_library(session):
     chosen = session.scenario()
-    found, oracle = stability.stability(chosen, stability.around(chosen)), margins(open_loop(chosen.loop))
+    found, oracle = (
+        stability.linear_stability(chosen, stability.linearise_corners(chosen)),
+        margins(open_loop(chosen.loop)),
+    )
     assert found.stable
     assert found.margins["phase"] == oracle.phase
     assert found.margins["gain_up"] == oracle.gain[1]
@@ -331,18 +334,18 @@ def test_margins_are_those_of_the_library(session):
 @killed_by("explore/stability.py", "if known and known.of == of:", "if known:")
 @killed_by("explore/stability.py", "if known and known.of == of:", "if False:")
 def test_corners_are_looked_at_again_only_where_they_move(session):
-    first = stability.around(session.scenario())
+    first = stability.linearise_corners(session.scenario())
     session.turn("plant.mass", "5.5")  # has a range in [design.over]
-    assert stability.around(session.scenario(), first) is first
+    assert stability.linearise_corners(session.scenario(), first) is first
     session.turn("controller.gain.1", "-60")
-    moved = stability.around(session.scenario(), first)
+    moved = stability.linearise_corners(session.scenario(), first)
     assert moved is not first
-    fresh = stability.around(session.scenario())
+    fresh = stability.linearise_corners(session.scenario())
     np.testing.assert_array_equal(moved.poles, fresh.poles)
     assert (moved.worst, moved.unstable, moved.systems) == (fresh.worst, fresh.unstable, fresh.systems)
     session.turn("plant.mass", "6")
-    found = stability.around(session.scenario(), moved)
-    whole = stability.around(session.scenario())
+    found = stability.linearise_corners(session.scenario(), moved)
+    whole = stability.linearise_corners(session.scenario())
     np.testing.assert_array_equal(found.poles, whole.poles)
     assert found.worst == whole.worst
 
@@ -369,7 +372,7 @@ def test_what_is_not_accepted_is_withdrawn_with_all_that_came_after(session):
 
 def test_a_loop_without_a_linear_model_says_so():
     with pytest.raises(ValueError, match="no linear loop"):
-        stability.stability(friction.with_factor(load("lab-rig")), None)
+        stability.linear_stability(friction.with_factor(load("lab-rig")), None)
 
 
 @killed_by("explore/tuning.py", "given = chosen.tune.free.get(path)", "given = None")
@@ -377,37 +380,39 @@ def test_a_tuning_begins_from_what_is_shown(file):
     session = Session(str(file(SHORT.replace("[-100.0, -15.0]", "[-100.0, -45.0]"))))
     assert session.knobs["controller.gain.1"].high > -45  # a slider goes further than the scenario tunes
     session.turn("controller.gain.1", "-46")
-    chosen = tuning.goal(session.scenario(), *tuning.usual(session.scenario()), session.knobs)
+    chosen = tuning.scenario_with_goal(session.scenario(), *tuning.default_tuning(session.scenario()), session.knobs)
     assert chosen.tune.free == {"controller.gain": ((-1e5, -300.0), (-100.0, -45.0))}
     assert chosen.tune.objective == {"iae": 1.0}
     assert get(chosen.loop, "controller.gain.1") == -46
-    other = tuning.goal(session.scenario(), ["reference.slip"], "stop_distance", session.knobs)
+    other = tuning.scenario_with_goal(session.scenario(), ["reference.slip"], "stop_distance", session.knobs)
     ends = other.tune.free["reference.slip"]
     assert ends
     low, high = ends
     assert 0 < low < 0.2 < high <= 1
     assert other.tune.objective == {"stop_distance": 1.0}
     with pytest.raises(ScenarioError, match=r"tune\.free is empty"):
-        tuning.goal(session.scenario(), [], "iae", session.knobs)
+        tuning.scenario_with_goal(session.scenario(), [], "iae", session.knobs)
     with pytest.raises(ScenarioError, match="is not measured"):
-        tuning.goal(session.scenario(), ["reference.slip"], "beauty", session.knobs)
+        tuning.scenario_with_goal(session.scenario(), ["reference.slip"], "beauty", session.knobs)
 
 
 def test_a_tuning_stays_between_the_bounds_that_are_typed(file):
     session = Session(str(file(SHORT)))
     now, known = session.scenario(), session.knobs
-    assert tuning.bounds(now, "controller.gain", known)["controller.gain.1"] == (-300.0, -15.0)
+    assert tuning.bounds_on_page(now, "controller.gain", known)["controller.gain.1"] == (-300.0, -15.0)
     typed = {"controller.gain.1": ("-60", "-20.5")}
-    chosen = tuning.goal(now, ["controller.gain", "reference.slip"], "iae", known, typed)
+    chosen = tuning.scenario_with_goal(now, ["controller.gain", "reference.slip"], "iae", known, typed)
     assert chosen.tune.free["controller.gain"] == ((-1e5, -60.0), (-100.0, -20.5))
-    assert chosen.tune.free["reference.slip"] == tuple(tuning.bounds(now, "reference.slip", known)["reference.slip"])
+    assert chosen.tune.free["reference.slip"] == tuple(
+        tuning.bounds_on_page(now, "reference.slip", known)["reference.slip"]
+    )
     for pair, words in (
         (("-20", "-60"), r"tune\.free\.controller\.gain\.1: -20 is not below -60 N m"),
         (("low", "-60"), 'controller.gain.1 = "low" is text'),
         (("nan", "-60"), "controller.gain.1 = nan"),
     ):
         with pytest.raises(ScenarioError, match=words):
-            tuning.goal(now, ["controller.gain"], "iae", known, {"controller.gain.1": pair})
+            tuning.scenario_with_goal(now, ["controller.gain"], "iae", known, {"controller.gain.1": pair})
 
 
 def test_each_gain_of_a_balance_has_the_unit_of_its_state():
@@ -429,31 +434,33 @@ def test_speeds_of_a_plant_without_a_wheel_stay_in_si(session):
 def test_a_transient_ends_when_the_signal_has_settled_to_its_target():
     t = np.linspace(0.0, 10.0, 1001)
     decay = np.exp(-t) * np.cos(3 * t)  # inside 5 % of its start from t = 2.98 s on (where exp(-t) < 0.05 and cos is 0)
-    lines = (Line("slip", 0.2 + decay), Line("target", np.full_like(t, 0.2)))
+    lines = (Curve("slip", 0.2 + decay), Curve("target", np.full_like(t, 0.2)))
     found = Curves(t, (Panel("1", lines),), {}, "", draft=False)
     last = t[np.flatnonzero(np.abs(decay) > 0.05)[-1]]
-    assert curves.transient(found) == pytest.approx(1.5 * last, abs=0.02)
-    never = found._replace(panels=(Panel("1", (Line("slip", np.cos(t)), lines[1])),))
-    assert curves.transient(never) == 10.0
-    still = found._replace(panels=(Panel("1", (Line("slip", lines[1].values), lines[1])),))
-    assert curves.transient(still) == 10.0
-    assert charts.until(1.23456789) == {"dataZoom": [{"startValue": 0, "endValue": 1.2346}]}
+    assert curves.transient_end(found) == pytest.approx(1.5 * last, abs=0.02)
+    never = found._replace(panels=(Panel("1", (Curve("slip", np.cos(t)), lines[1])),))
+    assert curves.transient_end(never) == 10.0
+    still = found._replace(panels=(Panel("1", (Curve("slip", lines[1].values), lines[1])),))
+    assert curves.transient_end(still) == 10.0
+    assert charts.change_time_axis(1.23456789) == {"dataZoom": [{"startValue": 0, "endValue": 1.2346}]}
 
 
 @killed_by("explore/charts.py", "third - quarter, high - third", "third - quarter, high - low")
 def test_charts_are_plain_json_whatever_a_run_was():
-    lines = (Line("slip", np.array([0.1, np.nan, np.inf])), Line("target", np.array([0.0, 1e-30, 123456.789])))
-    torque = Panel("N m", (Line("control", np.array([0.0, 9.03, np.nan])), Line("command", np.array([0.0, 1e9, 5.0]))))
+    lines = (Curve("slip", np.array([0.1, np.nan, np.inf])), Curve("target", np.array([0.0, 1e-30, 123456.789])))
+    torque = Panel(
+        "N m", (Curve("control", np.array([0.0, 9.03, np.nan])), Curve("command", np.array([0.0, 1e9, 5.0])))
+    )
     found = Curves(np.array([0.0, 0.1, 0.2]), (Panel("1", lines), torque), {}, "", draft=False)
-    change = charts.curves(found)
+    change = charts.change_curves(found)
     source = change["dataset"][0]["source"]
     assert source["0.0"] == [0.1, None, None]
     assert source["0.1"] == [0.0, 1e-30, 123460.0]
     assert change["yAxis"] == [{}, {"min": 0, "max": 15.0, "interval": 5.0}]  # the command is beyond what can be given
     bands = tuple(np.array([[0.0], [1.0], [2.0], [4.0], [8.0]]) for _ in range(2))
-    steps = charts.fan(Fan(np.array([0.0]), bands, 200, 0, ""))["dataset"][0]["source"]
+    steps = charts.change_fan(Fan(np.array([0.0]), bands, 200, 0, ""))["dataset"][0]["source"]
     assert [steps[f"0.{i}"] for i in range(4)] == [[0.0], [1.0], [3.0], [4.0]]  # each on top of the one before
-    json.dumps([charts.frame(found), change, charts.pole_frame(), charts.poles(None)], allow_nan=False)
+    json.dumps([charts.run_chart(found), change, charts.pole_chart(), charts.change_poles(None)], allow_nan=False)
 
 
 @killed_by("explore/guard.py", "len(host) == 1 and host[0] in self.hosts", "len(host) == 1")
@@ -541,9 +548,9 @@ async def answered(kind, path, query, cookie):
 @killed_by("explore/server.py", "path.touch(mode=0o600,", "path.touch(mode=0o644,")
 def test_a_browser_is_led_to_the_token_by_a_file_of_its_user(tmp_path):
     pytest.importorskip("nicegui")
-    from diffabs.explore.server import leading_to
+    from diffabs.explore.server import write_redirect_file
 
-    path = leading_to(f"http://127.0.0.1:8342/?token={TOKEN}", tmp_path)
+    path = write_redirect_file(f"http://127.0.0.1:8342/?token={TOKEN}", tmp_path)
     assert path.stat().st_mode & 0o077 == 0
     assert f'url=http://127.0.0.1:8342/?token={TOKEN}"' in path.read_text()
 
@@ -555,7 +562,7 @@ def test_a_browser_is_led_to_the_token_by_a_file_of_its_user(tmp_path):
 )
 def test_a_worker_does_the_newest_and_drops_what_waited():
     gate, done, ended, errors = threading.Event(), [], threading.Event(), []
-    worker = Latest("test of a worker", errors.append)
+    worker = NewestJobThread("test of a worker", errors.append)
     began = threading.Event()
     worker.ask(lambda: (began.set(), gate.wait(10), done.append(0)))
     assert began.wait(10)
@@ -596,4 +603,4 @@ def test_a_scenario_that_is_wrong_is_said_before_anything_listens(monkeypatch, f
 
 def test_precision_is_that_of_the_command_line(session):
     assert jax.config.jax_enable_x64
-    assert curves.curves(session.scenario()).t.dtype == np.float64
+    assert curves.run_curves(session.scenario()).t.dtype == np.float64

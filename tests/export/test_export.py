@@ -32,7 +32,7 @@ from diffabs.controllers import (
     StateFeedback,
 )
 from diffabs.core.protocols import BalanceOutput, BrakeOutput
-from diffabs.export import NotExported, c_source, device, equations, structured_text
+from diffabs.export import NotExported, c_source, computer_program, difference_equations, structured_text
 from diffabs.export.device import Input
 from diffabs.plants import ArmBalance, LabRig, MirroredRig
 from diffabs.references import FilteredSlip, FixedSlip, PeakLatch
@@ -92,7 +92,7 @@ def measured(loop, seed, lost=True):
 def commands_of_parts(loop, seen, dtype, step=None):
     """What the parts themselves command, sample by sample: reference, feed-forward, `Sampled`'s own tick."""
     with jax.enable_x64(dtype == np.float64):
-        loop, seen = jax.tree.map(lambda x: jnp.asarray(x, dtype), (d.core.pytree.strong(loop), seen))
+        loop, seen = jax.tree.map(lambda x: jnp.asarray(x, dtype), (d.core.pytree.canonical_dtypes(loop), seen))
         h = loop.controller.period / (step or 1)
 
         def tracking(reference, y):
@@ -146,8 +146,8 @@ def commands_of_c(found, text, name, seen, folder):
 
 @killed_by(
     "export/c_words.py",
-    'CHOSEN = {"lower": "<", "higher": ">"}',
-    'CHOSEN = {"lower": ">", "higher": "<"}',
+    'CLAMP_COMPARISONS = {"lower": "<", "higher": ">"}',
+    'CLAMP_COMPARISONS = {"lower": ">", "higher": "<"}',
     case="PID, filtered derivative-float64",
 )
 @killed_by(
@@ -169,7 +169,7 @@ def commands_of_c(found, text, name, seen, folder):
 def test_what_is_exported_commands_what_the_parts_do(name, dtype, tmp_path):
     loop, seen = LOOPS[name], measured(LOOPS[name], seed=11)
     step = 4 if name == "filtered target" else None
-    found = device(loop, step=1e-3 / 4 if step else None, dtype=dtype)
+    found = computer_program(loop, step=1e-3 / 4 if step else None, dtype=dtype)
     text = c_source(found, "unit")
     wanted = commands_of_parts(loop, seen, dtype, step)
     result = commands_of_c(found, text, "unit", seen, tmp_path)
@@ -216,7 +216,7 @@ def limited():
 def test_parameters_can_be_changed_and_a_lost_sample_is_told_in_c(tmp_path):
     """Also the first measurement, at the start, may be lost."""
     loop, wanted, held = limited()
-    (tmp_path / "unit.c").write_text(c_source(device(loop), "unit"))
+    (tmp_path / "unit.c").write_text(c_source(computer_program(loop), "unit"))
     (tmp_path / "caller.c").write_text(CALLER)
     flags = [flag for flag in FLAGS if flag != "-pedantic"]
     subprocess.run(["cc", *flags, "caller.c", "-o", "caller", "-lm"], check=True, cwd=tmp_path)
@@ -228,7 +228,7 @@ def test_parameters_can_be_changed_and_a_lost_sample_is_told_in_c(tmp_path):
 
 def test_parameters_can_be_changed_and_a_lost_sample_is_told_in_structured_text():
     loop, wanted, held = limited()
-    text = structured_text(device(loop), "Unit")
+    text = structured_text(computer_program(loop), "Unit")
     block, found = Block(text), []
     for slip in (0.1, np.nan, 0.1, 0.3):
         found.append((block(slip=slip), int(block.values["HELD"])))
@@ -262,7 +262,7 @@ def test_a_comment_ends_where_it_should(text, tmp_path):
         def output(self, t, memory, signal):
             return self.k * signal.measured.slip
 
-    found = device(rig(Gain()))
+    found = computer_program(rig(Gain()))
     found = dataclasses.replace(found, control_unit=text, units={name: text for name in found.units})
     program = compiled(c_source(found, "unit", [text]), "unit", tmp_path)
     said = subprocess.run([program], input="0.5\n", capture_output=True, text=True, check=True).stdout
@@ -286,7 +286,7 @@ def test_names_that_c_does_not_have_get_others(tmp_path):
         def output(self, t, memory, signal):
             return self.α * signal.measured.slip + self.β
 
-    found = device(rig(Greek()))
+    found = computer_program(rig(Greek()))
     program = compiled(c_source(found, "unit"), "unit", tmp_path)
     said = subprocess.run([program], input="0.5\n", capture_output=True, text=True, check=True).stdout
     assert float(said) == 2.0
@@ -295,7 +295,7 @@ def test_names_that_c_does_not_have_get_others(tmp_path):
 
 def test_numbers_are_called_as_in_the_source():
     """No number has a name that says nothing."""
-    text = c_source(device(LOOPS["PID, filtered derivative"]), "unit")
+    text = c_source(computer_program(LOOPS["PID, filtered derivative"]), "unit")
     assert "error = " in text
     assert "derivative_2 = p->cutoff * derivative;" in text
     assert not re.search(r"\b[a-z]\d+\b", text.replace("int64_t", ""))
@@ -303,7 +303,7 @@ def test_numbers_are_called_as_in_the_source():
 
 @needs_cc
 def test_a_compiler_that_assumes_that_there_is_no_nan_is_refused(tmp_path):
-    (tmp_path / "unit.c").write_text(c_source(device(LOOPS["state feedback"]), "unit"))
+    (tmp_path / "unit.c").write_text(c_source(computer_program(LOOPS["state feedback"]), "unit"))
     result = subprocess.run(["cc", "-ffast-math", "-c", "unit.c"], cwd=tmp_path, capture_output=True, text=True)
     assert result.returncode != 0
     assert "compile without -ffast-math" in result.stderr
@@ -323,7 +323,7 @@ def test_a_whole_run_is_what_the_exported_controller_does(tmp_path):
     run = d.rollout(chosen.loop, d.FixedStep(chosen.solver.step, 0.4, every=every), chosen.objectives)
     count = int(run.trajectory.running.sum())
     seen = jax.tree.map(lambda x: np.asarray(x)[:count], run.trajectory.sample.output)
-    found = device(chosen.loop, step=chosen.solver.step)
+    found = computer_program(chosen.loop, step=chosen.solver.step)
     result = commands_of_c(found, c_source(found, "cured"), "cured", seen, tmp_path)
     assert count > 300
     np.testing.assert_allclose(result, np.asarray(run.trajectory.sample.command)[:count], rtol=1e-12, atol=1e-12)
@@ -334,8 +334,8 @@ def test_a_whole_run_is_what_the_exported_controller_does(tmp_path):
 def test_the_target_can_come_from_outside(tmp_path):
     loop = rig(PID(kp=60.0, ki=400.0, low=0.0, high=90.0), reference=PeakLatch())
     with pytest.raises(NotExported, match="PeakLatch follows what is measured"):
-        device(loop)
-    found = device(loop, given_target=True)
+        computer_program(loop)
+    found = computer_program(loop, given_target=True)
     text = c_source(found, "given")
     program = compiled(text, "given", tmp_path)
     said = subprocess.run([program], input="0.1 0.2\n0.1 0.3\n", capture_output=True, text=True, check=True).stdout
@@ -346,7 +346,7 @@ def test_the_target_can_come_from_outside(tmp_path):
 
 
 def test_difference_equations_are_the_controllers():
-    found = equations(
+    found = difference_equations(
         rig(PID(kp=60.0, ki=400.0, kd=0.3, cutoff=55.0, high=np.inf, low=0.0), feedforward=HoldingInput())
     )
     assert found["inputs"] == ["target", "slip", "feedforward"]
@@ -356,13 +356,13 @@ def test_difference_equations_are_the_controllers():
     np.testing.assert_allclose(found["H"], [400.0, -kd * wc], rtol=1e-12)
     np.testing.assert_allclose(found["J"], [60 + kd * wc, -60 - kd * wc, 1.0], rtol=1e-12)
     with pytest.raises(NotExported, match="continuous time"):
-        equations(braking(plant=MirroredRig(), controller=StateFeedback(), feedforward=HoldingInput()))
+        difference_equations(braking(plant=MirroredRig(), controller=StateFeedback(), feedforward=HoldingInput()))
 
 
 @pytest.mark.parametrize("name", ["2fast", "a b", "float", "while"])
 def test_a_name_that_c_does_not_have_is_refused(name):
     with pytest.raises(NotExported, match="no name that C has"):
-        c_source(device(LOOPS["state feedback"]), name)
+        c_source(computer_program(LOOPS["state feedback"]), name)
 
 
 def test_an_operation_without_translation_is_named():
@@ -374,10 +374,10 @@ def test_an_operation_without_translation_is_named():
             return jax.lax.lgamma(signal.measured.slip)
 
     with pytest.raises(NotExported, match="lgamma has no translation to C"):
-        c_source(device(rig(Sorted())), "unit")
+        c_source(computer_program(rig(Sorted())), "unit")
 
 
-@killed_by("export/difference_equations.py", "ROUNDING = 1e-12", "ROUNDING = 0.0")
+@killed_by("export/difference_equations.py", "ENTRY_ROUNDING = 1e-12", "ENTRY_ROUNDING = 0.0")
 @needs_cc
 def test_the_command_writes_a_file_that_compiles(tmp_path):
     path = tmp_path / "controller.c"
@@ -455,14 +455,14 @@ def test_the_controller_of_the_scenario_is_exported(tmp_path):
 def test_a_computer_without_events_is_exported_as_one_with():
     inner = PID(kp=60.0, ki=400.0, low=0.0, high=90.0)
     texts = [
-        c_source(device(dataclasses.replace(rig(inner), controller=one)), "unit")
+        c_source(computer_program(dataclasses.replace(rig(inner), controller=one)), "unit")
         for one in (Sampled(controller=inner, period=2e-3), SampledOnGrid(controller=inner, sampling_period=2e-3))
     ]
     assert texts[0] == texts[1]
 
 
 def test_inputs_are_what_the_plant_shows():
-    found = device(LOOPS["observer"])
+    found = computer_program(LOOPS["observer"])
     assert isinstance(found.input, Input)
     assert found.units["theta"] == "rad"
     assert found.period == pytest.approx(0.01)
@@ -487,7 +487,7 @@ def test_a_target_that_moves_is_returned_as_it_was(tmp_path):
             return signal.target
 
     loop = rig(Follow(), reference=FilteredSlip(slip=0.2, time_constant=0.01))
-    program = compiled(c_source(device(loop), "unit"), "unit", tmp_path)
+    program = compiled(c_source(computer_program(loop), "unit"), "unit", tmp_path)
     said = subprocess.run([program], input="0.1\n0.1\n0.1\n", capture_output=True, text=True, check=True).stdout
     np.testing.assert_allclose([*map(float, said.split())], 0.2 - 0.1 * np.exp(-np.arange(3) / 10), rtol=1e-6)
 
@@ -508,7 +508,7 @@ def test_memory_behind_memory_is_kept(tmp_path):
         def output(self, t, memory, signal):
             return memory.flow[0]
 
-    text = c_source(device(rig(Twice())), "unit")
+    text = c_source(computer_program(rig(Twice())), "unit")
     said = subprocess.run(
         [compiled(text, "unit", tmp_path)], input="0.1\n" * 4, capture_output=True, text=True, check=True
     ).stdout
@@ -545,7 +545,7 @@ def test_structured_text_commands_what_the_parts_do(name, dtype):
     """Over 10,000 samples to rounding: an integral gathers some, in single precision as much as C does."""
     loop, seen = LOOPS[name], measured(LOOPS[name], seed=11)
     step = 4 if name == "filtered target" else None
-    found = device(loop, step=1e-3 / 4 if step else None, dtype=dtype)
+    found = computer_program(loop, step=1e-3 / 4 if step else None, dtype=dtype)
     result = commands_of_text(structured_text(found, "Unit"), seen)
     wanted = commands_of_parts(loop, seen, dtype, step)
     assert np.ptp(wanted) > 0
@@ -563,7 +563,7 @@ def test_a_whole_run_is_what_the_function_block_does():
     run = d.rollout(chosen.loop, d.FixedStep(chosen.solver.step, 0.4, every=every), chosen.objectives)
     count = int(run.trajectory.running.sum())
     seen = jax.tree.map(lambda x: np.asarray(x)[:count], run.trajectory.sample.output)
-    text = structured_text(device(chosen.loop, step=chosen.solver.step), "Cured")
+    text = structured_text(computer_program(chosen.loop, step=chosen.solver.step), "Cured")
     assert count > 300
     result = commands_of_text(text, seen)
     np.testing.assert_allclose(result, np.asarray(run.trajectory.sample.command)[:count], rtol=1e-12, atol=1e-12)
@@ -571,7 +571,7 @@ def test_a_whole_run_is_what_the_function_block_does():
 
 @killed_by("export/structured_text.py", "IF reset OR NOT started", "IF NOT started")
 def test_a_block_begins_anew_when_it_is_told_to():
-    block = Block(structured_text(device(LOOPS["PID, filtered derivative"]), "Unit"))
+    block = Block(structured_text(computer_program(LOOPS["PID, filtered derivative"]), "Unit"))
     first = [block(slip=slip) for slip in (0.1, 0.15, 0.3)]
     assert [block(slip=slip, reset=k == 0) for k, slip in enumerate((0.1, 0.15, 0.3))] == first
     assert [block(slip=slip, reset=False) for slip in (0.1, 0.15, 0.3)] != first
@@ -602,7 +602,7 @@ def test_what_a_sample_stores_does_not_change_while_the_target_moves():
     seen = jax.tree.map(lambda x: x[:50], measured(loop, seed=2, lost=False))
     wanted = (0.2 - seen.slip[0]) * np.exp(-np.arange(-1, 49) / 10)
     wanted[0] = 0.0
-    block = Block(structured_text(device(loop, step=1e-3 / 4), "Unit"))
+    block = Block(structured_text(computer_program(loop, step=1e-3 / 4), "Unit"))
     result = [block(slip=slip) for slip in seen.slip]
     np.testing.assert_allclose(result, wanted, rtol=1e-4)
 
@@ -628,16 +628,16 @@ class Kinds:
 def test_structured_text_knows_every_kind_of_operation():
     loop = rig(Kinds())
     seen = measured(loop, seed=3)
-    result = commands_of_text(structured_text(device(loop), "Unit"), seen)
+    result = commands_of_text(structured_text(computer_program(loop), "Unit"), seen)
     wanted = commands_of_parts(loop, seen, np.float64)
     np.testing.assert_allclose(result, wanted, rtol=1e-12, atol=1e-13)
 
 
-@killed_by("export/structured_text.py", "or name.lower() in RESERVED:", "or False:", case="step")
+@killed_by("export/structured_text.py", "or name.lower() in ST_KEYWORDS:", "or False:", case="step")
 @pytest.mark.parametrize("name", ["2fast", "a b", "a__b", "Function_Block", "step"])
 def test_a_name_that_structured_text_does_not_have_is_refused(name):
     with pytest.raises(NotExported, match="no name that Structured Text has"):
-        structured_text(device(LOOPS["state feedback"]), name)
+        structured_text(computer_program(LOOPS["state feedback"]), name)
 
 
 def test_what_structured_text_cannot_say_is_named():
@@ -649,7 +649,7 @@ def test_what_structured_text_cannot_say_is_named():
             return jnp.expm1(signal.measured.slip)
 
     with pytest.raises(NotExported, match="expm1 has no translation to Structured Text"):
-        structured_text(device(rig(Expm1())), "unit")
+        structured_text(computer_program(rig(Expm1())), "unit")
 
 
 def test_the_command_writes_a_function_block(tmp_path):

@@ -19,7 +19,7 @@ from structured_text import Block
 
 import diffabs as d
 from diffabs.controllers import PID, ConstantInput, ConstantTorque, Sampled
-from diffabs.export import NotExported, device, fmu, structured_text
+from diffabs.export import NotExported, build_fmu, computer_program, structured_text
 from diffabs.kernel.compilers import COMPILER
 from diffabs.plants import MirroredRig
 from diffabs.references import FixedSlip
@@ -32,7 +32,7 @@ STEP, PERIOD, SAMPLES = 1e-4, 1e-3, 400
 
 def imported(loop, folder, step=STEP, name="plant"):
     path = folder / f"{name}.fmu"
-    path.write_bytes(fmu(loop, name, step=step))
+    path.write_bytes(build_fmu(loop, name, step=step))
     return Fmu(path, folder / name)
 
 
@@ -95,7 +95,7 @@ def test_a_loop_closed_outside_is_the_loop(tmp_path):
         feedforward=ConstantInput(value=2.7),
     )
     one = imported(loop, tmp_path).begin()
-    block = Block(structured_text(device(loop), "Law"))
+    block = Block(structured_text(computer_program(loop), "Law"))
     wanted = trajectory(loop, SAMPLES * PERIOD)
     names = ("slip", "speed", "wheel_speed", "distance")
     found = followed(one, SAMPLES, lambda k: block(slip=one.get("slip")[0]), names)
@@ -150,12 +150,12 @@ def test_steps_of_any_length_are_taken_by_whole_ones(tmp_path):
 @killed_by("export/fmi2.c", "|| strcmp(guid, GUID) != 0", "")
 def test_who_asks_for_another_is_given_none(tmp_path):
     path = tmp_path / "plant.fmu"
-    path.write_bytes(fmu(PLANTS["mirrored rig"], "plant", step=STEP))
+    path.write_bytes(build_fmu(PLANTS["mirrored rig"], "plant", step=STEP))
     assert Fmu(path, tmp_path / "a", guid="{no}").instance.value is None
 
 
 @killed_by("export/mockup.py", "enumerate(variables, 1)", "enumerate(variables)")
-@killed_by("export/mockup.py", '{"unit": printable(one.unit)}', "{}")
+@killed_by("export/mockup.py", '{"unit": make_printable(one.unit)}', "{}")
 @killed_by("export/mockup.py", "zipfile.ZipInfo(path, LONG_AGO)", "path")
 def test_the_description_says_what_is_what(tmp_path):
     one = imported(PLANTS["mirrored rig"], tmp_path)
@@ -174,7 +174,7 @@ def test_the_description_says_what_is_what(tmp_path):
     assert (tmp_path / "plant" / "sources" / "plant.c").is_file()
     with zipfile.ZipFile(tmp_path / "plant.fmu") as archive:
         assert {info.date_time[0] for info in archive.infolist()} == {1980}
-    again = fmu(PLANTS["mirrored rig"], "plant", step=STEP)
+    again = build_fmu(PLANTS["mirrored rig"], "plant", step=STEP)
     assert again == (tmp_path / "plant.fmu").read_bytes()
 
 
@@ -186,7 +186,7 @@ def strict(tmp_path_factory):
     """A function that makes an instance of the mirrored rig, compiled with all warnings as errors, and with checks."""
     folder = tmp_path_factory.mktemp("strict")
     path = folder / "plant.fmu"
-    path.write_bytes(fmu(PLANTS["mirrored rig"], "plant", step=STEP))
+    path.write_bytes(build_fmu(PLANTS["mirrored rig"], "plant", step=STEP))
     first = Fmu(path, folder / "in", flags=STRICT)
     return lambda: _another(first)
 
@@ -305,7 +305,7 @@ def test_what_is_no_state_of_this_plant_is_refused(strict):
 @pytest.mark.parametrize("about", ["bell \x07, null \0", "\x1b[2J", "<a b='&'> ]]>", "\ud800", "\ufffe"])
 def test_a_description_is_xml_whatever_the_title(about, tmp_path):
     path = tmp_path / "plant.fmu"
-    path.write_bytes(fmu(PLANTS["mirrored rig"], "plant", step=STEP, about=about))
+    path.write_bytes(build_fmu(PLANTS["mirrored rig"], "plant", step=STEP, about=about))
     one = Fmu(path, tmp_path / "in")  # reads it
     assert len(one.description.get("description")) == len(about)
     assert one.description.get("description").isprintable()
@@ -314,7 +314,7 @@ def test_a_description_is_xml_whatever_the_title(about, tmp_path):
 @pytest.mark.parametrize("name", ["../../x", "a b", "int", "é", ""])
 def test_a_name_that_c_does_not_have_is_refused(name):
     with pytest.raises(NotExported, match="no name that C has"):
-        fmu(PLANTS["mirrored rig"], name, step=STEP)
+        build_fmu(PLANTS["mirrored rig"], name, step=STEP)
 
 
 def test_fmpy_runs_it_to_the_simulation(tmp_path):
@@ -322,7 +322,7 @@ def test_fmpy_runs_it_to_the_simulation(tmp_path):
     fmpy = pytest.importorskip("fmpy")
     validation = pytest.importorskip("fmpy.validation")
     path = tmp_path / "plant.fmu"
-    path.write_bytes(fmu(PLANTS["mirrored rig"], "plant", step=STEP))
+    path.write_bytes(build_fmu(PLANTS["mirrored rig"], "plant", step=STEP))
     assert validation.validate_fmu(str(path)) == []
     found = fmpy.simulate_fmu(
         str(path), stop_time=0.2, output_interval=PERIOD, start_values={"control": 2.0}, output=["slip", "speed"]
@@ -362,7 +362,7 @@ def test_the_command_refuses_in_one_line(words, said, tmp_path, monkeypatch):
 def test_without_a_compiler_it_is_said(tmp_path, monkeypatch):
     monkeypatch.setenv(COMPILER, "")
     with pytest.raises(NotExported, match="needs a C compiler"):
-        fmu(PLANTS["mirrored rig"], "plant", step=STEP)
+        build_fmu(PLANTS["mirrored rig"], "plant", step=STEP)
     result = command("export", "slip-lmi", "--to", "fmu", "-o", tmp_path / "x.fmu", status=2)
     assert "an FMU needs a C compiler" in result.stderr
     assert left_in(tmp_path) == set()

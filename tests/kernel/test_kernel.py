@@ -240,7 +240,7 @@ class TestSweep:
     @pytest.mark.slow
     def test_is_that_of_xla_and_says_what_made_it(self, tmp_path):
         """Another engine does not go on with it."""
-        study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
+        study = section_sweep.build_study(scenario.load("slip-lmi", self.SETTINGS))
         tables = {}
         for engine in ("xla", "kernel"):
             one = dataclasses.replace(study, engine=engine)
@@ -258,7 +258,7 @@ class TestSweep:
     def test_is_refused_before_anything_is_written(self, tmp_path, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, "")
         native._run.clear_cache()
-        study = section_sweep.study(scenario.load("slip-lmi", self.SETTINGS))
+        study = section_sweep.build_study(scenario.load("slip-lmi", self.SETTINGS))
         with pytest.raises(ValueError, match=f"engine = 'kernel' is not possible: {compilers.COMPILER} is empty"):
             sweep(dataclasses.replace(study, engine="kernel"), tmp_path / "out")
         assert not (tmp_path / "out").exists()
@@ -415,7 +415,7 @@ class TestLibrary:
     @pytest.mark.slow
     def test_of_two_processes_at_once_and_of_one_that_is_killed(self, tmp_path):
         """Whoever comes first, or is ended in the middle: what has a name is whole."""
-        code = f"import ctypes; from diffabs.kernel import compilers; p = compilers.library({self.TEXT % 2!r})\n"
+        code = f"import ctypes; from diffabs.kernel import compilers; p = compilers.build_library({self.TEXT % 2!r})\n"
         code += (
             "f = ctypes.CDLL(str(p)).answer; f.restype, f.argtypes = ctypes.c_double, [ctypes.c_double]; print(f(0.0))"
         )

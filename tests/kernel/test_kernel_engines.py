@@ -20,7 +20,7 @@ from diffabs.objectives import IAE, StopTime
 from diffabs.scenario.defaults import braking
 from diffabs.simulate import native
 from diffabs.simulate.engine import EngineError, log_xla_reason
-from diffabs.tune.problem import Mode
+from diffabs.tune.problem import DerivativeMode
 
 pytestmark = pytest.mark.xdist_group("kernel engines")
 
@@ -73,9 +73,9 @@ class TestTune:
         assert expected.engine == {"name": "xla"}
         np.testing.assert_allclose(found.objective, expected.objective, rtol=1e-9)
         np.testing.assert_allclose(found.values["controller.torque"], expected.values["controller.torque"], rtol=1e-6)
-        assert found.mode is Mode.FORWARD
+        assert found.mode is DerivativeMode.FORWARD
 
-    @killed_by("tune/problem.py", 'engine="kernel", mode=Mode.FORWARD)', 'engine="kernel")')
+    @killed_by("tune/problem.py", 'engine="kernel", mode=DerivativeMode.FORWARD)', 'engine="kernel")')
     @pytest.mark.slow
     def test_without_lanes_of_its_own_and_of_many_parameters(self):
         """One lane; and forward mode where XLA would have taken reverse mode."""
@@ -85,16 +85,16 @@ class TestTune:
         ranges = {path: (0.9 * float(get(LOOP, path)), 1.1 * float(get(LOOP, path))) for path in paths}
         problems = [
             tune.build_problem(LOOP, **{**given, "free": ranges}, engine=e, mode=m)
-            for e, m in (("kernel", None), ("xla", Mode.REVERSE))
+            for e, m in (("kernel", None), ("xla", DerivativeMode.REVERSE))
         ]
         z = problems[0].space.place(LOOP)[None]
         none = tune.problem.Multipliers(np.zeros((1, 0)), np.ones(1))
         found, expected = (jax.device_get(problem.evaluator(1.0)(z, none)) for problem in problems)
         np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-7, atol=1e-12)
 
-    @killed_by("tune/problem.py", "NO_REVERSE_MESSAGE if mode is Mode.REVERSE else None", "None")
+    @killed_by("tune/problem.py", "NO_REVERSE_MESSAGE if mode is DerivativeMode.REVERSE else None", "None")
     def test_in_reverse_mode_is_refused(self):
-        method = tune.Method(mode=Mode.REVERSE)
+        method = tune.Method(mode=DerivativeMode.REVERSE)
         with pytest.raises(EngineError, match="engine = 'kernel' is not possible: a kernel has no reverse mode"):
             tune.tune(LOOP, **TUNED, method=method, engine="kernel")
 

@@ -12,7 +12,7 @@ import diffabs as d
 from diffabs import scenario
 from diffabs.core.pytree import get
 from diffabs.kernel import binaries, launch
-from diffabs.objectives import usual
+from diffabs.objectives import default_objectives
 from diffabs.scenario.defaults import balancing, braking
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernel parts")]
@@ -63,7 +63,7 @@ def test_a_part(family, name, kind):
         pytest.skip("1e-15 of its speed decides which lanes diverge")
     loop, path = with_part(family, name)
     values = {path: np.asarray(get(loop, path), float) * np.linspace(1 - SPREAD, 1 + SPREAD, LANES) + 1e-3}
-    same(*both(loop, values, SOLVERS[kind], usual(loop.plant), np.arange(LANES)), **close(name, kind))
+    same(*both(loop, values, SOLVERS[kind], default_objectives(loop.plant), np.arange(LANES)), **close(name, kind))
 
 
 @pytest.mark.parametrize("kind", SOLVERS)

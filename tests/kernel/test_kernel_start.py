@@ -24,7 +24,7 @@ from diffabs import objectives, roads
 from diffabs.kernel import launch
 from diffabs.scenario import load
 
-launch.VECTORS = 1
+launch.VECTORS_PER_BLOCK = 1
 Road, factor, kinds = roads.RationalCurve, float(sys.argv[1]), sys.argv[2:]
 original, code = Road.friction, Road.friction.__code__
 

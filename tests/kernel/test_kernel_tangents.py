@@ -22,11 +22,11 @@ from test_kernel_parts import CASES, VARIED, with_part
 
 import diffabs as d
 from diffabs import controllers, plants, scenario
-from diffabs.core.pytree import arrayed, get, parameters
+from diffabs.core.pytree import as_arrays, get, parameters
 from diffabs.kernel import binaries, launch, tangents
 from diffabs.kernel.graph import UpdateLevel
 from diffabs.kernel.launch import run_lanes
-from diffabs.objectives import IAE, usual
+from diffabs.objectives import IAE, default_objectives
 from diffabs.scenario.defaults import braking
 
 pytestmark = pytest.mark.xdist_group("kernel tangents")
@@ -250,7 +250,7 @@ print("on two devices")
 def moved(loop, solver, objectives, path, engine, ulps=0):
     """Values and derivatives of all metrics along changes of everything tunable in a loop, and of what its lanes begin
     with. A list of these where lanes begin so many last digits away, each."""
-    leaves, tree = jax.tree.flatten(arrayed(loop))
+    leaves, tree = jax.tree.flatten(as_arrays(loop))
     tunable = [spec.tunable for _, spec, _ in parameters(loop)]
     ways = [np.random.default_rng(i).uniform(0.5, 1.0, np.shape(x)) for i, x in enumerate(leaves)]
     spread = float(get(loop, path)) * np.linspace(0.96, 1.04, 12) + 1e-3
@@ -295,7 +295,9 @@ def compare(given, close, values=1e-13, sways=None):
 def test_a_part(family, name):
     """With steps of the grid alone."""
     loop, path = with_part(family, name)
-    compare((loop, d.FixedStep(1e-3, 0.06, kinks=False), usual(loop.plant), path), ROUNDED.get(name, EXACT))
+    compare(
+        (loop, d.FixedStep(1e-3, 0.06, kinks=False), default_objectives(loop.plant), path), ROUNDED.get(name, EXACT)
+    )
 
 
 @killed_by("simulate/native.py", "else method.for_derivatives()", "else method")

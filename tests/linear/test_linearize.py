@@ -23,8 +23,8 @@ from diffabs.controllers import (
 )
 from diffabs.core.blocks import Direct, Series
 from diffabs.core.protocols import BrakeOutput, Clock
-from diffabs.core.pytree import replace, strong
-from diffabs.core.validity import check
+from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.validity import check_part
 from diffabs.design.state_feedback import reduce_loop
 from diffabs.linear.linearization import linearize, tracking_dynamics
 from diffabs.linear.slip_model import LowPass, Sampling, SlipModel
@@ -146,7 +146,7 @@ jax.tree_util.register_pytree_node(SlipOnly, lambda r: ((), ()), lambda s, c: Sl
 def test_lab_rig_rests_where_it_is_held():
     """The remaining state, the brake, where its own rate is zero; then the slip's is, too."""
     model = SlipModel(plant=LabRig(), speed=8.0)
-    state, control = quick(SlipModel.point)(strong(model))
+    state, control = quick(SlipModel.point)(canonical_dtypes(model))
     rate = model.plant.derivative(0.0, state, control)
     assert abs(rate.brake) < 1e-12
     slip_rate = jax.jvp(lambda x: model.plant.output(x).slip, (state,), (rate,))[1]
@@ -241,7 +241,7 @@ def one_period(loop, z, period):
 
         return state.with_flow(rk4_step(rate, k * h, state.flow(), h)), None
 
-    state, _ = jax.lax.scan(step, strong(state), jnp.arange(STEPS))
+    state, _ = jax.lax.scan(step, canonical_dtypes(state), jnp.arange(STEPS))
     held = state.controller.held
     inner = held.inner.flow
     own = [inner.integral, inner.filtered] if len(z) == 5 else [inner]
@@ -332,7 +332,7 @@ def test_reduction_has_the_modes_of_the_loop(plant, name, actuator):
         assert np.min(np.abs(true - mode)) < 1e-9 * max(1, abs(mode))
 
 
-@killed_by("design/state_feedback.py", "in_words(line, units) for line", "line.replace('{control}', 'N m') for line")
+@killed_by("design/state_feedback.py", "insert_unit(line, units) for line", "line.replace('{control}', 'N m') for line")
 def test_what_is_neglected():
     lag = Lag(time_constant=0.02)
     loop = braking(
@@ -404,9 +404,9 @@ def test_unknown_parts(parts, message):
 
 def test_ranges():
     with pytest.raises(ValueError, match=r"delay = 0.002 s exceeds the period of 0.001 s"):
-        check(SlipModel(sampling=Sampling(delay=0.002)))
+        check_part(SlipModel(sampling=Sampling(delay=0.002)))
     with pytest.raises(ValueError, match=r"slip = 0 is outside \(0, 1\); speed = 0 is outside \(0, 200\] m/s"):
-        check(SlipModel(slip=0.0, speed=0.0))
+        check_part(SlipModel(slip=0.0, speed=0.0))
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, references, stops
-from diffabs.cli.show import at_bounds
+from diffabs.cli.show import numbers_at_bounds
 from diffabs.core.protocols import Memory, Tracking
 from diffabs.core.pytree import param, pytree
 from diffabs.core.values import ScenarioError
@@ -130,4 +130,4 @@ def test_a_tuning_says_on_which_bounds_it_stands():
         "reference.slip": {"after": 0.35, "low": 0.05, "high": 0.35},
         "controller.kp": {"after": 7.0, "low": 0.0, "high": math.inf},
     }
-    assert list(at_bounds(free)) == ["controller.gain.0 (lower, -10000)", "reference.slip (upper, 0.35)"]
+    assert list(numbers_at_bounds(free)) == ["controller.gain.0 (lower, -10000)", "reference.slip (upper, 0.35)"]

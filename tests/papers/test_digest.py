@@ -10,38 +10,40 @@ from rich.console import Console
 from diffabs import papers
 from diffabs.cli import show
 from diffabs.papers import arm_balance, lmi_design, record, slip_estimator, slip_lmi
-from diffabs.papers.digest import Refuted, close, computed, decimals, published, verdict
+from diffabs.papers.digest import Refuted, count_computed, count_published, decimals, is_close, verdict
 
 
 def estimator(**changed):
     """A record of [est] with our numbers a little off the printed ones; others by place."""
     rows = []
     for number, method in ((1, "conventional"), (2, "proposed")):
-        for name in ("no ABS", *(f"{method} {controller}" for controller in slip_estimator.GAINS)):
+        for name in ("no ABS", *(f"{method} {controller}" for controller in slip_estimator.PID_GAINS)):
             for quantity, unit, value in zip(("stopping time", "stopping distance"), "sm",
-                                             slip_estimator.PUBLISHED[name], strict=True):  # fmt: skip
+                                             slip_estimator.PUBLISHED_STOPS[name], strict=True):  # fmt: skip
                 label = f"Table {number}: {name}"
-                rows.append(record.printed(label, quantity, unit, value + changed.get(name, 0.004), value))
+                rows.append(record.printed_row(label, quantity, unit, value + changed.get(name, 0.004), value))
     rows += [{**row, "name": f"{row['name']} (Magic Formula)", "matches": False} for row in rows]
     rows.append(
-        record.row("estimator as printed, step 0.0001 s, after 10 s", "distance", "m", changed.get("rolls", 277))
+        record.computed_row(
+            "estimator as printed, step 0.0001 s, after 10 s", "distance", "m", changed.get("rolls", 277)
+        )
     )
     locked = changed.get("locked", 1.224)
-    rows.append(record.row("no ABS, from lock to stop", "time", "s", locked, published=1.4))
-    rows.append(record.row("bound, torque 90 N m", "distance", "m", 42.1808, reference=42.1808))
+    rows.append(record.computed_row("no ABS, from lock to stop", "time", "s", locked, published=1.4))
+    rows.append(record.computed_row("bound, torque 90 N m", "distance", "m", 42.1808, reference=42.1808))
     return {"paper": "slip-estimator", "title": slip_estimator.TITLE, "rows": rows, "figures": ["a.png"] * 9}
 
 
 def rig():
     rows = [
-        record.row(name, quantity, slip_lmi.UNITS[quantity], value * (1 + 3e-8), reference=value)
-        for name, values in slip_lmi.REFERENCE.items()
-        for quantity, value in zip(slip_lmi.QUANTITIES, values, strict=True)
+        record.computed_row(name, quantity, slip_lmi.QUANTITY_UNITS[quantity], value * (1 + 3e-8), reference=value)
+        for name, values in slip_lmi.REFERENCE_RUNS.items()
+        for quantity, value in zip(slip_lmi.COMPARED_QUANTITIES, values, strict=True)
     ]
     for name, values in slip_lmi.REFERENCE_CAR.items():
         for quantity, value in zip(("stop_time", "stop_distance"), values, strict=True):
-            rows.append(record.row(name, quantity, "", value, reference=value))
-    rows.append(record.row("order of the step: 5.3 kg, from slip 0.1", "stop_time", "1", 3.8, reference=4.0))
+            rows.append(record.computed_row(name, quantity, "", value, reference=value))
+    rows.append(record.computed_row("order of the step: 5.3 kg, from slip 0.1", "stop_time", "1", 3.8, reference=4.0))
     known = {
         ("friction curve, local peak", "slip"): 0.1875,
         ("K = [-11753, -48], 5..50 km/h", "common Lyapunov matrix"): 0.0,
@@ -49,22 +51,23 @@ def rig():
         ("LMI, Q = diag(1, 1), (31) as printed", "trace Z"): 20.8,
         ("LMI, Q = diag(1, 1)", "trace Z"): 4.59,
     }
-    rows += [record.row(*place, "", value, reference=value) for place, value in known.items()]
+    rows += [record.computed_row(*place, "", value, reference=value) for place, value in known.items()]
     return {"paper": "slip-lmi", "title": slip_lmi.TITLE, "rows": rows, "figures": ["a.png"] * 11}
 
 
 def arm():
     rows = [
-        record.row("correct, no limit", "fell", "1", 1.0),
-        record.row("correct, 48 V", "fell", "1", 1.0),
-        record.row("hanging", "fell", "1", 0.0),
-        record.row("hanging arm", "bound, multiple at 48 V", "1", 0.0933),
-        record.row("hanging arm, LQR", "recovered multiple at 24 V", "1", 0.045, reference=0.046),
-        record.row("printed model, Fig. 3", "peak_voltage", "V", 479.405, reference=479.0),
-        record.row("map, weights tuned by gradients", "share", "1", 0.4818),
+        record.computed_row("correct, no limit", "fell", "1", 1.0),
+        record.computed_row("correct, 48 V", "fell", "1", 1.0),
+        record.computed_row("hanging", "fell", "1", 0.0),
+        record.computed_row("hanging arm", "bound, multiple at 48 V", "1", 0.0933),
+        record.computed_row("hanging arm, LQR", "recovered multiple at 24 V", "1", 0.045, reference=0.046),
+        record.computed_row("printed model, Fig. 3", "peak_voltage", "V", 479.405, reference=479.0),
+        record.computed_row("map, weights tuned by gradients", "share", "1", 0.4818),
     ]
     rows += [
-        record.row("Acrobot, LQR", f"-K of {i}", "", k + 2e-7, published=k) for i, k in enumerate(arm_balance.SPONG)
+        record.computed_row("Acrobot, LQR", f"-K of {i}", "", k + 2e-7, published=k)
+        for i, k in enumerate(arm_balance.SPONG)
     ]
     return {"paper": "arm-balance", "title": arm_balance.TITLE, "rows": rows, "figures": ["a.png"] * 4}
 
@@ -72,7 +75,7 @@ def arm():
 def drawn(summary, width=80, **options):
     file = io.StringIO()
     Console(file=file, width=width, markup=False, highlight=False, **options).print(
-        show.compact(papers.compact(summary))
+        show.show_digest(papers.compact(summary))
     )
     return file.getvalue()
 
@@ -123,10 +126,10 @@ def test_published_numbers_are_counted_from_the_record():
     assert off.agreement[0].startswith("18 of 20 published numbers")
     assert off.agreement[0].endswith("not Table 2: proposed PI, stopping time: 2.9951; "
                                      "Table 2: proposed PI, stopping distance: 42.865.")  # fmt: skip
-    assert published("Table 1", []) == "The paper prints no number to compare with: Table 1."
-    row = record.row("a", "b", "", -98.6903424, published=-98.690342)
-    assert published("x", [row]).startswith("1 of 1")
-    assert published("x", [{**row, "ours": -98.6903427}]).startswith("0 of 1")
+    assert count_published("Table 1", []) == "The paper prints no number to compare with: Table 1."
+    row = record.computed_row("a", "b", "", -98.6903424, published=-98.690342)
+    assert count_published("x", [row]).startswith("1 of 1")
+    assert count_published("x", [{**row, "ours": -98.6903427}]).startswith("0 of 1")
 
 
 @pytest.mark.parametrize(
@@ -135,9 +138,9 @@ def test_published_numbers_are_counted_from_the_record():
      (479.405, 479.0, True), (480.0, 479.0, False), (0.045, 0.046, False), (4e-6, 1e-5, False), (1.01e-5, 1e-5, True)],
 )  # fmt: skip
 def test_what_counts_as_an_independent_number_reproduced(ours, reference, agrees):
-    row = record.row("a", "b", "", ours, reference=reference)
-    assert close(row) is agrees
-    assert computed([row]).startswith("1 of 1" if agrees else "0 of 1")
+    row = record.computed_row("a", "b", "", ours, reference=reference)
+    assert is_close(row) is agrees
+    assert count_computed([row]).startswith("1 of 1" if agrees else "0 of 1")
 
 
 def test_decimals_are_those_that_are_written():

@@ -20,7 +20,7 @@ from diffabs.cli import show
 from diffabs.objectives import BRAKING
 from diffabs.papers import PAPERS, arm_balance, compact, lmi_design, record, slip_estimator, slip_lmi
 from diffabs.references import FixedSlip
-from diffabs.report import documents, report
+from diffabs.report import build_report, find_documents
 from diffabs.scenario.defaults import braking
 
 SMALLEST_FIGURE = 10_000  # bytes: an empty sheet takes less than 6,000
@@ -72,10 +72,10 @@ def _rows(summary: dict[str, Any], start: str) -> list[dict[str, Any]]:
     return found
 
 
-@pytest.mark.parametrize("case", slip_lmi.REFERENCE)
+@pytest.mark.parametrize("case", slip_lmi.REFERENCE_RUNS)
 def test_the_braking_table_is_the_independent_solution(lmi, case):
     rows = {row["quantity"]: row for row in lmi["rows"] if row["name"] == case}
-    assert set(rows) == set(slip_lmi.QUANTITIES)
+    assert set(rows) == set(slip_lmi.COMPARED_QUANTITIES)
     for row in rows.values():
         # At the torque limits 2e-5 s leaves 5e-8 of the greatest slip; the rest is closer.
         assert row["ours"] == pytest.approx(row["reference"], rel=1e-6), row
@@ -105,7 +105,7 @@ def test_the_order_of_the_step(lmi):
 
 
 def test_the_design_is_that_of_other_solvers(lmi):
-    for weights in lmi_design.REFERENCE:
+    for weights in lmi_design.REFERENCE_GAINS:
         rows = {
             r["quantity"]: r for r in lmi["rows"] if r["name"] == f"LMI, Q = diag({weights[0]:.6g}, {weights[1]:g})"
         }
@@ -272,7 +272,7 @@ def test_what_a_person_is_shown_fits_and_counts(paper):
     claims = {"slip-lmi": lmi_design.CLAIMS, "slip-estimator": slip_estimator.CLAIMS, "arm-balance": arm_balance.CLAIMS}
     assert [word for word, _ in digest.verdicts] == ["refuted"] * len(claims[paper["paper"]])
     console = Console(file=(file := io.StringIO()), width=80)
-    console.print(show.compact(digest))
+    console.print(show.show_digest(digest))
     lines = file.getvalue().splitlines()
     assert len(lines) <= 20
     assert max(map(len, lines)) <= 80
@@ -293,7 +293,7 @@ def test_figures_are_pictures(paper):
 @killed_by("report/experiments.py", "if pathlib.PurePath(name).name == name]", "if False]", case="slip-lmi")
 def test_a_report_has_every_number_and_figure(paper):
     """And stands for itself: figures are in it, notes and verdicts are as they were written."""
-    page = Page(report(documents(paper.folder)))
+    page = Page(build_report(find_documents(paper.folder)))
     wanted = {repr(row[key]) for row in paper["rows"] + paper["judged"] for key in ("ours", "difference") if row[key]}
     assert wanted <= set(page.numbers)
     assert len(page.images) == len(paper["figures"])
@@ -304,16 +304,16 @@ def test_a_report_has_every_number_and_figure(paper):
 
 
 def test_rows_say_how_far_they_are():
-    assert record.row("a", "q", "m", 3.0, published=2.0)["difference"] == 1.0
-    assert record.row("a", "q", "m", 3.0, reference=4.0)["difference"] == -1.0
-    assert record.row("a", "q", "m", 3.0)["difference"] is None
-    assert record.printed("a", "q", "m", 2.994, 2.99)["matches"]
-    assert not record.printed("a", "q", "m", 2.996, 2.99)["matches"]
+    assert record.computed_row("a", "q", "m", 3.0, published=2.0)["difference"] == 1.0
+    assert record.computed_row("a", "q", "m", 3.0, reference=4.0)["difference"] == -1.0
+    assert record.computed_row("a", "q", "m", 3.0)["difference"] is None
+    assert record.printed_row("a", "q", "m", 2.994, 2.99)["matches"]
+    assert not record.printed_row("a", "q", "m", 2.996, 2.99)["matches"]
 
 
 def test_a_number_that_is_not_finite_is_not_written(tmp_path):
     with pytest.raises(ValueError, match="not JSON compliant"):
-        record.write(tmp_path, {"rows": [math.nan]})
+        record.write_summary(tmp_path, {"rows": [math.nan]})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -323,26 +323,26 @@ def short():
 
 
 def test_braking_draws_the_run(short, tmp_path):
-    figure = plot.braking(short, title="a run")
+    figure = plot.draw_braking(short, title="a run")
     slip, speed, torque, deceleration = figure.axes
     assert [line.get_label() for line in slip.lines] == ["slip", "target", "setpoint"]
     assert speed.get_ylabel() == "speed [km/h]"
     np.testing.assert_allclose(speed.lines[1].get_ydata()[0], 100.0, rtol=1e-12)
     np.testing.assert_allclose(torque.lines[1].get_ydata()[0], 90.0, rtol=1e-12)
     assert deceleration.get_ylabel() == "deceleration [m/s²]"
-    assert plot.save(figure, tmp_path / "run.png").stat().st_size > SMALLEST_FIGURE
+    assert plot.save_figure(figure, tmp_path / "run.png").stat().st_size > SMALLEST_FIGURE
     assert [path.name for path in tmp_path.iterdir()] == ["run.png"]
 
 
 def test_a_run_without_a_trajectory_cannot_be_drawn(short):
     with pytest.raises(ValueError, match="rollout"):
-        plot.braking(short._replace(trajectory=None))  # what `measure` returns
+        plot.draw_braking(short._replace(trajectory=None))  # what `measure` returns
 
 
 def test_a_figure_that_fails_leaves_nothing_behind(tmp_path):
     figure, _ = plot.sheet()
     with pytest.raises(ValueError, match="nonsense"):
-        plot.save(figure, tmp_path / "x.nonsense")
+        plot.save_figure(figure, tmp_path / "x.nonsense")
     assert list(tmp_path.iterdir()) == []
 
 

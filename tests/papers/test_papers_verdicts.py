@@ -35,8 +35,8 @@ def runs():
 
 @killed_by(
     "papers/estimator_claims.py",
-    'np.sum(np.abs(np.diff(seen(run)["torque"])))',
-    'np.sum(np.maximum(np.diff(seen(run)["torque"]), 0))',
+    'np.sum(np.abs(np.diff(run_columns(run)["torque"])))',
+    'np.sum(np.maximum(np.diff(run_columns(run)["torque"]), 0))',
 )
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_the_wheel_turns_once_near_half_a_second(runs):
     for name, one in runs.items():
         turns = estimator_claims.rebounds(one)
         assert turns == (2 if name in ("proposed P", "proposed PD") else 0), name
-    one = estimator_claims.seen(runs["proposed P"])
+    one = estimator_claims.run_columns(runs["proposed P"])
     up = one["t"][1:][np.diff(one["wheel_speed"]) > 0]
     assert 0.5 < up[0] < up[-1] < 0.6
 
@@ -80,8 +80,11 @@ def test_the_wheel_turns_once_near_half_a_second(runs):
 def test_four_controllers_do_not_differ_in_the_proposed_method_only():
     """From the paper's own tables: "no significant difference" is 2 cm there, and in the conventional method 1.05 m,
     more than the 1.01 m by which the proposed method shortens the distance under P."""
-    distance = {name: d for name, (_, d) in slip_estimator.PUBLISHED.items()}
-    spread = {m: np.ptp([distance[f"{m} {c}"] for c in estimator_claims.CONTROLLERS]) for m in estimator_claims.METHODS}
+    distance = {name: d for name, (_, d) in slip_estimator.PUBLISHED_STOPS.items()}
+    spread = {
+        m: np.ptp([distance[f"{m} {c}"] for c in estimator_claims.CONTROLLERS])
+        for m in estimator_claims.COMPARED_METHODS
+    }
     assert spread["proposed"] == pytest.approx(0.02, abs=1e-9)
     assert spread["conventional"] == pytest.approx(1.05, abs=1e-9)
     assert spread["conventional"] > distance["conventional P"] - distance["proposed P"] == pytest.approx(1.01, abs=1e-9)
@@ -89,7 +92,7 @@ def test_four_controllers_do_not_differ_in_the_proposed_method_only():
 
 def test_the_proposed_method_is_shorter_under_every_controller():
     for controller in estimator_claims.CONTROLLERS:
-        ours, theirs = (slip_estimator.PUBLISHED[f"{m} {controller}"] for m in ("proposed", "conventional"))
+        ours, theirs = (slip_estimator.PUBLISHED_STOPS[f"{m} {controller}"] for m in ("proposed", "conventional"))
         assert ours[0] < theirs[0]
         assert ours[1] < theirs[1]
 
@@ -101,8 +104,8 @@ def test_friction_at_low_speed(runs):
     greatest = 9.81 * 0.99064
     assert estimator_claims.slow_deceleration(runs["proposed PI"]) / greatest == pytest.approx(0.9975, abs=5e-4)
     assert estimator_claims.slow_deceleration(runs["conventional PI"]) / greatest == pytest.approx(0.907, abs=5e-4)
-    whole, slow = estimator_claims.gained(runs["conventional PI"], runs["proposed PI"])
-    metrics = [runs[f"{m} PI"].metrics["stop_distance"] for m in estimator_claims.METHODS]
+    whole, slow = estimator_claims.braking_gain(runs["conventional PI"], runs["proposed PI"])
+    metrics = [runs[f"{m} PI"].metrics["stop_distance"] for m in estimator_claims.COMPARED_METHODS]
     assert whole == pytest.approx(metrics[0] - metrics[1], abs=2e-3)  # the integral of v dv/a is the distance
     assert slow / whole == pytest.approx(0.08, abs=0.005)
 
@@ -117,7 +120,7 @@ def test_the_identified_curve_peaks_at_half_of_what_the_paper_calls_usual():
 def test_were_friction_greatest_at_the_conventional_target_nothing_could_be_gained():
     """So the paper's own tables refute 0.2 on its curve: P holds the slip within 0.02 of the target, and the estimate
     is 1.01 m shorter."""
-    assert slip_estimator.PUBLISHED["conventional P"][1] - slip_estimator.PUBLISHED["proposed P"][1] > 1
+    assert slip_estimator.PUBLISHED_STOPS["conventional P"][1] - slip_estimator.PUBLISHED_STOPS["proposed P"][1] > 1
     mu = jax.jit(CAR.road.friction)
     assert float(mu(0.2)) < float(mu(0.1)) - 0.07
 
@@ -171,7 +174,7 @@ def test_equation_9_with_events_releases_a_locked_wheel_again_and_again():
         assert np.max(w[late]) == pytest.approx(released, rel=0.01)
         assert np.mean(w[late] > 0) == pytest.approx(0.5, abs=0.01)
     t, v, _ = literally(2e-4, 3.6, events=("wheel", "car"))
-    time, distance = slip_estimator.PUBLISHED["no ABS"]
+    time, distance = slip_estimator.PUBLISHED_STOPS["no ABS"]
     assert t[np.argmax(v <= 0)] == pytest.approx(time, abs=0.01)
     assert np.sum(v) * 2e-4 == pytest.approx(distance, abs=0.05)
 
@@ -189,7 +192,7 @@ def test_equation_10_without_an_event_drives_a_stopped_car_backwards():
 
 @pytest.fixture(scope="module")
 def rig():
-    return polytope(SlipModel(plant=MirroredRig(), slip=0.2), lmi_design.OVER)
+    return polytope(SlipModel(plant=MirroredRig(), slip=0.2), lmi_design.DESIGN_BOX)
 
 
 def test_the_mass_does_not_move_the_braking():
@@ -199,13 +202,13 @@ def test_the_mass_does_not_move_the_braking():
         one = MirroredRig(mass=mass)
         rates.append(float(one.output(one.start(BrakeStart(speed=10.0, slip=0.3))).deceleration))
     np.testing.assert_allclose(rates, rates[0], rtol=1e-14)
-    times = [slip_lmi.REFERENCE[f"{mass} kg, torque unlimited"][2] for mass in (5.3, 6.2)]
+    times = [slip_lmi.REFERENCE_RUNS[f"{mass} kg, torque unlimited"][2] for mass in (5.3, 6.2)]
     assert abs(times[1] / times[0] - 1) < 2e-5
 
 
 def test_a_tonne_as_five_kilograms():
     """Its arithmetic holds, and both masses that the laboratory rig has are near 5 kg."""
-    assert [lmi_claims.scaled(n) for n in (1, 4)] == pytest.approx([5.3, 6.2], rel=1e-15)
+    assert [lmi_claims.scaled_mass(n) for n in (1, 4)] == pytest.approx([5.3, 6.2], rel=1e-15)
     by_inertia, by_weight = lmi_claims.rig_masses()
     assert by_inertia == pytest.approx(2 * 25.6e-3 / 0.099**2, rel=1e-12) == pytest.approx(5.22, abs=5e-3)
     assert by_weight == pytest.approx(58.217466 / 9.81, rel=1e-7) == pytest.approx(5.93, abs=5e-3)
@@ -215,7 +218,7 @@ def test_a_cost_that_is_small_for_any_mass(rig):
     """Over the paper's masses the cost moves by 0.2 % at most, under any of the gains; for any mass the claim is false:
     a fixed gain ends where alpha, which grows with the mass, reaches beta |k2|."""
     weights, gain = (1.0, 1.0), np.array([-0.833854, -2.599026])
-    fast = lmi_design.OVER["speed"][1]
+    fast = lmi_design.DESIGN_BOX["speed"][1]
     for q, k in ((weights, gain), ((11753.0**2, 1.0), np.array([-11752.96, -158.171]))):
         light, heavy = (lmi_claims.cost(*lmi_claims.corner(rig, mass, fast), k, q) for mass in (5.3, 6.2))
         assert abs(heavy / light - 1) < 2e-3
@@ -234,7 +237,7 @@ def test_the_nearest_explanation_of_the_gain(rig):
     """The optimum at 5 km/h alone with the published k1 has k2 = -50.3, and more for any weight on the slip error, any
     cross weight and any greater speed; -48 is that of 4.54 km/h. So the design saw the slow end of its range only: at
     50 km/h its own weights would have it at -158."""
-    (light, _), (slow, fast) = lmi_design.OVER["plant.mass"], lmi_design.OVER["speed"]
+    (light, _), (slow, fast) = lmi_design.DESIGN_BOX["plant.mass"], lmi_design.DESIGN_BOX["speed"]
     A, B = lmi_claims.corner(rig, light, slow)
     K, _ = lmi_claims.optimum(A, B, (11753.0**2, 0.0))
     alpha, beta, omega = 83.8796606703, 133.472842636189, 14.0291806958  # computed without this package
@@ -248,7 +251,7 @@ def test_the_nearest_explanation_of_the_gain(rig):
     assert 3.6 * lmi_claims.nearest_speed(rig) == pytest.approx(4.54, abs=5e-3)
     weights = (11753.0**2, 1.0)
     excess = [
-        lmi_claims.cost(A, B, lmi_design.PUBLISHED, weights) / lmi_claims.optimum(A, B, weights)[1] - 1
+        lmi_claims.cost(A, B, lmi_design.PUBLISHED_GAIN, weights) / lmi_claims.optimum(A, B, weights)[1] - 1
         for A, B in (lmi_claims.corner(rig, light, speed) for speed in (slow, fast))
     ]
     np.testing.assert_allclose(excess, [0.0012, 0.81], rtol=0.05)
@@ -287,7 +290,9 @@ def test_what_the_printed_equations_of_motion_miss_of_their_own_lagrangian():
     b2, b3, c2, c3, g = 10.0, 30.0, 7.0, 21.0, 9.81
     for q, v, a in points():
         t1, t2, t3 = q
-        missing = arm_equations.derived(arm_equations.lagrangian, ARM, q, v, a) - arm_equations.printed(ARM, q, v, a)
+        missing = arm_equations.euler_lagrange(
+            arm_equations.lagrangian, ARM, q, v, a
+        ) - arm_equations.printed_equations(ARM, q, v, a)
         expected = [
             -(c2 - b2) * np.sin(t2) * v[1] ** 2,
             2 * c2 * np.sin(t2) * v[0] ** 2 + 2 * b2 * g * np.sin(t1 - t2),
@@ -308,8 +313,8 @@ def test_equation_7_is_the_lagrangian_of_another_machine():
 
     for q, v, _ in points(5):
         a = np.array(free.accelerations(ArmState(*q, *v), 0.0))
-        np.testing.assert_allclose(arm_equations.derived(with_sums, ARM, q, v, a), 0, atol=1e-9)
-        assert np.max(np.abs(arm_equations.derived(arm_equations.lagrangian, ARM, q, v, a))) > 1
+        np.testing.assert_allclose(arm_equations.euler_lagrange(with_sums, ARM, q, v, a), 0, atol=1e-9)
+        assert np.max(np.abs(arm_equations.euler_lagrange(arm_equations.lagrangian, ARM, q, v, a))) > 1
 
 
 def test_printed_gravity_comes_from_no_potential():
@@ -317,14 +322,14 @@ def test_printed_gravity_comes_from_no_potential():
     stiffness = arm_equations.gravity_stiffness(ARM)
     np.testing.assert_allclose((stiffness - stiffness.T)[0, 1:], 2 * 9.81 * np.array([10.0, 30.0]), rtol=1e-12)
     zero = jnp.zeros(3)
-    of_7 = jax.jacfwd(lambda q: arm_equations.derived(arm_equations.lagrangian, ARM, q, zero, zero))(zero)
+    of_7 = jax.jacfwd(lambda q: arm_equations.euler_lagrange(arm_equations.lagrangian, ARM, q, zero, zero))(zero)
     np.testing.assert_allclose(of_7, of_7.T, atol=1e-9)
 
 
 def test_table_1_of_the_arms_paper_is_of_uniform_rods():
     """Each inertia to the printed digits, so that "tip to centre" and "axis to centre" are one length. Its motor, taken
     at its word, has 192 W at 48 V behind a torque of 480 N m."""
-    rows = {row["name"]: row for row in arm_equations.judged(ARM)}
+    rows = {row["name"]: row for row in arm_equations.judge_equations(ARM)}
     for name, printed in (("body", "3.6"), ("arm", "1.7"), ("rider", "6.0")):
         assert f"{rows[f'a uniform rod as the {name}']['ours']:.1f}" == printed
     assert rows["motor, most at 48 V"]["ours"] == pytest.approx(192)

@@ -11,7 +11,7 @@ from mutants import killed_by
 from oracles import arm_rates
 from scipy.integrate import solve_ivp
 
-from diffabs.core.pytree import replace, strong
+from diffabs.core.pytree import canonical_dtypes, replace
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.linear.recoverable import transmission_zeros
 from diffabs.linear.regulator import lqr
@@ -50,7 +50,7 @@ def after(plant, start, step, count):
         first = plant.energy(x)
         return jax.lax.scan(body, (x, 0.0 * first), length=count)[0]
 
-    return run(*strong((plant, start)))
+    return run(*canonical_dtypes((plant, start)))
 
 
 def model(plant):
@@ -140,7 +140,7 @@ def test_the_closed_form_is_lagranges_equation(plant):
         force = jnp.stack([0.0, torque, -p.damping * rates[2]])
         return jnp.linalg.solve(mass, force + jax.grad(lagrangian, 1)(p, q, rates) - by_both @ rates)
 
-    plant = strong(plant)
+    plant = canonical_dtypes(plant)
     q, rates = np.stack(x[:3], axis=1), np.stack(x[3:], axis=1)
     expected = jax.vmap(euler_lagrange, (None, 0, 0, 0))(plant, q, rates, torque).T
     found = jax.jit(lambda p, x, torque: p.accelerations(x, torque))(plant, x, torque)
@@ -162,7 +162,7 @@ def test_what_the_motor_puts_in_and_the_damper_takes_out_is_the_energys_change(p
         p.gear * p.torque_constant * (volts - p.gear * p.back_emf * x.psi_rate) / p.resistance - p.friction * x.psi_rate
     )
     terms = tau * x.psi_rate, p.damping * x.phi_rate**2
-    found = change(*strong((plant, x, volts)))
+    found = change(*canonical_dtypes((plant, x, volts)))
     gravity = np.max(np.abs(x.theta_rate)) * p.gravity * 107  # the largest rate of an energy that is only exchanged
     np.testing.assert_allclose(found, terms[0] - terms[1], rtol=0, atol=1e-12 * max(gravity, np.max(np.abs(terms))))
     np.testing.assert_allclose(plant.power(x, volts), terms, rtol=1e-13, atol=1e-9)

@@ -36,7 +36,7 @@ def boxes(axis):
 def test_labels_of_a_logarithmic_axis_do_not_touch(ends):
     _, (ax,) = plot.sheet(size=(2.6, 2.2))
     for axis in "xy":
-        plot.logarithmic(ax, axis)
+        plot.make_logarithmic(ax, axis)
     ax.set_xlim(*ends)
     ax.set_ylim(*ends)
     for i, axis in enumerate((ax.xaxis, ax.yaxis)):
@@ -49,7 +49,7 @@ def test_labels_of_a_logarithmic_axis_do_not_touch(ends):
 @killed_by("plot/style.py", "few = low > 0 and", "few = low > 0 or")
 def test_a_long_axis_has_powers_and_a_short_one_numbers():
     _, (ax,) = plot.sheet()
-    plot.logarithmic(ax, "x")
+    plot.make_logarithmic(ax, "x")
     said = ax.xaxis.get_major_formatter()
     ax.set_xlim(1e-6, 1e4)
     assert said(1e-3) == "10⁻³"
@@ -113,7 +113,7 @@ def test_a_dollar_sign_begins_no_formula(tmp_path):
     figure, (ax,) = plot.sheet(title="$x^$ costs")
     ax.plot([1.0, 2.0], [1.0, 2.0], label="$a^$")
     ax.set_yticks([1.0, 2.0], ["$b^$", "c"])
-    plot.label(ax, "$d^$", "$\\e$", "$f^$")
-    plot.save(figure, tmp_path / "figure.png")
-    plot.save(figure, tmp_path / "figure.svg")
+    plot.label_axes(ax, "$d^$", "$\\e$", "$f^$")
+    plot.save_figure(figure, tmp_path / "figure.png")
+    plot.save_figure(figure, tmp_path / "figure.svg")
     assert (tmp_path / "figure.png").stat().st_size > 1000

@@ -67,7 +67,7 @@ def lines(ax):
 
 
 def test_histograms_are_those_of_the_runs_that_did_not_diverge(found):
-    figure = plots.distributions(found, UNITS)
+    figure = plots.draw_distributions(found, UNITS)
     assert list(panels(figure)) == ["overshoot", "effort"]  # locked_time is constant
     ax, values = panels(figure)["overshoot"], OVERSHOOT[~DIVERGED]
     counts, edges, _ = ax.patches[0].get_data()
@@ -82,7 +82,7 @@ def test_histograms_are_those_of_the_runs_that_did_not_diverge(found):
 
 def test_what_would_press_a_histogram_together_is_counted_outside(made):
     values = np.r_[A, 1e3, 2e3]
-    ax = plots.distributions(made({"a": np.r_[A, 0, 1]}, {"effort": values})).axes[0]
+    ax = plots.draw_distributions(made({"a": np.r_[A, 0, 1]}, {"effort": values})).axes[0]
     counts, edges, _ = ax.patches[0].get_data()
     assert counts.sum() == N
     assert edges[-1] < 4
@@ -91,7 +91,8 @@ def test_what_would_press_a_histogram_together_is_counted_outside(made):
 
 def test_a_bound_far_from_the_data_does_not_press_them_together(made):
     near, far = (
-        plots.distributions(made({"a": A}, {"effort": A}, failures={"effort": bound})).axes[0] for bound in (1.5, 30.0)
+        plots.draw_distributions(made({"a": A}, {"effort": A}, failures={"effort": bound})).axes[0]
+        for bound in (1.5, 30.0)
     )
     assert near.get_xlim()[1] > 1.5
     assert far.get_xlim()[1] < 1.1
@@ -100,7 +101,7 @@ def test_a_bound_far_from_the_data_does_not_press_them_together(made):
 
 @killed_by("plot/sweeps.py", "ax.plot(x, counts / n,", "ax.plot(x, 1 - counts / n,")
 def test_exceedance_is_one_minus_the_empirical_distribution(found):
-    figure = plots.exceedance(found, UNITS, confidence=0.9)
+    figure = plots.draw_exceedance(found, UNITS, confidence=0.9)
     ax, values = panels(figure)["overshoot"], OVERSHOOT[~DIVERGED]
     x, share = lines(ax)["runs"]
     inner = x[1:-1].reshape(-1, 2)
@@ -115,7 +116,7 @@ def test_exceedance_is_one_minus_the_empirical_distribution(found):
 
 @killed_by("plot/sweeps.py", "Count(int(k), n)", "Count(int(n - k), n)")
 def test_the_band_is_that_of_clopper_and_pearson(found):
-    ax, n = panels(plots.exceedance(found, confidence=0.9))["overshoot"], N - 3
+    ax, n = panels(plots.draw_exceedance(found, confidence=0.9))["overshoot"], N - 3
     x, share = lines(ax)["runs"]
     k = np.round(share * n)
     low = np.where(k > 0, beta.ppf(0.05, np.maximum(k, 1), n - k + 1), 0.0)
@@ -129,23 +130,23 @@ def test_the_band_is_that_of_clopper_and_pearson(found):
 
 @pytest.mark.parametrize(("design", "label"), [("sobol", "95 % band (as if independent)"), ("grid", None)])
 def test_a_band_says_what_it_takes_for_granted(made, design, label):
-    (ax,) = plots.exceedance(made({"a": A}, {"effort": A}, design=design)).axes
+    (ax,) = plots.draw_exceedance(made({"a": A}, {"effort": A}, design=design)).axes
     assert [band.get_label() for band in ax.collections] == ([label] if label else [])
 
 
 def test_of_a_saltelli_design_the_rows_a_are_drawn(made):
     sweep = made({"a": A, "b": B}, {"effort": A}, design="saltelli")
-    (ax,) = plots.exceedance(sweep).axes
+    (ax,) = plots.draw_exceedance(sweep).axes
     x, share = lines(ax)["runs"]
     assert set(x[1:-1]) <= set(A[::4])
     assert share[2] == 1 - 4 / N
-    counts, *_ = plots.distributions(sweep).axes[0].patches[0].get_data()
+    counts, *_ = plots.draw_distributions(sweep).axes[0].patches[0].get_data()
     assert counts.sum() == N / 4
 
 
 @killed_by("plot/sweeps.py", 'found.column("sample")[good]\n', "np.arange(np.sum(good))\n")
 def test_the_worst_are_marked_and_named(found):
-    figure = plots.worst(found, UNITS, count=6)
+    figure = plots.draw_worst(found, UNITS, count=6)
     ax = figure.axes[0]
     values = np.where(DIVERGED, -np.inf, OVERSHOOT)
     ends = np.argsort(-values)[:6]
@@ -161,7 +162,7 @@ def test_the_worst_are_marked_and_named(found):
 
 
 def test_names_of_the_worst_do_not_cover_each_other_or_the_points(found):
-    figure = plots.worst(found)
+    figure = plots.draw_worst(found)
     figure.draw_without_rendering()
     ax = figure.axes[0]
     boxes = [Text.get_window_extent(text) for text in ax.texts]  # without the line to the point
@@ -175,7 +176,7 @@ def test_of_many_runs_some_are_drawn_and_the_worst_of_all(made):
     n = 40_000
     x, y = np.random.default_rng(1).random((2, n))
     metric = np.where(np.isin(np.arange(n), (17, 39_000)), 2 + x, y)
-    ax = plots.worst(made({"x": x, "y": y}, {"effort": metric}), count=2).axes[0]
+    ax = plots.draw_worst(made({"x": x, "y": y}, {"effort": metric}), count=2).axes[0]
     points = ax.collections[0].get_offsets()
     assert 4900 < len(points) <= 5000
     drawn = set(map(tuple, points.tolist()))
@@ -187,7 +188,7 @@ def test_of_many_runs_some_are_drawn_and_the_worst_of_all(made):
 
 def test_a_metric_that_varies_is_taken_where_none_has_a_bound(made):
     sweep = made({"a": A}, {"locked_time": 0 * A, "effort": A**2})
-    (ax, _) = plots.worst(sweep, {"effort": "J"}).axes
+    (ax, _) = plots.draw_worst(sweep, {"effort": "J"}).axes
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("a", "effort [J]")
     np.testing.assert_allclose(
         sorted(map(tuple, ax.collections[0].get_offsets().tolist())), np.c_[A, A**2][A.argsort()]
@@ -209,7 +210,7 @@ DOCUMENT = {
 
 def test_rank_correlations_have_bars_and_intervals(made):
     sweep = made({"a": A, "b": B, "c": 0 * C}, {"effort": A, "locked_time": 0 * A})
-    (ax,) = plots.sensitivity(sweep, DOCUMENT).axes
+    (ax,) = plots.draw_sensitivity(sweep, DOCUMENT).axes
     assert [text.get_text() for text in ax.get_yticklabels()] == ["b", "a"]
     assert [bar.get_width() for bar in ax.patches] == [-0.8, 0.1]
     centres = [bar.get_y() + bar.get_height() / 2 for bar in ax.patches]
@@ -222,7 +223,7 @@ def test_sobol_indices_have_two_bars_and_no_interval_where_there_is_none(made):
     one = {"value": 0.6, "low": 0.5, "high": 0.7}
     rows = {"a": {"first": one, "total": {**one, "value": 0.9}}, "b": {"first": one, "total": {**one, "low": None}}}
     sweep = made({"a": A, "b": B}, {"effort": A}, design="saltelli")
-    figure = plots.sensitivity(sweep, {"confidence": 0.95, "sensitivity": {"effort": rows}})
+    figure = plots.draw_sensitivity(sweep, {"confidence": 0.95, "sensitivity": {"effort": rows}})
     ax = figure.axes[0]
     assert [bar.get_width() for bar in ax.patches] == [0.6, 0.6, 0.9, 0.6]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["first", "total"]
@@ -231,7 +232,8 @@ def test_sobol_indices_have_two_bars_and_no_interval_where_there_is_none(made):
 
 def test_no_sensitivities_no_figure(made):
     assert (
-        plots.sensitivity(made({"a": A}, {"effort": A}, design="grid"), {"confidence": 0.95, "sensitivity": {}}) is None
+        plots.draw_sensitivity(made({"a": A}, {"effort": A}, design="grid"), {"confidence": 0.95, "sensitivity": {}})
+        is None
     )
 
 
@@ -255,7 +257,7 @@ def mesh(ax):
 
 @killed_by("plot/sweeps.py", "lanes == 0, table).T, **colours", "lanes == 0, table), **colours")
 def test_the_map_has_the_share_of_failed_runs(found):
-    figure = plots.failure_map(found, UNITS)
+    figure = plots.draw_failure_map(found, UNITS)
     ax = figure.axes[0]
     edges, table = mesh(ax)
     failed = DIVERGED | (C <= 0.1) | (OVERSHOOT > 0.3)
@@ -277,7 +279,7 @@ def test_each_kind_of_failure_is_in_the_map(made, kind):
         stopped=~bad | (kind != "stopped"),
         diverged=bad & (kind == "diverged"),
     )
-    ax = plots.failure_map(sweep).axes[0]
+    ax = plots.draw_failure_map(sweep).axes[0]
     edges, table = mesh(ax)
     assert ax.get_xlabel() == "a"
     np.testing.assert_allclose(table, shares(A, B, edges, bad), rtol=1e-14)
@@ -286,9 +288,9 @@ def test_each_kind_of_failure_is_in_the_map(made, kind):
 def test_cells_without_a_run_are_empty_and_levels_have_cells_of_their_own(made):
     """On a triangle of levels."""
     x, y = (np.repeat(level, 4) for level in np.tril_indices(6))
-    ax = plots.failure_map(made({"x": x + 0.0, "y": y + 0.0}, {"effort": x + 0.5 * y}, failures={"effort": 4.2})).axes[
-        0
-    ]
+    ax = plots.draw_failure_map(
+        made({"x": x + 0.0, "y": y + 0.0}, {"effort": x + 0.5 * y}, failures={"effort": 4.2})
+    ).axes[0]
     edges, table = mesh(ax)
     np.testing.assert_array_equal(edges, [np.arange(-0.5, 6)] * 2)
     np.testing.assert_array_equal(np.isnan(table), np.triu(np.ones((6, 6)), 1) > 0)
@@ -300,7 +302,7 @@ def test_cells_without_a_run_are_empty_and_levels_have_cells_of_their_own(made):
 def test_a_map_where_nothing_failed_is_over_what_moves_the_metric(found, made):
     metrics = {"overshoot": OVERSHOOT, "effort": 5 + A}
     sweep = made({"a": A, "b": B, "c": C}, metrics, failures={"overshoot": 9.0})
-    ax = plots.failure_map(sweep).axes[0]
+    ax = plots.draw_failure_map(sweep).axes[0]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("b", "c")
     edges, table = mesh(ax)
     across, upward = (np.clip(np.digitize(x, edge) - 1, 0, 9) for x, edge in zip((B, C), edges, strict=True))
@@ -314,19 +316,19 @@ def test_names_are_cells_upward(made):
     roads = np.array(["wet", "dry", "snow"])[np.random.default_rng(6).integers(3, size=N)]
     failed = (roads == "snow") & (A > 0.5)
     sweep = made({"road": roads, "a": A, "b": B}, {"effort": failed + 0.1 * B}, failures={"effort": 0.5})
-    ax = plots.failure_map(sweep).axes[0]
+    ax = plots.draw_failure_map(sweep).axes[0]
     edges, table = mesh(ax)
     order = ["dry", "snow", "wet"]
     assert [text.get_text() for text in ax.get_yticklabels()] == order
     assert ax.get_xlabel() == "a"
     expected = shares(A, np.array([order.index(name) for name in roads]), edges, failed)
     np.testing.assert_allclose(table, expected, rtol=1e-14)
-    scatter = plots.worst(sweep).axes[0]
+    scatter = plots.draw_worst(sweep).axes[0]
     assert {scatter.get_xlabel(), scatter.get_ylabel()} == {"a", "b"}  # numbers first
 
 
 def test_with_one_variable_the_map_is_a_strip(made):
-    ax = plots.failure_map(made({"a": A}, {"effort": A}, failures={"effort": 0.6})).axes[0]
+    ax = plots.draw_failure_map(made({"a": A}, {"effort": A}, failures={"effort": 0.6})).axes[0]
     (across, _), table = mesh(ax)
     assert table.shape == (len(across) - 1, 1) == (24, 1)
     np.testing.assert_allclose(table[:, 0], shares(A, 0 * A, (across, np.array([0, 1])), A > 0.6)[:, 0], rtol=1e-14)
@@ -335,12 +337,12 @@ def test_with_one_variable_the_map_is_a_strip(made):
 
 def test_a_number_of_a_list_has_its_own_unit(made):
     sweep = made({"gain.0": A, "gain.1": B}, {"effort": A + 2 * B})
-    ax = plots.worst(sweep, dict.fromkeys(("gain.0", "gain.1"), "N m/s, N m")).axes[0]
+    ax = plots.draw_worst(sweep, dict.fromkeys(("gain.0", "gain.1"), "N m/s, N m")).axes[0]
     assert {ax.get_xlabel(), ax.get_ylabel()} == {"gain.0 [N m/s]", "gain.1 [N m]"}
 
 
 def test_draw_writes_what_there_is(found, tmp_path):
-    paths = plots.draw(found, summarise_sweep(found), tmp_path, UNITS)
+    paths = plots.draw_sweep(found, summarise_sweep(found), tmp_path, UNITS)
     names = ["distributions", "exceedance", "worst", "sensitivity", "failure_map"]
     assert [path.name for path in paths] == [f"{name}.png" for name in names]
     for path in paths:
@@ -373,6 +375,6 @@ ODD = {
 @pytest.mark.parametrize("kind", list(ODD))
 def test_odd_sweeps_are_drawn_without_a_warning(made, tmp_path, monkeypatch, kind):
     variables, metrics, given, names = ODD[kind]
-    monkeypatch.setattr(plots, "save", lambda figure, path: (figure.draw_without_rendering(), path)[1])
+    monkeypatch.setattr(plots, "save_figure", lambda figure, path: (figure.draw_without_rendering(), path)[1])
     sweep = made(variables, metrics, **given)
-    assert [path.stem for path in plots.draw(sweep, summarise_sweep(sweep), tmp_path, {})] == names
+    assert [path.stem for path in plots.draw_sweep(sweep, summarise_sweep(sweep), tmp_path, {})] == names

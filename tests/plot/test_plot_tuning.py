@@ -29,7 +29,7 @@ def lines(ax):
 
 
 def test_history_is_over_the_gradients_computed(tmp_path):
-    figure = plots.history(HISTORY)
+    figure = plots.draw_history(HISTORY)
     objective, gradient, violation = figure.axes
     np.testing.assert_array_equal(objective.get_lines()[0].get_data(), [[1, 3, 5, 7, 9], [10, 1, 0.1, 0.01, 0.001]])
     np.testing.assert_allclose(gradient.get_lines()[0].get_data()[1], 10.0 ** -np.arange(5.0), rtol=1e-15)
@@ -42,12 +42,12 @@ def test_history_is_over_the_gradients_computed(tmp_path):
 def test_an_objective_that_changes_little_or_its_sign_is_not_logarithmic():
     little = [point._replace(objective=40 + point.gradient, violation=0.0) for point in HISTORY]
     negative = [point._replace(objective=point.objective - 1) for point in HISTORY]
-    assert [plots.history(points).axes[0].get_yscale() for points in (little, negative)] == ["linear"] * 2
-    assert len(plots.history(little).axes) == 2
+    assert [plots.draw_history(points).axes[0].get_yscale() for points in (little, negative)] == ["linear"] * 2
+    assert len(plots.draw_history(little).axes) == 2
 
 
 def test_tuning_has_history_and_both_runs():
-    axes = plots.tuning(HISTORY, {"before": SLOW, "after": FAST}, title="T", lane="plant.mass = 6").axes
+    axes = plots.draw_tuning(HISTORY, {"before": SLOW, "after": FAST}, title="T", lane="plant.mass = 6").axes
     slip, torque = axes[2], axes[3]
     np.testing.assert_array_equal(lines(slip)["after"], [FAST.sample.t, FAST.sample.output.slip])
     np.testing.assert_array_equal(lines(torque)["before"], [SLOW.sample.t, SLOW.sample.control])
@@ -56,7 +56,7 @@ def test_tuning_has_history_and_both_runs():
 
 def test_runs_are_shown_until_they_have_settled():
     """To 2 % after ln(50)/10 s."""
-    for ax in plots.tuning(HISTORY, {"before": SLOW, "after": FAST}).axes[2:4]:
+    for ax in plots.draw_tuning(HISTORY, {"before": SLOW, "after": FAST}).axes[2:4]:
         assert ax.get_xlim()[1] == pytest.approx(1.5 * np.log(50) / 10, abs=0.02)
 
 
@@ -68,14 +68,16 @@ def test_a_front_has_the_points_that_no_other_beats():
         any((x[j] <= x[i]) & (y[j] <= y[i]) & ((x[j] < x[i]) | (y[j] < y[i])) for j in range(60)) for i in range(60)
     ]
     expected = {(x[i], y[i]) for i in range(60) if not beaten[i] and np.isfinite(x[i])}
-    found = plots.front(x, y)
+    found = plots.pareto_front(x, y)
     assert {(x[i], y[i]) for i in found} == expected
     assert (np.diff(x[found]) > 0).all()
-    assert plots.front([np.nan], [1.0]).size == 0
+    assert plots.pareto_front([np.nan], [1.0]).size == 0
 
 
 def test_pareto_joins_the_front_and_shows_the_rest():
-    ax = plots.pareto({"gain": ([1.0, 2.0, 3.0, 2.5], [5.0, 3.0, 2.0, 4.0])}, marks={"published": (2.0, 4.0)}).axes[0]
+    ax = plots.draw_pareto(
+        {"gain": ([1.0, 2.0, 3.0, 2.5], [5.0, 3.0, 2.0, 4.0])}, marks={"published": (2.0, 4.0)}
+    ).axes[0]
     np.testing.assert_array_equal(lines(ax)["gain"], [[1, 2, 3], [5, 3, 2]])
     np.testing.assert_array_equal(lines(ax)["published"], [[2], [4]])
     assert "stopping distance" in ax.get_ylabel()
@@ -84,7 +86,7 @@ def test_pareto_joins_the_front_and_shows_the_rest():
 
 def test_the_worst_case_says_where_it_is():
     found = {"plant.mass": 6.2, "controller.gain": np.array([-9000.0, -60.0])}
-    figure = plots.worst_case(SLOW, FAST, found, metric="overshoot = 0.31", title="rig")
+    figure = plots.draw_worst_case(SLOW, FAST, found, metric="overshoot = 0.31", title="rig")
     assert figure.get_suptitle() == "rig\novershoot = 0.31 at plant.mass = 6.2, controller.gain = [-9000, -60]"
     np.testing.assert_array_equal(lines(figure.axes[0])["worst case"][1], FAST.sample.output.slip)
     assert "nominal: 24.00 m" in lines(figure.axes[2])

@@ -23,11 +23,11 @@ from mutants import killed_by
 
 from diffabs import tune
 from diffabs.cli import report as reporting
-from diffabs.core.pictures import AXES, with_text, without_text
-from diffabs.report import ReportError, documents, report
-from diffabs.report.charts import lines
-from diffabs.report.page import image
-from diffabs.report.writing import SECTIONS
+from diffabs.core.pictures import AXES_KEY, with_text, without_text
+from diffabs.report import ReportError, build_report, find_documents
+from diffabs.report.charts import draw_lines
+from diffabs.report.page import embed_image
+from diffabs.report.writing import SECTION_BY_KIND
 
 TUNED = tune_section(2, 1.0)
 HOSTILE = '<script>alert("x")</script><img src=http://x.test/a.png onerror=alert(1)>'
@@ -84,7 +84,7 @@ SOURCES = {"sweep": "sweep", "certificate": "certificate.json", **{kind: f"{kind
 
 
 def page(results, kind):
-    return Page(report(documents(results / SOURCES[kind])))
+    return Page(build_report(find_documents(results / SOURCES[kind])))
 
 
 def leaves(value):
@@ -107,7 +107,7 @@ def test_a_report_stands_for_itself(results, kind):
     assert {"tune": 0, "sweep": 5}.get(kind, 0) == len(found.images)
     assert ("svg" in found.tags) == (kind == "tune")
     assert len(found.scripts) == (1 if found.axes else 0)
-    (document,) = documents(results / SOURCES[kind])
+    (document,) = find_documents(results / SOURCES[kind])
     assert document.kind == kind
     if kind not in ("certificate", "sweep"):
         assert f"diffabs {kind} " in found.text
@@ -116,7 +116,7 @@ def test_a_report_stands_for_itself(results, kind):
 
 
 def test_every_kind_of_document_has_a_section(results):
-    assert set(SECTIONS) == {*SOURCES, "reproduce"}
+    assert set(SECTION_BY_KIND) == {*SOURCES, "reproduce"}
 
 
 SAID = {
@@ -129,7 +129,7 @@ SAID = {
 OWN = {"sweep": {"least", "greatest"}, "rare": {"spread"}, "tune": {"missed"}}  # that only the document has
 
 
-@killed_by("report/page.py", "repr(value))]", "number(value))]", case="tune")
+@killed_by("report/page.py", "repr(value))]", "round_for_table(value))]", case="tune")
 @killed_by("report/findings.py", "value - NORMAL * deviation", "value", case="identify")
 @pytest.mark.parametrize("kind", cases(SAID, *LONG))
 def test_numbers_are_those_of_the_document(results, kind):
@@ -158,10 +158,10 @@ def test_numbers_are_those_of_the_document(results, kind):
         known |= ends
     if kind == "sweep":  # the scenario's text says them in its own way
         known |= {number for number in found.numbers if float(number) in {math.inf, -math.inf}}
-        from diffabs.scenario.model import numbers
+        from diffabs.scenario.model import describe_numbers
         from diffabs.scenario.scenario import loads
 
-        known |= leaves(numbers(loads(manifest["source"]["scenario"].encode(), "small", "manifest")))
+        known |= leaves(describe_numbers(loads(manifest["source"]["scenario"].encode(), "small", "manifest")))
     assert set(found.numbers) <= known
 
 
@@ -177,7 +177,7 @@ def test_a_certificate_says_what_is_proved(results):
     wrong = results.folder / "wrong.json"
     wrong.write_text(text.replace(repr(content["decay_rate"]), "1e3"))
     try:
-        assert "1 of 2 claims are proved." in Page(report(documents(wrong))).text
+        assert "1 of 2 claims are proved." in Page(build_report(find_documents(wrong))).text
     finally:
         wrong.unlink()
 
@@ -186,7 +186,7 @@ def test_a_certificate_says_what_is_proved(results):
 def test_a_disproved_gain_is_said_to_be(tmp_path):
     out = command("certify", "slip-lmi", "--gain=-11753,48", "--json", status=1).stdout
     (tmp_path / "bad.json").write_text(out)
-    found = Page(report(documents(tmp_path / "bad.json")))
+    found = Page(build_report(find_documents(tmp_path / "bad.json")))
     assert "disproved one Lyapunov matrix" in found.text
     assert json.loads(out)["reason"] in found.text
 
@@ -217,7 +217,7 @@ def test_hostile_names_are_text(results, tmp_path, kind):
     content = named(content, names)
     content["made"]["command"] = content["reason"] = HOSTILE
     (tmp_path / "x.json").write_text(json.dumps(content))
-    found = Page(report(documents(tmp_path / "x.json")))
+    found = Page(build_report(find_documents(tmp_path / "x.json")))
     assert found.foreign == []
     assert "script" not in found.tags
     assert found.text.count(HOSTILE) >= 5
@@ -226,27 +226,27 @@ def test_hostile_names_are_text(results, tmp_path, kind):
 
 def drawn(path):
     """A figure of known numbers, in a file."""
-    from diffabs.plot.style import label, save, sheet
+    from diffabs.plot.style import label_axes, save_figure, sheet
 
     figure, (left, right) = sheet(1, 2)
     t = np.linspace(0.0, 2.0, 5001)
     left.plot(t, np.exp(-t) / 3, label="slip", color="#0072B2")
     left.plot(t[:3], [np.nan, 1 / 3, np.inf], label="broken")
     left.axvline(0.5)
-    label(left, "time [s]", "slip [1]")
+    label_axes(left, "time [s]", "slip [1]")
     counts, edges = np.histogram(np.sin(np.arange(100.0)), 7)
     right.stairs(counts, edges, fill=True)
     right.scatter([1e-3, 10.0], [5.0, 6.0], label="<b>runs</b>")
     right.set_xscale("log")
-    save(figure, path)
+    save_figure(figure, path)
     return t, counts, edges
 
 
 @killed_by("plot/shown.py", "line.get_xdata(), line.get_ydata())", "line.get_ydata(), line.get_xdata())")
-@killed_by("plot/shown.py", "np.linspace(0, len(there) - 1,", "np.linspace(0, min(MOST, len(there)) - 1,")
+@killed_by("plot/shown.py", "np.linspace(0, len(there) - 1,", "np.linspace(0, min(MAX_SERIES_POINTS, len(there)) - 1,")
 def test_a_picture_has_the_numbers_that_it_shows(tmp_path):
     t, counts, edges = drawn(tmp_path / "a.png")
-    found = image(tmp_path / "a.png")
+    found = embed_image(tmp_path / "a.png")
     left, right = json.loads(found.axes)
     slip, broken = left["series"]
     assert (slip["name"], slip["colour"], left["names"]) == ("slip", "#0072b2", ["time [s]", "slip [1]"])
@@ -272,8 +272,8 @@ def test_axes_lie_where_the_picture_has_them(tmp_path):
 
     drawn(tmp_path / "a.png")
     there = Image.open(tmp_path / "a.png")
-    assert AXES in there.info  # where Pillow finds it
-    (left, _) = json.loads(image(tmp_path / "a.png").axes)
+    assert AXES_KEY in there.info  # where Pillow finds it
+    (left, _) = json.loads(embed_image(tmp_path / "a.png").axes)
     dark = np.asarray(there.convert("L")) < 150
     x0, y0, _, y1 = (part * size for part, size in zip(left["box"], 2 * there.size, strict=True))
     columns = np.flatnonzero(dark[round(y0) + 3 : round(y1) - 3].mean(axis=0) > 0.95)
@@ -286,11 +286,11 @@ def test_axes_lie_where_the_picture_has_them(tmp_path):
 def test_numbers_of_a_picture_leave_no_trace_in_its_bytes(tmp_path):
     drawn(tmp_path / "a.png")
     whole = (tmp_path / "a.png").read_bytes()
-    bare, text = without_text(whole, AXES)
-    assert with_text(bare, AXES, text) == whole
-    assert base64.b64decode(image(tmp_path / "a.png").address.partition(",")[2]) == bare
-    assert without_text(bare, AXES) == (bare, "")
-    assert without_text(whole[:50], AXES) == (whole[:50], "")
+    bare, text = without_text(whole, AXES_KEY)
+    assert with_text(bare, AXES_KEY, text) == whole
+    assert base64.b64decode(embed_image(tmp_path / "a.png").address.partition(",")[2]) == bare
+    assert without_text(bare, AXES_KEY) == (bare, "")
+    assert without_text(whole[:50], AXES_KEY) == (whole[:50], "")
 
 
 @killed_by("report/page.py", 'all(map(_is_series, one["series"])) and', 'one["series"] is not None and')
@@ -302,9 +302,9 @@ def test_numbers_of_a_picture_leave_no_trace_in_its_bytes(tmp_path):
 )  # fmt: skip
 def test_a_picture_that_says_nonsense_is_only_a_picture(tmp_path, text):
     drawn(tmp_path / "a.png")
-    bare, _ = without_text((tmp_path / "a.png").read_bytes(), AXES)
-    (tmp_path / "b.png").write_bytes(with_text(bare, AXES, text))
-    found = image(tmp_path / "b.png")
+    bare, _ = without_text((tmp_path / "a.png").read_bytes(), AXES_KEY)
+    (tmp_path / "b.png").write_bytes(with_text(bare, AXES_KEY, text))
+    found = embed_image(tmp_path / "b.png")
     assert found.address.endswith(base64.b64encode(bare).decode())
     assert found.axes == ""
 
@@ -321,7 +321,9 @@ def test_a_sweep_s_histogram_is_that_of_its_runs(results):
 
 
 @killed_by(
-    "report/page.py", "kind = IMAGES.get(path.suffix.lower())", 'kind = IMAGES.get(path.suffix.lower(), "image/png")'
+    "report/page.py",
+    "kind = IMAGES.get(path.suffix.lower())",
+    'kind = IMAGES.get(path.suffix.lower(), "embed_image/png")',
 )
 def test_figures_outside_of_the_folder_are_not_shown(results, tmp_path):
     """Names in a document are not trusted; and what is no picture is none."""
@@ -331,7 +333,7 @@ def test_figures_outside_of_the_folder_are_not_shown(results, tmp_path):
     for plot, count in (("secret.txt", 0), ("/somewhere/else/drawn.png", 1)):
         content["files"] = {"plot": str(tmp_path / plot) if plot == "secret.txt" else plot}
         (tmp_path / "x.json").write_text(json.dumps(content))
-        found = Page(report(documents(tmp_path / "x.json")))
+        found = Page(build_report(find_documents(tmp_path / "x.json")))
         assert len(found.images) == count
         assert base64.b64encode(b"secret").decode() not in found.source
     (data,) = found.images
@@ -342,12 +344,12 @@ def test_figures_outside_of_the_folder_are_not_shown(results, tmp_path):
 @pytest.mark.slow
 def test_a_folder_of_results_is_one_file(results):
     """What `sweep --json` has printed beside the sweep's folder is the same result, and comes once."""
-    read = documents(results.all())
+    read = find_documents(results.all())
     assert sorted(one.kind for one in read) == sorted(SOURCES)
-    found = Page(report(read))
+    found = Page(build_report(read))
     assert len([one for one in found.headings if one == "Question"]) == len(SOURCES)
     assert found.headings[0] == f"{len(SOURCES)} results"
-    (printed,) = documents(results / "sweep.json")
+    (printed,) = find_documents(results / "sweep.json")
     assert printed.folder == results / "sweep"
 
 
@@ -361,7 +363,7 @@ def test_the_command_says_where_it_is(results, tmp_path):
     assert left_in(tmp_path) == {"mine.html"}
 
 
-@killed_by("cli/sweep.py", "report.write([out], out / report.NAME)", "pass")
+@killed_by("cli/sweep.py", "report.write_report_file([out], out / report.DEFAULT_NAME)", "pass")
 @pytest.mark.slow
 def test_a_sweep_with_figures_writes_its_report(results):
     text = (results / "sweep" / "report.html").read_text(encoding="utf-8")
@@ -402,7 +404,7 @@ def test_a_file_of_others_is_refused_in_one_line(tmp_path, text):
     assert left_in(tmp_path) == {"x.json"}
 
 
-@killed_by("cli/report.py", "and not (target.is_file() and ours(target))", "and False")
+@killed_by("cli/report.py", "and not (target.is_file() and is_report(target))", "and False")
 def test_files_of_others_stay(results, tmp_path):
     out = tmp_path / "report.html"
     out.write_text("<html>a thesis</html>")
@@ -420,7 +422,7 @@ def test_the_old_report_stays_where_the_new_one_cannot_be_made(results, tmp_path
     before = out.read_bytes()
     (tmp_path / "x.json").write_text('{"free": {}, "history": [], "constraints": []}')
     command("report", tmp_path / "x.json", "-o", out, status=2)
-    monkeypatch.setattr(reporting.files, "write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    monkeypatch.setattr(reporting.files, "write_file", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
     assert_one_error_line(command("report", results / "tune.json", "-o", out, status=1))
     assert out.read_bytes() == before
     assert left_in(tmp_path) == {"report.html", "x.json"}
@@ -435,27 +437,27 @@ def test_a_terminal_of_80_columns(results, tmp_path):
     assert left_in(tmp_path) == {"report.html"}
 
 
-@killed_by("report/charts.py", "round(HEIGHT - BOTTOM - (y - low)", "round(TOP + (y - low)")
+@killed_by("report/charts.py", "HEIGHT - AXIS_BOTTOM - (y - low)", "AXIS_TOP + (y - low)")
 def test_a_chart_has_its_points_where_they_are():
     """Of a straight line, the places are on one; a value that is no number has none."""
-    text = lines([(0, 1.0), (1, 2.0), (2, math.nan), (3, 4.0)], "x < 1", "y")
+    text = draw_lines([(0, 1.0), (1, 2.0), (2, math.nan), (3, 4.0)], "x < 1", "y")
     points = [tuple(map(float, point.split(","))) for point in text.split('points="')[1].split('"')[0].split()]
     assert len(points) == 3
     (a, b), (c, d) = itertools.pairwise(points)
     assert (b[1] - a[1]) / (b[0] - a[0]) == pytest.approx((d[1] - c[1]) / (d[0] - c[0]), rel=1e-3)
     assert points[0][1] > points[-1][1]
     assert "x &lt; 1" in text
-    assert lines([(0, None)], "x", "y") == ""
+    assert draw_lines([(0, None)], "x", "y") == ""
 
 
 def test_what_a_document_lacks_is_named(tmp_path):
     (tmp_path / "x.json").write_text('{"gain": [1.0], "states": ["a"], "over": {}, "poles": []}')
     with pytest.raises(ReportError, match=r"no whole document of design: KeyError 'lower_bound'"):
-        report(documents(tmp_path))
+        build_report(find_documents(tmp_path))
 
 
 def test_a_number_that_no_float_can_be_is_one_line(tmp_path):
     path = tmp_path / "summary.json"
     path.write_text(f'{{"samples": {10**400}}}')
     with pytest.raises(ReportError, match=r"summary\.json: a whole number of 401 digits is too large$"):
-        documents(path)
+        find_documents(path)

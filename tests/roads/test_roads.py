@@ -9,8 +9,8 @@ from parts import ROADS, differences, jacobian
 from scipy.interpolate import BSpline, PchipInterpolator
 from scipy.optimize import brentq
 
-from diffabs.core.pytree import replace, strong
-from diffabs.core.validity import check, problems
+from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.validity import check_part, find_problems
 from diffabs.roads import (
     DRY_ASPHALT,
     ICE,
@@ -57,7 +57,7 @@ def test_rig_numbers():
 
 def test_rig_peaks_before_its_target():
     """Not at 0.2, and lower than a locked wheel's friction: two errors of the paper."""
-    slip, mu = best(strong(RIG))
+    slip, mu = best(canonical_dtypes(RIG))
     np.testing.assert_allclose((slip, mu), (0.187542005875, 0.395794085737), rtol=1e-10, atol=0)
     assert mu < RIG.friction(1.0)
 
@@ -97,7 +97,7 @@ def test_burckhardt_peak(name):
     road = replace(ROADS[name], {"c4": 0.0})
     c1, c2, c3 = TABLE[name]
     s = np.log(c1 * c2 / c3) / c2
-    slip, mu = best(strong(road), 12.0)
+    slip, mu = best(canonical_dtypes(road), 12.0)
     np.testing.assert_allclose(slip, s, rtol=1e-12, atol=0)
     np.testing.assert_allclose(mu, c1 - c3 / c2 - c3 * s, rtol=1e-12, atol=0)
 
@@ -131,7 +131,7 @@ def test_magic_formula():
 def test_magic_peak():
     """The greatest mu is D, where C arctan(...) = pi/2."""
     road = MagicFormula()
-    slip, mu = best(strong(road))
+    slip, mu = best(canonical_dtypes(road))
     place = brentq(
         lambda s: road.B * s * (1 - road.E) + road.E * np.arctan(road.B * s) - np.tan(np.pi / 2 / road.C),
         0,
@@ -164,7 +164,7 @@ STEEP_ENDS = (np.array([0.0, 0.3, 0.35, 0.4, 0.45, 1.0]), np.array([0.0, 0.05, 0
     + [FLAT, STEEP_ENDS, (SPLINE_B.slip, SPLINE_B.mu)],
 )
 def test_tabulated_is_pchip(slip, mu):
-    road = check(Tabulated(slip=slip, mu=mu))
+    road = check_part(Tabulated(slip=slip, mu=mu))
     s = np.linspace(0.0, 1.0, 401)
     oracle = PchipInterpolator(slip, mu)
     np.testing.assert_allclose(curve(road, s), oracle(s), rtol=1e-12, atol=1e-12)
@@ -178,7 +178,7 @@ def test_tabulated_is_pchip(slip, mu):
 def test_a_factor_along_the_road_is_a_b_spline():
     """SciPy's, the first and the last factor going on; within the factors, and no steeper than they are."""
     factors, d = np.random.default_rng(5).uniform(0.5, 1.5, 9), 0.7
-    road = check(ScaledAlong(road=RIG, factors=factors, spacing=d))
+    road = check_part(ScaledAlong(road=RIG, factors=factors, spacing=d))
     known = BSpline(d * np.arange(-5, 9 + 5.0), np.concatenate([3 * [factors[0]], factors, 3 * [factors[-1]]]), 3)
     x = np.linspace(-2.0 * d, 10.0 * d, 401)
     found = np.array([float(road.friction(0.13, 8.0, at)) for at in x]) / float(RIG.friction(0.13))
@@ -218,7 +218,7 @@ def test_spline_b_knots():
     slip, mu = (np.array(line.split(), float) for line in text.strip().splitlines())
     np.testing.assert_allclose(SPLINE_B.slip, slip, rtol=0, atol=0)
     np.testing.assert_allclose(SPLINE_B.mu, mu, rtol=0, atol=0)
-    np.testing.assert_allclose(best(strong(SPLINE_B)), (0.10539, 0.99064), rtol=1e-9, atol=0)
+    np.testing.assert_allclose(best(canonical_dtypes(SPLINE_B)), (0.10539, 0.99064), rtol=1e-9, atol=0)
 
 
 def test_tabulated_objects_to_bad_tables():
@@ -230,7 +230,7 @@ def test_tabulated_objects_to_bad_tables():
         (x, y + 0.1, r"from \(0, 0.1\)"),
     ):
         with pytest.raises(ValueError, match=message):
-            check(Tabulated(slip=slip, mu=mu))
+            check_part(Tabulated(slip=slip, mu=mu))
 
 
 # Compound roads
@@ -270,9 +270,9 @@ def test_sharp_patches():
 
 
 def test_patches_object_to_bad_edges():
-    assert list(problems(Patches(edges=np.array([1.0, 2.0])))) == ["edges has shape (2,); 2 roads need (1,)"]
+    assert list(find_problems(Patches(edges=np.array([1.0, 2.0])))) == ["edges has shape (2,); 2 roads need (1,)"]
     road = Patches(roads=(ICE, SNOW, ICE), edges=np.array([2.0, 1.0]))
-    assert list(problems(road)) == ["edges = [2.0, 1.0] m is not increasing"]
+    assert list(find_problems(road)) == ["edges = [2.0, 1.0] m is not increasing"]
 
 
 # The best slip
@@ -280,7 +280,7 @@ def test_patches_object_to_bad_edges():
 
 def test_monotone_curve_is_best_locked():
     ice = replace(ICE, {"c4": 0.0})
-    np.testing.assert_allclose(best(strong(ice)), (1.0, 0.05), rtol=1e-12, atol=0)
+    np.testing.assert_allclose(best(canonical_dtypes(ice)), (1.0, 0.05), rtol=1e-12, atol=0)
     slope = jacobian(found, ice)
     assert np.all(np.isfinite(slope))
     np.testing.assert_allclose(slope[:, 0], 0.0, rtol=0, atol=0)
@@ -316,20 +316,20 @@ def test_peak_of_a_table_moves_with_its_knot():
 )
 def test_a_road_that_drives_is_refused(road, where):
     with pytest.raises(ValueError, match=f"{where}.*is negative: such a road drives"):
-        check(road)
+        check_part(road)
 
 
 @pytest.mark.parametrize("road", [DRY_ASPHALT, SNOW, ICE, WET_COBBLESTONE, RIG, RIG_UNROUNDED, Burckhardt(c3=1.28)])
 def test_a_road_that_only_brakes_is_accepted(road):
     """The rig's published polynomial dips to -3e-6 below slip 7e-5, which is forgiven."""
-    assert check(road) is road
+    assert check_part(road) is road
 
 
 def test_roads_are_checked_in_single_precision_too():
     """A library user who leaves JAX's default alone; here, beside programs compiled in double precision."""
-    check(RIG)
+    check_part(RIG)
     with jax.enable_x64(False):
-        assert check(RIG) is RIG
-        assert check(Scaled(road=SNOW, scale=2.0)).scale == 2.0
+        assert check_part(RIG) is RIG
+        assert check_part(Scaled(road=SNOW, scale=2.0)).scale == 2.0
         with pytest.raises(ValueError, match="such a road drives"):
-            check(Burckhardt(c1=0.0))
+            check_part(Burckhardt(c1=0.0))

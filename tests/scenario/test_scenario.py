@@ -12,7 +12,7 @@ from diffabs.objectives import BRAKING
 from diffabs.scenario import registry, scenario
 from diffabs.scenario.defaults import braking
 from diffabs.scenario.scenario import dump, load, names
-from diffabs.scenario.section_design import Task
+from diffabs.scenario.section_design import DesignTask
 from diffabs.scenario.section_tune import Goal
 from diffabs.simulate.solution import Adaptive, FixedStep
 from diffabs.tune import risk
@@ -36,7 +36,9 @@ def test_packaged_names():
     assert {"slip-lmi", "slip-estimator", "slip-cured", "lab-rig"} <= set(names())
 
 
-@killed_by("scenario/parameter_paths.py", "return tuple(in_si(end, self.scale) for end in ends)", "return tuple(ends)")
+@killed_by(
+    "scenario/parameter_paths.py", "return tuple(scale_to_si(end, self.scale) for end in ends)", "return tuple(ends)"
+)
 def test_slip_lmi_is_the_papers_example():
     s = load("slip-lmi")
     assert type(s.loop.plant).__name__ == "MirroredRig"
@@ -52,7 +54,7 @@ def test_slip_lmi_is_the_papers_example():
     assert s.description
     speeds = (s.loop.stop.speed, s.loop.initial.speed)
     over = {"plant.mass": (5.3, 6.2), "initial.speed": speeds}
-    assert s.design == Task(Q=(11753.0**2, 1.0), R=1.0, over=over)
+    assert s.design == DesignTask(Q=(11753.0**2, 1.0), R=1.0, over=over)
     assert s.design.box(s.loop) == {"plant.mass": (5.3, 6.2), "speed": speeds}
 
 
@@ -145,7 +147,7 @@ def test_steps_are_adaptive_unless_their_length_is_given(file, section, solver):
 
 
 def test_members_are_told_by_shape():
-    assert set(registry.types("plant")) == {
+    assert set(registry.family_types("plant")) == {
         "quarter-car",
         "mirrored-rig",
         "lab-rig",
@@ -153,24 +155,27 @@ def test_members_are_told_by_shape():
         "acrobot",
         "printed-arm",
     }
-    assert set(registry.types("initial")) == {"brake-start", "balance-start"}
-    assert {"burckhardt", "snow", "rig-unrounded", "spline-b"} <= set(registry.types("road"))
-    assert not {"peak", "piecewise-cubic"} & set(registry.types("road"))
-    assert "pid" in registry.types("controller")
-    assert set(registry.types("antiwindup")) == {"no-anti-windup", "clamping", "back-calculation"}
-    assert set(registry.types("feedforward")) == {"no-feedforward", "constant-input", "holding-input"}
-    assert not set(registry.types("controller")) & {*registry.types("antiwindup"), *registry.types("feedforward")}
-    assert {"direct", "series", "lag"} <= set(registry.types("actuator"))
-    assert {"direct", "series", "noise"} <= set(registry.types("sensor"))
-    assert set(registry.types("stop")) == {"standstill", "speed-reached", "fallen", "no-stop"}
-    assert registry.types("road")["snow"] is roads.SNOW
+    assert set(registry.family_types("initial")) == {"brake-start", "balance-start"}
+    assert {"burckhardt", "snow", "rig-unrounded", "spline-b"} <= set(registry.family_types("road"))
+    assert not {"peak", "piecewise-cubic"} & set(registry.family_types("road"))
+    assert "pid" in registry.family_types("controller")
+    assert set(registry.family_types("antiwindup")) == {"no-anti-windup", "clamping", "back-calculation"}
+    assert set(registry.family_types("feedforward")) == {"no-feedforward", "constant-input", "holding-input"}
+    assert not set(registry.family_types("controller")) & {
+        *registry.family_types("antiwindup"),
+        *registry.family_types("feedforward"),
+    }
+    assert {"direct", "series", "lag"} <= set(registry.family_types("actuator"))
+    assert {"direct", "series", "noise"} <= set(registry.family_types("sensor"))
+    assert set(registry.family_types("stop")) == {"standstill", "speed-reached", "fallen", "no-stop"}
+    assert registry.family_types("road")["snow"] is roads.SNOW
 
 
 @pytest.mark.parametrize("family", registry.FAMILIES)
 def test_every_exported_part_is_in_one_family_or_another(family):
     """An exported part class that no family recognises could not be used in a scenario."""
     modules, _ = registry.FAMILIES[family]
-    known = {type(part) for name in registry.FAMILIES for part in registry.types(name).values()}
+    known = {type(part) for name in registry.FAMILIES for part in registry.family_types(name).values()}
     helpers = {"Peak"}
     for module in modules:
         classes = {x for x in vars(module).values() if isinstance(x, type) and dataclasses.is_dataclass(x)}
@@ -291,7 +296,7 @@ def test_ranges_are_the_same_however_they_are_written(file):
         )
     )
     over = {"plant.mass": (5.0, 6.5), "plant.road.scale": (0.5, 1.0), "initial.speed": (1.0, 10.0)}
-    assert dotted.design == Task(Q=((4.0, 1.0), (1.0, 3.0)), R=(2.0,), decay=1.0, damping=0.25, over=over)
+    assert dotted.design == DesignTask(Q=((4.0, 1.0), (1.0, 3.0)), R=(2.0,), decay=1.0, damping=0.25, over=over)
     assert nested.design == dotted.design
     assert nested.design.box(nested.loop) == {"plant.mass": (5.0, 6.5), "plant.road.scale": (0.5, 1), "speed": (1, 10)}
     assert_same(dotted, load(file(dump(dotted))))
@@ -379,7 +384,9 @@ WHAT = Goal(
 )
 
 
-@killed_by("scenario/parameter_paths.py", "return tuple(in_si(end, self.scale) for end in ends)", "return tuple(ends)")
+@killed_by(
+    "scenario/parameter_paths.py", "return tuple(scale_to_si(end, self.scale) for end in ends)", "return tuple(ends)"
+)
 def test_what_is_tuned_is_the_same_however_it_is_written(file):
     dotted = load(
         file(

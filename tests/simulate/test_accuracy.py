@@ -12,7 +12,7 @@ from oracles import brake
 
 import diffabs as d
 from diffabs import actuators, controllers, plants, references, sensors, stops
-from diffabs.cli.checking import loose
+from diffabs.cli.checking import describe_loose_metrics
 from diffabs.core import blocks
 from diffabs.objectives import IAE, MaxSlip, StopDistance, StopTime
 from diffabs.scenario.defaults import braking
@@ -185,7 +185,7 @@ def test_a_run_says_what_its_solver_does_not_hold():
         asked.append(other)
         return d.Run({"a": 2.0, "b": 2.0, "c": 1e-9, "t": never}, True, False, False, None, None)  # pyright: ignore[reportArgumentType]
 
-    (line,) = loose({"a": 2.0 + 2.1e-3, "b": 2.0 + 1.9e-3, "c": 2e-9, "t": never}, solver, again)
+    (line,) = describe_loose_metrics({"a": 2.0 + 2.1e-3, "b": 2.0 + 1.9e-3, "c": 2e-9, "t": never}, solver, again)
     assert line.startswith("solver.rtol = 6.3e-07 changes a by 0.1 %: the run chatters")
     assert asked == [dataclasses.replace(solver, rtol=1e-5 / 16)]
-    assert not loose({"a": 2.0, "b": 2.0, "c": 1e-9, "t": never}, solver, again)
+    assert not describe_loose_metrics({"a": 2.0, "b": 2.0, "c": 1e-9, "t": never}, solver, again)

@@ -14,7 +14,7 @@ from mutants import killed_by
 import diffabs as d
 from diffabs import actuators, controllers, plants, references, roads, stops
 from diffabs.core.cubic import Cubic
-from diffabs.core.pytree import arrayed, get, prepared, refined, strong
+from diffabs.core.pytree import as_arrays, canonical_dtypes, get, prepare_parts, refine_parts
 from diffabs.design.attraction import Cells, region_of_attraction
 from diffabs.objectives import BRAKING, IAE, MaxSlip, StopDistance
 from diffabs.scenario.scenario import load
@@ -87,7 +87,7 @@ def test_random_loops_of_any_parts_are_right_to_1e_4(name):
     loop = random_loops.drawn(name, 0, 0)
     run = d.measure(loop, d.Adaptive(1e-5, structure.duration, structure.step), measured, key=key)
     fixed = d.FixedStep(structure.step / FINE, structure.duration, kinks=True)
-    close(run, d.measure(refined(loop, FINE), fixed, measured, key=key), 1e-4, 1e-3)
+    close(run, d.measure(refine_parts(loop, FINE), fixed, measured, key=key), 1e-4, 1e-3)
 
 
 @killed_by(
@@ -415,7 +415,9 @@ def test_lines_say_when_comparisons_change_and_when_they_did():
     "moved = state",
 )
 def test_the_error_of_a_step_is_that_of_the_worst_state():
-    loop = prepared(strong(arrayed(load("slip-lmi", ["actuator=lag", "actuator.time_constant=0.01"]).loop)))
+    loop = prepare_parts(
+        canonical_dtypes(as_arrays(load("slip-lmi", ["actuator=lag", "actuator.time_constant=0.01"]).loop))
+    )
     state = loop.start()
     state = state.with_flow(jax.tree.map(lambda x: x + 2.0, state.flow()))
     sample = loop.signals(0.0, state).sample
@@ -439,7 +441,7 @@ def test_the_error_of_a_step_is_that_of_the_worst_state():
 @killed_by("simulate/lengths.py", "(moves) / size", "(moves * 0.0 + size[0]) / size", case="arm-hanging")
 @pytest.mark.parametrize("name", ["slip-lmi", "arm-hanging"])
 def test_the_longest_stable_step_is_that_of_the_eigenvalues(name):
-    loop = prepared(strong(arrayed(load(name).loop)))
+    loop = prepare_parts(canonical_dtypes(as_arrays(load(name).loop)))
     state = loop.start()
     z, tree = jax.flatten_util.ravel_pytree(state.flow())
 

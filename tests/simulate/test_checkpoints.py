@@ -98,8 +98,8 @@ def test_groups_after_the_end_are_skipped_and_have_no_derivative():
 
 @killed_by(
     "simulate/rk4.py",
-    "pushed(lambda *step: _scan(f, *step), primals",
-    "pushed(lambda *step: _scan(f, *step[:4], jax.lax.stop_gradient(step[4])), primals",
+    "jvp_nonzero(lambda *step: _scan(f, *step), primals",
+    "jvp_nonzero(lambda *step: _scan(f, *step[:4], jax.lax.stop_gradient(step[4])), primals",
 )
 @pytest.mark.slow
 def test_reverse_forward_and_differences_agree_in_nested_scans(monkeypatch):

@@ -14,7 +14,7 @@ from mutants import killed_by
 import diffabs as d
 from diffabs import objectives
 from diffabs.controllers import HoldingInput, StateFeedback
-from diffabs.core.summary import Summary, cell, number
+from diffabs.core.summary import Summary, format_cell, round_for_table
 from diffabs.identify import Traces, identify
 from diffabs.plants import BrakeStart, MirroredRig
 from diffabs.references import FixedSlip
@@ -42,7 +42,7 @@ def run():
     return d.rollout(rig(), SOLVER, objectives.BRAKING)
 
 
-@killed_by("core/summary.py", "NOTHING = 1e-14", "NOTHING = 0.0")
+@killed_by("core/summary.py", "ZERO_TOLERANCE = 1e-14", "ZERO_TOLERANCE = 0.0")
 @pytest.mark.parametrize(
     ("value", "text"),
     [
@@ -55,14 +55,14 @@ def run():
     ],
 )
 def test_rounding_is_no_number(value, text):
-    assert number(value) == text
+    assert round_for_table(value) == text
 
 
 def test_a_cell_of_a_list_is_its_beginning():
-    assert cell(np.arange(6.0)) == "[0, 1, 2, 3, ...]"
-    assert cell(np.array([1.5, -1e-17])) == "[1.5, 0]"
-    assert cell(None) == ""
-    assert cell(True) == "True"
+    assert format_cell(np.arange(6.0)) == "[0, 1, 2, 3, ...]"
+    assert format_cell(np.array([1.5, -1e-17])) == "[1.5, 0]"
+    assert format_cell(None) == ""
+    assert format_cell(True) == "True"
 
 
 @killed_by("core/summary.py", "<strong>{html.escape(self.title)}</strong>", "<strong>{self.title}</strong>")
@@ -231,7 +231,7 @@ def test_a_sweep_of_before_has_no_units(swept):
 def test_no_table_of_the_command_line_has_rounding_for_a_number(monkeypatch):
     from diffabs.cli import show
 
-    assert show.brief(8e-17) == "0"
-    assert show.brief([1.0, 8e-17]) == "[1, 0]"
+    assert show.format_brief(8e-17) == "0"
+    assert show.format_brief([1.0, 8e-17]) == "[1, 0]"
     result = json.loads(command("simulate", "slip-lmi", "--set", "solver.step=1e-3", "--json").stdout)
     assert set(result["metrics"]) >= {"iae"}

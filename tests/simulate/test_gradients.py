@@ -14,7 +14,7 @@ from mutants import killed_by
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors
 from diffabs.core import blocks
-from diffabs.core.pytree import get, parameters, replace, strong
+from diffabs.core.pytree import canonical_dtypes, get, parameters, replace
 from diffabs.objectives import MaxSlip
 from diffabs.scenario.defaults import braking
 from diffabs.stops import Fallen, SpeedReached, Standstill
@@ -208,7 +208,7 @@ SLOW = (
 @functools.cache
 def flat(name):
     """(names, values, objectives as a function of the values, its Jacobian) of the tunable parameters of a loop."""
-    loop = strong(LOOPS[name])
+    loop = canonical_dtypes(LOOPS[name])
     paths = [p for p, spec, v in parameters(loop) if spec.tunable and np.all(np.isfinite(v))]
     measures = OF_BALANCE if name.startswith("arm") else OBJECTIVES
     values, unravel = jax.flatten_util.ravel_pytree([get(loop, p) for p in paths])
@@ -272,7 +272,7 @@ _distances = jax.jit(jax.vmap(_distance, (0, None, None)), static_argnums=2)
 
 def _sensitivity(loop, paths, difference=None):
     """d(distance)/d ln(parameter) for each path, by forward mode or a central difference of that relative size."""
-    loop, paths = strong(loop), tuple(paths)
+    loop, paths = canonical_dtypes(loop), tuple(paths)
     if difference is None:
         return np.asarray(_slopes(jnp.zeros(len(paths)), loop, paths))
     moves = difference * jnp.eye(len(paths))

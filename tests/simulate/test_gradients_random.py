@@ -8,7 +8,7 @@ from gradients_random import WIDTHS, Found, judge, line, offenders, studied
 from parts import inside
 
 from diffabs import actuators, controllers, plants, references, roads, sensors
-from diffabs.core.validity import check
+from diffabs.core.validity import check_part
 
 COUNTS = dict.fromkeys(random_loops.STRUCTURES, 3) | {"relay, latch, lag": 6}  # loops of a structure
 LEFT_OUT = {"Quantisation", "PeakLiteral"}  # parts whose derivative says nothing of their jumps, as they document
@@ -34,7 +34,7 @@ def test_gradients_of_adaptive_runs_are_those_of_wide_differences():
 @pytest.mark.parametrize("name", random_loops.STRUCTURES)
 def test_random_loops_are_allowed(name):
     for number in range(20):
-        check(random_loops.drawn(name, number, 0))
+        check_part(random_loops.drawn(name, number, 0))
 
 
 def test_random_loops_have_every_part():

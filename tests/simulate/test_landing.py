@@ -71,9 +71,11 @@ def test_a_margin_that_falls_all_at_once_is_landed_on(solver):
 
 
 @killed_by("controllers/sampled.py", "output, self._until(clock.t), jnp", "output, clock.t + self.delay, jnp")
-@killed_by("simulate/landing.py", "jnp.where(steep, moved -", "jnp.where(steep & False, moved -", case="0.002")
+@killed_by("simulate/landing.py", "jnp.where(steep, moved -", "jnp.where(steep & False, moved -", case="fixed-0.002")
 @pytest.mark.parametrize("late", cases([2e-3, 4e-3, 2.3e-3, 5e-3], 2e-3, 4e-3, 5e-3))
-@pytest.mark.parametrize("solver", [d.FixedStep(H, 0.03), pytest.param(d.Adaptive(1e-5, 0.03, H), id="adaptive")])
+@pytest.mark.parametrize(
+    "solver", [pytest.param(d.FixedStep(H, 0.03), id="fixed"), pytest.param(d.Adaptive(1e-5, 0.03, H), id="adaptive")]
+)
 def test_the_moment_of_an_event_on_the_grid_is_differentiable(late, solver):
     """A computer says the time, each 5 ms, and takes a while for it. Some of these moments are a rounding after the
     beginning of a step: an event at once has its derivatives as any other. Where it takes all the time that it may, a

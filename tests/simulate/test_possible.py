@@ -12,7 +12,7 @@ from diffabs import actuators, controllers, objectives
 from diffabs.core import blocks
 from diffabs.core.pytree import parameters, replace
 from diffabs.objectives import BALANCE, BRAKING
-from diffabs.scenario.compatibility import misfits
+from diffabs.scenario.compatibility import find_misfits
 from diffabs.scenario.defaults import braking
 
 MEASURED = {
@@ -34,7 +34,7 @@ def drawn(rng, task):
     loop = dataclasses.replace(typical, plant=plant)
     for name, family in choices.items():
         other = dataclasses.replace(loop, **{name: rng.choice(np.array(list(family.values()), object))})
-        loop = loop if list(misfits(other, MEASURED[task])) else other
+        loop = loop if list(find_misfits(other, MEASURED[task])) else other
     return loop
 
 

@@ -14,9 +14,9 @@ from sweeping import described
 
 import diffabs as d
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors
-from diffabs.core.protocols import BrakeOutput, Ending, Sample, still
-from diffabs.core.pytree import replace, strong
-from diffabs.core.validity import problems
+from diffabs.core.protocols import BrakeOutput, Ending, Sample, resting_segment
+from diffabs.core.pytree import canonical_dtypes, replace
+from diffabs.core.validity import find_problems
 from diffabs.design.attraction import classify_starts
 from diffabs.identify import Traces, identify
 from diffabs.objectives import BALANCE, BRAKING
@@ -163,7 +163,9 @@ class TestBeforeARun:
             "plant.mass": rng.uniform(4, 8, n),
             "controller.gain.1": -(10 ** rng.uniform(1, 4, n)),
         }
-        lanes = jax.vmap(lambda v: replace(strong(RIG), v))({path: jnp.asarray(x) for path, x in values.items()})
+        lanes = jax.vmap(lambda v: replace(canonical_dtypes(RIG), v))(
+            {path: jnp.asarray(x) for path, x in values.items()}
+        )
         steps = stable_step.stable_steps(lanes)
         for h in (1e-4, float(steps[7]), float(steps[8]) * (1 + 1e-6)):
             np.testing.assert_array_equal(stable_step.is_step_stable(RIG, values, h), steps >= h)
@@ -191,7 +193,9 @@ class TestBeforeARun:
         monkeypatch.setattr(stable_step, "MIN_ENTRYWISE_MATRICES", 0)
         many = bounds()
         np.testing.assert_allclose(many, few, rtol=1e-6)
-        loops = jax.vmap(lambda v: replace(strong(RIG), v))({path: jnp.asarray(x) for path, x in values.items()})
+        loops = jax.vmap(lambda v: replace(canonical_dtypes(RIG), v))(
+            {path: jnp.asarray(x) for path, x in values.items()}
+        )
         modes = np.abs(np.linalg.eigvals(stable_step._jacobians(loops))).max((1, 2))
         assert (modes <= many).all()
         assert (many < 3 * modes).all()
@@ -264,7 +268,7 @@ def sample(speed, wheel, distance, control=0.0, deceleration=0.0):
     return Sample(0.0, y, 0.2, 0.2, 0.0, control, control)
 
 
-@killed_by("plants/audit.py", "_driving(-before.control, -sample.control)", "0.0")
+@killed_by("plants/audit.py", "_driving_power(-before.control, -sample.control)", "0.0")
 @pytest.mark.parametrize(
     ("before", "after", "fine"),
     [
@@ -282,7 +286,8 @@ def test_what_no_braked_car_does(before, after, fine):
     a, b = sample(*before), sample(*after)
     memory = audit.start(a)
     value = audit.value(
-        memory._replace(held=audit.update(memory, still(a, 1e-3)._replace(end=b))), Ending(b, False, 0.0, 0.0)
+        memory._replace(held=audit.update(memory, resting_segment(a, 1e-3)._replace(end=b))),
+        Ending(b, False, 0.0, 0.0),
     )
     assert bool(value <= 1) is fine
 
@@ -395,7 +400,11 @@ def test_the_sweep_of_the_report(tmp_path):
     assert not (set(document["metrics"]) - set(BRAKING))
 
 
-@killed_by("controllers/sampled.py", "array(cutoff) * array(period) < 2", "array(cutoff) * array(period) < 200")
+@killed_by(
+    "controllers/sampled.py",
+    "as_rule_array(cutoff) * as_rule_array(period) < 2",
+    "as_rule_array(cutoff) * as_rule_array(period) < 200",
+)
 @killed_by("controllers/sampled_on_grid.py", "within_period(self.controller,", "within_period(None,")
 @pytest.mark.parametrize(("cutoff", "grows"), [(1990.0, False), (2010.0, True)])
 def test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows(cutoff, grows):
@@ -407,7 +416,7 @@ def test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows(cutoff, gro
     line = f"controller.controller.cutoff = {cutoff:g} rad/s is outside (0, 2000) rad/s: sampled every 0.001 s"
     for computer in (controllers.Sampled, controllers.SampledOnGrid):
         said = list(
-            problems(
+            find_problems(
                 dataclasses.replace(
                     RIG, controller=computer(controller=controllers.PID(cutoff=cutoff, low=0.0, high=90.0))
                 )

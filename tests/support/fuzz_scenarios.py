@@ -115,7 +115,7 @@ def structure(rng: np.random.Generator) -> tuple[str, Scenario]:
     family = BALANCES if rng.random() < 0.2 else BRAKES
     sections = {name: {"type": str(rng.choice(there))} for name, there in family.items()}
     if family is BRAKES:
-        sections["road"] = {"type": str(rng.choice(list(registry.types("road"))))}
+        sections["road"] = {"type": str(rng.choice(list(registry.family_types("road"))))}
     if sections["controller"]["type"] == "sampled":
         inner = [name for name in family["controller"] if name != "sampled"]
         sections["controller"]["controller"] = {"type": str(rng.choice(inner))}
@@ -127,11 +127,11 @@ def structure(rng: np.random.Generator) -> tuple[str, Scenario]:
     sections["objective"] = {
         str(name): {"type": str(name)} for name in rng.choice(extra, rng.integers(0, 3), replace=False)
     }
-    first = loads(toml.document({}, sections).encode(), "fuzz", "fuzz.toml", integrated=False)
+    first = loads(toml.write_toml({}, sections).encode(), "fuzz", "fuzz.toml", integrated=False)
     most = stable_step(first.loop) / (1.5 if rng.random() < 0.95 else 0.7)
     step = next((step for step in CANDIDATES if step <= most), CANDIDATES[-1])
     sections["solver"] = {"step": step, "duration": STEPS * step}
-    base = loads(toml.document({}, sections).encode(), "fuzz", "fuzz.toml", integrated=False)
+    base = loads(toml.write_toml({}, sections).encode(), "fuzz", "fuzz.toml", integrated=False)
     return dump(base), base  # with every field written, so that single numbers of lists can be changed
 
 

@@ -45,7 +45,7 @@ import jax.numpy as jnp
 import numpy as np
 import random_loops
 
-from diffabs.core.pytree import get, refined, replace, strong
+from diffabs.core.pytree import canonical_dtypes, get, refine_parts, replace
 from diffabs.simulate.run import measure
 from diffabs.simulate.solution import Adaptive, FixedStep
 
@@ -115,8 +115,8 @@ class Program:
 
     def study(self, number: int, seed: int, widths: Sequence[float] = WIDTHS, slopes: bool = True) -> Found:
         """Gradients and differences of a loop, or differences alone."""
-        loop = strong(refined(random_loops.drawn(self.name, number, seed), self.times))
-        measures = strong(self.measured)
+        loop = canonical_dtypes(refine_parts(random_loops.drawn(self.name, number, seed), self.times))
+        measures = canonical_dtypes(self.measured)
         self.places = random_loops.numbers(loop, measures)
         x = np.array([_at(loop, measures, path)[place] for path, places in self.places.items() for place in places])
         size = np.where(np.abs(x) > 1e-6, np.abs(x), 1e-2)

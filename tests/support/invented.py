@@ -3,7 +3,7 @@
 import numpy as np
 
 from diffabs.core.pytree import parameters, replace
-from diffabs.tune import DescentPoint, Mode, Reason, Tuned
+from diffabs.tune import DerivativeMode, DescentPoint, Reason, Tuned
 from diffabs.tune.result import StartResult
 
 HISTORY = [DescentPoint(0, 2.0, 1.0, 0.5, 0.1, 1), DescentPoint(1, 1.5, 0.75, 0.01, 0.0, 3)]
@@ -24,7 +24,7 @@ def tuned(loop, **what):
         Reason.CHANGE,
         HISTORY,
         [StartResult({}, 1.5, 0.0, Reason.CHANGE, HISTORY)],
-        Mode.FORWARD,
+        DerivativeMode.FORWARD,
         (0, 0),
         {"name": "xla"},
     )

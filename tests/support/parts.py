@@ -16,10 +16,20 @@ from jax.flatten_util import ravel_pytree
 
 from diffabs import actuators, controllers, objectives, plants, references, roads, sensors, stops
 from diffabs.core import blocks
-from diffabs.core.blocks import Passage, offers, recorded
+from diffabs.core.blocks import Passage, offers, record_signal
 from diffabs.core.numerics import axpy
-from diffabs.core.protocols import BalanceOutput, BrakeOutput, Clock, Ending, Memory, Sample, Segment, Shown, Tracking
-from diffabs.core.pytree import strong
+from diffabs.core.protocols import (
+    BalanceOutput,
+    BrakeOutput,
+    Clock,
+    Ending,
+    Memory,
+    Sample,
+    Segment,
+    Shown,
+    Tracking,
+)
+from diffabs.core.pytree import canonical_dtypes
 from diffabs.simulate.rk4 import rk4_step
 
 FAMILIES = (roads, plants, controllers, references, actuators, sensors, objectives, stops, blocks)
@@ -275,7 +285,7 @@ def passed(family: str, block: Any, memory: Memory, t: Any) -> Passage:
     """The step that ends at t; before the first there is none."""
 
     def seen(t: Any) -> Any:
-        return recorded(block, t, memory, signal_at(family, block, t))
+        return record_signal(block, t, memory, signal_at(family, block, t))
 
     start = jnp.maximum(t - H, 0.0)
     (first, rate), (last, final) = (jax.jvp(seen, (at,), (jnp.ones_like(at),)) for at in (start, t))
@@ -376,19 +386,19 @@ def _linearised(function: Any, tree: Any) -> Any:
 
 def value(function: Any, tree: Any) -> np.ndarray:
     """function(tree), its leaves in one vector."""
-    return np.asarray(_linearised(function, strong(tree))[1])
+    return np.asarray(_linearised(function, canonical_dtypes(tree))[1])
 
 
 def jacobian(function: Any, tree: Any) -> np.ndarray:
     """d(function)/d(every element of every leaf), one row for each element, by forward-mode differentiation.
 
     Compiled once for each function and structure of the tree: give it functions that outlive the test."""
-    return np.asarray(_linearised(function, strong(tree))[0]).T
+    return np.asarray(_linearised(function, canonical_dtypes(tree))[0]).T
 
 
 def differences(function: Any, tree: Any, step: float = 1e-5) -> np.ndarray:
     """The same by central differences, with a step relative to the element (absolute for a zero)."""
-    x, unravel = ravel_pytree(strong(tree))
+    x, unravel = ravel_pytree(canonical_dtypes(tree))
     h = step * np.where(np.isfinite(x) & (np.abs(x) > 1e-6), np.abs(x), 1.0)
     left, right = (np.array([value(function, unravel(x + sign * d)) for d in np.diag(h)]) for sign in (-1, 1))
     return (right - left) / (2 * h[:, None]) if len(x) else jacobian(function, tree)

@@ -64,7 +64,7 @@ check = 0
 
 
 def described(text):
-    return section_sweep.study(loads(text.encode(), "small", "small.toml"))
+    return section_sweep.build_study(loads(text.encode(), "small", "small.toml"))
 
 
 def manifest(samples, chunk, variables=("plant.mass",), objectives=("iae",), **study):

@@ -33,12 +33,12 @@ def scenario(file, tmp_path):
 def test_a_file_is_its_numbers(scenario):
     """In the unit of the path, from the folder of the scenario; the dump holds the numbers themselves."""
     chosen = load(scenario)
-    study = section_sweep.study(chosen)
+    study = section_sweep.build_study(chosen)
     mass, speed = study.space.variables.values()
     assert mass == Empirical(tuple(MASSES))
     np.testing.assert_allclose(speed.values, np.array(SPEEDS) / 3.6, rtol=1e-15)
     assert set(study.draw(0, 200)["plant.mass"]) == set(MASSES)
-    again = section_sweep.study(loads(dump(chosen).encode(), "again", "again"))
+    again = section_sweep.build_study(loads(dump(chosen).encode(), "again", "again"))
     assert again.table() == study.table()
 
 
@@ -58,7 +58,7 @@ def test_another_file_is_another_sweep(scenario, tmp_path):
 
 def test_it_may_be_set_on_the_command_line_and_interpolated(scenario):
     change = 'sweep.over.plant.mass={type="empirical", file="day/masses.csv", column="mass [kg]", interpolated=true}'
-    chosen = section_sweep.study(load(scenario, [change]))
+    chosen = section_sweep.build_study(load(scenario, [change]))
     assert chosen.space.variables["plant.mass"] == Empirical(tuple(MASSES), interpolated=True)
     assert not set(chosen.draw(0, 20)["plant.mass"]) <= set(MASSES)
 
@@ -106,6 +106,6 @@ def test_what_is_wrong_with_a_file_is_said(scenario, tmp_path, change, needed):
 )
 def test_what_is_wrong_with_the_table_is_said(scenario, given, needed):
     with pytest.raises(ScenarioError) as error:
-        section_sweep.study(load(scenario, [f"sweep.over.plant.mass={given}"]))
+        section_sweep.build_study(load(scenario, [f"sweep.over.plant.mass={given}"]))
     assert needed in str(error.value)
     assert "\n" not in str(error.value)

@@ -14,8 +14,8 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from diffabs.core.pytree import Spec
-from diffabs.core.values import plain
-from diffabs.scenario.toml import document
+from diffabs.core.values import as_plain
+from diffabs.scenario.toml import write_toml
 from diffabs.sweep import distributions, sampling
 from diffabs.sweep import variables as space
 from diffabs.sweep.distributions import (
@@ -423,9 +423,9 @@ TABLES = [
 
 @pytest.mark.parametrize("ours", TABLES, ids=str)
 def test_tables_of_distributions_are_read_back(ours):
-    table = plain(ours, brief=True)
+    table = as_plain(ours, brief=True)
     assert distributions.read_distribution(json.loads(json.dumps(table)), "x") == ours
-    assert distributions.read_distribution(tomllib.loads(document({"x": table}, {}))["x"], "x") == ours
+    assert distributions.read_distribution(tomllib.loads(write_toml({"x": table}, {}))["x"], "x") == ours
 
 
 @pytest.mark.parametrize(
@@ -434,9 +434,9 @@ def test_tables_of_distributions_are_read_back(ours):
     ids=str,
 )
 def test_tables_of_designs_are_read_back(ours):
-    table = plain(ours, brief=True)
+    table = as_plain(ours, brief=True)
     assert sampling.read_sampling_design(json.loads(json.dumps(table)), "x") == ours
-    assert tomllib.loads(document({"x": table}, {}))["x"] == table
+    assert tomllib.loads(write_toml({"x": table}, {}))["x"] == table
 
 
 def test_the_table_of_a_space_is_read_back():

@@ -15,16 +15,27 @@ from scipy.stats import qmc
 import diffabs as d
 from diffabs import actuators, controllers, plants, references
 from diffabs.core.protocols import Memory
-from diffabs.core.pytree import pytree, strong
+from diffabs.core.pytree import canonical_dtypes, pytree
 from diffabs.design.polytopes import Polytope
 from diffabs.design.speed_scaled import SpeedScaled, greatest_speed_fall
 from diffabs.linear.slip_model import Sampling, SlipModel
 from diffabs.objectives import BRAKING
-from diffabs.objectives.tracking import nothing, unchanged
+from diffabs.objectives.tracking import keep_memory, no_integral
 from diffabs.scenario.defaults import braking
 from diffabs.simulate.stable_step import stable_step, stable_steps
 from diffabs.stops import SpeedReached
-from diffabs.tune import AtMost, CertifiedDecay, Method, Mode, Poles, Stopping, WorstCase, grid, tune, worst_case
+from diffabs.tune import (
+    AtMost,
+    CertifiedDecay,
+    DerivativeMode,
+    Method,
+    Poles,
+    Stopping,
+    WorstCase,
+    grid,
+    tune,
+    worst_case,
+)
 from diffabs.tune.problem import Multipliers
 from diffabs.tune.tuning import build_problem
 from diffabs.tune.weights import lq_weights, lqr_gain_design
@@ -53,7 +64,7 @@ def value_and_gradient(problem):
 def test_the_gradient_is_that_of_differences_forward_and_reverse():
     """Objective and both terms of the augmented Lagrangian."""
     ask = {"objective": {"iae": 1.0}, "over": TWO, "solver": SOLVER, "constraints": [AtMost("overshoot", 0.01)]}
-    forward, reverse = (value_and_gradient(build_problem(RIG, free=GAINS, mode=mode, **ask)) for mode in Mode)
+    forward, reverse = (value_and_gradient(build_problem(RIG, free=GAINS, mode=mode, **ask)) for mode in DerivativeMode)
     z = build_problem(RIG, free=GAINS, **ask).space.place(RIG)
     found = forward(z)
     assert (found.seen.excess > 0).all()
@@ -80,7 +91,7 @@ def test_it_finds_what_nelder_mead_finds_and_stays_where_the_step_is_stable():
     assert found.objective[1] <= theirs.fun * (1 + 1e-3)
     assert found.objective[1] < 0.8 * found.objective[0]
     assert stable_step(found.loop) >= SOLVER.step
-    assert found.mode is Mode.FORWARD
+    assert found.mode is DerivativeMode.FORWARD
     assert found.history[-1].objective == found.objective[1]
     again = tune(RIG, free=GAINS, method=Method(starts=2, stopping=Stopping(iterations=40)), **ask)
     assert again.history == found.history
@@ -145,7 +156,7 @@ def test_lanes_in_groups_are_the_lanes_together():
 class TestStability:
     def test_many_loops_at_once(self):
         masses = np.array([5.3, 6.2, 9.0])
-        batch = jax.vmap(lambda m: d.replace(strong(RIG), {"plant.mass": m}))(masses)
+        batch = jax.vmap(lambda m: d.replace(canonical_dtypes(RIG), {"plant.mass": m}))(masses)
         each = [stable_step(d.replace(RIG, {"plant.mass": m})) for m in masses]
         np.testing.assert_allclose(stable_steps(batch), each, rtol=1e-12)
 
@@ -326,7 +337,7 @@ class Shortness:
 
     unit = "m"
     physical = (-np.inf, 0.0)
-    flow, update = nothing, unchanged
+    flow, update = no_integral, keep_memory
 
     def start(self, sample):
         """Nothing to remember."""

@@ -235,7 +235,7 @@ class Certificate:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file whole or not at all. Raises OSError."""
         claims = ((claim.kind, claim.data) for claim in self.claims)
-        files.write(pathlib.Path(path), serialise.format_certificate(self.system, self.gain, claims).encode())
+        files.write_file(pathlib.Path(path), serialise.format_certificate(self.system, self.gain, claims).encode())
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Certificate":

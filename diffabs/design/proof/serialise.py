@@ -79,7 +79,7 @@ def read_certificate(
     path: str | os.PathLike[str],
 ) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, Any]]]]:
     """System, gain, and (kind, data) of the claims in a file. Raises OSError, or ValueError that names the field."""
-    raw = files.content(path, MAX_CERTIFICATE_BYTES + 1)
+    raw = files.read_content(path, MAX_CERTIFICATE_BYTES + 1)
     if len(raw) > MAX_CERTIFICATE_BYTES:
         raise ValueError(f"the file is larger than {MAX_CERTIFICATE_BYTES} bytes")
     content = raw.decode()
