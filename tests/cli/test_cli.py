@@ -379,7 +379,7 @@ def test_show_prints_a_scenario_to_start_from(tmp_path):
     assert first["title"] == second["title"] == "slip-lmi with plant.mass=6.2, " + ", ".join(SHORT[1::2])
 
 
-def test_completion_offers_commands_scenarios_fields_and_families():
+def test_completion_offers_commands_scenarios_and_fields():
     code = """
 import contextlib, os, sys
 from diffabs.cli.main import main

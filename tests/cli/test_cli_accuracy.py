@@ -50,7 +50,7 @@ def test_simulate_check_says_how_accurate_each_metric_is(file):
 
 
 @pytest.mark.slow
-def test_simulate_check_gives_no_numbers_where_there_is_nothing_to_compare(file):
+def test_check_without_a_metric_to_compare_gives_no_number(file):
     result = run(
         "simulate",
         file(RELAY.replace('"mirrored-rig"', '"mirrored-rig"\nreference = "peak-literal"')),

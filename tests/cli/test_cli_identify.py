@@ -329,7 +329,7 @@ def test_without_the_extra(small, csv, monkeypatch):
     assert 'pip install ".[tune]" in a clone' in result.stderr
 
 
-def test_a_trajectory_is_as_long_as_the_data_and_fits_into_memory(small, csv):
+def test_a_trajectory_is_as_long_as_the_data(small, csv):
     solver, readings = load(small).solver, read_measurements(csv(HEADER, *ROWS), UNITS)
     assert commands_identify._solver(solver, readings).steps == 302
     long = commands_identify._solver(FixedStep(1e-6, 1.0), readings)

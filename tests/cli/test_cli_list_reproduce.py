@@ -142,7 +142,7 @@ def test_reproduce_keeps_the_old_result_when_interrupted(papers, tmp_path):
     assert left_in(tmp_path) == {"slip-lmi"}
 
 
-def test_reproduce_puts_the_old_result_back_when_the_new_one_cannot_take_its_place(papers, tmp_path, monkeypatch):
+def test_a_failed_rename_restores_the_old_result(papers, tmp_path, monkeypatch):
     run("reproduce", "slip-lmi", "--out", tmp_path)
     (tmp_path / "slip-lmi" / "summary.json").write_text("old")
     rename = pathlib.Path.rename

@@ -168,7 +168,7 @@ def test_json_has_what_scripts_rely_on(tuned):
 
 
 @killed_by("cli/tune.py", 'after = chosen.with_loop(found.loop, "tuned")', "after = chosen")
-def test_what_is_written_loads_and_simulates_to_what_was_reported(tuned):
+def test_the_tuned_scenario_simulates_to_the_reported_numbers(tuned):
     folder, document, _ = tuned
     before, after = load(folder / "small.toml"), load(folder / "out.toml")
     for when, chosen in (("before", before), ("after", after)):

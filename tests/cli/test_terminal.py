@@ -283,7 +283,7 @@ def test_a_table_that_fits_is_as_it_was():
     assert printed(*tables.fit_table(table, COLUMNS)) == printed(table)
 
 
-def test_lines_are_folded_between_words_and_commands_can_be_copied(monkeypatch, capsys):
+def test_lines_fold_between_words_and_commands_stay_whole(monkeypatch, capsys):
     monkeypatch.setattr(console, "_terminal_width", lambda: 40)
     line = "error: a line that is far too long for such a narrow terminal, controller.controller.gain"
     console.say(line)

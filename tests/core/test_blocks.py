@@ -152,7 +152,7 @@ def test_scheduled_feedback_interpolates_between_many_nodes():
 
 
 @killed_by("controllers/gain_schedule.py", "(signal.measured.speed / self.reference_speed)", "1.0")
-def test_proportional_feedback_is_state_feedback_with_a_gain_that_goes_with_the_speed():
+def test_proportional_is_state_feedback_scaled_by_speed():
     k = ProportionalFeedback(gain=np.array([-30.0, -5.0]), reference_speed=4.0, torque_max=9.0)
     for speed, part in ((4.0, 1.0), (1.0, 0.25), (8.0, 2.0)):  # all beyond 9 N m with an integral of -3
         signal = tracking(0.1, 2.5)
@@ -403,7 +403,7 @@ def test_latch_does_not_move_for_rounding():
 
 @killed_by("core/loop.py", "((a >= 0) & ((b < 0) | (c < 0)))", "((a >= 0) & (c < 0))")
 @pytest.mark.slow
-def test_noise_of_a_sampled_accelerometer_latches_where_it_jumps_down():
+def test_a_noisy_sampled_accelerometer_latches_on_a_drop():
     """a = 3 + 50 t + noise that is held for 2 steps: a jump down from more than ever is a maximum, wherever it goes to,
     and the slip is the slip then."""
     key, noise, steps = jax.random.key(5), Noise(deceleration=0.5, period=2 * H), 80

@@ -262,7 +262,7 @@ def test_a_derivative_through_a_kink_is_that_of_the_closed_form(name):
 
 
 @pytest.mark.slow
-def test_a_comparison_close_to_the_beginning_of_a_run_is_landed_on():
+def test_a_step_ends_on_a_comparison_near_the_start():
     """At rest all comparisons of a run are near their zeros. A probe for one of them would lie before the first step,
     where another one changes: then the backward pass would be of no number, where the run and its tangents are."""
     loop = braking(

@@ -92,7 +92,7 @@ def test_nan_is_in_no_range():
     "return value if type(value) in PLAIN_TYPES else",
     "return value if isinstance(value, PLAIN_TYPES) else",
 )
-def test_parts_are_written_whole_and_the_rest_in_short_if_wanted():
+def test_parts_are_written_whole_and_the_rest_in_short():
     assert as_plain(Burckhardt(c1=np.float32(0.5), c2=30, c3=0.25)) == {
         "type": "burckhardt", **{"c1": 0.5, "c2": 30.0, "c3": 0.25, "c4": Burckhardt().c4}
     }  # fmt: skip
@@ -124,7 +124,7 @@ def test_a_sweep_is_read_once_into_si_by_path_of_the_loop():
     assert again.table() == chosen.sweep.table()
 
 
-def test_a_distribution_that_cannot_be_is_refused_when_the_scenario_is_read():
+def test_an_impossible_distribution_is_refused_on_reading():
     with pytest.raises(ScenarioError, match=r"sweep.over.initial.speed_kmh = uniform\(36, 900\) reaches \[36, 900\]"):
         load("slip-lmi", ["sweep.over.initial.speed_kmh=36,900"])
 

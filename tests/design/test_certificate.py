@@ -206,7 +206,7 @@ def lyapunov(k1, k2):
 
 
 @pytest.mark.parametrize("k1", [-1.0, -20.0, -300.0])
-def test_the_rig_has_a_common_function_exactly_where_the_formula_says(k1):
+def test_the_rig_has_a_common_function_where_the_formula_says(k1):
     critical = (np.sqrt(B * abs(k1)) * (np.sqrt(W_HIGH) - np.sqrt(W_LOW)) + A_HIGH) / B
     for factor in (1.001, 1.5, 4.0):
         P, found = lyapunov(k1, -critical * factor)
@@ -367,7 +367,7 @@ def test_the_checker_for_outsiders(kind, seed, tmp_path):
     assert "NOT PROVED" in refused.stdout
 
 
-def test_the_checker_for_outsiders_refuses_what_it_does_not_know(tmp_path):
+def test_the_independent_checker_refuses_unknown_entries(tmp_path):
     assert short(example("damping", seed=3), tmp_path).returncode == 1
 
 

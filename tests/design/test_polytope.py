@@ -143,7 +143,7 @@ class Cube:
         return StateSpace(y[:4].reshape(2, 2), y[4:].reshape(2, 1))
 
 
-def test_corners_whose_facets_merge_by_rounding_are_judged_by_linear_programs():
+def test_merged_facets_are_decided_by_linear_programs():
     """The facets of a cube in six dimensions are flat to rounding: Qhull gives up on its 64 corners."""
     over = dict.fromkeys("abcdef", (0.0, 1.0))
     ends = np.array(list(itertools.product((0.0, 1.0), repeat=6)))

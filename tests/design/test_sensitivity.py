@@ -238,7 +238,7 @@ def test_decay_is_what_can_be_proved(gain, system):
     case="continuous",
 )
 @both_times
-def test_derivative_of_the_decay_is_a_difference_of_certificates(system, monkeypatch):
+def test_the_decay_derivative_is_a_difference_of_certificates(system, monkeypatch):
     monkeypatch.setattr(analysis, "DECAY_TOLERANCE", 1e-8)
     monkeypatch.setattr(analysis, "MAX_SEARCH_PROGRAMS", 60)
     gain, h = np.array([-999.7, -111.07]), 0.03

@@ -216,7 +216,7 @@ def test_what_it_says(tmp_path):
     assert (found["proved"], found["claims"][0]["proved"], found["claims"][0]["reason"]) == (True, True, "")
 
 
-def test_it_needs_no_solver_and_the_checker_nothing_of_the_package(tmp_path):
+def test_the_checker_imports_no_solver_and_no_diffabs(tmp_path):
     path = saved(certificate("decay", P=np.eye(2), rate=0.5), tmp_path)
     code = "import sys; sys.modules.update(dict.fromkeys(['cvxpy', 'scipy', 'clarabel', 'optax'])); "
     code += f"import diffabs.cli.main as c; c.app(['verify', {str(path)!r}])"

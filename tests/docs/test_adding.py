@@ -37,7 +37,7 @@ def run(project, *command):
     )
 
 
-def test_the_page_has_a_road_and_a_controller_in_under_80_lines_each():
+def test_the_page_adds_two_parts_in_under_80_lines_each():
     files = {target: text.count("\n") for target, text in BLOCKS if "," not in target}
     assert len(files) == 2
     assert all(20 < lines < 80 for lines in files.values()), files

@@ -42,7 +42,7 @@ def test_the_problem_of_the_peers_is_that_of_our_parts():
         assert problem.holding(mass) == pytest.approx(float(held), rel=1e-6)
 
 
-def test_errors_are_the_worst_of_all_lanes_and_a_missing_number_is_the_worst():
+def test_the_error_is_the_worst_run_and_nan_is_worse():
     errors = module("peers.problem").errors
     right = np.full((4, 3), 2.0)
     found = right.copy()
@@ -89,7 +89,7 @@ def test_lanes_dealt_to_devices_come_back_in_their_order():
         dealt(5, 2)
 
 
-def test_the_first_accurate_setting_is_taken_else_the_most_accurate():
+def test_the_first_accurate_setting_is_taken():
     best = module("record").best
     points = [{"setting": s, "error": e} for s, e in ((1.0, 0.5), (0.5, 0.01), (0.25, 0.1), (0.1, 0.001))]
     assert best(points, 0.02)["setting"] == 0.5
@@ -162,7 +162,7 @@ RECORD = {"loops": {"lmi": {"rows": {"forward 1": {"ratio": 2.0}, "reverse": {"r
 
 
 @pytest.mark.parametrize(("reverse", "status"), [(6.0, 0), (8.9, 0), (9.1, 1), (float("nan"), 1)])
-def test_a_ratio_that_became_worse_is_named_and_is_the_exit_status(tmp_path, monkeypatch, capsys, reverse, status):
+def test_a_worse_ratio_is_named_and_sets_the_exit_status(tmp_path, monkeypatch, capsys, reverse, status):
     RECORD["loops"]["lmi"]["rows"]["reverse"]["ratio"] = reverse
     (tmp_path / "gradient.json").write_text(json.dumps(RECORD))
     stored, check = tmp_path / "ratios.json", module("check")

@@ -53,7 +53,7 @@ def test_noise_blinds_the_bare_latch_and_not_the_robust_one():
     np.testing.assert_allclose(means["robust"], 42.9, rtol=0, atol=0.3)  # 42.87 +- .11 elsewhere
 
 
-def test_the_laboratory_rig_locks_and_its_brake_is_too_slow_for_the_published_gain():
+def test_the_laboratory_rig_locks_with_the_published_gain():
     module = experiment("lab_rig")
     config = module.Config()
     for row in module.checks(config):
@@ -63,7 +63,7 @@ def test_the_laboratory_rig_locks_and_its_brake_is_too_slow_for_the_published_ga
     assert any(abs(value - 4.02e-3) < 2e-5 or abs(value - 4.02) < 2e-2 for value in critical), critical
 
 
-def test_nothing_drawn_from_three_uncertainties_is_slower_than_proved(tmp_path):
+def test_no_drawn_system_is_slower_than_proved(tmp_path):
     module = experiment("three_uncertainties")
     result = module.main(module.Config(samples=10_000, out=str(tmp_path)))
     found = {row["quantity"]: row["value"] for row in result["table"]}
@@ -99,7 +99,7 @@ def test_one_prior_is_enough_to_identify_a_magic_formula(monkeypatch):
     assert found.uncertainty.degrees == 13
 
 
-def test_the_cure_is_proved_and_holds_at_the_corners_of_its_box_and_not_beyond(tmp_path, monkeypatch):
+def test_the_cure_holds_at_its_corners_and_not_beyond(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
     module = experiment("cure_overshoot")
     box = module.Box(masses=(5.3, 6.2), speeds=(5.0, 50.0))
@@ -217,7 +217,7 @@ def test_what_searches_spent_is_counted(monkeypatch):
     assert (row["gradients"], row["tune"], row["differences / gradients"]) == (None, None, None)
 
 
-def test_weights_tuned_by_gradients_recover_more_starts_and_are_proved(tmp_path):
+def test_tuned_weights_recover_more_starts_and_are_proved(tmp_path):
     """24 x 24 cells know the share to some 2 %: the full run has 0.294, 0.328, 0.464 and 0.487. What any control could
     do is a strip, whose area is also counted."""
     module = experiment("arm_weights")
@@ -246,7 +246,7 @@ def test_an_observer_recovers_nearly_what_the_whole_state_does(tmp_path):
     assert observed["of the full state's"] >= 0.9
 
 
-def test_a_stronger_motor_raises_the_bound_as_the_root_of_its_power(monkeypatch):
+def test_the_bound_rises_as_the_root_of_the_motor_power(monkeypatch):
     """And the best machine for a bound is where the ranges end: long, heavy; the gear is inside."""
     monkeypatch.syspath_prepend(FOLDER)
     module = experiment("arm_codesign")

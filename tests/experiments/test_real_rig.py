@@ -166,7 +166,7 @@ def slip_poles(k, at):
 
 
 @pytest.mark.slow
-def test_what_fails_at_a_vertex_of_a_hull_is_not_said_of_a_machine(rig):
+def test_a_failing_hull_vertex_is_no_failing_machine(rig):
     """The PI of CMA-ES has a pole of 1.087 at a vertex, and none outside of the circle at a machine; the published gain
     has one. Poles of machines are SciPy's."""
     proof, box = rig["proof"], rig["box"]
@@ -337,7 +337,7 @@ def test_the_estimator_averages_the_first_samples():
     "h = self.period * self.reference_speed / jnp.maximum(signal.speed, self.floor)",
     "h = self.period",
 )
-def test_a_limited_target_asks_for_the_same_torque_at_every_speed():
+def test_a_limited_target_has_one_torque_at_every_speed():
     """Its rise, times the speed, is at most rate v0; and then it settles with T v/v0."""
     target = references.LimitedSlip(rate=3.0, time_constant=0.02, reference_speed=10.0)
     for v in (5.0, 20.0):
@@ -354,7 +354,7 @@ def test_a_limited_target_asks_for_the_same_torque_at_every_speed():
 
 
 @pytest.mark.slow
-def test_the_packaged_scenario_neither_locks_nor_goes_far_astray(rig):
+def test_the_packaged_scenario_neither_locks_nor_strays(rig):
     """slip-real, with sixteen noises, beside the same loop that sees the true speed."""
     found = scenario.load("slip-real", integrated=False)
     lanes = d.Batch({"sensor.blocks.3.deceleration": np.linspace(-0.1, 0.1, 16)}, np.arange(16))

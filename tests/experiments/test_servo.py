@@ -207,7 +207,7 @@ def test_units_are_those_of_the_loop(servo):
 
 
 @killed_by("simulate/stable_step.py", "for one in (loop, arrived)", "for one in (loop,)")
-def test_the_step_is_judged_where_the_controller_is_not_at_its_limit(servo):
+def test_the_step_is_judged_with_an_unsaturated_controller(servo):
     """At the start the PID commands 24 V whatever happens; its own fast mode is only seen on the target."""
     loop, _ = linear(servo, value=1.0)
     limited = replace(loop, {"controller.high": 24.0, "controller.low": -24.0, "controller.kd": 5.0})

@@ -223,7 +223,7 @@ def test_a_friction_factor_comes_and_goes_without_a_trace(name):
 
 @killed_by("explore/session.py", "        now = self.scenario()\n", "        now = self._base\n", case="turned0")
 @pytest.mark.parametrize("turned", [{"plant.mass": 5.61}, {"plant.mass": 5.61, "plant.road.scale": 0.77}, {}])
-def test_the_command_line_runs_what_was_saved_to_the_same_numbers(session, tmp_path, turned):
+def test_the_command_line_reproduces_the_saved_scenario(session, tmp_path, turned):
     for key, value in turned.items():
         session.turn(key, value)
     shown = curves.run_curves(session.scenario())
@@ -355,7 +355,7 @@ def test_corners_are_looked_at_again_only_where_they_move(session):
     "        self.adopt(self._accepted)\n",
     "        self._values = dict(list(self._values.items())[:-1])\n",
 )
-def test_what_is_not_accepted_is_withdrawn_with_all_that_came_after(session):
+def test_a_refused_edit_is_withdrawn_with_later_edits(session):
     session.turn("plant.mass", "5.5")
     session.put("initial.speed", "5")  # below the stop's
     session.put("controller.gain.1", "-60")
@@ -431,7 +431,7 @@ def test_speeds_of_a_plant_without_a_wheel_stay_in_si(session):
     assert session.knobs["initial.speed"].spec.unit == "km/h"
 
 
-def test_a_transient_ends_when_the_signal_has_settled_to_its_target():
+def test_a_transient_ends_when_the_signal_has_settled():
     t = np.linspace(0.0, 10.0, 1001)
     decay = np.exp(-t) * np.cos(3 * t)  # inside 5 % of its start from t = 2.98 s on (where exp(-t) < 0.05 and cos is 0)
     lines = (Curve("slip", 0.2 + decay), Curve("target", np.full_like(t, 0.2)))
@@ -595,7 +595,7 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
     assert found.stderr == 'error: no_such_framework needed: pip install ".[explore]" in a clone\n'
 
 
-def test_a_scenario_that_is_wrong_is_said_before_anything_listens(monkeypatch, file):
+def test_a_wrong_scenario_is_refused_before_listening(monkeypatch, file):
     monkeypatch.setitem(console.EXTRAS, "explore", ())
     found = run("explore", file("[plant]\ntype = 'quarter-car'\nmass = -1.0"), status=2)
     assert re.fullmatch(r"error: plant\.mass = -1 is outside \(0, inf\) kg\n", found.stderr)

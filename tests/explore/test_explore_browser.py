@@ -159,7 +159,7 @@ def test_dragging_a_slider_moves_the_curve_and_its_number(tabs):
 
 @needs_browser
 @pytest.mark.parametrize("name", names())
-def test_every_packaged_scenario_is_dragged_from_the_first_second(name, tmp_path, browser):
+def test_every_packaged_scenario_can_be_dragged_at_once(name, tmp_path, browser):
     """Also while everything is still being compiled; in the end nothing computes any more, and nothing failed."""
     one = Explorer(tmp_path, name)
     context = browser.new_context(viewport={"width": 1280, "height": 800})
@@ -269,7 +269,7 @@ def test_tuned_saved_and_run_by_the_command_line(tabs, explorer):
 
 
 @needs_browser
-def test_the_time_axis_fits_the_transient_and_the_whole_run_again(tabs):
+def test_the_time_axis_fits_the_transient_then_the_run(tabs):
     page = tabs()
     rested(page)
     shown = """() => { const box = document.querySelector('[data-id=curves] .nicegui-echart');
@@ -356,7 +356,7 @@ def test_ctrl_c_ends_it_without_a_word_too_many(tmp_path):
 
 
 @needs_browser
-def test_ctrl_c_ends_it_while_a_page_is_open_and_a_tuning_under_way(tmp_path, browser):
+def test_ctrl_c_ends_it_during_a_tuning(tmp_path, browser):
     one, context = Explorer(tmp_path), browser.new_context()
     try:
         page = context.new_page()

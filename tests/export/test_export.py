@@ -213,7 +213,7 @@ def limited():
 
 
 @needs_cc
-def test_parameters_can_be_changed_and_a_lost_sample_is_told_in_c(tmp_path):
+def test_c_code_takes_parameters_and_lost_samples(tmp_path):
     """Also the first measurement, at the start, may be lost."""
     loop, wanted, held = limited()
     (tmp_path / "unit.c").write_text(c_source(computer_program(loop), "unit"))
@@ -226,7 +226,7 @@ def test_parameters_can_be_changed_and_a_lost_sample_is_told_in_c(tmp_path):
     assert rows[:, 1].tolist() == held
 
 
-def test_parameters_can_be_changed_and_a_lost_sample_is_told_in_structured_text():
+def test_structured_text_takes_parameters_and_lost_samples():
     loop, wanted, held = limited()
     text = structured_text(computer_program(loop), "Unit")
     block, found = Block(text), []
@@ -302,7 +302,7 @@ def test_numbers_are_called_as_in_the_source():
 
 
 @needs_cc
-def test_a_compiler_that_assumes_that_there_is_no_nan_is_refused(tmp_path):
+def test_a_compiler_without_nan_is_refused(tmp_path):
     (tmp_path / "unit.c").write_text(c_source(computer_program(LOOPS["state feedback"]), "unit"))
     result = subprocess.run(["cc", "-ffast-math", "-c", "unit.c"], cwd=tmp_path, capture_output=True, text=True)
     assert result.returncode != 0
@@ -582,7 +582,7 @@ def test_a_block_begins_anew_when_it_is_told_to():
     "yield from self._operations(live_nodes([*stored.values(), *more]), indent)",
     "yield from (*self._moves(indent), *self._operations(live_nodes([*stored.values(), *more]), indent))",
 )
-def test_what_a_sample_stores_does_not_change_while_the_target_moves():
+def test_a_stored_sample_ignores_a_moving_target():
     """A controller that remembers the very number that the target's own movement computes anew."""
 
     @d.core.pytree.pytree

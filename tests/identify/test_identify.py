@@ -124,7 +124,7 @@ class TestFit:
         np.testing.assert_allclose(found.uncertainty.covariance, np.linalg.inv(A.T @ A), rtol=1e-6, atol=0)
         assert len(found.residuals) == 13
 
-    def test_a_prior_makes_up_for_too_few_data_but_not_for_what_they_say(self):
+    def test_a_prior_replaces_missing_data_only(self):
         prior = gaussian({"a": (1.0, 0.1), "k": (0.5, 0.1), "c": (0.1, 0.1)})
         few = tuple(x[:2] for x in DATA)
         found = fit(Decay(), ["a", "k", "c"], decay_residuals, data=few, sigma=0.1, prior=prior)
@@ -280,7 +280,7 @@ class TestTraces:
         "identify/traces.py", "part = clamp(ratio(t - times[i], times[i + 1] - times[i]), 0.0, 1.0)", "part = 0.0 * t"
     )
     @pytest.mark.slow
-    def test_the_loop_is_compared_between_its_instants_and_stays_where_it_ended(self):
+    def test_the_output_is_interpolated_and_constant_after_the_end(self):
         t = np.array([0.0, 0.0103, 0.1999, 0.3, 0.41, 0.59])
         over = {"initial.speed": np.array([26.0, 30.0]), "plant.inertia": np.array([1.0, 1.2])}
         data = Traces(
@@ -391,7 +391,7 @@ class TestTable:
 
 
 @pytest.mark.slow
-def test_the_derivative_through_interpolation_and_the_end_is_right():
+def test_the_derivative_through_interpolation_is_right():
     data = Traces(
         t=np.array([0.1037, 0.55]), columns={"distance": np.zeros(2)}, over={"initial.speed": np.array([26.0])}
     )

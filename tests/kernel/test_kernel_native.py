@@ -52,7 +52,7 @@ def _ulps(found, expected, dtype):
 @killed_by("kernel/native/functions.h", "0.05876946456", "0.05876946466", case="float64-")
 @pytest.mark.parametrize("plain", PLAIN, ids=["", "plain"])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_elementary_functions_are_right_to_a_unit_in_the_last_place(dtype, plain, monkeypatch):
+def test_elementary_functions_are_right_to_one_ulp(dtype, plain, monkeypatch):
     if plain:
         monkeypatch.setattr(compilers, "CPP_FLAGS", (*compilers.CPP_FLAGS, "-DPLAIN"))
     x = _arguments(dtype)

@@ -235,7 +235,7 @@ def test_a_pure_delay_turns_the_phase_and_nothing_else():
 
 @killed_by("linear/opened_loop.py", "rest = max(delay - whole * self.period, 0.0)", "rest = 0.0")
 @pytest.mark.slow
-def test_a_sampled_loop_behind_a_delay_is_that_of_a_step_response():
+def test_a_sampled_loop_with_delay_fits_its_step_response():
     """2.6 periods of delay: the pulse response of L(z) is that of the continuous plant, which has one state."""
     period, delay, gain = 2e-3, 5.2e-3, -20.0
     controller = Sampled(controller=StateFeedback(gain=(0.0, gain)), period=period)
@@ -256,7 +256,7 @@ def test_a_sampled_loop_behind_a_delay_is_that_of_a_step_response():
 
 
 @killed_by("linear/stability_margins.py", "loop.period is None or not math.isfinite(guess)", "True")
-def test_the_delay_margin_of_a_sampled_loop_is_where_it_turns_unstable():
+def test_a_sampled_loop_is_unstable_beyond_its_delay_margin():
     loop = rig(controller=Sampled(controller=StateFeedback(gain=(-3000.0, -48.0)), period=4e-3))
     opened = open_loop(loop)
     found = margins(opened)

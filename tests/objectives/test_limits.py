@@ -58,7 +58,7 @@ SOLVER = d.FixedStep(1e-3, 0.4)
 WEAK = controllers.PID(kp=60e3)  # holds 60/80 of the target: x = 0.03 * 0.75 (1 - exp(-80 t))
 
 
-def test_no_controller_has_the_limits_of_a_brake_unless_it_is_told():
+def test_controllers_have_no_brake_limits_by_default():
     end = d.measure(pulled(WEAK), SOLVER, {"error": objectives.FinalError()}).metrics["error"]
     assert 0.03 - end == pytest.approx(0.0225, rel=1e-6)  # 90 N would give 0.0045 m
     far = Tracking(1.0, Position(0.0), 0.0)

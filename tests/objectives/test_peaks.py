@@ -49,7 +49,7 @@ def test_a_voltage_that_rises_to_a_limit_does_not_leave_it(objective, value):
 
 
 @pytest.mark.parametrize("corner", [0.0, 0.5])
-def test_the_error_of_a_setpoint_with_a_corner_at_an_end_is_that_within_the_step(corner):
+def test_a_corner_at_the_end_of_a_step_leaves_the_error(corner):
     """The setpoint rises by 2 t within the step, and falls before or after it. Integral of |theta - setpoint|."""
     within = corner == 0.0
 
@@ -69,7 +69,7 @@ def test_the_error_of_a_setpoint_with_a_corner_at_an_end_is_that_within_the_step
 
 
 @pytest.mark.slow
-def test_the_variation_of_a_control_with_a_corner_is_that_of_short_steps():
+def test_the_variation_with_a_corner_is_that_of_short_steps():
     """A limit and the nodes of a gain schedule are corners of the control, at which adaptive steps begin and end. The
     rate beyond a corner makes no extremum before it. Against the sum of |du| over short steps."""
     loop = d.Loop(
@@ -122,7 +122,7 @@ def test_a_peak_on_an_event_of_the_grid_moves_with_the_event(lag, end):
 
 
 @pytest.mark.slow
-def test_a_peak_of_the_torque_has_the_derivative_of_accurate_runs():
+def test_a_torque_peak_has_the_derivative_of_accurate_runs():
     """Between the ends of fixed steps, behind a lag. Against differences of adaptive runs at three widths."""
     loop = d.Loop(
         plant=plants.ArmBalance(gear=1.1, rotor_inertia=0.3, current_max=40.0),
@@ -145,7 +145,7 @@ def test_a_peak_of_the_torque_has_the_derivative_of_accurate_runs():
         np.testing.assert_allclose(slope, (up - down) / (2 * width), rtol=1e-3)
 
 
-def test_a_cubic_without_a_root_ends_at_its_end_and_does_not_move():
+def test_a_cubic_without_a_root_returns_its_end():
     """A signal outside its band at both ends enters it no earlier than at the end, where its set point may jump."""
 
     def place(start):

@@ -77,7 +77,7 @@ def test_the_wheel_turns_once_near_half_a_second(runs):
     assert 0.5 < up[0] < up[-1] < 0.6
 
 
-def test_four_controllers_do_not_differ_in_the_proposed_method_only():
+def test_the_conventional_method_differs_by_controller_too():
     """From the paper's own tables: "no significant difference" is 2 cm there, and in the conventional method 1.05 m,
     more than the 1.01 m by which the proposed method shortens the distance under P."""
     distance = {name: d for name, (_, d) in slip_estimator.PUBLISHED_STOPS.items()}
@@ -110,14 +110,14 @@ def test_friction_at_low_speed(runs):
     assert slow / whole == pytest.approx(0.08, abs=0.005)
 
 
-def test_the_identified_curve_peaks_at_half_of_what_the_paper_calls_usual():
+def test_the_identified_curve_peaks_at_half_the_usual_slip():
     """ "Near 0.2 in general": 0.105 on the curve that gives its tables, and on the other one."""
     found = {name: float(jax.jit(peak)(car.road).slip) for name, car in slip_estimator.CARS.items()}
     assert found["spline B"] == pytest.approx(0.10539, abs=1e-5)
     assert found["Magic Formula"] == pytest.approx(0.10359, abs=1e-5)
 
 
-def test_were_friction_greatest_at_the_conventional_target_nothing_could_be_gained():
+def test_no_gain_if_friction_peaks_at_the_usual_target():
     """So the paper's own tables refute 0.2 on its curve: P holds the slip within 0.02 of the target, and the estimate
     is 1.01 m shorter."""
     assert slip_estimator.PUBLISHED_STOPS["conventional P"][1] - slip_estimator.PUBLISHED_STOPS["proposed P"][1] > 1
@@ -164,7 +164,7 @@ def test_equation_9_without_events_turns_the_wheel_backwards():
     assert np.interp(t[np.argmax(v < 0)], t, w) == pytest.approx(-57 / 3.6, abs=1)
 
 
-def test_equation_9_with_events_releases_a_locked_wheel_again_and_again():
+def test_equation_9_releases_a_locked_wheel_repeatedly():
     """With the brake off, the stopped wheel starts again, by the road's torque for one step, and is stopped in the
     next: it vanishes with the step, and what is left is the locked wheel of `QuarterCar`, and the published row."""
     for step in (2e-3, 5e-4):
@@ -179,7 +179,7 @@ def test_equation_9_with_events_releases_a_locked_wheel_again_and_again():
     assert np.sum(v) * 2e-4 == pytest.approx(distance, abs=0.05)
 
 
-def test_equation_10_without_an_event_drives_a_stopped_car_backwards():
+def test_equation_10_drives_a_stopped_car_backwards():
     """Beyond standstill the slip of a locked wheel is 1 as before it, so friction goes on in the same direction."""
     t, v, _ = literally(1e-3, 4.46, events=("wheel",))
     stopped = t[np.argmax(v < 0)]
@@ -285,7 +285,7 @@ def test_equations_4_and_6_lack_gravity():
 
 
 @killed_by("papers/arm_equations.py", "eighth - m2 * lg * sin2", "eighth - m2 * l * lg * sin2")
-def test_what_the_printed_equations_of_motion_miss_of_their_own_lagrangian():
+def test_the_printed_equations_miss_terms_of_their_lagrangian():
     """Eq. (8) lacks l in one term; (9) and (10) have the other sign in the centrifugal term and in gravity."""
     b2, b3, c2, c3, g = 10.0, 30.0, 7.0, 21.0, 9.81
     for q, v, a in points():

@@ -149,7 +149,7 @@ def test_the_closed_form_is_lagranges_equation(plant):
 
 @killed_by("plants/arm_balance.py", "c2 * sin2 * v2 * (2 * v1 + v2)", "c2 * sin2 * v2 * (v1 + v2)", case="hanging")
 @pytest.mark.parametrize("plant", [ARM, HANGING, GEARED], ids=["upright", "hanging", "geared"])
-def test_what_the_motor_puts_in_and_the_damper_takes_out_is_the_energys_change(plant):
+def test_motor_and_damper_power_is_the_change_of_energy(plant):
     """Here as tau psi' - d phi'^2, with the torque of eq. (11) by hand, relative to the largest term."""
     x, volts = states(3), np.random.default_rng(4).uniform(-50, 50, COUNT)
 

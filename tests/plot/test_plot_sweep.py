@@ -80,7 +80,7 @@ def test_histograms_are_those_of_the_runs_that_did_not_diverge(found):
     assert figure.get_suptitle() == "rig: distributions of 1,197 runs (3 diverged)"
 
 
-def test_what_would_press_a_histogram_together_is_counted_outside(made):
+def test_outliers_are_counted_beside_the_histogram(made):
     values = np.r_[A, 1e3, 2e3]
     ax = plots.draw_distributions(made({"a": np.r_[A, 0, 1]}, {"effort": values})).axes[0]
     counts, edges, _ = ax.patches[0].get_data()
@@ -161,7 +161,7 @@ def test_the_worst_are_marked_and_named(found):
     assert figure.axes[1].get_ylabel() == "overshoot [1], line: bound 0.3"
 
 
-def test_names_of_the_worst_do_not_cover_each_other_or_the_points(found):
+def test_names_of_the_worst_do_not_overlap(found):
     figure = plots.draw_worst(found)
     figure.draw_without_rendering()
     ax = figure.axes[0]
@@ -219,7 +219,7 @@ def test_rank_correlations_have_bars_and_intervals(made):
     assert drawn == [[[-0.9, centres[0]], [-0.7, centres[0]]], [[-0.1, centres[1]], [0.3, centres[1]]]]
 
 
-def test_sobol_indices_have_two_bars_and_no_interval_where_there_is_none(made):
+def test_sobol_bars_have_no_interval_if_there_is_none(made):
     one = {"value": 0.6, "low": 0.5, "high": 0.7}
     rows = {"a": {"first": one, "total": {**one, "value": 0.9}}, "b": {"first": one, "total": {**one, "low": None}}}
     sweep = made({"a": A, "b": B}, {"effort": A}, design="saltelli")
@@ -285,7 +285,7 @@ def test_each_kind_of_failure_is_in_the_map(made, kind):
     np.testing.assert_allclose(table, shares(A, B, edges, bad), rtol=1e-14)
 
 
-def test_cells_without_a_run_are_empty_and_levels_have_cells_of_their_own(made):
+def test_cells_without_a_run_are_empty(made):
     """On a triangle of levels."""
     x, y = (np.repeat(level, 4) for level in np.tril_indices(6))
     ax = plots.draw_failure_map(
@@ -299,7 +299,7 @@ def test_cells_without_a_run_are_empty_and_levels_have_cells_of_their_own(made):
 
 
 @killed_by("plot/sweeps.py", "np.maximum.at(table, cell, values)", "table[:] = values.max()")
-def test_a_map_where_nothing_failed_is_over_what_moves_the_metric(found, made):
+def test_a_map_without_failures_shows_the_strongest_inputs(found, made):
     metrics = {"overshoot": OVERSHOOT, "effort": 5 + A}
     sweep = made({"a": A, "b": B, "c": C}, metrics, failures={"overshoot": 9.0})
     ax = plots.draw_failure_map(sweep).axes[0]

@@ -39,7 +39,7 @@ def test_history_is_over_the_gradients_computed(tmp_path):
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
-def test_an_objective_that_changes_little_or_its_sign_is_not_logarithmic():
+def test_an_objective_of_either_sign_has_a_linear_axis():
     little = [point._replace(objective=40 + point.gradient, violation=0.0) for point in HISTORY]
     negative = [point._replace(objective=point.objective - 1) for point in HISTORY]
     assert [plots.draw_history(points).axes[0].get_yscale() for points in (little, negative)] == ["linear"] * 2

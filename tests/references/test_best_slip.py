@@ -118,7 +118,7 @@ def test_seeking_ends_at_the_peak_of_a_road():
     "return (signal.deceleration - memory.flow) / self.time_constant",
     "return 1e3 * (signal.deceleration - memory.flow)",
 )
-def test_a_slip_by_deceleration_is_interpolated_behind_its_filter():
+def test_the_slip_by_deceleration_is_interpolated_and_filtered():
     """np.interp, of the step response of the filter."""
     nodes, slips = np.array([1.0, 2.0, 5.0]), np.array([0.05, 0.2, 0.1])
     block = references.SlipByDeceleration(decelerations=nodes, slips=slips, time_constant=0.1)
@@ -156,7 +156,7 @@ def best_stop(mass, v0, road, torque, width=None, edge=np.inf):
     ("mass", "mu"),
     [pytest.param(12.0, 0.3, marks=pytest.mark.slow), (15.0, 0.98), pytest.param(20.0, 1.1, marks=pytest.mark.slow)],
 )
-def test_the_bound_is_the_stop_with_all_the_torque_and_then_the_peak(experiment, mass, mu):
+def test_the_bound_is_full_torque_and_then_the_peak(experiment, mass, mu):
     """The last one has more friction than 90 N m can use."""
     road = {"B": 13.0, "C": 1.45, "D": mu, "E": -0.8}
     values = {f"plant.road.roads.{i}.{n}": np.array([x]) for i in (0, 1) for n, x in road.items()}

@@ -66,7 +66,7 @@ def ours(bias):
 
 @killed_by("references/peak_slip.py", "return jnp.abs(signal.deceleration)", "return signal.deceleration", case="0.1")
 @pytest.mark.parametrize("bias", [-0.2, -0.05, 0.0, 0.1, 0.2])
-def test_a_biased_accelerometer_misleads_the_latch_as_the_paper_has_it(bias):
+def test_a_biased_accelerometer_misleads_the_latch(bias):
     """Forward biases of 0.1 m/s^2 and more: |a| falls through zero before the wheel has slipped, the latch takes that
     slip, 0, and the car rolls on: 333 m in 12 s. A backward bias changes the distance by decimetres."""
     distance, stopped = ours(bias)

@@ -128,7 +128,7 @@ class TestKnown:
 
 
 class TestSubset:
-    def test_no_bias_beyond_its_standard_error_and_intervals_that_cover(self):
+    def test_the_estimate_is_unbiased_and_its_intervals_cover(self):
         # a bias of 1 to 2 % is expected at 2800 samples; the interval covers 95 % (measured: 94 to 96 %)
         truth = parabola_probability(0.05, 10, B6)
         found = runs(parabola(0.05)[0], 10, B6, 100, draws=0)
@@ -174,7 +174,7 @@ class TestSubset:
         assert flat.interval[1] == 3 / 2800
         assert norm.sf(3.0) * 3 / 280 < cut.interval[1] < 2 * norm.sf(3.0) * 3 / 280  # of the chains' starts
 
-    def test_levels_that_run_out_end_with_a_bound_or_with_what_was_counted(self):
+    def test_exhausted_levels_end_with_a_bound_or_a_count(self):
         none = subset_simulation(linear(2), 2, B6, levels=3)
         assert none.reason is SubsetReason.LEVELS
         assert len(none.levels) == 3
@@ -267,7 +267,7 @@ class TestSubset:
         assert len(new.z) == 100
         assert len(np.unique(new.family)) == 10
 
-    def test_ancestors_tell_the_variance_between_the_bounds_of_independent_and_dependent_levels(self):
+    def test_the_variance_lies_between_its_two_bounds(self):
         level = subset_simulation(linear(2), 2, 1.0, draws=0).levels[0]
         levels = [level._replace(cov=0.1, share=0.1), level._replace(cov=0.2, share=0.1)]
         for count, cov in [(1, 0.3), (16, 0.25), (1000, np.sqrt(0.05))]:
@@ -393,7 +393,7 @@ class TestGradient:
         doubled = runs(linear(100), 100, B6, 1, gradient=of_linear(100), price=6.0)[0]
         assert doubled.cost == informed[0].cost + 3 * informed[0].gradients
 
-    def test_it_pays_where_the_limit_is_curved_and_where_there_are_two(self):
+    def test_it_pays_for_curved_limits_and_for_two_regions(self):
         """Against subset simulation alone: 10 and 20 for seeds 0 to 199."""
         score, gradient = parabola(0.05)
         for f, g, b, least in [(score, gradient, B6, 4), (both_sides, of_both_sides, norm.isf(5e-7), 6)]:

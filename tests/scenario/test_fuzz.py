@@ -14,7 +14,7 @@ from diffabs.scenario.scenario import ScenarioError, load
 
 
 @pytest.mark.slow
-def test_some_scenarios_are_refused_in_a_line_or_run_to_numbers_that_can_be():
+def test_random_scenarios_are_refused_in_a_line_or_run():
     tally = fuzz.fuzz(12, seed=4, per_structure=12)
     assert tally.findings == []
     assert tally.counts["accepted"] + tally.counts["refused"] == 12

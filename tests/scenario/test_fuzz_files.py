@@ -7,7 +7,7 @@ pytestmark = pytest.mark.usefixtures("any_step_is_stable", "without_load")
 
 
 @pytest.mark.slow
-def test_changed_folders_and_certificates_end_in_no_traceback_other_number_or_false_proof():
+def test_changed_files_are_refused_or_change_nothing():
     failures, tally = fuzz(40, seed=1, outsiders=False)
     assert not failures, "\n".join(failures)
     outcomes = {outcome for _, outcome in tally}

@@ -87,7 +87,7 @@ def test_a_number_or_depth_beyond_all_measure_in_a_file(file, text):
         f"plant.mass={DEEP}",
     ],
 )
-def test_a_number_or_depth_beyond_all_measure_on_the_command_line(change):
+def test_a_huge_number_or_depth_on_the_command_line(change):
     said = refused("simulate", "slip-lmi", "--set", change)
     assert "is a whole number outside [-2^63, 2^63)" in said or "nested" in said
 
@@ -97,7 +97,7 @@ def test_bytes_that_are_no_text(change):
     assert refused("simulate", "slip-lmi", "--set", change).endswith("is not UTF-8 text\n")
 
 
-def test_a_certificate_with_numbers_and_depths_beyond_all_measure(tmp_path):
+def test_a_certificate_with_huge_numbers_and_depths(tmp_path):
     """JSON has no hexadecimal numbers; thousands of decimal digits are no finite float."""
     for text in (HEX, "9" * 4400, DEEP, '{"format": ' * 5000):
         path = tmp_path / "x.json"

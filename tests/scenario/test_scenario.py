@@ -473,7 +473,7 @@ def test_slip_cured_is_the_rig_with_what_the_paper_leaves_out():
 
 
 @pytest.mark.usefixtures("any_step_is_stable")
-def test_another_part_takes_the_ranges_of_the_one_it_replaces_with_it():
+def test_a_replaced_part_takes_its_ranges_with_it():
     assert set(load("slip-lmi").design.over) == {"plant.mass", "initial.speed"}
     assert set(load("slip-lmi", ["plant=lab-rig"]).design.over) == {"initial.speed"}
     again = load("slip-lmi", ["plant=quarter-car", "design.over.plant.mass=12,20"])

@@ -195,7 +195,7 @@ BAD = [
     "        if False:",
 )
 @pytest.mark.parametrize("case", BAD, ids=lambda case: case[0][:40].encode("unicode_escape").decode())
-def test_bad_value_is_one_line_that_says_where_what_and_what_is_needed(file, case):
+def test_a_bad_value_is_refused_in_one_line(file, case):
     override, *needed = case
     line = message(file(""), override)
     for text in needed:

@@ -58,7 +58,7 @@ def test_the_error_of_a_smooth_loop_is_that_of_fourth_order():
         assert one.converges
 
 
-def test_a_torque_limit_costs_the_order_and_the_estimate_says_so():
+def test_the_estimate_shows_the_order_lost_to_a_torque_limit():
     loop = d.replace(RIG, {"controller.torque_min": 0.0, "controller.torque_max": 8.0})
     exact = truth(0.0, 8.0)
     found = acc.estimate_accuracy(loop, d.FixedStep(2e-3, 2.0), OBJECTIVES)

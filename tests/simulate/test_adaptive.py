@@ -49,7 +49,7 @@ def close(run, reference, tolerance, least=1e-6):
 @pytest.mark.parametrize(
     "name", ["lab-rig", *(pytest.param(n, marks=pytest.mark.slow) for n in ("slip-estimator", "arm-hanging"))]
 )
-def test_what_a_packaged_scenario_measures_is_what_fixed_steps_measure(name):
+def test_a_packaged_scenario_agrees_with_fixed_steps(name):
     chosen = load(name)
     run = d.measure(chosen.loop, d.Adaptive(1e-5, chosen.solver.duration, chosen.solver.step), chosen.objectives)
     reference = d.measure(chosen.loop, chosen.solver, chosen.objectives)
@@ -58,7 +58,7 @@ def test_what_a_packaged_scenario_measures_is_what_fixed_steps_measure(name):
 
 
 @pytest.mark.slow
-def test_every_lane_of_a_box_is_right_on_limits_that_no_part_declares():
+def test_every_run_of_a_box_is_right_on_undeclared_limits():
     chosen = rig()
     mass, speed = (x.ravel() for x in np.meshgrid(np.linspace(5.3, 6.2, 6), np.linspace(8.5, 16.5, 6)))
     lanes = d.Batch({"plant.mass": mass, "initial.speed": speed})
@@ -67,7 +67,7 @@ def test_every_lane_of_a_box_is_right_on_limits_that_no_part_declares():
 
 
 @pytest.mark.slow
-def test_a_smaller_error_of_a_step_makes_a_smaller_error_of_the_run():
+def test_a_smaller_step_error_makes_a_smaller_run_error():
     chosen = rig()
     exact = d.measure(chosen.loop, d.FixedStep(1e-5, 2.5), {"iae": IAE()}).metrics["iae"]
     errors = [
@@ -94,7 +94,7 @@ def test_random_loops_of_any_parts_are_right_to_1e_4(name):
     "simulate/lengths.py", "jnp.minimum(loop.next_tick(k, self.h), self.steps)", "jnp.minimum(k + 1, self.steps)"
 )
 @pytest.mark.slow
-def test_a_computer_strikes_on_its_own_clock_and_not_on_the_grid():
+def test_a_computer_ticks_on_its_own_clock():
     chosen = load("slip-cured", ["sensor=noise", "sensor.slip=0.002"])
     key = jax.random.key(4)
     coarse, fine = (
@@ -127,7 +127,7 @@ def test_a_trajectory_is_kept_on_the_grid_and_changes_nothing():
 
 
 @pytest.mark.slow
-def test_neither_the_order_of_lanes_nor_their_company_changes_a_number():
+def test_the_other_runs_of_a_batch_change_no_number():
     """As many lanes each time, and as above, so that one program runs them. Those without a speed, or that begin beyond
     their stop, have diverged."""
     speed = np.linspace(8.0, 16.0, 36)
@@ -188,7 +188,7 @@ def on_limits(solver):
 )
 @killed_by("simulate/adaptive.py", "system.kinks if control.notes else 0", "0")
 @pytest.mark.slow
-def test_derivatives_on_limits_agree_with_differences_of_three_widths():
+def test_derivatives_on_limits_agree_with_differences():
     slopes = jax.jit(jax.jacfwd(on_limits(d.Adaptive(1e-5, 2.5))))(jnp.zeros(2))
     exact = jax.jit(jax.vmap(on_limits(d.Adaptive(1e-9, 2.5))))
     widths = np.array([1e-2, 3e-3, 1e-3])
@@ -226,7 +226,7 @@ def relay_at_its_rate():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [clamped_rig, relay_at_its_rate])
-def test_derivatives_through_many_comparisons_agree_with_differences(make):
+def test_derivatives_through_many_comparisons(make):
     """Two widths of differences of runs at a far smaller error. The scale is the derivative, or a thousandth of the
     value where that is more: 1 % of it is 10 rtol of the value."""
     loop = make()
@@ -278,7 +278,7 @@ def test_reverse_mode_is_forward_mode(name):
 
 @killed_by("simulate/replay.py", "    t = one.t + shift\n", "    shift *= 0.0\n    t = one.t + shift\n")
 @pytest.mark.slow
-def test_a_derivative_through_a_relay_and_a_latch_is_that_of_fixed_steps():
+def test_a_derivative_through_relay_and_latch_is_that_of_rk4():
     structure, loop = random_loops.STRUCTURES["relay, latch, lag"], random_loops.drawn("relay, latch, lag", 3, 0)
 
     def slope(solver):
@@ -298,7 +298,7 @@ def test_a_derivative_through_a_relay_and_a_latch_is_that_of_fixed_steps():
     "    return point.t, point.state.flow(), jax.tree.map(lambda x: 0.0 * x, point.rate[0])",
 )
 @pytest.mark.slow
-def test_between_the_instants_of_a_computer_a_trajectory_is_that_of_fixed_steps():
+def test_a_trajectory_between_ticks_is_that_of_fixed_steps():
     chosen = load("slip-lmi", ["controller={type='sampled',controller='pid',period=0.005}"])
     solvers = d.Adaptive(1e-6, 0.03), d.FixedStep(1e-4, 0.03, every=10)
     seen, reference = (d.rollout(chosen.loop, one, {}).trajectory.sample.output.slip for one in solvers)

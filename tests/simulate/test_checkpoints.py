@@ -57,7 +57,7 @@ def memory(steps):
 
 @killed_by("simulate/checkpoint.py", "MAX_SAVED_CARRIES = 1800", "MAX_SAVED_CARRIES = 10**9")
 @pytest.mark.slow
-def test_memory_of_reverse_mode_hardly_grows_with_the_number_of_steps():
+def test_reverse_mode_memory_hardly_grows_with_steps():
     sizes = [memory(steps) for steps in (1000, 4000, 16000)]
     assert max(sizes) < 2 * min(sizes), sizes
 
@@ -80,7 +80,7 @@ def test_slots_leave_little_over_and_are_few(count):
     assert len({round_up_capacity(n) for n in range(1000, 4000)}) <= 17
 
 
-def test_groups_after_the_end_are_skipped_and_have_no_derivative():
+def test_groups_after_the_end_have_no_derivative():
     def power(x, count, room):
         def step(carry):
             return carry[0] * x, carry[1] + 1

@@ -307,7 +307,7 @@ def test_sensitivity_of_the_conventional_brake():
     ("ki", "published"),
     [(0.0, (4.305, -4.646)), (5000.0, None)],  # by another program with the same correction
 )
-def test_gradient_through_the_latch_agrees_with_a_wide_difference(ki, published):
+def test_the_gradient_through_the_latch_is_a_wide_difference(ki, published):
     """A narrow difference would agree with a wrong derivative: both miss how the latched slip moves between samples."""
     loop = dataclasses.replace(
         FULL, reference=references.PeakLatch(), controller=controllers.PID(ki=ki, low=0.0, high=90.0)
@@ -320,7 +320,7 @@ def test_gradient_through_the_latch_agrees_with_a_wide_difference(ki, published)
 
 
 @pytest.mark.slow
-def test_a_maximum_on_a_knot_of_the_road_has_the_slip_of_the_knot():
+def test_a_maximum_on_a_knot_has_the_slip_of_the_knot():
     """Where the spline of the paper has its greatest friction, its curvature jumps; whatever the inertia."""
     loop = dataclasses.replace(FULL, reference=references.PeakLatch(), controller=controllers.PID(low=0.0, high=90.0))
     loop = dataclasses.replace(

@@ -26,7 +26,7 @@ def test_gradients_are_those_of_wide_differences(name):
 
 
 @pytest.mark.slow
-def test_gradients_of_adaptive_runs_are_those_of_wide_differences():
+def test_adaptive_gradients_are_wide_differences():
     wrong = offenders(studied("rig, limited, clamped", range(3), seed=1, told=False, rtol=1e-6))
     assert not wrong, "\n".join(line(row) for row in wrong)
 

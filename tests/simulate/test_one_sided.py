@@ -86,7 +86,7 @@ def test_a_delay_has_the_derivative_of_differences(loop, path, places, solver):
         np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-6, err_msg=f"{path} = {x}")
 
 
-def test_a_computer_without_delay_has_the_derivative_from_the_right():
+def test_without_delay_the_derivative_is_from_the_right():
     loop, path, places = DELAYS[0].values
     found, differences = beside(*run(loop, path, d.FixedStep(STEP, 0.02)), *places[0])
     assert (np.abs(differences) > 1e-2).any()
@@ -268,7 +268,7 @@ def test_points_with_one_side_are_named_in_any_run_and_subject():
 
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
-def test_the_variation_behind_a_delay_has_no_derivative_with_adaptive_steps(derivative):
+def test_an_adaptive_variation_behind_a_delay_is_refused(derivative):
     loop = DELAYS[2].values[0]
 
     def measured(time):
@@ -279,7 +279,7 @@ def test_the_variation_behind_a_delay_has_no_derivative_with_adaptive_steps(deri
 
 
 @pytest.mark.slow
-def test_a_pure_delay_has_the_derivative_of_differences_with_adaptive_steps():
+def test_an_adaptive_pure_delay_agrees_with_differences():
     loop = DELAYS[2].values[0]
     measured = {name: one for name, one in MEASURED.items() if name != "variation"}
 

@@ -209,7 +209,7 @@ class TestBeforeARun:
 class TestAfterARun:
     @killed_by("simulate/result.py", 'audit = getattr(loop.plant, "audit", None)', "audit = None")
     @pytest.mark.parametrize("step", [1e-4, 1e-3])
-    def test_an_unstable_step_is_seen_although_every_number_is_finite(self, step):
+    def test_an_unstable_step_with_finite_numbers_is_refused(self, step):
         """At 1e-6 s the run ends after three steps at -1e13 m: it has not stopped, and there is no mean to enter."""
 
         def one(T):
@@ -407,7 +407,7 @@ def test_the_sweep_of_the_report(tmp_path):
 )
 @killed_by("controllers/sampled_on_grid.py", "within_period(self.controller,", "within_period(None,")
 @pytest.mark.parametrize(("cutoff", "grows"), [(1990.0, False), (2010.0, True)])
-def test_a_filter_too_fast_for_its_samples_is_refused_where_it_grows(cutoff, grows):
+def test_a_filter_too_fast_for_its_samples_is_refused(cutoff, grows):
     """The oracle is the computer's own recursion, d + T wc (e - d), written out for e = 0."""
     period, d = 1e-3, 1.0
     for _ in range(2000):

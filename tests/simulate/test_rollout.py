@@ -173,7 +173,7 @@ def plainly(loop, objectives, method, tries):
     "like", [d.FixedStep(1e-3), pytest.param(d.Adaptive(), marks=pytest.mark.slow)], ids=["fixed", "adaptive"]
 )
 @pytest.mark.parametrize("duration", [0.02, 0.3, 3.0])
-def test_another_duration_is_the_same_program_and_the_same_steps(duration, like):
+def test_another_duration_compiles_nothing_new(duration, like):
     """Against the steps one after the other, without any driver but what renews the longest stable step."""
     solver = dataclasses.replace(like, duration=duration)
     d.measure(RIG, dataclasses.replace(like, duration=0.5), BRAKING)
@@ -187,7 +187,7 @@ def test_another_duration_is_the_same_program_and_the_same_steps(duration, like)
 
 
 @pytest.mark.slow
-def test_trajectories_of_other_durations_and_strides_are_of_one_program():
+def test_trajectories_of_all_durations_share_a_program():
     d.rollout(RIG, d.FixedStep(1e-3, 0.5, every=5), BRAKING)
     before = _run._cache_size()
     all_of_it = d.rollout(RIG, d.FixedStep(1e-3, 3.0), BRAKING).trajectory
@@ -224,7 +224,7 @@ def test_a_batch_ends_with_its_last_lane():
 
 
 @killed_by("simulate/result.py", "jnp.where(diverged, jnp.nan, value)", "value")
-def test_a_diverging_lane_is_flagged_and_leaves_the_others_alone():
+def test_a_diverging_run_changes_no_other_run():
     solver = d.FixedStep(1e-3, 0.5)
 
     def run(gain):

@@ -159,7 +159,7 @@ def test_the_certified_decay_has_first_derivatives_only():
         jax.eval_shape(jax.hessian(rate), jnp.array([[-2.0, -2.0]]))
 
 
-def test_the_peak_of_a_road_has_the_second_derivatives_of_its_closed_form():
+def test_a_road_peak_has_closed_form_second_derivatives():
     """mu = s exp(-a s): the peak is at 1/a, its height exp(-1)/a."""
 
     class Hump:

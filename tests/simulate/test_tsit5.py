@@ -109,7 +109,7 @@ def test_the_middle_of_a_power_is_that_of_its_cubic_or_known(power):
 @killed_by(
     "simulate/tsit5.py", "h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b)", "0.5 * h * (a + MIDPOINT_ERROR_WEIGHTS[-1] * b)"
 )
-def test_what_is_said_of_the_middle_is_how_far_the_cubic_is_off_there():
+def test_the_error_at_the_middle_is_that_of_the_cubic():
     """x' = -x + sin 2t: against the closed form."""
 
     def exact(t):
@@ -148,7 +148,7 @@ def written_out(f, t, x, rate, h, given):
     "rounds = (jnp.arange(1, count), jnp.asarray(STAGE_NODES, dtype), jnp.asarray(rows, dtype))",
     "rounds = (jnp.arange(1, count - 1), jnp.asarray(STAGE_NODES[:-1], dtype), jnp.asarray(rows[:-1], dtype))",
 )
-def test_derivatives_by_a_loop_over_stages_are_those_of_the_stages_written_out():
+def test_a_loop_over_stages_has_the_unrolled_derivatives():
     end, at = moved(tsit5_step_from)
     plain, _ = moved(written_out)
     for found, expected in zip(jax.tree.leaves(end(*at)), jax.tree.leaves(plain(*at)), strict=True):

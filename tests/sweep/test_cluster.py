@@ -262,7 +262,7 @@ def test_the_command_is_killed_or_interrupted(scenario, tmp_path, how):
 @pytest.mark.parametrize(
     ("threads", "stopped", "somebody"), [({}, True, False), ({}, False, True), ({"a": 1}, True, True)]
 )
-def test_only_who_was_interrupted_and_has_no_worker_waits_for_nobody(threads, stopped, somebody):
+def test_an_interrupted_client_without_workers_ends_at_once(threads, stopped, somebody):
     """Ctrl-C in a terminal ends the workers, too: sometimes none comes back."""
     looks = iter([False, False, True])
     client, finished = SimpleNamespace(nthreads=lambda: threads), SimpleNamespace(has_ready=lambda: next(looks))

@@ -235,7 +235,7 @@ def test_random_numbers_stay_inside_the_open_interval(monkeypatch, word):
     np.testing.assert_array_equal(np.minimum(u, 1 - u), 2.0**-53)
 
 
-def test_random_draws_do_not_depend_on_jaxs_precision_and_compile_once():
+def test_draws_do_not_depend_on_precision_and_compile_once():
     large = 2**32 - 1
     expected = Random().unit(large, 4_000_000_000, 4_000_000_017, 2, large)
     with jax.enable_x64(False):
@@ -372,7 +372,7 @@ def test_correlations_are_recovered():
         assert stats.kstest(x[path], theirs.cdf).pvalue > 1e-3
 
 
-def test_normal_marginals_are_jointly_normal_with_the_covariance():
+def test_normal_marginals_have_the_given_covariance():
     """x = mean + chol(C) z, exactly; the correlations of a covariance are those of its Cholesky factor."""
     covariance = np.array([[0.09, 0.05], [0.05, 0.25]])
     variables = {"b": Normal(1.0, 0.5), "a": Normal(5.0, 0.3)}
@@ -673,7 +673,7 @@ def test_a_seed_has_32_bits(design, seed):
         design.unit(seed, 0, 4, 1, 4)
 
 
-def test_a_covariance_that_contradicts_the_deviations_is_refused():
+def test_a_covariance_unlike_the_deviations_is_refused():
     variables = {"a": Normal(5.0, 0.3), "b": Uniform(0, 1)}
     Correlation.from_covariance(("a", "b"), [[0.09, 0.0], [0.0, 4.0]], variables)
     with pytest.raises(ValueError, match=r"a: deviation = 0.3 is not 0.4, the root of its variance in the covariance"):

@@ -298,7 +298,7 @@ def test_a_manifest_that_is_no_file(copy, kind):
     assert "is no sweep: manifest.json: " in result.stderr
 
 
-def test_a_sweep_of_the_time_before_seals_is_not_read_unverified(copy):
+def test_a_sweep_without_seals_is_not_read(copy):
     there = json.loads((copy / "manifest.json").read_text())
     del there["digest"]
     (copy / "manifest.json").write_text(json.dumps({**there, "format": 1}))

@@ -139,7 +139,7 @@ def test_a_lane_has_the_drawn_parameters(with_roads):
         assert isinstance(loop.plant.road, roads.Scaled) == (drawn["plant.road"][i] == "1")
 
 
-def test_lanes_that_diverge_are_counted_and_kept_with_their_parameters(study, swept):
+def test_diverged_runs_are_counted_and_keep_their_row(study, swept):
     bad = swept.column("controller.gain.1") > 0
     assert 5 < bad.sum() < 40
     assert np.array_equal(swept.column("diverged"), bad)

@@ -71,7 +71,7 @@ def test_two_processes_make_the_table_of_one(folder, digest):
 
 
 @pytest.mark.parametrize("victim", [0, 1])
-def test_a_process_that_dies_ends_the_others_and_the_commands_go_on(folder, digest, victim):
+def test_a_process_that_dies_ends_the_others(folder, digest, victim):
     """Process p computes the chunks p, p + 2, ...; the first one coordinates."""
     longer = SCENARIO.replace("samples = 3200", "samples = 32000")
     (folder / "study.toml").write_text(longer)
@@ -99,7 +99,7 @@ def test_a_process_that_dies_ends_the_others_and_the_commands_go_on(folder, dige
 
 
 @killed_by("sweep/run.py", "        except Exception:", "        except ZeroDivisionError:")
-def test_a_full_disk_of_one_process_is_said_after_the_other_has_finished(folder):
+def test_a_full_disk_of_one_process_is_reported_at_the_end(folder):
     broken = SCRIPT.replace("\nprint(", f"{FULL}print(")
     (folder / "many.py").write_text(broken.replace(".digest", ".complete"))
     processes = all_started(folder)

@@ -187,7 +187,7 @@ class TestCVaR:
         assert found.low == pytest.approx(stats.binom.ppf(0.025, 1000, 0.045) / 50, abs=0.021)
         assert 1.0 < found.high < 1.3
 
-    def test_too_few_in_the_tail_have_no_interval_and_equal_ones_no_width(self):
+    def test_a_tail_with_too_few_samples_has_no_interval(self):
         assert ends(estimates.cvar(self.X, 0.96)) == [-math.inf, math.inf]
         assert math.isfinite(estimates.cvar(self.X, 0.95).high)
         np.testing.assert_allclose(estimates.cvar(np.minimum(self.X, 1.1), 0.9)[:3], 1.1, rtol=1e-12, atol=0)
@@ -247,7 +247,7 @@ class TestCorrelations:
         np.testing.assert_allclose([one.value, *ends(one)], [0.8699639, 0.5840951, 0.9638297], rtol=0, atol=5e-8)
 
     @pytest.mark.parametrize("binormal", [True, False])
-    def test_a_constant_has_none_and_a_monotone_function_a_perfect_one(self, binormal):
+    def test_constants_have_no_correlation_and_monotone_ones_one(self, binormal):
         x = np.stack([np.full(80, 0.1), self.Y**3, -self.Y], axis=1)
         found = sensitivity.correlations(x, self.Y, binormal=binormal)
         for one in (found.pearson[0], found.spearman[0]):
@@ -345,7 +345,7 @@ class TestSobol:
             np.testing.assert_allclose(other.value, one.value, rtol=1e-9, atol=1e-12)
             np.testing.assert_allclose(other.high - other.low, one.high - one.low, rtol=0.2, atol=0)
 
-    def test_a_seed_is_an_interval_an_offset_no_matter_and_a_constant_without_any(self):
+    def test_a_seed_changes_the_interval_and_an_offset_nothing(self):
         a, b, ab = outputs(ishigami, 3, 100, np.random.default_rng(18))
         one = sensitivity.sobol_indices(a, b, ab, seed=3)
         assert sensitivity.sobol_indices(a, b, ab, seed=3) == one

@@ -182,7 +182,7 @@ class TestDescent:
         "elif float(found.gradient @ descent_state.update) < WOLFE_FRACTION * slope and not longest:",
         "elif False:",
     )
-    def test_a_step_that_is_much_too_short_is_not_content_with_little(self):
+    def test_a_very_short_step_does_not_end_the_search(self):
         """Weak Wolfe conditions, written out here, where the first direction is a thousandth of the way."""
         f = lambda z: 1e-3 * jnp.sum(jnp.sqrt(1 + z**2))  # noqa: E731
         start = np.array([1.0, -0.7])
@@ -306,7 +306,7 @@ class TestConstraints:
         assert found.objective[1] == pytest.approx(2 / 3, rel=5e-3)  # a margin of 1e-3 costs 2e-3 of it
 
     @killed_by("tune/descent.py", "        if worst <= 0:", "        if False:")
-    def test_a_step_that_meets_them_is_returned_where_the_end_does_not(self):
+    def test_a_feasible_iterate_is_returned_for_an_infeasible_end(self):
         """Two iterations and no multipliers raised: from inside, the penalty alone ends outside of the bound."""
         problem = Constrained([1.0, 1.0], lambda z: jnp.array([1 - z[0] - z[1]]))
         few = Method(rounds=0, stopping=Stopping(iterations=20))
@@ -319,7 +319,7 @@ class TestConstraints:
         assert (last.objective, last.violation) == (found.objective[1], 0.0)
         assert last.evaluations == max(point.evaluations for point in found.history)
 
-    def test_a_bound_that_leaves_no_room_for_the_margin_can_still_be_met(self):
+    def test_a_bound_tighter_than_the_margin_can_be_met(self):
         """x <= 0 and -x <= 0: only x = 0, where the descent starts."""
         problem = Constrained([0.0, 2.0], lambda z: jnp.array([z[0], -z[0]]))
         found = AugmentedLagrangianSearch(problem, Method(), None).result()
