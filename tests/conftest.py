@@ -9,7 +9,9 @@ import importlib.metadata
 import os
 import pathlib
 
+from marks import readable_id
 from project import CACHE
+from seams import replace_seam
 
 QUICK = ["--xla_backend_optimization_level=0", "--xla_cpu_parallel_codegen_split_count=1"]
 if importlib.metadata.version("jaxlib").startswith("0.10."):  # later ones end the process that names it
@@ -34,6 +36,13 @@ conformance real_rig sweep blocks export kinks batch riccati margins delay cli_t
 kernel sweep_kill kernel_start explore cli_design linearize kernel_tangents frames sealed adaptive gradients arm_basin
 servo
 """  # the last ones for what is slow in them
+
+
+def pytest_make_parametrize_id(config: pytest.Config, val: object, argname: str) -> str | None:
+    """Ids of texts and of functions without a name; None leaves the others to pytest."""
+    if isinstance(val, str):
+        return readable_id(val)
+    return argname if getattr(val, "__name__", "") == "<lambda>" else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]):
@@ -61,21 +70,16 @@ def _float64():
 @pytest.fixture(scope="module")
 def any_step_is_stable():
     """Loading a scenario without the seconds of the stability check, which has tests of its own."""
-
-    from diffabs.simulate import admissible
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(admissible, "stable_step", lambda loop: np.inf)
+        replace_seam(patch, "stable_step", lambda loop: np.inf)
         yield
 
 
 @pytest.fixture(autouse=True, scope="session")
 def without_load():
     """No lines on stderr that depend on the machine's load: of commands in this process, no wait is long."""
-    from diffabs.cli import console
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(console, "PATIENCE", np.inf)
+        replace_seam(patch, "patience", np.inf)
         yield
 
 

@@ -16,10 +16,12 @@ import numpy as np
 import pytest
 import typer
 from commands import assert_one_error_line, left_in, run, umask
+from marks import readable_id
 from project import ROOT
+from seams import replace_seam
 
 import diffabs
-from diffabs.cli import console, main
+from diffabs.cli import main
 from diffabs.core.pytree import parameters
 from diffabs.objectives import BRAKING
 from diffabs.scenario import model, registry, scenario
@@ -38,13 +40,7 @@ class Figure:
         pathlib.Path(path).write_text(f"{self.text} {pathlib.Path(path).suffix}")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def stable():
-    """Seconds saved in every run (the step has a test of its own), and no lines that depend on the machine's load."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(main.console, "PATIENCE", math.inf)
-        patch.setattr("diffabs.simulate.admissible.stable_step", lambda loop: np.inf)
-        yield
+pytestmark = pytest.mark.usefixtures("any_step_is_stable")  # it has tests of its own
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +55,7 @@ def whole(tmp_path_factory, runs):
     folder = tmp_path_factory.mktemp("whole")
     simulated = main._run
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(main, "_run", lambda *args, **more: runs.append(simulated(*args, **more)) or runs[-1])
+        replace_seam(patch, "main_run", lambda *args, **more: runs.append(simulated(*args, **more)) or runs[-1])
 
         def draw(run, *, title="", unit=""):
             return Figure(f"{title}: {bool(run.stopped)}")
@@ -125,7 +121,7 @@ def test_figure_and_nothing_else_is_left(whole):
 
 
 def test_a_long_trajectory_is_thinned(tmp_path, monkeypatch):
-    monkeypatch.setattr(main, "MAX_CSV_ROWS", 5)
+    replace_seam(monkeypatch, "max_csv_rows", 5)
     (tmp_path / "a.csv").write_text("old")
     os.link(tmp_path / "a.csv", tmp_path / "reader.csv")  # stands for someone who has the old file open
     run("simulate", "slip-lmi", *SHORT, "--csv", tmp_path / "a.csv")
@@ -171,7 +167,7 @@ def test_seed_decides_the_noise():
 @pytest.fixture
 def simulated(whole, runs, monkeypatch):
     """Every simulation gives the run of slip-lmi."""
-    monkeypatch.setattr(main, "_run", lambda chosen, key, keep: runs[0])
+    replace_seam(monkeypatch, "main_run", lambda chosen, key, keep: runs[0])
 
 
 def test_lab_rig_commands_have_no_torque_unit(tmp_path, simulated):
@@ -192,7 +188,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("args", "needed"), BAD, ids=[" ".join(args) for args, _ in BAD])
+@pytest.mark.parametrize(("args", "needed"), BAD, ids=[readable_id(" ".join(args)) for args, _ in BAD])
 def test_bad_scenario_is_one_line_and_leaves_nothing(tmp_path, args, needed):
     result = run("simulate", *args, "--json", "--csv", tmp_path / "a.csv", status=2)
     assert_one_error_line(result)
@@ -201,7 +197,7 @@ def test_bad_scenario_is_one_line_and_leaves_nothing(tmp_path, args, needed):
 
 
 def test_step_that_is_not_stable(monkeypatch):
-    monkeypatch.setattr("diffabs.simulate.admissible.stable_step", stable_step)
+    replace_seam(monkeypatch, "stable_step", stable_step)
     result = run("simulate", "slip-lmi", "--set", "solver.step=0.01", status=2)
     assert_one_error_line(result)
     assert "solver.step = 0.01 s is not stable" in result.stderr
@@ -221,7 +217,7 @@ def test_step_that_is_not_stable(monkeypatch):
 )
 def test_target_that_cannot_be_written(tmp_path, monkeypatch, args, needed):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(console, "load", lambda *_: pytest.fail("looked at the scenario first"))
+    replace_seam(monkeypatch, "console_load", lambda *_: pytest.fail("looked at the scenario first"))
     (tmp_path / "file").write_text("")
     result = run("simulate", "slip-lmi", *args, status=2)
     assert_one_error_line(result)
@@ -295,7 +291,7 @@ def test_a_figure_does_not_claim_what_was_changed(tmp_path, runs, monkeypatch):
         return Figure(title)
 
     monkeypatch.setitem(sys.modules, "diffabs.plot", types.SimpleNamespace(figure_for=lambda plant: draw))
-    monkeypatch.setattr(main, "_run", lambda chosen, key, keep: runs[0])
+    replace_seam(monkeypatch, "main_run", lambda chosen, key, keep: runs[0])
     gain = ("--set", "controller.gain=-4000,-40")
     tables = [run("simulate", "slip-lmi", *more, "--plot", tmp_path / "a.png").stdout for more in ((), gain)]
     named = ("--set", "title=mine")
@@ -348,7 +344,7 @@ USAGE = [
 ]
 
 
-@pytest.mark.parametrize(("args", "needed"), USAGE, ids=[" ".join(args) for args, _ in USAGE])
+@pytest.mark.parametrize(("args", "needed"), USAGE, ids=[readable_id(" ".join(args)) for args, _ in USAGE])
 def test_wrong_usage_is_one_line(args, needed):
     result = run(*args, status=2)
     assert_one_error_line(result)
@@ -358,7 +354,7 @@ def test_wrong_usage_is_one_line(args, needed):
 @pytest.mark.slow
 def test_quiet_says_results_and_warnings_only(monkeypatch):
     noise = ("--set", "sensor=noise", "--set", "solver.seed=3")
-    monkeypatch.setattr(console, "PATIENCE", 0.0)
+    replace_seam(monkeypatch, "patience", 0.0)
     loud, quiet = (run("simulate", "slip-lmi", *SHORT, *noise, *more) for more in ((), ("-q",)))
     assert "checking the scenario" in loud.stderr
     assert {line.partition(":")[0] for line in quiet.stderr.splitlines()} == {"warning"}

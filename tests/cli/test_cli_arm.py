@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from marks import readable_id
 from mutants import killed_by
 
 from diffabs import FixedStep, stops
-from diffabs.cli import console
 from diffabs.objectives import BALANCE
 from diffabs.scenario import section_sweep
 from diffabs.scenario.scenario import load
@@ -23,13 +23,7 @@ METRICS = {"settling_time", "peak_lean", "peak_arm_angle", "peak_voltage", "peak
 SHORT = ("--set", "solver.duration=0.02")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quiet():
-    """No lines that depend on the machine's load, and no seconds for whether the step is stable."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr("diffabs.simulate.admissible.stable_step", lambda loop: np.inf)
-        yield
+pytestmark = pytest.mark.usefixtures("any_step_is_stable")  # it has tests of its own
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +93,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("change", "needed"), BAD, ids=[change for change, _ in BAD])
+@pytest.mark.parametrize(("change", "needed"), BAD, ids=[readable_id(change) for change, _ in BAD])
 def test_what_does_not_fit_is_one_line(tmp_path, change, needed):
     result = run("simulate", "arm-hanging", "--set", change, "--json", "--csv", tmp_path / "a.csv", status=2)
     assert_one_error_line(result)

@@ -1,7 +1,6 @@
 """`diffabs design` and `diffabs certify`: what scripts read, what is proved, and how they fail."""
 
 import json
-import math
 import pathlib
 import subprocess
 import sys
@@ -10,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from marks import readable_id
 from mutants import killed_by
 from project import ROOT
+from seams import replace_seam
 
-from diffabs.cli import console
 from diffabs.core.pytree import Scalar, param, pytree
-from diffabs.design import Certificate, DesignError, analysis, parameter_box, synthesis
+from diffabs.design import Certificate, DesignError
 from diffabs.design.frozen import analyse_frozen_loops
 from diffabs.design.sdp import solver
 from diffabs.linear.linearization import StateSpace
@@ -68,18 +68,17 @@ CORNERS = [{"plant.mass": m, "speed": v / 3.6} for m in (5.3, 6.2) for v in (5.0
 
 
 @pytest.fixture(autouse=True, scope="module")
-def quiet():
-    """No lines that depend on the machine's load; and nothing is integrated, so no step need be stable."""
+def no_stable_step():
+    """Nothing is integrated, so no step need be stable."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr("diffabs.simulate.admissible.stable_step", lambda loop: pytest.fail("asked for a stable step"))
+        replace_seam(patch, "stable_step", lambda loop: pytest.fail("asked for a stable step"))
         yield
 
 
 @pytest.fixture
 def no_polytope(monkeypatch):
     """What is wrong must be said before anything dear is computed."""
-    monkeypatch.setattr(parameter_box, "polytope", lambda *_: pytest.fail("computed a polytope first"))
+    replace_seam(monkeypatch, "polytope", lambda *_: pytest.fail("computed a polytope first"))
 
 
 def checked(path: pathlib.Path) -> subprocess.CompletedProcess:
@@ -170,7 +169,7 @@ def infeasible(monkeypatch):
     def none(polytope, spec):
         raise DesignError("no gain passes its checks. CLARABEL: the solver says infeasible")
 
-    monkeypatch.setattr(synthesis, "design", none)
+    replace_seam(monkeypatch, "design", none)
 
 
 @killed_by(
@@ -311,7 +310,7 @@ def test_specifications_that_are_proved():
 
 @killed_by("cli/certificates.py", '[] if stable else [f"quad', '[] if stable is not False else [f"quad')
 def test_undecided_is_not_proved(tmp_path, monkeypatch):
-    monkeypatch.setattr(analysis, "certify", lambda gain, polytope, *_, **__: Certificate(polytope, gain, ()))
+    replace_seam(monkeypatch, "certify", lambda gain, polytope, *_, **__: Certificate(polytope, gain, ()))
     result = run("certify", "slip-lmi", "--json", "--out", tmp_path / "c.json", status=1)
     document = json.loads(result.stdout)
     assert document["quadratically_stable"] is None
@@ -366,7 +365,7 @@ BAD = [
 
 
 @killed_by("cli/certificates.py", "    if len(values) != len(states):", "    if False:")
-@pytest.mark.parametrize(("args", "needed"), BAD, ids=[" ".join(args) for args, _ in BAD])
+@pytest.mark.parametrize(("args", "needed"), BAD, ids=[readable_id(" ".join(args)) for args, _ in BAD])
 def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, no_polytope, args, needed):
     monkeypatch.chdir(tmp_path)
     out = () if "--out" in args else ("--out", "c.json")
@@ -380,7 +379,7 @@ def test_vertex_without_a_solution_is_bad_input(monkeypatch):
     def none(polytope, spec):
         raise ValueError("vertex 0 has no stabilising Riccati solution")
 
-    monkeypatch.setattr(synthesis, "design", none)
+    replace_seam(monkeypatch, "design", none)
     result = run("design", "slip-lmi", status=2)
     assert_one_error_line(result)
     assert "no stabilising Riccati solution" in result.stderr
@@ -390,7 +389,7 @@ def test_failure_of_the_linear_algebra_is_not_bad_input(monkeypatch):
     def none(*_, **__):
         raise np.linalg.LinAlgError("SVD did not converge")
 
-    monkeypatch.setattr(analysis, "certify", none)
+    replace_seam(monkeypatch, "certify", none)
     assert_one_error_line(run("certify", "slip-lmi", status=1))
 
 

@@ -1,24 +1,23 @@
 """`diffabs identify`: measured runs as files, what is found in them, and how it fails."""
 
 import json
-import math
 import sys
 
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from marks import readable_id
 from mutants import killed_by
+from seams import replace_seam
 from sweeping import rig
 
 import diffabs.identify.identification as library
-from diffabs.cli import console
 from diffabs.cli import identify as commands_identify
 from diffabs.core.protocols import BrakeOutput
 from diffabs.identify.fit import Identified
 from diffabs.identify.uncertainty import uncertainty
 from diffabs.scenario.measurements import read_measurements
 from diffabs.scenario.scenario import ScenarioError, load
-from diffabs.simulate import admissible
 from diffabs.simulate.solution import FixedStep
 from diffabs.tune import Reason
 
@@ -49,13 +48,7 @@ duration = 0.5
 """
 
 
-@pytest.fixture(autouse=True, scope="module")
-def quick():
-    """No lines that depend on the machine's load, and no seconds for what has tests of its own."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr(admissible, "stable_step", lambda loop: np.inf)
-        yield
+pytestmark = pytest.mark.usefixtures("any_step_is_stable")  # it has tests of its own
 
 
 @pytest.fixture
@@ -113,7 +106,7 @@ BAD_FILES = [
 
 
 @killed_by("scenario/measurements.py", "np.flatnonzero(np.diff(t) <= 0)", "np.flatnonzero(np.diff(t) < -1e9)")
-@pytest.mark.parametrize(("lines", "needed"), BAD_FILES, ids=[needed[:40] for _, needed in BAD_FILES])
+@pytest.mark.parametrize(("lines", "needed"), BAD_FILES, ids=[readable_id(needed) for _, needed in BAD_FILES])
 def test_a_bad_file_is_one_line(csv, lines, needed):
     path = csv(*lines) if lines else csv("")
     path.write_text(path.read_text() if lines else "")
@@ -155,7 +148,7 @@ def invented(monkeypatch):
         one = np.ones(n)
         return Identified(part, found, residuals, one, 5.0, 5.0, known, [9.0, 5.0], 4, Reason.CHANGE, {})
 
-    monkeypatch.setattr(library, "identify", identify)
+    replace_seam(monkeypatch, "identify", identify)
     return asked
 
 
@@ -279,7 +272,7 @@ def test_interrupted_it_leaves_nothing_half_written(small, csv, tmp_path, monkey
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(library, "identify", interrupted)
+    replace_seam(monkeypatch, "identify", interrupted)
     args = ("--data", csv(HEADER, *ROWS), *FREE, "--out", tmp_path / "out.toml")
     assert run("identify", small, *args, status=130).stderr == "interrupted\n"
     assert left_in(tmp_path) == {"small.toml", "run.csv"}
@@ -305,7 +298,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("args", "needed"), BAD, ids=[" ".join(args) for args, _ in BAD])
+@pytest.mark.parametrize(("args", "needed"), BAD, ids=[readable_id(" ".join(args)) for args, _ in BAD])
 def test_bad_input_is_one_line_and_leaves_nothing(small, csv, tmp_path, monkeypatch, args, needed):
     monkeypatch.chdir(tmp_path)
     path = csv(HEADER, *ROWS)

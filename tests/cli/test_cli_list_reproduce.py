@@ -10,8 +10,9 @@ import types
 import pytest
 from commands import assert_one_error_line, left_in, run, umask
 from mutants import killed_by
+from seams import replace_seam
 
-from diffabs.cli import catalogue, console, report
+from diffabs.cli import catalogue
 from diffabs.papers.digest import Digest
 from diffabs.scenario import registry
 
@@ -80,8 +81,10 @@ def papers(monkeypatch):
 
     importlib.import_module("diffabs.report")  # before its papers are replaced
     found = {"slip-lmi": good, "slip-estimator": good}
-    monkeypatch.setattr(
-        report, "write_report_file", lambda sources, target, title="": target.write_text(f"report of {len(sources)}")
+    replace_seam(
+        monkeypatch,
+        "write_report_file",
+        lambda sources, target, title="": target.write_text(f"report of {len(sources)}"),
     )
     monkeypatch.setitem(sys.modules, "diffabs.papers", types.SimpleNamespace(PAPERS=found, compact=compact))
     return found, interrupted
@@ -113,8 +116,8 @@ def test_on_a_terminal_the_spinner_says_which_step(papers, tmp_path, monkeypatch
         shown.append(f"{message} ... {detail()}")
         return result
 
-    monkeypatch.setattr(console, "is_animated", lambda: True)
-    monkeypatch.setattr(console, "run_with_progress", waited)
+    replace_seam(monkeypatch, "is_animated", lambda: True)
+    replace_seam(monkeypatch, "run_with_progress", waited)
     result = run("reproduce", "slip-lmi", "--out", tmp_path)
     assert shown == ["reproducing slip-lmi ... drawing"]
     assert "drawing" not in result.stderr

@@ -11,9 +11,9 @@ from commands import assert_one_error_line, run
 from marks import cases
 from project import ROOT
 from scipy.stats import norm
+from seams import replace_seam
 from sweeping import SCENARIO, described
 
-from diffabs.reliability import failure
 from diffabs.reliability.failure import failure_probability
 from diffabs.scenario.scenario import load
 from diffabs.simulate.batch import Batch, run_batch
@@ -47,9 +47,7 @@ def test_the_document_is_the_librarys_answer(scenario):
 @pytest.mark.parametrize("runs", cases(["invented", "real"], "real"))
 def test_tables_for_a_person(scenario, runs, monkeypatch):
     if runs == "invented":  # 8.5 m/s^2 from each speed to 25 km/h: nothing is compiled
-        monkeypatch.setattr(
-            failure, "_measure_metric", lambda study, metric, at: (at["initial.speed"] ** 2 - 48.2) / 17
-        )
+        replace_seam(monkeypatch, "measure_metric", lambda study, metric, at: (at["initial.speed"] ** 2 - 48.2) / 17)
     text = run("rare", scenario, "stop_distance=2.8", "--samples", 200, "--seed", 5).stdout  # as above: compiled
     assert "stop_distance >= 2.8 m" in text
     assert re.search(rf"probability {NUMBER}, 95 % interval {NUMBER} to {NUMBER}", text)

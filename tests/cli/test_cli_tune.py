@@ -17,17 +17,17 @@ import pytest
 from commands import assert_one_error_line, left_in, run, umask
 from invented import HISTORY
 from invented import tuned as invention
+from marks import readable_id
 from mutants import killed_by
+from seams import replace_seam
 from sweeping import rig, tune_section
 
 import diffabs.tune as library
 from diffabs.cli import certificates, console, progress, tune_document
 from diffabs.cli import tune as commands_tune
-from diffabs.core import interrupt
 from diffabs.core.pytree import parameters, replace
 from diffabs.design.sdp import solver
 from diffabs.scenario.scenario import load
-from diffabs.simulate import admissible
 from diffabs.simulate.run import measure
 from diffabs.tune import DerivativeMode, Reason, StartError, Tuned
 
@@ -61,12 +61,13 @@ def drawn(history, runs, *, title, lane, unit):
     return Figure(f"{title}: {len(history)} points, {', '.join(runs)}, {lane} [{unit}]")
 
 
+pytestmark = pytest.mark.usefixtures("any_step_is_stable")  # it has tests of its own
+
+
 @pytest.fixture(autouse=True, scope="module")
 def quick():
-    """No lines that depend on the machine's load, and no seconds for what has tests of its own."""
+    """No seconds for figures, which have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(console, "PATIENCE", math.inf)
-        patch.setattr(admissible, "stable_step", lambda loop: np.inf)
         patch.setitem(sys.modules, "diffabs.plot.tuning", types.SimpleNamespace(draw_tuning=drawn))
         yield
 
@@ -100,7 +101,7 @@ def unproved(monkeypatch):
     def none(chosen):
         raise ValueError("no proof was asked for")
 
-    monkeypatch.setattr(certificates, "build_proof_task", none)
+    replace_seam(monkeypatch, "build_proof_task", none)
 
 
 @pytest.fixture
@@ -112,7 +113,7 @@ def invented(monkeypatch, unproved):
         asked.update(what, loop=loop)
         return invention(loop, **what)
 
-    monkeypatch.setattr(library, "tune", tune)
+    replace_seam(monkeypatch, "tune_tune", tune)
     return asked
 
 
@@ -133,10 +134,8 @@ def tuned(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tuned")
     (folder / "small.toml").write_text(SMALL)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(certificates, "build_proof_task", lambda chosen: pytest.fail("asked for a proof too early"))
-        patch.setattr(
-            commands_tune, "certify_result", lambda after: commands_tune.Proved({"decay_rate": None}, "no proof")
-        )
+        replace_seam(patch, "build_proof_task", lambda chosen: pytest.fail("asked for a proof too early"))
+        replace_seam(patch, "certify_result", lambda after: commands_tune.Proved({"decay_rate": None}, "no proof"))
         out = ("--out", folder / "out.toml", "--plot", folder / "a.png")
         result = run("tune", folder / "small.toml", "--json", *out)
     return folder, json.loads(result.stdout), result.stderr
@@ -251,9 +250,9 @@ def test_how_far_it_is():
 
 
 def test_progress_is_told_again_when_it_changes(monkeypatch, capsys):
-    monkeypatch.setattr(console, "PATIENCE", 0.0)
-    monkeypatch.setattr(console, "SECOND_INTERRUPT_S", 0.0)
-    monkeypatch.setattr(progress, "QUIET", math.inf)  # no seconds, which depend on the machine's load
+    replace_seam(monkeypatch, "patience", 0.0)
+    replace_seam(monkeypatch, "second_interrupt_s", 0.0)
+    replace_seam(monkeypatch, "progress_quiet", math.inf)  # no seconds, which depend on the machine's load
     steps = iter(["one", "one", "two", "two"])
     told = threading.Event()
 
@@ -270,7 +269,7 @@ def test_progress_is_told_again_when_it_changes(monkeypatch, capsys):
 def test_without_the_design_extra_there_is_no_certificate(small, invented, monkeypatch):
     monkeypatch.undo()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(library, "tune", lambda loop, **what: fake(loop, what))
+        replace_seam(patch, "tune_tune", lambda loop, **what: fake(loop, what))
         patch.setitem(sys.modules, "cvxpy", None)
         solver.solvers.cache_clear()
         result = run("tune", small, "--json")
@@ -300,7 +299,7 @@ def fake(loop, what):
 
 
 def test_a_loop_that_is_not_linear_has_no_certificate(small, monkeypatch):
-    monkeypatch.setattr(library, "tune", lambda loop, **what: fake(loop, what))
+    replace_seam(monkeypatch, "tune_tune", lambda loop, **what: fake(loop, what))
     changes = ("controller=relay", "tune.free.reference.slip=0.1,0.3")
     result = run("tune", small, *(word for change in changes for word in ("--set", change)))
     assert result.stderr == ("no certificate: controller relay is not linear: it cannot be brought to state feedback\n")
@@ -404,7 +403,7 @@ def test_no_start_that_can_be_used_could_not_be_done(small, monkeypatch):
     def none(*_, **__):
         raise StartError(f"{Reason.START.value}: 2 of 2 lanes diverge there")
 
-    monkeypatch.setattr(library, "tune", none)
+    replace_seam(monkeypatch, "tune_tune", none)
     result = run("tune", small, "--json", status=1)
     assert_one_error_line(result)
     assert "small: no start can be used: the start diverged" in result.stderr
@@ -414,7 +413,7 @@ def test_what_does_not_fit_is_bad_input(small, monkeypatch):
     def none(*_, **__):
         raise ValueError("something\ndoes not fit")
 
-    monkeypatch.setattr(library, "tune", none)
+    replace_seam(monkeypatch, "tune_tune", none)
     assert_one_error_line(run("tune", small, status=2))
 
 
@@ -422,7 +421,7 @@ def test_interrupted_it_leaves_nothing_half_written(small, tmp_path, monkeypatch
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(library, "tune", interrupted)
+    replace_seam(monkeypatch, "tune_tune", interrupted)
     result = run("tune", small, "--out", tmp_path / "out.toml", "--plot", tmp_path / "a.png", status=130)
     assert result.stderr == "interrupted\n"
     assert left_in(tmp_path) == {"small.toml"}
@@ -442,8 +441,8 @@ def endless(invented, monkeypatch):
         return dataclasses.replace(found(loop, **what), reason=Reason.INTERRUPTED)
 
     found = library.tune
-    monkeypatch.setattr(library, "tune", tune)
-    monkeypatch.setattr(interrupt, "take_interrupt", lambda: bool(told) and bool(told.pop()))
+    replace_seam(monkeypatch, "tune_tune", tune)
+    replace_seam(monkeypatch, "take_interrupt", lambda: bool(told) and bool(told.pop()))
 
 
 def test_interrupted_it_shows_and_writes_the_best_so_far(small, endless, tmp_path):
@@ -474,7 +473,7 @@ def test_interrupted_while_it_certifies_it_shows_what_was_found(small, invented,
     def interrupted(_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands_tune, "certify_result", interrupted)
+    replace_seam(monkeypatch, "certify_result", interrupted)
     document = json.loads(run("tune", small, "--json", "--out", tmp_path / "out.toml", status=130).stdout)
     assert (document["interrupted"], document["met"]) == (True, True)
     assert document["certificate"]["reason"] == "interrupted"
@@ -485,7 +484,7 @@ def test_interrupted_while_it_draws_there_is_no_picture(small, invented, tmp_pat
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands_tune, "_draw", interrupted)
+    replace_seam(monkeypatch, "tune_draw", interrupted)
     files = ("--out", tmp_path / "out.toml", "--plot", tmp_path / "a.png")
     document = json.loads(run("tune", small, "--json", *files, status=130).stdout)
     assert document["files"] == {"out": str(tmp_path / "out.toml")}
@@ -511,11 +510,11 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize("case", BAD, ids=[" ".join(case[0]) for case in BAD])
+@pytest.mark.parametrize("case", BAD, ids=[readable_id(" ".join(case[0])) for case in BAD])
 def test_bad_input_is_one_line_and_leaves_nothing(small, tmp_path, monkeypatch, case):
     args, *needed = case
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(library, "tune", lambda *_, **__: pytest.fail("tuned"))
+    replace_seam(monkeypatch, "tune_tune", lambda *_, **__: pytest.fail("tuned"))
     out = () if "--out" in args else ("--out", "c.toml")
     result = run("tune", small, *args, *out, "--json", status=2)
     assert_one_error_line(result)

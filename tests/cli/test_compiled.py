@@ -7,6 +7,7 @@ import sys
 
 import jax
 import pytest
+from seams import replace_seam
 
 from diffabs.cli import compiled
 
@@ -108,11 +109,11 @@ def test_the_oldest_half_goes_where_there_is_too_much(user, monkeypatch):
         path = folder / f"{i}-cache"
         path.write_bytes(bytes(10))
         os.utime(path, (i, i))
-    monkeypatch.setattr(compiled, "ROOM", 40)
+    replace_seam(monkeypatch, "compiled_room", 40)
     jax.config.update("jax_compilation_cache_dir", None)
     assert compiled.use_compilation_cache() == folder
     assert len(list(folder.iterdir())) == 4
-    monkeypatch.setattr(compiled, "ROOM", 39)
+    replace_seam(monkeypatch, "compiled_room", 39)
     jax.config.update("jax_compilation_cache_dir", None)
     assert compiled.use_compilation_cache() == folder
     assert {path.name for path in folder.iterdir()} == {"2-cache", "3-cache"}

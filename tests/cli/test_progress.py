@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 from mutants import killed_by
+from seams import replace_seam
 
 from diffabs.cli import console, progress
 from diffabs.cli.progress import WorkProgress, WorkTiming
@@ -19,7 +20,7 @@ def clock(monkeypatch):
     """A time that tests set, and a stopwatch with nothing on it."""
     now = [100.0]
     watch = stopwatch.Stopwatch()
-    monkeypatch.setattr(stopwatch, "_compiling", watch)
+    replace_seam(monkeypatch, "compiling", watch)
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     return now, watch
 
@@ -90,8 +91,8 @@ def test_a_time_in_words(seconds, words):
 @killed_by("cli/progress.py", "if told != (told := words):", "if True:")
 def test_every_wait_says_how_long_it_takes(monkeypatch, capsys):
     """Where nothing can be drawn over, in lines; those that only differ in time are not told again."""
-    monkeypatch.setattr(console, "PATIENCE", 1.0)
-    monkeypatch.setattr(console, "SECOND_INTERRUPT_S", 0.1)
+    replace_seam(monkeypatch, "patience", 1.0)
+    replace_seam(monkeypatch, "second_interrupt_s", 0.1)
     begun, later = time.monotonic(), threading.Event()
     asked = []
 

@@ -14,6 +14,7 @@ import types
 import pytest
 from rich.console import Console
 from rich.table import Table
+from seams import replace_seam
 from sweeping import SCENARIO, chunks, environment, tune_section
 from terminal import COLUMNS, SPINNER, Terminal, assert_fits, assert_orderly, words
 
@@ -284,7 +285,7 @@ def test_a_table_that_fits_is_as_it_was():
 
 
 def test_lines_fold_between_words_and_commands_stay_whole(monkeypatch, capsys):
-    monkeypatch.setattr(console, "_terminal_width", lambda: 40)
+    replace_seam(monkeypatch, "terminal_width", lambda: 40)
     line = "error: a line that is far too long for such a narrow terminal, controller.controller.gain"
     console.say(line)
     told = capsys.readouterr().err

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from marks import readable_id
 from mutants import killed_by
 from project import ROOT
 
@@ -66,7 +67,7 @@ def test_a_table_becomes_a_dataclass():
         ({"volume": 1, "marks": {"a\nb": 1}}, r'cup.marks."a\nb" = 1 is a number; text is needed'),
         ({"volume": 1, "marks": []}, "cup.marks = [] is a list; a table of texts is needed"),
     ],
-    ids=str,
+    ids=readable_id,
 )
 def test_what_is_wrong_is_one_line(given, line):
     with pytest.raises(ScenarioError) as caught:

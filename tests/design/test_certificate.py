@@ -15,6 +15,7 @@ import checker
 import numpy as np
 import pytest
 from project import ROOT
+from seams import replace_seam
 
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof import exact
@@ -580,7 +581,7 @@ def test_a_proof_holds_for_vertices_that_are_off(monkeypatch):
             return array * (1 + 0.999 * 2.0**-40 * rng.choice([-1, 1], array.shape))
 
         with monkeypatch.context() as patch:
-            patch.setattr(exact, "as_uncertain_dyadic", exact.as_dyadic)
+            replace_seam(patch, "as_uncertain_dyadic", exact.as_dyadic)
             for _ in range(50):
                 moved = Polytope(off(system.A), off(system.B), system.period)
                 other = {"Bw": off(data["Bw"])} if "Bw" in data else {}

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, QhullError
+from seams import replace_seam
 
 from diffabs.actuators import Lag
 from diffabs.core.pytree import param, pytree, replace
-from diffabs.design import parameter_box as boxes
 from diffabs.design.parameter_box import polytope, schedule
 from diffabs.linear.linearization import StateSpace
 from diffabs.linear.slip_model import Sampling, SlipModel
@@ -293,7 +293,7 @@ def test_matrices_that_are_not_finite():
 
 
 def test_box_of_too_many_vertices(monkeypatch):
-    monkeypatch.setattr(boxes, "MAX_VERTICES", 2)
+    replace_seam(monkeypatch, "max_vertices", 2)
     with pytest.raises(ValueError, match="the box needs 4 vertices, more than 2: vary fewer parameters, or by less"):
         polytope(made(lambda p, q: scalars(p, p**2)), {"p": (-1.0, 1.0)})
 

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from mutants import killed_by
+from seams import replace_seam
 
-from diffabs.design import Polytope, Spec, analysis, certify, design
+from diffabs.design import Polytope, Spec, certify, design
 from diffabs.design.interior.decay_rate import certified_decay
 from diffabs.design.interior.differentiable import robust_design, robust_gain
 from diffabs.design.sdp import solver
@@ -239,8 +240,8 @@ def test_decay_is_what_can_be_proved(gain, system):
 )
 @both_times
 def test_the_decay_derivative_is_a_difference_of_certificates(system, monkeypatch):
-    monkeypatch.setattr(analysis, "DECAY_TOLERANCE", 1e-8)
-    monkeypatch.setattr(analysis, "MAX_SEARCH_PROGRAMS", 60)
+    replace_seam(monkeypatch, "decay_tolerance", 1e-8)
+    replace_seam(monkeypatch, "max_search_programs", 60)
     gain, h = np.array([-999.7, -111.07]), 0.03
     slope = decay(gain, system.A, system.B, system.period)[1]
     for j in range(2):

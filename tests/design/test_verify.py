@@ -14,10 +14,11 @@ import checker
 import numpy as np
 import pytest
 from commands import assert_one_error_line, run
+from marks import readable_id
 from mutants import killed_by
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
 
-from diffabs.cli import console, design
+from diffabs.cli import design
 from diffabs.design import verify
 from diffabs.design.polytopes import Polytope, Schedule
 from diffabs.design.proof.certificate import Certificate, Claim
@@ -26,11 +27,6 @@ C = np.array([[-1.0, 2.0], [-2.0, -1.0]])  # poles -1 +- 2j, damping 1/sqrt(5) =
 STEP = np.array([[0.5, 0.2], [-0.2, 0.5]])  # radius sqrt(0.29) = 0.5385
 K = np.zeros((1, 2))
 B = np.array([[0.0], [1.0]])
-
-
-@pytest.fixture(autouse=True)
-def quiet(monkeypatch):
-    monkeypatch.setattr(console, "PATIENCE", np.inf)
 
 
 def certificate(kind, a=C, period=None, gain=K, **data):
@@ -163,7 +159,7 @@ FALSE = [
 @killed_by(
     "design/verify.py", '("[0, inf)", lambda x: x >= 0),\n    "factor"', '("[0, inf)", lambda x: True),\n    "factor"'
 )
-@pytest.mark.parametrize(("content", "status", "needed"), FALSE, ids=[needed for *_, needed in FALSE])
+@pytest.mark.parametrize(("content", "status", "needed"), FALSE, ids=[readable_id(needed) for *_, needed in FALSE])
 def test_nothing_false_and_no_nonsense_is_proved(tmp_path, content, status, needed):
     (tmp_path / "c.json").write_text(json.dumps(content))
     result = run("verify", tmp_path / "c.json", status=status)

@@ -17,6 +17,7 @@ import scipy.linalg
 from commands import assert_one_error_line, run
 from mutants import killed_by
 from project import ROOT
+from seams import replace_seam
 
 from diffabs import FixedStep, Loop, measure, replace, rollout
 from diffabs.controllers import PID, Clamping, Sampled
@@ -45,7 +46,7 @@ def forgotten(monkeypatch):
     """In the folder of the example; what is known of it, and the Python path, are as before afterwards."""
     monkeypatch.chdir(HERE)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(outside, "_named", {})
+    replace_seam(monkeypatch, "outside_named", {})
     yield
     outside.installed_modules.cache_clear()
 

@@ -16,6 +16,7 @@ import pytest
 from commands import run
 from kernels import FOLDER, applied, both, same
 from mutants import killed_by
+from seams import replace_seam
 
 import diffabs as d
 from diffabs import controllers, plants, scenario, sensors
@@ -88,7 +89,7 @@ class TestRuns:
         same(found, expected, rtol=1e-13, atol=1e-15)
 
     def test_do_not_depend_on_their_order_nor_on_threads(self, runs, monkeypatch):
-        monkeypatch.setattr(launch, "thread_count", lambda: 3)
+        replace_seam(monkeypatch, "thread_count", lambda: 3)
         native._run.clear_cache()
         order = np.random.default_rng(1).permutation(LANES)
         values = {path: column[order] for path, column in VALUES.items()}
@@ -97,7 +98,7 @@ class TestRuns:
             np.testing.assert_array_equal(found.metrics[name], value[order])
 
     def test_of_new_numbers_are_the_same_program(self, runs, monkeypatch):
-        monkeypatch.setattr(compilers, "build_library", None)
+        replace_seam(monkeypatch, "build_library", None)
         loop = d.replace(LOOP, {"controller.gain.0": -3900.0, "plant.mass": 6.0})
         found = jax.device_get(self._by_kernel(VALUES, KEYS, loop))
         assert not np.any(found.metrics["iae"] == runs[0].metrics["iae"])
@@ -114,7 +115,7 @@ class TestRuns:
 
     @pytest.mark.slow
     def test_of_lanes_in_two_parts(self, runs, monkeypatch):
-        monkeypatch.setattr(native, "MAX_LANES_PER_LAUNCH", 32)
+        replace_seam(monkeypatch, "max_lanes_per_launch", 32)
         found = jax.device_get(self._by_kernel(VALUES, KEYS))
         for name, value in runs[0].metrics.items():
             np.testing.assert_array_equal(found.metrics[name], value)
@@ -264,9 +265,9 @@ class TestSweep:
         assert not (tmp_path / "out").exists()
 
     @killed_by("cli/sweep.py", 'if engine == "xla":', "if True:", case="kernel-")
-    @killed_by("cli/sweep.py", 'if line and engine == "kernel":', "if line:", case="auto-note: runs are made by XLA: ")
+    @killed_by("cli/sweep.py", 'if line and engine == "kernel":', "if line:", case="auto-note: runs are made by XLA:")
     @pytest.mark.slow
-    @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA: "), ("kernel", "")])
+    @pytest.mark.parametrize(("engine", "line"), [("auto", "note: runs are made by XLA:"), ("kernel", "")])
     def test_by_the_command(self, engine, line, tmp_path, monkeypatch):
         monkeypatch.setenv(compilers.COMPILER, "")
         native._run.clear_cache()
@@ -320,7 +321,7 @@ class TestLibrary:
         compilers.find_compiler()  # has been tried, which is noted
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
         path = compilers.build_library(self.TEXT % 1)
-        monkeypatch.setattr(compilers, "_compile", None)
+        replace_seam(monkeypatch, "compile", None)
         assert compilers.build_library(self.TEXT % 1) == path
         assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
@@ -329,9 +330,7 @@ class TestLibrary:
         """Also one whose file is a library, but another one: no damaged file is ever loaded."""
         compilers.find_compiler()
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
-        monkeypatch.setattr(
-            compilers, "_compile", lambda words, source, result, s: result.write_bytes(source.read_bytes())
-        )
+        replace_seam(monkeypatch, "compile", lambda words, source, result, s: result.write_bytes(source.read_bytes()))
         path, other = compilers.build_library("one library"), compilers.build_library("another")
         whole = path.read_bytes()
         damaged = {
@@ -363,7 +362,7 @@ class TestLibrary:
         path.write_text("#!/bin/sh\nsleep 60 &\nwait\n")
         path.chmod(0o755)
         monkeypatch.setenv(compilers.COMPILER, str(path))
-        monkeypatch.setattr(compilers, "PROBE_TIMEOUT_S", 0.2)
+        replace_seam(monkeypatch, "probe_timeout_s", 0.2)
         begun = time.monotonic()
         with pytest.raises(compilers.NoCompiler, match=rf"{path} did not end within 0\.2 s and was stopped"):
             compilers.find_compiler()
@@ -372,15 +371,15 @@ class TestLibrary:
     def test_that_was_not_used_for_longest_goes(self, tmp_path, monkeypatch):
         compilers.find_compiler()
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
-        monkeypatch.setattr(compilers, "_compile", lambda words, source, result, s: result.write_bytes(bytes(10)))
+        replace_seam(monkeypatch, "compile", lambda words, source, result, s: result.write_bytes(bytes(10)))
         first, second, third = (compilers.build_library(text) for text in ("first", "second", "third"))
         for i, path in enumerate((first, second, third)):
             os.utime(path, (i, i))
         compilers.build_library("first")  # is used again
-        monkeypatch.setattr(binaries, "MAX_CACHE_BYTES", 30)
+        replace_seam(monkeypatch, "max_cache_bytes", 30)
         fourth = compilers.build_library("fourth")
         assert set(tmp_path.glob("*.so")) == {first, second, third, fourth}
-        monkeypatch.setattr(binaries, "MAX_CACHE_BYTES", 39)
+        replace_seam(monkeypatch, "max_cache_bytes", 39)
         fifth = compilers.build_library("fifth")
         assert set(tmp_path.glob("*.so")) == {first, fourth, fifth}
 
@@ -389,9 +388,9 @@ class TestLibrary:
     def test_is_another_for_other_flags_and_processors(self, changed, tmp_path, monkeypatch):
         compilers.find_compiler()
         monkeypatch.setenv(binaries.CACHE, str(tmp_path))
-        monkeypatch.setattr(compilers, "_compile", lambda words, source, result, s: result.write_bytes(b""))
+        replace_seam(monkeypatch, "compile", lambda words, source, result, s: result.write_bytes(b""))
         path, made = compilers.build_library("one"), compilers.find_compiler()
-        monkeypatch.setattr(compilers, "find_compiler", lambda: made)
+        replace_seam(monkeypatch, "find_compiler", lambda: made)
         monkeypatch.setattr(compilers, changed, ("-O1",) if changed == "CPP_FLAGS" else lambda: "another")
         assert compilers.build_library("one") != path
 

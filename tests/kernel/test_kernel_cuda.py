@@ -18,6 +18,7 @@ from cuda_on_processor import Processor
 from kernels import FOLDER, applied, both, same
 from mutants import killed_by
 from project import ROOT
+from seams import replace_seam
 from test_kernel import AT_ONCE, DIVERGING, KEYS, LOOP, MEASURED, NEVER, SOLVER, VALUES
 
 import diffabs as d
@@ -43,7 +44,7 @@ def _own_folder(monkeypatch):
 @pytest.fixture
 def processor(monkeypatch):
     found = Processor()
-    monkeypatch.setattr(gpu, "find_gpu", lambda: found)
+    replace_seam(monkeypatch, "find_gpu", lambda: found)
     return found
 
 
@@ -169,14 +170,14 @@ def test_machine_code_is_made_once(tmp_path, monkeypatch):
     """For the same text, flags and architecture."""
     made = []
     monkeypatch.setenv(binaries.CACHE, str(tmp_path))
-    monkeypatch.setattr(nvrtc, "nvrtc_version", lambda: (13, 5))
-    monkeypatch.setattr(nvrtc, "_compile_cubin", lambda *args: (made.append(args), (b"code", "what was said"))[1])
+    replace_seam(monkeypatch, "nvrtc_version", lambda: (13, 5))
+    replace_seam(monkeypatch, "compile_cubin", lambda *args: (made.append(args), (b"code", "what was said"))[1])
     path = nvrtc.build_cubin("text", "sm_90")
     assert nvrtc.build_cubin("text", "sm_90") == path
     assert (len(made), path.read_bytes(), path.with_suffix(".log").read_text()) == (1, b"code", "what was said")
     assert sorted(p.suffix for p in tmp_path.iterdir()) == [".cubin", ".log"]
     others = {nvrtc.build_cubin("text", "sm_80"), nvrtc.build_cubin("other", "sm_90")}
-    monkeypatch.setattr(nvrtc, "NVRTC_FLAGS", (*nvrtc.NVRTC_FLAGS, "-w"))
+    replace_seam(monkeypatch, "nvrtc_flags", (*nvrtc.NVRTC_FLAGS, "-w"))
     assert len({path, *others, nvrtc.build_cubin("text", "sm_90")}) == 4
 
 
@@ -237,7 +238,7 @@ class Driver:
 
 class TestDriver:
     def start(self, driver, count, monkeypatch, tmp_path):
-        monkeypatch.setattr(gpu, "_load_driver", lambda: driver)
+        replace_seam(monkeypatch, "load_driver", lambda: driver)
         code = tmp_path / "one.cubin"
         code.write_bytes(b"")
         arrays = gpu._pack_addresses([1, 2, 3, 4, 5, 6], [1, 1, 2, 2])

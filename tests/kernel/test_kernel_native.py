@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from kernels import FOLDER, applied
 from mutants import killed_by
+from seams import replace_seam
 
-from diffabs.kernel import binaries, compilers, launch
+from diffabs.kernel import binaries, compilers
 
 pytestmark = pytest.mark.xdist_group("kernel")
 
@@ -23,7 +24,7 @@ PLAIN = [False, pytest.param(True, marks=pytest.mark.slow)]
 def _own_folder(monkeypatch):
     """And blocks of one vector, which are compiled in a fourth of the time."""
     monkeypatch.setenv(binaries.CACHE, FOLDER)
-    monkeypatch.setattr(launch, "VECTORS_PER_BLOCK", 1)
+    replace_seam(monkeypatch, "vectors_per_block", 1)
 
 
 def _arguments(dtype):
@@ -54,7 +55,7 @@ def _ulps(found, expected, dtype):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_elementary_functions_are_right_to_one_ulp(dtype, plain, monkeypatch):
     if plain:
-        monkeypatch.setattr(compilers, "CPP_FLAGS", (*compilers.CPP_FLAGS, "-DPLAIN"))
+        replace_seam(monkeypatch, "cpp_flags", (*compilers.CPP_FLAGS, "-DPLAIN"))
     x = _arguments(dtype)
     with jax.enable_x64(dtype is np.float64):
         found = applied({name: getattr(jnp, name) for name in (*REAL, *EXACT)}, jnp.asarray(x))
@@ -73,7 +74,7 @@ def test_elementary_functions_are_right_to_one_ulp(dtype, plain, monkeypatch):
 def test_ends_of_functions(plain, monkeypatch):
     """Infinite, NaN, zeros of either sign, and what flows over."""
     if plain:
-        monkeypatch.setattr(compilers, "CPP_FLAGS", (*compilers.CPP_FLAGS, "-DPLAIN"))
+        replace_seam(monkeypatch, "cpp_flags", (*compilers.CPP_FLAGS, "-DPLAIN"))
     x = np.array([np.inf, -np.inf, np.nan, 0.0, -0.0, 1.0, -1.0, 710.0, -746.0, 1e300, -1e300, 1e6, -3e5])
     found = applied({name: getattr(jnp, name) for name in (*REAL, *EXACT)}, x)
     with np.errstate(all="ignore"):

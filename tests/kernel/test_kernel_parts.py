@@ -7,11 +7,12 @@ import numpy as np
 import parts
 import pytest
 from kernels import FOLDER, both, same
+from seams import replace_seam
 
 import diffabs as d
 from diffabs import scenario
 from diffabs.core.pytree import get
-from diffabs.kernel import binaries, launch
+from diffabs.kernel import binaries
 from diffabs.objectives import default_objectives
 from diffabs.scenario.defaults import balancing, braking
 
@@ -38,7 +39,7 @@ LAST_DIGIT = {
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
     monkeypatch.setenv(binaries.CACHE, FOLDER)
-    monkeypatch.setattr(launch, "VECTORS_PER_BLOCK", 2)
+    replace_seam(monkeypatch, "vectors_per_block", 2)
 
 
 def close(name, kind):

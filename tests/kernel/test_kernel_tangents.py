@@ -18,6 +18,7 @@ from kernels import FOLDER
 from marks import cases
 from mutants import killed_by
 from project import ROOT
+from seams import replace_seam
 from test_kernel_parts import CASES, VARIED, with_part
 
 import diffabs as d
@@ -47,7 +48,7 @@ PARTS_HERE = [case for case in CASES if case[0] != "stop"]
 @pytest.fixture(autouse=True)
 def _own_folder(monkeypatch):
     monkeypatch.setenv(binaries.CACHE, FOLDER)
-    monkeypatch.setattr(launch, "VECTORS_PER_BLOCK", 2)
+    replace_seam(monkeypatch, "vectors_per_block", 2)
 
 
 def chain(gain, rates, engine="kernel", wanted=None):
@@ -130,8 +131,10 @@ class TestLaunch:
         """The fourth number moves with nothing, and what comes from no tangent is no operation."""
         seen = []
         spread = tangents.replicate_tangents
-        monkeypatch.setattr(
-            tangents, "replicate_tangents", lambda f, one, *more: seen.append(one.moved_arrays) or spread(f, one, *more)
+        replace_seam(
+            monkeypatch,
+            "replicate_tangents",
+            lambda f, one, *more: seen.append(one.moved_arrays) or spread(f, one, *more),
         )
         jax.jvp(lambda g: chain(g, RATES), (2.0,), (1.0,))
         assert seen[-1][UpdateLevel.STEP] == (1, 2, 3)
@@ -142,8 +145,10 @@ class TestLaunch:
         """The third number leads to nothing but itself, and has no tangent; the second has those that it has anyway."""
         seen = []
         spread = tangents.replicate_tangents
-        monkeypatch.setattr(
-            tangents, "replicate_tangents", lambda f, one, *more: seen.append(one.moved_arrays) or spread(f, one, *more)
+        replace_seam(
+            monkeypatch,
+            "replicate_tangents",
+            lambda f, one, *more: seen.append(one.moved_arrays) or spread(f, one, *more),
         )
         wanted = (False, False, True, False, False)
         found = jax.jvp(lambda g: chain(g, RATES, wanted=wanted), (2.0,), (1.0,))[1]
@@ -177,7 +182,7 @@ class TestLaunch:
     def test_tangents_are_one_launch(self, many, launches, monkeypatch):
         made = []
         launched = launch._launch_lanes
-        monkeypatch.setattr(launch, "_launch_lanes", lambda *args, **how: made.append(1) or launched(*args, **how))
+        replace_seam(monkeypatch, "launch_lanes", lambda *args, **how: made.append(1) or launched(*args, **how))
         jax.jacfwd(lambda x: chain(jnp.sum(x), RATES))(jnp.ones(many))
         assert len(made) == launches
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from seams import replace_seam
 
 pytest.importorskip("matplotlib")
 
@@ -350,7 +351,7 @@ def test_without_a_solver_the_design_is_left_out(monkeypatch):
     def missing():
         raise ModuleNotFoundError('robust design needs cvxpy: pip install ".[design]" in a clone', name="cvxpy")
 
-    monkeypatch.setattr(lmi_design, "Designed", missing)
+    replace_seam(monkeypatch, "designed", missing)
     rows, figures, more = slip_lmi._designed({}, None)
     assert (rows, figures, more["design"]) == ([], {}, None)
     assert 'pip install ".[design]" in a clone' in more["notes"][0]

@@ -7,6 +7,7 @@ import pytest
 from matplotlib.text import Text
 from mutants import killed_by
 from scipy.stats import beta
+from seams import replace_seam
 from sweeping import manifest
 
 from diffabs.plot import sweeps as plots
@@ -375,6 +376,6 @@ ODD = {
 @pytest.mark.parametrize("kind", list(ODD))
 def test_odd_sweeps_are_drawn_without_a_warning(made, tmp_path, monkeypatch, kind):
     variables, metrics, given, names = ODD[kind]
-    monkeypatch.setattr(plots, "save_figure", lambda figure, path: (figure.draw_without_rendering(), path)[1])
+    replace_seam(monkeypatch, "save_figure", lambda figure, path: (figure.draw_without_rendering(), path)[1])
     sweep = made(variables, metrics, **given)
     assert [path.stem for path in plots.draw_sweep(sweep, summarise_sweep(sweep), tmp_path, {})] == names

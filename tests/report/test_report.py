@@ -13,6 +13,7 @@ from commands import assert_one_error_line, left_in
 from commands import run as command
 from marks import cases
 from reports import Page
+from seams import replace_seam
 from sweeping import SCENARIO, tune_section
 from terminal import Terminal, assert_fits, assert_orderly
 
@@ -21,7 +22,6 @@ pytest.importorskip("matplotlib")
 
 from mutants import killed_by
 
-from diffabs import tune
 from diffabs.cli import report as reporting
 from diffabs.core.pictures import AXES_KEY, with_text, without_text
 from diffabs.report import ReportError, build_report, find_documents
@@ -62,7 +62,7 @@ class Results:
             "rare": [self.scenario, "stop_distance=2.5", "--samples", 100],
         }[kind]  # fmt: skip
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(tune, "tune", invented.tuned)  # what it writes is as of a real one
+            replace_seam(patch, "tune_tune", invented.tuned)  # what it writes is as of a real one
             (self.folder / f"{kind}.json").write_text(command(kind, *words, "--json").stdout)
 
     def all(self):

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 from mutants import killed_by
+from seams import replace_seam
 
 from diffabs import controllers, roads
 from diffabs.objectives import BRAKING
@@ -335,7 +336,7 @@ def test_ranges_by_the_names_of_the_linear_model(file):
 
 
 def test_no_stable_step_is_needed_for_what_is_not_integrated(monkeypatch):
-    monkeypatch.setattr("diffabs.simulate.admissible.stable_step", lambda loop: pytest.fail("asked"))
+    replace_seam(monkeypatch, "stable_step", lambda loop: pytest.fail("asked"))
     load("slip-lmi", integrated=False)
 
 

@@ -1,7 +1,9 @@
 """A scenario that is wrong: one clear line that names field, value, range and unit."""
 
 import pytest
+from marks import readable_id
 from mutants import killed_by
+from seams import replace_seam
 
 from diffabs.scenario.scenario import ScenarioError, load, names
 
@@ -194,7 +196,7 @@ BAD = [
     "        if not (allowed.holds(low) and allowed.holds(high)):",
     "        if False:",
 )
-@pytest.mark.parametrize("case", BAD, ids=lambda case: case[0][:40].encode("unicode_escape").decode())
+@pytest.mark.parametrize("case", BAD, ids=lambda case: readable_id(case[0]))
 def test_a_bad_value_is_refused_in_one_line(file, case):
     override, *needed = case
     line = message(file(""), override)
@@ -269,7 +271,7 @@ def test_nothing_is_evaluated(file):
 def checked_step(monkeypatch):
     from diffabs.simulate.stable_step import stable_step
 
-    monkeypatch.setattr("diffabs.simulate.admissible.stable_step", stable_step)
+    replace_seam(monkeypatch, "stable_step", stable_step)
 
 
 def test_unstable_step(checked_step):

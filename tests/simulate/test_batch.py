@@ -14,6 +14,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from marks import cases
 from mutants import killed_by
 from project import ROOT
+from seams import replace_seam
 
 import diffabs as d
 from diffabs import controllers, plants
@@ -81,7 +82,7 @@ class Slow(NamedTuple):
 @pytest.fixture(params=cases(["refilled", "together"], "together"))
 def driven(request, monkeypatch):
     """`run_batch` by each of its drivers, results as NumPy arrays."""
-    monkeypatch.setattr(packed, "LANES_AT_ONCE", SOME)
+    replace_seam(monkeypatch, "lanes_at_once", SOME)
     together = request.param == "together"
     return lambda *args, **more: jax.device_get(d.run_batch(*args, together=together, **more))
 
@@ -100,7 +101,7 @@ class TestLanes:
     @pytest.mark.parametrize("width", cases(WIDTHS, 4))
     def test_are_those_of_single_runs(self, width, keys, expected, monkeypatch):
         """Of whom enough is never seen: no car is slower than 0."""
-        monkeypatch.setattr(packed, "LANES_AT_ONCE", width)
+        replace_seam(monkeypatch, "lanes_at_once", width)
         never = Slow(jnp.zeros(len(SPEEDS)))
         run = d.run_batch(LOOP, Batch(VALUES, keys), SOLVER, MEASURED, accepted=True, enough=never)
         same(jax.device_get(run), expected)
@@ -178,7 +179,7 @@ class TestLanes:
         same(jax.device_get(d.run_batch(LOOP, lanes, SOLVER, MEASURED, together=True, accepted=True)), expected)
 
     def test_are_compiled_once(self, keys, monkeypatch):
-        monkeypatch.setattr(packed, "LANES_AT_ONCE", SOME)
+        replace_seam(monkeypatch, "lanes_at_once", SOME)
         lanes = Batch(VALUES, keys)
         d.run_batch(LOOP, lanes, SOLVER, MEASURED, accepted=True)
         before = packed._run._cache_size()
@@ -195,7 +196,7 @@ class TestLanes:
 @pytest.mark.parametrize("width", cases(WIDTHS, 4))
 def test_a_lane_of_which_enough_is_seen_is_taken_off(keys, expected, width, monkeypatch):
     """At the next look; it has not stopped, and the others are what they were."""
-    monkeypatch.setattr(packed, "LANES_AT_ONCE", width)
+    replace_seam(monkeypatch, "lanes_at_once", width)
     limits = np.zeros(len(SPEEDS))
     limits[NEVER], limits[8], limits[SHORT] = 24.5, 7.5, 6.9
     slow = Slow(jnp.asarray(limits))

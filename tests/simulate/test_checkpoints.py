@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from mutants import killed_by
+from seams import replace_seam
 
 import diffabs as d
 from diffabs import controllers, plants
 from diffabs.core.pytree import get
 from diffabs.objectives import IAE, StopDistance
 from diffabs.scenario.defaults import braking
-from diffabs.simulate import checkpoint
 from diffabs.simulate.checkpoint import MAX_SAVED_CARRIES, SCAN_GROUP_STEPS, nested_scan_lengths, repeat_step
 from diffabs.simulate.drivers import round_up_capacity
 from diffabs.stops import SpeedReached
@@ -103,7 +103,7 @@ def test_groups_after_the_end_have_no_derivative():
 )
 @pytest.mark.slow
 def test_reverse_forward_and_differences_agree_in_nested_scans(monkeypatch):
-    monkeypatch.setattr(checkpoint, "MAX_SAVED_CARRIES", 16)
+    replace_seam(monkeypatch, "max_saved_carries", 16)
     jax.clear_caches()
     assert nested_scan_lengths(104) == (15, 7)
     mean, zero = objective(100, lanes=2, step=2e-3), jnp.zeros(len(PATHS))

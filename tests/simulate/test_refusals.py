@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from mutants import killed_by
+from seams import replace_seam
 from sweeping import described
 
 import diffabs as d
@@ -95,10 +96,10 @@ BAD = {  # a loop, values by lane of which the first is fine, and what is said o
 @pytest.fixture
 def any_step(monkeypatch):
     """Without the seconds that the stability takes to compile."""
-    monkeypatch.setattr(
-        admissible, "is_step_stable", lambda loop, values, step: np.ones(len(jax.tree.leaves(values)[0]), bool)
+    replace_seam(
+        monkeypatch, "is_step_stable", lambda loop, values, step: np.ones(len(jax.tree.leaves(values)[0]), bool)
     )
-    monkeypatch.setattr(admissible, "stable_step", lambda loop: np.inf)
+    replace_seam(monkeypatch, "stable_step", lambda loop: np.inf)
 
 
 class TestBeforeARun:
@@ -190,7 +191,7 @@ class TestBeforeARun:
             return np.asarray(jax.jit(lambda values: bound(RIG, values, squarings=0))(values))
 
         few = bounds()
-        monkeypatch.setattr(stable_step, "MIN_ENTRYWISE_MATRICES", 0)
+        replace_seam(monkeypatch, "min_entrywise_matrices", 0)
         many = bounds()
         np.testing.assert_allclose(many, few, rtol=1e-6)
         loops = jax.vmap(lambda v: replace(canonical_dtypes(RIG), v))(

@@ -20,6 +20,7 @@ import pytest
 from commands import assert_one_error_line, left_in, run
 from distributed import Client, LocalCluster
 from mutants import killed_by
+from seams import replace_seam
 from sweeping import PATIENCE, SCENARIO, chunks, command, described, environment, free_port, started, until
 
 from diffabs.sweep import SweepError, cluster, sweep
@@ -207,7 +208,7 @@ def test_a_scheduler_and_two_workers_in_processes_of_their_own(scenario, alone, 
 
 @pytest.mark.slow
 def test_a_scheduler_that_dies_ends_it_with_one_line(scenario, alone, tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "TIMEOUT_SECONDS", 60.0)
+    replace_seam(monkeypatch, "timeout_seconds", 60.0)
     out = tmp_path / "out"
     with Processes(tmp_path) as processes:
         processes.worker()
@@ -318,7 +319,7 @@ def test_a_worker_that_is_killed_while_it_starts_is_one_line(scenario, tmp_path)
 
 @pytest.fixture
 def impatient(monkeypatch):
-    monkeypatch.setattr(cluster, "TIMEOUT_SECONDS", 1.0)
+    replace_seam(monkeypatch, "timeout_seconds", 1.0)
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,12 @@ import tomllib
 import jax
 import numpy as np
 import pytest
+from marks import readable_id
 from mutants import killed_by
 from scipy import stats
 from scipy.special import ndtri
 from scipy.stats import qmc
+from seams import replace_seam
 
 from diffabs.core.pytree import Spec
 from diffabs.core.values import as_plain
@@ -171,7 +173,7 @@ def test_a_sample_is_drawn_again():
     assert Empirical(SAMPLE).value([0.0, 1.0]).tolist() == [-1.0, 7.5]
 
 
-@pytest.mark.parametrize("design", [Random(), Sobol(), LatinHypercube()], ids=str)
+@pytest.mark.parametrize("design", [Random(), Sobol(), LatinHypercube()], ids=readable_id)
 def test_draws_are_distributed_as_scipy_says(design):
     """Kolmogorov-Smirnov at 1 in 1000, mean and deviation within 4.5 standard errors; the seed is fixed."""
     n = 2**14
@@ -229,7 +231,7 @@ def test_random_samples_are_keys_folded_with_their_number():
 @pytest.mark.parametrize("word", [0, 2**32 - 1])
 def test_random_numbers_stay_inside_the_open_interval(monkeypatch, word):
     """The extreme words, which nobody lives to see drawn."""
-    monkeypatch.setattr(sampling, "_random_words", lambda *_: np.full((1, 2, 2), word, np.uint32))
+    replace_seam(monkeypatch, "random_words", lambda *_: np.full((1, 2, 2), word, np.uint32))
     u = Random().unit(0, 0, 1, 2, 1)
     assert ((u > 0) & (u < 1)).all()
     np.testing.assert_array_equal(np.minimum(u, 1 - u), 2.0**-53)
@@ -421,7 +423,7 @@ TABLES = [
 ]
 
 
-@pytest.mark.parametrize("ours", TABLES, ids=str)
+@pytest.mark.parametrize("ours", TABLES, ids=readable_id)
 def test_tables_of_distributions_are_read_back(ours):
     table = as_plain(ours, brief=True)
     assert distributions.read_distribution(json.loads(json.dumps(table)), "x") == ours
@@ -431,7 +433,7 @@ def test_tables_of_distributions_are_read_back(ours):
 @pytest.mark.parametrize(
     "ours",
     [Random(), Sobol(), Sobol(8), LatinHypercube(), Grid(3), Grid({"a": 3, "b": (0.1, 1.0)}), Corners(), Saltelli()],
-    ids=str,
+    ids=readable_id,
 )
 def test_tables_of_designs_are_read_back(ours):
     table = as_plain(ours, brief=True)
@@ -475,7 +477,7 @@ def test_the_table_of_a_space_is_read_back():
         (Rows({"x": [1.0, 2.0]}, [0.0, 0.0]), ["m: weights have sum 0"]),
         (Rows({"x": [1.0, 2.0]}, [-1.0, 2.0]), ["m: weights = [-1.0, 2.0] are not all in [0, inf)"]),
     ],
-    ids=str,
+    ids=readable_id,
 )
 def test_what_is_wrong_with_a_variable_is_said(ours, lines):
     assert list(ours.problems("m")) == lines
@@ -505,7 +507,7 @@ def test_what_is_wrong_with_a_variable_is_said(ours, lines):
         ({"type": "categorical", "choices": [True]}, "x.choices.0 = true is a boolean; a number"),
         ({"type": "empirical", "values": [1.0], "interpolated": 1}, "x.interpolated = 1 is a number; true or false"),
     ],
-    ids=str,
+    ids=readable_id,
 )
 def test_what_is_wrong_with_a_table_is_said(given, line):
     with pytest.raises(ValueError, match="x") as caught:
@@ -528,7 +530,7 @@ def test_what_is_wrong_with_a_table_is_said(given, line):
         ({"type": "grid", "levels": {"a": 1.5}}, "x.levels.a = 1.5 is a number; a whole number in [2, 4294967295]"),
         ({"type": "grid", "levels": {"a": [0.5, 1.5]}}, "x: a = [0.5, 1.5] are not quantile levels in [0, 1]"),
     ],
-    ids=str,
+    ids=readable_id,
 )
 def test_what_is_wrong_with_the_table_of_a_design_is_said(given, line):
     with pytest.raises(ValueError, match="x") as caught:
@@ -588,7 +590,7 @@ def test_levels_of_other_variables_are_refused():
         (Corners(), 5, "samples = 5 is not 4, the number of points of the corners"),
         (Saltelli(), 2, "samples = 2 is not a multiple of 4, the number of variables plus 2; 4 would be"),
     ],
-    ids=str,
+    ids=readable_id,
 )
 def test_a_design_that_cannot_have_so_many_samples_says_so(design, samples, line):
     with pytest.raises(ValueError, match="samples") as caught:
@@ -666,7 +668,7 @@ def test_samples_that_are_not_there_are_refused(start, stop):
         Space(FIVE).draw(0, start, stop, 10)
 
 
-@pytest.mark.parametrize("design", [Random(), Sobol(), LatinHypercube()], ids=str)
+@pytest.mark.parametrize("design", [Random(), Sobol(), LatinHypercube()], ids=readable_id)
 @pytest.mark.parametrize("seed", [-1, 2**32])
 def test_a_seed_has_32_bits(design, seed):
     with pytest.raises(ValueError, match=rf"seed = {seed} is outside \[0, 4294967295\]"):

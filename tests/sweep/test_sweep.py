@@ -14,8 +14,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from commands import assert_one_error_line, left_in, run
-from marks import cases
+from marks import cases, readable_id
 from mutants import killed_by
+from seams import replace_seam
 from sweeping import described, rig
 
 import diffabs as d
@@ -241,7 +242,6 @@ def test_two_devices_change_no_bit(over_roads, file, tmp_path):
 
 
 def test_every_device_is_used(study, monkeypatch):
-    from diffabs.sweep import engines
 
     asked = []
 
@@ -254,7 +254,7 @@ def test_every_device_is_used(study, monkeypatch):
             none = {"diverged": np.zeros(2, bool), "refused": np.full(2, "", object)}
             return [none | {"stopped": np.ones(2, bool), "iae": np.ones(2)} for _ in chunks]
 
-    monkeypatch.setattr(engines, "Runner", Runner)
+    replace_seam(monkeypatch, "runner", Runner)
     few = dataclasses.replace(study, objectives={"iae": study.objectives["iae"]}, failures={})
     found = [one.chunk for one in Local(["a", "b"]).run(few, [0, 3, 4, 6, 7], lambda: False)]
     assert asked == [["a", "b"], [0, 3], [4, 6], [7]]
@@ -379,7 +379,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize("case", BAD, ids=[" ".join(case[0]) for case in BAD])
+@pytest.mark.parametrize("case", BAD, ids=[readable_id(" ".join(case[0])) for case in BAD])
 def test_bad_input_is_one_line_and_leaves_nothing(file, tmp_path, case):
     args, *needed = case
     result = run("sweep", file(SMALL), "--out", tmp_path / "out", *args, status=2)
@@ -452,7 +452,7 @@ def test_a_sample_that_is_not_there(swept, args, needed, monkeypatch):
     if "outside" in needed:
         source = {"scenario": SMALL, "name": "small"}
         there = {**json.loads((swept.folder / "manifest.json").read_text()), "source": source}
-        monkeypatch.setattr("diffabs.sweep.store.read_manifest", lambda folder: there)
+        replace_seam(monkeypatch, "read_manifest", lambda folder: there)
     result = run("simulate", *(arg.format(swept.folder) for arg in args), status=2)
     assert_one_error_line(result)
     assert needed in result.stderr
@@ -488,7 +488,7 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "needed"), WRONG, ids=[needed for _, needed in WRONG])
+@pytest.mark.parametrize(("changes", "needed"), WRONG, ids=[readable_id(needed) for _, needed in WRONG])
 def test_a_study_that_cannot_be(study, tmp_path, changes, needed):
     with pytest.raises(ValueError, match=re.escape(needed)) as error:
         sweep(dataclasses.replace(study, **changes), tmp_path / "out")

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from commands import assert_one_error_line, left_in, run
+from marks import readable_id
 from sweeping import PATIENCE, SCENARIO, chunks, command, environment, manifest, started, until
 
 from diffabs.sweep import Results
@@ -373,7 +374,7 @@ CHANGED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("changes", "needed"), CHANGED, ids=[needed for _, needed in CHANGED])
+@pytest.mark.parametrize(("changes", "needed"), CHANGED, ids=[readable_id(needed) for _, needed in CHANGED])
 def test_another_configuration_is_refused(whole, changes, needed):
     before = contents(whole.folder)
     result = run("sweep", whole.scenario, "--out", whole.folder, "--resume", *changes, status=2)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from mutants import killed_by
 from scipy import stats
+from seams import replace_seam
 
 from diffabs.sweep.statistics import estimates, paired, sensitivity
 from diffabs.sweep.statistics.estimates import Count, Moments, Tail
@@ -172,7 +173,7 @@ class TestCVaR:
         x = np.random.default_rng(6).exponential(size=20_000)
         found = {}
         for atoms in (64, 1024, 10**6):
-            monkeypatch.setattr(estimates, "MAX_TAIL_ATOMS", atoms)
+            replace_seam(monkeypatch, "max_tail_atoms", atoms)
             found[atoms] = estimates.cvar(x, 0.8, replicates=799)
         half = 1.96 * np.std(np.maximum(x - np.quantile(x, 0.8), 0.0)) / 0.2 / math.sqrt(len(x))
         for atoms in (64, 1024):
@@ -339,7 +340,7 @@ class TestSobol:
         a, b, ab = outputs(ishigami, 3, 4000, np.random.default_rng(17))
         order = np.argsort(a)
         rows = sensitivity.sobol_indices(a, b, ab)
-        monkeypatch.setattr(sensitivity, "MAX_ROW_GROUPS", 500)
+        replace_seam(monkeypatch, "max_row_groups", 500)
         groups = sensitivity.sobol_indices(a[order], b[order], ab[:, order])
         for one, other in zip(rows.first + rows.total, groups.first + groups.total, strict=True):
             np.testing.assert_allclose(other.value, one.value, rtol=1e-9, atol=1e-12)

@@ -1,0 +1,71 @@
+"""The places inside the package that tests replace: a limit that is small, a slow part that is counted or left out.
+
+Tests name a seam; only this file knows where it is."""
+
+import pytest
+
+SEAMS = {
+    "build_proof_task": "diffabs.cli.certificates.build_proof_task",
+    "compiled_room": "diffabs.cli.compiled.ROOM",
+    "patience": "diffabs.cli.console.PATIENCE",
+    "second_interrupt_s": "diffabs.cli.console.SECOND_INTERRUPT_S",
+    "terminal_width": "diffabs.cli.console._terminal_width",
+    "is_animated": "diffabs.cli.console.is_animated",
+    "console_load": "diffabs.cli.console.load",
+    "run_with_progress": "diffabs.cli.console.run_with_progress",
+    "max_csv_rows": "diffabs.cli.main.MAX_CSV_ROWS",
+    "main_run": "diffabs.cli.main._run",
+    "progress_quiet": "diffabs.cli.progress.QUIET",
+    "write_report_file": "diffabs.cli.report.write_report_file",
+    "tune_draw": "diffabs.cli.tune._draw",
+    "certify_result": "diffabs.cli.tune.certify_result",
+    "take_interrupt": "diffabs.core.interrupt.take_interrupt",
+    "compiling": "diffabs.core.stopwatch._compiling",
+    "decay_tolerance": "diffabs.design.analysis.DECAY_TOLERANCE",
+    "max_search_programs": "diffabs.design.analysis.MAX_SEARCH_PROGRAMS",
+    "certify": "diffabs.design.analysis.certify",
+    "max_vertices": "diffabs.design.parameter_box.MAX_VERTICES",
+    "polytope": "diffabs.design.parameter_box.polytope",
+    "as_uncertain_dyadic": "diffabs.design.proof.exact.as_uncertain_dyadic",
+    "solve_sdp": "diffabs.design.sdp.solver.solve_sdp",
+    "design": "diffabs.design.synthesis.design",
+    "members": "diffabs.explore.curves.MEMBERS",
+    "identify": "diffabs.identify.identification.identify",
+    "max_cache_bytes": "diffabs.kernel.binaries.MAX_CACHE_BYTES",
+    "cpp_flags": "diffabs.kernel.compilers.CPP_FLAGS",
+    "probe_timeout_s": "diffabs.kernel.compilers.PROBE_TIMEOUT_S",
+    "compile": "diffabs.kernel.compilers._compile",
+    "build_library": "diffabs.kernel.compilers.build_library",
+    "find_compiler": "diffabs.kernel.compilers.find_compiler",
+    "load_driver": "diffabs.kernel.gpu._load_driver",
+    "find_gpu": "diffabs.kernel.gpu.find_gpu",
+    "vectors_per_block": "diffabs.kernel.launch.VECTORS_PER_BLOCK",
+    "launch_lanes": "diffabs.kernel.launch._launch_lanes",
+    "thread_count": "diffabs.kernel.launch.thread_count",
+    "nvrtc_flags": "diffabs.kernel.nvrtc.NVRTC_FLAGS",
+    "compile_cubin": "diffabs.kernel.nvrtc._compile_cubin",
+    "nvrtc_version": "diffabs.kernel.nvrtc.nvrtc_version",
+    "replicate_tangents": "diffabs.kernel.tangents.replicate_tangents",
+    "designed": "diffabs.papers.lmi_design.Designed",
+    "save_figure": "diffabs.plot.sweeps.save_figure",
+    "measure_metric": "diffabs.reliability.failure._measure_metric",
+    "outside_named": "diffabs.scenario.outside._named",
+    "is_step_stable": "diffabs.simulate.admissible.is_step_stable",
+    "stable_step": "diffabs.simulate.admissible.stable_step",
+    "max_saved_carries": "diffabs.simulate.checkpoint.MAX_SAVED_CARRIES",
+    "max_lanes_per_launch": "diffabs.simulate.native.MAX_LANES_PER_LAUNCH",
+    "lanes_at_once": "diffabs.simulate.packed.LANES_AT_ONCE",
+    "min_entrywise_matrices": "diffabs.simulate.stable_step.MIN_ENTRYWISE_MATRICES",
+    "timeout_seconds": "diffabs.sweep.cluster.TIMEOUT_SECONDS",
+    "runner": "diffabs.sweep.engines.Runner",
+    "random_words": "diffabs.sweep.sampling._random_words",
+    "max_tail_atoms": "diffabs.sweep.statistics.estimates.MAX_TAIL_ATOMS",
+    "max_row_groups": "diffabs.sweep.statistics.sensitivity.MAX_ROW_GROUPS",
+    "read_manifest": "diffabs.sweep.store.read_manifest",
+    "tune_tune": "diffabs.tune.tune",
+}
+
+
+def replace_seam(patch: pytest.MonkeyPatch, seam: str, value: object) -> None:
+    """Replace a seam of the package until `patch` is undone. Raises AttributeError if it is not where `SEAMS` says."""
+    patch.setattr(SEAMS[seam], value)
