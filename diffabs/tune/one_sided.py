@@ -85,9 +85,7 @@ def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, 
     if not equal.any():
         return
     slopes = jax.jacfwd(lambda values: jnp.subtract(*compared(values)))(values)
-    moves = {
-        path: abs(np.asarray(slope)) > small for path, slope in slopes.items()
-    }  # above rounding
+    moves = {path: abs(np.asarray(slope)) > small for path, slope in slopes.items()}  # above rounding
     for i, name in enumerate(names):
         moving = [path for path, ones in moves.items() if ones[:, i][equal[:, i]].any()]
         if moving:
