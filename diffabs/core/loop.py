@@ -45,7 +45,7 @@ class LoopState(NamedTuple):
         return (self.plant, *(m.flow for m in self[1:]))
 
     def with_flow(self, flow: tuple[Any, ...]) -> "LoopState":
-        """Return the state with these continuous memories and the same held memories."""
+        """Return the state with the continuous memories in `flow` and the same held memories."""
         return LoopState(flow[0], *(m._replace(flow=f) for m, f in zip(self[1:], flow[1:], strict=True)))
 
 
@@ -219,7 +219,7 @@ class Loop:
         return state
 
     def signal_rates(self, t: Scalar, state: LoopState, flow: Any) -> Signals:
-        """Return d(signals)/dt away from jumps, for d(state.flow())/dt equal to `flow`."""
+        """Return d(signals)/dt at time `t` in `state`, away from jumps, for d(state.flow())/dt equal to `flow`."""
         moves = (jnp.ones_like(jnp.asarray(t)), flow)
         return jax.jvp(lambda t, z: self.signals(t, state.with_flow(z)), (jnp.asarray(t), state.flow()), moves)[1]
 
