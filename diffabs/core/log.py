@@ -2,7 +2,7 @@
 
 A step of a run selects between the old and the new value of every memory. For a table of a thousand rows the selection
 copies the table in each step, although one row is new. A solver may therefore lend the tables. The blocks then only
-name the new row, and the solver writes it in place, at the end of a step or before the next read.
+name the new row. The solver writes it in place, at the end of a step or before the next read.
 """
 
 import dataclasses
