@@ -1,4 +1,4 @@
-"""`python -m diffabs`."""
+"""The command line program, as `python -m diffabs`."""
 
 from diffabs.cli.main import main
 

@@ -1,1 +1,1 @@
-"""What a part is, what a loop is, and the contracts between them. Knows no particular part."""
+"""The model of parts and loops, and the contracts between them. The package depends on no particular part."""

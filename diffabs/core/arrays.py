@@ -1,4 +1,4 @@
-"""Numbers as arrays, without a program of JAX for each."""
+"""Conversion of numbers to JAX arrays without a compiled program for each number."""
 
 import functools
 import math
@@ -10,8 +10,14 @@ import numpy as np
 
 
 def as_array(x: Any, dtype: Any) -> jax.Array:
-    """Return `jnp.asarray(x, dtype)`, where nothing is traced, by NumPy: JAX would compile a program for it. That of
-    a Python number is made once: that takes longer than what many calls do with it."""
+    """Return `jnp.asarray(x, dtype)`, but convert untraced values by NumPy, since JAX would compile a program for each.
+
+    The array of a Python number is cached: its creation takes longer than many computations with it.
+
+    Args:
+        x: Number, array, or list of numbers.
+        dtype: Type of the array.
+    """
     if isinstance(x, jax.Array):
         return jnp.asarray(x, dtype)
     if isinstance(x, float):
@@ -22,6 +28,10 @@ def as_array(x: Any, dtype: Any) -> jax.Array:
 
 @functools.lru_cache(maxsize=4096)
 def _number(x: float, sign: float, dtype: np.dtype, around: Any) -> jax.Array:
-    """Of a sign, since 0 equals -0; `around`: what decides precision and device besides."""
+    """Return the array of a Python number, from a cache.
+
+    `sign` distinguishes the keys 0.0 and -0.0, which compare equal. `around` holds the settings that decide precision
+    and device.
+    """
     del sign, around
     return jax.device_put(np.asarray(x, dtype))

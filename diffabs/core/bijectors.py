@@ -6,8 +6,9 @@
     half open                      low + scale exp(z), high - scale exp(z)
     everywhere                     start + scale z
 
-so that no step leaves a range, and a unit of z is a reasonable step everywhere. A range is the declared one of the
-parameter or a narrower one that the caller gives."""
+No step in z leaves a range, and one unit of z is a reasonable step everywhere. The range is the declared range of the
+parameter or a narrower one from the caller.
+"""
 
 import dataclasses
 import math
@@ -20,76 +21,76 @@ import numpy as np
 
 from diffabs.core.pytree import Spec, parameters, replace
 
-LOGARITHMIC_RATIO = 10.0
-END_SHARE = 1e-9  # relative: a start this close to an end of its range cannot leave it
+LOGARITHMIC_RATIO = 10.0  # ratio of the ends from which a range is mapped in the logarithm
+END_SHARE = 1e-9  # relative; the map is flat near an end, so a closer start could not leave it
 
 Range = tuple[Any, Any]
-RANGE_END_SHARE = 0.3  # of the spread over a finite range: exp(0.3 * 3.9) is about three
+RANGE_END_SHARE = 0.3  # spread in z on half lines, over that on finite ranges: exp(0.3 * 3.9) is about 3
 T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
 class Interval:
-    """value = low + (high - low) s(z)."""
+    """The map value = low + (high - low) s(z) onto a finite range."""
 
     low: float
     high: float
 
     def value(self, z: Any) -> Any:
-        """Inside (low, high)."""
+        """Return the value at `z`, inside (low, high)."""
         return self.low + (self.high - self.low) * jax.nn.sigmoid(z)
 
     def place(self, value: float) -> float:
-        """z of a value."""
+        """Return z of a `value`."""
         part = (value - self.low) / (self.high - self.low)
         return math.log(part) - math.log1p(-part)
 
 
 @dataclasses.dataclass(frozen=True)
 class Decades:
-    """value = sign exp(Interval in ln |value|)."""
+    """The map value = sign exp(Interval in ln |value|) onto a finite range over a decade or more."""
 
     logarithm: Interval
     sign: float
 
     def value(self, z: Any) -> Any:
-        """Between two numbers of one sign."""
+        """Return the value at `z`, between two numbers of one sign."""
         return self.sign * jnp.exp(self.logarithm.value(z))
 
     def place(self, value: float) -> float:
-        """z of a value."""
+        """Return z of a `value`."""
         return self.logarithm.place(math.log(self.sign * value))
 
 
 @dataclasses.dataclass(frozen=True)
 class HalfLine:
-    """value = end + scale exp(z); below the end for a negative scale."""
+    """The map value = end + scale exp(z) onto a half-open range, below `end` if the scale is negative."""
 
     end: float
     scale: float
 
     def value(self, z: Any) -> Any:
-        """On one side of the end."""
+        """Return the value at `z`, on one side of `end`."""
         return self.end + self.scale * jnp.exp(z)
 
     def place(self, value: float) -> float:
-        """z of a value."""
+        """Return z of a `value`."""
         return math.log((value - self.end) / self.scale)
 
 
 @dataclasses.dataclass(frozen=True)
 class UnboundedLine:
-    """value = start + scale z."""
+    """The map value = start + scale z onto all numbers."""
 
     start: float
     scale: float
 
     def value(self, z: Any) -> Any:
-        """Anywhere."""
+        """Return the value at `z`."""
         return self.start + self.scale * z
 
     def place(self, value: float) -> float:
-        """z of a value."""
+        """Return z of a `value`."""
         return (value - self.start) / self.scale
 
 
@@ -97,7 +98,13 @@ Bijection = Interval | Decades | HalfLine | UnboundedLine
 
 
 def bijection(low: float, high: float, start: float) -> Bijection:
-    """The map for a range, with `start` inside it."""
+    """Return the map from z onto the range (low, high).
+
+    Args:
+        low: Lower end, or -inf.
+        high: Upper end, or inf.
+        start: A value inside the range, which sets the scale of unbounded ranges.
+    """
     if math.isfinite(low) and math.isfinite(high):
         if low * high > 0:
             near, far = sorted((abs(low), abs(high)))
@@ -113,7 +120,7 @@ def bijection(low: float, high: float, start: float) -> Bijection:
 
 @dataclasses.dataclass(frozen=True)
 class FreeParameter:
-    """A free parameter: its path, shape, and the map of each of its numbers."""
+    """A free parameter: its path, its shape, and map and range of each of its elements."""
 
     path: str
     shape: tuple[int, ...]
@@ -129,12 +136,12 @@ class FreeSpace:
 
     @property
     def size(self) -> int:
-        """How many numbers are free."""
+        """Number of free elements, over all parameters."""
         return sum(len(entry.maps) for entry in self.entries)
 
     @property
     def names(self) -> list[str]:
-        """One for each number: `controller.kp`, `controller.gain.0`."""
+        """Name of each free element: `controller.kp`, `controller.gain.0`."""
         return [
             entry.path + ("." + ".".join(map(str, at)) if at else "")
             for entry in self.entries
@@ -143,11 +150,11 @@ class FreeSpace:
 
     @property
     def ranges(self) -> list[tuple[float, float]]:
-        """One for each number."""
+        """Range (low, high) of each free element."""
         return [ends for entry in self.entries for ends in entry.ranges]
 
     def values(self, z: Any) -> dict[str, Any]:
-        """Parameters by path. Differentiable."""
+        """Return the parameters at `z` by path. Differentiable."""
         found, first = {}, 0
         for entry in self.entries:
             numbers = [m.value(z[first + i]) for i, m in enumerate(entry.maps)]
@@ -156,18 +163,26 @@ class FreeSpace:
         return found
 
     def at(self, part: T, z: Any) -> T:
-        """The part with its free parameters at z. Differentiable."""
+        """Return `part` with its free parameters at `z`. Differentiable."""
         return replace(part, self.values(z))
 
     def place(self, part: Any) -> np.ndarray:
-        """z of a part's own values. Raises ValueError for a value that is not inside its range."""
+        """Return z of the present values of `part`.
+
+        Raises:
+            ValueError: A value is not inside its range.
+        """
         return np.concatenate([self._placed(entry, value) for entry, value in self._of(part)])
 
     def spread(self, key: jax.Array, count: int) -> np.ndarray:
-        """Random starts (count, size): uniform over finite ranges (over their logarithms where they span decades),
-        within a factor of three of the present value on half lines."""
+        """Return `count` random starts (count, size) from the random `key`.
+
+        They are uniform over finite ranges (over the logarithm if a range spans decades). On half lines they lie within
+        a factor of three of the present value.
+        """
         u = np.asarray(jax.random.uniform(key, (count, self.size), minval=0.02, maxval=0.98))
         bounded = [isinstance(m, Interval | Decades) for entry in self.entries for m in entry.maps]
+        # The logit of a uniform number is uniform over the range once s(z) maps it back.
         return (np.log(u) - np.log1p(-u)) * np.where(bounded, 1.0, RANGE_END_SHARE)
 
     def _of(self, part: Any) -> list[tuple[FreeParameter, np.ndarray]]:
@@ -182,12 +197,16 @@ class FreeSpace:
 
 
 def parameter_space(part: Any, free: Sequence[str] | Mapping[str, Range | None]) -> FreeSpace:
-    """The space of some parameters of a part, by dotted path; with a range each (numbers, or arrays of the parameter's
-    shape), or None for the declared one.
+    """Return the space of some parameters of a part.
+
+    Args:
+        part: Part with the parameters.
+        free: Dotted paths, or a mapping from path to range. A range is a pair of numbers or of arrays of the
+            parameter's shape; None is the declared range.
 
     Raises:
-        ValueError: a path that is no parameter, or one on which a run does not depend smoothly; a range that is empty
-            or leaves the declared one; a present value at an end of its range or beyond.
+        ValueError: A path is not a parameter, or a run does not depend on it smoothly. A range is empty or leaves the
+            declared range. A present value is at an end of its range or outside.
     """
     given = free if isinstance(free, Mapping) else dict.fromkeys(free)
     if not given:
@@ -218,6 +237,7 @@ def _entry(path: str, spec: Spec, value: np.ndarray, ends: Range | None) -> Free
 
 
 def _check_inside(path: str, value: float, low: float, high: float) -> None:
+    """Raise a ValueError if a value is too close to an end of its range, or outside."""
     ends = [end for end in (low, high) if math.isfinite(end)]
     room = END_SHARE * (high - low if len(ends) == 2 else max(1.0, *map(abs, ends), 0.0) if ends else 1.0)
     if not low + room <= value <= high - room:

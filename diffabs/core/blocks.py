@@ -1,4 +1,4 @@
-"""Blocks in series, for sensors and actuators, and the block that does nothing."""
+"""Blocks in series, for sensors and actuators, and the identity block."""
 
 from collections.abc import Callable, Sequence
 from functools import partial, reduce
@@ -13,8 +13,14 @@ from diffabs.core.timing import steps_in_period
 
 
 class Passage(NamedTuple):
-    """A block's signal over a step, within which nothing jumps: time [s], value and rate at both ends; the first after
-    what changes there, the last before that."""
+    """The signal of a block over a step without jumps.
+
+    Attributes:
+        start: Time [s] at the start of the step.
+        end: Time [s] at its end.
+        values: The signal at both ends: after the changes at the start, before the changes at the end.
+        rates: Its rates at both ends [1/s].
+    """
 
     start: Scalar
     end: Scalar
@@ -24,25 +30,25 @@ class Passage(NamedTuple):
 
 @pytree
 class Direct:
-    """The signal itself: a perfect sensor, an actuator without limits."""
+    """A perfect sensor, or an actuator without limits: the output is the signal itself."""
 
     start = no_memory
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Any) -> Any:
-        """The signal."""
+        """Return the signal."""
         del t, memory
         return signal
 
 
 @pytree
 class Series:
-    """Blocks one after the other, the first nearest to the input."""
+    """Blocks in series, the first one nearest to the input."""
 
     blocks: tuple[Block, ...] = part(default=(Direct(),))
 
     def start(self, signal: Any) -> Memory:
-        """The memories, each started on what the blocks before it put out."""
+        """Return the memories, each started on the output of the blocks before it."""
         memories = []
         for block in self.blocks:
             memories.append(block.start(signal))
@@ -50,7 +56,7 @@ class Series:
         return _join_memories(memories)
 
     def flow(self, t: Scalar, memory: Memory, signal: Any) -> Any:
-        """Their rates."""
+        """Return the rates of the blocks."""
         rates = []
         for block, m in self._pairs(memory):
             rates.append(block.flow(t, m, signal))
@@ -58,17 +64,18 @@ class Series:
         return tuple(rates)
 
     def output(self, t: Scalar, memory: Memory, signal: Any) -> Any:
-        """What the last one puts out."""
+        """Return the output of the last block."""
         for block, m in self._pairs(memory):
             signal = block.output(t, m, signal)
         return signal
 
     def offers(self, hook: str) -> bool:
-        """Whether one of the blocks has this hook."""
+        """Return whether one of the blocks has this hook."""
         return any(offers(block, hook) for block in self.blocks)
 
     def tick(self, clock: Clock, memory: Memory, signal: Any) -> Memory:
-        """Their ticks, in order; each draws from its own random stream."""
+        """Return the memories after the ticks of the blocks, in order; each block draws from its own random stream."""
+        # `before` follows the signal before this instant: each block's old output is the next block's old input.
         memories, before = [], signal if clock.before is None else clock.before
         for i, (block, m) in enumerate(self._pairs(memory)):
             key = None if clock.key is None else jax.random.fold_in(clock.key, i)
@@ -78,7 +85,7 @@ class Series:
         return _join_memories(memories)
 
     def margins(self, t: Scalar, memory: Memory, signal: Any, rate: Callable[[], Any]) -> tuple[Any, ...]:
-        """Those of all blocks, in order."""
+        """Return the margins of all blocks, in order."""
         found: tuple[Any, ...] = ()
         for block, m in self._pairs(memory):
             if offers(block, "margins"):
@@ -87,7 +94,7 @@ class Series:
         return found
 
     def event(self, t: Scalar, memory: Memory, signal: Any, fired: tuple[Any, ...]) -> Memory:
-        """Their events, in order."""
+        """Return the memories after the events of the blocks, in order."""
         memories = []
         for block, m in self._pairs(memory):
             after = m
@@ -99,7 +106,7 @@ class Series:
         return _join_memories(memories)
 
     def recorded(self, t: Scalar, memory: Memory, signal: Any) -> tuple[Any, ...]:
-        """The signals of the blocks that record them, in order."""
+        """Return the inputs of the recording blocks, in order, for the input `signal` at time `t` with `memory`."""
         found: tuple[Any, ...] = ()
         for block, m in self._pairs(memory):
             found += (record_signal(block, t, m, signal),) if offers(block, "record") else ()
@@ -107,7 +114,7 @@ class Series:
         return found
 
     def record(self, memory: Memory, passage: Passage) -> Memory:
-        """Each records its own."""
+        """Return the memories after each recording block has recorded its input."""
         (starts, ends), (rates, last) = passage.values, passage.rates
         each = zip(starts, ends, rates, last, strict=True)
         memories = []
@@ -123,21 +130,40 @@ class Series:
 
 
 def offers(block: Any, *hooks: str) -> bool:
-    """Whether a block has one of these hooks, by default a tick or margins; a block made of blocks says it itself."""
+    """Return whether a block has one of the hooks, by default a tick or margins; a composite block decides itself.
+
+    Args:
+        block: Block.
+        hooks: Names of hooks.
+    """
     asked = getattr(block, "offers", None)
     return any(asked(hook) if asked else hasattr(block, hook) for hook in hooks or ("tick", "margins"))
 
 
 def next_tick(block: Any, k: Any, h: Scalar) -> Any:
-    """Return the number of the first instant after the k-th of a grid of step h [s] at which a block ticks, that of a
-    block made of blocks at which one does."""
+    """Return the number of the first grid instant after the k-th at which a block ticks.
+
+    For a composite block, the first tick of any of its blocks counts.
+
+    Args:
+        block: Block with a tick.
+        k: Number of the present grid instant.
+        h: Step of the grid [s].
+    """
     ticking = [one for one in getattr(block, "blocks", (block,)) if offers(one, "tick")]
     lengths = [steps_in_period(one.period, h) if hasattr(one, "period") else 1 for one in ticking]
     return reduce(jnp.minimum, ((k // n + 1) * n for n in lengths))
 
 
 def record_signal(block: Any, t: Scalar, memory: Memory, signal: Any) -> Any:
-    """Return what a block records of its signal: all of it; of blocks in series, the signal of each that records."""
+    """Return the signals that a block records: its input, or for blocks in series the input of each recording block.
+
+    Args:
+        block: Block that records.
+        t: Time [s].
+        memory: Memory of the block.
+        signal: Input of the block.
+    """
     inner = getattr(block, "recorded", None)
     return inner(t, memory, signal) if inner else signal
 
@@ -147,7 +173,7 @@ def _join_memories(memories: Sequence[Memory]) -> Memory:
 
 
 def _output_rate(block: Block, t: Scalar, memory: Memory, signal: Any, rate: Callable[[], Any]) -> Any:
-    """d(output)/dt of a block whose signal has this rate."""
+    """Return d(output)/dt of a block for the rate of its input."""
     t, moving = jnp.asarray(t), rate()
     moves = (jnp.ones_like(t), block.flow(t, memory, signal), moving)
     return jax.jvp(lambda t, z, s: block.output(t, memory._replace(flow=z), s), (t, memory.flow, signal), moves)[1]
@@ -155,9 +181,9 @@ def _output_rate(block: Block, t: Scalar, memory: Memory, signal: Any, rate: Cal
 
 @pytree
 class NoFeedforward:
-    """No feed-forward: 0."""
+    """A feed-forward input of zero."""
 
     def input(self, plant: Any, output: Any, target: Scalar) -> Any:
-        """Zero."""
+        """Return zero."""
         del plant, output
-        return 0.0 * target
+        return 0.0 * target  # zero with the shape and type of the target

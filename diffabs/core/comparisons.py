@@ -1,11 +1,14 @@
-"""A program whose comparisons are visible, and can be answered from outside.
+"""A program whose comparisons are visible and can be answered from outside.
 
-A limit, the knot of a spline, a wheel that stands: between comparisons of numbers that depend on the state, x > y,
-max(x, y), |x|, the flow of a loop is smooth. Its jaxpr is walked, so that no part has to declare them. The answers
-together are a regime. While they are held the program is smooth beyond its kinks, too, as one who looks for the place
-of a kink needs it; and a derivative has one side.
+Examples are a limit, the knot of a spline, or a wheel at standstill. The flow of a loop is smooth between comparisons
+of numbers that depend on the state: x > y, max(x, y), |x|. `SwitchedProgram` walks the jaxpr to find them, so that
+parts need not declare them.
 
-Comparisons in loops, in conditionals, and in functions with a derivative rule of their own stay as they are."""
+The answers to all comparisons together are a mode. With frozen answers the program is smooth also beyond its kinks, as
+event location requires, and a derivative at a kink is one-sided.
+
+Comparisons inside loops, conditionals, and functions with their own derivative rule stay unchanged.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -18,12 +21,14 @@ import numpy as np
 from diffabs.core.modes import WORD_BITS, BitRange, ComparisonAnswers, ComparisonTrace, Mode
 
 INLINED_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "checkpoint")
-SEARCHSORTED = "searchsorted"  # of `jax.numpy`, in at most WORD knots
+SEARCHSORTED = "searchsorted"  # of `jax.numpy` or `core.numerics`, in at most WORD_BITS knots
 
 
 class _Op(NamedTuple):
-    """An operation on numbered values. Of one that compares: its name, and of each comparison the number, and whether
-    it is asked the other way round."""
+    """An operation on numbered values.
+
+    A comparing operation has a name, and for each of its comparisons the number and whether the comparison is reversed.
+    """
 
     apply: Callable[..., Sequence[Any]]
     ins: tuple[int, ...]
@@ -34,16 +39,19 @@ class _Op(NamedTuple):
 
 
 class SwitchedProgram:
-    """f(moving, fixed), of pytrees and to one. Comparisons count that depend on `moving`, and on which the outputs
-    depend that `counts` picks. Only shapes and types of the arguments matter."""
+    """The program f(moving, fixed) between pytrees, with numbered comparisons.
+
+    A comparison has a number if it depends on `moving` and an output in `counts` depends on it. Only shapes and types
+    of the arguments matter.
+    """
 
     def __init__(self, f: Callable[[Any, Any], Any], moving: Any, fixed: Any, counts: Callable[[Any], Any]):
-        """Trace f for arguments of these shapes; `counts` picks outputs."""
+        """Trace `f` for arguments with the shapes of `moving` and `fixed`; `counts` picks outputs."""
         closed, shape = jax.make_jaxpr(f, return_shape=True)(moving, fixed)
         self.ops: list[_Op] = []
         self.places: list[BitRange] = []
         self._constants: dict[int, Any] = {}
-        self._names: list[Any] = []  # of values; the same for one operation on the same values
+        self._names: list[Any] = []  # of values; equal for the same operation on the same values
         self._moves: list[bool] = []
         self._known: dict[Any, int] = {}
         self._zero = self._value("zero", False)
@@ -56,23 +64,24 @@ class SwitchedProgram:
 
     @property
     def answers(self) -> int:
-        """How many bits hold the answers."""
+        """Number of bits that hold the answers."""
         return max((first + int(np.prod(shape)) for first, shape in self.places), default=0)
 
     @property
     def words(self) -> int:
-        """How many words hold them; at least one."""
+        """Number of words that hold the answers; at least one."""
         return max(1, -(-self.answers // WORD_BITS))
 
     def __call__(self, pick: Callable[[Any], Any], moving: Any, fixed: Any, mode: Mode) -> Any:
-        """What `pick` picks of the outputs."""
+        """Return the outputs that `pick` picks."""
         return self._run(pick, moving, fixed, mode, False)[0]
 
     def look(self, pick: Callable[[Any], Any], moving: Any, fixed: Any, mode: Mode) -> tuple[Any, ComparisonAnswers]:
-        """The same, and the answers to all comparisons."""
+        """Return the outputs that `pick` picks at (`moving`, `fixed`) in `mode`, and the answers to all comparisons."""
         return self._run(pick, moving, fixed, mode, True)
 
     def _run(self, pick: Any, moving: Any, fixed: Any, mode: Mode, look: bool) -> tuple[Any, Any]:
+        """Evaluate only the operations that the picked outputs need."""
         values = dict(self._constants)
         values.update(zip(self._inputs, map(jnp.asarray, jax.tree.leaves((moving, fixed))), strict=True))
         picked, tree = jax.tree.flatten(pick(self.outputs))
@@ -91,7 +100,7 @@ class SwitchedProgram:
         return self._orders[wanted]
 
     def _needed_operations(self, values: set[int]) -> list[bool]:
-        """Whether these values depend on each of the operations."""
+        """Return for each operation whether these values depend on it."""
         needed = []
         for op in reversed(self.ops):
             needed.append(not values.isdisjoint(op.outs))
@@ -99,11 +108,13 @@ class SwitchedProgram:
         return needed[::-1]
 
     def _value(self, name: Any, moves: bool) -> int:
+        """Return the number of a new value; equal names mark equal values."""
         self._names.append(self._known.setdefault(name, len(self._names)))
         self._moves.append(moves)
         return len(self._names) - 1
 
     def _kept(self, constants: Sequence[Any]) -> list[int]:
+        """Return the numbers of new constants."""
         found = [self._value(("constant", len(self._names) + i), False) for i in range(len(constants))]
         self._constants.update(zip(found, constants, strict=True))
         return found
@@ -115,7 +126,7 @@ class SwitchedProgram:
         return new
 
     def _add_jaxpr(self, jaxpr: Any, constants: list[int], inputs: list[int]) -> list[int]:
-        """Add the operations of a jaxpr, and return its outputs."""
+        """Add the operations of a jaxpr, and return the numbers of its outputs."""
         at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
         def read(atom: Any) -> int:
@@ -133,6 +144,8 @@ class SwitchedProgram:
         return [read(atom) for atom in jaxpr.outvars]
 
     def _operation(self, eqn: Any, ins: tuple[int, ...]) -> list[int]:
+        """Add an operation, and return the numbers of its outputs."""
+        # The same operation on the same values gets the same name, so that a repeated comparison has one number.
         said = tuple(sorted((key, str(value)) for key, value in eqn.params.items() if not callable(value)))
         same = (eqn.primitive.name, said, tuple(self._names[i] for i in ins))
         moves = any(self._moves[i] for i in ins)
@@ -145,7 +158,7 @@ class SwitchedProgram:
         return outs
 
     def _number_comparisons(self, counted: set[int]) -> None:
-        """Number the comparisons that count."""
+        """Number the comparisons on which the counted outputs depend."""
         numbers: dict[Any, int] = {}
         for i, (op, on) in enumerate(zip(self.ops, self._needed_operations(counted), strict=True)):
             if on and op.name:
@@ -156,27 +169,29 @@ class SwitchedProgram:
                 self.ops[i] = op._replace(queries=tuple(asks))
 
     def _number(self, numbers: dict[Any, int], x: int, y: int, strict: bool, shape: Any) -> tuple[int, bool]:
-        """The number of x > y, or x >= y, and whether what has the number is its contrary, y >= x, or y > x."""
+        """Return the number of x > y or x >= y, and whether that number denotes the negation (y >= x or y > x)."""
         x, y = self._names[x], self._names[y]
+        # One number for x > y and y >= x, which are negations of each other: the order of the names decides.
         turned = x > y
         key = (y, x, not strict) if turned else (x, y, strict)
         if key not in numbers:
             numbers[key] = len(self.places)
             first, size = self.answers, int(np.prod(shape))
+            # Answers that fit in a word do not straddle two words: `ComparisonTrace.search` reads a single word.
             fits = first % WORD_BITS + size <= WORD_BITS or size > WORD_BITS
             self.places.append((first if fits else -(-first // WORD_BITS) * WORD_BITS, shape))
         return numbers[key], turned
 
 
 def _is_knot_search(eqn: Any) -> bool:
-    """Whether this is the search of one number in a few knots."""
+    """Return whether an equation searches one number in at most `WORD_BITS` knots."""
     shapes = [atom.aval.shape for atom in eqn.invars]
     named = eqn.primitive.name in INLINED_CALLS and eqn.params.get("name") == SEARCHSORTED
     return named and len(shapes) == 2 and shapes[1] == () and len(shapes[0]) == 1 and shapes[0][0] <= WORD_BITS
 
 
 def _bind_equation(eqn: Any) -> Callable[..., Sequence[Any]]:
-    """An operation as a function. One with a function inside is run as a program of its own."""
+    """Return an operation as a function; an operation with an inner function becomes a program of its own."""
     if not any(callable(x) or hasattr(x, "eqns") or hasattr(x, "jaxpr") for x in eqn.params.values()):
 
         def bind(*ins: Any) -> Sequence[Any]:
@@ -184,6 +199,7 @@ def _bind_equation(eqn: Any) -> Callable[..., Sequence[Any]]:
             return outs if eqn.primitive.multiple_results else (outs,)
 
         return bind
+    # Primitives with inner functions (custom rules, scans) cannot be bound from their parameters alone.
     places = {atom: i for i, atom in enumerate(eqn.invars) if not isinstance(atom, jex.Literal)}
     kept = [i for i, out in enumerate(eqn.outvars) if not isinstance(out, jex.DropVar)]
     told = jex.DebugInfo("kinks", str(eqn.primitive), None, None)
@@ -199,7 +215,7 @@ def _bind_equation(eqn: Any) -> Callable[..., Sequence[Any]]:
     return call
 
 
-# What an operation asks, as (x, y, strict) of its inputs after zero, and what it makes of the answers.
+# Comparisons of an operation as (x, y, strict), from the constant zero and the operation's inputs.
 _COMPARISONS: dict[str, Callable[..., list[tuple[int, int, bool]]]] = {
     "gt": lambda zero, x, y: [(x, y, True)],
     "ge": lambda zero, x, y: [(x, y, False)],
@@ -229,6 +245,7 @@ def _search(trace: ComparisonTrace, op: _Op, knots: Any, x: Any) -> list[Any]:
     return [trace.search(op.queries[0], lambda: op.apply(knots, x)[0], knots, x)]
 
 
+# Result of an operation from the answers to its comparisons. `jnp.where` has the derivative of the selected branch.
 _RESULT_FROM_ANSWERS: dict[str, Callable[..., list[Any]]] = {
     "gt": lambda trace, op, x, y: [trace(op.queries[0], x, y, True)],
     "ge": lambda trace, op, x, y: [trace(op.queries[0], x, y, False)],

@@ -1,7 +1,8 @@
-"""Programs that run once: compiling them is what they cost.
+"""Compilation of programs that run once, so that their compilation time dominates.
 
-XLA is told to compile faster where a function is called with numbers. Inside jit, and so under vmap and grad, what
-surrounds it decides."""
+A function called with numbers is compiled with options for a faster compilation. Inside jit, and so under vmap and
+grad, the surrounding program decides the options.
+"""
 
 import functools
 import os
@@ -13,22 +14,26 @@ from jax.core import Tracer
 
 F = TypeVar("F", bound=Callable)
 
-# JAX 0.10: its older emitters make the same numbers as the newer ones in half the time; later JAX has no such option.
-# Of a program's 32 parts, which cores may compile at the same time, each costs: four take a tenth less time.
+# JAX 0.10: the older emitters give the same numbers as the newer ones in half the compilation time. Later versions of
+# JAX do not have this option. A program is split into 32 parts for parallel compilation, and each part has a cost: a
+# split into 4 parts takes a tenth less time.
 SAME_RESULT_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 if SAME_RESULT_OPTIONS and "codegen_split_count" not in os.environ.get("XLA_FLAGS", ""):
     SAME_RESULT_OPTIONS["xla_cpu_parallel_codegen_split_count"] = 4
 QUICK_COMPILE_OPTIONS: dict[str, Any] = {
     **SAME_RESULT_OPTIONS,
     "xla_backend_optimization_level": 0,
-}  # rounds differently
+}  # results differ by rounding
 
 
 def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | None = None) -> Callable[[F], F]:
-    """Return the decorator `jax.jit` for a function that is mostly called with numbers, once for each of its shapes.
+    """Return a decorator like `jax.jit`, for a function that is mostly called with numbers, once for each of its
+    shapes.
 
-    static: names of static arguments, by which they are given, or the number of leading ones
-    options: of XLA (`SAME_RESULT_OPTIONS`, `QUICK_COMPILE_OPTIONS`), which apply where nothing is traced"""
+    Args:
+        static: Names of static arguments, which are then passed by name, or the number of leading static arguments.
+        options: Options of XLA (`SAME_RESULT_OPTIONS`, `QUICK_COMPILE_OPTIONS`), used if nothing is traced.
+    """
     leading, names = (static, ()) if isinstance(static, int) else (0, tuple(static))
     fixed: dict[str, Any] = {"static_argnums": tuple(range(leading)), "static_argnames": names}
 
@@ -47,6 +52,12 @@ def compile_once(static: Iterable[str] | int = (), options: dict[str, Any] | Non
 
 
 def is_traced(*trees: Any) -> bool:
-    """Return whether a trace is under way (jit), or these are no numbers yet (also grad, vmap): options are for a whole
-    program, and of what is no number nothing can be asked."""
+    """Return whether a trace is under way (jit), or a leaf is a tracer (also grad, vmap).
+
+    XLA options apply only to a whole program, and a tracer has no value.
+
+    Args:
+        trees: Pytrees of numbers or tracers.
+    """
+    # Under jit, device_put of a constant is staged and returns a tracer.
     return isinstance(jax.device_put(0), Tracer) or any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))

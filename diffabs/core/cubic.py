@@ -1,9 +1,10 @@
-"""The cubic through the values and the rates at both ends of a step (Hermite's): values, roots, extrema, integrals.
+"""The cubic Hermite interpolant from values and rates at both ends of a step: values, roots, extrema, integrals.
 
     p(x) = a + c1 x + c2 x^2 + c3 x^3,   x = (t - t0)/h in [0, 1]
     c1 = h a',  c2 = 3 (b - a) - h (2 a' + b'),  c3 = 2 (a - b) + h (a' + b')
 
-It differs from a smooth function by O(h^4)."""
+It differs from a smooth function by O(h^4).
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,11 +15,11 @@ import jax.numpy as jnp
 from diffabs.core.numerics import clamp, later_of_larger
 from diffabs.core.pytree import Scalar
 
-NEWTON_ITERATIONS = 4  # iterations from the secant, before the last: in a long step the cubic is no line
+NEWTON_ITERATIONS = 4  # from the secant's root, before the last: in a long step the cubic is far from a line
 
 
 class Cubic(NamedTuple):
-    """Values at both ends, and the rates there times the length of the step."""
+    """A cubic, given by its values at both ends and its rates there times the step length."""
 
     start: Scalar
     end: Scalar
@@ -26,41 +27,46 @@ class Cubic(NamedTuple):
     end_slope: Scalar
 
     def __call__(self, x: Scalar) -> Any:
-        """p(x)."""
+        """Return p(x)."""
         c1, c2, c3 = self._coefficients()
         return self.start + x * (c1 + x * (c2 + x * c3))
 
     def slope(self, x: Scalar) -> Any:
-        """dp/dx."""
+        """Return dp/dx at `x`."""
         c1, c2, c3 = self._coefficients()
         return c1 + x * (2.0 * c2 + x * 3.0 * c3)
 
     def minus(self, level: Scalar) -> "Cubic":
-        """p - level."""
+        """Return the cubic p - `level`."""
         return self._replace(start=self.start - level, end=self.end - level)
 
     def times(self, factor: Scalar) -> "Cubic":
-        """factor p."""
+        """Return the cubic `factor` p."""
         return Cubic(*(factor * x for x in self))
 
     def integral(self, x: Scalar) -> Any:
-        """Integral of p from 0 to x, in steps."""
+        """Return the integral of p from 0 to `x`, in units of the step."""
         c1, c2, c3 = self._coefficients()
         return x * (self.start + x * (c1 / 2.0 + x * (c2 / 3.0 + x * c3 / 4.0)))
 
     def moment(self, x: Scalar) -> Any:
-        """Integral of x p from 0 to x, in steps."""
+        """Return the integral of x p from 0 to `x`, in units of the step."""
         c1, c2, c3 = self._coefficients()
         return x * x * (self.start / 2.0 + x * (c1 / 3.0 + x * (c2 / 4.0 + x * c3 / 5.0)))
 
     def root(self) -> Any:
-        """The place at which p changes its sign, where its ends have different ones; else the end, 1. Its derivative is
-        the implicit function theorem's."""
+        """Return the place x at which p changes sign, or 1 if both ends have the same sign.
+
+        The derivative of x follows from the implicit function theorem.
+        """
+        # The iterations run without derivatives; `_refine_zero` adds the derivative of the root once at the end.
         still = jax.lax.stop_gradient(self)
         spread = still.start - still.end
         x = clamp(still.start / jnp.where(spread == 0, 1.0, spread), 0.0, 1.0)
         low, high = jnp.zeros_like(x), jnp.ones_like(x)
-        for _ in range(NEWTON_ITERATIONS):  # a derivative by the root is wrong by as much as the root is
+        # Safeguarded Newton iterations: a step that leaves the bracket is replaced by bisection. The accuracy matters
+        # for derivatives, too: an error of the root is an error of the same size in a derivative by the root.
+        for _ in range(NEWTON_ITERATIONS):
             value = still(x)
             before = (value < 0) == (still.start < 0)
             low, high = jnp.where(before, x, low), jnp.where(before, high, x)
@@ -72,11 +78,16 @@ class Cubic(NamedTuple):
         return jnp.where(changes, x, 1.0)
 
     def greatest(self) -> Any:
-        """The greatest value of p in [0, 1]. The derivative is that of p at the place of the extremum, which moves by a
-        Newton step: what that changes is of second order."""
+        """Return the greatest value of p in [0, 1].
+
+        Its derivative is the derivative of p at the place of the extremum. A Newton step moves that place; its effect
+        on the value is of second order.
+        """
         c1, c2, c3 = jax.lax.stop_gradient(self._coefficients())
         inside = (c1 > 0) & (c1 + 2.0 * c2 + 3.0 * c3 < 0)
         square = c2 * c2 - 3.0 * c1 * c3
+        # Root of p' = c1 + 2 c2 x + 3 c3 x^2 as c1/(sqrt(c2^2 - 3 c1 c3) - c2), which has no cancellation for c2 < 0.
+        # The inner `where` keeps the root's argument positive, since 0 times an infinite gradient is NaN.
         bend = jnp.sqrt(jnp.where(inside & (square > 0), square, 1.0)) - c2
         x = clamp(_quotient(c1, bend), 0.0, 1.0)
         x = _refine_zero(x, self.slope, jnp.where(inside, 2.0 * c2 + 6.0 * c3 * x, 0.0))
@@ -86,7 +97,7 @@ class Cubic(NamedTuple):
 
     @property
     def falls(self) -> Any:
-        """Whether p falls from the start on."""
+        """Whether p falls at the start."""
         return jax.lax.stop_gradient(self.start_slope) < 0
 
     def _greater_end(self) -> Any:
@@ -99,13 +110,16 @@ class Cubic(NamedTuple):
 
 
 def _refine_zero(x: Any, function: Callable[[Any], Any], slope: Any) -> Any:
-    """x, with the derivatives of the zero of a function near x: those of a Newton step, whose order is twice that of
-    x's."""
+    """Return x unchanged in value, with the derivatives of the zero of `function` near x.
+
+    They are the derivatives of a Newton step, and their order is twice the order of x.
+    """
+    # `left - stop_gradient(left)` is 0 in value and has the derivative of `left`.
     left = function(x)
     return x - _quotient(left - jax.lax.stop_gradient(left), slope)
 
 
 def _quotient(x: Any, y: Any) -> Any:
-    """x/y without a derivative in y, and 0 where y is."""
+    """Return x/y without a derivative in y, and 0 where y is 0."""
     y = jax.lax.stop_gradient(y)
     return jnp.where(y == 0, 0.0, x / jnp.where(y == 0, 1.0, y))

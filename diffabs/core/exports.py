@@ -1,4 +1,4 @@
-"""What a package exports, imported when it is first asked for: whoever needs one module of it does not load all."""
+"""Lazy exports of packages: each exported name is imported on its first use, without the package's other modules."""
 
 import ast
 import functools
@@ -9,8 +9,14 @@ from typing import Any
 
 
 def lazy_getattr(package: str) -> Callable[[str], Any]:
-    """Return the `__getattr__` of a package (PEP 562) that imports for type checkers alone what it exports, each name
-    `as` itself. The text of the package is read, so that it says this once."""
+    """Return the `__getattr__` of a package (PEP 562) that imports an exported name on its first use.
+
+    The exports are the package's imports of the form `from m import x as x`, which only type checkers execute. The
+    function reads them from the package's source, so that each export is listed once.
+
+    Args:
+        package: Name of the package.
+    """
 
     @functools.cache
     def homes() -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Files that are read and written: only regular ones, whole or not at all, and nothing left behind."""
+"""Reading of regular files, and writing of files that appear whole or not at all and leave no temporary files."""
 
 import contextlib
 import errno
@@ -12,14 +12,21 @@ import tempfile
 from collections.abc import Iterator
 from typing import BinaryIO
 
-NONBLOCKING_FLAG = getattr(os, "O_NONBLOCK", 0)  # opening a pipe that nobody writes to would wait for ever
+NONBLOCKING_FLAG = getattr(os, "O_NONBLOCK", 0)  # without it, opening a pipe without a writer blocks for ever
 
 _unfinished: set[pathlib.Path] = set()
 
 
 @contextlib.contextmanager
 def open_regular(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
-    """A regular file, to be read. Raises OSError for one that cannot be, and for a folder, a pipe or a device."""
+    """Yield a regular file, open for reading.
+
+    Args:
+        path: Path of the file.
+
+    Raises:
+        OSError: The file cannot be opened, or is a folder, a pipe or a device.
+    """
     handle = os.open(path, os.O_RDONLY | NONBLOCKING_FLAG | getattr(os, "O_BINARY", 0))
     try:
         if stat.S_ISDIR(os.fstat(handle).st_mode):
@@ -33,14 +40,30 @@ def open_regular(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 def read_content(path: str | os.PathLike[str], most: int = sys.maxsize) -> bytes:
-    """The first `most` bytes of a regular file. Raises OSError, as `opened`."""
+    """Return the first bytes of a regular file.
+
+    Args:
+        path: Path of the file.
+        most: Greatest number of bytes.
+
+    Raises:
+        OSError: As in `open_regular`.
+    """
     with open_regular(path) as file:
         return file.read(-1 if most == sys.maxsize else most)
 
 
 def make_room(folder: pathlib.Path, pattern: str, room: int) -> None:
-    """Remove the older half of those files of a folder that match, where they have more than `room` bytes. Raises
-    OSError for a folder that cannot be read."""
+    """Remove the older half of the matching files of a folder if they have more than `room` bytes together.
+
+    Args:
+        folder: Folder.
+        pattern: Glob pattern of the files.
+        room: Greatest total size [bytes].
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
     found = []
     for path in folder.glob(pattern):
         with contextlib.suppress(FileNotFoundError):  # another process was quicker
@@ -53,12 +76,17 @@ def make_room(folder: pathlib.Path, pattern: str, room: int) -> None:
 
 @contextlib.contextmanager
 def temporary_path(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A file or folder that is gone afterwards, unless it was renamed to its place; also where `clear` has to end what
-    a thread still does."""
+    """Yield the path of a file or folder, and remove it at the end unless it was renamed to its final place.
+
+    `remove_unfinished` removes it, too, if the process leaves while a thread still writes.
+
+    Args:
+        path: Path of the file or folder.
+    """
     _unfinished.add(path)
     try:
         yield path
-    except BaseException:  # it stays known: a thread that goes on may write it once more
+    except BaseException:  # the path stays in `_unfinished`: a running thread may create the file again
         _remove(path)
         raise
     _remove(path)
@@ -67,9 +95,17 @@ def temporary_path(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
 @contextlib.contextmanager
 def new_file(target: pathlib.Path, temporary: pathlib.Path | None = None) -> Iterator[pathlib.Path]:
-    """An empty file beside `target` that takes its place at the end, or vanishes if anything goes wrong: readers see
-    the old file or the whole new one. Whoever removes it leaves `target` as it was. `temporary`: its path, where only
-    one process writes; else one that nobody else has. Raises OSError where no file can be made."""
+    """Yield an empty file beside `target` that replaces `target` at the end, or vanishes after an error.
+
+    Readers see the old file or the whole new one. If the caller removes the file, `target` stays unchanged.
+
+    Args:
+        target: Path of the file to write.
+        temporary: Path of the empty file, for a target that only one process writes; None takes an unused name.
+
+    Raises:
+        OSError: The file cannot be created.
+    """
     temporary = temporary or target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     temporary.touch(exist_ok=False)
     with temporary_path(temporary):
@@ -79,14 +115,31 @@ def new_file(target: pathlib.Path, temporary: pathlib.Path | None = None) -> Ite
 
 
 def write_file(target: pathlib.Path, data: bytes) -> None:
-    """Write a file, whole or not at all. Raises OSError."""
+    """Write a file, whole or not at all.
+
+    Args:
+        target: Path of the file.
+        data: Content.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     with new_file(target) as temporary:
         temporary.write_bytes(data)
 
 
 def write_synced(target: pathlib.Path, data: bytes) -> pathlib.Path:
-    """Write a file that is whole at every instant at which it is there, also after a power cut. Several processes may
-    write it at once: the last one's stays. Returns the path. Raises OSError."""
+    """Write a file that is whole whenever it exists, also after a power cut, and return its path.
+
+    Several processes may write it at once; the content of the last one stays.
+
+    Args:
+        target: Path of the file.
+        data: Content.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     with new_file(target) as temporary, temporary.open("wb") as file:
         file.write(data)
         file.flush()
@@ -95,7 +148,14 @@ def write_synced(target: pathlib.Path, data: bytes) -> pathlib.Path:
 
 
 def others_may_write(folder: pathlib.Path) -> bool:
-    """Return whether users other than this one and root may write to a folder. Raises OSError."""
+    """Return whether users other than this one and root may write to a folder.
+
+    Args:
+        folder: Folder.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
     if not hasattr(os, "getuid"):
         return False  # Windows: a user's folders are the user's
     there = folder.stat()
@@ -103,8 +163,18 @@ def others_may_write(folder: pathlib.Path) -> bool:
 
 
 def write_durably(target: pathlib.Path, data: bytes) -> pathlib.Path:
-    """Write a file that is whole at every instant at which it is there, also after a power cut; only one process may.
-    What a kill leaves behind ends in `.tmp`. Returns the path. Raises OSError."""
+    """Write a file that is whole whenever it exists, also after a power cut, and return its path.
+
+    Only one process may write it. A killed process leaves at most a file that ends in `.tmp`. The folder is synced,
+    too, so that the new file survives a power cut.
+
+    Args:
+        target: Path of the file.
+        data: Content.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     temporary = target.with_name(f"{target.name}.tmp")
     temporary.unlink(missing_ok=True)
     with new_file(target, temporary), temporary.open("wb") as file:
@@ -122,8 +192,14 @@ def write_durably(target: pathlib.Path, data: bytes) -> pathlib.Path:
 
 @contextlib.contextmanager
 def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
-    """An empty folder beside `target` that takes its place at the end, or vanishes if anything goes wrong. Raises
-    OSError where the folder cannot be made or replaced; the old one is then back."""
+    """Yield an empty folder beside `target` that replaces `target` at the end, or vanishes after an error.
+
+    Args:
+        target: Path of the folder to write.
+
+    Raises:
+        OSError: The folder cannot be created or put in place; the old folder is then restored.
+    """
     target.parent.mkdir(parents=True, exist_ok=True)
     with temporary_path(pathlib.Path(tempfile.mkdtemp(prefix=f".{target.name}.", dir=target.parent))) as room:
         new, old = room / "new", room / "old"
@@ -140,7 +216,7 @@ def new_folder(target: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def remove_unfinished() -> None:
-    """Remove what is unfinished: for a process that leaves without waiting for its threads."""
+    """Remove all unfinished files and folders, for a process that leaves without waiting for its threads."""
     for path in list(_unfinished):
         _remove(path)
 

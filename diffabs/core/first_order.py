@@ -1,8 +1,9 @@
-"""An error where a derivative would be wrong: by a parameter that has none, and second ones of a frozen rule.
+"""Errors in place of wrong derivatives: by a parameter without a derivative, and second derivatives of a frozen rule.
 
-A rule for derivatives that freezes what depends on the parameters has right first derivatives and wrong second ones.
-Such a rule wraps both the tangents that it gets and the tangents that it returns in `first_order`. A second pass in
-forward mode meets the wrapper of the result, a pass in reverse mode that of the argument."""
+A derivative rule that freezes values that depend on the parameters has correct first derivatives and wrong second ones.
+Such a rule wraps both its input tangents and its output tangents in `first_order`. A second pass in forward mode meets
+the wrapper of the output, a second pass in reverse mode that of the input.
+"""
 
 from functools import partial
 from typing import Any
@@ -15,7 +16,12 @@ _operation = jex.Primitive("first_order")
 
 
 def first_order(tangents: Any, why: str) -> Any:
-    """Return tangents (a pytree) as they are. Whoever differentiates them gets a ValueError that says `why`."""
+    """Return tangents unchanged; their differentiation raises a ValueError with the message `why`.
+
+    Args:
+        tangents: Pytree of tangents.
+        why: Message of the error.
+    """
 
     def each(x: Any) -> Any:
         return x if getattr(x, "dtype", None) == jax.dtypes.float0 else _operation.bind(x, why=why)
@@ -25,14 +31,19 @@ def first_order(tangents: Any, why: str) -> Any:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def without_derivative(path: str, x: Any) -> Any:
-    """Return x, the value of the parameter at this path. Whoever differentiates it gets a ValueError that names it."""
+    """Return x, the value of a parameter; its differentiation raises a ValueError that names the parameter.
+
+    Args:
+        path: Dotted path of the parameter.
+        x: Value of the parameter.
+    """
     del path
     return x
 
 
 @without_derivative.defjvp
 def _raise_for_parameter(path: str, at: Any, moves: Any) -> tuple[Any, Any]:
-    # JAX asks for this rule only where x has a tangent: one that is known to be zero does not come here.
+    # JAX calls this rule only if x has a tangent that is not a symbolic zero.
     del at, moves
     raise ValueError(
         f"{path} has no derivative: a run does not depend smoothly on it. Differentiate by other parameters, or hold"

@@ -1,11 +1,12 @@
-"""Ctrl-C, at any moment: no traceback, exit status 130.
+"""Ctrl-C at any moment: no traceback, exit status 130.
 
-An exception that a signal raises wherever the program happens to be comes out as it pleases: an import reports it, a
-destructor prints and forgets it, compiled code does not see it. So a signal only counts here. While the command is
-being imported there is nothing to keep, and the process ends at once; later it is asked for where work is waited for
-(`console.waited`). Whoever presses for the third time unheard ends the process, whatever it does.
+An exception raised by a signal handler appears at an arbitrary place. An import reports it, a destructor prints and
+drops it, and compiled code does not see it. So a signal handler here only counts. While the command is being imported
+there is no work to save, and the process ends at once. Later, code that waits for work polls the count
+(`console.waited`). The third press without a poll ends the process in any state.
 
-Standard library only, because it comes before all other imports."""
+The module imports only the standard library, because it precedes all other imports.
+"""
 
 import contextlib
 import os
@@ -25,13 +26,15 @@ _terminated = False
 
 
 def end_early_on_interrupt() -> None:
-    """If this process is the command `diffabs`, Ctrl-C ends it at once, until `begin()`; a library leaves it alone."""
+    """Let Ctrl-C end the process at once until `begin_hearing`, if the process is the command `diffabs`; not in a
+    library.
+    """
     if _is_command():
         _answer(_leave)
 
 
 def begin_hearing() -> None:
-    """From now on Ctrl-C and SIGTERM are heard where `pressed()` is asked, if the process does not ignore them."""
+    """Count Ctrl-C and SIGTERM from now on, for `take_interrupt`, unless the process ignores them."""
     global _pending
     _pending = 0
     _answer(_press)
@@ -40,18 +43,18 @@ def begin_hearing() -> None:
 
 
 def stop_hearing() -> None:
-    """From now on the process ends, and cannot be interrupted in that."""
+    """Ignore Ctrl-C from now on, while the process ends."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def was_terminated() -> bool:
-    """Whether SIGTERM was among the signals."""
+    """Return whether SIGTERM was among the signals."""
     return _terminated
 
 
 def take_interrupt() -> bool:
-    """Whether Ctrl-C was pressed since this was last answered with yes."""
+    """Return whether Ctrl-C or SIGTERM arrived since the last call that returned True."""
     global _pending
     if not _pending:
         return False
@@ -60,13 +63,14 @@ def take_interrupt() -> bool:
 
 
 def _is_command() -> bool:
+    """Return whether this process is the command `diffabs`, not a child process or another program."""
     multiprocessing = sys.modules.get("multiprocessing.process")
     child = multiprocessing is not None and multiprocessing.parent_process() is not None
     return not child and pathlib.Path(sys.argv[0] if sys.argv else "").name.removesuffix(".exe") in COMMAND_NAMES
 
 
 def _answer(handler: Any) -> None:
-    """Nothing is changed where somebody else has said what Ctrl-C does, as a shell does for what runs behind it."""
+    """Set the handler of Ctrl-C unless another program has set one, as a shell does for background processes."""
     if threading.current_thread() is not threading.main_thread():
         return
     if signal.getsignal(signal.SIGINT) in (signal.default_int_handler, _leave, _press):
@@ -87,6 +91,7 @@ def _terminate(*_: Any) -> None:
 
 
 def _leave(*_: Any) -> None:
+    """End the process at once, with a restored cursor and the line `interrupted`."""
     with contextlib.suppress(OSError):
         os.write(2, (SHOW_CURSOR + b"\n" if _pending and os.isatty(2) else b"") + b"interrupted\n")
     os._exit(TERMINATED if _terminated else INTERRUPTED)

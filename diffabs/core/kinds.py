@@ -1,5 +1,8 @@
-"""What can be a number of a run. JAX converts far more than that: text is parsed, an imaginary part dropped, truth
-becomes 1, and one leaf in 16 bits makes a whole run of 16 bits."""
+"""The kinds of values that can be a number of a run.
+
+JAX converts far more values: it parses text, drops imaginary parts and turns truth values into 1. A single 16-bit leaf
+makes a whole run 16-bit.
+"""
 
 import functools
 import math
@@ -11,13 +14,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-FEWEST_BITS = 32  # of a float: in 16, the instants of a run are all the same after a second
+FEWEST_BITS = 32  # of a float: with 16 bits, the time stops advancing by small steps after a second
 MAX_SHOWN_LENGTH = 60  # characters of a value in a message
 
 
 def find_value_objection(value: Any) -> str:
-    """What keeps a value from being a number of a run, or an array of them, such as `is text`; empty if nothing does.
-    Types alone are looked at, so it may be traced."""
+    """Return why a value cannot be a number of a run or an array of numbers, such as `is text`; empty if it can.
+
+    The function looks only at types, so the value may be traced.
+
+    Args:
+        value: Number, array, or nested lists of numbers.
+    """
     if type(value) is float:
         return ""
     if isinstance(value, list | tuple):
@@ -39,6 +47,7 @@ def _overflows(value: Any) -> bool:
 
 @functools.cache
 def _of_type(dtype: Any) -> str:
+    """Return the objection to an array of this type, or an empty text."""
     if jnp.issubdtype(dtype, jax.dtypes.extended) or np.dtype(dtype).kind in "mM":  # keys, dates
         return f"is of type {dtype}"
     if jnp.issubdtype(dtype, np.floating):
@@ -49,14 +58,22 @@ def _of_type(dtype: Any) -> str:
 
 
 def value_shape(value: Any) -> tuple[int, ...]:
-    """Of an array, a number, or a list of them; it may be traced."""
+    """Return the shape of an array, a number, or a list of them, which may be traced.
+
+    Args:
+        value: Array, number, or list.
+    """
     if isinstance(value, list | tuple):
         return (len(value), *(value_shape(value[0]) if value else ()))
     return np.shape(value)
 
 
 def format_value(value: Any) -> str:
-    """A value as it may stand in a message: on one line, of bounded length."""
+    """Return a value for a message: on one line, of bounded length.
+
+    Args:
+        value: Any value.
+    """
     try:
         text = " ".join(str(value).split()) if hasattr(value, "dtype") else repr(value)
     except ValueError:  # a whole number of thousands of digits

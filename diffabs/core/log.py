@@ -1,8 +1,9 @@
-"""A long memory of which little changes at a time.
+"""A long memory in which each step changes one row.
 
-A step of a run chooses, of everything, between what was and what is to be. Of a table of a thousand rows that costs a
-copy of it each time, though one row is new. So a solver may lend the tables to the blocks, who then only say which row
-is to be written, and write these itself: at the end of a step, or before the next one reads, in place."""
+A step of a run selects between the old and the new value of every memory. For a table of a thousand rows the selection
+copies the table in each step, although one row is new. A solver may therefore lend the tables. The blocks then only
+name the new row. The solver writes it in place, at the end of a step or before the next read.
+"""
 
 import dataclasses
 from functools import partial
@@ -15,8 +16,14 @@ import jax.numpy as jnp
 @partial(jax.tree_util.register_dataclass, data_fields=["rows", "place", "row"], meta_fields=["lent"])
 @dataclasses.dataclass(frozen=True)
 class Log:
-    """Rows (size, n); the place of the last one that was put, and that row (n,). While they are lent, that row is not
-    among them."""
+    """A table of rows with the place and the value of the row written last.
+
+    Attributes:
+        rows: Rows, shape (size, n).
+        place: Place of the row written last.
+        row: That row, shape (n,). While the rows are lent, `rows` does not contain it.
+        lent: Whether a solver holds the rows.
+    """
 
     rows: Any
     place: Any
@@ -25,40 +32,60 @@ class Log:
 
     @property
     def size(self) -> int:
-        """How many rows there are."""
+        """Number of rows."""
         return len(self.rows)
 
     def put(self, place: Any, row: Any) -> "Log":
-        """The log with a row at a place, a whole number of the row's type."""
+        """Return the log with `row` at `place`, a whole number of the row's type."""
         rows = self.rows if self.lent else self.rows.at[place.astype(int)].set(row)
         return dataclasses.replace(self, rows=rows, place=place, row=row)
 
     def read(self, places: Any) -> Any:
-        """The rows at these places (k,)."""
+        """Return the rows at these `places` (k,), shape (k, n)."""
         rows = self.rows[places]
         return jnp.where((places == self.place.astype(int))[:, None], self.row, rows) if self.lent else rows
 
 
 def log_rows(tree: Any) -> list[Any]:
-    """Return the rows of all logs."""
+    """Return the rows of all logs in a pytree.
+
+    Args:
+        tree: Pytree with logs.
+    """
     return [log.rows for log in jax.tree.leaves(tree, is_leaf=_is_log) if _is_log(log)]
 
 
 def borrow(tree: Any, rows: list[Any] | None) -> Any:
-    """Return a tree whose logs have these rows, lent; with None, no rows at all."""
+    """Return a tree whose logs are lent and have these rows, or no rows.
+
+    Args:
+        tree: Pytree with logs.
+        rows: Rows of each log, or None for no rows.
+    """
     each = iter(rows or ())
     return _map_logs(lambda log: Log(next(each) if rows else None, log.place, log.row, lent=True), tree)
 
 
 def commit(tree: Any, rows: list[Any]) -> Any:
-    """Return a tree whose logs have these rows, and the row that was put while they were lent."""
+    """Return a tree whose logs have these rows and contain the row that was put while they were lent.
+
+    Args:
+        tree: Pytree with logs.
+        rows: Rows of each log.
+    """
     each = iter(rows)
     return _map_logs(lambda log: Log(next(each), log.place, log.row).put(log.place, log.row), tree)
 
 
 def write_last_rows(tree: Any) -> list[Any]:
-    """Return the rows of all logs with the row that was put last. Who writes what the step before has put, and then
-    reads, does so in place; who reads first needs a copy, unless the row depends on what was read."""
+    """Return the rows of all logs, with the row written last.
+
+    A write of the previous step's row followed by a read happens in place. A read before the write needs a copy, unless
+    the row depends on the value read.
+
+    Args:
+        tree: Pytree with logs.
+    """
     return log_rows(commit(tree, log_rows(tree)))
 
 

@@ -1,9 +1,9 @@
-"""One hybrid closed loop: plant, sensor, reference, feed-forward, controller, actuator, and when it ends.
+"""The hybrid closed loop: plant, sensor, reference, feed-forward, controller, actuator, and stop condition.
 
     between instants   dz/dt = flow(t, z; held)         z: plant state and the blocks' continuous memories
     at instants        (z, held) -> change(z, held)     sensor, reference, controller, actuator, in this order
 
-An instant is a tick of a clock, or an event: a margin of a block falls through zero.
+An instant is a tick of a clock or an event, at which a margin of a block falls through zero.
 
 A `Loop` is one pytree: every parameter of every part is a leaf with a dotted path, `loop.plant.road.scale`.
 """
@@ -32,7 +32,7 @@ from diffabs.core.pytree import Scalar, part, parts, pytree
 
 
 class LoopState(NamedTuple):
-    """Plant state and the memories of the blocks."""
+    """The state of the plant and the memories of the blocks."""
 
     plant: Any
     sensor: Memory
@@ -41,16 +41,23 @@ class LoopState(NamedTuple):
     actuator: Memory
 
     def flow(self) -> tuple[Any, ...]:
-        """What is integrated."""
+        """Return the integrated part of the state: plant state and continuous memories."""
         return (self.plant, *(m.flow for m in self[1:]))
 
     def with_flow(self, flow: tuple[Any, ...]) -> "LoopState":
-        """The same held memories with other continuous ones."""
+        """Return the state with the continuous memories in `flow` and the same held memories."""
         return LoopState(flow[0], *(m._replace(flow=f) for m, f in zip(self[1:], flow[1:], strict=True)))
 
 
 class Signals(NamedTuple):
-    """Every signal of the loop at an instant; once more, by the name of the block, those that a block records."""
+    """All signals of the loop at an instant.
+
+    Attributes:
+        sample: Signals of a sample.
+        measured: Output of the sensor.
+        tracking: Input of the controller.
+        recorded: The signals that a block records, by the name of the block.
+    """
 
     sample: Sample
     measured: Any
@@ -58,13 +65,13 @@ class Signals(NamedTuple):
     recorded: dict[str, Any]
 
 
-Margins = dict[str, tuple[Any, ...]]  # of the stop and of each block that has events, by name
+Margins = dict[str, tuple[Any, ...]]  # margins of the stop and of each block with events, by name
 BLOCKS = ("sensor", "reference", "controller", "actuator")
 
 
 @pytree
 class Loop:
-    """Plant and controller with what is around them."""
+    """A closed loop of plant and controller with the blocks around them."""
 
     plant: Plant = part()
     initial: Any = part()
@@ -76,7 +83,7 @@ class Loop:
     stop: Stop = part()
 
     def start(self) -> LoopState:
-        """State at t = 0, before the first tick."""
+        """Return the state at t = 0, before the first tick."""
         x = self.plant.start(self.initial)
         y = self.plant.output(x)
         sensor = self.sensor.start(y)
@@ -88,7 +95,7 @@ class Loop:
         return LoopState(x, sensor, reference, controller, actuator)
 
     def signals(self, t: Scalar, state: LoopState) -> Signals:
-        """Follow the signal once around the loop."""
+        """Return the signals at time `t` [s] in `state`, computed once around the loop."""
         y = self.plant.output(state.plant)
         measured = self.sensor.output(t, state.sensor, y)
         tracking = self._tracking(t, state.reference, measured)
@@ -103,7 +110,7 @@ class Loop:
         return Signals(sample, measured, tracking, kept)
 
     def flow(self, t: Scalar, state: LoopState, signals: Signals) -> tuple[Any, ...]:
-        """d(state.flow())/dt, from the signals at (t, state)."""
+        """Return d(state.flow())/dt from the `signals` at (t, state)."""
         sample, measured, tracking, _ = signals
         return (
             self.plant.derivative(t, state.plant, sample.control),
@@ -124,7 +131,9 @@ class Loop:
         return any(offers(getattr(self, name), "tick") for name in BLOCKS)
 
     def next_tick(self, k: Any, h: Scalar) -> Any:
-        """The number of the first instant after the k-th of a grid of step h [s] at which a block ticks."""
+        """Return the number of the first grid instant after the `k`-th at which a block ticks; `h` is the grid's step
+        [s].
+        """
         blocks = (getattr(self, name) for name in BLOCKS)
         return reduce(jnp.minimum, (next_tick(block, k, h) for block in blocks if offers(block, "tick")))
 
@@ -135,16 +144,19 @@ class Loop:
 
     @property
     def jumps(self) -> bool:
-        """Whether a rate in the flow jumps where a comparison changes, as a part of the loop says."""
+        """Whether a part of the loop declares that a rate in the flow jumps where a comparison changes."""
         return any(_jumps(getattr(self, name)) for name in ("plant", *BLOCKS))
 
     @property
     def recorders(self) -> tuple[str, ...]:
-        """The blocks that record their signal, by name."""
+        """Names of the blocks that record their signal."""
         return tuple(name for name in BLOCKS if offers(getattr(self, name), "record"))
 
     def margins(self, t: Scalar, state: LoopState, signals: Signals, flow: Callable[[], Any]) -> Margins:
-        """The stop's margin and those of the blocks; `flow()` is d(state.flow())/dt, for those that need a rate."""
+        """Return the margins of the stop and of the blocks; `flow()` is d(state.flow())/dt, for blocks that need a
+        rate.
+        """
+        # The rates cost a derivative of the loop: they are computed at most once, and only if a block calls `rate`.
         rates = cache(lambda: _block_inputs(self.signal_rates(t, state, flow())))
         seen = _block_inputs(signals)
 
@@ -163,13 +175,19 @@ class Loop:
         fired: Margins,
         passed: dict[str, Passage] | None = None,
     ) -> LoopState:
-        """The state after an instant: each block, in the order of the signal, has its events, records the step that
-        ends here, and has its tick.
+        """Return the state after an instant.
 
-        before, margins: those until now. An event also happens where the change of a block before it makes a margin
-            negative, at either end of the jump of the signal and with the jump for a rate: a maximum is where it falls
-        fired: a bool for each margin, whether it has just fallen through zero
-        passed: the step that ends here, for the blocks that record it; none does at the start of a run
+        Each block, in the order of the signal, has its events, records the step that ends here, and has its tick. An
+        event also occurs if the change of an earlier block makes a margin negative. The test covers both ends of the
+        signal's jump, with the jump as the rate, so that the margin of a maximum sees the fall.
+
+        Args:
+            clock: The instant.
+            state: State before the instant.
+            before: Signals before the instant.
+            margins: Margins before the instant.
+            fired: For each margin, whether it has just fallen through zero.
+            passed: The step that ends here, for the blocks that record it; None at the start of a run.
         """
         was, moved = _block_inputs(before), False
 
@@ -179,6 +197,7 @@ class Loop:
             if name in fired:
                 happens = fired[name]
                 if moved:
+                    # An earlier block has changed at this instant, so the input may jump across a margin's zero.
                     jump = jax.tree.map(jnp.subtract, signal, was[name])
                     ends = (block.margins(clock.t, memory, end, lambda: jump) for end in (was[name], signal))
                     crossed = zip(happens, margins[name], *ends, strict=True)
@@ -200,7 +219,7 @@ class Loop:
         return state
 
     def signal_rates(self, t: Scalar, state: LoopState, flow: Any) -> Signals:
-        """d(signals)/dt where nothing jumps and d(state.flow())/dt is `flow`."""
+        """Return d(signals)/dt at time `t` in `state`, away from jumps, for d(state.flow())/dt equal to `flow`."""
         moves = (jnp.ones_like(jnp.asarray(t)), flow)
         return jax.jvp(lambda t, z: self.signals(t, state.with_flow(z)), (jnp.asarray(t), state.flow()), moves)[1]
 
@@ -211,20 +230,25 @@ class Loop:
 
 
 def _jumps(one: Any) -> bool:
-    """Whether a part says so, or one in it; of a block without a flow nothing is integrated."""
+    """Return whether a part, or a part in it, declares jumps; a block without a flow has nothing to integrate."""
     if getattr(type(one), "flow", None) is no_flow:
         return False
     return getattr(one, "jumps", False) or any(map(_jumps, parts(one)))
 
 
 def _block_inputs(signals: Signals) -> dict[str, Any]:
-    """What each block is given."""
+    """Return the input of each block by its name."""
     sample, measured, tracking, _ = signals
     return {"sensor": sample.output, "reference": measured, "controller": tracking, "actuator": sample.command}
 
 
 def run_signals(sample: Sample, plant: Plant) -> dict[str, tuple[str, Any]]:
-    """Unit and values of what is kept of a run, by name: time, all that the plant shows, target, command, control."""
+    """Return unit and values of the stored signals of a run by name: time, plant outputs, target, command, control.
+
+    Args:
+        sample: Samples of the run.
+        plant: Plant of the loop.
+    """
     units = plant.shows.units
     shown = {name: (units[name], values) for name, values in sample.output._asdict().items()}
     asked = {"target": (units[sample.output._fields[0]], sample.target)}

@@ -1,5 +1,7 @@
-"""What the parts of a loop hand each other: what plants show, the memory of a block, the instant at which it may
-change, the samples and segments of a run. Imported from `core.protocols`, the page of contracts."""
+"""Data that the parts of a loop exchange: plant outputs, memories, the clock, samples, and segments of a run.
+
+`core.protocols`, the page of contracts, re-exports these names.
+"""
 
 from collections.abc import Callable
 from types import MappingProxyType
@@ -14,7 +16,7 @@ from diffabs.core.timing import steps_in_period
 
 
 class BrakeOutput(NamedTuple):
-    """What a braking plant shows of itself, and what a sensor measures."""
+    """The outputs of a braking plant, which are also the signals of its sensor."""
 
     slip: Scalar  # [1] (v - r omega)/v
     speed: Scalar  # [m/s] of the vehicle
@@ -25,12 +27,14 @@ class BrakeOutput(NamedTuple):
     units = MappingProxyType({
         **{"slip": "1", "speed": "m/s", "wheel_speed": "m/s", "deceleration": "m/s^2", "distance": "m"},
     })  # fmt: skip
-    highest = 1.0  # that the first signal can be
+    highest = 1.0  # greatest possible value of the first signal
 
 
 class BalanceOutput(NamedTuple):
-    """What a balancing plant shows of itself, and what a sensor measures. The motor's torque under a voltage u is
-    constant * clamp((u - emf)/resistance, -current_max, current_max)."""
+    """The outputs of a balancing plant, which are also the signals of its sensor.
+
+    The motor's torque under a voltage u is constant * clamp((u - emf)/resistance, -current_max, current_max).
+    """
 
     theta: Scalar  # [rad] frame, from the vertical
     psi: Scalar  # [rad] arm, from the frame
@@ -39,7 +43,7 @@ class BalanceOutput(NamedTuple):
     psi_rate: Scalar  # [rad/s]
     phi_rate: Scalar  # [rad/s]
     constant: Scalar  # [N m/A] torque per ampere, at the joint
-    emf: Scalar  # [V] that the turning joint induces
+    emf: Scalar  # [V] induced by the turning joint
     resistance: Scalar  # [ohm]
     current_max: Scalar  # [A]
 
@@ -50,16 +54,23 @@ class BalanceOutput(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What a block remembers: `flow` is integrated with the plant, `held` changes only in ticks and events."""
+    """The memory of a block: `flow` is integrated with the plant, `held` changes only in ticks and events."""
 
     flow: Any = ()
     held: Any = ()
 
 
 class Clock(NamedTuple):
-    """An instant at which blocks may change: time [s]; step of the integration's grid [s] and number of the grid's last
-    instant; whether this is that instant, and no event between two of them; the run's random key (or None). `before` is
-    the block's signal until then (None: the same), which a block before it may have changed."""
+    """An instant at which blocks may change.
+
+    Attributes:
+        t: Time [s].
+        h: Step of the integration grid [s].
+        k: Number of the last grid instant.
+        key: Random key of the run, or None.
+        on_grid: Whether this is that grid instant; False for an event between two grid instants.
+        before: Signal of the block before this instant, which an earlier block may have changed; None: unchanged.
+    """
 
     t: Scalar
     h: Scalar
@@ -69,7 +80,9 @@ class Clock(NamedTuple):
     before: Any = None
 
     def ticks(self, period: Scalar | None = None) -> tuple[Any, Any]:
-        """Whether a clock of this period [s] (None: that of the grid) strikes now, and for how many times before."""
+        """Return whether a clock of this `period` [s] (None: the grid's) ticks now, and the number of its earlier
+        ticks.
+        """
         if period is None:
             return jnp.asarray(self.on_grid), self.k
         n = steps_in_period(period, self.h)
@@ -77,7 +90,7 @@ class Clock(NamedTuple):
 
 
 class Tracking(NamedTuple):
-    """What a controller is given: target (a slip, an angle), measured output, and the feed-forward input."""
+    """The input of a controller: target (a slip, an angle), measured output, and feed-forward input."""
 
     target: Scalar
     measured: Any
@@ -85,20 +98,27 @@ class Tracking(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What is seen of a run at an instant; the input of an objective."""
+    """The signals of a run at an instant; the input of an objective."""
 
     t: Scalar  # [s]
-    output: Any  # the truth, not the measurement: what the plant shows
-    target: Scalar  # what the controller is told to follow now, in the unit of the first signal
-    setpoint: Scalar  # where the target will settle
+    output: Any  # true outputs of the plant, not the measurement
+    target: Scalar  # present target of the controller, in the unit of the first output
+    setpoint: Scalar  # final value of the target
     feedforward: Scalar  # in the unit of the control
-    command: Scalar  # what the controller asks for
-    control: Scalar  # what the actuator delivers
+    command: Scalar  # output of the controller
+    control: Scalar  # output of the actuator
 
 
 class Ending(NamedTuple):
-    """How a run ended: its last sample, whether it reached the stop, and what remains to be added after the last sample
-    (the way from the stop speed to standstill; for a run that did not stop, the pessimistic rest)."""
+    """The end of a run.
+
+    Attributes:
+        sample: Last sample.
+        stopped: Whether the run reached the stop.
+        time_left: Time to add after the last sample [s]: from the stop speed to standstill; a pessimistic estimate for
+            a run that did not stop.
+        distance_left: Distance to add after the last sample [m].
+    """
 
     sample: Sample
     stopped: Any
@@ -107,25 +127,35 @@ class Ending(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """Of a sample: what the plant shows, and the setpoint of its first signal; or their rates."""
+    """The plant outputs and the setpoint of the first output, or their rates."""
 
     output: Any
     setpoint: Scalar
 
     @classmethod
     def of(cls, sample: Sample) -> "Shown":
-        """That of a sample."""
+        """Return outputs and setpoint of a `sample`."""
         return cls(sample.output, sample.setpoint)
 
 
 class Segment(NamedTuple):
-    """A step of a run, from one instant to the next, within which nothing jumps: the samples at both ends (the first
-    after the jumps there, the last before them), its length [s], and the step of the grid [s]. What `output`,
-    `error` and `sample` return is the cubic of something seen, from values and rates at both ends: its extrema, roots
-    and integrals are those of the run to the order of the method. `smooth`: no limit is reached within, either, because
-    the step would end there; else the cubic of a signal that has limits may leave them. `within`: whether the
-    rates at the start, and those at the end, are those within the step, also where a limit is reached there. Where one
-    is not, the cubic is the parabola through both ends with the other rate; without either, the line."""
+    """A step of a run between two instants, without a jump inside.
+
+    `output`, `error`, `shown` and `sample` return the cubic of a signal from values and rates at both ends. Its
+    extrema, roots and integrals are those of the run to the order of the method.
+
+    Attributes:
+        start: Sample at the start, after the jumps there.
+        end: Sample at the end, before the jumps there.
+        h: Length [s].
+        step: Step of the grid [s].
+        shown_rates: Function that returns the rates of plant outputs and setpoint at both ends.
+        sample_rates: Function that returns the rates of all signals at both ends.
+        smooth: True if no limit is reached inside, because the step would end there. Otherwise the cubic of a limited
+            signal may exceed the limits.
+        within: Whether the rates at the start and at the end are the rates inside the step, also at a limit. With only
+            one such rate, the cubic is the parabola through both ends with that rate; with none, the straight line.
+    """
 
     start: Sample
     end: Sample
@@ -137,25 +167,26 @@ class Segment(NamedTuple):
     within: tuple[Any, Any] = (True, True)
 
     def output(self, read: Callable[[Any], Scalar] = lambda output: output[0]) -> Cubic:
-        """The cubic of read(output): by default of the first signal that the plant shows."""
+        """Return the cubic of `read`(output), by default of the first plant output."""
         start, end = self.shown_rates()
         return self._cubic(read, (self.start.output, self.end.output), (start.output, end.output))
 
     def error(self) -> Cubic:
-        """The cubic of the first signal - setpoint, which a reference may move within a step."""
+        """Return the cubic of the first plant output minus its setpoint, which a reference may move within a step."""
         return self.shown(lambda shown: shown.output[0] - shown.setpoint)
 
     def shown(self, read: Callable[[Shown], Scalar]) -> Cubic:
-        """The cubic of read(shown): of what the plant shows and the setpoint of its first signal."""
+        """Return the cubic of `read`(shown), a function of the plant outputs and the setpoint."""
         return self._cubic(read, (Shown.of(self.start), Shown.of(self.end)), self.shown_rates())
 
     def sample(self, read: Callable[[Sample], Scalar]) -> Cubic:
-        """The cubic of read(sample): of anything seen. It costs the rates of all signals."""
+        """Return the cubic of `read`(sample), a function of any signals. It costs the rates of all signals."""
         return self._cubic(read, (self.start, self.end), self.sample_rates())
 
     def _cubic(self, read: Callable[[Any], Scalar], ends: tuple[Any, Any], rates: tuple[Any, Any]) -> Cubic:
         (a, da), (b, db) = (jax.jvp(read, (end,), (rate,)) for end, rate in zip(ends, rates, strict=True))
         first, last, rise, (start, end) = self.h * da, self.h * db, b - a, self.within
+        # `within` may be traced; the comparison with True is decided at trace time and skips the selections.
         if start is True and end is True:
             return Cubic(a, b, first, last)
         return Cubic(
@@ -167,7 +198,12 @@ class Segment(NamedTuple):
 
 
 def resting_segment(sample: Sample, h: Scalar) -> Segment:
-    """Return a step of length h [s] in which nothing moves."""
+    """Return a segment of length h in which nothing moves.
+
+    Args:
+        sample: Sample at both ends.
+        h: Length [s].
+    """
     sample = jax.tree.map(jnp.asarray, sample)
     rest = jax.tree.map(jnp.zeros_like, sample)
     return Segment(sample, sample, h, h, lambda: (Shown.of(rest), Shown.of(rest)), lambda: (rest, rest))

@@ -1,4 +1,4 @@
-"""Answers to the comparisons of a program (`core.comparisons`), given from outside: packed in words, a bit for each."""
+"""Modes: frozen answers to the comparisons of a program (`core.comparisons`), packed in words, one bit for each."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -8,15 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 
 WORD_BITS = 32  # answers in a word
-ROUNDING_POWER = 0.75  # power of the precision: of two numbers, a relative difference that says nothing
+ROUNDING_POWER = 0.75  # eps to this power is a relative difference that may come from rounding alone
 
 ModeBits = tuple[Any, ...]
-BitRange = tuple[int, tuple[int, ...]]  # of a comparison: its first bit, and its shape
+BitRange = tuple[int, tuple[int, ...]]  # first bit and shape of a comparison
 
 
 class Mode(NamedTuple):
-    """Answers (None: as the numbers say); whether they do not count, after all; and, where one looks, those of them
-    that give way where the numbers say otherwise."""
+    """Frozen answers to the comparisons of a program.
+
+    Attributes:
+        words: The answers; None takes the answers of the numbers.
+        free: True overrides the frozen answers by the answers of the numbers.
+        released: Answers that give way where the numbers contradict them, in an evaluation with `look`.
+    """
 
     words: ModeBits | None
     free: Any = None
@@ -24,9 +29,14 @@ class Mode(NamedTuple):
 
 
 class ComparisonAnswers(NamedTuple):
-    """The answers that were taken; those that the numbers contradict, by more than rounding, and that did not give way;
-    the margins until they do, negative then, each with the numbers of its bits. Of answers as the numbers say it, the
-    margins are x - y, with either sign."""
+    """The answers of an evaluation with `look`.
+
+    Attributes:
+        words: Answers that were used.
+        contradicted: Answers that the numbers contradict by more than rounding, and that did not give way.
+        margins: Margins until the numbers contradict the answers, negative after that, each with the numbers of its
+            bits. Without frozen answers the margins are x - y, with either sign.
+    """
 
     words: ModeBits
     contradicted: ModeBits
@@ -34,20 +44,34 @@ class ComparisonAnswers(NamedTuple):
 
 
 def single_bit(which: Any, words: int) -> ModeBits:
-    """Return the words of one bit."""
+    """Return the words with one bit set.
+
+    Args:
+        which: Number of the bit.
+        words: Number of words.
+    """
     word, place = which // WORD_BITS, (which % WORD_BITS).astype(jnp.uint32)
     return tuple(jnp.where(word == i, jnp.uint32(1) << place, jnp.uint32(0)) for i in range(words))
 
 
 def find_contradicted(answers: ComparisonAnswers, which: Any, like: Any) -> tuple[Any, Any, Any, Any]:
-    """Return a comparison other than `which` that is contradicted, -1 if none is; whether `which` is; which of both
-    this is about, `which` if it is contradicted or no other is; and its margin, of the type of `like`. Numbers are
-    those of bits."""
+    """Return which comparisons are contradicted: (other, crossed, chosen, margin).
+
+    `other` is a contradicted comparison apart from `which`, or -1. `crossed` states whether `which` is contradicted.
+    `chosen` is `which` if it is contradicted or no other comparison is, and `other` otherwise. `margin` is the margin
+    of `chosen`. Comparisons are numbered by their bits.
+
+    Args:
+        answers: Answers and margins of an evaluation.
+        which: Number of a bit.
+        like: A number with the type of the margin.
+    """
     other, crossed = jnp.asarray(-1, which.dtype), jnp.asarray(False)
     for i, (word, bit) in enumerate(
         zip(answers.contradicted, single_bit(which, len(answers.contradicted)), strict=True)
     ):
         rest = word & ~bit
+        # x & -x keeps the lowest set bit; one less has as many bits set as there are places below it.
         lowest = jax.lax.population_count((rest & (~rest + 1)) - 1)
         other = jnp.where(rest != 0, i * WORD_BITS + lowest.astype(which.dtype), other)
         crossed |= (word & bit) != 0
@@ -61,10 +85,10 @@ def find_contradicted(answers: ComparisonAnswers, which: Any, like: Any) -> tupl
 
 
 class ComparisonTrace:
-    """The comparisons of one run of a program."""
+    """The comparisons of one evaluation of a program."""
 
     def __init__(self, places: Sequence[BitRange], words: int, mode: Mode, look: bool):
-        """Comparisons at these places, of which a caller may want to `look` at the margins."""
+        """Set the bits of the comparisons; `look` keeps the margins."""
         self.places, self.mode, self.look = places, mode, look
         self.taken: dict[int, Any] = {}
         self.against: list[Any] = [jnp.uint32(0)] * words
@@ -72,7 +96,7 @@ class ComparisonTrace:
         self.margins: list[tuple[Any, Any]] = []
 
     def __call__(self, ask: tuple[int, bool], x: Any, y: Any, strict: bool) -> Any:
-        """Whether x > y, or x >= y."""
+        """Return the answer to x > y if strict, else to x >= y."""
         number, turned = ask
         if number not in self.taken:
             self.taken[number] = self._compare(number, *((y, x, not strict) if turned else (x, y, strict)))
@@ -80,6 +104,7 @@ class ComparisonTrace:
         return ~taken if turned else taken
 
     def _compare(self, number: int, x: Any, y: Any, strict: bool) -> Any:
+        """Return the frozen answer, or the answer of the numbers, and record the contradiction and the margin."""
         first, shape = self.places[number]
 
         def says() -> Any:
@@ -94,7 +119,9 @@ class ComparisonTrace:
             return taken if self.mode.free is None else jnp.where(self.mode.free, says(), taken)
         margin = jnp.where(taken, x - y, y - x)
         against = margin < -_rounding(x)
-        if self.mode.released is not None:  # a product that has become 0 contradicts nobody, and would be held for ever
+        if self.mode.released is not None:
+            # A margin of exactly 0 (a product that has become 0) is no contradiction; without this line a released
+            # answer would stay frozen for ever.
             gives = unpack_answers(self.mode.released, first, shape)
             against |= gives & (margin == 0) & (says() != taken)
             taken ^= against & gives
@@ -103,7 +130,10 @@ class ComparisonTrace:
         return taken
 
     def search(self, ask: tuple[int, bool], says: Callable[[], Any], knots: Any, x: Any) -> Any:
-        """How many of the knots lie below x: a bit for each of them."""
+        """Return the number of knots below `x`, with one bit for each knot.
+
+        `ask` is the number of the comparison, `says()` the search by the numbers, and `knots` (n,) are the knots.
+        """
         number, count = ask[0], len(knots)
         first = self.places[number][0]
         word, shift, all = first // WORD_BITS, np.uint32(first % WORD_BITS), np.uint32((1 << count) - 1)
@@ -117,6 +147,7 @@ class ComparisonTrace:
         if not self.look:
             return below if self.mode.free is None else jnp.where(self.mode.free, says(), below)
         low, high = self._between(first, below, knots, x)
+        # The neighbouring interval if x has left the frozen one by more than rounding.
         next = below + jnp.where(high < -_rounding(x), 1, 0) - jnp.where(low < -_rounding(x), 1, 0)
         if self.mode.free is not None:
             next = jnp.where(self.mode.free, says(), next)
@@ -129,7 +160,7 @@ class ComparisonTrace:
         self.margins.append((first + np.arange(np.prod(shape)).reshape(shape) if shape else first, margin))
 
     def _between(self, first: int, below: Any, knots: Any, x: Any) -> tuple[Any, Any]:
-        """How far x is from the knots on either side of it."""
+        """Return the distances of x from the knots on either side of it."""
         count = len(knots)
         low = jnp.where(below > 0, x - knots[jnp.maximum(below - 1, 0)], jnp.inf)
         high = jnp.where(below < count, knots[jnp.minimum(below, count - 1)] - x, jnp.inf)
@@ -137,6 +168,7 @@ class ComparisonTrace:
         return low, high
 
     def _pack(self, words: list[Any], first: int, answer: Any) -> None:
+        """Set the bits of an answer in these words."""
         if not jnp.ndim(answer):
             words[first // WORD_BITS] |= jnp.where(answer, np.uint32(1 << first % WORD_BITS), np.uint32(0))
             return
@@ -145,7 +177,7 @@ class ComparisonTrace:
             words[word] |= jnp.sum(jnp.where(here, np.uint32(1) << places, np.uint32(0)), dtype=jnp.uint32)
 
     def answers(self) -> ComparisonAnswers:
-        """What was found."""
+        """Return the answers, the contradicted bits and the margins."""
         against = self.against
         if self.mode.words is None:
             return ComparisonAnswers(tuple(self.said), tuple(against), self.margins)
@@ -157,17 +189,24 @@ class ComparisonTrace:
 
 
 def _ones(count: Any) -> Any:
-    """So many bits, from the lowest."""
+    """Return a word with the lowest `count` bits set."""
     return (jnp.uint32(1) << count.astype(jnp.uint32)) - 1
 
 
 def _rounding(x: Any) -> Any:
+    """Return the difference from x below which a comparison is undecided by rounding."""
     most = jnp.finfo(jnp.result_type(x))
     return most.eps**ROUNDING_POWER * jnp.minimum(jnp.abs(x), most.max)
 
 
 def unpack_answers(words: ModeBits, first: int, shape: tuple[int, ...]) -> Any:
-    """Return the answers of a comparison, bool of this shape."""
+    """Return the answers of a comparison as booleans.
+
+    Args:
+        words: Packed answers.
+        first: First bit of the comparison.
+        shape: Shape of the comparison.
+    """
     if not shape:
         return (words[first // WORD_BITS] & np.uint32(1 << first % WORD_BITS)) != 0
     parts = [(words[word] & (np.uint32(1) << places)) != 0 for _, word, places in locate_bits(first, shape)]
@@ -175,7 +214,12 @@ def unpack_answers(words: ModeBits, first: int, shape: tuple[int, ...]) -> Any:
 
 
 def locate_bits(first: int, shape: tuple[int, ...]) -> list[tuple[int, int, np.ndarray]]:
-    """Where the bits of a comparison lie: the first of them in a word, the word, and places in it."""
+    """Return the place of a comparison's bits, as a list of (first element, word, bits in the word).
+
+    Args:
+        first: First bit of the comparison.
+        shape: Shape of the comparison.
+    """
     size, found, start = int(np.prod(shape)), [], 0
     while start < size:
         at = (first + start) % WORD_BITS

@@ -1,4 +1,4 @@
-"""Elementary functions whose gradients stay finite where the textbook ones do not."""
+"""Elementary functions whose gradients stay finite where the textbook formulas fail."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,40 +8,71 @@ import jax.numpy as jnp
 
 from diffabs.core.pytree import Scalar
 
-EQUAL_EPS = 1024.0  # precisions: two values of a signal at instants that are one to rounding
+EQUAL_EPS = 1024.0  # in units of eps: difference of a signal between instants that are equal to rounding
 
 
 def clamp(x: Scalar, low: Scalar, high: Scalar) -> Any:
-    """x limited to [low, high]. The slope in x is 1 at a limit and 0 beyond it, where that in the limit is 1.
+    """Return x limited to [low, high].
 
-    Selections, since the tangent of `jnp.clip` divides, and `lax.clamp` refuses to batch an upper limit
-    alone (JAX 0.10; of the kind of github.com/jax-ml/jax/issues/5325, whose repair leaves this case out).
+    The slope in x is 1 at a limit and 0 beyond it; the slope in a limit is 1 beyond that limit. The function uses
+    selections for two reasons. The tangent of `jnp.clip` divides. `lax.clamp` refuses to batch an upper limit alone
+    (JAX
+    0.10; similar to github.com/jax-ml/jax/issues/5325, whose repair leaves this case out).
+
+    Args:
+        x: Number to limit.
+        low: Lower limit.
+        high: Upper limit.
     """
     return jnp.where(jnp.less(x, low), low, jnp.where(jnp.greater(x, high), high, x))
 
 
 def larger(x: Scalar, y: Scalar) -> Any:
-    """max(x, y). Equal, the slope is that in x: `jnp.maximum` shares it between both, by a division in its tangent."""
+    """Return max(x, y), with the slope in x where both are equal.
+
+    `jnp.maximum` shares the slope between both, by a division in its tangent.
+
+    Args:
+        x: First number.
+        y: Second number.
+    """
     return jnp.where(jnp.greater_equal(x, y), x, y)
 
 
 def later_of_larger(x: Scalar, y: Scalar, falls: Any = False) -> Any:
-    """max(x, y) of two values one after the other. Where they are equal to rounding, the slope is that of the later
-    one, y: the end of a step without a length moves with the event there, its beginning does not. If the signal `falls`
-    from x on, it is that of x: a peak at an event that is a rounding before the grid does not stand on the grid."""
+    """Return max(x, y) of two successive values of a signal, with the slope of y where both are equal to rounding.
+
+    The end y of a step of zero length moves with the event there; its start x does not. If the signal falls after x,
+    the slope is that of x. A peak at an event just before a grid instant then does not move with the grid.
+
+    Args:
+        x: Earlier value.
+        y: Later value.
+        falls: Whether the signal falls at x.
+    """
     rounding = EQUAL_EPS * jnp.finfo(jnp.result_type(x, y)).eps * jnp.abs(x)
     more = jnp.where(falls, rounding, -rounding)
     return jnp.where(jnp.greater_equal(y, x + more), y, x)
 
 
 def smaller(x: Scalar, y: Scalar) -> Any:
-    """min(x, y), with the slope in x where they are equal."""
+    """Return min(x, y), with the slope in x where both are equal.
+
+    Args:
+        x: First number.
+        y: Second number.
+    """
     return jnp.where(jnp.less_equal(x, y), x, y)
 
 
 @jax.custom_jvp
 def quotient(x: Scalar, y: Scalar) -> Any:
-    """x/y, whose derivatives (dx - (x/y) dy)/y share one 1/y. JAX's own divide three times more."""
+    """Return x/y; its derivatives (dx - (x/y) dy)/y share one 1/y. JAX's own derivatives divide three more times.
+
+    Args:
+        x: Numerator.
+        y: Denominator.
+    """
     return x / y
 
 
@@ -53,16 +84,27 @@ def _quotient_slope(at: Any, moves: Any) -> tuple[Any, Any]:
 
 
 def ratio(numerator: Scalar, denominator: Scalar, otherwise: Scalar = 0.0) -> Any:
-    """numerator/denominator, and `otherwise` where the denominator is zero (with zero slope there)."""
+    """Return numerator/denominator, or `otherwise` with zero slope where the denominator is zero.
+
+    Args:
+        numerator: Numerator.
+        denominator: Denominator.
+        otherwise: Value for a zero denominator.
+    """
+    # The inner `where` replaces a zero denominator: 0 times the infinite derivative of 1/0 would be NaN.
     fine = jnp.not_equal(denominator, 0)
     return jnp.where(fine, quotient(numerator, jnp.where(fine, denominator, 1.0)), otherwise)
 
 
 def power(base: Scalar, exponent: Scalar) -> Any:
-    """base ** exponent for base >= 0 and exponent > 1, with slope 0 at base = 0 in both arguments.
+    """Return base ** exponent for base >= 0 and exponent > 1, with slope 0 at base = 0 in both arguments.
 
-    exp(q log x): XLA's own power is three to four times slower on a CPU. By the square of the base, so that a step that
-    goes on beyond 0 before it is tried again (`core.comparisons`) finds a number there.
+    The formula is exp(q log x): XLA's own power is three to four times slower on a CPU. It uses the square of the base.
+    A trial step that passes base = 0 with frozen comparisons (`core.comparisons`) then gets a finite number.
+
+    Args:
+        base: Base.
+        exponent: Exponent q.
     """
     square = base * base
     fine = jnp.not_equal(square, 0)
@@ -72,36 +114,67 @@ def power(base: Scalar, exponent: Scalar) -> Any:
 
 @jax.jit
 def searchsorted(knots: Any, x: Scalar) -> Any:
-    """Return how many of a few increasing knots (n,) are not above x.
+    """Return the number of knots that are not above x, for a few knots.
 
-    `core.comparisons` recognises a search by this name, which is JAX's. JAX's own looks for NaN among the knots each
-    time."""
+    `core.comparisons` recognises the search by this name, which JAX uses, too. JAX's own search looks for NaN among the
+    knots in each call.
+
+    Args:
+        knots: Increasing knots, shape (n,).
+        x: Number to search.
+    """
     return jnp.sum(x >= knots).astype(jnp.int32)
 
 
 def sign(x: Scalar) -> Any:
-    """+1 for x >= 0, else -1: the odd extension of a curve given for x >= 0 keeps the slope of its right side at 0."""
+    """Return +1 for x >= 0, else -1; with it, the odd extension of a curve keeps its right-hand slope at 0.
+
+    Args:
+        x: Number.
+    """
     return jnp.where(jnp.greater_equal(x, 0), 1.0, -1.0)
 
 
 def odd(curve: Callable[[Any], Any], x: Scalar) -> Any:
-    """The odd extension of a curve given for x >= 0. At 0 the slope is that of the curve (|x| would make it 0)."""
+    """Return the odd extension of a curve for x >= 0, with the curve's slope at 0 (|x| would give slope 0).
+
+    Args:
+        curve: Function for x >= 0.
+        x: Argument of either sign.
+    """
     s = sign(x)
     return s * curve(s * x)
 
 
 def interval_shares(x: Scalar, nodes: Any) -> Any:
-    """How much of each interval between nodes (n,), which increase, lies below x, from 0 to 1 (n-1,). A `table` is a
-    sum over it: no index to look up, which derivatives would have to scatter to."""
+    """Return the share of each interval between the nodes that lies below x, from 0 to 1, shape (n - 1,).
+
+    `interpolate_shares` sums over the shares. It looks up no index, to which derivatives would have to scatter.
+
+    Args:
+        x: Number.
+        nodes: Increasing nodes, shape (n,).
+    """
     inside = (x - nodes[:-1]) / jnp.diff(nodes)
     return jnp.where(x >= nodes[1:], 1.0, jnp.where(x < nodes[:-1], 0.0, inside))
 
 
 def interpolate_shares(risen: Any, values: Any) -> Any:
-    """The values (n,) at the nodes: linear between them, constant beyond."""
+    """Return the piecewise linear interpolant of the values at the nodes, constant beyond the nodes.
+
+    Args:
+        risen: Shares of the intervals from `interval_shares`, shape (n - 1,).
+        values: Values at the nodes, shape (n,).
+    """
     return values[0] + jnp.sum(risen * jnp.diff(values))
 
 
 def axpy(a: Scalar, x: Any, y: Any) -> Any:
-    """a x + y on pytrees."""
+    """Return a x + y on pytrees.
+
+    Args:
+        a: Factor.
+        x: Pytree.
+        y: Pytree of the same structure.
+    """
     return jax.tree.map(lambda x, y: a * x + y, x, y)

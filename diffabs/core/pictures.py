@@ -1,7 +1,9 @@
-"""Text inside a PNG file: what a picture shows, as numbers, goes where the picture goes.
+"""Text inside a PNG file: the numbers that a figure shows travel with the figure.
 
-W3C, Portable Network Graphics (third edition), section 11.3.3: a `tEXt` chunk is a keyword, a zero, and Latin-1 text;
-each chunk is its length, its type, its data and their CRC."""
+A `tEXt` chunk is a keyword, a zero, and Latin-1 text. Each chunk is its length, its type, its data and their CRC.
+
+Source: W3C, Portable Network Graphics (third edition), section 11.3.3.
+"""
 
 import struct
 import zlib
@@ -13,7 +15,13 @@ PNG_HEADER_BYTES = len(PNG_SIGNATURE) + 25  # bytes until after IHDR, which is a
 
 
 def with_text(picture: bytes, key: str, text: str) -> bytes:
-    """Return a PNG with a text of ASCII under a keyword; what is no PNG as it is."""
+    """Return a PNG with an ASCII text under a keyword, or other data unchanged.
+
+    Args:
+        picture: Content of the file.
+        key: Keyword.
+        text: ASCII text.
+    """
     if not picture.startswith(PNG_SIGNATURE):
         return picture
     data = b"tEXt" + key.encode("ascii") + b"\0" + text.encode("ascii")
@@ -22,8 +30,14 @@ def with_text(picture: bytes, key: str, text: str) -> bytes:
 
 
 def without_text(picture: bytes, key: str) -> tuple[bytes, str]:
-    """Return a picture without the text under a keyword, and that text; the same and "" for one that has none, is no
-    PNG, or is not whole."""
+    """Return a PNG without the text under a keyword, and that text.
+
+    Without such a text, or for data that is not a whole PNG, the picture is unchanged and the text is empty.
+
+    Args:
+        picture: Content of the file.
+        key: Keyword.
+    """
     keyword = b"tEXt" + key.encode("ascii") + b"\0"
     for start, end in _chunks(picture):
         data = picture[start + 4 : end - 4]
@@ -33,7 +47,7 @@ def without_text(picture: bytes, key: str) -> tuple[bytes, str]:
 
 
 def _chunks(picture: bytes) -> Iterator[tuple[int, int]]:
-    """Where chunks begin and end."""
+    """Yield the first byte of each whole chunk, and the byte after its last."""
     start = len(PNG_SIGNATURE) if picture.startswith(PNG_SIGNATURE) else len(picture)
     while start + 12 <= len(picture):
         end = start + 12 + int.from_bytes(picture[start : start + 4], "big")

@@ -1,4 +1,4 @@
-"""Where a number comes from: versions of what computed it, and the commit."""
+"""The origin of a result: versions of the software, the machine, and the commit."""
 
 import contextlib
 import datetime
@@ -17,20 +17,31 @@ import jax
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Return the versions of diffabs, JAX, these packages, and Python, by name."""
+    """Return the versions of diffabs, JAX, these packages, and Python, by name.
+
+    Args:
+        packages: Names of distributions.
+    """
     found = {name: importlib.metadata.version(name) for name in ("jax", *packages)}
-    own = sys.modules[__name__.partition(".")[0]].__version__  # the distribution has another name than the package
+    own = sys.modules[__name__.partition(".")[0]].__version__  # the distribution's name differs from the package's
     return {"diffabs": own, **found, "python": platform.python_version()}
 
 
 def describe_platform(*packages: str) -> dict[str, str]:
-    """Return what can change a bit of a result: `versions`, JAX's backend, and the processor."""
+    """Return everything that can change a bit of a result: `versions`, JAX's backend, and the processor.
+
+    Args:
+        packages: Names of distributions.
+    """
     return versions(*packages) | {"backend": jax.default_backend(), "machine": platform.machine()}
 
 
 @functools.cache
 def processor() -> str:
-    """Return a name of this kind of processor: programs compiled for another may not run here, and homes are shared."""
+    """Return a name of this kind of processor.
+
+    Programs compiled for another kind may not run here, and home folders are shared between machines.
+    """
     known = f"{platform.machine()} {platform.processor()}"
     with contextlib.suppress(OSError):
         lines = pathlib.Path("/proc/cpuinfo").read_text(errors="replace").partition("\n\n")[0].splitlines()
@@ -39,8 +50,11 @@ def processor() -> str:
 
 
 def describe_making(words: Sequence[str]) -> dict[str, str | int]:
-    """Return when (UTC) and on which kind of machine something is computed, the commit where there is one, and the
-    command, of the words after `diffabs`, that computes it again."""
+    """Return date (UTC), machine, commit if there is one, and the command that repeats a computation.
+
+    Args:
+        words: Words of the command after `diffabs`.
+    """
     now = datetime.datetime.now(datetime.UTC).replace(microsecond=0)
     machine = {"machine": platform.machine(), "system": platform.system(), "processors": os.cpu_count() or 1}
     command = shlex.join(["diffabs", *map(str, words)])
@@ -48,7 +62,7 @@ def describe_making(words: Sequence[str]) -> dict[str, str | int]:
 
 
 def commit() -> dict[str, str]:
-    """The commit of a working copy, marked where files differ from it; nothing for an installed package."""
+    """Return the commit of a working copy, marked if files differ from it; empty for an installed package."""
     root = pathlib.Path(__file__).parents[2]
     if not (root / ".git").exists():
         return {}

@@ -1,14 +1,14 @@
-"""How a part is made: a frozen, keyword-only dataclass that is a JAX pytree.
+"""The construction of parts: a part is a frozen, keyword-only dataclass that is a JAX pytree.
 
-A part's leaves are its parameters. So `jax.vmap` over a plant is a Monte-Carlo sweep, `jax.grad` with respect to a
-controller is tuning, and no second dictionary of parameters exists. A field is one of three kinds:
+The leaves of a part are its parameters. So `jax.vmap` over a plant is a Monte-Carlo sweep, and `jax.grad` with respect
+to a controller is tuning. A second dictionary of parameters does not exist. A field is one of three kinds:
 
     param(...)   a leaf: a float (or array), with unit and range; differentiable and batchable
     part(...)    another part, or a tuple of parts
     static(...)  a shape or a choice fixed at trace time
 
-Ranges are not checked when a part is built, because JAX rebuilds parts with tracers and placeholders; `check(part)`
-of `core.validity` does it on the host, and names every offender at once.
+The construction of a part does not check ranges, because JAX rebuilds parts with tracers and placeholders.
+`check(part)` of `core.validity` checks them on the host, and names every parameter outside its range at once.
 """
 
 import dataclasses
@@ -36,9 +36,19 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(frozen=True)
 class Spec:
-    """What a parameter may be: its unit and the interval it lives in. `tunable` is False where the run does not depend
-    on the value smoothly (a sampling period, say), so that its derivative is zero or not defined. `shape` is that of a
-    part that is not batched; None where it is free."""
+    """The declaration of a parameter: its unit and its range.
+
+    Attributes:
+        unit: Unit, or a unit relative to the loop.
+        low: Lower end of the range.
+        high: Upper end of the range.
+        open_low: Whether the lower end is outside the range.
+        open_high: Whether the upper end is outside the range.
+        infinite: Whether infinite values are allowed.
+        tunable: False if a run does not depend smoothly on the value, for example on a sampling period. The derivative
+            is then zero or undefined.
+        shape: Shape in an unbatched part; None if it is free.
+    """
 
     unit: str
     low: float = -math.inf
@@ -50,26 +60,27 @@ class Spec:
     shape: tuple[int, ...] | None = dataclasses.field(default=None, compare=False)
 
     def interval(self) -> str:
-        """The range as a person writes it: `(0, 1] kg`."""
+        """Return the range as text: `(0, 1] kg`."""
         left = "(" if self.open_low or self.low == -math.inf else "["
         right = ")" if self.open_high or self.high == math.inf else "]"
         unit = "" if self.unit == "1" else f" {self.unit}"
         return f"{left}{self.low:g}, {self.high:g}{right}{unit}"
 
     def around(self, units: Units | None) -> "Spec":
-        """The same in a loop, in whose units a relative unit is worked out."""
+        """Return the declaration with a relative unit resolved in the `units` of a loop."""
         unit = resolve_unit(self.unit, units)
         return self if unit == self.unit else dataclasses.replace(self, unit=unit)
 
     def within(self, value: Any) -> Any:
-        """Whether every element lies in the range, also of traced numbers. Written so that NaN does not."""
+        """Return whether every element of `value` lies in the range, also for traced numbers. NaN does not."""
         x = as_rule_array(value)
+        # Comparisons that must be true, not ones that must be false: NaN fails each of them.
         above = x > self.low if self.open_low else x >= self.low
         below = x < self.high if self.open_high else x <= self.high
         return (above & below & ((abs(x) < math.inf) | self.infinite)).all()
 
     def holds(self, value: ArrayLike) -> bool:
-        """The same of concrete numbers."""
+        """Return whether every element of a concrete `value` lies in the range."""
         return bool(self.within(np.asarray(value, float)))
 
 
@@ -85,8 +96,19 @@ def param(
     tunable: bool = True,
     free: bool = False,
 ) -> Any:
-    """A parameter: one differentiable leaf. `low`/`high` belong to the range, `above`/`below` do not. Its shape is that
-    of its default, unless it is `free`."""
+    """Return the field of a parameter: one differentiable leaf, with the shape of its default.
+
+    Args:
+        default: Default value.
+        unit: Unit of the value.
+        low: Lower end of the range, which belongs to the range.
+        high: Upper end of the range, which belongs to the range.
+        above: Lower end of the range, which does not belong to the range.
+        below: Upper end of the range, which does not belong to the range.
+        infinite: Whether infinite values are allowed.
+        tunable: False if a run does not depend smoothly on the value.
+        free: Whether the value may have any shape.
+    """
     spec = Spec(
         unit,
         low if above is None else above,
@@ -98,13 +120,18 @@ def param(
         None if free or default is dataclasses.MISSING else np.shape(default),
     )
     if isinstance(default, tuple | list | np.ndarray):
+        # A copy for each instance: dataclasses refuse mutable defaults.
         values = np.array(default, float)
         return dataclasses.field(default_factory=values.copy, metadata={"spec": spec})
     return dataclasses.field(default=default, metadata={"spec": spec})
 
 
 def part(*, default: Any = dataclasses.MISSING) -> Any:
-    """A field that holds another part, or a tuple of parts. `default` is a part or a class to call."""
+    """Return a field that holds another part, or a tuple of parts.
+
+    Args:
+        default: A part, or a class to call.
+    """
     if default is dataclasses.MISSING:
         return dataclasses.field(metadata={"part": True})
     make = default if isinstance(default, type) else lambda: default
@@ -112,7 +139,11 @@ def part(*, default: Any = dataclasses.MISSING) -> Any:
 
 
 def static(*, default: Any = dataclasses.MISSING) -> Any:
-    """A field known at trace time: changing it compiles again."""
+    """Return a field known at trace time; another value causes another compilation.
+
+    Args:
+        default: Default value.
+    """
     return dataclasses.field(default=default, metadata={"static": True})
 
 
@@ -120,7 +151,14 @@ def static(*, default: Any = dataclasses.MISSING) -> Any:
     frozen_default=True, kw_only_default=True, eq_default=False, field_specifiers=(param, part, static)
 )
 def pytree(cls: type[T]) -> type[T]:
-    """Make a class a part. Raises TypeError for `__post_init__`, which JAX would call with tracers and None."""
+    """Return a class as a part: a frozen dataclass and a JAX pytree.
+
+    Args:
+        cls: Class with fields declared by `param`, `part` or `static`.
+
+    Raises:
+        TypeError: The class has `__post_init__`, which JAX would call with tracers and None, or an undeclared field.
+    """
     if "__post_init__" in cls.__dict__:
         raise TypeError(f"{cls.__name__}: no __post_init__ on a part; write rules(self) for check() instead")
     new = dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
@@ -134,12 +172,13 @@ def pytree(cls: type[T]) -> type[T]:
 
 
 def _register(cls: type, data: list[str], meta: list[str]) -> None:
-    """Tell JAX how to take a part apart and put it together.
+    """Register a class as a JAX pytree with keys.
 
-    Not `jax.tree_util.register_dataclass`: with that, in JAX 0.10, the tree structures of two different classes compare
-    equal if they have as many leaves and the same static values, and so jit, when their hashes meet, now and then runs
-    what it compiled for the other class. No issue of JAX is known to us;
-    `test_structures_of_different_classes_differ` shows it."""
+    `jax.tree_util.register_dataclass` is not used. With it, in JAX 0.10, the tree structures of two different classes
+    compare equal if they have as many leaves and the same static values. If their hashes meet, jit runs the program
+    compiled for the other class. No issue of JAX is known to us; `test_structures_of_different_classes_differ` shows
+    the error.
+    """
 
     def flatten(part: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         return tuple(getattr(part, name) for name in data), tuple(getattr(part, name) for name in meta)
@@ -155,8 +194,15 @@ def _register(cls: type, data: list[str], meta: list[str]) -> None:
 
 
 def parameters(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[tuple[str, Spec, Any]]:
-    """Every parameter below `part` as (dotted path, spec, value), in the order of declaration. Units relative to a loop
-    are worked out below a part with a plant, or in the `units` given."""
+    """Yield every parameter below a part as (dotted path, spec, value), in the order of declaration.
+
+    Relative units are resolved below a part with a plant, or in the given `units`.
+
+    Args:
+        part: Part.
+        prefix: Text before every path.
+        units: Units of the loop, or None.
+    """
     units = units or units_of(getattr(part, "plant", None))
     for name, field, value in children(part, prefix):
         if field is not None and "spec" in field.metadata:
@@ -166,7 +212,12 @@ def parameters(part: Any, prefix: str = "", units: Units | None = None) -> Itera
 
 
 def children(part: Any, prefix: str) -> Iterator[tuple[str, dataclasses.Field[Any] | None, Any]]:
-    """What a part holds as (dotted path, field, value), but for static fields; items of a tuple have no field."""
+    """Yield the fields of a part as (dotted path, field, value), except static fields; items of a tuple have no field.
+
+    Args:
+        part: Part, or tuple of parts.
+        prefix: Text before every path.
+    """
     if isinstance(part, tuple):
         for i, item in enumerate(part):
             yield f"{prefix}{i}", None, item
@@ -177,7 +228,11 @@ def children(part: Any, prefix: str) -> Iterator[tuple[str, dataclasses.Field[An
 
 
 def parts(part: Any) -> Iterator[Any]:
-    """The parts of which a part is made."""
+    """Yield the parts that a part holds.
+
+    Args:
+        part: Part.
+    """
     for _, field, value in children(part, ""):
         if field is None:
             yield value
@@ -186,7 +241,12 @@ def parts(part: Any) -> Iterator[Any]:
 
 
 def elements(part: Any) -> dict[str, Spec]:
-    """What each single number below `part` may be, by path; those of a list have their place at the end."""
+    """Return the declaration of each single number below a part by path; elements of a list have their index at the
+    end.
+
+    Args:
+        part: Part.
+    """
     found: dict[str, Spec] = {}
     for path, spec, value in parameters(part):
         shape = np.shape(value)
@@ -195,8 +255,15 @@ def elements(part: Any) -> dict[str, Spec]:
 
 
 def get(part: Any, path: str) -> Any:
-    """Return the value in `part` at a dotted `path`, `plant.road.scale`, or `controller.gain.0` for one of a list.
-    Raises KeyError naming what is there instead."""
+    """Return the value in a part at a dotted path, `plant.road.scale`, or `controller.gain.0` for an element of a list.
+
+    Args:
+        part: Part.
+        path: Dotted path.
+
+    Raises:
+        KeyError: The path does not exist; the message names the existing ones.
+    """
     for name in path.split("."):
         names = _names(part)
         if name not in names:
@@ -212,14 +279,20 @@ def _names(part: Any) -> list[str]:
 
 
 def replace(part: T, values: Mapping[str, Any]) -> T:
-    """Return a copy of `part` with the parameters in `values`, by dotted path, replaced.
+    """Return a copy of `part` with the parameters in `values`, by dotted path, replaced. Works under jit, grad and
+    vmap.
+
+    Args:
+        part: Part.
+        values: New values by dotted path.
+
+    Raises:
+        KeyError: A path does not exist.
 
     >>> import diffabs as d
     >>> loop = d.replace(d.braking(), {"plant.mass": 12.0, "plant.road.mu.2": 0.8})
     >>> loop.plant.mass, round(float(loop.plant.road.mu[2]), 3)
     (12.0, 0.8)
-
-    Works under jit, grad and vmap. Raises KeyError for a path that does not exist.
     """
     for path, value in values.items():
         get(part, path)
@@ -239,16 +312,25 @@ def _replace(part: Any, names: list[str], value: Any) -> Any:
 
 
 def as_arrays(part: T) -> T:
-    """The same part with arrays where a parameter is a list or a tuple of numbers."""
+    """Return the part with arrays in place of lists and tuples of numbers.
+
+    Args:
+        part: Part.
+    """
     listed = {path: value for path, _, value in parameters(part) if isinstance(value, list | tuple)}
     return replace(part, {path: jnp.asarray(value) for path, value in listed.items()})
 
 
 def canonical_dtypes(tree: T) -> T:
-    """Every leaf as a float array of one dtype: that of the arrays among the leaves, else JAX's default float.
+    """Return the tree with float arrays of one dtype: the dtype of its arrays, or JAX's default float if it has none.
 
     Python numbers are weakly typed: mixed with arrays they would cause a second compilation of the same function.
-    Raises ValueError for a leaf that is no real number, or a float of fewer than 32 bits.
+
+    Args:
+        tree: Pytree of numbers and arrays.
+
+    Raises:
+        ValueError: A leaf is not a real number, or a float of fewer than 32 bits.
     """
     leaves, structure = jax.tree.flatten(tree)
     if any(map(kinds.find_value_objection, leaves)):
@@ -257,32 +339,51 @@ def canonical_dtypes(tree: T) -> T:
     dtype = jnp.result_type(*arrays) if arrays else jnp.result_type(float)
     if is_traced(leaves):
         return structure.unflatten([jnp.asarray(x, dtype) for x in leaves])
-    with np.errstate(over="ignore"):  # what single precision cannot hold is infinite
+    with np.errstate(over="ignore"):  # a number too large for single precision becomes infinite
         return structure.unflatten([as_array(x, dtype) for x in leaves])
 
 
 def _first_unfit(tree: Any) -> str:
-    """The first leaf that is no number of a run."""
+    """Return a line on the first leaf that cannot be a number of a run."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     path, leaf = next((path, leaf) for path, leaf in leaves if kinds.find_value_objection(leaf))
     return f"{jax.tree_util.keystr(path).lstrip('.')} = {kinds.format_value(leaf)} {kinds.find_value_objection(leaf)}"
 
 
 def prepare_parts(part: Any) -> Any:
-    """The same parts, with everything worked out that does not change during a run: a part that has a method
-    `prepared()` is replaced by what it returns. Differentiable; a run does it once, inside its compiled function."""
+    """Return the parts with all values precomputed that stay constant during a run.
+
+    A part with a method `prepared()` is replaced by its result. Differentiable; a run does it once, inside its compiled
+    function.
+
+    Args:
+        part: Part.
+    """
     return _rebuild_parts(part, "prepared")
 
 
 def refine_parts(part: Any, times: int) -> Any:
-    """The same parts for steps that are so many times shorter: a part whose memory is as long as so many steps has a
-    method `refined(times)`."""
+    """Return the parts for steps shorter by a factor `times`.
+
+    A part whose memory covers a number of steps has a method `refined(times)`.
+
+    Args:
+        part: Part.
+        times: Factor.
+    """
     return _rebuild_parts(part, "refined", times)
 
 
 def prepare_derivatives(part: Any, paths: Iterable[str], prefix: str = "") -> Any:
-    """The same parts, where derivatives by the parameters at these paths are asked for: a part that has a method
-    `differentiated(names)` is replaced by what it returns for those of its own."""
+    """Return the parts for derivatives by the parameters at these paths.
+
+    A part with a method `differentiated(names)` is replaced by its result for the names of its own parameters.
+
+    Args:
+        part: Part.
+        paths: Dotted paths.
+        prefix: Path of the part, with a final dot.
+    """
     if isinstance(part, tuple):
         return tuple(prepare_derivatives(item, paths, f"{prefix}{i}.") for i, item in enumerate(part))
     if not dataclasses.is_dataclass(part):
@@ -295,7 +396,7 @@ def prepare_derivatives(part: Any, paths: Iterable[str], prefix: str = "") -> An
 
 
 def _rebuild_parts(part: Any, method: str, *args: Any) -> Any:
-    """The same parts, each that has this method replaced by what it returns; the innermost first."""
+    """Return the parts, each with this method replaced by the method's result, from the innermost outwards."""
     if isinstance(part, tuple):
         return tuple(_rebuild_parts(item, method, *args) for item in part)
     if not dataclasses.is_dataclass(part):

@@ -1,10 +1,10 @@
-"""Why an iteration ended."""
+"""The reasons for the end of an iteration."""
 
 import enum
 
 
 class Reason(enum.Enum):
-    """Why a descent ended."""
+    """The reason for the end of a descent."""
 
     GRADIENT = "the gradient is zero within its tolerance"
     CHANGE = "steps no longer change the loss within its tolerance"

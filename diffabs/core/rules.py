@@ -1,7 +1,8 @@
-"""What must hold between the numbers of a part, said once: of one loop with its numbers, of many lanes as an array.
+"""Rules between the numbers of a part, written once for a single loop and for the runs of a batch.
 
-A part has a method `rules()` that yields them, and `grid_rules(step)` for those that concern the integration step [s].
-They are evaluated with concrete numbers, and traced, for all lanes of a batch in one compiled call."""
+A part yields its rules from a method `rules()`, and from `grid_rules(step)` the rules on the integration step [s]. They
+are evaluated with concrete numbers, or traced, for all runs of a batch in one compiled call.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,28 +17,44 @@ MAX_SHOWN_NUMBERS = 8  # numbers of a list in a message
 
 
 class Rule(NamedTuple):
-    """holds: bool, an expression of the part's numbers; broken: what is said of lanes that break it, without numbers;
-    says: the same of one part, with its numbers, for which they must be concrete; ` {control}` in it is the unit of the
-    loop's control."""
+    """A condition on the numbers of a part.
+
+    Attributes:
+        holds: Boolean expression of the part's numbers.
+        broken: Message for the runs of a batch that break the rule, without numbers.
+        says: Function that returns the message for a single part, with its numbers, which must be concrete. `
+            {control}` in it stands for the unit of the loop's control.
+    """
 
     holds: Any
     broken: str
     says: Callable[[], str]
 
     def under(self, prefix: str, units: Units | None = None) -> "Rule":
-        """The same rule, of a part at this place, in a loop with these units."""
+        """Return the same rule for a part at the path `prefix`, in a loop with these `units`."""
         return Rule(self.holds, prefix + self.broken, lambda: prefix + insert_unit(self.says(), units))
 
 
 def as_rule_array(x: Any) -> Any:
-    """An array to calculate with: traced numbers as they are, others in float64 whatever JAX's default type is."""
+    """Return x as an array: traced numbers unchanged, other numbers in float64 for any default type of JAX.
+
+    Args:
+        x: Number, array, or list of numbers.
+    """
     if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(x)):
         return jnp.asarray(x)
     return np.asarray(x, float)
 
 
 def order_rule(low: tuple[str, Any], high: tuple[str, Any], unit: str, *, equal: bool = True) -> Rule:
-    """A lower limit that does not exceed the upper one, or lies below it; both (name, value)."""
+    """Return the rule that a lower limit does not exceed an upper limit, or lies below it.
+
+    Args:
+        low: Name and value of the lower limit.
+        high: Name and value of the upper limit.
+        unit: Unit of both.
+        equal: Whether the limits may be equal.
+    """
     (below, a), (above, b) = low, high
     relation = "exceeds" if equal else "is not below"
     return Rule(
@@ -48,7 +65,14 @@ def order_rule(low: tuple[str, Any], high: tuple[str, Any], unit: str, *, equal:
 
 
 def increase_rule(name: str, values: Any, broken: str, unit: str) -> Rule:
-    """Numbers (n,) each of which is greater than the one before."""
+    """Return the rule that each number is greater than the one before.
+
+    Args:
+        name: Name of the numbers.
+        values: Numbers, shape (n,).
+        broken: Message after the name.
+        unit: Unit of the numbers.
+    """
     x = as_rule_array(values)
     return Rule(
         (x[1:] > x[:-1]).all(),

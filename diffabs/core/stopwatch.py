@@ -1,6 +1,7 @@
-"""How long this process has compiled: by XLA, which tells, and by compilers of other languages, which are counted here.
+"""The compilation time of this process: by XLA, as JAX reports it, and by compilers of other languages, timed here.
 
-Compiling within compiling, and several threads at once, count once: it is the time in which anything was compiled."""
+Nested compilations and simultaneous threads count once: the time is that of the union of all spans.
+"""
 
 import contextlib
 import threading
@@ -10,27 +11,28 @@ from typing import Any
 
 import jax.monitoring
 
-COMPILE_EVENT = "/jax/core/compile/"  # how events of JAX begin that are about compiling, tracing included
+COMPILE_EVENT = "/jax/core/compile/"  # prefix of JAX's events about compilation, including tracing
 
 
 class Stopwatch:
-    """Spans of time [s], that may overlap, as one length."""
+    """The total length of time spans [s] that may overlap."""
 
     def __init__(self) -> None:
-        """Nothing was measured."""
-        self._spans: list[tuple[float, float]] = []  # apart from each other, in order
+        """Create a stopwatch without spans."""
+        self._spans: list[tuple[float, float]] = []  # disjoint, in increasing order
         self._lock = threading.Lock()
 
     def add(self, start: float, end: float) -> None:
-        """Count a span that has just ended."""
+        """Add a span from `start` to `end`, which has just ended."""
         with self._lock:
+            # Spans are added in the order of their ends, so only the last ones can overlap the new span.
             while self._spans and self._spans[-1][1] >= start:
                 earlier, later = self._spans.pop()
                 start, end = min(start, earlier), max(end, later)
             self._spans.append((start, end))
 
     def seconds(self, since: float = 0.0) -> float:
-        """Return how long all spans are, from an instant on."""
+        """Return the length of the union of all spans after the instant `since`."""
         with self._lock:
             return sum(max(end - max(start, since), 0.0) for start, end in self._spans)
 
@@ -40,7 +42,7 @@ _listening = False
 
 
 def count_compilations() -> None:
-    """Count from now on what JAX compiles."""
+    """Count the compilations of JAX from now on."""
     global _listening
     if not _listening:
         _listening = True
@@ -56,7 +58,7 @@ def _add_duration(event: str, duration_secs: float, **more: Any) -> None:
 
 @contextlib.contextmanager
 def count_as_compiling() -> Iterator[None]:
-    """Count what happens within as compiling."""
+    """Count the duration of the context as compilation."""
     start = time.monotonic()
     try:
         yield
@@ -65,6 +67,9 @@ def count_as_compiling() -> Iterator[None]:
 
 
 def compile_time_since(since: float = 0.0) -> float:
-    """Return for how long [s] something was compiled from an instant of `time.monotonic` on; what has not ended yet is
-    not in it."""
+    """Return the compilation time [s] since an instant, without compilations that have not ended.
+
+    Args:
+        since: Instant of `time.monotonic`.
+    """
     return _compiling.seconds(since)

@@ -1,4 +1,4 @@
-"""A result in a few lines, for whoever looks at it: text for a terminal, HTML for a notebook."""
+"""The summary of a result in a few lines: text for a terminal, HTML for a notebook."""
 
 import dataclasses
 import html
@@ -7,17 +7,26 @@ from typing import Any
 
 import numpy as np
 
-ZERO_TOLERANCE = 1e-14  # less than this is rounding, of numbers in SI
+ZERO_TOLERANCE = 1e-14  # smaller numbers, in SI units, are rounding errors
 
 
 def round_for_table(value: Any, digits: int = 6) -> str:
-    """Return a number for a table, to so many digits: what is rounding alone is 0."""
+    """Return a number as text for a table; numbers of the size of rounding errors give 0.
+
+    Args:
+        value: Number in SI units.
+        digits: Number of significant digits.
+    """
     value = float(value)
     return "0" if abs(value) < ZERO_TOLERANCE else f"{value:.{digits}g}"
 
 
 def format_cell(value: Any) -> str:
-    """Return what a table shows of a value: of a list the first four entries."""
+    """Return a value as text for a table; of a list, the first four entries.
+
+    Args:
+        value: Text, number, list, or None.
+    """
     if isinstance(value, str | bool | np.bool_) or value is None:
         return "" if value is None else str(value)
     if np.ndim(value):
@@ -36,7 +45,7 @@ class Summary:
     note: str = ""
 
     def __str__(self) -> str:
-        """As text."""
+        """Return the summary as text."""
         lines = [list(self.columns), *([format_cell(value) for value in row] for row in self.rows)] if self.rows else []
         widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         table = [
@@ -49,7 +58,7 @@ class Summary:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        """For a notebook."""
+        """Return the summary as HTML for a notebook."""
         head = "".join(f"<th>{html.escape(name)}</th>" for name in self.columns)
         body = "".join(_row(row) for row in self.rows)
         note = f"<p>{html.escape(self.note)}</p>" if self.note else ""

@@ -10,12 +10,23 @@ from diffabs.core.rules import Rule, as_rule_array
 
 
 def steps_in_period(period: Scalar, h: Scalar) -> Any:
-    """How many steps of length h make a period. An integer, so without a derivative."""
+    """Return the number of steps of length h in a period: an integer, so without a derivative.
+
+    Args:
+        period: Period [s].
+        h: Step [s].
+    """
     return jnp.maximum(jnp.round(jax.lax.stop_gradient(period / h)), 1).astype(int)
 
 
 def whole_steps(name: str, period: Scalar, step: float) -> Rule:
-    """A period is a whole multiple of the step."""
+    """Return the rule that a period is a whole multiple of the step.
+
+    Args:
+        name: Name of the period.
+        period: Period [s].
+        step: Step [s].
+    """
     count = as_rule_array(period) / step
     return Rule(
         (count >= 0.5) & (abs(count - count.round()) <= 1e-6 * count),

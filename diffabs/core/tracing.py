@@ -1,4 +1,4 @@
-"""Find out by tracing, without computing anything, what depends on what."""
+"""Dependences between the inputs and outputs of functions, found by tracing without a computation."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,16 +13,26 @@ from diffabs.core.pytree import parameters
 
 
 def differentiated_paths(tangents: Any) -> frozenset[str]:
-    """Return the paths of a part's parameters by which it is differentiated, from its tangents in a rule with
-    `symbolic_zeros`."""
+    """Return the paths of the parameters by which a part is differentiated.
+
+    Args:
+        tangents: Tangents of the part in a rule with `symbolic_zeros`.
+    """
     return frozenset(path for path, _, move in parameters(tangents) if type(move) is not SymbolicZero)
 
 
 def jvp_nonzero(function: Callable[..., Any], primals: Any, tangents: Any, once: str = "") -> tuple[Any, Any]:
-    """Return function(*primals) and its derivative along tangents, of a rule with `symbolic_zeros`. Only what has a
-    tangent is differentiated: zeros worked out would cost as much as any other.
+    """Return function(*primals) and its derivative along tangents, for a rule with `symbolic_zeros`.
 
-    once: why a function has no second derivatives; whoever asks for them gets a ValueError with this line"""
+    Only arguments with a tangent are differentiated, since zero tangents cost as much as others.
+
+    Args:
+        function: Function of the primals.
+        primals: Arguments.
+        tangents: Their tangents, with symbolic zeros.
+        once: Reason why the function has no second derivatives: the message of the ValueError that they raise. Empty if
+            it has second derivatives.
+    """
     values, tree = jax.tree.flatten(primals)
     moves = tree.flatten_up_to(tangents)
     live = [type(move) is not SymbolicZero for move in moves]
@@ -39,11 +49,19 @@ def jvp_nonzero(function: Callable[..., Any], primals: Any, tangents: Any, once:
 
 
 def split_batched(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable[[Any], Any]]:
-    """`make` over a batch, with what does not depend on the batch worked out once: the leaves (n, ...) that do, and a
-    function from those of one member to the whole. In a loop over lanes constants then stay numbers, which a processor
-    keeps in registers, instead of becoming columns."""
+    """Return the batch-dependent leaves of `make` over a batch, and a function from the leaves of one member to its
+    result.
+
+    The leaves that do not depend on the batch are computed once. In a loop over runs constants then stay numbers, which
+    a processor keeps in registers, instead of columns.
+
+    Args:
+        make: Function of one member.
+        batch: Pytree with leaves (n, ...).
+    """
     one = jax.tree.map(lambda x: x[0], batch)
     program, shape = jax.make_jaxpr(make, return_shape=True)(one)
+    # Forward pass: each equation with a dependent input has dependent outputs. Literals have `val` and do not depend.
     depends = set(program.jaxpr.invars)
     for step in program.jaxpr.eqns:
         if any(not hasattr(v, "val") and v in depends for v in step.invars):
@@ -62,13 +80,23 @@ def split_batched(make: Callable[[Any], Any], batch: Any) -> tuple[Any, Callable
 
 
 def depends_on_signal(function: Callable[[Any], Any], signal: Any) -> bool:
-    """Return whether what a function of a signal returns depends on it, as its program has it; a product with a zero
-    that stands there does not."""
+    """Return whether the traced result of a function depends on its signal; a product with a literal zero does not.
+
+    Args:
+        function: Function of the signal.
+        signal: Signal.
+    """
     return any(leaf_dependence(function, signal))
 
 
 def leaf_dependence(function: Callable[[Any], Any], signal: Any) -> list[bool]:
-    """Return for each leaf of a signal whether what a function of it returns depends on the leaf, as in `follows`."""
+    """Return for each leaf of a signal whether the traced result of a function depends on it, as in
+    `depends_on_signal`.
+
+    Args:
+        function: Function of the signal.
+        signal: Signal.
+    """
     program = jax.make_jaxpr(function)(signal).jaxpr
     needed = {atom for atom in program.outvars if not hasattr(atom, "val")}
     for step in reversed(program.eqns):
@@ -78,14 +106,22 @@ def leaf_dependence(function: Callable[[Any], Any], signal: Any) -> list[bool]:
 
 
 def moving_leaves(function: Callable[[Any, Any], Any], fixed: Any, batch: Any) -> Any:
-    """Return by which leaves of `batch` (n, ...) function(fixed, batch), of one member, has derivatives: truths, as
-    `batch`. What only decides has none."""
+    """Return for each leaf of `batch` whether function(fixed, batch) of one member has a derivative by it.
+
+    Leaves that only enter decisions have no derivative.
+
+    Args:
+        function: Function of `fixed` and of one member of the batch.
+        fixed: Pytree with leaves (n, ...).
+        batch: Pytree with leaves (n, ...).
+    """
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), (fixed, batch))
     program = jax.make_jaxpr(function)(*one).jaxpr
 
     def moves(atom: Any) -> bool:
         return not hasattr(atom, "val") and jnp.issubdtype(atom.aval.dtype, jnp.inexact)
 
+    # Integer and boolean values carry no derivative: a comparison ends the dependence.
     needed = {atom for atom in program.outvars if moves(atom)}
     for step in reversed(program.eqns):
         if not needed.isdisjoint(step.outvars):
@@ -95,5 +131,5 @@ def moving_leaves(function: Callable[[Any, Any], Any], fixed: Any, batch: Any) -
 
 
 def _zero(step: Any) -> bool:
-    """Whether a step of a program multiplies by zero."""
+    """Return whether an equation of a jaxpr multiplies by a literal zero."""
     return step.primitive.name == "mul" and any(np.all(v.val == 0) for v in step.invars if hasattr(v, "val"))

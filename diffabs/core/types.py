@@ -1,4 +1,4 @@
-"""Names of types for annotations. An `Array` may be a tracer; a `pytree.Scalar` is a number or an array."""
+"""Type names for annotations. An `Array` may be a tracer; a `pytree.Scalar` is a number or an array."""
 
 from collections.abc import Mapping
 from typing import Any, TypeAlias
@@ -9,7 +9,7 @@ import numpy as np
 Array: TypeAlias = jax.Array
 Key: TypeAlias = jax.Array  # a key of jax.random
 NumPyArray: TypeAlias = np.ndarray
-Bool: TypeAlias = bool | jax.Array  # of one run, or of a batch
+Bool: TypeAlias = bool | jax.Array  # of one run or of a batch
 Int: TypeAlias = int | jax.Array
-PyTree: TypeAlias = Any  # leaves and structure are the caller's
+PyTree: TypeAlias = Any  # with any leaves and structure
 Params: TypeAlias = Mapping[str, Any]  # values by dotted path, "plant.mass"

@@ -1,9 +1,9 @@
-"""Units that a part cannot know alone, in terms of the loop that it is in.
+"""Units relative to the loop of a part.
 
-    "control/signal"     a gain: N m around a brake, whose slip is a number; V/rad around a servo
+    "control/signal"     a gain: N m for a brake, whose slip is a number; V/rad for a servo
     "control^2 s"        N^2 m^2 s, or V^2 s
 
-`control` is the unit of the plant's control, `signal` that of the first signal it shows, and so of the target.
+`control` is the unit of the plant's control, `signal` the unit of the plant's first output, and so of the target.
 """
 
 import functools
@@ -15,40 +15,59 @@ UNIT_FACTOR = re.compile(r"(/?)\s*([^\s/^]+)(?:\^(\d+))?")
 
 
 class Units(NamedTuple):
-    """What the words `control` and `signal` stand for in a loop."""
+    """The units for the words `control` and `signal` in a loop."""
 
     control: str
     signal: str
 
 
 def units_of(plant: Any) -> Units | None:
-    """Return the units of a plant's control and first signal; None where it does not say them."""
+    """Return the units of a plant's control and first output, or None if the plant declares none.
+
+    Args:
+        plant: Plant, or None.
+    """
     shown = getattr(getattr(plant, "shows", None), "units", None)
     return Units(plant.control_unit, next(iter(shown.values()))) if shown else None
 
 
 @functools.lru_cache(maxsize=1024)
 def resolve_unit(unit: str, units: Units | None) -> str:
-    """Return a unit with `control` and `signal` worked out: "V s/rad". Without a loop (None) it stays as it is. Units
-    of a list's elements are separated by commas."""
+    """Return a unit with `control` and `signal` replaced: "V s/rad". Commas separate the units of a list's elements.
+
+    Args:
+        unit: Unit.
+        units: Units of the loop; None leaves the unit unchanged.
+    """
     if units is None or not RELATIVE_UNIT.search(unit):
         return unit
     return ", ".join(_multiply_units(one, units._asdict()) for one in unit.split(", "))
 
 
 def unit_at(unit: str, place: int, count: int) -> str:
-    """Return the unit of entry `place` of `count`: of a list of k units each holds for count/k entries, in order."""
+    """Return the unit of an entry of a list; each of k units applies to count/k entries, in order.
+
+    Args:
+        unit: Units, separated by commas.
+        place: Index of the entry.
+        count: Number of entries.
+    """
     units = unit.split(", ")
     return units[place * len(units) // count]
 
 
 def insert_unit(text: str, units: Units | None) -> str:
-    """Return a sentence with the control's unit in the place of ` {control}`, or nothing where that is not known."""
+    """Return a sentence with ` {control}` replaced by the unit of the control, or removed if the unit is unknown.
+
+    Args:
+        text: Sentence.
+        units: Units of the loop, or None.
+    """
     return text.replace(" {control}", f" {units.control}" if units and units.control != "1" else "")
 
 
 def _multiply_units(unit: str, meaning: dict[str, str]) -> str:
-    """A product of powers, in the order in which they first occur; those of negative power behind a slash each."""
+    """Return a product of powers in the order of their first occurrence, with a slash before each negative power."""
     powers: dict[str, int] = {}
     for slash, name, power in UNIT_FACTOR.findall(unit):
         exponent = int(power or 1) * (-1 if slash else 1)

@@ -1,7 +1,9 @@
-"""What is wrong with a part: ranges of its parameters, and what the parts themselves object to.
+"""Validity of a part: ranges of its parameters, and the conditions that the parts declare themselves.
 
-Parts say it by the methods `problems` (shapes of fields), `rules` (between numbers), `grid_rules` (of an integration
-step) and `cautions` (allowed, but hardly meant). Each is asked here, of a part and of all parts in it."""
+Parts declare conditions by the methods `problems` (shapes of fields), `rules` (between numbers), `grid_rules` (on the
+integration step) and `cautions` (allowed, but hardly intended). The functions here evaluate them for a part and for all
+parts in it.
+"""
 
 from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
@@ -17,8 +19,16 @@ T = TypeVar("T")
 
 
 def find_problems(part: Any, prefix: str = "", units: Units | None = None) -> Iterator[str]:
-    """One line for each field that is out of range, then what the parts themselves object to: the shapes of their
-    fields (a method `problems`), and if these are right, the rules between their numbers (`rules`)."""
+    """Yield one line for each field that is out of range, and for each condition of the parts that fails.
+
+    The conditions are first the shapes of fields (`problems`). If these are correct, the rules between numbers
+    (`rules`) follow.
+
+    Args:
+        part: Part.
+        prefix: Text before every name.
+        units: Units of the loop, or None.
+    """
     found = False
     units = units or units_of(getattr(part, "plant", None))
     for name, field, value in children(part, prefix):
@@ -34,37 +44,57 @@ def find_problems(part: Any, prefix: str = "", units: Units | None = None) -> It
             within = list(find_problems(value, f"{name}.", units))
             found |= bool(within)
             yield from within
+    # Rules between numbers assume correct fields and shapes: they are evaluated only without earlier errors.
     if not found:
         shapes = list(part.problems()) if hasattr(part, "problems") else []
         yield from (prefix + insert_unit(line, units) for line in shapes or find_broken(_own(part, "rules")))
 
 
 def part_rules(part: Any, prefix: str = "") -> Iterator[Rule]:
-    """Every rule of a part and the parts in it, ranges of fields first: `problems` as arrays, for lanes whose values
-    differ. The shapes are taken to be right."""
+    """Yield every rule of a part and of the parts in it, first the ranges of fields.
+
+    These are the conditions of `find_problems` as arrays, for runs with different values. The shapes must be correct.
+
+    Args:
+        part: Part.
+        prefix: Text before every name.
+    """
     for name, spec, value in parameters(part, prefix):
         outside = f"is outside {spec.interval()}"
         line = f"{name} = {{}} {outside}"
+        # The defaults bind the values of this iteration; the lambda is called after the loop.
         yield Rule(spec.within(value), f"{name} {outside}", lambda line=line, value=value: line.format(_show(value)))
     yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "rules")
 
 
 def grid_rules(part: Any, step: float, prefix: str = "") -> Iterator[Rule]:
-    """What the parts demand of an integration step [s]."""
+    """Yield the rules of the parts on an integration step.
+
+    Args:
+        part: Part.
+        step: Integration step [s].
+        prefix: Text before every name.
+    """
     yield from _below(part, prefix, units_of(getattr(part, "plant", None)), "grid_rules", step)
 
 
 def find_broken(rules: Iterable[Rule]) -> Iterator[str]:
-    """A line for each rule of concrete numbers that does not hold."""
+    """Yield a line for each rule that does not hold.
+
+    Args:
+        rules: Rules with concrete numbers.
+    """
     yield from (rule.says() for rule in rules if not bool(rule.holds))
 
 
 def _own(part: Any, hook: str, *args: Any) -> Iterator[Rule]:
+    """Yield the rules from a method of this part alone."""
     if hasattr(part, hook):
         yield from getattr(part, hook)(*args)
 
 
 def _below(part: Any, prefix: str, units: Units | None, hook: str, *args: Any) -> Iterator[Rule]:
+    """Yield the rules from a method of the part and of the parts in it, the innermost first."""
     for name, field, value in children(part, prefix):
         if field is None or "spec" not in field.metadata:
             yield from _below(value, f"{name}.", units, hook, *args)
@@ -72,8 +102,14 @@ def _below(part: Any, prefix: str, units: Units | None, hook: str, *args: Any) -
 
 
 def find_misshapen(part: Any, prefix: str = "") -> Iterator[str]:
-    """One line for each parameter of a single part that is no number, or has another shape than its field. It may be
-    traced: values are not looked at."""
+    """Yield one line for each parameter of an unbatched part that is not a number or has another shape than its field.
+
+    The function does not look at values, so they may be traced.
+
+    Args:
+        part: Part.
+        prefix: Text before every name.
+    """
     for name, spec, value in parameters(part, prefix):
         if line := _find_unfit(name, spec, value):
             yield line
@@ -82,13 +118,18 @@ def find_misshapen(part: Any, prefix: str = "") -> Iterator[str]:
 
 
 def _find_unfit(name: str, spec: Spec, value: Any) -> str:
-    """A line for what is no number, or empty."""
+    """Return a line for a value that is not a number of a run, or an empty text."""
     line = kinds.find_value_objection(value)
     return line and f"{name} = {kinds.format_value(value)} {line}; a number in {spec.interval()} is needed"
 
 
 def find_cautions(part: Any, prefix: str = "") -> Iterator[str]:
-    """One line for each thing that is allowed but hardly meant: what the parts' methods `cautions` say."""
+    """Yield one line for each setting that is allowed but hardly intended, from the methods `cautions` of the parts.
+
+    Args:
+        part: Part.
+        prefix: Text before every name.
+    """
     for name, field, value in children(part, prefix):
         if field is None or "spec" not in field.metadata:
             yield from find_cautions(value, f"{name}.")
@@ -99,10 +140,13 @@ def find_cautions(part: Any, prefix: str = "") -> Iterator[str]:
 def check_part(part: T, prefix: str = "") -> T:
     """Return `part` if every parameter is in its range.
 
-    prefix: is put before every name in a message, `"plant."`
+    Args:
+        part: Part.
+        prefix: Text before every name in a message, `"plant."`.
 
     Raises:
-        ValueError: names every offending field with its value, range and unit. NaN offends.
+        ValueError: A field is out of range or NaN, or a rule fails; the message names each field with value, range and
+            unit.
     """
     lines = list(find_problems(part, prefix))
     if lines:

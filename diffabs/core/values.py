@@ -1,8 +1,8 @@
-"""Values that somebody wrote, in TOML, in JSON or on the command line: read once, or refused in one line; and the way
-back.
+"""Input from TOML, JSON or the command line: values are read once or refused in one line. Also the conversion back.
 
-A table becomes a dataclass, whose fields say how they are read: `entry(reader, default)`, or the reader of their type.
-A reader takes what was given and the place for messages, and returns the value."""
+A table becomes a dataclass. The fields of the dataclass declare their readers, by `table_field(read, default)` or by
+their type. A reader takes the given value and its path for messages, and returns the value.
+"""
 
 import dataclasses
 import difflib
@@ -25,56 +25,92 @@ Reader = Callable[[Any, str], Any]
 
 
 class ScenarioError(ValueError):
-    """A value, or what is made of it, that cannot be used; the message is one line for a person."""
+    """A value that cannot be used, or whose part cannot be used; the message is one line for a person."""
 
     def __init__(self, message: str):
-        """Whatever the user wrote, the message stays on one line."""
+        """Set the `message`, joined to one line."""
         super().__init__(" ".join(message.split()))
 
 
 def kebab_case(name: str) -> str:
-    """Return the name in tables: `QuarterCar`, `PID`, `RIG_UNROUNDED` are `quarter-car`, `pid`, `rig-unrounded`."""
+    """Return the name in tables: `QuarterCar`, `PID`, `RIG_UNROUNDED` are `quarter-car`, `pid`, `rig-unrounded`.
+
+    Args:
+        name: Name of a class or a constant.
+    """
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z]{2})(?=[A-Z][a-z])", "-", name).replace("_", "-").lower()
 
 
 def dotted_path(path: str, key: str) -> str:
-    """Return the path of a key below another path, as it may stand in a message."""
+    """Return the path of a key below another path, in a form for messages.
+
+    Args:
+        path: Path of the table, or an empty text.
+        key: Key in the table.
+    """
     key = key if re.fullmatch(r"[\w-]{1,60}", key) else format_given(key)
     return f"{path}.{key}" if path else key
 
 
 def format_given(value: Any, most: int = 60) -> str:
-    """Return a value as it may stand in a message: on one line, of bounded length."""
+    """Return a value for a message: on one line, of bounded length.
+
+    Args:
+        value: Any value.
+        most: Greatest number of characters.
+    """
     if isinstance(value, float) or (isinstance(value, int) and abs(value) < 10**15):
         return f"{value:.15g}" if not isinstance(value, bool) else str(value).lower()
     try:
         text = json.dumps(value, ensure_ascii=True) if isinstance(value, str) else repr(value)
-    except (ValueError, RecursionError):  # more digits than Python writes, more levels than it descends
+    except (ValueError, RecursionError):  # more digits than Python converts, or deeper nesting than its recursion limit
         text = "a number of thousands of digits" if isinstance(value, int) else "something nested too deeply"
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def unknown_name_error(what: str, name: Any, there: Iterable[str]) -> ScenarioError:
-    """Return the error for a name that is not there, with the nearest one that is."""
+    """Return the error for an unknown name, with the nearest existing name.
+
+    Args:
+        what: Beginning of the message.
+        name: The unknown name.
+        there: Existing names.
+    """
     there = list(there)
     near = difflib.get_close_matches(str(name).lower(), there, 1, 0.5)
     hint = f"did you mean {near[0]}? There is" if near else "there is"
     return ScenarioError(f"{what}; {hint} {', '.join(there) or 'nothing'}")
 
 
-# Older names of a controller's limits, which scenarios may still use where its own are `low` and `high`.
+# Former names of a controller's limits `low` and `high`, which scenarios may still use.
 FORMER_FIELDS = {"torque_min": "low", "torque_max": "high"}
 
 
 def wrong_kind_error(path: str, value: Any, needed: str) -> ScenarioError:
-    """Return the error for a value of the wrong kind."""
+    """Return the error for a value of the wrong kind.
+
+    Args:
+        path: Path of the value.
+        value: The value.
+        needed: The required kind, in words.
+    """
     kinds = ((bool, "a boolean"), (str, "text"), ((int, float), "a number"), (list, "a list"), (dict, "a table"))
     kind = next((name for of, name in kinds if isinstance(value, of)), "nothing" if value is None else "a date or time")
     return ScenarioError(f"{path} = {format_given(value)} is {kind}; {needed} is needed")
 
 
 def read_number(value: Any, spec: Spec, path: str) -> float:
-    """Return a number as a float. Raises ScenarioError for anything else; the range is not looked at."""
+    """Return a number as a float, without a check of its range.
+
+    Args:
+        value: Given value.
+        spec: Range, for messages.
+        path: Path of the value, for messages.
+
+    Raises:
+        ScenarioError: The value is not a number, or too large for a float.
+    """
+    # bool is a subclass of int, so it is excluded first.
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise wrong_kind_error(path, value, f"a number in {spec.interval()}")
     try:
@@ -84,7 +120,16 @@ def read_number(value: Any, spec: Spec, path: str) -> float:
 
 
 def read_number_in_range(value: Any, spec: Spec, path: str) -> float:
-    """Return a number as a float. Raises ScenarioError for anything else, or out of range."""
+    """Return a number as a float.
+
+    Args:
+        value: Given value.
+        spec: Range.
+        path: Path of the value, for messages.
+
+    Raises:
+        ScenarioError: The value is not a number, or out of range.
+    """
     found = read_number(value, spec, path)
     if not spec.holds(found):
         raise ScenarioError(f"{path} = {format_given(found)} is outside {spec.interval()}")
@@ -92,7 +137,17 @@ def read_number_in_range(value: Any, spec: Spec, path: str) -> float:
 
 
 def read_whole(value: Any, low: int, high: int, path: str) -> int:
-    """Return a whole number. Raises ScenarioError for anything else, or out of range."""
+    """Return a whole number.
+
+    Args:
+        value: Given value.
+        low: Least value.
+        high: Greatest value.
+        path: Path of the value, for messages.
+
+    Raises:
+        ScenarioError: The value is not a whole number, or out of range.
+    """
     if isinstance(value, bool) or not isinstance(value, int):
         raise wrong_kind_error(path, value, f"a whole number in [{low}, {high}]")
     if not low <= value <= high:
@@ -101,17 +156,30 @@ def read_whole(value: Any, low: int, high: int, path: str) -> int:
 
 
 def whole_reader(low: int, high: int) -> Reader:
-    """Return the reader of whole numbers in a range."""
+    """Return the reader of whole numbers in a range.
+
+    Args:
+        low: Least value.
+        high: Greatest value.
+    """
     return lambda given, path: read_whole(given, low, high, path)
 
 
 def range_reader(spec: Spec) -> Reader:
-    """Return the reader of numbers in a range."""
+    """Return the reader of numbers in a range.
+
+    Args:
+        spec: Range.
+    """
     return lambda given, path: read_number_in_range(given, spec, path)
 
 
 def choice_reader(*names: str) -> Reader:
-    """Return the reader of one of these texts."""
+    """Return the reader of one of several texts.
+
+    Args:
+        names: The allowed texts.
+    """
 
     def read(given: Any, path: str) -> str:
         if not isinstance(given, str):
@@ -124,7 +192,11 @@ def choice_reader(*names: str) -> Reader:
 
 
 def list_reader(item: Reader) -> Reader:
-    """Return the reader of lists, as tuples, whose items this one reads."""
+    """Return the reader of lists, which it returns as tuples.
+
+    Args:
+        item: Reader of the items.
+    """
 
     def read(given: Any, path: str) -> tuple[Any, ...]:
         if not isinstance(given, list | tuple):
@@ -135,7 +207,12 @@ def list_reader(item: Reader) -> Reader:
 
 
 def table_reader(item: Reader, what: str = "") -> Reader:
-    """Return the reader of tables whose values this one reads, under any names. `what`: they are, for a message."""
+    """Return the reader of tables with any keys.
+
+    Args:
+        item: Reader of the values.
+        what: Kind of the values, for messages.
+    """
 
     def read(given: Any, path: str) -> dict[str, Any]:
         if not isinstance(given, Mapping):
@@ -146,20 +223,41 @@ def table_reader(item: Reader, what: str = "") -> Reader:
 
 
 def read_as_given(value: Any, path: str) -> Any:
-    """Return the value itself, whatever it is."""
+    """Return the value unchanged.
+
+    Args:
+        value: Given value.
+        path: Path of the value; not used.
+    """
     del path
     return value
 
 
 def read_text(given: Any, path: str) -> str:
-    """Return a text. Raises ScenarioError for anything else."""
+    """Return a text.
+
+    Args:
+        given: Given value.
+        path: Path of the value, for messages.
+
+    Raises:
+        ScenarioError: The value is not a text.
+    """
     if not isinstance(given, str):
         raise wrong_kind_error(path, given, "text")
     return given
 
 
 def read_printable_line(given: Any, path: str) -> str:
-    """Return a text that is one printable line. Raises ScenarioError for anything else."""
+    """Return a text that is one printable line.
+
+    Args:
+        given: Given value.
+        path: Path of the value, for messages.
+
+    Raises:
+        ScenarioError: The value is not a text, or not one printable line.
+    """
     found = read_text(given, path)
     if not found.isprintable():
         raise ScenarioError(f"{path} = {format_given(found)} is outside one line of printable characters")
@@ -167,7 +265,15 @@ def read_printable_line(given: Any, path: str) -> str:
 
 
 def read_printable_lines(given: Any, path: str) -> str:
-    """Return a text of printable lines. Raises ScenarioError for anything else."""
+    """Return a text of printable lines.
+
+    Args:
+        given: Given value.
+        path: Path of the value, for messages.
+
+    Raises:
+        ScenarioError: The value is not a text, or a line is not printable.
+    """
     found = read_text(given, path)
     if not all(line.isprintable() for line in found.split("\n")):
         raise ScenarioError(f"{path} = {format_given(found)} is outside lines of printable characters")
@@ -175,23 +281,44 @@ def read_printable_lines(given: Any, path: str) -> str:
 
 
 def make_printable(text: str) -> str:
-    """Return a text as one printable line, with another character for each that is not printable."""
+    """Return a text as one printable line, with a replacement character for each unprintable character.
+
+    Args:
+        text: Text.
+    """
     return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
 def read_switch(given: Any, path: str) -> bool:
-    """Return true or false. Raises ScenarioError for anything else."""
+    """Return true or false.
+
+    Args:
+        given: Given value.
+        path: Path of the value, for messages.
+
+    Raises:
+        ScenarioError: The value is not a truth value.
+    """
     if not isinstance(given, bool):
         raise wrong_kind_error(path, given, "true or false")
     return given
 
 
 def read_any_number(given: Any, path: str) -> float:
-    """Return any number, also NaN and infinity, as a float. Raises ScenarioError for anything else."""
+    """Return any number, also NaN and infinity, as a float.
+
+    Args:
+        given: Given value.
+        path: Path of the value, for messages.
+
+    Raises:
+        ScenarioError: The value is not a number.
+    """
     return read_number(given, FINITE_SPEC, path)
 
 
 def _choice(given: Any, path: str) -> float | str:
+    """Return a text unchanged, or a number as a float."""
     return given if isinstance(given, str) else read_any_number(given, path)
 
 
@@ -207,8 +334,12 @@ READER_BY_TYPE: dict[Any, Reader] = {
 
 
 def table_field(read: Reader, default: Any = dataclasses.MISSING) -> Any:
-    """Return the field of a dataclass that is read so. A default that is a class or a function is called for
-    each new one."""
+    """Return the field of a dataclass with this reader.
+
+    Args:
+        read: Reader of the field.
+        default: Default value, or a class or function that is called for each new one.
+    """
     if isinstance(default, type | types.FunctionType):
         return dataclasses.field(default_factory=default, metadata={"read": read})
     return dataclasses.field(default=default, metadata={"read": read})
@@ -217,8 +348,15 @@ def table_field(read: Reader, default: Any = dataclasses.MISSING) -> Any:
 def read_table(cls: type, given: Any, path: str, kind: str = "", **readers: Reader) -> Any:
     """Return the instance of a dataclass that a table describes.
 
-    kind: what it is called in messages, else by its path; readers: of fields whose own need more than the table.
-    Raises ScenarioError, in one line, for what is no table, an unknown or missing field, and what a reader refuses.
+    Args:
+        cls: Dataclass.
+        given: Given value.
+        path: Path of the table, for messages.
+        kind: Name of the dataclass in messages; empty takes the path.
+        readers: Readers of fields that need more than the table, by name.
+
+    Raises:
+        ScenarioError: The value is not a table, a field is unknown or missing, or a reader refuses a value.
     """
     fields = {field.name: field for field in dataclasses.fields(cls)}
     if not isinstance(given, Mapping):
@@ -235,13 +373,23 @@ def read_table(cls: type, given: Any, path: str, kind: str = "", **readers: Read
 
 
 def _reader(field: dataclasses.Field[Any]) -> Reader:
+    """Return the reader of a field: of its range, its own, or of its type."""
     spec = field.metadata.get("spec")
     return range_reader(spec) if spec else field.metadata.get("read") or READER_BY_TYPE[field.type]
 
 
 def read_one(kinds: Mapping[str, type], given: Any, path: str, **readers: Reader) -> Any:
-    """Return the instance of one of these dataclasses, by name, that a table with a type, or a bare name, describes.
-    Raises ScenarioError, as `read`."""
+    """Return the instance of one of several dataclasses, described by a table with a type or by a bare name.
+
+    Args:
+        kinds: Dataclasses by name.
+        given: Given value.
+        path: Path of the value, for messages.
+        readers: Readers of fields that need more than the table, by name.
+
+    Raises:
+        ScenarioError: The type is missing or unknown, or as in `read_table`.
+    """
     table = {"type": given} if isinstance(given, str) else given
     if not isinstance(table, Mapping):
         raise wrong_kind_error(path, given, f"a table, or the name of a type ({', '.join(kinds)}),")
@@ -252,15 +400,27 @@ def read_one(kinds: Mapping[str, type], given: Any, path: str, **readers: Reader
 
 
 def check_sound(part: Any, name: str) -> Any:
-    """Return the part. Raises ScenarioError with everything that its method `problems` says of it, under this name."""
+    """Return the part.
+
+    Args:
+        part: Object with a method `problems(name)`.
+        name: Name of the part in messages.
+
+    Raises:
+        ScenarioError: The method `problems` reports errors; the message contains all of them.
+    """
     if lines := list(part.problems(name)):
         raise ScenarioError("; ".join(lines))
     return part
 
 
 def as_plain(value: Any, *, brief: bool = False) -> Any:
-    """Return a value as TOML and JSON have them: parts as tables, with every field or, if `brief`, without those that
-    are as by default; numbers of parts at full precision."""
+    """Return a value as TOML and JSON represent it: parts as tables, their numbers at full precision.
+
+    Args:
+        value: Part, mapping, list, number or text.
+        brief: Whether tables omit fields with their default values.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {"type": kebab_case(type(value).__name__), **plain_fields(value, brief=brief)}
     if isinstance(value, Mapping):
@@ -271,7 +431,12 @@ def as_plain(value: Any, *, brief: bool = False) -> Any:
 
 
 def plain_fields(part: Any, *, brief: bool = False) -> dict[str, Any]:
-    """Return the fields of a dataclass by name, as `plain` values."""
+    """Return the fields of a dataclass by name, converted by `as_plain`.
+
+    Args:
+        part: Instance of a dataclass.
+        brief: Whether to omit fields with their default values.
+    """
     found = {}
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)
@@ -284,7 +449,11 @@ def plain_fields(part: Any, *, brief: bool = False) -> dict[str, Any]:
 
 
 def format_table(part: Any) -> str:
-    """Return a dataclass as messages have it: `normal(5.75, 0.3, low = 5)`."""
+    """Return a dataclass as text for messages: `normal(5.75, 0.3, low = 5)`.
+
+    Args:
+        part: Instance of a dataclass.
+    """
     cells = []
     for field in dataclasses.fields(part):
         value = getattr(part, field.name)

@@ -1,14 +1,17 @@
-"""The probability that a metric of a study exceeds a bound, where it is too small to be counted.
+"""The probability that a metric of a study exceeds a bound, if it is too small for a count of runs.
 
-Standard normal coordinates z are mapped to the parameters v by `Space.normal`, and the metric m of the run is the score
-of `rare.subset_simulation`. All runs share one sequence of sensor noise: the probability is that over the parameters,
-given this noise. It is of the whole space: where `simulate` would refuse a point there is no answer, since no run says
-on which side of the bound it lies. If asked for, design points are found by
+`Space.normal` maps standard normal coordinates z to the parameters v. The metric m of the run is the score of
+`subset_simulation`.
+
+The probability is taken over the parameters, given one sequence of sensor noise that all runs share. It covers the
+whole space: a point that `simulate` refuses raises an error, since its side of the bound is unknown. On request, the
+search for design points uses
 
     dm/dz_j = sum_i dm/dv_i dv_i/dz_j
 
-with dm/dv through the run in reverse mode, or forward by a kernel, and dv/dz, which costs no run, by central
-differences."""
+The derivative dm/dv passes through the run, in reverse mode or, with a kernel, in forward mode. The derivative dv/dz
+costs no run and comes from central differences.
+"""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -23,18 +26,28 @@ from diffabs.simulate.admissible import batch_admissibility
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.sweep.study import Study, noise_key, precision
 
-DIFFERENCE_STEP = 1e-4  # of the differences in z: errors of 1e-9 and 1e-12 of the values
+DIFFERENCE_STEP = 1e-4  # step in z: relative errors of 1e-9 (truncation) and 1e-12 (rounding)
 
 
 def failure_probability(
     study: Study, metric: str, bound: float, *, gradients: bool = False, **options: Any
 ) -> RareEvent:
-    """Return an estimate of P[metric >= bound] over the space of a study, whose design and samples do not matter. Runs
-    are made by the study's engine.
+    """Return an estimate of P[metric >= bound] over the space of a study, with runs on the study's engine.
 
-    metric: a name of what the study measures
-    gradients: also draw around design points, found by gradients through the run
-    options: those of `subset_simulation`; runs that diverge do not count as failures and are reported
+    The study's design and its number of samples have no influence. Runs that diverge do not count as failures; the
+    result reports their number.
+
+    Args:
+        study: Loop, space, solver and objectives.
+        metric: Name of a metric that the study measures.
+        bound: Bound on the metric, in its unit.
+        gradients: True draws around design points, too, found by gradients through the run.
+        options: Options of `subset_simulation`.
+
+    Raises:
+        ValueError: The metric is not measured, the study draws parts, the bound is not finite, or a drawn point cannot
+            be run.
+        importance_sampling.DivergenceError: Too many runs diverge.
 
     >>> import diffabs as d
     >>> from diffabs import controllers, reliability, stops, sweep
@@ -45,9 +58,6 @@ def failure_probability(
     >>> found = reliability.failure_probability(study, "stop_time", 0.878)
     >>> print(f"{found.probability:.0e}")  # 1.1e-3 in closed form
     1e-03
-
-    Raises ValueError for a metric that is not measured, for a study that draws parts, for a bound that is not finite,
-    for a point that is drawn and cannot be run, and (`importance_sampling.Diverged`) where too many runs diverge.
     """
     study.check()
     if metric not in study.objectives:
@@ -63,9 +73,15 @@ def failure_probability(
 
 
 def find_metric_objection(study: Study, metric: str) -> str | None:
-    """Return why a kernel cannot make these runs, or None. None is made, but what makes them is compiled.
+    """Return why a kernel cannot make these runs, or None. The check compiles the kernel but makes no run.
 
-    Raises ValueError for what cannot be run at all."""
+    Args:
+        study: Loop, space, solver and objectives.
+        metric: Name of a metric that the study measures.
+
+    Raises:
+        ValueError: The loop cannot be run at all.
+    """
     from diffabs.simulate import native
 
     values = study.space.normal(np.zeros((1, study.space.dimension)))
@@ -74,14 +90,15 @@ def find_metric_objection(study: Study, metric: str) -> str | None:
 
 
 def _cast_arguments(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
-    """Loop, values, solver and objectives, of the study's type."""
+    """Return loop, values, solver and objectives; loop and objectives have the study's number type."""
     given = study.loop, {metric: study.objectives[metric]}
     loop, objective = jax.tree.map(lambda x: np.asarray(x, study.dtype), given)
     return loop, values, study.solver, objective
 
 
 def _run_scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
-    """The metric at z (n, dimension), NaN where the run diverges. n is filled up to a power of two: few programs."""
+    """Return the metric at z (n, dimension), NaN where the run diverges."""
+    # Padding to a power of two keeps the number of batch shapes, and so of compilations, small.
     values = study.space.normal(_pad_with_last(z, 1 << (len(z) - 1).bit_length()))
     _check_runnable(study, values, len(z))
     with precision(study.dtype):
@@ -89,15 +106,16 @@ def _run_scores(study: Study, metric: str, z: np.ndarray) -> np.ndarray:
 
 
 def _measure_metric(study: Study, metric: str, values: Mapping[str, Any]) -> Any:
-    """The metric of lanes (n,) that share one sequence of noise."""
+    """Return the metric of runs (n,) that share one sequence of noise."""
     loop, _, solver, objective = _cast_arguments(study, metric, values)
+    # The same key for every run, so that the score is a deterministic function of z.
     keys = jax.vmap(lambda _: noise_key(study.seed, 0))(np.arange(Batch(values).size))
     lanes = Batch(values, keys)
     return run_batch(loop, lanes, solver, objective, accepted=True, engine=study.engine).metrics[metric]
 
 
 def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) -> None:
-    """Raises ValueError, in a line, for points of which the first `count` cannot all be run."""
+    """Raise a ValueError of one line if any of the first `count` points cannot be run."""
     refused = batch_admissibility(study.loop, values, study.solver)
     bad = np.flatnonzero(refused.codes[:count])
     if len(bad):
@@ -107,7 +125,7 @@ def _check_runnable(study: Study, values: Mapping[str, np.ndarray], count: int) 
 
 
 def _make_gradient(study: Study, metric: str) -> Gradient:
-    """The metric (n,) and its derivative (n, dimension) at z (n, dimension), n at most STARTS."""
+    """Return a function z (n, dimension) -> (metric (n,), derivative (n, dimension)), n <= `DESIGN_POINT_STARTS`."""
     slopes = _compile_derivatives(study, metric)
 
     def gradient(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -123,18 +141,23 @@ def _make_gradient(study: Study, metric: str) -> Gradient:
 
 
 def _compile_derivatives(study: Study, metric: str) -> Callable[[Mapping[str, Any]], Any]:
-    """The metric of a batch of values, and its derivative in each: in reverse, by a kernel forward. Compiled once."""
+    """Return a compiled function from values to the metric of each run and its derivatives by the values of that run.
+
+    XLA computes the derivatives in reverse mode, a kernel in forward mode.
+    """
 
     def forward(values: Mapping[str, Any]) -> Any:
         def along(way: Mapping[str, Any]) -> Any:
             return jax.jvp(lambda values: _measure_metric(study, metric, values), (values,), (way,))
 
+        # One tangent for each parameter. Runs are independent, so a tangent of ones gives each run's own derivative.
         rows = dict(zip(values, np.eye(len(values)), strict=True))
         ways = {path: jnp.outer(rows[path], jnp.ones_like(column)) for path, column in values.items()}
         scores, rates = jax.vmap(along, out_axes=(None, 0))(ways)
         return scores, dict(zip(values, rates, strict=True))
 
     def slopes(values: Mapping[str, Any]) -> Any:
+        # Runs are independent, so the gradient of their sum holds each run's own derivative.
         scores, pull = jax.vjp(lambda values: _measure_metric(study, metric, values), values)
         return scores, *pull(jnp.ones_like(scores))
 
@@ -142,7 +165,7 @@ def _compile_derivatives(study: Study, metric: str) -> Callable[[Mapping[str, An
 
 
 def _parameter_slopes(study: Study, z: np.ndarray) -> dict[str, np.ndarray]:
-    """dv/dz (n, dimension) of each parameter: zero for lists of values, but next to their edges."""
+    """Return dv/dz (n, dimension) of each parameter; it is zero for lists of values, except close to their edges."""
     n, d = z.shape
     offsets = DIFFERENCE_STEP * np.eye(d)
     points = np.stack([z[:, None] + offsets, z[:, None] - offsets]).reshape(-1, d)
@@ -151,5 +174,5 @@ def _parameter_slopes(study: Study, z: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def _pad_with_last(z: np.ndarray, size: int) -> np.ndarray:
-    """With copies of the last row."""
+    """Return z with copies of its last row appended, `size` rows in all."""
     return np.concatenate([z, np.repeat(z[-1:], size - len(z), axis=0)])

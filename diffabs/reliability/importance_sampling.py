@@ -1,17 +1,20 @@
-"""Importance sampling from mixtures of normals, centred where a few failures lie or where gradients lead.
+"""Importance sampling from mixtures of normal distributions, centred on known failures or on design points.
 
     P = E_q[w 1_F],   q(z) = sum_k a_k N(z; c_k, u_k u_k' + s_k^2 (I - u_k u_k')),   u = c/|c|,   w = phi/q
 
     E_q[w^2 1_F]/P^2 = E[w|F]/P
 
-The last equation foretells the variance of importance sampling from failures alone, before a run is spent. The
-variance is finite whatever the centres since s^2 > 1/2; s, one number for all directions across, follows the curvature
-of the limit and stays near one in the many directions that do not matter.
+The last equation predicts the variance of importance sampling from failures alone, before any run. The variance is
+finite for all centres since s^2 > 1/2. One number s serves all directions across u. It follows the curvature of the
+limit surface, and stays near one in the many directions without influence.
 
-Centres: maximum likelihood of the failures (expectation maximisation; cross-entropy method, R. Y. Rubinstein and D. P.
-Kroese, The Cross-Entropy Method, 2004), or design points, the points of F nearest to the origin (improved HL-RF,
-Y. Zhang and A. Der Kiureghian, Two improved algorithms for reliability analysis, in Reliability and Optimization of
-Structural Systems, 1995)."""
+The centres are either the maximum-likelihood fit of the failures or design points. Expectation maximisation computes
+the fit (cross-entropy method, R. Y. Rubinstein and D. P. Kroese, The Cross-Entropy Method, 2004). Design points are the
+points of F nearest to the origin. The improved HL-RF method finds them.
+
+Source: Y. Zhang and A. Der Kiureghian, Two improved algorithms for reliability analysis, in Reliability and
+Optimization of Structural Systems, 1995.
+"""
 
 import math
 import statistics
@@ -22,16 +25,16 @@ import numpy as np
 
 COMPONENT_COUNTS = (1, 2, 4, 8, 16)  # numbers of centres that are tried
 EM_STEPS = 15  # steps of expectation maximisation
-DEFENSIVE_SHARE = 0.1  # of the draws, shared equally by all centres: the failures at hand may miss where others are
+DEFENSIVE_SHARE = 0.1  # of the draws, shared equally by all centres: the known failures may miss parts of F
 SCALE_RANGE = 0.8, 2.0  # least and greatest s: the weights' variance is finite above sqrt(1/2)
-MAX_DESIGN_POINT_STEPS = 30  # of a search for a design point, and so its gradients
+MAX_DESIGN_POINT_STEPS = 30  # steps, and so gradients, of a search for a design point
 MIN_POINT_DISTANCE = 0.5  # distance below which two design points are one
-STEP_TOLERANCE = 0.05  # length of a step that ends a search: a centre need not be more accurate
-MIN_STEP_SHARE = 1e-3  # share of a step
+STEP_TOLERANCE = 0.05  # length of a step that ends a search; a centre needs no more accuracy
+MIN_STEP_SHARE = 1e-3  # least t of a step, below which a search stops
 CONFIDENCE = 0.95
-DESIGN_POINT_STARTS = 8  # of searches for design points
-MAX_COV_RATIO = 0.5  # of the coefficient of variation, that importance sampling must promise
-MAX_DEVIATIONS_APART = 4.0  # standard deviations between two estimates that do not agree
+DESIGN_POINT_STARTS = 8  # number of searches for design points
+MAX_COV_RATIO = 0.5  # greatest predicted coefficient of variation over that of subset simulation
+MAX_DEVIATIONS_APART = 4.0  # standard deviations below subset simulation at which the two estimates contradict
 
 Score = Callable[[np.ndarray], np.ndarray]
 Gradient = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -39,11 +42,11 @@ Fit = Callable[[np.ndarray], "Mixture"]
 
 
 class DivergenceError(ValueError):
-    """Too many runs diverged to tell a probability; one line."""
+    """Too many runs diverged to estimate a probability; the message is one line."""
 
 
 class ProbabilityEstimate(NamedTuple):
-    """A probability, its coefficient of variation, and an interval of 95 %."""
+    """A probability, its coefficient of variation, and its 95 % interval."""
 
     probability: float
     cov: float
@@ -51,8 +54,14 @@ class ProbabilityEstimate(NamedTuple):
 
 
 class ImportanceEstimate(NamedTuple):
-    """Importance sampling around `centres` (k, d); the effective sample size (sum w)^2/sum w^2; the coefficient of
-    variation that was foretold."""
+    """The result of importance sampling.
+
+    Attributes:
+        estimate: Probability, coefficient of variation and interval.
+        effective_samples: Effective sample size (sum w)^2/sum w^2.
+        predicted_cov: Coefficient of variation predicted from the failures before any run.
+        centres: Centres of the mixture, shape (k, d).
+    """
 
     estimate: ProbabilityEstimate
     effective_samples: float
@@ -61,10 +70,10 @@ class ImportanceEstimate(NamedTuple):
 
 
 class CountedScore:
-    """The score and its gradient, counted; NaN becomes -inf, which fails at no threshold."""
+    """A score and its gradient that count their evaluations; a NaN score becomes -inf, which fails at no threshold."""
 
     def __init__(self, score: Score, gradient: Gradient | None, tolerated: float):
-        """None for no gradient; the share of runs that may diverge."""
+        """Set the score, its gradient (None: no gradient) and the share of runs that may diverge."""
         self.score, self.slope, self.tolerated = score, gradient, tolerated
         self.evaluations = self.gradients = self.diverged = 0
 
@@ -73,6 +82,11 @@ class CountedScore:
         return self._clean(self.score(z), z)
 
     def gradient(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the score (n,) and its derivative (n, d) at `z` (n, d).
+
+        Raises:
+            ValueError: The score or the derivative has the wrong shape.
+        """
         assert self.slope is not None
         self.gradients += len(z)
         score, slope = self.slope(z)
@@ -90,7 +104,11 @@ class CountedScore:
         return np.where(lost, -np.inf, score)
 
     def since(self, evaluations: int, diverged: int) -> int:
-        """How many runs diverged, after that many before; too many are an error."""
+        """Return the number of runs that diverged since the counts `evaluations` and `diverged`.
+
+        Raises:
+            DivergenceError: The share of diverged runs exceeds the tolerated share.
+        """
         lost, of = self.diverged - diverged, self.evaluations - evaluations
         if lost > self.tolerated * of:
             raise DivergenceError(
@@ -100,8 +118,15 @@ class CountedScore:
 
 
 class Mixture(NamedTuple):
-    """Normal distributions with centres (k, d) and weights (k,), of variance one along the centre's direction u, in
-    which the density falls, and s^2 (k,) across: c + u u'x + s (x - u u'x), x ~ N(0, I)."""
+    """A mixture of normal distributions c + u u'x + s (x - u u'x), x ~ N(0, I).
+
+    The variance is one along the direction u of each centre, in which the density falls, and s^2 across it.
+
+    Attributes:
+        centres: Centres c, shape (k, d).
+        weights: Weights, shape (k,).
+        scales: Standard deviations s across the centre's direction, shape (k,).
+    """
 
     centres: np.ndarray
     weights: np.ndarray
@@ -109,30 +134,36 @@ class Mixture(NamedTuple):
 
     @property
     def directions(self) -> np.ndarray:
-        """u (k, d)."""
+        """Directions u of the centres, shape (k, d)."""
         size = np.linalg.norm(self.centres, axis=1, keepdims=True)
         return np.where(size > 0, self.centres / np.where(size > 0, size, 1.0), np.eye(1, self.centres.shape[1]))
 
     def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
-        """Points (count, d)."""
+        """Return `count` points (count, d) drawn with `rng`."""
         chosen = rng.choice(len(self.weights), size=count, p=self.weights)
         x, u, s = rng.standard_normal((count, self.centres.shape[1])), self.directions[chosen], self.scales[chosen]
         return self.centres[chosen] + s[:, None] * x + ((1 - s) * np.sum(u * x, axis=1))[:, None] * u
 
     def log_weight(self, z: np.ndarray) -> np.ndarray:
-        """log(phi/q) at z (n, d)."""
+        """Return log(phi/q) at `z` (n, d), shape (n,)."""
         return -np.logaddexp.reduce(self._terms(z)[0], axis=1)
 
     def parts(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """With which probability z (n, d) was drawn around each centre (n, k), and the square of its distance from the
-        line through the origin and that."""
+        """Return each centre's share of the density at `z` (n, d), and squared distances from the centres' lines, each
+        (n, k).
+
+        The share is the probability that z was drawn around that centre. The line passes through the origin and the
+        centre.
+        """
         terms, across = self._terms(z)
         odds = np.exp(terms - np.max(terms, axis=1, keepdims=True))
         return odds / np.sum(odds, axis=1, keepdims=True), across
 
     def _terms(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return log(weight * density/phi) of each centre, and squared distances from its line, each (n, k)."""
         along, square = z @ self.directions.T, np.sum(z**2, axis=1)[:, None]
         across, size = np.maximum(square - along**2, 0.0), np.linalg.norm(self.centres, axis=1)
+        # (along - size)^2 is the squared distance along u; d - 1 directions across have standard deviation s.
         log_q = -0.5 * ((along - size) ** 2 + across / self.scales**2) - (z.shape[1] - 1) * np.log(self.scales)
         return np.log(self.weights) + log_q + 0.5 * square, across
 
@@ -140,13 +171,17 @@ class Mixture(NamedTuple):
 def fit_proposal(
     failures: np.ndarray, group: np.ndarray, probability: float, centres: np.ndarray | None = None
 ) -> tuple[Mixture, float]:
-    """The mixture of least second moment E_q[w^2 1_F]/P^2, and the logarithm of that.
+    """Return the mixture with the least second moment E_q[w^2 1_F]/P^2, and the logarithm of that moment.
 
-    failures (n, d): distributed as phi on F
-    group (n,): failures with the same integer depend on each other; odd groups foretell for even ones and vice versa
-    probability: P
-    centres (k, d): an alternative to those fitted to the failures; only their weights are fitted
+    Args:
+        failures: Points (n, d), distributed as phi on F.
+        group: Integers (n,); failures with the same integer depend on each other. Fits to odd groups predict the moment
+            on even groups, and vice versa.
+        probability: Probability P.
+        centres: Centres (k, d) as an alternative to the fitted centres; only their weights and scales are fitted. None
+            gives no alternative.
     """
+    # k=k binds the value of the loop; a plain k would be the last count in every lambda.
     fits: list[Fit] = [
         lambda z, k=k: _fit_mixture(z, choose_spread_points(z, k), moving=True) for k in COMPONENT_COUNTS
     ]
@@ -159,7 +194,7 @@ def fit_proposal(
 
 
 def _second_moment(fit: Fit, failures: np.ndarray, odd: np.ndarray) -> float:
-    """log E[w|F], of weights fitted to other failures than those averaged over."""
+    """Return log E[w|F], with each half of the failures evaluated under the mixture fitted to the other half."""
     halves = failures[odd], failures[~odd]
     if min(map(len, halves)) == 0:
         return np.inf
@@ -168,12 +203,13 @@ def _second_moment(fit: Fit, failures: np.ndarray, odd: np.ndarray) -> float:
 
 
 def _fit_mixture(z: np.ndarray, centres: np.ndarray, *, moving: bool) -> Mixture:
-    """Weights and scales of most likelihood, and centres, too, if `moving`."""
+    """Return the mixture with weights and scales of maximum likelihood, and fitted centres if `moving`."""
     count, d = len(centres), z.shape[1]
     found = Mixture(centres, np.full(count, 1 / count), np.ones(count))
     for _ in range(EM_STEPS):
         parts, across = found.parts(z)
         total = np.maximum(parts.sum(axis=0), np.finfo(float).tiny)
+        # Each centre has d - 1 directions across, all with the same variance.
         square = np.sum(parts * across, axis=0) / total / max(d - 1, 1)
         found = Mixture(
             parts.T @ z / total[:, None] if moving else centres,
@@ -184,8 +220,15 @@ def _fit_mixture(z: np.ndarray, centres: np.ndarray, *, moving: bool) -> Mixture
 
 
 def choose_spread_points(z: np.ndarray, count: int) -> np.ndarray:
-    """Up to `count` of the points z (n, d): the nearest to the origin, then always the one whose direction is farthest
-    from those chosen before."""
+    """Return up to `count` of the points: first the nearest to the origin, then points in directions far from each
+    other.
+
+    Each further point has the direction farthest from the directions chosen so far.
+
+    Args:
+        z: Points, shape (n, d).
+        count: Greatest number of points.
+    """
     size = np.linalg.norm(z, axis=1)
     directions = z / np.maximum(size, np.finfo(float).tiny)[:, None]
     chosen = [int(np.argmin(size))]
@@ -197,18 +240,26 @@ def choose_spread_points(z: np.ndarray, count: int) -> np.ndarray:
 
 
 def design_points(gradient: Gradient, starts: np.ndarray, threshold: float) -> np.ndarray:
-    """Local minima (k, d) of |z| on g(z) = threshold, from all starts (n, d) together, the nearest first.
+    """Return local minima (k, d) of |z| on g(z) = threshold, the nearest to the origin first.
 
         z' = (a'z + threshold - g) a/|a|^2,   a = dg/dz
 
-    z + t (z' - z) is taken if |z|^2/2 + 2 (|z| + 1)/|a| |threshold - g| falls, and t halved if not.
+    A search moves to z + t (z' - z) if the merit |z|^2/2 + 2 (|z| + 1)/|a| |threshold - g| falls. Otherwise t is
+    halved. All searches advance together.
 
-    A search that meets a kink, a plateau (a = 0) or a diverged run stops where it is, which is a poor centre but no
-    error: any centre will do for an unbiased estimate."""
+    A search that meets a kink, a plateau (a = 0) or a diverged run stops there. The point is then a poor centre, but
+    the estimate stays unbiased for any centre.
+
+    Args:
+        gradient: Function z (n, d) -> (score g (n,), derivative (n, d)).
+        starts: Starting points, shape (n, d).
+        threshold: Score at the limit surface.
+    """
     z = starts.copy()
     score, slope = gradient(z)
     t = np.ones(len(z))
     for _ in range(MAX_DESIGN_POINT_STEPS):
+        # A plateau (slope 0) or a diverged run (score -inf) gives infinite or NaN moves: `go` drops these searches.
         with np.errstate(all="ignore"):
             squared = np.sum(slope**2, axis=1)
             move = ((np.sum(slope * z, axis=1) + threshold - score) / squared)[:, None] * slope - z
@@ -245,12 +296,26 @@ def try_importance_sampling(
     draws: int,
     rng: np.random.Generator,
 ) -> tuple[ImportanceEstimate | None, str]:
-    """Importance sampling, if the failures (n, d) of subset simulation foretell that it pays, and what came of it.
-    `group` (n,) as for `proposal`."""
+    """Run importance sampling if the failures predict a benefit; return the estimate (or None) and a note on the
+    outcome.
+
+    Args:
+        runs: Score and its gradient.
+        failures: Failures of subset simulation, shape (n, d).
+        group: Dependent failures, as in `fit_proposal`, shape (n,).
+        subset: Estimate of subset simulation.
+        threshold: Score at the limit surface.
+        draws: Number of draws.
+        rng: Random generator.
+
+    Raises:
+        DivergenceError: Too many runs diverge.
+    """
     centres = None
     if runs.slope:
         centres = design_points(runs.gradient, choose_spread_points(failures, DESIGN_POINT_STARTS), threshold)
     mixture, moment = fit_proposal(failures, group, subset.probability, centres)
+    # cov^2 = (E_q[w^2 1_F]/P^2 - 1)/draws; the limits keep the root real and expm1 from an overflow.
     predicted_cov = math.sqrt(math.expm1(min(max(moment, 0.0), 700.0)) / draws)
     if predicted_cov > MAX_COV_RATIO * subset.cov:
         return None, f"subset simulation: {predicted_cov:.2g} is the coefficient of variation to be had otherwise"
@@ -263,7 +328,14 @@ def try_importance_sampling(
 
 
 def is_better_estimate(found: ImportanceEstimate, subset: ProbabilityEstimate) -> bool:
-    """Whether importance sampling is less uncertain, and not too low, as it is where it misses failures."""
+    """Return whether importance sampling is less uncertain than subset simulation and not far below it.
+
+    An estimate far below misses failures.
+
+    Args:
+        found: Result of importance sampling.
+        subset: Estimate of subset simulation.
+    """
     cov = found.estimate.cov
     if cov > subset.cov:
         return False
@@ -274,8 +346,20 @@ def is_better_estimate(found: ImportanceEstimate, subset: ProbabilityEstimate) -
 def importance_sampling(
     score: Score, threshold: float, mixture: Mixture, draws: int, predicted_cov: float, rng: np.random.Generator
 ) -> ImportanceEstimate:
-    """Unbiased whatever the mixture. The coefficient of variation is the one seen or foretold, whichever is greater,
-    as both are low where heavy weights are rare. Interval: of log P, by Student's t of (effective size - 1) degrees."""
+    """Return the estimate of importance sampling, which is unbiased for any mixture.
+
+    The coefficient of variation is the greater of the observed and the predicted one, since both are low if heavy
+    weights are rare. The interval is an interval of log P, from Student's t with (effective size - 1) degrees of
+    freedom.
+
+    Args:
+        score: Function z (n, d) -> score (n,).
+        threshold: Score at the limit surface.
+        mixture: Distribution of the draws.
+        draws: Number of draws, >= 2.
+        predicted_cov: Coefficient of variation predicted from the failures.
+        rng: Random generator.
+    """
     z = mixture.draw(draws, rng)
     weights = np.where(score(z) >= threshold, np.exp(mixture.log_weight(z)), 0.0)
     probability = float(np.mean(weights))
@@ -289,13 +373,26 @@ def importance_sampling(
 
 
 def lognormal_estimate(probability: float, cov: float, deviation: float, degrees: float) -> ProbabilityEstimate:
-    """With the interval P exp(+- t deviation) of a standard deviation of log P."""
+    """Return the estimate with the interval P exp(+- t deviation).
+
+    Args:
+        probability: Probability P.
+        cov: Coefficient of variation.
+        deviation: Standard deviation of log P.
+        degrees: Degrees of freedom of Student's t.
+    """
     reach = math.exp(min(student_quantile(degrees) * deviation, 700.0))
     return ProbabilityEstimate(probability, cov, (probability / reach, min(1.0, probability * reach)))
 
 
 def student_quantile(degrees: float) -> float:
-    """The upper quantile of Student's t for a two-sided interval of 95 %, Cornish and Fisher's expansion about the
-    normal: within 2 % from 4 degrees, and fewer are counted as 2."""
+    """Return the upper quantile of Student's t for a two-sided 95 % interval.
+
+    The formula is the expansion of Cornish and Fisher about the normal distribution. Its error is at most 2 % from 4
+    degrees of freedom. Less than 2 degrees count as 2.
+
+    Args:
+        degrees: Degrees of freedom.
+    """
     z, n = statistics.NormalDist().inv_cdf(0.5 + CONFIDENCE / 2), max(degrees, 2.0)
     return z + (z**3 + z) / (4 * n) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * n**2)

@@ -1,24 +1,28 @@
-"""Probabilities too small to count: subset simulation, and importance sampling where its failures say that it pays.
+"""Subset simulation for small probabilities, followed by importance sampling if the failures predict a benefit.
 
     P[F] = P[F_1] P[F_2|F_1] ... P[F_m|F_m-1],   F_j = {z: g(z) >= b_j},   z ~ N(0, I),   b_m = threshold
 
-S.-K. Au and J. L. Beck, Probabilistic Engineering Mechanics 16 (2001). b_j leaves `share` of the samples; those are the
-seeds of chains that fill the next level by adaptive conditional sampling (I. Papaioannou et al., ibid. 41 (2015)),
+The method is that of S.-K. Au and J. L. Beck, Probabilistic Engineering Mechanics 16 (2001). A fraction `share` of the
+samples reaches b_j. These samples are the seeds of Markov chains that fill the next level by adaptive conditional
+sampling (I. Papaioannou et al., ibid. 41 (2015)):
 
     z' = sqrt(1 - s^2) z + s xi,  accepted if g(z') >= b_j,   log s += (acceptance - 0.44)/sqrt(step)
 
-where all chains make each step together and so adapt together. The shares are counted, not presumed, so scores may
-tie. The estimate is consistent, its bias O(1/samples) (positive, a few per cent by default).
+All chains make each step together and share the adapted s. The shares are counted, not presumed, so scores may tie. The
+estimate is consistent; its bias is O(1/samples) (positive, a few per cent by default).
 
-A level's relative variance is (1 - p)/(p n) (1 + correlation along chains). Levels depend on each other, too: the
-total is taken from the failures' ancestors among the first samples, sum_a (share of a)^2 (A. Lee and N. Whiteley,
-Biometrika 105 (2018)), but no less than for independent levels and no more than for fully dependent ones (the bounds
-of Au and Beck). Its interval is log-normal, with quantiles of Student's t of one degree for each effective ancestor.
+A level's relative variance is (1 - p)/(p n) (1 + correlation along chains). The levels depend on each other, too. The
+total variance comes from the failures' ancestors among the first samples, sum_a (share of a)^2 (A. Lee and N. Whiteley,
+Biometrika 105 (2018)). It is bounded by the value for independent levels below and for fully dependent levels above
+(the bounds of Au and Beck). The interval is log-normal, with quantiles of Student's t and one degree of freedom for
+each effective ancestor.
 
-Importance sampling follows if the failures foretell that it will halve the coefficient of variation at least
-(`importance_sampling`). It replaces the estimate unless it proves more uncertain, or is far below, as it would be if it
-missed some. Failures that a few normal distributions do not cover (the surface of a sphere in ten dimensions) thus stay
-with subset simulation. Choosing one of two consistent estimates makes a small bias of its own, too."""
+Importance sampling follows if the failures predict that it at least halves the coefficient of variation
+(`importance_sampling`). Its estimate replaces that of subset simulation unless it proves more uncertain or far lower. A
+far lower estimate would follow from missed failures. A few normal distributions do not cover some failure sets, for
+example the surface of a sphere in ten dimensions. Subset simulation then gives the result. The choice between two
+consistent estimates adds a small bias.
+"""
 
 import dataclasses
 import enum
@@ -39,14 +43,14 @@ from diffabs.reliability.importance_sampling import (
     try_importance_sampling,
 )
 
-TARGET_ACCEPTANCE, FIRST_SPREAD = 0.44, 0.6  # aimed at, and the s of the first step: Papaioannou et al.
-MAX_FAILING_POINTS = 100  # failures in a result
+TARGET_ACCEPTANCE, FIRST_SPREAD = 0.44, 0.6  # acceptance aimed at, and s of the first step: Papaioannou et al.
+MAX_FAILING_POINTS = 100  # greatest number of failures in a result
 RULE_OF_THREE = 3.0  # 0/n with 95 % confidence: less than 3/n
 Rng = np.random.Generator
 
 
 class SubsetReason(enum.Enum):
-    """Why no further level was made."""
+    """The reason why no further level was made."""
 
     REACHED = "the threshold was reached"
     PLATEAU = "no progress: no sample is above the score that they share"
@@ -54,7 +58,9 @@ class SubsetReason(enum.Enum):
 
 
 class SubsetProgress(NamedTuple):
-    """After each level: its number from 1, and what it reached."""
+    """The progress after a level: its number from 1, its threshold, the share that reached it, and all evaluations so
+    far.
+    """
 
     level: int
     threshold: float
@@ -63,11 +69,11 @@ class SubsetProgress(NamedTuple):
 
 
 class SubsetLevel(NamedTuple):
-    """Samples of F_j-1, of which `share` are in F_j."""
+    """The samples of F_j-1, with the fraction `share` in F_j."""
 
     threshold: float  # b_j
     share: float
-    cov: float  # of the share: the chains' correlation included
+    cov: float  # coefficient of variation of the share, with the correlation along chains
     acceptance: float  # of the proposals; 1 for the first level, whose samples are independent
     spread: float  # s, after the last step
     diverged: int
@@ -75,15 +81,22 @@ class SubsetLevel(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RareEvent:
-    """P[g(z) >= threshold], and how it was found.
+    """An estimate of P[g(z) >= threshold].
 
-    probability, cov, interval: of the better estimate. Where the threshold was not reached: 0 and infinite if no
-        sample failed, and an upper bound as the interval's end
-    subset, importance: both estimates; None where importance sampling was not tried, and `note` says why it is or is
-        not what is reported
-    failing (k, d): failures of subset simulation, distributed as phi on F, the most likely first; at most 100
-    evaluations, gradients: runs; `cost` counts a gradient as `price` of them
-    diverged: runs whose score was NaN. They count as not failing; a score says otherwise by +inf
+    Attributes:
+        probability: Probability of the better estimate; 0 if no sample failed.
+        cov: Coefficient of variation of the better estimate; infinite if no sample failed.
+        interval: 95 % interval of the better estimate; its upper end is an upper bound if no sample failed.
+        reason: Reason for the last level.
+        levels: The levels of subset simulation.
+        subset: Estimate of subset simulation.
+        importance: Result of importance sampling, or None if it was not tried.
+        note: Name of the better estimate, and the reason for the choice.
+        failing: Failures (k, d) of subset simulation, distributed as phi on F, the most likely first; at most 100.
+        evaluations: Number of runs.
+        gradients: Number of gradients.
+        diverged: Number of runs with a NaN score. They count as not failing; a score of +inf counts as failing.
+        price: Cost of a gradient in runs.
     """
 
     probability: float
@@ -102,7 +115,7 @@ class RareEvent:
 
     @property
     def cost(self) -> float:
-        """In runs."""
+        """Total cost in runs, each gradient counted as `price` runs."""
         return self.evaluations + self.price * self.gradients
 
 
@@ -123,21 +136,29 @@ def subset_simulation(
 ) -> RareEvent:
     """Return an estimate of P[score(z) >= threshold] for z ~ N(0, I) in R^dimension.
 
-    score: (n, dimension) -> (n,); n is `samples` once, then samples * share, and `draws` at the end
-    samples, share: of each level; P = share^m costs samples (1 + (m - 1)(1 - share)) runs: 15400 for 1e-6
-    seed: of everything that is drawn
-    levels: at most
-    draws: of importance sampling; 0 for none
-    gradient: (n, dimension) -> score (n,), its derivative (n, dimension), n at most 8. It finds design points to draw
-        around, which the failures alone do not tell in many dimensions (from about 20)
-    price: runs that a gradient counts as, in `cost`
-    tolerated: share of a level's runs that may diverge
-    progress: told after every level how far it is
+    Args:
+        score: Function (n, dimension) -> (n,); n is `samples` once, then samples * share, and `draws` at the end.
+        dimension: Number of coordinates z.
+        threshold: Threshold of the score.
+        samples: Number of samples of each level.
+        share: Share of the samples that start the next level. P = share^m costs samples (1 + (m - 1)(1 - share)) runs:
+            15400 for 1e-6.
+        seed: Seed of all draws.
+        levels: Greatest number of levels.
+        draws: Number of draws of importance sampling; 0 for no importance sampling.
+        gradient: Function (n, dimension) -> score (n,), its derivative (n, dimension), n at most 8; or None. It locates
+            design points as centres. In many dimensions (from about 20) the failures alone do not locate them.
+        price: Cost of a gradient in runs, for `RareEvent.cost`.
+        tolerated: Share of a level's runs that may diverge.
+        progress: Called after every level.
 
-    Raises ValueError: no such dimension, threshold or number of samples; a score of another shape; too many diverged.
+    Raises:
+        ValueError: The dimension, the threshold or a number of samples, levels or draws is invalid, the score has the
+            wrong shape, or too many runs diverge.
     """
     plan = _make_plan(dimension, threshold, samples, share, levels, draws)
     runs = CountedScore(score, gradient, tolerated)
+    # Separate streams: importance sampling does not change the draws of subset simulation.
     first, second = (np.random.default_rng(each) for each in np.random.SeedSequence(seed).spawn(2))
     sequence = _run_levels(runs, dimension, plan, first, progress)
     subset = _subset_estimate(sequence, plan)
@@ -154,6 +175,11 @@ class _Plan(NamedTuple):
 
 
 def _make_plan(dimension: int, threshold: float, samples: int, share: float, levels: int, draws: int) -> _Plan:
+    """Return the checked settings.
+
+    Raises:
+        ValueError: A setting is invalid.
+    """
     chains = round(samples * share)
     if dimension < 1:
         raise ValueError(f"dimension must be at least 1, not {dimension}")
@@ -169,8 +195,10 @@ def _make_plan(dimension: int, threshold: float, samples: int, share: float, lev
 
 
 class _Population(NamedTuple):
-    """Samples (n, d) of a level, step by step, so that chain c holds c, c + chains, ...; `family`: the first sample
-    that each descends from."""
+    """Samples (n, d) of a level, step by step: chain c holds rows c, c + chains, ...
+
+    `family` is the index of the first-level sample from which each sample descends.
+    """
 
     z: np.ndarray
     scores: np.ndarray
@@ -182,7 +210,7 @@ class _Population(NamedTuple):
 
 
 class _LevelSequence(NamedTuple):
-    """All levels; the last one's samples, and which of them fail (n,); why there is no further one."""
+    """All levels, the samples of the last one, the mask (n,) of its failures, and the reason for the end."""
 
     levels: list[SubsetLevel]
     last: _Population
@@ -213,10 +241,13 @@ def _run_levels(
 
 
 def _next_threshold(scores: np.ndarray, plan: _Plan) -> float | None:
-    """The next level: the threshold if half as many samples as there are chains fail (another level would cost more
-    than it tells), else the score that `chains` samples reach. If ties let more than half of all reach it: the next
-    greater score, if a tenth of the chains can start from there or nothing else would be gained. None if all samples
-    share one score."""
+    """Return the next threshold b_j, or None if all samples share one score.
+
+    It is the final threshold if at least half as many samples as there are chains fail: another level would cost more
+    than it contributes. Otherwise it is the score that `chains` samples reach. If ties let more than half of all
+    samples reach it, the next greater score is taken. That score must leave at least a tenth of the chains, unless all
+    samples reach the tied score.
+    """
     if np.sum(scores >= plan.threshold) >= plan.chains / 2:
         return plan.threshold
     reached = np.sort(scores)[-plan.chains]
@@ -229,8 +260,9 @@ def _next_threshold(scores: np.ndarray, plan: _Plan) -> float | None:
 def _advance_chains(
     runs: CountedScore, old: _Population, hits: np.ndarray, value: float, plan: _Plan, rng: Rng
 ) -> _Population:
-    """Chains from the samples that reached a level; some samples start several where there are fewer than chains."""
+    """Return the population of chains that start from the samples of a level, some from the same sample."""
     before = runs.evaluations, runs.diverged
+    # np.resize repeats the permuted indices if fewer samples than chains reached the level.
     seeds = np.resize(rng.permutation(np.flatnonzero(hits)), plan.chains)
     z, scores, s, length = old.z[seeds], old.scores[seeds], old.spread, plan.samples // plan.chains
     points, values, taken = [z], [scores], []
@@ -249,17 +281,23 @@ def _advance_chains(
 
 
 def _level_cov(hits: np.ndarray) -> float:
-    """sqrt((1 - p)/(p n) (1 + 2 sum_k (1 - k/length) correlation_k)) of hits (length, chains): Au and Beck."""
+    """Return the coefficient of variation of a level's share from hits (length, chains).
+
+        sqrt((1 - p)/(p n) (1 + 2 sum_k (1 - k/length) correlation_k))
+
+    Source: Au and Beck.
+    """
     p, length = float(np.mean(hits)), len(hits)
     if p in (0.0, 1.0):
         return np.inf if p == 0 else 0.0
     lags = [np.mean(hits[:-k] & hits[k:]) - p**2 for k in range(1, length)]
+    # An estimated correlation may be negative by chance; max(0, ...) keeps the variance on the safe side.
     excess = 2 * sum((1 - k / length) * lag for k, lag in enumerate(lags, 1)) / (p * (1 - p))
     return math.sqrt((1 - p) / (p * hits.size) * (1 + max(0.0, excess)))
 
 
 def _subset_estimate(sequence: _LevelSequence, plan: _Plan) -> ProbabilityEstimate:
-    """What the levels tell; an upper bound where nothing failed."""
+    """Return the estimate of the levels; its interval ends at an upper bound if no sample failed."""
     levels, last, hits, _ = sequence
     found = _product_estimate(levels, last.family[hits])
     return found if hits.any() else found._replace(interval=(0.0, _upper_bound(levels[:-1], last, plan.samples)))
@@ -268,6 +306,7 @@ def _subset_estimate(sequence: _LevelSequence, plan: _Plan) -> ProbabilityEstima
 def _importance_estimate(
     runs: CountedScore, sequence: _LevelSequence, subset: ProbabilityEstimate, plan: _Plan, rng: Rng
 ) -> tuple[ImportanceEstimate | None, str]:
+    """Return the result of importance sampling (or None) and a note on the outcome."""
     levels, last, hits, _ = sequence
     if not hits.any() or plan.draws == 0 or len(levels) == 1:
         return None, "subset simulation: no importance sampling of what one level shows, or without failures or draws"
@@ -285,7 +324,8 @@ def _build_rare_event(
     note: str,
     price: float,
 ) -> RareEvent:
-    """The better estimate, and all that was seen."""
+    """Return the result with the better estimate."""
+    # A chain that rejects a proposal repeats its sample.
     failing = np.unique(sequence.last.z[sequence.hits], axis=0)
     return RareEvent(
         *(tried.estimate if tried and is_better_estimate(tried, subset) else subset),
@@ -303,7 +343,7 @@ def _build_rare_event(
 
 
 def _product_estimate(levels: list[SubsetLevel], family: np.ndarray) -> ProbabilityEstimate:
-    """The product of the shares, with the variance that the families of the failures show."""
+    """Return the product of the shares, with the variance estimated from the families of the failures."""
     covs = np.array([level.cov for level in levels])
     if not np.all(np.isfinite(covs)):
         return ProbabilityEstimate(0.0, np.inf, (0.0, 1.0))
@@ -315,7 +355,10 @@ def _product_estimate(levels: list[SubsetLevel], family: np.ndarray) -> Probabil
 
 
 def _upper_bound(levels: list[SubsetLevel], last: _Population, samples: int) -> float:
-    """What P is below: the upper end for the last level, times 3/n if none of n independent samples fails. Of chains
-    only the different starts count."""
+    """Return an upper bound of P for samples without a failure.
+
+    It is the upper end of the interval for the last level, times 3/n if none of n independent samples fails. Of chains
+    only the distinct starts count.
+    """
     starts = len(np.unique(last.z[: samples // last.length], axis=0))
     return _product_estimate(levels, last.family).interval[1] * min(1.0, RULE_OF_THREE / starts)

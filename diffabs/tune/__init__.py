@@ -1,4 +1,4 @@
-"""Tuning by gradients, and worst cases: what a differentiable model is for."""
+"""Gradient-based tuning of controllers, and the search for worst cases."""
 
 from typing import TYPE_CHECKING
 

@@ -1,8 +1,13 @@
-"""Descents under multipliers that are raised until the constraints hold: the method of multipliers.
+"""Constrained minimisation by the method of multipliers (augmented Lagrangian).
 
-    m <- max(0, m + c (g + d)) after each descent; c grows where the violation has not become much smaller
+Each round descends under fixed multipliers and then updates them:
 
-J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., sec. 17.4.
+    m <- max(0, m + c (g + d))
+
+g are the excesses of the constraints, d is the margin and c the penalty. The penalty c grows if the violation has not
+shrunk to `MAX_VIOLATION_RATIO` of its earlier value. Rounds end when every constraint holds.
+
+Source: J. Nocedal and S. J. Wright, Numerical Optimization, 2nd ed., sec. 17.4.
 """
 
 import dataclasses
@@ -20,14 +25,14 @@ from diffabs.tune.descent import Descent, DescentPoint, DescentState, Optimiser,
 from diffabs.tune.problem import Multipliers, ObjectiveEvaluation, Problem
 from diffabs.tune.result import Method, StartError, StartResult, Tuned, TuningProgress
 
-FIRST_PENALTY = 10.0  # at first; the loss is of the order of one
-PENALTY_GROWTH = 4.0  # how much the penalty grows where the violation does not shrink enough
-MAX_VIOLATION_RATIO = 0.3
+FIRST_PENALTY = 10.0  # penalty of the first round; the scaled loss is of the order of one
+PENALTY_GROWTH = 4.0  # factor of the penalty if the violation does not shrink enough
+MAX_VIOLATION_RATIO = 0.3  # violation after a round over the violation after the round before
 MAX_PENALTY = 1e7
 
 
 class AugmentedLagrangianSearch:
-    """Descents under multipliers that are raised until the constraints hold."""
+    """A search for a constrained minimum by the method of multipliers, from several starts at once."""
 
     def __init__(
         self,
@@ -36,8 +41,13 @@ class AugmentedLagrangianSearch:
         progress: Callable[[TuningProgress], None] | None,
         stopping: Callable[[], bool] = lambda: False,
     ):
-        """Starts: the subject itself, and as many random ones as the method asks for. Raises StartError if the subject
-        must not be run as it is, and there is no other start."""
+        """Choose the starts and evaluate the objective at the subject's own parameters.
+
+        The first start is the subject itself. The method draws the others at random from the ranges of the parameters.
+
+        Raises:
+            StartError: The subject cannot run with its own parameters, and the method has no other start.
+        """
         self.problem, self.method, self.progress, self.stopping = problem, method, progress, stopping
         self.refused = problem.refused()
         if self.refused and method.starts == 1:
@@ -45,20 +55,25 @@ class AugmentedLagrangianSearch:
         own = problem.space.place(problem.subject)[None]
         drawn = problem.space.spread(jax.random.key(method.seed), method.starts - 1)
         self.starts = np.concatenate([own, drawn])
-        alike = np.repeat(own, len(self.starts), axis=0)  # one program serves this and the search
+        # Copies of the own start give the same batch shape as the search, so that both share one compiled program.
+        alike = np.repeat(own, len(self.starts), axis=0)
         self.before: ObjectiveEvaluation = jax.device_get(
             slice_start(problem.evaluator(1.0)(alike, self._multipliers()).seen, 0)
         )
-        if self.refused:  # its numbers mean nothing
+        if self.refused:  # the results of inadmissible runs are meaningless
             self.before = jax.tree.map(lambda x: np.full(np.shape(x), np.nan), self.before)._replace(diverged=0)
         size = abs(float(self.before.objective))
         self.scale = size if np.isfinite(size) and size > 0 else 1.0
         self.round = 0
-        self.earlier: list[list[DescentPoint]] = [[] for _ in self.starts]  # points of the rounds before
-        self.best: DescentState | None = None  # so far, as it was when it was met
+        self.earlier: list[list[DescentPoint]] = [[] for _ in self.starts]  # points of the earlier rounds
+        self.best: DescentState | None = None  # snapshot of the best start so far
 
     def result(self) -> Tuned:
-        """Raises StartError if no start could be left."""
+        """Run the search and return the best result over all starts.
+
+        Raises:
+            StartError: No start has a finite objective and gradient, a stable step and only runs that do not diverge.
+        """
         problem, method = self.problem, self.method
         chosen = (
             lbfgs(method.memory)
@@ -87,6 +102,7 @@ class AugmentedLagrangianSearch:
         return self._build_result(best, descent_states)
 
     def _run_rounds(self, descent: Descent) -> list[DescentState]:
+        """Run descents, each followed by a multiplier update, until every constraint holds or the rounds are spent."""
         m = self._multipliers()
         descent_states = descent.run(self.starts, m)
         if not self.problem.excesses:
@@ -109,16 +125,17 @@ class AugmentedLagrangianSearch:
         return descent_states
 
     def _multipliers(self) -> Multipliers:
-        """At the start."""
+        """Return the multipliers of the first round: zero, with the initial penalty and the margin of the method."""
         count, k = len(self.starts), self.problem.excesses
         return Multipliers(np.zeros((count, k)), np.full(count, FIRST_PENALTY), np.full(count, self.method.margin))
 
     def _rank(self, point: DescentPoint) -> tuple[bool, float]:
-        """Those that meet the constraints first."""
+        """Return a sort key: feasible points first, by objective; then infeasible points, by violation."""
         met = point.violation <= 0
         return not met, point.objective if met else point.violation
 
     def _told(self, descent_states: list[DescentState]) -> None:
+        """Record the best feasible or least infeasible point so far and report the progress."""
         for before, descent_state in zip(self.earlier, descent_states, strict=True):
             better = self.best is None or self._rank(descent_state.history[-1]) < self._rank(self.best.history[-1])
             if better and descent_state.reason is not Reason.START:
@@ -181,19 +198,20 @@ def _violations(descent_states: list[DescentState]) -> np.ndarray:
 
 
 def _raise_multipliers(m: Multipliers, descent_states: list[DescentState]) -> Multipliers:
-    """m <- max(0, m + c (g + d))."""
+    """Return the updated multipliers, m <- max(0, m + c (g + d))."""
     excess = np.stack([descent_state.seen.excess for descent_state in descent_states]) + m.margin[:, None]
+    # A NaN excess (a start rejected at its first evaluation) leaves the multiplier unchanged.
     return m._replace(values=np.maximum(0.0, m.values + m.penalty[:, None] * np.nan_to_num(excess)))
 
 
 def _raise_penalty(m: Multipliers, before: np.ndarray, after: np.ndarray) -> Multipliers:
-    """A greater penalty where the violation has not become much smaller."""
+    """Return the multipliers with a greater penalty for the starts whose violation has not shrunk enough."""
     slow = after > MAX_VIOLATION_RATIO * before
     return m._replace(penalty=np.minimum(np.where(slow, PENALTY_GROWTH * m.penalty, m.penalty), MAX_PENALTY))
 
 
 def _join_histories(before: list[DescentPoint], history: list[DescentPoint]) -> list[DescentPoint]:
-    """The history of a start over its rounds."""
+    """Return the history of a start over its rounds, with iterations and evaluations counted from the first round."""
     if not before:
         return list(history)
     shift = before[-1]

@@ -1,5 +1,9 @@
-"""What a tuned loop must satisfy. Each constraint is an array of excesses, positive where it is violated, in units of
-its own scale; `augmented_lagrangian` has a multiplier for each. Met is met: no excess above zero."""
+"""Constraints on a tuned loop.
+
+Each constraint returns an array of excesses in units of its own scale. An excess is positive if the constraint is
+violated. `augmented_lagrangian` has one multiplier for each excess. A constraint holds if no excess is above zero;
+there is no tolerance.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -12,27 +16,31 @@ from diffabs.design.interior.differentiable import certified_decay
 from diffabs.design.polytopes import Polytope
 from diffabs.design.state_feedback import feedback_gain
 
-MIN_POLE_MAGNITUDE = 1e-9  # |z| of a discrete pole that decays at once
+MIN_POLE_MAGNITUDE = 1e-9  # |z| below which a discrete pole decays within one period
 
 
 class Constraint(Protocol):
-    """A requirement on a loop and on the metrics of its lanes."""
+    """A requirement on a loop and on the metrics of its runs."""
 
     def excess(self, loop: Loop, metrics: Mapping[str, Any]) -> Any:
-        """(k,), <= 0 where met. `metrics` are (lanes,) each."""
+        """Return the excesses (k,) of `loop`, <= 0 where the constraint holds; each of `metrics` has shape (runs,)."""
         ...
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class AtMost:
-    """metric <= bound on every lane: `AtMost("overshoot", 0.01)`; a bound for each lane (lanes,) will do. The scale is
-    the bound, where it is not zero."""
+    """The constraint metric <= bound in every run, for example `AtMost("overshoot", 0.01)`.
+
+    Attributes:
+        metric: Name of a measured metric.
+        bound: One bound, or one for each run, shape (runs,). Its magnitude is the scale of the excess, 1 if it is zero.
+    """
 
     metric: str
     bound: Any
 
     def excess(self, loop: Loop, metrics: Mapping[str, Any]) -> Any:
-        """(metric - bound)/|bound|, (lanes,)."""
+        """Return (metric - bound)/|bound| from `metrics`, shape (runs,); `loop` is not used."""
         del loop
         bound = jnp.asarray(self.bound)
         return (metrics[self.metric] - bound) / jnp.where(bound == 0, 1.0, jnp.abs(bound))
@@ -40,11 +48,18 @@ class AtMost:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Poles:
-    """Every pole s of every vertex has -Re s >= decay [1/s], -Re s >= damping |s|; in discrete time s = ln(z)/period.
+    """The constraint that the closed loop of every vertex has poles with a minimum decay rate and damping ratio.
 
-    The gain is that of the loop's controller on the states of the polytope, which stays as it is: free parameters that
-    move the model (a lag, a filter's cutoff) are not seen. Where poles meet, the derivative is not defined, and a step
-    that lands there is rejected.
+    Every pole s satisfies -Re s >= decay and -Re s >= damping |s|. In discrete time, s = ln(z)/period.
+
+    The closed loop uses the feedback gain of the loop's controller on the states of the polytope. The polytope is
+    fixed: the constraint does not see free parameters that change the model, such as a lag or a filter's cutoff. The
+    derivative is undefined where poles coincide; the search rejects a step to such a point.
+
+    Attributes:
+        system: Polytope of linear models.
+        decay: Minimum decay rate [1/s].
+        damping: Minimum damping ratio [1].
     """
 
     system: Polytope
@@ -52,21 +67,22 @@ class Poles:
     damping: float = 0.0
 
     def excess(self, loop: Loop, metrics: Mapping[str, Any]) -> Any:
-        """(decay + Re s)/decay, and damping + Re s/|s|, for each vertex and pole."""
+        """Return (decay + Re s)/decay and damping + Re s/|s| of each vertex and pole of `loop`; `metrics` is unused."""
         del metrics
         real, ratios = self._modes(loop)
         rates = (self.decay + real) / (self.decay or 1.0)
         return jnp.concatenate([rates.ravel(), (self.damping - ratios).ravel() if self.damping else jnp.zeros(0)])
 
     def least_damping(self, loop: Loop) -> Any:
-        """The least -Re s/|s| of the poles s of all vertices."""
+        """Return the least damping ratio -Re s/|s| of `loop` over the poles s of all vertices."""
         return jnp.min(self._modes(loop)[1])
 
     def _modes(self, loop: Loop) -> tuple[Any, Any]:
-        """Re s and -Re s/|s| of the poles (V, n)."""
+        """Return Re s and -Re s/|s| of the poles, each of shape (vertices, n)."""
         modes = jnp.linalg.eigvals(_closed_loop_matrices(self.system, loop))
         if self.system.period is not None:
-            alive = jnp.abs(modes) > MIN_POLE_MAGNITUDE  # the rest decays at once
+            # ln 0 and its derivative are infinite, so a pole at z = 0 is replaced before the logarithm.
+            alive = jnp.abs(modes) > MIN_POLE_MAGNITUDE
             modes = jnp.log(jnp.where(alive, modes, MIN_POLE_MAGNITUDE)) / self.system.period
         real = modes.real
         return real, -real / jnp.sqrt(real**2 + modes.imag**2)
@@ -74,15 +90,22 @@ class Poles:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CertifiedDecay:
-    """A common Lyapunov matrix proves a decay of at least `decay` [1/s] at every vertex, however fast the system varies
-    between them (`certified_decay` of `design.interior.differentiable`). The gain is seen as by `Poles`. In floating
-    point: `certify` proves it of the result."""
+    """The constraint that a common Lyapunov matrix proves a minimum decay rate at every vertex.
+
+    The proof holds for a system that varies arbitrarily fast between the vertices (`certified_decay` of
+    `design.interior.differentiable`). The gain is the same as in `Poles`. The computation uses floating point: apply
+    `certify` to the result for a rigorous proof.
+
+    Attributes:
+        system: Polytope of linear models.
+        decay: Minimum decay rate [1/s].
+    """
 
     system: Polytope
     decay: float
 
     def excess(self, loop: Loop, metrics: Mapping[str, Any]) -> Any:
-        """(decay - what is proved)/max(|decay|, 1), (1,)."""
+        """Return (decay - proved decay)/max(|decay|, 1) of `loop`, shape (1,); `metrics` is not used."""
         del metrics
         system = self.system
         proved = certified_decay(feedback_gain(loop, system.states), system.A, system.B, system.period)
@@ -90,6 +113,6 @@ class CertifiedDecay:
 
 
 def _closed_loop_matrices(system: Polytope, loop: Loop) -> Any:
-    """A + B K (V, n, n), K the loop's."""
+    """Return A + B K of every vertex, shape (vertices, n, n), with the gain K of the loop's controller."""
     gain = feedback_gain(loop, system.states)
     return jnp.asarray(system.A) + jnp.asarray(system.B) @ gain[None, :]

@@ -1,13 +1,15 @@
-"""Safeguarded descent from many starts at once, with any optimiser of optax.
+"""Safeguarded gradient descent from many starts at once, with any optimiser of optax.
 
-The optimiser proposes an update u; the step t u is taken if the loop there is finite and its integration stable, and,
-where u is only a direction (L-BFGS), if it satisfies the weak Wolfe conditions
+The optimiser proposes an update u. The search takes the step t u if every run there is finite and its integration is
+stable. Updates of L-BFGS are only directions; the step must then also satisfy the weak Wolfe conditions
 
     L(z + t u) <= L(z) + 1e-4 t g'u,   g(z + t u)'u >= 0.9 g'u
 
-t is found by bisection and expansion, as A. S. Lewis and M. L. Overton, Nonsmooth optimization via quasi-Newton
-methods, Math. Program. 141 (2013), recommend for functions with kinks. A point that diverges or is not stable is too
-far, and its gradient is never used. All starts are evaluated in one compiled call; each decides on its own."""
+Bisection and expansion find t, as A. S. Lewis and M. L. Overton, Nonsmooth optimization via quasi-Newton methods, Math.
+Program. 141 (2013), recommend for functions with kinks. A trial point whose runs diverge or are unstable shortens the
+step, and the search never uses its gradient. One compiled call evaluates all starts; each start accepts or rejects its
+step independently.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -22,18 +24,25 @@ from diffabs.core.reason import Reason
 from diffabs.tune.problem import LossEvaluation, Multipliers
 
 ARMIJO_FRACTION, WOLFE_FRACTION = 1e-4, 0.9
-MIN_STEP_FACTOR = 1e-10  # of t
-STEP_EXPANSION = 4.0
-MAX_TRIALS = 12  # of a line search that has found something better, before it is content with that
-MAX_JUMPS = 2  # such searches in a row: no point beyond is better, so the loss jumps there and its gradient is no guide
-MAX_UPDATE_COMPONENT = 2.0  # of a component of u, in units of z: about half of a finite range
-MAX_IDLE_STEPS = 3  # accepted steps in a row that gain nothing
+MIN_STEP_FACTOR = 1e-10  # least t of a line search
+STEP_EXPANSION = 4.0  # factor of t while no upper bound on t is known
+MAX_TRIALS = 12  # of a line search that holds a point with sufficient decrease, before it accepts that point
+# Consecutive line searches that end at MAX_TRIALS with an upper bound on t: the loss jumps at that bound, and its
+# gradient gives no information about the jump.
+MAX_JUMPS = 2
+MAX_UPDATE_COMPONENT = 2.0  # greatest |u_i|, in units of z: about half of a finite range
+MAX_IDLE_STEPS = 3  # consecutive accepted steps without a significant change of the loss
 
 
 @dataclasses.dataclass(frozen=True)
 class Stopping:
-    """When a descent ends: the greatest component of the gradient of L (of order one at the start), the relative change
-    of L over three steps, or the number of accepted steps."""
+    """The conditions that end a descent.
+
+    Attributes:
+        gradient: Greatest component of the gradient of L; the gradient is of order one at the start.
+        change: Relative change of L in each of three consecutive steps.
+        iterations: Number of accepted steps.
+    """
 
     gradient: float = 1e-6
     change: float = 1e-7
@@ -41,18 +50,18 @@ class Stopping:
 
 
 class DescentPoint(NamedTuple):
-    """A line of a history."""
+    """One line of the history of a descent."""
 
     iteration: int
     objective: float
     loss: float
     gradient: float  # greatest component
     violation: float  # greatest excess, in units of the constraints' scales
-    evaluations: int  # so far, rejected ones included
+    evaluations: int  # total so far, including rejected trials
 
 
 class FeasiblePoint(NamedTuple):
-    """A step that meets every constraint."""
+    """An accepted step that meets every constraint."""
 
     z: np.ndarray
     seen: Any
@@ -61,7 +70,7 @@ class FeasiblePoint(NamedTuple):
 
 @dataclasses.dataclass
 class DescentState:
-    """One start on its way."""
+    """The state of the descent from one start."""
 
     z: np.ndarray
     loss: float
@@ -69,8 +78,8 @@ class DescentState:
     seen: Any
     update: np.ndarray
     t: float = 1.0
-    low: float = 0.0  # greatest step known to be too short, and `better`, what is there
-    high: float = np.inf  # least step known to be too long
+    low: float = 0.0  # greatest t known to be too short; `better` is the point there
+    high: float = np.inf  # least t known to be too long
     better: tuple[np.ndarray, Any] | None = None
     trials: int = 0
     idle: int = 0
@@ -79,10 +88,10 @@ class DescentState:
     iterations: int = 0
     reason: Reason | None = None
     history: list[DescentPoint] = dataclasses.field(default_factory=list)
-    kept: FeasiblePoint | None = None  # the best step so far that meets every constraint
+    kept: FeasiblePoint | None = None  # best feasible step so far
 
     def note(self) -> None:
-        """Add the present point to the history, and keep it if it is the best that meets the constraints."""
+        """Append the present point to the history, and keep it if it is the best feasible point so far."""
         worst = float(np.max(self.seen.excess, initial=0.0))
         self.history.append(
             DescentPoint(
@@ -98,12 +107,12 @@ class DescentState:
             self.keep(FeasiblePoint(self.z, self.seen, self.history[-1]))
 
     def keep(self, other: FeasiblePoint | None) -> None:
-        """The better of two."""
+        """Keep the feasible point `other` if its objective is less than the objective of the point kept so far."""
         if other and not (self.kept and self.kept.point.objective <= other.point.objective):
             self.kept = other
 
     def go_back(self) -> None:
-        """To the step that was kept, if the present point does not meet the constraints."""
+        """Return to the feasible point that was kept, if the present point violates a constraint."""
         last = self.history[-1]
         if self.kept and not last.violation <= 0:
             self.z, self.seen, self.reason = self.kept.z, self.kept.seen, Reason.KEPT
@@ -112,14 +121,23 @@ class DescentState:
 
 
 class Optimiser(NamedTuple):
-    """An optimiser of optax; `searches` if its updates are directions for a line search, not steps to be taken."""
+    """An optimiser of optax.
+
+    Attributes:
+        transformation: The transformation from gradients to updates.
+        searches: True if the updates are directions for a line search; False if they are complete steps.
+    """
 
     transformation: optax.GradientTransformationExtraArgs
     searches: bool
 
 
 def lbfgs(memory: int = 10) -> Optimiser:
-    """optax's L-BFGS direction; the line search is this module's, which knows what to do where a run diverges."""
+    """Return optax's L-BFGS direction, for the line search of this module, which rejects runs that diverge.
+
+    Args:
+        memory: Number of steps that L-BFGS stores.
+    """
     chain = optax.chain(optax.scale_by_lbfgs(memory_size=memory), optax.scale(-1.0))
     return Optimiser(optax.with_extra_args_support(chain), True)
 
@@ -128,7 +146,7 @@ Evaluate = Callable[[Any, Multipliers], LossEvaluation]
 
 
 class Descent:
-    """Descends from the starts z (starts, p) under fixed multipliers."""
+    """A descent from the starts z (starts, p) under fixed multipliers."""
 
     def __init__(
         self,
@@ -140,8 +158,17 @@ class Descent:
         told: Callable[[list[DescentState]], None],
         interrupted: Callable[[], bool] = lambda: False,
     ):
-        """`loss` is that of one start, for optimisers that search on their own; `told` is called with all starts after
-        every evaluation, and then `interrupted`, which ends them all."""
+        """Set the evaluations and the conditions that end the descent.
+
+        Args:
+            evaluate: Loss and gradient of all starts.
+            loss: Loss of one start, for optimisers with a line search of their own.
+            steady: Maps z (starts, p) to whether every run there is admissible, shape (starts,).
+            optimiser: Source of the updates.
+            stopping: Conditions that end the descent of a start.
+            told: Called with all starts after every evaluation.
+            interrupted: Called after `told`; True ends the descent of all starts.
+        """
         self.evaluate, self.steady, self.stopping, self.told = evaluate, steady, stopping, told
         self.interrupted = interrupted
         self.searches = optimiser.searches
@@ -154,7 +181,9 @@ class Descent:
         self._update = jax.jit(jax.vmap(update))
 
     def run(self, starts: np.ndarray, multipliers: Multipliers) -> list[DescentState]:
-        """Every start to its end."""
+        """Run the descent from each of `starts` (starts, p) under `multipliers` to its end, and return the final
+        states.
+        """
         self.multipliers = multipliers
         first, fine = self._evaluate_at(starts)
         descent_states = [
@@ -192,7 +221,7 @@ class Descent:
         self._propose(descent_states, moved)
 
     def _evaluate_at(self, z: np.ndarray) -> tuple[LossEvaluation, np.ndarray]:
-        """Evaluation, and which of them may be used."""
+        """Return the evaluation at z and a mask (starts,) of the finite, admissible points."""
         found = jax.device_get(self.evaluate(jnp.asarray(z), self.multipliers))
         fine = np.isfinite(found.loss) & np.isfinite(found.gradient).all(axis=1) & (found.seen.diverged == 0)
         return found, fine & self.steady(z)
@@ -200,10 +229,11 @@ class Descent:
     def _judged(
         self, descent_state: DescentState, fine: bool, z: np.ndarray, found: LossEvaluation
     ) -> tuple[np.ndarray, LossEvaluation] | None:
-        """The point to go to; or None, and another step to try."""
+        """Return the accepted point and its evaluation; otherwise None, with the next trial step set in the state."""
         descent_state.evaluations += 1
         descent_state.trials += 1
         slope = float(descent_state.gradient @ descent_state.update)
+        # At the greatest step no expansion is possible, so the curvature condition is waived there (1e-9: rounding).
         longest = descent_state.t * np.max(np.abs(descent_state.update)) >= MAX_UPDATE_COMPONENT * (1 - 1e-9)
         if fine and not self.searches:
             return z, found
@@ -215,6 +245,7 @@ class Descent:
             descent_state.jumps = 0
             return z, found
         if descent_state.better and descent_state.trials >= MAX_TRIALS:
+            # No trial below `high` satisfies the curvature condition: the loss jumps near `high`, or has a kink there.
             descent_state.jumps += np.isfinite(descent_state.high)
             return descent_state.better
         descent_state.t = _next_step_factor(descent_state, float(found.loss) if fine else np.inf, slope)
@@ -245,6 +276,7 @@ class Descent:
         descent_state.reason = self._finish_reason(descent_state)
 
     def _finish_reason(self, descent_state: DescentState) -> Reason | None:
+        """Return the reason why the descent of this start ends, or None if it continues."""
         if np.max(np.abs(descent_state.gradient)) <= self.stopping.gradient:
             return Reason.GRADIENT
         if descent_state.idle >= MAX_IDLE_STEPS:
@@ -254,13 +286,14 @@ class Descent:
         return Reason.LIMIT if descent_state.iterations >= self.stopping.iterations else None
 
     def _propose(self, descent_states: list[DescentState], fresh: list[bool]) -> None:
-        """New updates for the starts that have moved; the others keep theirs."""
+        """Compute new updates for the starts that have moved; the others keep theirs."""
         if not any(fresh):
             return
         z, g = (
             jnp.stack([getattr(descent_state, name) for descent_state in descent_states]) for name in ("z", "gradient")
         )
         loss = jnp.array([descent_state.loss for descent_state in descent_states])
+        # A start rejected at its first evaluation may have a NaN gradient; zero keeps the optimiser's state finite.
         g = jnp.where(jnp.isfinite(g), g, 0.0)
         updates, states = self._update(g, self.states, z, loss, self.multipliers)
         updates = np.array(updates)
@@ -269,6 +302,7 @@ class Descent:
             for u, descent_state in zip(updates, descent_states, strict=True)
         ]
         if any(b and f for b, f in zip(bad, fresh, strict=True)):
+            # The curvature memory of L-BFGS gives an ascent direction: restart it, which gives steepest descent.
             again, restarted = self._update(g, self._init(z), z, loss, self.multipliers)
             updates = np.where(np.array(bad)[:, None], again, updates)
             states = _select_by_start(np.array(bad), restarted, states)
@@ -281,8 +315,11 @@ class Descent:
 
 
 def _next_step_factor(descent_state: DescentState, loss: float, slope: float) -> float:
-    """The next step of a line search: longer, or between what is too short and what is too long; there the minimum of
-    the parabola through what is known, where nothing is known to be too short."""
+    """Return the next step factor t of a line search.
+
+    Without an upper bound on t the step expands. With both bounds it is bisected. With only an upper bound, t is the
+    minimum of the parabola through both losses and the slope. If the loss at t is not finite, t is divided by 4.
+    """
     if not np.isfinite(descent_state.high):
         return min(STEP_EXPANSION * descent_state.t, MAX_UPDATE_COMPONENT / float(np.max(np.abs(descent_state.update))))
     if descent_state.low > 0 or not np.isfinite(loss):
@@ -292,15 +329,21 @@ def _next_step_factor(descent_state: DescentState, loss: float, slope: float) ->
 
 
 def _is_descent_direction(update: np.ndarray, gradient: np.ndarray) -> bool:
+    """Return whether the update is finite and at an acute angle to the negative gradient."""
     size = np.linalg.norm(update) * np.linalg.norm(gradient)
     return bool(np.isfinite(size) and update @ gradient < -1e-10 * size)
 
 
 def _select_by_start(which: np.ndarray, a: Any, b: Any) -> Any:
-    """Start by start, a or b."""
+    """Return the leaves of `a` for the starts in `which` and the leaves of `b` for the others."""
     return jax.tree.map(lambda x, y: jnp.where(which.reshape(-1, *[1] * (jnp.ndim(x) - 1)), x, y), a, b)
 
 
 def slice_start(tree: Any, i: int) -> Any:
-    """Return what is said of one start."""
+    """Return the leaves of one start.
+
+    Args:
+        tree: Tree whose leaves have a leading axis of starts.
+        i: Index of the start.
+    """
     return jax.tree.map(lambda x: x[i], tree)

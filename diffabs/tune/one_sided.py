@@ -1,4 +1,4 @@
-"""Points at which a derivative by a parameter is that of one side alone (`docs/gradients.md` says of which)."""
+"""Warnings for points with a one-sided derivative by a parameter (listed in `docs/gradients.md`)."""
 
 import warnings
 from collections.abc import Iterator, Mapping
@@ -16,14 +16,20 @@ from diffabs.simulate.batch import Batch
 from diffabs.simulate.solution import FixedStep, Solver
 from diffabs.tune.problem import build_subject_loop
 
-EQUAL_ROUNDING_STEPS = 64.0  # precisions: numbers that are equal
+EQUAL_ROUNDING_STEPS = 64.0  # tolerance of equality, in units of the relative precision
 ADVICE = "a search may end there without a minimum: start it from other values, or hold one of these parameters"
 
 
 def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, Any, Any]]:
-    """Yield, for each point of `loop` with a one-sided derivative, its name and the two numbers that are equal there.
+    """Yield the name and the two compared numbers of each condition under which a derivative of `loop` is one-sided.
 
-    The name depends on the parts of the loop alone, so both numbers may be traced."""
+    The derivative is one-sided where the two numbers are equal. The name depends on the parts of the loop alone, so
+    both numbers may be traced.
+
+    Args:
+        loop: Closed loop.
+        solver: Solver of the runs; its step takes part in some conditions.
+    """
     sampled: Any = loop.controller
     inner: Any = getattr(sampled, "controller", sampled)
     prefix = "controller." if inner is sampled else "controller.controller."
@@ -53,10 +59,18 @@ def one_sided_candidates(loop: Loop, solver: Solver) -> Iterator[tuple[str, Any,
 
 
 def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, where: str) -> None:
-    """Warn of the parameters of `subject` by whose `values`, by path, a derivative of some run is one-sided."""
+    """Warn of parameters whose derivative is one-sided in some run of the batch.
+
+    Args:
+        subject: Loop, or a part with a method `closed()`.
+        values: Values of the parameters by path.
+        batch: The runs.
+        solver: Solver of the runs.
+        where: First words of the warning.
+    """
 
     def compared(values: Mapping[str, Any]) -> Any:
-        """Both numbers of each pair in each run, (2, runs, pairs)."""
+        """Return both numbers of each pair in each run, shape (2, runs, pairs)."""
         loop = as_arrays(build_subject_loop(replace(subject, values)))
         both = batch.each(loop, lambda loop, _: [jnp.stack(two) for _, *two in one_sided_candidates(loop, solver)])
         return jnp.moveaxis(jnp.stack(both, axis=1), 2, 0)
@@ -71,7 +85,7 @@ def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, 
     if not equal.any():
         return
     slopes = jax.jacfwd(lambda values: jnp.subtract(*compared(values)))(values)
-    moves = {path: abs(np.asarray(slope)) > small for path, slope in slopes.items()}  # and not the rounding of zero
+    moves = {path: abs(np.asarray(slope)) > small for path, slope in slopes.items()}  # above rounding
     for i, name in enumerate(names):
         moving = [path for path, ones in moves.items() if ones[:, i][equal[:, i]].any()]
         if moving:
@@ -81,7 +95,7 @@ def warn(subject: Any, values: Mapping[str, Any], batch: Batch, solver: Solver, 
 
 
 def _actuators(actuator: Any) -> Iterator[tuple[str, Any]]:
-    """Yield an actuator, or those of a series, by path."""
+    """Yield the path and the part of an actuator, or of each actuator in a series."""
     series = getattr(actuator, "blocks", None)
     if isinstance(series, tuple):
         yield from ((f"actuator.blocks.{i}", one) for i, one in enumerate(series))

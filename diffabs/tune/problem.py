@@ -1,11 +1,12 @@
-"""What is tuned, as a function of the unbounded vector z: loss, gradient, and what is needed to judge a step.
+"""The tuning problem as a function of the unbounded vector z: loss, gradient and admissibility.
 
-    J(z) = aggregate over the lanes of (sum of weight * metric)
+    J(z) = aggregate over the runs of (sum of weight * metric)
     L(z) = J/s + sum over the constraints of [max(0, m + c (g + d))^2 - m^2]/(2 c)
 
-L is the augmented Lagrangian of Powell, Hestenes and Rockafellar for g + d <= 0 with multipliers m and penalty c; s is
-the objective's size at the start, so that L is of the order of one. d is a margin: multipliers come to a bound from
-outside and never quite reach it, so what is aimed at lies a little inside, and g <= 0 holds where a search ends.
+L is the augmented Lagrangian of Powell, Hestenes and Rockafellar for g + d <= 0, with multipliers m and penalty c. The
+scale s is the magnitude of the objective at the start, so that L is of the order of one. The margin d moves the target
+a little inside the feasible set. Iterates of the method of multipliers approach a bound from outside and do not quite
+reach it. With the margin, g <= 0 holds at the end of a search.
 """
 
 import dataclasses
@@ -31,9 +32,9 @@ from diffabs.simulate.solution import Run, Solver
 from diffabs.tune.constraints import Constraint
 from diffabs.tune.risk import Aggregate
 
-MAX_QUICK_COMPILE_RUNS = 64  # lanes from which on their runs take longer than compiling them
+MAX_QUICK_COMPILE_RUNS = 64  # above this number of runs, a fully optimised compilation pays for itself
 NO_REVERSE_MESSAGE = "a kernel has no reverse mode; forward mode, or engine = 'xla'"
-MAX_FORWARD_PARAMETERS = 6  # parameters up to which forward mode is the cheaper one (benchmarks/bench_gradient.py)
+MAX_FORWARD_PARAMETERS = 6  # parameters up to which forward mode is cheaper (benchmarks/bench_gradient.py)
 
 
 class DerivativeMode(enum.Enum):
@@ -44,7 +45,7 @@ class DerivativeMode(enum.Enum):
 
 
 class ObjectiveEvaluation(NamedTuple):
-    """What is known at one z: objective J, excesses (k,), how many lanes diverged, the metrics of every lane."""
+    """The evaluation at one z: objective J, excesses (k,), number of diverged runs, and the metrics of every run."""
 
     objective: Any
     excess: Any
@@ -53,7 +54,7 @@ class ObjectiveEvaluation(NamedTuple):
 
 
 class LossEvaluation(NamedTuple):
-    """Loss, its gradient (p,), and what was seen; with a leading axis of starts where there are several."""
+    """The loss, its gradient (p,) and the evaluation of the objective, with a leading axis of starts if batched."""
 
     loss: Any
     gradient: Any
@@ -61,7 +62,7 @@ class LossEvaluation(NamedTuple):
 
 
 class Multipliers(NamedTuple):
-    """Multipliers (k,), penalty and margin of the augmented Lagrangian; None is no margin."""
+    """The multipliers (k,), penalty and margin of the augmented Lagrangian; a margin of None means zero."""
 
     values: Any
     penalty: Any
@@ -69,14 +70,31 @@ class Multipliers(NamedTuple):
 
 
 def build_subject_loop(subject: Any) -> Loop:
-    """The loop that a part stands for: itself, or what its method `closed()` makes of its parameters."""
+    """Return the closed loop of `subject`: the subject itself, or the result of its method `closed()`.
+
+    Args:
+        subject: Loop, or a part with a method `closed()`.
+    """
     return subject if isinstance(subject, Loop) else subject.closed()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
-    """A part, its free parameters, and how a choice of them is judged. `subject` is a Loop, or a part with a method
-    `closed()`, whose parameters may then be anything that a loop can be computed from (LQ weights, say)."""
+    """A tuning problem: a part, its free parameters, and the objective and constraints of a choice of them.
+
+    Attributes:
+        subject: Loop, or a part with a method `closed()`. The parameters of such a part may be of any kind that
+            determines a loop, for example LQ weights.
+        space: Map from the unbounded vector z to the free parameters.
+        solver: Solver of every run.
+        measured: Objectives by metric.
+        weights: Weights of the metrics in the objective.
+        batch: The runs.
+        aggregate: Map from one number for each run to one number.
+        constraints: Constraints on the loop and its metrics.
+        mode: Mode of differentiation.
+        engine: Engine of the runs, "xla" or "kernel".
+    """
 
     subject: Any
     space: FreeSpace
@@ -90,16 +108,21 @@ class Problem:
     engine: str = "xla"
 
     def runs(self, z: Any) -> Run:
-        """All lanes at z, without trajectories."""
+        """Return all runs at `z`, without trajectories."""
         together = True if self.engine == "xla" else None
         loop = build_subject_loop(self.space.at(self.subject, z))
         return run_batch(loop, self.batch, self.solver, self.measured, together=together, engine=self.engine)
 
     def with_engine(self, engine: str, mode: DerivativeMode | None = None) -> "Problem":
-        """Return the problem whose runs are made by this engine; "auto" is a kernel if it can be one, and tells the log
-        once why it is not. Of a kernel the mode is forward, if none is asked for.
+        """Return the problem with its runs on `engine`: "xla", "kernel" or "auto".
 
-        Raises EngineError for a kernel in reverse mode."""
+        "auto" chooses a kernel if one can make the runs; otherwise it logs the reason once and keeps XLA. A kernel
+        computes forward derivatives unless `mode` is reverse.
+
+        Raises:
+            ValueError: The engine is unknown.
+            EngineError: The engine is "kernel" and the mode is reverse.
+        """
         if engine not in REQUESTABLE_ENGINES:
             raise ValueError(f"engine = {engine!r} is unknown; there is {', '.join(REQUESTABLE_ENGINES)}")
         if engine == "xla":
@@ -114,22 +137,25 @@ class Problem:
         return found
 
     def objection(self) -> str | None:
-        """Return why its engine cannot make the runs and their derivatives, or None. None is made, but what makes them
-        is compiled, and kept."""
+        """Return why the engine cannot make the runs and their derivatives, or None.
+
+        The check makes no runs. It compiles the program and keeps it.
+        """
         z = jax.ShapeDtypeStruct((1, self.space.size), jnp.result_type(float))
         none = Multipliers(np.zeros((1, self.excesses)), np.ones(1), None)
         try:
             self._evaluate.lower(z, none, 1.0)
         except EngineError as error:
             return str(error)
-        except NoCompiler as error:  # where that is already known to be no objection, and is one now
+        except NoCompiler as error:  # a kernel of this loop is possible, but its compiler is missing
             return str(EngineError.of(error))
         return None
 
     def seen(self, z: Any) -> ObjectiveEvaluation:
-        """Objective and excesses at z."""
+        """Return objective, excesses, number of diverged runs and metrics at `z`."""
         runs = self.runs(z)
         each = sum(weight * runs.metrics[name] for name, weight in self.weights.items())
+        # Weights of runs multiply before the aggregate; a batch without weights counts each run once.
         each = each if self.batch.weights is None else each * jnp.asarray(self.batch.weights)
         loop = build_subject_loop(self.space.at(self.subject, z))
         excess = self._excess(loop, runs.metrics)
@@ -137,7 +163,8 @@ class Problem:
 
     @functools.cached_property
     def excesses(self) -> int:
-        """How many excesses there are."""
+        """Number of excesses over all constraints."""
+        # eval_shape needs only the shapes of the metrics, so no run is made.
         lanes = {name: jax.ShapeDtypeStruct((self.batch.size,), jnp.result_type(float)) for name in self.measured}
         z = self.space.place(self.subject)
         return jax.eval_shape(
@@ -149,7 +176,7 @@ class Problem:
         return jnp.concatenate(excess) if excess else jnp.zeros(0)
 
     def loss(self, scale: Any) -> Callable[[Any, Multipliers], tuple[Any, tuple[Any, ObjectiveEvaluation]]]:
-        """(z, multipliers) -> L, and (L, what was seen)."""
+        """Return the function (z, multipliers) -> (L, (L, evaluation)) for an objective divided by `scale`."""
 
         def loss(z: Any, m: Multipliers) -> tuple[Any, tuple[Any, ObjectiveEvaluation]]:
             seen = self.seen(z)
@@ -159,8 +186,11 @@ class Problem:
         return loss
 
     def evaluator(self, scale: float) -> Callable[[Any, Multipliers], LossEvaluation]:
-        """(starts, p) and multipliers with a leading axis of starts -> Evaluation; compiled, one call for all, and once
-        for every scale."""
+        """Return the compiled function (z, multipliers) -> LossEvaluation for an objective divided by `scale`.
+
+        z has shape (starts, p), and the multipliers have a leading axis of starts. One call evaluates all starts, and
+        one compiled program serves every scale.
+        """
         return lambda z, m: self._evaluate(z, m, scale)
 
     @functools.cached_property
@@ -175,16 +205,19 @@ class Problem:
         return jax.jit(jax.vmap(evaluate, in_axes=(0, 0, None)), compiler_options=options)
 
     def objective_evaluator(self) -> Callable[[Any], ObjectiveEvaluation]:
-        """(starts, p) -> Seen: without a gradient."""
+        """Return the compiled function z (starts, p) -> ObjectiveEvaluation, without a gradient."""
         return jax.jit(jax.vmap(self.seen))
 
     def refused(self) -> str | None:
-        """The first lane of the part as it is that must not be run, and why, in a line; None if all may."""
+        """Return a one-line reason why the first inadmissible run of the subject cannot start, or None."""
         return first_refusal(build_subject_loop(self.subject), self.batch.values, self.solver)
 
     def steady(self) -> Callable[[np.ndarray], np.ndarray]:
-        """(starts, p) -> whether every lane may be run there (starts,): the parts' rules, and a stable step. Compiled
-        once."""
+        """Return the function z (starts, p) -> mask (starts,) of the starts at which every run is admissible.
+
+        A run is admissible if it meets the rules of its parts and its integration step is stable. The program is
+        compiled once.
+        """
 
         def loops(z: Any) -> Loop:
             return self.batch.each(
@@ -195,6 +228,7 @@ class Problem:
         compiled = jax.jit(jax.vmap(loops))
 
         def accepted(z: np.ndarray) -> np.ndarray:
+            # Starts and runs share one axis, so that one call checks all of them.
             flat = jax.tree.map(lambda x: np.reshape(x, (-1, *x.shape[2:])), jax.device_get(compiled(jnp.asarray(z))))
             return batch_admissibility(None, flat, self.solver).accepted.reshape(len(z), -1).min(axis=1)
 
@@ -202,11 +236,15 @@ class Problem:
 
 
 def choose_gradient_mode(space: FreeSpace) -> DerivativeMode:
-    """Forward for few parameters, reverse for many."""
+    """Return forward mode for up to `MAX_FORWARD_PARAMETERS` parameters, otherwise reverse mode.
+
+    Args:
+        space: Space of the free parameters.
+    """
     return DerivativeMode.FORWARD if space.size <= MAX_FORWARD_PARAMETERS else DerivativeMode.REVERSE
 
 
 def _penalty(excess: Any, m: Multipliers) -> Any:
-    """[max(0, m + c (g + d))^2 - m^2]/(2 c), summed."""
+    """Return the sum over the excesses of [max(0, m + c (g + d))^2 - m^2]/(2 c)."""
     aimed = excess if m.margin is None else excess + m.margin
     return jnp.sum(jnp.maximum(0.0, m.values + m.penalty * aimed) ** 2 - m.values**2) / (2 * m.penalty)

@@ -1,4 +1,4 @@
-"""How a minimum is looked for, and what was found."""
+"""Settings and results of a tuning search."""
 
 import dataclasses
 from typing import Any, NamedTuple
@@ -13,21 +13,23 @@ from diffabs.tune.problem import DerivativeMode, build_subject_loop
 
 
 class StartError(ValueError):
-    """No start could be left: the runs diverge there, or the integration step is not stable."""
+    """No start is usable: the runs diverge there, or the integration step is not stable."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """How a minimum is looked for.
+    """The settings of a tuning search.
 
-    optimiser: any of optax; None is L-BFGS with a line search that rejects what diverges
-    starts: the first is the part itself, the others are drawn from the ranges with `seed`
-    mode: forward or reverse; None decides by the number of parameters
-    stopping: of each descent; with constraints there is one per round
-    rounds: of the augmented Lagrangian, at most
-    margin: how far inside of every constraint it aims, in units of the constraint's scale (of a bound, relative to it),
-        so that what was asked for holds where it ends, without a tolerance
-    memory: how many steps L-BFGS remembers; more than there are parameters is of little use
+    Attributes:
+        optimiser: Any optimiser of optax; None is L-BFGS with a line search that rejects diverging runs.
+        starts: Number of starts: the first is the part itself, the others are drawn from the ranges.
+        seed: Seed of the drawn starts.
+        mode: Forward or reverse mode; None decides by the number of parameters.
+        stopping: Conditions that end a descent; with constraints there is one descent in each round.
+        rounds: Greatest number of rounds of the augmented Lagrangian.
+        margin: Distance inside each constraint at which the search aims, in units of the constraint's scale (relative
+            to the bound). The result then meets the constraints without a tolerance.
+        memory: Number of steps that L-BFGS stores; a number greater than the number of parameters is of little use.
     """
 
     optimiser: optax.GradientTransformation | None = None
@@ -41,15 +43,15 @@ class Method:
 
 
 class TuningProgress(NamedTuple):
-    """What is told on the way: of the best start so far."""
+    """The progress of a search: round, number of running starts, and the last point of the best start so far."""
 
     round: int
-    starts: int  # that are still on their way
+    starts: int  # starts whose descent has not ended
     point: DescentPoint
 
 
 class StartResult(NamedTuple):
-    """How a descent went: parameters by path, objective J, greatest excess, why it ended, and its history."""
+    """The result from one start: parameters by path, objective J, greatest excess, reason for the end, and history."""
 
     values: dict[str, Any]
     objective: float
@@ -60,16 +62,21 @@ class StartResult(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Tuned:
-    """The best part found.
+    """The best part that a search has found.
 
-    part: the given one with its free parameters changed; `loop` is what it stands for
-    values: the free parameters by path
-    objective: J before and after; violation: the greatest excess before and after; metrics (lanes,) before and after
-    met: whether every constraint holds, without a tolerance
-    reason: why the descent of the best start ended, in its last round
-    history: of the best start; `starts` has all of them
-    engine: what made the runs, with compiler and flags of a kernel
-    evaluations: gradients that were computed for the best start, rejected trials included
+    Attributes:
+        part: The given part with tuned values of the free parameters; `loop` is its closed loop.
+        values: Free parameters by path.
+        objective: J before and after.
+        violation: Greatest excess before and after.
+        metrics: Metrics (runs,) before and after.
+        met: Whether every constraint holds, without a tolerance.
+        reason: Reason why the descent of the best start ended, in its last round.
+        history: History of the best start.
+        starts: Results and histories of all starts.
+        mode: Mode of differentiation.
+        diverged: Number of diverged runs before and after.
+        engine: Engine of the runs, with compiler and flags if it is a kernel.
     """
 
     part: Any
@@ -86,7 +93,7 @@ class Tuned:
     engine: dict[str, str]
 
     def table(self) -> Summary:
-        """What was found: the free parameters; means of the metrics and the objective, before and after."""
+        """Return a table of the free parameters and of mean metrics and objective before and after."""
         rows: list[tuple[Any, ...]] = [(name, "", value) for name, value in self.values.items()]
         rows += [(f"mean {name}", *(_finite_mean(one[name]) for one in self.metrics)) for name in self.metrics[0]]
         rows.append(("objective", *self.objective))
@@ -96,30 +103,30 @@ class Tuned:
         return Summary(title, ("", "before", "after"), tuple(rows), met)
 
     def __repr__(self) -> str:
-        """The table."""
+        """Return the table as text."""
         return str(self.table())
 
     def _repr_html_(self) -> str:
-        """The table for a notebook."""
+        """Return the table as HTML for a notebook."""
         return self.table()._repr_html_()
 
     @property
     def loop(self) -> Any:
-        """The tuned loop."""
+        """Tuned closed loop."""
         return build_subject_loop(self.part)
 
     @property
     def gradient(self) -> float:
-        """The greatest component of the gradient where it ended."""
+        """Greatest component of the gradient at the last point."""
         return self.history[-1].gradient
 
     @property
     def evaluations(self) -> int:
-        """Gradients computed for the best start."""
+        """Number of gradients computed for the best start, including rejected trials."""
         return self.history[-1].evaluations
 
 
 def _finite_mean(values: Any) -> float:
-    """Of the lanes that did not diverge; NaN where all did."""
+    """Return the mean over the finite values, NaN if there are none."""
     good = np.asarray(values)[np.isfinite(values)]
     return float(good.mean()) if good.size else float("nan")

@@ -1,4 +1,4 @@
-"""From one number per lane to one number: what of a batch is made small."""
+"""Aggregates: maps from one number for each run of a batch to the one number that a search minimises."""
 
 import math
 from typing import Any, Protocol
@@ -10,60 +10,76 @@ from diffabs.core.pytree import Scalar, Vector, param, pytree
 
 
 class Aggregate(Protocol):
-    """A function of one number per lane."""
+    """A function from one number for each run to one number."""
 
     def __call__(self, values: Vector) -> Scalar:
-        """values (n,) -> scalar."""
+        """Return a scalar from `values` (runs,)."""
         ...
 
 
 @pytree
 class Mean:
-    """The mean over the lanes."""
+    """The mean over the runs."""
 
     def __call__(self, values: Vector) -> Any:
-        """Mean."""
+        """Return the mean of `values`."""
         return jnp.mean(values)
 
 
 @pytree
 class SmoothWorst:
-    """w ln(mean exp(x/w)), w = `softness` times the mean of |x|: between the mean (w -> infinity) and the greatest
-    value (w -> 0), from below."""
+    """A smooth maximum over the runs, w ln(mean exp(x/w)), with w = `softness` times the mean of |x|.
+
+    It lies between the mean (w -> infinity) and the greatest value (w -> 0).
+
+    Attributes:
+        softness: Width w over the mean of |x| [1], > 0.
+    """
 
     softness: Scalar = param(default=0.02, unit="1", above=0.0)
 
     def __call__(self, values: Vector) -> Any:
-        """Smooth maximum."""
+        """Return the smooth maximum of `values`."""
+        # The bound keeps values / w finite if every value is zero.
         w = self.softness * jnp.maximum(jnp.mean(jnp.abs(values)), 1e-300)
         return w * (jax.nn.logsumexp(values / w) - math.log(len(values)))
 
 
 @pytree
 class CVaR:
-    """Conditional value at risk: the mean of the worst fraction 1 - level of the lanes, the one at its edge in part.
+    """The conditional value at risk: the mean over the worst fraction 1 - level of the runs.
 
-    R. T. Rockafellar and S. Uryasev, Optimization of conditional value-at-risk, J. Risk 2 (2000). Level 0 is the mean.
+    The run at the edge of that fraction counts in part. Level 0 is the mean.
+
+    Attributes:
+        level: Fraction of the runs outside the tail [1], 0 <= level < 1.
+
+    Source: R. T. Rockafellar and S. Uryasev, Optimization of conditional value-at-risk, J. Risk 2 (2000).
     """
 
     level: Scalar = param(default=0.9, unit="1", low=0.0, below=1.0)
 
     def __call__(self, values: Vector) -> Any:
-        """Mean of the tail."""
+        """Return the mean of the tail of `values`."""
         n = len(values)
         share = n * (1 - self.level)
+        # 1 for each whole run of the tail, the remaining fraction for the run at its edge, 0 for the others.
         weights = jnp.clip(share - jnp.arange(n), 0.0, 1.0)
         return jnp.sum(weights * -jnp.sort(-values)) / share
 
 
 @pytree
 class Quantile:
-    """The value that a fraction `level` of the lanes does not exceed, interpolated linearly."""
+    """The value that a fraction `level` of the runs does not exceed, interpolated linearly.
+
+    Attributes:
+        level: Fraction of the runs [1], from 0 to 1.
+    """
 
     level: Scalar = param(default=0.9, unit="1", low=0.0, high=1.0)
 
     def __call__(self, values: Vector) -> Any:
-        """Quantile."""
+        """Return the quantile of `values`."""
         return jnp.quantile(values, self.level)
 
 

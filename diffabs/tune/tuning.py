@@ -1,4 +1,4 @@
-"""Tune any parameters of any part by gradients, under constraints, over a batch of runs."""
+"""Gradient-based tuning of any parameters of any part, under constraints, over a batch of runs."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -37,21 +37,31 @@ def tune(
     stopping: Callable[[], bool] = lambda: False,
     engine: str = "xla",
 ) -> Tuned:
-    """Minimise an aggregate, over a batch of runs, of a weighted sum of metrics, and return what was found.
+    """Minimise an aggregate, over a batch of runs, of a weighted sum of metrics, and return the best part found.
 
-    subject: a Loop, or a part with a method `closed()`
-    free: dotted paths of its parameters, with ranges in which they stay (declared ones where None)
-    measured: objectives by metric; None is what is usual for what the plant shows
-    objective: weight of each metric of `measured`, `{"stop_distance": 1.0, "effort": 1e-4}`
-    over: the runs, parameters of the loop by path; none is the loop itself
-    solver: of every run
-    aggregate: from a number per lane to one: Mean (as None), SmoothWorst, CVaR, Quantile
-    constraints: what must hold: AtMost of a metric on every lane, Poles, CertifiedDecay
-    method: optimiser, starts, iterations; None is L-BFGS from the subject's own values
-    progress: told the best so far after every iteration
-    stopping: asked after every evaluation; True ends the search with the best that it has met so far
-    engine: what makes the runs and their derivatives, as in `run_batch`; a kernel's are forward, of however many
-        parameters
+    The function warns if a derivative by a free parameter is one-sided (`docs/gradients.md`) in a run of the start or
+    the result. A search may end at such a point without a minimum.
+
+    Args:
+        subject: A Loop, or a part with a method `closed()`.
+        free: Dotted paths of the free parameters, with the ranges that bound them (None: the declared range).
+        objective: Weight of each metric of `measured` in the objective, `{"stop_distance": 1.0, "effort": 1e-4}`.
+        over: The runs, as parameters of the loop by path; None is one run of the loop itself.
+        solver: Solver of every run.
+        measured: Objectives by metric; None takes the default objectives of the plant.
+        aggregate: Map from one number for each run to one number: Mean (also for None), SmoothWorst, CVaR, Quantile.
+        constraints: Constraints: AtMost of a metric in every run, Poles, CertifiedDecay.
+        method: Optimiser, starts, iterations; None is L-BFGS from the subject's own values.
+        progress: Called with the best point so far after every evaluation.
+        stopping: Called after every evaluation; True ends the search with the best point so far.
+        engine: Engine of the runs and their derivatives, as in `run_batch`. A kernel computes forward derivatives for
+            any number of parameters.
+
+    Raises:
+        ValueError: A path, range, metric or batch does not fit, or a run is inadmissible for every choice of
+            parameters.
+        EngineError: The engine is "kernel", and a kernel cannot make the runs.
+        StartError: A start diverges or its integration step is not stable, and there is no other start.
 
     >>> import diffabs as d
     >>> from diffabs import controllers, objectives, plants, roads, stops, tune
@@ -62,14 +72,6 @@ def tune(
     >>> found = tune.tune(loop, free=free, objective={"iae": 1.0}, measured=measured, solver=solver)
     >>> print(f"{found.values['controller.torque']:.1f} N m, {found.objective[0]:.2f} to {found.objective[1]:.2f} s")
     85.6 N m, 1.14 to 0.18 s
-
-    Warns where a derivative by a free parameter is that of one side (`docs/gradients.md`), in a run of the start or the
-    result: a search may end there without a minimum.
-
-    Raises:
-        ValueError: a path, range, metric or batch that does not fit; a lane that must not be run whatever is tuned.
-        EngineError: what stands against the engine "kernel".
-        StartError: a start that diverges, or at which the integration step is not stable, if there is no other.
     """
     method = method or Method()
     problem = build_problem(
@@ -106,12 +108,16 @@ def build_problem(
     mode: DerivativeMode | None = None,
     engine: str = "xla",
 ) -> Problem:
-    """Return the problem that `tune` solves, for those who bring their own search.
+    """Return the problem that `tune` solves, for use with another search.
 
-    subject, free, objective, over, solver, measured, aggregate, constraints, engine: as in `tune`
-    mode: of differentiation, forward or reverse; None is the cheaper one
+    Args:
+        subject, free, objective, over, solver, measured, aggregate, constraints, engine: As in `tune`.
+        mode: Forward or reverse mode of differentiation; None is the cheaper mode.
 
-    Raises ValueError as `tune` does."""
+    Raises:
+        ValueError: As in `tune`.
+        EngineError: As in `tune`.
+    """
     check_part(subject)
     loop = build_subject_loop(subject)
     measured = default_objectives(loop.plant) if measured is None else measured

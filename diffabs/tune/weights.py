@@ -1,12 +1,12 @@
-"""LQ weights as the parameters of a loop: tuned through the Riccati equation, or through the robust design itself.
+"""LQ weights as the parameters of a loop, tuned through the Riccati equation or through the robust design.
 
     Q = L L',  L lower triangular with diagonal exp(d),   R = exp(rho);   gain = design(Q, R)
 
-The log-Cholesky coordinates (d, the rest of L, rho) reach every positive definite pair, and nothing else. Only Q/R
-matters to the gain, so rho is usually left where it is. `design` is any differentiable function of (Q, R):
+The log-Cholesky coordinates (d, the rest of L, rho) describe every positive definite pair and no other pair. The gain
+depends on Q/R alone, so rho is usually held fixed. `design` is any differentiable function of (Q, R):
 
-    regulator(model)       the LQ regulator of one linear model, by `linear.lqr` or `dlqr`
-    robust(polytope)       eqs. (29)-(32) of Maeda and Sugiura over a polytope, by `robust_gain`
+    lqr_gain_design(model)         the LQ regulator of one linear model, by `linear.lqr` or `dlqr`
+    robust_gain_design(polytope)   eqs. (29)-(32) of Maeda and Sugiura over a polytope, by `robust_gain`
 """
 
 from collections.abc import Callable
@@ -26,8 +26,19 @@ GainDesign = Callable[[Any, Any], Any]
 
 @pytree
 class LQWeights:
-    """A loop whose gain, at `path`, is designed from weights. Q (n, n) has the order of the design's states; the gain
-    keeps as many of its first numbers as there is room for at `path`."""
+    """A loop whose gain at `path` is designed from LQ weights.
+
+    Q (n, n) has the order of the design's states. The first row (n,) of the designed gain replaces the parameter at
+    `path`.
+
+    Attributes:
+        loop: The loop.
+        log_diagonal: Logarithm d (n,) of the diagonal of L [1].
+        lower: Entries of L below the diagonal, row by row [1].
+        log_effort: rho = ln R [1].
+        design: Function (Q, R) -> gain.
+        path: Dotted path of the gain in the loop.
+    """
 
     loop: Loop = part(default=Loop)
     log_diagonal: Vector = param(default=(0.0, 0.0), unit="1")
@@ -37,7 +48,7 @@ class LQWeights:
     path: str = static(default="controller.gain")
 
     def weights(self) -> tuple[Any, Any]:
-        """Q (n, n), R (1, 1)."""
+        """Return Q (n, n) and R (1, 1)."""
         n = len(self.log_diagonal)
         diagonal = jnp.exp(jnp.asarray(self.log_diagonal))
         root = jnp.zeros((n, n), diagonal.dtype).at[np.tril_indices(n, -1)].set(jnp.asarray(self.lower))
@@ -45,15 +56,22 @@ class LQWeights:
         return root @ root.T, jnp.exp(jnp.asarray(self.log_effort))[None, None]
 
     def closed(self) -> Loop:
-        """The loop with the gain that these weights give."""
+        """Return the loop with the gain designed from these weights."""
         return replace(self.loop, {self.path: self.design(*self.weights())[0]})
 
 
 def lq_weights(loop: Loop, Q: Any, R: float, design: GainDesign, path: str = "controller.gain") -> LQWeights:
-    """A loop with weights Q (n, n) or a diagonal (n,), positive definite, and R > 0 as its parameters.
+    """Return a loop with the LQ weights Q and R as its parameters.
+
+    Args:
+        loop: The loop.
+        Q: State weight, shape (n, n), or its diagonal (n,); positive definite.
+        R: Input weight, > 0.
+        design: Function (Q, R) -> gain.
+        path: Dotted path of the gain in the loop.
 
     Raises:
-        ValueError: Q is not positive definite, R is not positive.
+        ValueError: Q is not positive definite, or R is not positive.
     """
     q = np.asarray(Q, float)
     q = np.diag(q) if q.ndim == 1 else q
@@ -71,11 +89,21 @@ def lq_weights(loop: Loop, Q: Any, R: float, design: GainDesign, path: str = "co
 
 
 def lqr_gain_design(model: Any) -> GainDesign:
-    """The LQ regulator of a linear model (`matrices()`, `period`), in discrete time if the model is."""
+    """Return the function (Q, R) -> LQ gain of a linear model, in discrete time if the model is discrete.
+
+    Args:
+        model: Linear model with `matrices()` and `period`.
+    """
     solve, (a, b) = (lqr if model.period is None else dlqr), model.matrices()
     return lambda Q, R: solve(a, b, Q, R).gain
 
 
 def robust_gain_design(system: Polytope) -> GainDesign:
-    """The gain with the least guaranteed cost over a polytope; NaN where there is none: such weights are rejected."""
+    """Return the function (Q, R) -> gain with the least guaranteed cost over a polytope.
+
+    The gain is NaN for weights without a robust gain; a search rejects such weights.
+
+    Args:
+        system: Polytope of linear models.
+    """
     return lambda Q, R: robust_gain(system, Q, R)

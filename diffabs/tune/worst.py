@@ -1,11 +1,11 @@
-"""The worst case of a given controller inside a box of plant, road and initial parameters.
+"""The search for the worst case of a given controller in a box of plant, road and initial parameters.
 
     maximise metric(p),  p in [low, high]
 
-by gradient ascent from the worst of the box's corners and of random points, screened in one batch. A local method: what
-it finds is a counterexample for sure, and the worst with no more certainty than its starts give. Often it is a corner,
-which a run of all corners finds without a gradient: `report` says what found it. Where a certificate covers the box the
-two belong together: `report` says which of them speaks.
+One batch screens the box's corners and random points. Gradient ascent starts from the worst of them. The method is
+local: a bound exceeded is a proven counterexample, but the worst case found depends on the starts. The worst case is
+often a corner; a run of all corners then finds it without a gradient. `WorstCase.report` states how the search found
+the worst case, and whether a certificate covers the box.
 """
 
 import dataclasses
@@ -32,20 +32,27 @@ from diffabs.tune.problem import DerivativeMode, Multipliers, Problem, choose_gr
 from diffabs.tune.risk import Mean
 
 MAX_CORNERS = 64
-CORNER_TOLERANCE = 1e-6  # of a value: no more than a corner's, which an ascent approaches and does not reach
-EDGE_SHARE = 0.01  # of a range: as near to its ends as an ascent starts; it may end nearer
+CORNER_TOLERANCE = 1e-6  # relative; an ascent that approaches a corner never quite reaches it
+EDGE_SHARE = 0.01  # of a range: least distance of a start from the ends; an ascent may end nearer
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class WorstCase:
-    """The greatest value found of a metric.
+    """The greatest value of a metric that a search has found.
 
-    values: the parameters by path; loop: the loop there; metrics: all that were measured there
-    value: the metric there; screened: the greatest among the points that were run first; corner: the greatest among
-        the corners of the box that were, `corners` in number
-    rollouts: what it cost, a gradient counted as `price` rollouts
-    met: whether `bound` holds even there (None without a bound); diverged: a screened point at which the run diverges
-        or the metric is no number
+    Attributes:
+        metric: Name of the metric.
+        values: Parameters of the worst case by path.
+        value: Metric of the worst case.
+        corners: Number of corners that were run.
+        corner: Greatest metric among these corners.
+        screened: Greatest metric among all screened points.
+        metrics: All measured metrics of the worst case.
+        loop: Loop with the parameters of the worst case.
+        rollouts: Cost of the search; a gradient counts as `price` rollouts.
+        bound: Bound on the metric, or None.
+        diverged: Parameters of a screened point at which the run diverges or the metric is NaN, or None.
+        reasons: Reason for the end of each ascent.
     """
 
     metric: str
@@ -63,12 +70,14 @@ class WorstCase:
 
     @property
     def met(self) -> bool | None:
-        """Whether the bound holds."""
+        """Whether the bound holds in the worst case; None without a bound."""
         return None if self.bound is None else self.diverged is None and self.value <= self.bound
 
     def report(self, proved: bool | None = None) -> str:
-        """What is known, in a sentence or two: a counterexample, or how hard one was looked for. `proved`: whether a
-        certificate covers the box."""
+        """Return a counterexample, or the effort of the search that found none, in one or two sentences.
+
+        `proved` states whether a certificate covers the box; None means that no certificate was computed.
+        """
         at = ", ".join(f"{path} = {np.asarray(v).tolist()}" for path, v in self.values.items())
         if self.diverged is not None:
             at = ", ".join(f"{path} = {np.asarray(v).tolist()}" for path, v in self.diverged.items())
@@ -88,7 +97,7 @@ class WorstCase:
         )
 
     def _finder(self) -> str:
-        """What found it."""
+        """Return a sentence on how the search found the worst case: corner, screened point or gradients."""
         if self.value <= self.corner * (1 + CORNER_TOLERANCE):
             return f"That is a corner of the box: running its {self.corners} corners finds it."
         if self.value <= self.screened:
@@ -113,23 +122,25 @@ def worst_case(
     price: float | None = None,
     engine: str = "xla",
 ) -> WorstCase:
-    """Return the greatest value of a metric found over a box: Sobol points and corners, then ascent by gradients.
+    """Return the greatest value of a metric found in a box, by a screening of points and then gradient ascent.
 
-    loop: a Loop, or a part with a method `closed()`
-    over: the box {path: (low, high)}
-    metric: the name of what is made large
-    solver: of every run
-    measured: objectives by metric; None is what is usual for what the plant shows
-    bound: report, too, whether the metric exceeds it
-    screen: points of a scrambled Sobol sequence that are run first, besides the corners (up to 64)
-    starts: how many of the worst of them are ascended from, together, for so many `iterations`; 0 only runs them
-    seed, seed_of_noise: of the sequence, and of noisy sensors
-    price: rollouts that a gradient counts as; None is 1 + 1.5 p in forward mode and 6 in reverse
-    engine: what makes the runs and their derivatives, as in `run_batch`
+    Args:
+        loop: A Loop, or a part with a method `closed()`.
+        over: The box {path: (low, high)}.
+        metric: Name of the metric to maximise.
+        solver: Solver of every run.
+        measured: Objectives by metric; None takes the default objectives of the plant.
+        bound: Bound on the metric; the result then states whether the metric exceeds it.
+        screen: Number of points of a scrambled Sobol sequence that are run first, in addition to up to 64 corners.
+        starts: Number of the worst screened points from which ascents start, all together; 0 only runs the screening.
+        iterations: Greatest number of steps of each ascent.
+        seed: Seed of the Sobol sequence.
+        seed_of_noise: Seed of noisy sensors, or None.
+        price: Cost of a gradient in rollouts; None is 1 + 1.5 p in forward mode and 6 in reverse mode.
+        engine: Engine of the runs and their derivatives, as in `run_batch`.
 
     Raises:
-        ValueError: a path or range that does not fit, an unknown metric, a corner or another point of the box that
-            cannot be run.
+        ValueError: A path or range does not fit, the metric is unknown, or a screened point cannot be run.
     """
     check_part(loop)
     measured = _check_objectives(loop, metric, measured)
@@ -139,7 +150,9 @@ def worst_case(
     points = np.concatenate([corners, _draw_points(np.array(free.ranges), screen, seed)])
     lanes = Batch(_values_by_path(free, points), None if key is None else np.repeat(key, len(points)))
     screened = _run_screening(loop, lanes, solver, measured, engine)
+    # NaN sorts last: a diverged point is a counterexample of its own, not a start.
     worst = np.argsort(-np.nan_to_num(screened.metrics[metric], nan=-np.inf))[:starts]
+    # The weight -1 turns the minimisation of Problem into a maximisation.
     problem = Problem(
         middle, free, solver, measured, {metric: -1.0}, Batch({}, key), Mean(), (), choose_gradient_mode(free)
     )
@@ -150,7 +163,11 @@ def worst_case(
 
 
 def _check_objectives(loop: Any, metric: str, measured: Mapping[str, Objective] | None) -> Mapping[str, Objective]:
-    """The objectives, or the usual ones. Raises ValueError where the metric is none of them."""
+    """Return the given or the default objectives.
+
+    Raises:
+        ValueError: The metric is not among them.
+    """
     found = default_objectives(loop.plant) if measured is None else measured
     if metric not in found:
         raise ValueError(f"{metric} is not measured; there is {', '.join(found)}")
@@ -158,31 +175,36 @@ def _check_objectives(loop: Any, metric: str, measured: Mapping[str, Objective] 
 
 
 def _gradient_price(problem: Problem) -> float:
-    """Rollouts that a gradient costs."""
+    """Return the cost of a gradient in rollouts."""
     return 1 + 1.5 * problem.space.size if problem.mode is DerivativeMode.FORWARD else 6.0
 
 
 def _run_screening(loop: Any, lanes: Batch, solver: Solver, measured: Mapping[str, Objective], engine: str) -> Run:
-    """Run every point. Raises ValueError for one that cannot be run."""
+    """Run every point.
+
+    Raises:
+        ValueError: A point cannot be run.
+    """
     if line := first_refusal(loop, lanes.values, solver):
         raise ValueError(f"the box has points that cannot be run; {line}")
     return jax.device_get(run_batch(loop, lanes, solver, measured, accepted=True, engine=engine))
 
 
 def _box_corners(ranges: np.ndarray) -> np.ndarray:
-    """Corners (k, p), the first of them if there are too many."""
+    """Return the first `MAX_CORNERS` corners of the box, shape (corners, p)."""
     return np.array(list(itertools.islice(itertools.product(*ranges), MAX_CORNERS)))
 
 
 def _draw_points(ranges: np.ndarray, screen: int, seed: int) -> np.ndarray:
-    """Points spread over the box (screen, p)."""
+    """Return points of a scrambled Sobol sequence in the box, shape (screen, p)."""
     low, high = ranges.T
     sequence = qmc.Sobol(len(low), rng=np.random.default_rng(seed))
+    # Sobol points are balanced only in powers of two: draw the next power and keep the first `screen` points.
     return low + (high - low) * sequence.random_base2(max(screen - 1, 0).bit_length())[:screen]
 
 
 def _values_by_path(free: FreeSpace, point: Any) -> dict[str, Any]:
-    """Parameters by path from their numbers in a row, or in the rows of lanes."""
+    """Return the parameters by path from a vector (p,), or from the rows of a matrix (runs, p)."""
     found, first = {}, 0
     for entry in free.entries:
         n = len(entry.maps)
@@ -192,8 +214,9 @@ def _values_by_path(free: FreeSpace, point: Any) -> dict[str, Any]:
 
 
 def _ascend(problem: Problem, points: np.ndarray, iterations: int) -> list[DescentState]:
-    """From these points, a little inside of the box, where they can be left."""
+    """Return the final states of ascents from these points."""
     low, high = np.array(problem.space.ranges).T
+    # The map from z to a range is flat at its ends: an ascent from a corner would have no gradient.
     points = np.clip(points, low + EDGE_SHARE * (high - low), high - EDGE_SHARE * (high - low))
     z = np.stack(
         [problem.space.place(replace(problem.subject, _values_by_path(problem.space, point))) for point in points]
