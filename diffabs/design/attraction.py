@@ -80,7 +80,7 @@ class Basin(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """The largest recovered multiple, and whether the next multiple tried is undecided: if so, more may be recovered."""
+    """The largest recovered multiple, and whether the next tried one is undecided: then more may be recovered."""
 
     multiple: float
     undecided: bool
@@ -284,9 +284,7 @@ def recoverable_multiple(
         raise ValueError(f"{', '.join(others)}: a direction is one of the initial state")
     alike = {path: np.full(SEARCH_POINTS, value) for path, value in direction.items()}
     # All starts of the search share one system, so its ellipsoid is computed once.
-    inside = (
-        _system_ellipsoids(loop, alike, SEARCH_POINTS) if band is None else _ball_as_ellipsoid(band, SEARCH_POINTS)
-    )
+    inside = _system_ellipsoids(loop, alike, SEARCH_POINTS) if band is None else _ball_as_ellipsoid(band, SEARCH_POINTS)
     low, high, undecided = 0.0, float(most), False
     while high - low > MULTIPLE_TOLERANCE * high:
         tried = np.linspace(low, high, SEARCH_POINTS + 1)[1:]

@@ -19,8 +19,9 @@ BOUND_LOOSENINGS = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
 def decrease_matrix(p: Any, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
-    """Return -dV/dt - 2 rate V as a matrix for V = x'Px and x' = C x; in discrete time exp(-2 rate) V - V+ for x+ = C
-    x.
+    """Return -dV/dt - 2 rate V as a matrix, for V = x'Px and x' = C x.
+
+    In discrete time, x+ = C x, it is exp(-2 rate) V - V+.
 
     Args:
         p: Symmetric P, shape (..., n, n).
@@ -128,7 +129,7 @@ class Bounds:
         assert limit is not None
         rows = self.k @ at.T / limit.limit[:, None]
         starts = at.inverse @ limit.points.T
-        # P scales as 1/size^2: the unknown is P size^2, near the unit matrix whatever the unit of the starts.
+        # P scales as 1/size^2: the unknown is P size^2, near the unit matrix for starts in any unit.
         starts_size = float(np.linalg.norm(starts, axis=0).max())
 
         def held(v: Any) -> list[np.ndarray]:

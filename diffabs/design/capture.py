@@ -6,10 +6,10 @@ On x'Px <= c three conditions hold:
 
 - The motor is linear: |K x| <= U, and its current is within the limit.
 - The frame does not lie on the ground.
-- The rest y of the nonlinear equations is small. The plant bounds it, |y_k| <= Y_k(c), from the extent of each
-  combination of angles and rates on the ellipsoid: |row x| <= sqrt(c row P^-1 row').
+- The rest y of the nonlinear equations is small.
 
-Then, with V = x'Px,
+The plant bounds the rest, |y_k| <= Y_k(c), from the extent of each combination of angles and rates on the ellipsoid,
+|row x| <= sqrt(c row P^-1 row'). Then, with V = x'Px,
 
     V' <= -2 V (g - sum_k sqrt((D'PD)_kk) Y_k(c)/sqrt(c))
 
@@ -90,7 +90,7 @@ def capture_ellipsoids(loop: Loop, values: Mapping[str, Any]) -> CaptureEllipsoi
 
 
 def _largest_ellipsoids(systems: _ClosedLoops, slowest: np.ndarray) -> np.ndarray:
-    """Return the ellipsoid with the largest volume among the tried shapes; inf where the slowest decay is not positive."""
+    """Return the ellipsoid of largest volume among the tried shapes; inf where the slowest decay is not positive."""
     best = np.full_like(systems.closed, np.inf)
     volume = np.full(len(best), np.inf)
     for decay in DECAY_FRACTIONS:
