@@ -6,8 +6,8 @@ In a cell between the nodes a and b, let D = (P_b - P_a)/(p_b - p_a). For every 
 
     He[P (A + B K)] + r D + 2 rate P + Q + K'R K < 0
 
-The left side is quadratic along the cell. The program requires this inequality of its three Bernstein coefficients: P and K at a,
-at b, and mixed.
+The left side is quadratic along the cell. The program requires this inequality of its three Bernstein coefficients: P
+and K at a, at b, and mixed.
 
 The speed of a braking car falls no faster than friction allows. A common P would also admit jumps of the speed.
 """
