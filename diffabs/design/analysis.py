@@ -185,8 +185,7 @@ class _Analysis:
         """Return the claim with the fastest rate that a common P proves, by bisection.
 
         Each program at a rate between the bounds gives a P and multipliers. The rate of P is a lower bound. The
-        multipliers
-        exclude every rate above an upper bound.
+        multipliers exclude every rate above an upper bound.
         """
         p = np.asarray(claim.data["P"])
         low, high = self._proved_rate(p), self._slowest_mode()

@@ -6,9 +6,9 @@
     unstable    the linear loop about rest grows; almost no start comes to rest, so the start is not run
     undecided   none of these within the solver's duration; choose the duration so that no run is undecided
 
-The starts of a map are the centres of equal cells, so a share of them is a share of the box by area. A share is a
-count and has no derivative. `SoftLoss` is its differentiable surrogate: the mean of a sigmoid of log |x(T)| over the
-same starts. Its time T is so early that a run that will fall has not yet landed.
+The starts of a map are the centres of equal cells, so a share of them is a share of the box by area. A share is a count
+and has no derivative. `SoftLoss` is its differentiable surrogate: the mean of a sigmoid of log |x(T)| over the same
+starts. Its time T is so early that a run that will fall has not yet landed.
 """
 
 import concurrent.futures

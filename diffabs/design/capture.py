@@ -16,8 +16,8 @@ The plant bounds the rest, |y_k| <= Y_k(c), from the extent of each combination 
 Y_k falls at least as fast as sqrt(V). If the bracket is positive, V therefore falls to 0 from V <= c.
 
 Of several P the module takes the ellipsoid with the largest volume, and 90 % of its c. That leaves a tenth of g for
-rounding: the result is floating point with a margin, not a proof in integers. It holds for the differential equation;
-a run integrates this equation numerically.
+rounding: the result is floating point with a margin, not a proof in integers. It holds for the differential equation; a
+run integrates this equation numerically.
 
 Source: H. K. Khalil, Nonlinear Systems, 3rd ed., sec. 8.2.
 """

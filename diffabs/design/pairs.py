@@ -1,9 +1,9 @@
 """Multipliers from two vertices that exclude a common P, without a solver.
 
 V = x'P x falls along x' = C x exactly if it falls along x' = C^-1 x. With a common P every M(k) = C_i + k D, k > 0, is
-therefore stable, for D = C_j and for D = C_j^-1. M(k) is singular where -k is an eigenvalue of C_i C_j (for D =
-C_j^-1) or of C_i C_j^-1 (for D = C_j). If one of these products has a negative eigenvalue, no P exists. For order 2 a P
-exists if neither product has a negative eigenvalue (Shorten and Narendra 2002).
+therefore stable, for D = C_j and for D = C_j^-1. M(k) is singular where -k is an eigenvalue of C_i C_j (for D = C_j^-1)
+or of C_i C_j^-1 (for D = C_j). If one of these products has a negative eigenvalue, no P exists. For order 2 a P exists
+if neither product has a negative eigenvalue (Shorten and Narendra 2002).
 
 Beyond such a k, M(k) has modes x with growth s > 0. Sums over some k give multipliers V_i = sum x x* and V_j = sum k x
 x*:

@@ -3,8 +3,7 @@
 The corners of the box give the vertices. If the matrices depend on the parameters as in eq. (16) of Maeda and Sugiura,
 through alpha(m)/omega and beta/omega, the hull of the corners contains the whole box. In general it does not. The
 module therefore checks the hull on grids and random points, and moves the vertices outwards until all points lie
-inside.
-The systems between the checked points have no proof of coverage.
+inside. The systems between the checked points have no proof of coverage.
 
     gauge(x) = min t with x in c + t (hull - c),  c the vertices' mean:  covered if gauge <= 1
 """
@@ -301,8 +300,7 @@ def _largest_gauge(v: np.ndarray, x: np.ndarray) -> tuple[float, int]:
     """Return the largest gauge of points x (N, d) in the hull of v (V, d), and the number of checked points.
 
     For large hulls it checks only the points that reach furthest in one of many directions. The gauge is infinite if v
-    is
-    flat.
+    is flat.
     """
     centre = v.mean(axis=0)
     v, x, d = v - centre, x - centre, v.shape[1]

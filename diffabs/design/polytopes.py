@@ -3,8 +3,8 @@
     Polytope    x' = A x + B u (or x+ = A x + B u),  (A, B) anywhere, at any time, in the convex hull of the vertices
     Schedule    a chain of polytopes along one measured parameter, such as speed
 
-Source: Maeda and Sugiura, section 3. Their eq. (22) pairs A of one speed with B of another; here a vertex is a pair
-(A, B) of the same parameters.
+Source: Maeda and Sugiura, section 3. Their eq. (22) pairs A of one speed with B of another; here a vertex is a pair (A,
+B) of the same parameters.
 """
 
 import dataclasses

@@ -9,8 +9,8 @@
 with Q = Qh'Qh and R = Rh'Rh.
 
 Trace Z is the cost summed over starts at the unit vectors. It is guaranteed for every system of the polytope, also
-while
-the system varies. Decay, damping, L2 gain and input limits join it with the same X and F (`design.sdp.inequalities`).
+while the system varies. Decay, damping, L2 gain and input limits join it with the same X and F
+(`design.sdp.inequalities`).
 
 Source: Maeda and Sugiura, eqs. (29)-(32). Here a vertex is a pair (A, B) of the same parameters. Their eq. (31) pairs A
 of one speed with B of another in two blocks of four, which leaves two systems uncovered.
@@ -72,8 +72,7 @@ def design(system: Polytope | Schedule, spec: Spec) -> Design:
     """Return the gain that minimises the guaranteed cost (with Q, R), or else the L2 gain, under all specifications.
 
     Every answer is checked: exact proof of every specification (`certify`), duality gap, lower bound. After a failed
-    check
-    the search tries other coordinates, then other solvers.
+    check the search tries other coordinates, then other solvers.
 
     Args:
         system: A polytope, or a schedule along a measured parameter.

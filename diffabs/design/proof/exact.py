@@ -167,8 +167,8 @@ def l2_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Ineq
 def input_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
     """Yield the conditions for |u_j| <= limit_j for ever from the hull of `points`.
 
-    The points lie in {x' P x <= 1}, which no trajectory leaves. There (K_j x)^2 <= K_j P^-1 K_j' < limit_j^2, by
-    [[P, K_j'], [K_j, limit_j^2]] > 0.
+    The points lie in {x' P x <= 1}, which no trajectory leaves. There (K_j x)^2 <= K_j P^-1 K_j' < limit_j^2, by [[P,
+    K_j'], [K_j, limit_j^2]] > 0.
 
     Args:
         loop: Closed loops of the vertices.

@@ -1,7 +1,7 @@
 """The inequalities of a design, for V = x'X^-1 x and F = K X: each matrix must be positive semidefinite.
 
-Every function is affine in X, F, Z, g and takes stacks of them. `flow` is A X + B F, `drift` dX/dt along a schedule.
-In discrete time x+ = A x + B u, and a Schur complement with X takes the place of the derivative.
+Every function is affine in X, F, Z, g and takes stacks of them. `flow` is A X + B F, `drift` dX/dt along a schedule. In
+discrete time x+ = A x + B u, and a Schur complement with X takes the place of the derivative.
 
 Sources: Maeda and Sugiura, eqs. (30), (32); M. Chilali and P. Gahinet, H-infinity design with pole placement
 constraints (1996); S. Boyd et al., Linear Matrix Inequalities in System and Control Theory (1994).

@@ -90,7 +90,7 @@ class DesignProgram:
         return float(z) or 1.0, float(np.linalg.norm(frame.inverse @ e)) / np.sqrt(frame.tau) or 1.0
 
     def read(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return gains (nodes, m, n) and forms P = X^-1 (nodes, n, n) of the unknowns `y`, in the original coordinates."""
+        """Return gains (nodes, m, n) and forms P = X^-1 (nodes, n, n) of `y`, in the original coordinates."""
         v = self.unknowns.values(y)
         inverses = [np.linalg.inv(v[f"X{i}"]) for i in range(self.nodes)]
         gains = [self.frame.gain(v[f"F{i}"] @ inverse) for i, inverse in enumerate(inverses)]

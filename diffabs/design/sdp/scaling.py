@@ -132,8 +132,8 @@ def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, i: int,
 def _solve_by_hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray | None:
     """Return the Riccati solution from the stable eigenvectors of the Hamiltonian matrix and one Newton step.
 
-    The result is None if its residual is not small. The method takes a thirtieth of the time of SciPy's solver, whose
-    BLAS may start threads for such small matrices.
+    A large residual makes the result None. The method takes a thirtieth of the time of SciPy's solver, whose BLAS may
+    start threads for such small matrices.
     """
     n, push = len(a), b @ np.linalg.solve(r, b.T)
     # Scaling by `size` gives both off-diagonal blocks of the Hamiltonian matrix the same norm, for accurate

@@ -77,7 +77,7 @@ class Unknowns:
         return {name: np.tensordot(y, unit, 1) for name, unit in self.basis.items()}
 
     def blocks(self, formulas: Callable[[Mapping[str, np.ndarray]], list[Any]]) -> list[SdpBlock]:
-        """Return the blocks h + sum y_d G_d of `formulas` that are affine in the unknowns and work on stacks of them."""
+        """Return the blocks h + sum y_d G_d of `formulas`, which are affine in the unknowns and accept stacks."""
         values = formulas(self.stacked)
         # A formula without unknowns gives one matrix, with G = 0.
         wholes = [np.broadcast_to(value, (self.size + 1, *value.shape[-2:])) for value in values]
