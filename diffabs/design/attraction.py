@@ -227,10 +227,9 @@ def largest_recovered_multiples(
     *,
     engine: str = "xla",
 ) -> list[Reach]:
-    """Return for each row the largest multiple of `direction` up to which all multiples are recovered, 0 if the first
-    is not.
+    """Return for each row the largest multiple of `direction` up to which all multiples are recovered.
 
-    All runs are one batch.
+    It is 0 if the first multiple is not recovered. All runs are one batch.
 
     Args:
         loop: Closed loop about upright.

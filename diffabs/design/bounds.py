@@ -161,8 +161,7 @@ class Bounds:
         claim: Callable[[np.ndarray, Any, float], dict[str, Any]],
         once: Callable[[Any], list[np.ndarray]] | None = None,
     ) -> Claim | None:
-        """Solve for P and the other unknowns in a frame, then loosen the bound until its proof succeeds; None if it
-        does not.
+        """Return the claim of a solved program, loosened until its proof succeeds, or None.
 
         `everywhere` gives the inequalities of a vertex, `once` the inequalities without a vertex.
         """

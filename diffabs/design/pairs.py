@@ -27,13 +27,11 @@ MAX_PAIRED_VERTICES = 64  # no pairs are tried above this number of vertices
 RANGE_EXTENSION = 1e3  # factor by which a range extends beyond the last change of sign
 MAX_PAIRS = 8  # pairs to try, in decreasing order of the width of their range of k
 RANGE_POINTS = 16  # points in a range of k
-OTHERS_SHARE = 1e-3  # share of the inequality that the multipliers of the other vertices may take up
+OTHERS_SHARE = 1e-3  # largest share of W_i + W_j for each of the other vertices
 
 
 class Pair(NamedTuple):
-    """Vertices i and j, whether D is the inverse of C_j, and the range of k between `low` and `high` with an unstable
-    M(k).
-    """
+    """Vertices i and j, whether D is the inverse of C_j, and the range (low, high) of k with an unstable M(k)."""
 
     i: int
     j: int
@@ -64,7 +62,7 @@ def witnesses(closed: np.ndarray, factor: float | None = None) -> Iterator[np.nd
         inverses = np.linalg.inv(flows)
     except np.linalg.LinAlgError:
         return
-    # Small low/high first: the wider the range, the larger the growth rates and the safer the exact proof.
+    # Widest range of k first: its M(k) are furthest from stable ones.
     for pair in sorted(unstable_pairs(flows, inverses), key=lambda pair: pair.low / pair.high)[:MAX_PAIRS]:
         W = back @ multipliers(pair, flows, inverses) @ np.swapaxes(np.broadcast_to(back, flows.shape), 1, 2)
         W = (W + np.swapaxes(W, 1, 2)) / 2
@@ -93,8 +91,7 @@ def unstable_pairs(flows: np.ndarray, inverses: np.ndarray) -> Iterator[Pair]:
 
 
 def singular_factors(product: np.ndarray) -> list[float]:
-    """Return every k > 0 for which -k is an eigenvalue, in increasing order, with one value far below and one far
-    above.
+    """Return every k > 0 for which -k is an eigenvalue, increasing, with one value far below and one far above.
 
     Args:
         product: Product of two closed loops, shape (n, n).
@@ -134,8 +131,7 @@ def multipliers(pair: Pair, flows: np.ndarray, inverses: np.ndarray) -> np.ndarr
 
 
 def least_dominating_factor(strength: np.ndarray, taken: np.ndarray) -> float:
-    """Return the smallest c for which c `strength` + `taken` is positive semidefinite; inf if `strength` is not
-    definite.
+    """Return the smallest c for which c strength + taken is positive semidefinite; inf for an indefinite strength.
 
     Args:
         strength: Symmetric matrix, shape (n, n).

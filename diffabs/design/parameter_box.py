@@ -333,8 +333,9 @@ def _extreme_points(v: np.ndarray) -> list[int]:
 
 
 def _facets(v: np.ndarray) -> Any:
-    """Return the hull of v (V, d) with its facets; None if there are too many, or they merge by rounding (64 points in
-    6-d).
+    """Return the hull of v (V, d) with its facets, or None.
+
+    None stands for too many facets, or for facets that merge by rounding (64 points in 6-d).
     """
     from scipy.spatial import ConvexHull, QhullError
 

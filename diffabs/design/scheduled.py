@@ -138,7 +138,7 @@ def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: 
             closed = frame.states(a + b @ low), frame.states(a + b @ high)
             size = float(max(np.linalg.norm(c) for c in closed))
             for rate in sorted(set(spec.rates)):
-                # The defaults bind the loop variables now: the formula runs after the loop has moved on.
+                # The defaults bind the loop variables at the definition: a formula may run after the loop has moved on.
                 def coefficients(
                     v: Mapping[str, np.ndarray], i: int = i, c: Any = closed, q: Any = price, s: float = size,
                     drift: float = rate / width / frame.tau,

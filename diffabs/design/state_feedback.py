@@ -133,9 +133,7 @@ def _reduce_at_rest(loop: Loop) -> ReducedLoop:
 
 
 def _gains(controller: Any) -> tuple[Any, Any, Any, Any]:
-    """Return the gains on the integral, the slip error, and slip error minus filtered slip error; and the filter's
-    cutoff.
-    """
+    """Return the gains on integral, slip error, and slip error minus filtered slip error, and the filter's cutoff."""
     if isinstance(controller, StateFeedback | ProportionalFeedback):
         return controller.gain[0], controller.gain[1], 0.0, 0.0
     if isinstance(controller, PID):

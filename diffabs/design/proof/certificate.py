@@ -117,9 +117,7 @@ class Certificate:
 
     @property
     def stable(self) -> bool | None:
-        """True if a proof of stability exists, with one P or with one that depends on the parameter of a schedule; else
-        None.
-        """
+        """True if stability is proved, with one P or with a P that depends on a schedule's parameter; else None."""
         return True if any(self.proved(*QUADRATIC_KINDS, "scheduled")) else None
 
     @property

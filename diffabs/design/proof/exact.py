@@ -96,8 +96,7 @@ def decrease_terms(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> t
 
 
 def decay_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
-    """Yield the conditions that V = x' P x falls at least like exp(-2 rate t), or in discrete time by factor^2 a
-    period.
+    """Yield the conditions that V = x' P x falls at least like exp(-2 rate t), or by factor^2 a period.
 
     Args:
         loop: Closed loops of the vertices.
@@ -280,8 +279,7 @@ def conditions(
 
 
 def is_satisfied(inequality: Inequality) -> bool:
-    """Return whether an inequality over Dyadic matrices holds, errors included; False for a matrix that is not
-    symmetric.
+    """Return whether an inequality over Dyadic matrices holds, errors included; False without symmetry.
 
     Args:
         inequality: Inequality with Dyadic terms.
