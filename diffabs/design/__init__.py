@@ -1,7 +1,7 @@
-"""Robust design and its proofs: `design`, `certify`, and what they are about.
+"""Robust state feedback by linear matrix inequalities, with exact proofs: `design`, `certify` and their data types.
 
-Needs the extra `design` (cvxpy, Clarabel, SciPy), which is loaded when the first program is solved. Riccati
-and Lyapunov equations are pure JAX and need nothing.
+Design and certification need the extra `design` (cvxpy, Clarabel, SciPy). It is loaded when the first program is
+solved. Riccati and Lyapunov equations are pure JAX and work without it.
 """
 
 from diffabs.design.analysis import certify as certify

@@ -1,13 +1,14 @@
-"""Proofs about a gain, from wherever it comes.
+"""Proofs about a given state feedback u = K x, from any source.
 
     V = x'P x,  C = A + B K at every vertex,  P > 0
     decay      He[P C] + 2 rate P < 0
     cost       He[P C] + Q + K'RK < 0, minimise trace P
-    ...        see `certificate` for the others, for discrete time, and for schedules
 
-P is found by a solver in floating point and then proved in exact arithmetic (`certificate`). Where no common P exists
-the multipliers of the same program are the proof of that: W_i >= 0 with sum He[C_i W_i] > 0; where it has no answer,
-those of two vertices that refute at once (`pairs`).
+`design.proof.certificate` lists the inequalities of the other claims, of discrete time and of schedules.
+
+A solver finds P in floating point. Then `design.proof.exact` proves the inequality for that P in exact arithmetic. If
+no common P exists, the multipliers of the same program prove it: W_i >= 0 with sum He[C_i W_i] > 0. If the solver gives
+no such proof, `design.pairs` looks for two vertices that exclude a common P.
 """
 
 import math
@@ -26,27 +27,32 @@ from diffabs.design.sdp.scaling import analysis_frame, lyapunov_frame
 from diffabs.design.sdp.solver import Answer, Unknowns, he
 from diffabs.design.spec import Spec
 
-MAX_FRAMES = 4  # frames, each better than the one before
-DECAY_TOLERANCE = 1e-3  # relative: where the search for the fastest decay stops
-MAX_SEARCH_PROGRAMS = 20  # programs of that search, at most
+MAX_FRAMES = 4  # attempts, each in the frame of the last P
+DECAY_TOLERANCE = 1e-3  # relative width at which the search for the fastest decay stops
+MAX_SEARCH_PROGRAMS = 20  # programs of the search for the fastest decay, at most
 
 
 def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *, fastest: bool = False) -> Certificate:
-    """Return what can be proved about u = K x: quadratic stability or its impossibility, and each specified property.
+    """Return the proved properties of u = K x: quadratic stability or its impossibility, and each specification.
 
-    gain: K (m, n) or (n,); for a schedule also one for each node, (N + 1, m, n)
-    system: a polytope, in which the system may vary at will, or a schedule along a measured parameter
-    spec: what the gain is asked for besides; None is stability
-    fastest: look for the largest decay rate that a common P proves (a few more programs); else the claimed rate is
-        that of the specification, or what the first P happens to prove
+    A property without a proof raises no error: the certificate leaves it out.
 
-    Raises ValueError for shapes that do not fit, ModuleNotFoundError without cvxpy. That something cannot be proved is
-    no error: the certificate says so.
+    Args:
+        gain: Gain K, shape (m, n) or (n,); for a schedule also one gain for each node, shape (N + 1, m, n).
+        system: A polytope, within which the system may vary arbitrarily fast, or a schedule along a measured parameter.
+        spec: Specification to prove; None stands for stability alone.
+        fastest: Whether to search for the largest decay rate that a common P proves, with a few more programs.
+            Otherwise the claimed rate is the larger of the specified rate and the rate that the first P proves.
 
-    >>> from diffabs.design import Polytope, certify
-    >>> box = Polytope(A=[[[0.0, 1.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, -2.0]]], B=[[[0.0], [1.0]]] * 2)
-    >>> [certify(gain, box).quadratically_stable for gain in ((-1.0, -1.0), (1.0, -1.0))]
-    [True, False]
+    Raises:
+        ValueError: Shapes that do not fit.
+        ModuleNotFoundError: cvxpy is not installed.
+
+    Examples:
+        >>> from diffabs.design import Polytope, certify
+        >>> box = Polytope(A=[[[0.0, 1.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, -2.0]]], B=[[[0.0], [1.0]]] * 2)
+        >>> [certify(gain, box).quadratically_stable for gain in ((-1.0, -1.0), (1.0, -1.0))]
+        [True, False]
     """
     spec = Spec() if spec is None else spec
     if isinstance(system, Schedule):
@@ -59,7 +65,7 @@ def certify(gain: Any, system: Polytope | Schedule, spec: Spec | None = None, *,
 
 
 class _Analysis:
-    """The claims about one gain on one polytope."""
+    """The search for the claims about one gain on one polytope."""
 
     def __init__(self, system: Polytope, k: np.ndarray, spec: Spec):
         self.system, self.k, self.spec = system, k, spec
@@ -68,9 +74,10 @@ class _Analysis:
         self.frame = analysis_frame(self.closed, discrete=self.discrete)
 
     def claims(self, fastest: bool) -> Iterator[Claim]:
-        """Each is proved already; what could not be proved is absent."""
+        """Yield the claims whose proof succeeds; `fastest` asks for the largest decay rate."""
         spec, bounds = self.spec, Bounds(self.system, self.k, self.spec, self.frame)
         cost = bounds.cost() if spec.Q is not None and self._slowest_mode() > 0 else None
+        # The P of the cost also proves a decay, so one program serves both claims.
         stable = None if cost is None or fastest else self._decay_claim(np.asarray(cost.data["P"]), spec.decay)
         stable = stable or self._stability(fastest)
         yield from (claim for claim in (stable, cost) if claim is not None)
@@ -93,18 +100,21 @@ class _Analysis:
                 found = self._decay_claim(p, asked)
                 if found is not None:
                     return self._fastest_decay_claim(found) if fastest else found
-            # whatever the sign of the margin: where there is no P the best is P = 0, whose margin is 0 but for rounding
+            # For any sign of the margin: without a common P the optimum is P = 0, with a margin of 0 up to
+            # rounding.
             claim = Claim("infeasible", {"W": w, **self._rate_data(asked)})
             if np.isfinite(w).all() and self._proved(claim):
                 return claim
             try:
+                # In the frame of the last P the unknown is near the unit matrix: the solver is more accurate at the
+                # next attempt.
                 self.frame = lyapunov_frame(p, self.closed, np.eye(1), discrete=self.discrete)
             except np.linalg.LinAlgError:
                 break
         return self._refute_by_pair(asked)
 
     def _refute_by_pair(self, asked: float) -> Claim | None:
-        """Two vertices without a common P, whose multipliers need no solver."""
+        """Return a proof of infeasibility from two vertices whose multipliers need no solver, or None."""
         rate, scaled = self._rate_data(asked), self.frame.states(self.closed) * self.frame.tau
         t, factor = self.frame.T, rate.get("factor")
         for w in pairs.witnesses(scaled + rate.get("rate", 0.0) * np.eye(self.system.order), factor):
@@ -115,11 +125,16 @@ class _Analysis:
         return None
 
     def _common(self, rate: float) -> tuple[np.ndarray | None, float, np.ndarray]:
-        """The P, trace 1 in the frame, whose least margin over the vertices is largest; that margin; the multipliers.
-        Original coordinates."""
+        """Return P, its margin and the multipliers, in the original coordinates.
+
+        P has trace at most n in the frame and maximises the smallest margin over the vertices.
+        """
         n = self.system.order
         unknowns, scaled = Unknowns(P=n, t=(1, 1)), self.frame.states(self.closed)
+        # Unit of time in the frame: one period in discrete time, 1/tau in continuous time.
         step = self.system.period or 1 / self.frame.tau
+        # Each inequality is divided by the size of its vertex, so that one margin t is comparable over slow and fast
+        # vertices.
         sizes = np.linalg.norm(scaled, axis=(1, 2)) + 1.0 if self.discrete else np.linalg.norm(scaled, axis=(1, 2))
         one = np.eye(n)
         decreases = [
@@ -129,6 +144,7 @@ class _Analysis:
             for c, s in zip(scaled, sizes, strict=True)
         ]
         positive = unknowns.affine(lambda v: v["P"] - v["t"] * one)
+        # The inequalities are homogeneous in P: without the bound on its trace the margin t would have no maximum.
         total = unknowns.affine(lambda v: (1 - np.trace(v["P"], axis1=-2, axis2=-1) / n)[:, None, None])
         answer = solver.solve_sdp(unknowns.row(lambda v: -v["t"]), [solver.stack_blocks([*decreases, positive]), total])
         if not np.isfinite(answer.y).all():
@@ -137,7 +153,11 @@ class _Analysis:
         return self.frame.form(values["P"]), float(values["t"][0, 0]), self._witness(answer, sizes)
 
     def _witness(self, answer: Answer, sizes: np.ndarray) -> np.ndarray:
-        """W_i in the original coordinates, lifted off the boundary of the cone so that rounding cannot leave it."""
+        """Return the multipliers W_i in the original coordinates, moved off the boundary of the cone.
+
+        Without that move, rounding could make them indefinite.
+        """
+        # The last multiplier of the group belongs to P >= t I, not to a vertex.
         w = answer.multipliers[0][:-1]
         w = (w + np.swapaxes(w, 1, 2)) / 2
         w = w / np.trace(w.sum(axis=0)) + 1e-9 * np.eye(self.system.order)
@@ -146,11 +166,13 @@ class _Analysis:
         return he(w) / np.abs(w).max()
 
     def _decay_claim(self, p: np.ndarray, asked: float) -> Claim | None:
-        """The largest rate that this P proves; at least the rate asked for, or nothing."""
+        """Return the proved claim with the largest rate of this P, or None if that rate is below the specified one."""
         best = self._proved_rate(p)
         if best == -math.inf:
             return None
         for loosening in BOUND_LOOSENINGS:
+            # At the best rate the inequality is singular, and no proof of a strict inequality succeeds: step back from
+            # it.
             rate = best - loosening * (abs(best) + asked)
             claim = Claim("decay", {"P": p, **self._rate_data(max(rate, asked))})
             if self._proved(claim):
@@ -160,8 +182,11 @@ class _Analysis:
         return None
 
     def _fastest_decay_claim(self, claim: Claim) -> Claim:
-        """Close in on the fastest rate that a common P proves: each program between the bounds gives a P, whose own
-        rate is a lower bound, and multipliers, which are a witness against every rate above an upper bound."""
+        """Return the claim with the fastest rate that a common P proves, by bisection.
+
+        Each program at a rate between the bounds gives a P and multipliers. The rate of P is a lower bound. The
+        multipliers exclude every rate above an upper bound.
+        """
         p = np.asarray(claim.data["P"])
         low, high = self._proved_rate(p), self._slowest_mode()
         for _ in range(MAX_SEARCH_PROGRAMS):
@@ -177,14 +202,14 @@ class _Analysis:
         return self._decay_claim(p, self.spec.decay) or claim
 
     def _slowest_mode(self) -> float:
-        """The decay rate [1/s] of the slowest mode of any vertex."""
+        """Return the decay rate [1/s] of the slowest mode of all vertices."""
         modes = np.linalg.eigvals(self.closed)
         if self.discrete:
             return -math.log(np.abs(modes).max()) / (self.system.period or 1.0)
         return -float(modes.real.max())
 
     def _least_refuted_rate(self, w: np.ndarray) -> float:
-        """The least rate that the multipliers W are a witness against: sum He[C W] + 2 rate sum W >= 0."""
+        """Return the smallest rate [1/s] that the multipliers W exclude: sum He[C W] + 2 rate sum W >= 0."""
         root = np.linalg.inv(np.linalg.cholesky(w.sum(axis=0)))
         if self.discrete:
             spread = (self.closed @ w @ np.swapaxes(self.closed, 1, 2)).sum(axis=0)
@@ -193,7 +218,7 @@ class _Analysis:
         return -float(np.linalg.eigvalsh(root @ he(self.closed @ w).sum(axis=0) @ root.T)[0]) / 2
 
     def _proved_rate(self, p: np.ndarray) -> float:
-        """The decay rate [1/s] that V = x'Px has at the slowest vertex; -inf where V is not positive definite."""
+        """Return the decay rate [1/s] of V = x'Px at the slowest vertex; -inf if P is not positive definite."""
         try:
             root = np.linalg.cholesky(p).T
         except np.linalg.LinAlgError:
@@ -204,8 +229,9 @@ class _Analysis:
         return -float(np.linalg.eigvalsh(he(c)).max()) / 2
 
     def _rate_data(self, rate: float) -> dict[str, float]:
-        """As a claim has it: a rate [1/s], or the factor for one step, rounded to the safe side."""
+        """Return the rate as claim data: `rate` [1/s], or in discrete time a safely rounded `factor` per step."""
         if self.discrete:
+            # The relative 1e-15 rounds the factor up: a larger factor claims a slower decay.
             return {"factor": min(1.0, math.exp(-rate * (self.system.period or 1.0)) * (1 + 1e-15))}
         return {"rate": rate}
 

@@ -1,15 +1,14 @@
-"""Regions of attraction: from which starts a closed loop returns, by running every one of them.
+"""Regions of attraction: the starts from which a closed loop returns to rest, found by one run for each start.
 
-    recovered   the run came into an ellipsoid about rest from which the nonlinear loop, with its limits, provably
-                returns (`design.capture`); it ends there
+    recovered   the run entered an ellipsoid about rest from which the nonlinear loop, with its limits, provably
+                returns (`design.capture`); the run ends there
     fell        the run reached its stop
-    unstable    the linear loop about rest grows: from almost nowhere does it come to rest, so it is not run
-    undecided   none of these when its time was over, counted as what it is: `duration` is to be so long that there are
-                none
+    unstable    the linear loop about rest grows; almost no start comes to rest, so the start is not run
+    undecided   none of these within the solver's duration; choose the duration so that no run is undecided
 
-The starts of a map are the centres of equal cells, so that a share of them is a share of the box by area. A share is a
-count and has no derivative. `SoftLoss` is its differentiable surrogate: the mean of a sigmoid of log |x(T)| over the
-same starts, at a time T so early that a run that will fall has not yet landed.
+The starts of a map are the centres of equal cells, so a share of them is a share of the box by area. A share is a count
+and has no derivative. `SoftLoss` is its differentiable surrogate: the mean of a sigmoid of log |x(T)| over the same
+starts. Its time T is so early that a run that will fall has not yet landed.
 """
 
 import concurrent.futures
@@ -27,17 +26,15 @@ from diffabs.design.capture import capture_ellipsoids
 from diffabs.simulate.batch import Batch, run_batch
 from diffabs.simulate.solution import Solver
 
-MIN_RUNS_PER_CORE = 256  # lanes that a core is given on its own
-MULTIPLE_TOLERANCE, SEARCH_POINTS = (
-    1e-4,
-    33,
-)  # of a search for the greatest multiple: relative width of its last interval; runs at once
-INITIAL_PREFIX = "initial."  # paths of what a loop does not depend on
-CAPTURE_LEVEL = 0.98  # of x'Sx, where a run is ended: rounding does not take it out again
+MIN_RUNS_PER_CORE = 256  # a core gets at least so many runs
+# Search for the largest multiple: relative width of the last interval; runs of one batch.
+MULTIPLE_TOLERANCE, SEARCH_POINTS = 1e-4, 33
+INITIAL_PREFIX = "initial."  # paths of the start, on which the system and its ellipsoid do not depend
+CAPTURE_LEVEL = 0.98  # value of x'Sx at which a run ends: rounding cannot take it out of the ellipsoid again
 
 
 class Outcomes(NamedTuple):
-    """What became of each run (lanes,), and when [s] it was known."""
+    """The outcome of each run, shape (runs,), and the time [s] at which it is decided."""
 
     recovered: np.ndarray
     fell: np.ndarray
@@ -47,12 +44,12 @@ class Outcomes(NamedTuple):
 
     @property
     def undecided(self) -> np.ndarray:
-        """Nothing is known when the time was over; the run is finite."""
+        """Whether the run is finite but has no outcome at the end of its time, shape (runs,)."""
         return ~(self.recovered | self.fell | self.unstable | self.diverged)
 
 
 class Cells(NamedTuple):
-    """An axis in `number` equal cells from `low` to `high`."""
+    """An axis divided into `number` equal cells from `low` to `high`."""
 
     low: float
     high: float
@@ -60,12 +57,12 @@ class Cells(NamedTuple):
 
     @property
     def centres(self) -> np.ndarray:
-        """(number,)."""
+        """Centres of the cells, shape (number,)."""
         return self.low + (self.high - self.low) * (np.arange(self.number) + 0.5) / self.number
 
 
 class Basin(NamedTuple):
-    """Cells of two axes, n and m of them, and what became of the run from each centre (n, m)."""
+    """Cells of two axes, n and m of them, and the outcome of the run from each centre, shape (n, m)."""
 
     first: Cells
     second: Cells
@@ -73,46 +70,49 @@ class Basin(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Of the box by area, what is recovered."""
+        """Recovered share [1] of the box by area."""
         return float(np.mean(self.outcomes.recovered))
 
     @property
     def undecided(self) -> float:
-        """Of the box by area, what neither fell nor came to rest in time."""
+        """Share [1] of the box by area whose runs neither recover, fall, diverge nor are unstable."""
         return float(np.mean(self.outcomes.undecided))
 
 
 class Reach(NamedTuple):
-    """The greatest multiple that is recovered, and whether the run from the next one that was tried is undecided: then
-    more may be recovered."""
+    """The largest recovered multiple, and whether the next tried one is undecided: then more may be recovered."""
 
     multiple: float
     undecided: bool
 
 
 class _Ellipsoids(NamedTuple):
-    """|R x| <= 1, R (systems, 6, 6), and whether there is nothing to hope for (systems,); lane i is of system[i]."""
+    """Ellipsoids |R x| <= 1 with R (systems, 6, 6), and whether a system is unstable (systems,).
+
+    Run i belongs to the system `system[i]`.
+    """
 
     roots: Any
     hopeless: Any
     system: Any
 
     def own(self, number: Any) -> Any:
-        """Root and hopelessness of lane `number`."""
+        """Return R and the instability flag of run `number`."""
+        # An empty slot of a packed batch has a number beyond the last run.
         mine = self.system[jnp.minimum(number, len(self.system) - 1)]
         return self.roots[mine], self.hopeless[mine]
 
     def reached(self, own: Any, output: Any) -> Any:
-        """Whether a lane is inside, with something to spare, or hopeless."""
+        """Return whether a run is inside its ellipsoid, with a margin, or unstable."""
         root, hopeless = own
         return (jnp.sum((root @ state_of(output)) ** 2) <= CAPTURE_LEVEL) | hopeless
 
     def of(self, runs: slice) -> "_Ellipsoids":
-        """For some lanes only."""
+        """Return the same ellipsoids for the selected runs."""
         return self._replace(system=self.system[runs])
 
     def contain(self, x: np.ndarray) -> np.ndarray:
-        """Whether each state (lanes, 6) is inside; NaN is not."""
+        """Return whether each state (runs, 6) is inside its ellipsoid; False for NaN."""
         return np.sum(np.einsum("nij,nj->ni", self.roots[self.system], x) ** 2, axis=1) <= 1
 
 
@@ -125,14 +125,23 @@ def classify_starts(
     key: Any = None,
     engine: str = "xla",
 ) -> Outcomes:
-    """Of lanes that differ in the values (lanes,) at these paths: what becomes of each within the solver's duration.
+    """Return the outcome of each run within the solver's duration, shape (runs,).
 
-    band: |x| at the end of the run below which it counts as recovered, for loops of which no ellipsoid is known (noise,
-        observers, samples), where nothing is proved of what comes after
-    key: lanes of a noisy loop draw from fold_in(key, lane)
-    engine: what makes the runs, as in `run_batch`
+    Args:
+        loop: Closed loop about upright.
+        starts: Values by path in which the runs differ, each of shape (runs,).
+        solver: Solver with the duration of the runs.
+        band: Bound on |x| at the end of a run: the run counts as recovered below it. For loops without a known
+            ellipsoid
+            (noise, observers, samples); it proves nothing about the time after the run.
+        key: Random key of a noisy loop; run i draws from fold_in(key, i).
+        engine: Engine of the runs, as in `run_batch`.
 
-    Raises ValueError for a loop of which no ellipsoid is known, without a band.
+    Returns:
+        Outcomes, each of shape (runs,).
+
+    Raises:
+        ValueError: A loop without a known ellipsoid, and no band.
     """
     starts = {path: np.asarray(column) for path, column in starts.items()}
     count = len(next(iter(starts.values())))
@@ -149,21 +158,23 @@ def _classify_starts(
     key: Any,
     engine: str,
 ) -> Outcomes:
-    """early: a run that comes inside ends there."""
+    """Return the outcomes; with `early`, a run ends when it enters its ellipsoid."""
     count = len(inside.system)
+    # fold_in by the run's number, so that the draws do not depend on the split over cores.
     keys = None if key is None else jax.vmap(lambda i: jax.random.fold_in(key, i))(np.arange(count))
     parts = (
         max(1, min(os.cpu_count() or 1, count // MIN_RUNS_PER_CORE)) if engine == "xla" else 1
     )  # a kernel has its threads
 
     def part(runs: slice) -> Any:
-        """Every so many lanes: neighbours take equally long."""
+        """Return the batch of one strided slice of the runs."""
         mine = {path: column[runs] for path, column in starts.items()}
         own = None if keys is None else keys[runs]
         enough = inside.of(runs) if early else None
         return jax.device_get(run_batch(loop, Batch(mine, own), solver, enough=enough, engine=engine))
 
     found = Outcomes(*np.zeros((4, count), bool), time=np.zeros(count))
+    # Strided slices: neighbouring starts take about equally long, so each thread gets an equal share of slow runs.
     slices = [slice(i, None, parts) for i in range(parts)]
     with concurrent.futures.ThreadPoolExecutor(parts) as pool:
         for runs, run in zip(slices, pool.map(part, slices), strict=True):
@@ -186,8 +197,21 @@ def region_of_attraction(
     key: Any = None,
     engine: str = "xla",
 ) -> Basin:
-    """The region of attraction over the cells of two axes, the first rows; `band`, `key` and `engine` as for
-    `outcomes`."""
+    """Return the region of attraction over the cells of two axes, the first axis in rows.
+
+    Args:
+        loop: Closed loop about upright.
+        first: Cells of the first axis.
+        second: Cells of the second axis.
+        solver: Solver with the duration of the runs.
+        paths: Paths of the values on the two axes.
+        band: Bound on |x| at the end, as for `classify_starts`.
+        key: Random key, as for `classify_starts`.
+        engine: Engine of the runs, as in `run_batch`.
+
+    Raises:
+        ValueError: A loop without a known ellipsoid, and no band.
+    """
     grid = np.meshgrid(first.centres, second.centres, indexing="ij")
     starts = {path: axis.ravel() for path, axis in zip(paths, grid, strict=True)}
     found = classify_starts(loop, starts, solver, band=band, key=key, engine=engine)
@@ -203,13 +227,27 @@ def largest_recovered_multiples(
     *,
     engine: str = "xla",
 ) -> list[Reach]:
-    """For each of the values (rows,) at these paths the greatest of the rising `multiples` of `direction` (values by
-    path of the initial state) up to which all are recovered, 0 if none is. One batch."""
+    """Return for each row the largest multiple of `direction` up to which all multiples are recovered.
+
+    It is 0 if the first multiple is not recovered. All runs are one batch.
+
+    Args:
+        loop: Closed loop about upright.
+        rows: Values by path, each of shape (rows, ...): one loop for each row.
+        direction: Values of the initial state by path.
+        multiples: Increasing multiples of `direction` to try.
+        solver: Solver with the duration of the runs.
+        engine: Engine of the runs, as in `run_batch`.
+
+    Raises:
+        ValueError: A loop without a known ellipsoid.
+    """
     count = len(next(iter(rows.values())))
     runs = {path: np.repeat(np.asarray(column), len(multiples), axis=0) for path, column in rows.items()}
     runs |= {path: np.tile(value * np.asarray(multiples), count) for path, value in direction.items()}
     found = classify_starts(loop, runs, solver, engine=engine)
     fine, open_ = (x.reshape(count, -1) for x in (found.recovered, found.undecided))
+    # argmin of booleans is the index of the first failure.
     good = np.where(fine.all(axis=1), len(multiples), np.argmin(fine, axis=1))
     known = np.concatenate([[0.0], multiples])
     return [Reach(float(known[g]), bool(g < len(multiples) and row[g])) for g, row in zip(good, open_, strict=True)]
@@ -225,16 +263,27 @@ def recoverable_multiple(
     key: Any = None,
     engine: str = "xla",
 ) -> Reach:
-    """The greatest c in [0, most] such that the loop recovers from c' times `direction` (values by path of the initial
-    state) for every c' up to c that is tried; to a relative width of 1e-4. Every refinement is one batch.
+    """Return the largest c in [0, most] such that the loop recovers from every tried multiple of `direction` up to c.
 
-    Raises ValueError for other paths, and as `outcomes` does."""
+    The search ends at a relative width of 1e-4. Every refinement is one batch.
+
+    Args:
+        loop: Closed loop about upright.
+        direction: Values of the initial state by path.
+        solver: Solver with the duration of the runs.
+        most: Upper end of the search.
+        band: Bound on |x| at the end, as for `classify_starts`.
+        key: Random key, as for `classify_starts`.
+        engine: Engine of the runs, as in `run_batch`.
+
+    Raises:
+        ValueError: A path outside the initial state, or a loop without a known ellipsoid and no band.
+    """
     if others := [path for path in direction if not path.startswith(INITIAL_PREFIX)]:
         raise ValueError(f"{', '.join(others)}: a direction is one of the initial state")
     alike = {path: np.full(SEARCH_POINTS, value) for path, value in direction.items()}
-    inside = (
-        _system_ellipsoids(loop, alike, SEARCH_POINTS) if band is None else _ball_as_ellipsoid(band, SEARCH_POINTS)
-    )  # wherever the runs start
+    # All starts of the search share one system, so its ellipsoid is computed once.
+    inside = _system_ellipsoids(loop, alike, SEARCH_POINTS) if band is None else _ball_as_ellipsoid(band, SEARCH_POINTS)
     low, high, undecided = 0.0, float(most), False
     while high - low > MULTIPLE_TOLERANCE * high:
         tried = np.linspace(low, high, SEARCH_POINTS + 1)[1:]
@@ -250,18 +299,20 @@ def recoverable_multiple(
 
 
 def _system_ellipsoids(loop: Loop, starts: Mapping[str, np.ndarray], count: int) -> _Ellipsoids:
-    """One for each system among the lanes: where a run starts does not change it."""
+    """Return one ellipsoid for each distinct system among the runs; the start of a run does not change it."""
     own = [column.reshape(count, -1) for path, column in starts.items() if not path.startswith(INITIAL_PREFIX)]
     first, system = np.zeros(1, int), np.zeros(count, int)
     if own:
+        # One ellipsoid for each distinct row of values: `first` is a representative, `system` maps runs to rows.
         _, first, system = np.unique(np.concatenate(own, axis=1), axis=0, return_index=True, return_inverse=True)
     shapes, unstable = capture_ellipsoids(loop, {path: column[first] for path, column in starts.items()})
     known = np.isfinite(shapes[:, 0, 0])
     roots = np.full_like(shapes, np.inf)
+    # S = R'R. An unknown ellipsoid keeps R = inf, so that |R x| <= 1 is false everywhere.
     roots[known] = np.swapaxes(np.linalg.cholesky(shapes[known]), 1, 2)
     return _Ellipsoids(roots, unstable, system.reshape(-1))
 
 
 def _ball_as_ellipsoid(radius: float, count: int) -> _Ellipsoids:
-    """|x| <= radius for all."""
+    """Return the ball |x| <= radius as the ellipsoid of all runs."""
     return _Ellipsoids(np.eye(6)[None] / radius, np.zeros(1, bool), np.zeros(count, int))

@@ -1,4 +1,4 @@
-"""Bounds that a gain keeps: cost, damping, L2 gain, inputs. Each is the least that a common P proves."""
+"""Bounds that a gain keeps: cost, damping, L2 gain and inputs, each the smallest that a common P proves."""
 
 import math
 from collections.abc import Callable
@@ -14,38 +14,46 @@ from diffabs.design.sdp.scaling import Frame, analysis_frame, whitening_matrix
 from diffabs.design.sdp.solver import Unknowns, group_blocks, he, symmetric_from_blocks
 from diffabs.design.spec import Spec
 
-BOUND_LOOSENINGS = (
-    1e-9,
-    1e-8,
-    1e-7,
-    1e-6,
-    1e-5,
-    1e-4,
-)  # relative: by how much a bound is loosened until its proof succeeds
+# Relative amounts by which a bound is loosened, in this order, until its proof succeeds.
+BOUND_LOOSENINGS = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
 def decrease_matrix(p: Any, c: np.ndarray, rate: float, *, discrete: bool) -> np.ndarray:
-    """-dV/dt - 2 rate V for V = x'Px and x' = C x, or exp(-2 rate) V - V+ for x+ = C x; P may be a stack."""
+    """Return -dV/dt - 2 rate V as a matrix, for V = x'Px and x' = C x.
+
+    In discrete time, x+ = C x, it is exp(-2 rate) V - V+.
+
+    Args:
+        p: Symmetric P, shape (..., n, n).
+        c: Closed loop C, shape (n, n).
+        rate: Decay rate; in discrete time per step.
+        discrete: Whether the system is in discrete time.
+    """
     if discrete:
         return math.exp(-2 * rate) * p - c.T @ p @ c
     return -he(p @ c) - 2 * rate * p
 
 
 class Bounds:
-    """Each method gives a claim that is proved already, or None where no proof succeeds."""
+    """The search for the bounds of one gain: each method returns a proved claim, or None if no proof succeeds."""
 
     def __init__(self, system: Polytope, k: np.ndarray, spec: Spec, frame: Frame):
-        """For gain K (m, n) and a checked specification; `frame` is one for quadratic stability."""
+        """Prepare the closed loops of gain `k` (m, n) on `system`.
+
+        `spec` is a checked specification and `frame` a frame for quadratic stability.
+        """
         self.system, self.k, self.spec, self.frame = system, k, spec, frame
         self.closed, self.discrete = system.closed(k), system.period is not None
 
     def cost(self) -> Claim | None:
-        """The least trace P."""
+        """Return the claim with the smallest trace P."""
         q, r = self.spec.Q, self.spec.R
         weight = q + self.k.T @ r @ self.k
         at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
         scaled = at.weight(weight)
+        # Congruence by `even` makes the solver's absolute tolerance relative to the weight in every direction.
         even = whitening_matrix(scaled)
+        # trace P in the original coordinates, as a linear form of the scaled P.
         trace = at.trace_weight() / np.trace(at.trace_weight())
         return self._found(
             at,
@@ -56,8 +64,9 @@ class Bounds:
         )
 
     def damping(self) -> Claim | None:
-        """All poles of every frozen system in the cone asked for."""
+        """Return the claim that the poles of every frozen system lie in the cone of the specified damping."""
         zeta = self.spec.damping
+        # Rounded up: the proof requires cot^2 (1 - zeta^2) >= zeta^2 exactly.
         cot = zeta / math.sqrt(1 - zeta**2) * (1 + 1e-12)
 
         def cone(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
@@ -75,11 +84,13 @@ class Bounds:
         )
 
     def l2(self) -> Claim | None:
-        """The least gain."""
+        """Return the claim with the smallest L2 gain."""
         l2 = self.spec.l2
         assert l2 is not None
         z = l2.output + l2.feedthrough @ self.k
         weight = z.T @ z
+        # A small weight on every state, so that the Lyapunov solution of the frame is definite where the output misses
+        # a state.
         weight = weight + 1e-9 * np.trace(weight) * np.eye(len(weight))
         at = analysis_frame(self.closed, discrete=self.discrete, weight=weight)
         given = None if l2.disturbance is None else at.inverse @ l2.disturbance / math.sqrt(at.tau)
@@ -87,6 +98,7 @@ class Bounds:
         def bounded(v: Any, c: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
             e = at.inverse @ b / math.sqrt(at.tau) if given is None else given
             limit = v["g"] * np.eye(e.shape[1])
+            # 1e-10 keeps the answer strictly inside the inequality that the exact proof requires.
             top = decrease_matrix(v["P"], c, 0.0, discrete=self.discrete) - at.weight(z.T @ z) - 1e-10 * np.eye(len(c))
             if self.discrete:
                 return [symmetric_from_blocks([[top], [-e.T @ v["P"] @ c, limit - e.T @ v["P"] @ e]])]
@@ -109,12 +121,16 @@ class Bounds:
         )
 
     def input(self) -> Claim | None:
-        """The least fraction g^(1/2) of the limits that an invariant ellipsoid around the starts can prove."""
+        """Return the claim with the smallest input limits that an invariant ellipsoid around the starts proves.
+
+        All limits share one factor sqrt(g) relative to the specified limits.
+        """
         limit, at = self.spec.input, self.frame
         assert limit is not None
         rows = self.k @ at.T / limit.limit[:, None]
         starts = at.inverse @ limit.points.T
-        starts_size = float(np.linalg.norm(starts, axis=0).max())  # P is of the order of 1/size^2
+        # P scales as 1/size^2: the unknown is P size^2, near the unit matrix for starts in any unit.
+        starts_size = float(np.linalg.norm(starts, axis=0).max())
 
         def held(v: Any) -> list[np.ndarray]:
             p = v["P"]
@@ -125,6 +141,7 @@ class Bounds:
             at,
             {"P": self.system.order, "g": (1, 1)},
             lambda v: v["g"],
+            # The rate 1e-9 keeps the ellipsoid strictly invariant.
             lambda v, c, b: [decrease_matrix(v["P"], c, 1e-9, discrete=self.discrete) / np.linalg.norm(c)],
             lambda p, v, more: {
                 "kind": "input",
@@ -144,7 +161,10 @@ class Bounds:
         claim: Callable[[np.ndarray, Any, float], dict[str, Any]],
         once: Callable[[Any], list[np.ndarray]] | None = None,
     ) -> Claim | None:
-        """Solve for P and more in a frame, and loosen the answer until its proof succeeds; None if it does not."""
+        """Return the claim of a solved program, loosened until its proof succeeds, or None.
+
+        `everywhere` gives the inequalities of a vertex, `once` the inequalities without a vertex.
+        """
         unknowns = Unknowns(**shapes)
         blocks = unknowns.blocks(lambda v: [v["P"], *(once(v) if once else [])])
         for c, b in zip(at.states(self.closed), self.system.B, strict=True):

@@ -1,17 +1,25 @@
-"""From where a balance under u = clamp(K x) surely comes to rest: an ellipsoid x'Sx <= 1, for the nonlinear equations.
+"""Capture ellipsoids: x'Sx <= 1 from which a balance under u = clamp(K x) comes to rest, for the nonlinear equations.
 
     x' = A x + B u + D y(x),   S = P/c,   A'P + PA <= -2 g P  (A of the closed loop)
 
-On x'Px <= c the motor must be linear, |K x| <= U with its current within the limit, the frame must not lie on the
-ground, and the rest y of the nonlinear equations must be small: the plant bounds it, |y_k| <= Y_k(c), from how far each
-combination of angles and rates goes on the ellipsoid, |row x| <= sqrt(c row P^-1 row'). Then, with V = x'Px,
+On x'Px <= c three conditions hold:
+
+- The motor is linear: |K x| <= U, and its current is within the limit.
+- The frame does not lie on the ground.
+- The rest y of the nonlinear equations is small.
+
+The plant bounds the rest, |y_k| <= Y_k(c), from the extent of each combination of angles and rates on the ellipsoid,
+|row x| <= sqrt(c row P^-1 row'). Then, with V = x'Px,
 
     V' <= -2 V (g - sum_k sqrt((D'PD)_kk) Y_k(c)/sqrt(c))
 
-since Y_k falls at least as fast as sqrt(V). Where the bracket is positive, V falls to 0 from V <= c (H. K. Khalil,
-Nonlinear Systems, 3rd ed., sec. 8.2). Of several P the ellipsoid with the greatest volume is taken, and of its c 90 %,
-which leaves a tenth of g for rounding: this is floating point, with a margin, and not a proof in integers. It is about
-the differential equation; a run is its integration.
+Y_k falls at least as fast as sqrt(V). If the bracket is positive, V therefore falls to 0 from V <= c.
+
+Of several P the module takes the ellipsoid with the largest volume, and 90 % of its c. That leaves a tenth of g for
+rounding: the result is floating point with a margin, not a proof in integers. It holds for the differential equation; a
+run integrates this equation numerically.
+
+Source: H. K. Khalil, Nonlinear Systems, 3rd ed., sec. 8.2.
 """
 
 from collections.abc import Mapping
@@ -28,15 +36,19 @@ from diffabs.core.pytree import replace
 from diffabs.linear.balance_model import BalanceModel
 from diffabs.stops import Fallen
 
-SAFE_LEVEL_FRACTION = 0.9  # of the level c that the bound allows
+SAFE_LEVEL_FRACTION = 0.9  # part of the level c that the bound allows
 LEVEL_BISECTIONS = 50
-MIN_GROWTH_RATE = 1e-6  # 1/s, growth that is not rounding
-# Shapes that are tried: part of the slowest decay, and P's right side beside K'K/U^2, by its size and the arm's part.
+MIN_GROWTH_RATE = 1e-6  # 1/s, the smallest growth rate that counts as instability and not as rounding
+# Shapes to try: shift as a part of the slowest decay; size of the diagonal that joins K'K/U^2 on the right side of P's
+# Lyapunov equation; weight of the arm in that diagonal.
 DECAY_FRACTIONS, RIGHT_SIDE_SIZES, ARM_WEIGHT_FRACTIONS = (0.5, 0.9), (1.0, 100.0), (1e-3, 1e-1)
 
 
 class _ClosedLoops(NamedTuple):
-    """Closed loops, stacked: the plant, A (n, 6, 6), K/U (n, 1, 6), rows (n, m, 6) with |row x| <= 1 where linear."""
+    """Stacked closed loops: the plant, A (n, 6, 6), K/U (n, 1, 6), and rows (n, m, 6).
+
+    The loop is linear where |row x| <= 1 for every row.
+    """
 
     plant: Any
     closed: np.ndarray
@@ -45,38 +57,50 @@ class _ClosedLoops(NamedTuple):
 
 
 class CaptureEllipsoids(NamedTuple):
-    """S (n, 6, 6), infinite where nothing can be said, so that x'Sx <= 1 holds nowhere; and (n,) whether the loop is
-    unstable about upright, so that almost no start comes to rest there."""
+    """Capture ellipsoids of n loops.
+
+    Attributes:
+        shapes: S, shape (n, 6, 6). Infinite where no ellipsoid is known, so that x'Sx <= 1 holds nowhere.
+        unstable: Whether the loop is unstable about upright, shape (n,). Almost no start then comes to rest there.
+    """
 
     shapes: np.ndarray
     unstable: np.ndarray
 
 
 def capture_ellipsoids(loop: Loop, values: Mapping[str, Any]) -> CaptureEllipsoids:
-    """What is sure of loops that differ in the values (n, ...) at these paths.
+    """Return the capture ellipsoids of loops that differ in the values at these paths.
 
-    Raises ValueError for a loop of which this module can never say anything.
+    Args:
+        loop: Loop of a balance with feedback of the whole state.
+        values: Values by path, each of shape (n, ...).
+
+    Raises:
+        ValueError: A loop with a part for which no ellipsoid is known.
     """
     systems = _build_closed_loops(loop, values)
     found = CaptureEllipsoids(np.full_like(systems.closed, np.inf), np.zeros(len(systems.closed), bool))
     known = np.flatnonzero(np.isfinite(systems.closed).all(axis=(1, 2)))
     if len(known):
         slowest = -np.linalg.eigvals(systems.closed[known]).real.max(axis=-1)
+        # A pole within rounding of the imaginary axis counts neither as stable nor as unstable.
         found.unstable[known] = slowest < -MIN_GROWTH_RATE
         found.shapes[known] = _largest_ellipsoids(jax.tree.map(lambda x: x[known], systems), slowest)
     return found
 
 
 def _largest_ellipsoids(systems: _ClosedLoops, slowest: np.ndarray) -> np.ndarray:
-    """Of the shapes that are tried, the ellipsoid with the greatest volume; none where the slowest decay is not > 0."""
+    """Return the ellipsoid of largest volume among the tried shapes; inf where the slowest decay is not positive."""
     best = np.full_like(systems.closed, np.inf)
     volume = np.full(len(best), np.inf)
     for decay in DECAY_FRACTIONS:
         for size in RIGHT_SIDE_SIZES:
             for arm in ARM_WEIGHT_FRACTIONS:
+                # K'K/U^2 on the right makes the ellipsoid narrow in the direction in which the voltage saturates.
                 side = np.diag([1.0, arm, 1.0, 1.0, arm, 1.0]) * size + _square(systems.gain)
                 found = _scale_to_largest_level(systems, _solve_lyapunov(systems.closed, decay * slowest, side))
                 sure = (slowest > 0) & np.isfinite(found[:, 0, 0])
+                # The volume is proportional to det(S)^(-1/2): the smallest log det S wins.
                 log = np.linalg.slogdet(np.where(sure[:, None, None], found, np.eye(6)))[1]
                 better = sure & (log < volume)
                 best[better], volume[better] = found[better], log[better]
@@ -84,8 +108,9 @@ def _largest_ellipsoids(systems: _ClosedLoops, slowest: np.ndarray) -> np.ndarra
 
 
 def _build_closed_loops(loop: Loop, values: Mapping[str, Any]) -> _ClosedLoops:
-    """In float64 whatever the loop is in."""
+    """Return the closed loops in float64, for a loop of any precision."""
     _check_supported(loop)
+    # float64 on the CPU: an accelerator may have no float64.
     with jax.enable_x64(True), jax.default_device(jax.local_devices(backend="cpu")[0]):
         values = {path: np.asarray(column, float) for path, column in values.items()}
         exact = jax.tree.map(lambda x: np.asarray(x, float), loop)
@@ -95,6 +120,7 @@ def _build_closed_loops(loop: Loop, values: Mapping[str, Any]) -> _ClosedLoops:
     gain = many.controller.gain
     most = many.actuator.voltage_max if isinstance(loop.actuator, VoltageLimit) else np.full(len(a), np.inf)
     asked = (gain / most[:, None])[:, None]
+    # Each limit is a row with |row x| <= 1: voltage, fall angle, and the plant's own limits of its motor.
     lean = (np.eye(6)[:1] / many.stop.angle[:, None])[:, None]
     return _ClosedLoops(
         many.plant, a + b @ gain[:, None], asked, np.concatenate([asked, lean, many.plant.limits(gain)], 1)
@@ -102,6 +128,7 @@ def _build_closed_loops(loop: Loop, values: Mapping[str, Any]) -> _ClosedLoops:
 
 
 def _check_supported(loop: Loop) -> None:
+    """Raise ValueError for a part outside the analysis."""
     known = {"controller": BalanceFeedback, "sensor": Direct, "actuator": Direct | VoltageLimit, "stop": Fallen}
     for name, kind in known.items():
         if not isinstance(getattr(loop, name), kind):
@@ -115,24 +142,27 @@ def _square(rows: np.ndarray) -> np.ndarray:
 
 
 def _solve_lyapunov(a: np.ndarray, shift: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """P of (A + shift I)'P + P (A + shift I) = -side, per system."""
+    """Return P of (A + shift I)'P + P (A + shift I) = -side, shape (n, 6, 6)."""
     eye = np.eye(6)
     moved = np.swapaxes(a + shift[:, None, None] * eye, -1, -2)
+    # The Kronecker form of the Lyapunov equation: 36 unknowns for a state of 6, one batched solve.
     operator = np.einsum("nij,kl->nikjl", moved, eye) + np.einsum("ij,nkl->nikjl", eye, moved)
     p = np.linalg.solve(operator.reshape(-1, 36, 36), -side.reshape(-1, 36, 1)).reshape(a.shape)
     return (p + np.swapaxes(p, -1, -2)) / 2
 
 
 def _scale_to_largest_level(systems: _ClosedLoops, p: np.ndarray) -> np.ndarray:
-    """S = P/c with the largest c that the bound allows; infinite where P is no Lyapunov matrix."""
+    """Return S = P/c with the largest c that the bound allows; infinite where P is no Lyapunov matrix."""
     usable = np.linalg.eigvalsh(p)[:, 0] > 0
     p = np.where(usable[:, None, None], p, np.eye(6))
     root = np.linalg.inv(np.linalg.cholesky(p))
+    # In the coordinates of P = I the largest eigenvalue of A'P + PA is -2 g.
     falling = root @ (np.swapaxes(systems.closed, -1, -2) @ p + p @ systems.closed) @ np.swapaxes(root, -1, -2)
     decay = -np.linalg.eigvalsh(falling)[:, -1] / 2
     inverse = _square(root)
     reach = np.einsum("nmi,nij,nmj->nm", systems.limits, inverse, systems.limits)
     low, high = np.zeros(len(p)), 1 / reach.max(axis=1)
+    # Bisection; the largest level that the linear limits admit is tried first, and low = high ends the search there.
     for tried in [high] + [None] * LEVEL_BISECTIONS:
         level = (low + high) / 2 if tried is None else tried
         fine = _growth(systems, p, inverse, level) < decay
@@ -142,9 +172,10 @@ def _scale_to_largest_level(systems: _ClosedLoops, p: np.ndarray) -> np.ndarray:
 
 
 def _growth(systems: _ClosedLoops, p: np.ndarray, inverse: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """The sum over k in V' <= -2 V (g - sum), per system."""
+    """Return the sum over k in V' <= -2 V (g - sum), shape (n,)."""
 
     def extent(row: Any) -> np.ndarray:
+        """Return the largest |row x| on the ellipsoid x'Px <= level."""
         row = np.broadcast_to(row, (len(p), 6))
         return np.sqrt(level * np.einsum("ni,nij,nj->n", row, inverse, row))
 

@@ -1,7 +1,7 @@
-"""The loops of a box one by one, each with its parameters fixed: what is known of a gain that has no common P.
+"""The frozen loops of a box, each with its parameters fixed, for a gain that has no common P.
 
-Stable frozen loops are no proof for parameters that vary, and their poles are floating point; but a gain that no common
-Lyapunov matrix proves is not therefore unstable.
+Stable frozen loops are no proof for parameters that vary, and their poles are floating point. A gain without a common
+Lyapunov matrix is not necessarily unstable: the frozen loops show how stable it is for fixed parameters.
 """
 
 import itertools
@@ -14,12 +14,18 @@ from diffabs.core.pytree import replace
 from diffabs.design.parameter_box import check_box_bounds, evaluate_systems
 from diffabs.design.polytopes import as_gain_matrix
 
-MAX_POINTS_PER_AXIS, MAX_BOX_SYSTEMS = 17, 5000  # per parameter, and in all
+MAX_POINTS_PER_AXIS, MAX_BOX_SYSTEMS = 17, 5000  # points per parameter; systems in all
 
 
 class FrozenLoops(NamedTuple):
-    """How many systems of a box were looked at, how many of them a gain stabilises, and the decay rate [1/s] of the
-    slowest mode of all, negative where it grows, with the parameters there."""
+    """Stability of the frozen loops of a box.
+
+    Attributes:
+        systems: Number of systems on the grid.
+        stable: Number of these systems that the gain stabilises.
+        slowest: Decay rate [1/s] of the slowest mode of all systems, negative if it grows.
+        at: Parameters of the system with the slowest mode.
+    """
 
     systems: int
     stable: int
@@ -28,12 +34,20 @@ class FrozenLoops(NamedTuple):
 
 
 def analyse_frozen_loops(gain: Any, model: Any, over: Mapping[str, Sequence[float]]) -> FrozenLoops:
-    """The poles of A + B K at the points of a grid over the box {path: (low, high)}, its corners among them.
+    """Return the stability of A + B K at the points of a grid over a box, corners included.
 
-    Raises ValueError as `box.polytope`, and for a gain that does not fit.
+    Args:
+        gain: Gain K, shape (m, n) or (n,).
+        model: Model with `matrices()`, `states` and `period`.
+        over: Box {path: (low, high)}.
+
+    Raises:
+        ValueError: A gain that does not fit, or a box as in `parameter_box.polytope`.
     """
     low, high = check_box_bounds(model, over)
     free = tuple(path for path in over if low[path] < high[path])
+    # The largest equal number of points per axis whose grid stays within MAX_BOX_SYSTEMS; 1e-9 undoes rounding of the
+    # root.
     count = max(2, min(MAX_POINTS_PER_AXIS, int(MAX_BOX_SYSTEMS ** (1 / max(len(free), 1)) + 1e-9)))
     points = itertools.product(*(np.linspace(low[path], high[path], count) for path in free))
     grid = np.array(list(points)).reshape(count ** len(free), len(free))
@@ -43,6 +57,7 @@ def analyse_frozen_loops(gain: Any, model: Any, over: Mapping[str, Sequence[floa
     if model.period is None:
         rates = -modes.real.max(axis=1)
     else:
+        # A deadbeat loop has only poles at 0: the smallest float keeps its rate finite.
         rates = -np.log(np.maximum(np.abs(modes).max(axis=1), np.finfo(float).tiny)) / float(model.period)
     i = int(np.argmin(rates))
     at = {**low, **dict(zip(free, grid[i].tolist(), strict=True))}

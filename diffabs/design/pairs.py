@@ -1,14 +1,17 @@
-"""That two vertices alone have no common P, without a solver.
+"""Multipliers from two vertices that exclude a common P, without a solver.
 
-V = x' P x falls along x' = C x where it falls along x' = C^-1 x, so with a common P every M(k) = C_i + k D, k > 0, is
-stable, for D = C_j and for D = C_j^-1. M(k) is singular where -k is an eigenvalue of C_i C_j (of C_i C_j^-1): with a
-negative one there is no P, of order 2 with neither there is one (Shorten and Narendra 2002).
+V = x'P x falls along x' = C x exactly if it falls along x' = C^-1 x. With a common P every M(k) = C_i + k D, k > 0, is
+therefore stable, for D = C_j and for D = C_j^-1. M(k) is singular where -k is an eigenvalue of C_i C_j (for D = C_j^-1)
+or of C_i C_j^-1 (for D = C_j). If one of these products has a negative eigenvalue, no P exists. For order 2 a P exists
+if neither product has a negative eigenvalue (Shorten and Narendra 2002).
 
-Beyond such a k, M(k) has modes x with growth s > 0, and V_i = sum x x*, V_j = sum k x x* over some k are multipliers:
+Beyond such a k, M(k) has modes x with growth s > 0. Sums over some k give multipliers V_i = sum x x* and V_j = sum k x
+x*:
 
     He(C_i V_i) + He(D V_j) = sum 2 s x x* > 0        W_i = V_i, W_j = V_j or, for D = C_j^-1, D V_j D'
 
-In discrete time V falls by factor^2 along C where it falls along (C - factor I)(C + factor I)^-1 in continuous time.
+In discrete time V falls by factor^2 along C exactly if it falls along (C - factor I)(C + factor I)^-1 in continuous
+time.
 """
 
 import itertools
@@ -20,15 +23,15 @@ import numpy as np
 
 from diffabs.design.sdp.solver import he
 
-MAX_PAIRED_VERTICES = 64  # vertices of which every pair is looked at
-RANGE_EXTENSION = 1e3  # how far past the last change of sign
-MAX_PAIRS = 8  # pairs, those first whose M(k) is unstable for the widest range of k
-RANGE_POINTS = 16  # of a range of k
-OTHERS_SHARE = 1e-3  # of the multipliers' strength that the other vertices may take
+MAX_PAIRED_VERTICES = 64  # no pairs are tried above this number of vertices
+RANGE_EXTENSION = 1e3  # factor by which a range extends beyond the last change of sign
+MAX_PAIRS = 8  # pairs to try, in decreasing order of the width of their range of k
+RANGE_POINTS = 16  # points in a range of k
+OTHERS_SHARE = 1e-3  # largest share of W_i + W_j for each of the other vertices
 
 
 class Pair(NamedTuple):
-    """Vertices i and j, whether j counts by its inverse, and the range of k in which M(k) is unstable."""
+    """Vertices i and j, whether D is the inverse of C_j, and the range (low, high) of k with an unstable M(k)."""
 
     i: int
     j: int
@@ -38,21 +41,28 @@ class Pair(NamedTuple):
 
 
 def witnesses(closed: np.ndarray, factor: float | None = None) -> Iterator[np.ndarray]:
-    """Multipliers W (V, n, n) of the closed loops (V, n, n), each of which may be a proof, `infeasible` of
-    `certificate`; nothing where no pair refutes. `factor` is that of discrete time; a rate is added to C before.
+    """Yield candidate multipliers W, shape (vertices, n, n), for a proof that no common P exists.
 
-    In floats: whether they prove anything is for `exact` to say. More than LARGEST vertices are not looked at.
+    They are floating point: `design.proof.exact` decides whether they prove anything. The iterator is empty if no pair
+    excludes a common P, or above MAX_PAIRED_VERTICES vertices.
+
+    Args:
+        closed: Closed loops C, shape (vertices, n, n); in continuous time with the rate already added to the diagonal.
+        factor: Factor of the decay per step in discrete time; None for continuous time.
     """
     one = np.eye(closed.shape[-1])
     flows = closed
     if len(closed) > MAX_PAIRED_VERTICES:
         return
     try:
+        # The Cayley transform maps discrete time to continuous time; W of the transformed loops returns as back W
+        # back'.
         back = one if factor is None else np.linalg.inv(closed + factor * one)
         flows = closed if factor is None else (closed - factor * one) @ back
         inverses = np.linalg.inv(flows)
     except np.linalg.LinAlgError:
         return
+    # Widest range of k first: its M(k) are furthest from stable ones.
     for pair in sorted(unstable_pairs(flows, inverses), key=lambda pair: pair.low / pair.high)[:MAX_PAIRS]:
         W = back @ multipliers(pair, flows, inverses) @ np.swapaxes(np.broadcast_to(back, flows.shape), 1, 2)
         W = (W + np.swapaxes(W, 1, 2)) / 2
@@ -61,33 +71,56 @@ def witnesses(closed: np.ndarray, factor: float | None = None) -> Iterator[np.nd
 
 
 def unstable_pairs(flows: np.ndarray, inverses: np.ndarray) -> Iterator[Pair]:
-    """The ranges of k between sign changes of det M(k), or up to BEYOND times the last, where M(k) is not stable."""
+    """Yield the ranges of k on which M(k) is unstable.
+
+    A range lies between two sign changes of det M(k), or extends from the last one by the factor RANGE_EXTENSION.
+
+    Args:
+        flows: Closed loops C, shape (vertices, n, n).
+        inverses: Their inverses, shape (vertices, n, n).
+    """
     sign = (-1.0) ** flows.shape[-1]  # of the determinant of a stable matrix
     for inverse, others, products in ((False, flows, inverses), (True, inverses, flows)):
         for i, j in itertools.combinations(range(len(flows)), 2):
             for low, high in itertools.pairwise(singular_factors(flows[i] @ products[j])):
+                # det M(k) keeps its sign between two singular k, so one point, the geometric mean, decides for the
+                # whole range.
                 middle = flows[i] + math.sqrt(low * high) * others[j]
                 if high > low and sign * np.linalg.slogdet(middle)[0] < 0:
                     yield Pair(i, j, inverse, low, high)
 
 
 def singular_factors(product: np.ndarray) -> list[float]:
-    """Every k > 0 for which -k is an eigenvalue, in order, and one far below and above them."""
+    """Return every k > 0 for which -k is an eigenvalue, increasing, with one value far below and one far above.
+
+    Args:
+        product: Product of two closed loops, shape (n, n).
+    """
     modes = np.linalg.eigvals(product)
     k = np.sort(-np.real(modes[(np.real(modes) < 0) & (np.abs(np.imag(modes)) <= 1e-12 * np.abs(modes))]))
     return [float(k[0]) / RANGE_EXTENSION, *map(float, k), float(k[-1]) * RANGE_EXTENSION] if len(k) else []
 
 
 def multipliers(pair: Pair, flows: np.ndarray, inverses: np.ndarray) -> np.ndarray:
-    """W (V, n, n), of i and j as above, of the others as much of their sum as the inequality can bear; 0 if none."""
+    """Return the multipliers W of a pair, shape (vertices, n, n).
+
+    Each other vertex gets the share OTHERS_SHARE of W_i + W_j, or as much of it as the inequality bears.
+
+    Args:
+        pair: Two vertices and a range of k.
+        flows: Closed loops C, shape (vertices, n, n).
+        inverses: Their inverses, shape (vertices, n, n).
+    """
     C, D = flows[pair.i], (inverses if pair.inverse else flows)[pair.j]
     k = pair.low * (pair.high / pair.low) ** ((np.arange(RANGE_POINTS) + 0.5) / RANGE_POINTS)
     modes, vectors = np.linalg.eig(C + k[:, None, None] * D)
+    # A mode with growth s adds 2 s x x* to the sum. Decaying modes would subtract from it.
     growing = np.where(np.real(modes) > 0, 1.0, 0.0)
     each = np.real(np.einsum("kim,km,kjm->kij", vectors, growing, vectors.conj()))
     both, second = each.sum(axis=0), np.tensordot(k, each, 1)
     W = np.zeros(flows.shape)
     W[pair.i], W[pair.j] = both, D @ second @ D.T if pair.inverse else second
+    # The factor keeps the sum over the vertices positive definite; inf makes the share of the others 0.
     others, total = np.setdiff1d(np.arange(len(flows)), (pair.i, pair.j)), W.sum(axis=0)
     W[others] = (
         OTHERS_SHARE
@@ -98,7 +131,12 @@ def multipliers(pair: Pair, flows: np.ndarray, inverses: np.ndarray) -> np.ndarr
 
 
 def least_dominating_factor(strength: np.ndarray, taken: np.ndarray) -> float:
-    """The least c for which c times a positive definite matrix and another are not negative; inf if it is not."""
+    """Return the smallest c for which c strength + taken is positive semidefinite; inf for an indefinite strength.
+
+    Args:
+        strength: Symmetric matrix, shape (n, n).
+        taken: Symmetric matrix, shape (n, n).
+    """
     try:
         root = np.linalg.inv(np.linalg.cholesky(strength))
     except np.linalg.LinAlgError:

@@ -1,9 +1,9 @@
-"""From a box of parameters to a polytope that covers it.
+"""Polytopes that cover a box of parameters.
 
-The corners of the box give the vertices. Where the matrices depend on the parameters as they do in Maeda and Sugiura's
-eq. (16), through alpha(m)/omega and beta/omega, the hull of the corners contains the whole box. In general it does
-not, so it is checked on grids and random points, and the vertices are moved outwards until all of those lie inside.
-What lies between the checked points is not proved to be covered.
+The corners of the box give the vertices. If the matrices depend on the parameters as in eq. (16) of Maeda and Sugiura,
+through alpha(m)/omega and beta/omega, the hull of the corners contains the whole box. In general it does not. The
+module therefore checks the hull on grids and random points, and moves the vertices outwards until all points lie
+inside. The systems between the checked points have no proof of coverage.
 
     gauge(x) = min t with x in c + t (hull - c),  c the vertices' mean:  covered if gauge <= 1
 """
@@ -21,22 +21,20 @@ from diffabs.core.pytree import parameters, replace
 from diffabs.core.validity import check_part
 from diffabs.design.polytopes import MAX_VERTICES, Coverage, Polytope, Schedule
 
-CHUNK = 1024  # systems computed at once
-ENTRY_TOLERANCE = 1e-10  # an entry that varies by less, relative to itself, is constant
-MIN_RELATIVE_EXTENT = (
-    1e-9  # a direction in which the data reach less far than this, relative to the furthest, does not count
-)
-GAUGE_TOLERANCE = 1e-9  # gauges are known to about this
-RANDOM_POINTS = 2000  # points checked between those of a grid, each time
-MAX_COVER_ROUNDS = 6  # of checking and growing
-MAX_CORNER_SPREAD = 2.0  # factor by which corners are spread, at most, before a box takes their place
-RANK_TOLERANCE = 1e-6  # corners that reach less far than this in some direction are flat
+CHUNK = 1024  # systems of one batch
+ENTRY_TOLERANCE = 1e-10  # relative variation below which an entry counts as constant
+MIN_RELATIVE_EXTENT = 1e-9  # relative extent of the data below which a direction is ignored
+GAUGE_TOLERANCE = 1e-9  # accuracy of a gauge
+RANDOM_POINTS = 2000  # random points of each check, between the points of the grid
+MAX_COVER_ROUNDS = 6  # rounds of checking and growing
+MAX_CORNER_SPREAD = 2.0  # largest factor by which corners are spread; above it a box replaces them
+RANK_TOLERANCE = 1e-6  # corners with a smaller extent in some direction are flat
 FACETS = (6, 256)  # facets are computed up to this dimension and number of vertices; above, linear programs
 PROBES = 200  # directions whose extreme systems the linear programs check
 
 
 class _SystemRows(NamedTuple):
-    """Systems as rows A, B flattened."""
+    """Systems as rows of the flattened A and B."""
 
     rows: np.ndarray
     order: int
@@ -51,24 +49,33 @@ class _SystemRows(NamedTuple):
 
 
 def polytope(model: Any, over: Mapping[str, Sequence[float]], *, grid: int = 9, most: int = 20_000) -> Polytope:
-    """The polytope of `model`, which has `matrices()`, `states` and `period`, over a box {path: (low, high)}.
+    """Return the polytope that covers `model` over a box {path: (low, high)}.
 
-    `grid` points per parameter are checked, then twice as many, but not more than `most` of them at once, and 2000
-    random points each time, until a new look finds nothing outside. If some lie outside of the corners' hull, the
-    corners are spread about their mean by the smallest factor that covers them: `coverage.spread`, 1 where the corners
-    suffice. Where that factor would exceed 2, or the systems leave the plane of the corners (a curved dependence on
-    one parameter: factor inf), the vertices are those of a box along the systems' principal directions, and `corners`
-    is empty. Vertices inside the hull of the others are dropped. Covered means to 1e-9 of the range of an entry.
+    The check uses a grid and 2000 random points, then twice as fine a grid, until a new check finds no system outside.
+    If systems lie outside the corners' hull, the corners are spread about their mean by the smallest factor that covers
+    them. `coverage.spread` is that factor, 1 if the corners suffice.
 
-    >>> from diffabs.design import polytope
-    >>> from diffabs.linear import SlipModel
-    >>> box = polytope(SlipModel(), {"plant.mass": (5.3, 6.2), "speed": (1.4, 13.9)})
-    >>> box.A.shape, box.B.shape, box.coverage.spread
-    ((4, 2, 2), (4, 2, 1), 1.0)
+    If the factor exceeds 2, a box along the systems' principal directions replaces the corners. The factor is inf if
+    the systems leave the plane of the corners (a curved dependence on one parameter). `corners` of a box is empty.
+
+    Vertices inside the hull of the others are dropped. Coverage holds to 1e-9 of the range of an entry.
+
+    Args:
+        model: Model with `matrices()`, `states` and `period`.
+        over: Box {path: (low, high)} of parameters of the model.
+        grid: Points per parameter of the first check.
+        most: Largest number of grid points in one check.
 
     Raises:
-        ValueError: a path that is no parameter of the model, an interval that is inverted, not finite or outside of the
-            parameter's range, a period that varies, more than 2^12 vertices, matrices that are not finite.
+        ValueError: A path that is no parameter of the model; an interval that is inverted, not finite or out of range;
+            a period that varies; more than 2^12 vertices; matrices that are not finite.
+
+    Examples:
+        >>> from diffabs.design import polytope
+        >>> from diffabs.linear import SlipModel
+        >>> box = polytope(SlipModel(), {"plant.mass": (5.3, 6.2), "speed": (1.4, 13.9)})
+        >>> box.A.shape, box.B.shape, box.coverage.spread
+        ((4, 2, 2), (4, 2, 1), 1.0)
     """
     _require_scipy()
     low, high = check_box_bounds(model, over)
@@ -89,11 +96,18 @@ def polytope(model: Any, over: Mapping[str, Sequence[float]], *, grid: int = 9, 
 def schedule(
     model: Any, over: Mapping[str, Sequence[float]], along: str, nodes: int | Sequence[float], **options: Any
 ) -> Schedule:
-    """A chain of polytopes: the box, cut along one of its parameters at `nodes`. A number of cells cuts in geometric
-    progression (linearly where the interval reaches 0 or below). Options as for `polytope`.
+    """Return a chain of polytopes: the box, cut along one of its parameters at `nodes`.
+
+    Args:
+        model: Model with `matrices()`, `states` and `period`.
+        over: Box {path: (low, high)} of parameters of the model.
+        along: Path of the parameter to cut along.
+        nodes: Increasing nodes from the low to the high end, or a number of cells. A number cuts in geometric
+            progression, or linearly if the interval reaches 0 or below.
+        options: Options of `polytope`.
 
     Raises:
-        ValueError: a parameter that is not in the box, nodes that do not increase from its low to its high end.
+        ValueError: A parameter outside the box, or nodes that do not increase from its low to its high end.
     """
     if along not in over:
         raise ValueError(f"along = '{along}' is not a parameter of the box; there is {', '.join(over) or 'nothing'}")
@@ -119,7 +133,16 @@ def _require_scipy() -> None:
 
 
 def check_box_bounds(model: Any, over: Mapping[str, Sequence[float]]) -> tuple[dict[str, float], dict[str, float]]:
-    """The low and the high end of every interval, checked."""
+    """Return the low and the high end of every interval, after a check of each.
+
+    Args:
+        model: Model whose parameters the paths name.
+        over: Box {path: (low, high)}.
+
+    Raises:
+        ValueError: A path that is no scalar parameter, an inverted interval, a value out of range, or a period that
+            varies.
+    """
     known = {path: value for path, _, value in parameters(model)}
     for path, ends in over.items():
         if path not in known:
@@ -144,8 +167,18 @@ def _batch(model: Any, free: tuple[str, ...], points: Any) -> Any:
 
 
 def evaluate_systems(model: Any, free: tuple[str, ...], points: np.ndarray) -> _SystemRows:
-    """The matrices at points (N, k) of the box, in float64."""
+    """Return the matrices at points of the box, in float64.
+
+    Args:
+        model: Model with `matrices()`.
+        free: Paths of the varied parameters.
+        points: Values of these parameters, shape (N, k).
+
+    Raises:
+        ValueError: Matrices that are not finite.
+    """
     parts, n, m = [], 0, 0
+    # Rounding of float32 would exceed the tolerance of the gauge.
     with jax.enable_x64(True):
         for chunk in np.split(points, range(CHUNK, len(points), CHUNK)):
             filled = np.concatenate([chunk, np.repeat(chunk[:1], CHUNK - len(chunk), 0)])  # one shape, one compilation
@@ -161,7 +194,7 @@ def evaluate_systems(model: Any, free: tuple[str, ...], points: np.ndarray) -> _
 
 
 def _points(box: np.ndarray, grid: int, most: int, seed: int) -> np.ndarray:
-    """A grid over the box and random points in it."""
+    """Return a grid over the box and random points in it, shape (points, k)."""
     k = len(box)
     count = max(2, min(grid, int(most ** (1 / k) + 1e-9)))
     axes = [np.linspace(low, high, count) for low, high in box]
@@ -173,16 +206,18 @@ def _points(box: np.ndarray, grid: int, most: int, seed: int) -> np.ndarray:
 def _cover_box(
     model: Any, free: tuple[str, ...], box: np.ndarray, corners: _SystemRows, grid: int, most: int
 ) -> tuple[np.ndarray, Sequence[int], Coverage]:
-    """Vertices as rows, which corners they are, and what was checked."""
+    """Return the vertices as rows, their corner numbers, and the coverage."""
     if not free:
         return corners.rows, [0], Coverage(1, 0.0, 1.0)
     seen, hull = corners.rows, None
     for i in range(MAX_COVER_ROUNDS):
+        # The seed differs in each round, so that the random points of the last round are new to the hull.
         new = evaluate_systems(model, free, _points(box, (grid - 1) * 2 ** min(i, 1) + 1, most, i)).rows
         seen, reach = np.concatenate([seen, new]), hull.reach(new)[0] if hull else 1.0
         if hull and reach <= 1 + GAUGE_TOLERANCE:
             break
-        # what this look found beyond the last is granted once more, to what lies between its points
+        # The excess that this check finds beyond the last hull is added once more, as a margin for the systems between
+        # its points.
         hull = _Hull.around(corners.rows, seen, reach if np.isfinite(reach) else 1.0)
     assert hull is not None
     furthest, checked = hull.reach(seen)
@@ -192,7 +227,7 @@ def _cover_box(
 
 
 class _PlaneCoordinates(NamedTuple):
-    """The plane in which the rows lie, and coordinates in it: each reaches over an interval of length 2."""
+    """The plane that contains the rows, and coordinates in it, each over an interval of length 2."""
 
     origin: np.ndarray
     scale: np.ndarray
@@ -202,9 +237,11 @@ class _PlaneCoordinates(NamedTuple):
     @classmethod
     def of(cls, rows: np.ndarray) -> "_PlaneCoordinates":
         size, extent = np.abs(rows).max(axis=0), np.ptp(rows, axis=0)
+        # A constant entry varies only by rounding. It must not become a direction of the plane.
         varies = extent > ENTRY_TOLERANCE * size
         scale = np.where(varies, extent, np.where(size > 0, size, 1.0))
         z = (rows - rows[0]) / scale
+        # `* varies` removes the constant entries from the basis.
         basis = np.linalg.svd(z - z.mean(axis=0), full_matrices=False)[2] * varies
         half = np.ptp(z @ basis.T, axis=0) / 2
         return cls(rows[0], scale, basis[half > MIN_RELATIVE_EXTENT], half[half > MIN_RELATIVE_EXTENT])
@@ -220,7 +257,7 @@ class _PlaneCoordinates(NamedTuple):
 
 
 class _Hull(NamedTuple):
-    """Vertices as rows and in the coordinates of a frame; the factor that the corners needed; whether it is a box."""
+    """Vertices as rows and in plane coordinates, the spread that the corners need, and whether the hull is a box."""
 
     frame: _PlaneCoordinates
     rows: np.ndarray
@@ -230,12 +267,13 @@ class _Hull(NamedTuple):
 
     @classmethod
     def around(cls, corners: np.ndarray, seen: np.ndarray, margin: float) -> "_Hull":
-        """The corners if they cover what was seen, spread by up to WIDEST if not, else a box."""
+        """Return the corners, spread by up to MAX_CORNER_SPREAD to cover all rows, or else a box."""
         frame = _PlaneCoordinates.of(seen)
         v, x = frame.to_plane(corners), frame.to_plane(seen)
         needed = _largest_gauge(v, x)[0]
         spread = 1.0 if needed <= 1 + GAUGE_TOLERANCE else needed * margin * (1 + GAUGE_TOLERANCE)
         count = 2 ** len(frame.half)
+        # A box in many directions has too many vertices: then widely spread corners are the only hull.
         if spread <= MAX_CORNER_SPREAD or (np.isfinite(spread) and count > MAX_VERTICES):
             rows, v = (a.mean(axis=0) + spread * (a - a.mean(axis=0)) if spread > 1 else a for a in (corners, v))
             return cls(frame, rows, v, spread, False)
@@ -248,7 +286,7 @@ class _Hull(NamedTuple):
         return cls(frame, frame.from_plane(v), v, spread, True)
 
     def reach(self, rows: np.ndarray) -> tuple[float, int]:
-        """The largest gauge of the rows, and how many were looked at."""
+        """Return the largest gauge of the rows, and the number of rows."""
         if not self.frame.holds(rows):
             return np.inf, len(rows)
         x = self.frame.to_plane(rows)
@@ -259,8 +297,11 @@ class _Hull(NamedTuple):
 
 
 def _largest_gauge(v: np.ndarray, x: np.ndarray) -> tuple[float, int]:
-    """The largest gauge of points x (N, d) in the hull of v (V, d), and how many of them were looked at: beyond some
-    size only those that reach furthest in one of many directions. Infinite if v is flat."""
+    """Return the largest gauge of points x (N, d) in the hull of v (V, d), and the number of checked points.
+
+    For large hulls it checks only the points that reach furthest in one of many directions. The gauge is infinite if v
+    is flat.
+    """
     centre = v.mean(axis=0)
     v, x, d = v - centre, x - centre, v.shape[1]
     if not d:
@@ -281,7 +322,7 @@ def _largest_gauge(v: np.ndarray, x: np.ndarray) -> tuple[float, int]:
 
 
 def _extreme_points(v: np.ndarray) -> list[int]:
-    """Which points span the hull of v."""
+    """Return the indices of the points that span the hull of v."""
     if not v.shape[1]:
         return [0]
     if v.shape[1] == 1:
@@ -292,7 +333,10 @@ def _extreme_points(v: np.ndarray) -> list[int]:
 
 
 def _facets(v: np.ndarray) -> Any:
-    """The hull of v (V, d) with its facets; None where they are too many, or merge by rounding (64 points in 6-d)."""
+    """Return the hull of v (V, d) with its facets, or None.
+
+    None stands for too many facets, or for facets that merge by rounding (64 points in 6-d).
+    """
     from scipy.spatial import ConvexHull, QhullError
 
     if v.shape[1] > FACETS[0] or len(v) > FACETS[1]:

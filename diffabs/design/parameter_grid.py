@@ -1,9 +1,10 @@
-"""From a box of parameters to the systems on a grid of it: for models that are rational in their parameters.
+"""Polytopes of the systems on a grid of a box, for models that are rational in their parameters.
 
 A balance's A and B contain the inverse of a mass matrix. The hull of the corners of a box of masses then covers the box
-only if it is spread so far that it contains systems no vehicle has, and no gain holds those. So the vertices are the
-systems on the grid, corners included, and what is proved is about their hull: between the points it is likely, not
-proved. A finer grid says more.
+only with a large spread. Such a hull contains systems that no vehicle has, and no gain stabilises them.
+
+The vertices are therefore the systems on the grid, corners included, and a proof is about their hull. Coverage of the
+systems between the points is likely, not proved. A finer grid makes it more likely.
 """
 
 import itertools
@@ -18,11 +19,15 @@ from diffabs.design.polytopes import MAX_VERTICES, Polytope
 
 
 def grid_polytope(model: Any, over: Mapping[str, Sequence[float]], points: int = 3) -> Polytope:
-    """The polytope whose vertices are the systems of `model` at `points` values of each parameter of the box {path:
-    (low, high)}, its ends among them.
+    """Return the polytope whose vertices are the systems of `model` on a grid over a box, its ends included.
+
+    Args:
+        model: Model with `matrices()`, `states` and `period`.
+        over: Box {path: (low, high)} of parameters of the model.
+        points: Values of each parameter, >= 2.
 
     Raises:
-        ValueError: as `box.polytope`; fewer than two points, more than 2^12 systems.
+        ValueError: A box as in `parameter_box.polytope`, fewer than two points, or more than 2^12 systems.
     """
     if points < 2:
         raise ValueError(f"points = {points} is outside [2, inf): a grid has the ends of the box")

@@ -1,9 +1,10 @@
-"""Sets of linear systems: what a robust design is robust against.
+"""Sets of linear systems for robust design.
 
     Polytope    x' = A x + B u (or x+ = A x + B u),  (A, B) anywhere, at any time, in the convex hull of the vertices
-    Schedule    a chain of polytopes along one parameter that is measured, such as speed
+    Schedule    a chain of polytopes along one measured parameter, such as speed
 
-Maeda and Sugiura, section 3. Their eq. (22) pairs A of one speed with B of another; here a vertex is a pair.
+Source: Maeda and Sugiura, section 3. Their eq. (22) pairs A of one speed with B of another; here a vertex is a pair (A,
+B) of the same parameters.
 """
 
 import dataclasses
@@ -12,13 +13,18 @@ from typing import Any
 
 import numpy as np
 
-MAX_VERTICES = 2**12  # vertices; an LMI for each
+MAX_VERTICES = 2**12  # each vertex adds an LMI
 
 
 @dataclasses.dataclass(frozen=True)
 class Coverage:
-    """What was checked about a hull: how many systems of a dense grid over the box lie in it, how far the furthest
-    reaches (1 = on the boundary, relative to the centre), and by what factor the corners were spread to cover all."""
+    """The check of a hull against systems of the box.
+
+    Attributes:
+        checked: Number of systems of a dense grid over the box that were checked.
+        furthest: Largest gauge of these systems: 1 on the boundary, relative to the centre.
+        spread: Factor by which the corners were spread to cover all systems.
+    """
 
     checked: int
     furthest: float
@@ -27,10 +33,18 @@ class Coverage:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Polytope:
-    """Vertices A (V, n, n) and B (V, n, m); `period` [s] of a discrete-time system, None for continuous time.
+    """The convex hull of vertices A (V, n, n) and B (V, n, m).
 
-    `states` and `corners` (the parameters at each vertex) are for people. Raises ValueError for shapes that do not fit,
-    numbers that are not finite, no vertex or more than 2^12.
+    Attributes:
+        A: State matrices of the vertices, shape (V, n, n).
+        B: Input matrices of the vertices, shape (V, n, m).
+        period: Sampling period [s] of a discrete-time system; None for continuous time.
+        states: Names of the states, as labels.
+        corners: Parameters at each vertex, as labels.
+        coverage: Check of the hull, if there is one.
+
+    Raises:
+        ValueError: Shapes that do not fit, numbers that are not finite, no vertex or more than 2^12.
     """
 
     A: np.ndarray
@@ -41,7 +55,7 @@ class Polytope:
     coverage: Coverage | None = None
 
     def __post_init__(self) -> None:
-        """Arrays of float64, of matching shapes."""
+        """Convert the matrices to float64 and check their shapes."""
         for name in ("A", "B"):
             object.__setattr__(self, name, np.array(getattr(self, name), float))
         a, b = self.A.shape, self.B.shape
@@ -54,34 +68,41 @@ class Polytope:
 
     @property
     def vertices(self) -> int:
-        """V."""
+        """Number of vertices V."""
         return self.A.shape[0]
 
     @property
     def order(self) -> int:
-        """n, the number of states."""
+        """Number of states n."""
         return self.A.shape[1]
 
     @property
     def inputs(self) -> int:
-        """m."""
+        """Number of inputs m."""
         return self.B.shape[2]
 
     def closed(self, gain: Any) -> np.ndarray:
-        """A + B K at each vertex (V, n, n). Raises ValueError for a gain of the wrong shape or not finite."""
+        """Return A + B K at each vertex for K = `gain`, shape (V, n, n).
+
+        Raises:
+            ValueError: A gain of the wrong shape, or not finite.
+        """
         return self.A + self.B @ as_gain_matrix(gain, (self.inputs, self.order))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Schedule:
-    """Polytopes `cells[i]` for values of `parameter` between `nodes[i]` and `nodes[i + 1]` (increasing)."""
+    """A chain of polytopes: `cells[i]` holds for values of `parameter` between `nodes[i]` and `nodes[i + 1]`.
+
+    The nodes increase.
+    """
 
     parameter: str
     nodes: np.ndarray
     cells: tuple[Polytope, ...]
 
     def __post_init__(self) -> None:
-        """Nodes increase; one cell between two."""
+        """Check that the nodes increase and that one cell lies between two nodes."""
         object.__setattr__(self, "nodes", np.array(self.nodes, float))
         if len(self.nodes) != len(self.cells) + 1 or not self.cells or not (np.diff(self.nodes) > 0).all():
             raise ValueError(f"a schedule of {len(self.cells)} cells needs one node more, increasing: {self.nodes}")
@@ -90,7 +111,15 @@ class Schedule:
 
 
 def as_gain_matrix(gain: Any, shape: tuple[int, int]) -> np.ndarray:
-    """A gain (m, n); (n,) is one row. Raises ValueError for another shape, or numbers that are not finite."""
+    """Return a gain as a matrix of floats, shape (m, n); a gain of shape (n,) is one row.
+
+    Args:
+        gain: Gain, shape (m, n) or (n,).
+        shape: Required shape (m, n).
+
+    Raises:
+        ValueError: Another shape, or numbers that are not finite.
+    """
     k = np.atleast_2d(np.array(gain, float))
     if k.shape != shape:
         raise ValueError(f"the gain has shape {k.shape}; inputs and states of the system need {shape}")

@@ -1,13 +1,15 @@
-"""Parameter-dependent Lyapunov functions, for a gain that no common one can prove.
+"""Proofs with a parameter-dependent Lyapunov function, for a gain that no common P can prove.
 
     V = x'P(p) x,  P piecewise linear in a measured parameter p (speed, say) that moves within r_lo <= p' <= r_hi
 
-In a cell between the nodes a, b, with D = (P_b - P_a)/(p_b - p_a), for every vertex of the cell and r = r_lo, r_hi,
+In a cell between the nodes a and b, let D = (P_b - P_a)/(p_b - p_a). For every vertex of the cell and r = r_lo, r_hi,
 
     He[P (A + B K)] + r D + 2 rate P + Q + K'R K < 0
 
-is asked of the three Bernstein coefficients of its left side, quadratic along the cell: P and K at a, at b, and mixed.
-A car that brakes has a speed that falls no faster than friction allows; a common P pretends that it may jump.
+The left side is quadratic along the cell. The program requires this inequality of its three Bernstein coefficients: P
+and K at a, at b, and mixed.
+
+The speed of a braking car falls no faster than friction allows. A common P would also admit jumps of the speed.
 """
 
 from collections.abc import Iterator, Mapping
@@ -23,21 +25,22 @@ from diffabs.design.sdp.scaling import Frame, analysis_frame
 from diffabs.design.sdp.solver import Unknowns, group_blocks, he
 from diffabs.design.spec import Spec
 
-SCHEDULE_DECAY_TOLERANCE = 0.01  # relative: how close the search for the fastest decay comes
-FORM_LOOSENINGS = (
-    1e-9,
-    1e-7,
-    1e-6,
-    1e-5,
-    1e-4,
-)  # relative: by how much the answer is loosened until its proof succeeds
+SCHEDULE_DECAY_TOLERANCE = 0.01  # relative width at which the search for the fastest decay stops
+# Relative amounts by which the answer is loosened, in this order, until its proof succeeds.
+FORM_LOOSENINGS = (1e-9, 1e-7, 1e-6, 1e-5, 1e-4)
 
 
 def certify_schedule(gain: Any, system: Schedule, spec: Spec, *, fastest: bool = False) -> Certificate:
-    """What can be proved about a gain, constant (m, n) or linear between nodes (N + 1, m, n), with P(p).
+    """Return the proved properties of a gain with a parameter-dependent P(p).
 
-    Raises ValueError for shapes that do not fit, without rates, in discrete time, and for specifications other than
-    decay and cost.
+    Args:
+        gain: Gain, constant of shape (m, n), or linear between the nodes, shape (N + 1, m, n).
+        system: A schedule in continuous time.
+        spec: Specification with `rates`; only decay and cost have a proof here.
+        fastest: Whether to add the claim with the fastest decay that a P(p) proves.
+
+    Raises:
+        ValueError: Shapes that do not fit, missing rates, discrete time, or a specification other than decay and cost.
     """
     first = system.cells[0]
     spec = spec.checked(first.order, first.inputs)
@@ -53,8 +56,9 @@ def certify_schedule(gain: Any, system: Schedule, spec: Spec, *, fastest: bool =
 
 
 def _fastest_decay_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
-    """The claim with the fastest decay, by bisection up to the slowest mode of any vertex."""
+    """Return the claim with the fastest decay, by bisection up to the slowest mode of any vertex."""
     pairs = [(cell, k) for i, cell in enumerate(system.cells) for k in gains[i : i + 2]]
+    # No P(p) proves a decay faster than the slowest mode of a frozen loop.
     low, high = spec.decay, min(-np.real(np.linalg.eigvals(cell.closed(k))).max() for cell, k in pairs)
     best = None
     while high - low > SCHEDULE_DECAY_TOLERANCE * high:
@@ -65,7 +69,15 @@ def _fastest_decay_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Cla
 
 
 def gains_at_nodes(gain: Any, system: Schedule) -> np.ndarray:
-    """Gains at the nodes (N + 1, m, n) from those or from a constant one. Raises ValueError for other shapes."""
+    """Return the gains at the nodes, shape (N + 1, m, n).
+
+    Args:
+        gain: Gains at the nodes, shape (N + 1, m, n), or a constant gain, shape (m, n) or (n,).
+        system: Schedule with N + 1 nodes.
+
+    Raises:
+        ValueError: Other shapes.
+    """
     first, k = system.cells[0], np.array(gain, float)
     shape = (first.inputs, first.order)
     if k.ndim < 3:
@@ -76,8 +88,9 @@ def gains_at_nodes(gain: Any, system: Schedule) -> np.ndarray:
 
 
 def _find_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None:
-    """The claim with the least mean trace P (with Q, R), or with the largest margin; None where no proof succeeds."""
+    """Return the claim with the smallest mean trace P (with Q, R) or the largest margin; None if no proof succeeds."""
     n, nodes = system.cells[0].order, range(len(system.nodes))
+    # One loop of each cell suffices for a frame: the scaling need not be exact.
     middle = [(cell.A + cell.B @ gains[i])[:1] for i, cell in enumerate(system.cells)]
     frame = analysis_frame(np.concatenate(middle), discrete=False)
     unknowns = Unknowns(**{f"P{i}": n for i in nodes}, **({} if spec.Q is not None else {"t": (1, 1)}))
@@ -108,7 +121,7 @@ def _find_claim(gains: np.ndarray, system: Schedule, spec: Spec) -> Claim | None
 
 
 def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: Frame) -> Iterator[Any]:
-    """For each cell, vertex and end of the rates, the Bernstein coefficients as formulas of the P at the nodes."""
+    """Yield for each cell, vertex and end of the rates the Bernstein coefficients as formulas of P at the nodes."""
     assert spec.rates is not None
     n = system.cells[0].order
     weight = np.zeros((n, n)) if spec.Q is None else spec.Q
@@ -117,6 +130,7 @@ def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: 
         width = float(system.nodes[i + 1] - system.nodes[i])
         low, high = gains[i], gains[i + 1]
         price = [
+            # 1e-12 keeps the answer strictly inside the inequality that the exact proof requires.
             frame.weight(weight + part) + 1e-12 * np.eye(n)
             for part in (low.T @ effort @ low, he(low.T @ effort @ high) / 2, high.T @ effort @ high)
         ]
@@ -124,12 +138,13 @@ def _bernstein_formulas(gains: np.ndarray, system: Schedule, spec: Spec, frame: 
             closed = frame.states(a + b @ low), frame.states(a + b @ high)
             size = float(max(np.linalg.norm(c) for c in closed))
             for rate in sorted(set(spec.rates)):
-
+                # The defaults bind the loop variables at the definition: a formula may run after the loop has moved on.
                 def coefficients(
                     v: Mapping[str, np.ndarray], i: int = i, c: Any = closed, q: Any = price, s: float = size,
                     drift: float = rate / width / frame.tau,
                 ) -> list[np.ndarray]:  # fmt: skip
                     start, end = v[f"P{i}"], v[f"P{i + 1}"]
+                    # dP/dt is constant along the cell, so all three Bernstein coefficients contain it in full.
                     common = drift * (end - start)
                     spare = v["t"] * np.eye(n) if spec.Q is None else 0.0
                     flows = (he(start @ c[0]), (he(start @ c[1]) + he(end @ c[0])) / 2, he(end @ c[1]))

@@ -1,4 +1,4 @@
-"""What a design has to achieve, or a certificate to prove. Specifications combine freely; all are optional."""
+"""Specifications of a design or a certificate; they combine freely, and all are optional."""
 
 import dataclasses
 import math
@@ -11,7 +11,7 @@ from diffabs.linear.weights import as_weight_matrix
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class InputLimit:
-    """|u_j(t)| <= limit_j at all times, from every start in the hull of `points` (k, n)."""
+    """The bound |u_j(t)| <= limit_j at all times, from every start in the hull of `points` (k, n)."""
 
     limit: Any
     points: Any
@@ -19,8 +19,16 @@ class InputLimit:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class L2Gain:
-    """|z|_2 <= bound |w|_2 from rest, z = C x + D u, x' = A x + B u + E w: an H-infinity bound for every frozen system,
-    and for every varying one. `bound` None asks for the smallest; `disturbance` E (n, w) None acts where u does."""
+    """The L2 bound |z|_2 <= bound |w|_2 from rest. Here z = C x + D u and x' = A x + B u + E w.
+
+    It is an H-infinity bound for every frozen system, and it holds for every varying system too.
+
+    Attributes:
+        output: C, shape (z, n).
+        feedthrough: D, shape (z, m); None stands for 0.
+        disturbance: E, shape (n, w); None lets w act at the input, E = B.
+        bound: Bound of the gain; None asks for the smallest.
+    """
 
     output: Any
     feedthrough: Any = None
@@ -32,11 +40,14 @@ class L2Gain:
 class Spec:
     """Specifications for x' = A x + B u, u = K x.
 
-    Q (n, n) or its diagonal, R (m, m), its diagonal, or a number: cost integral of x'Qx + u'Ru (a sum in discrete time)
-    decay [1/s]: |x| <= c exp(-decay t)
-    damping [1]: at least this, for the poles of every frozen system
-    input, l2: see `InputLimit` and `L2Gain`
-    rates: lowest and highest d(parameter)/dt of a `Schedule`
+    Attributes:
+        Q: State weight, shape (n, n), or its diagonal. The cost is the integral of x'Qx + u'Ru, a sum in discrete time.
+        R: Input weight, shape (m, m), its diagonal, or a number.
+        decay: Decay rate [1/s]: |x| <= c exp(-decay t).
+        damping: Smallest damping ratio [1] of the poles of every frozen system.
+        input: Limit of the inputs.
+        l2: Bound of the L2 gain.
+        rates: Lowest and highest d(parameter)/dt of a `Schedule`.
     """
 
     Q: Any = None
@@ -48,7 +59,11 @@ class Spec:
     rates: tuple[float, float] | None = None
 
     def checked(self, order: int, inputs: int) -> "Spec":
-        """The same with full matrices. Raises ValueError naming what does not fit, its value and the allowed range."""
+        """Return the specification with full matrices, for a system of `order` states and `inputs` inputs.
+
+        Raises:
+            ValueError: A field that does not fit; the message names it, its value and the allowed range.
+        """
         if (self.Q is None) != (self.R is None):
             raise ValueError("a quadratic cost needs both Q and R")
         weights = {}

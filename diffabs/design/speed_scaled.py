@@ -1,12 +1,15 @@
-"""The slip error under a feedback that is proportional to the speed, in coordinates in which the loop hardly varies.
+"""The slip error under a feedback proportional to the speed, in coordinates in which the loop hardly varies.
 
-A torque of size v moves the slip equally fast at every speed v. In units of v/v0 for every torque of a sampled model
+A torque proportional to v moves the slip equally fast at every speed v. With every torque of a sampled model in units
+of v/v0,
 
     x = S z,  u = (v/v0) w,  S = diag(1, 1, ..., v/v0, ...),      x+ = A(v) x + B(v) u
     z+ = S(v+)^-1 (A S z + B (v/v0) w) = D [S^-1 A S z + S^-1 B (v/v0) w],  D = diag(1, 1, ..., v/v+, ...)
 
-so w = K z is `ProportionalFeedback`. v/v+ = 1 + fall is how much the speed falls in a period: with it in the polytope,
-a certificate holds for every course of the speed whose fall per period is in the range.
+so w = K z is `ProportionalFeedback`.
+
+The ratio v/v+ = 1 + fall gives the fall of the speed in a period. With a range of `fall` in the polytope, a certificate
+holds for every course of the speed whose fall per period is in that range.
 """
 
 from functools import partial
@@ -36,14 +39,14 @@ class SpeedScaled:
 
     @property
     def states(self) -> tuple[str, ...]:
-        """What the states are."""
+        """Names of the states."""
         return self.model.states
 
     def matrices(self) -> StateSpace:
-        """A (n, n) and B (n, 1), differentiable in every parameter.
+        """Return A (n, n) and B (n, 1), differentiable in every parameter.
 
         Raises:
-            ValueError: a model in continuous time, in which the speed's fall would have to be a rate.
+            ValueError: A model in continuous time, where the fall of the speed would be a rate.
         """
         if not isinstance(self.model.sampling, Sampling):
             raise ValueError("a speed-scaled model is a sampled one: model.sampling is continuous")
@@ -51,7 +54,13 @@ class SpeedScaled:
 
 
 def greatest_speed_fall(deceleration: float, speed: float, period: float) -> float:
-    """The greatest fall v/v+ - 1 over a period [s], at a deceleration [m/s^2] and from the lowest speed [m/s]."""
+    """Return the largest fall v/v+ - 1 of the speed [1] over a period.
+
+    Args:
+        deceleration: Deceleration [m/s^2].
+        speed: Lowest speed at the start of a period [m/s].
+        period: Sampling period [s].
+    """
     return deceleration * period / (speed - deceleration * period)
 
 
@@ -62,5 +71,6 @@ def _matrices(scaled: SpeedScaled, torques: tuple[bool, ...]) -> StateSpace:
     torque = jnp.array(torques)
     size = scaled.model.speed / scaled.reference_speed
     s = jnp.where(torque, size, 1.0)
+    # left = D S^-1 as a vector: only the torques are scaled.
     left = jnp.where(torque, 1 + scaled.fall, 1.0) / s
     return StateSpace(left[:, None] * a * s, left[:, None] * b * size)

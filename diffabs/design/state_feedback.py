@@ -1,12 +1,12 @@
-"""A loop's controller as static state feedback u = K x on a linear slip model: what a certificate is about.
+"""A loop's controller as static state feedback u = K x on a linear model, the form that a certificate needs.
 
     StateFeedback   K = (k1, k2)
-    BalanceFeedback K as it is, on the model of a balance: see `upright`
+    BalanceFeedback K unchanged, on the model of a balance (`design.state_feedback_balance`)
     any other       around a plant that is no brake: on the states of the loop at rest (`operating_point`)
-    PID             K = (-ki, -(kp + kd wc), ..., kd wc), the last state being the slip error behind the filter wc
+    PID             K = (-ki, -(kp + kd wc), ..., kd wc), with the slip error behind the filter wc as the last state
 
-since e = target - slip = -x2, and d = -x_f in Aoki and Nakamura's eq. (13). `Sampled` makes the model a discrete one;
-gains of zero leave out the integral and the filter.
+The signs follow from e = target - slip = -x2, and from d = -x_f in Aoki and Nakamura's eq. (13). `Sampled` makes the
+model a discrete one. Gains of zero leave out the integral and the filter.
 """
 
 import dataclasses
@@ -41,8 +41,14 @@ from diffabs.sensors import Bias, Noise
 
 
 class ReducedLoop(NamedTuple):
-    """u = gain x on `model`, gain of shape (n,). `exact`: near the target, inside all limits and at a frozen speed,
-    this is the loop's own linearisation. `neglected` says what it leaves out, in sentences."""
+    """State feedback u = gain x on `model`.
+
+    Attributes:
+        model: Linear model of the plant, the actuator and the filter.
+        gain: Gain K, shape (n,).
+        exact: Whether this is the loop's own linearisation near the target, inside all limits and at a frozen speed.
+        neglected: Neglected parts of the loop, in sentences.
+    """
 
     model: SlipModel | BalanceModel | OperatingPoint
     gain: np.ndarray
@@ -51,10 +57,13 @@ class ReducedLoop(NamedTuple):
 
 
 def reduce_loop(loop: Loop) -> ReducedLoop:
-    """The loop at its initial speed and its setpoint as state feedback.
+    """Return the loop at its initial speed and its setpoint as state feedback.
+
+    Args:
+        loop: Closed loop with a linear controller and actuator.
 
     Raises:
-        ValueError: a controller or an actuator that is not linear, a parameter out of its range, a setpoint of 1; a
+        ValueError: A controller or an actuator that is not linear, a parameter out of its range, a setpoint of 1, or a
             loop that does not come to rest.
     """
     check_part(loop)
@@ -66,6 +75,7 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
     controller = inner_controller(loop.controller)
     integral, _, derivative, cutoff = map(float, _gains(controller))
     actuator, by_actuator, exact = _actuator(loop.actuator)
+    # The model of a loop with a moving reference holds at its setpoint at the start.
     setpoint = jax.jit(lambda loop: loop.reference.setpoint(loop.start().reference))(loop)
     model = SlipModel(
         plant=loop.plant,
@@ -74,6 +84,7 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
         actuator=actuator,
         sampling=Sampling(period=float(sampled.period), delay=float(sampled.delay)) if sampled else Continuous(),
         filter=LowPass(cutoff=cutoff) if derivative else Direct(),
+        # Without integral action its state would be a pole at 0, and no proof of stability would succeed.
         integral=integral != 0,
     )
     gain = np.asarray(feedback_gain(loop, check_part(model).states), float)
@@ -84,11 +95,16 @@ def reduce_loop(loop: Loop) -> ReducedLoop:
 
 
 def feedback_gain(loop: Loop, states: Sequence[str]) -> Any:
-    """K (n,) of a loop's controller on the states of a `SlipModel`, by their names; 0 on those it does not use.
-    Differentiable in the controller's parameters. That of a `ProportionalFeedback` is at its reference speed.
+    """Return K (n,) of a loop's controller on the named states, with 0 for unused states.
+
+    K is differentiable in the controller's parameters. The K of a `ProportionalFeedback` holds at its reference speed.
+
+    Args:
+        loop: Closed loop with a linear controller.
+        states: Names of the states of a linear model such as `SlipModel`.
 
     Raises:
-        ValueError: a controller that is not linear.
+        ValueError: A controller that is not linear.
     """
     controller = inner_controller(loop.controller)
     if isinstance(controller, BalanceFeedback):
@@ -98,6 +114,7 @@ def feedback_gain(loop: Loop, states: Sequence[str]) -> Any:
     integral, proportional, derivative, _ = _gains(controller)
     gains = {
         "integral of slip error": integral,
+        # The derivative acts on slip error minus filtered slip error: its gain enters both states with opposite signs.
         "slip error": proportional + derivative,
         "filtered slip error": -derivative,
     }
@@ -105,7 +122,7 @@ def feedback_gain(loop: Loop, states: Sequence[str]) -> Any:
 
 
 def _reduce_at_rest(loop: Loop) -> ReducedLoop:
-    """Any other loop, at rest on its setpoint. Noise and bias of the sensor are disturbances."""
+    """Return a loop around another plant, at rest on its setpoint; noise and bias of the sensor are disturbances."""
     disturbed = isinstance(loop.sensor, Noise | Bias)
     model = operating_point(dataclasses.replace(loop, sensor=Direct()) if disturbed else loop)
     neglected = ["Everything that is not linear: the proof is about the neighbourhood of rest on the setpoint, inside"
@@ -116,7 +133,7 @@ def _reduce_at_rest(loop: Loop) -> ReducedLoop:
 
 
 def _gains(controller: Any) -> tuple[Any, Any, Any, Any]:
-    """On the integral, the slip error, and slip error minus filtered slip error; the filter's cutoff."""
+    """Return the gains on integral, slip error, and slip error minus filtered slip error, and the filter's cutoff."""
     if isinstance(controller, StateFeedback | ProportionalFeedback):
         return controller.gain[0], controller.gain[1], 0.0, 0.0
     if isinstance(controller, PID):
@@ -126,7 +143,7 @@ def _gains(controller: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
-    """The linear actuator, what it leaves out, and whether that is nothing near the target."""
+    """Return the linear actuator, its neglected parts, and whether it is exact near the target."""
     blocks = actuator.blocks if isinstance(actuator, Series) else (actuator,)
     lags, neglected, exact = [], [], True
     for block in blocks:
@@ -142,6 +159,7 @@ def _actuator(actuator: Any) -> tuple[Direct | Lag, tuple[str, ...], bool]:
                 neglected.append(
                     f"The actuator's limits of {float(block.low):g} and {float(block.high):g} {{control}}."
                 )
+            # Limits are inactive near the target, a delay is not: the model is then inexact even for small errors.
             case Delay():
                 exact = False
                 neglected.append(f"The actuator's delay of {float(block.time):g} s, which can destabilise.")
@@ -163,7 +181,7 @@ def _controller_omissions(controller: Any) -> Iterator[str]:
 
 
 def _loop_omissions(loop: Loop) -> Iterator[str]:
-    """What is left out of the rest of the loop."""
+    """Yield the neglected parts of the sensor, the reference and the feed-forward."""
     yield "The fall of the speed: it is frozen."
     if isinstance(loop.sensor, Noise | Bias):
         yield f"The sensor's {_part_name(loop.sensor)}, a disturbance."
@@ -177,5 +195,5 @@ def _loop_omissions(loop: Loop) -> Iterator[str]:
 
 
 def _part_name(part: Any) -> str:
-    """SlidingMode as `sliding mode`."""
+    """Return the name of a part in words: `sliding mode` for SlidingMode."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", type(part).__name__).lower()

@@ -16,10 +16,13 @@ from diffabs.linear.slip_model import Continuous, Sampling
 
 
 def reduce_balance_loop(loop: Loop) -> tuple[BalanceModel, np.ndarray, bool, tuple[str, ...]]:
-    """Model, gain (6,), whether this is the loop's own linearisation, and what is left out, in sentences.
+    """Return model, gain (6,), whether this is the loop's own linearisation, and its neglected parts in sentences.
+
+    Args:
+        loop: Closed loop of a balance.
 
     Raises:
-        ValueError: a controller that is not feedback of the whole state, an actuator with dynamics.
+        ValueError: A controller other than feedback of the whole state, or an actuator with dynamics.
     """
     sampled = loop.controller if isinstance(loop.controller, Sampled) else None
     controller = inner_controller(loop.controller)

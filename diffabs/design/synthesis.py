@@ -6,10 +6,14 @@
     [  Qh X           I      0      ] >= 0 at every vertex (A, B),   [ Z  I ] >= 0,   minimise trace Z
     [  Rh F           0      I      ]                                [ I  X ]
 
-Maeda and Sugiura, eqs. (29)-(32), with Q = Qh'Qh, R = Rh'Rh, and with vertices that are pairs: their eq. (31) pairs A
-of one speed with B of another in two blocks of four, and leaves two systems uncovered. trace Z is the cost summed over
-starts at the unit vectors, guaranteed for every system of the polytope, also while it varies. Decay, damping, L2 gain
-and input limits join it with the same X and F (`inequalities`).
+with Q = Qh'Qh and R = Rh'Rh.
+
+Trace Z is the cost summed over starts at the unit vectors. It is guaranteed for every system of the polytope, also
+while the system varies. Decay, damping, L2 gain and input limits join it with the same X and F
+(`design.sdp.inequalities`).
+
+Source: Maeda and Sugiura, eqs. (29)-(32). Here a vertex is a pair (A, B) of the same parameters. Their eq. (31) pairs A
+of one speed with B of another in two blocks of four, which leaves two systems uncovered.
 """
 
 import dataclasses
@@ -27,34 +31,32 @@ from diffabs.design.sdp.scaling import Frame, design_frames
 from diffabs.design.sdp.solver import he
 from diffabs.design.spec import Spec
 
-GAP = 1e-6  # relative: how far from the optimum an answer may be
+GAP = 1e-6  # largest relative distance of an answer from the optimum
 ROUGH_GAP = 1e-4  # the same for a schedule, and for an L2 gain
-FRAMES_PER_SOLVER = 3  # tried for each solver
-INPUT_LIMIT_LEVELS = np.geomspace(
-    1.0, 1e4, 25
-)  # of the invariant set for an input limit, relative to the least conceivable
-CLAIM_OF_SPECIFICATION = {
-    "Q": "cost",
-    "decay": "decay",
-    "damping": "damping",
-    "l2": "l2",
-    "input": "input",
-}  # claim of a specification
+FRAMES_PER_SOLVER = 3  # frames to try for each solver
+# Levels of the invariant set for an input limit, relative to the smallest possible level.
+INPUT_LIMIT_LEVELS = np.geomspace(1.0, 1e4, 25)
+# Kind of the claim that proves a field of the specification.
+CLAIM_OF_SPECIFICATION = {"Q": "cost", "decay": "decay", "damping": "damping", "l2": "l2", "input": "input"}
 
 
 class DesignError(RuntimeError):
-    """No gain was found that passes its checks; the message has the numbers."""
+    """The error that no gain passes its checks; its message has the numbers."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Design:
-    """A gain (m, n), or (N + 1, m, n) at the nodes of a schedule, and its proof.
+    """A gain and its proof.
 
-    trace_cost: trace Z, the least guaranteed cost (None without Q, R); of a schedule the mean over its nodes
-    lower_bound: the largest trace of the vertices' own Riccati solutions, which no common gain can beat
-    gap: bound on (objective - optimum)/objective
-    residual: largest eigenvalue over the vertices of He[P(A + BK)] + K'RK + Q relative to Q + K'RK; at the vertices
-        that decide it is 0 but for rounding
+    Attributes:
+        gain: Gain K, shape (m, n), or (N + 1, m, n) at the nodes of a schedule.
+        certificate: Proof of the specifications.
+        trace_cost: Trace Z, the smallest guaranteed cost; for a schedule its mean over the nodes. None without Q, R.
+        lower_bound: Largest trace of the vertices' own Riccati solutions, which no common gain can beat.
+        gap: Bound on (objective - optimum)/objective.
+        residual: Largest eigenvalue over the vertices of He[P(A + BK)] + K'RK + Q relative to Q + K'RK. At the active
+            vertices it is 0 up to rounding.
+        attempts: Result of each attempt, in words.
     """
 
     gain: np.ndarray
@@ -69,28 +71,31 @@ class Design:
 def design(system: Polytope | Schedule, spec: Spec) -> Design:
     """Return the gain that minimises the guaranteed cost (with Q, R), or else the L2 gain, under all specifications.
 
-    system: a polytope, or a schedule along a measured parameter
-    spec: weights, decay, damping, input limit, L2 gain: what the gain must have at every vertex
+    Every answer is checked: exact proof of every specification (`certify`), duality gap, lower bound. After a failed
+    check the search tries other coordinates, then other solvers.
 
-    Every answer is checked: exact proof of every specification (`certify`), duality gap, lower bound. A failed check
-    tries other coordinates, then other solvers.
-
-    >>> from diffabs.design import Polytope, Spec, design
-    >>> box = Polytope(A=[[[0.0, 1.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, -2.0]]], B=[[[0.0], [1.0]]] * 2)
-    >>> found = design(box, Spec(Q=(1.0, 1.0), R=1.0, decay=0.5))
-    >>> found.certificate.verified_exactly, found.certificate.decay_rate > 0.5
-    (True, True)
+    Args:
+        system: A polytope, or a schedule along a measured parameter.
+        spec: Weights, decay, damping, input limit and L2 gain that hold at every vertex.
 
     Raises:
-        ValueError: a specification that does not fit, nothing to minimise, a vertex that is not stabilisable.
-        DesignError: no gain passes; says for each attempt why.
+        ValueError: A specification that does not fit, nothing to minimise, or a vertex that is not stabilisable.
+        DesignError: No gain passes the checks; the message has the reason for each attempt.
         ModuleNotFoundError: cvxpy or a solver is missing.
+
+    Examples:
+        >>> from diffabs.design import Polytope, Spec, design
+        >>> box = Polytope(A=[[[0.0, 1.0], [0.0, -1.0]], [[0.0, 1.0], [0.0, -2.0]]], B=[[[0.0], [1.0]]] * 2)
+        >>> found = design(box, Spec(Q=(1.0, 1.0), R=1.0, decay=0.5))
+        >>> found.certificate.verified_exactly, found.certificate.decay_rate > 0.5
+        (True, True)
     """
     whole = pool_vertices(system)
     spec = _check_specification(system, whole, spec)
     attempts: list[str] = []
     for solver in lmi.solvers():
         for frame, bound in itertools.islice(_frames(whole, spec), FRAMES_PER_SOLVER):
+            # The cost of a schedule is a mean over its nodes, which the largest Riccati trace does not bound.
             lower = bound if spec.Q is not None and isinstance(system, Polytope) else None
             found, trouble = _attempt(system, whole, spec, frame, solver, lower)
             attempts.append(f"{solver}: {trouble or 'passed'}")
@@ -100,7 +105,11 @@ def design(system: Polytope | Schedule, spec: Spec) -> Design:
 
 
 def pool_vertices(system: Polytope | Schedule) -> Polytope:
-    """All vertices of a schedule as one polytope; a polytope as it is."""
+    """Return all vertices of a schedule as one polytope; a polytope is returned unchanged.
+
+    Args:
+        system: A polytope or a schedule.
+    """
     if isinstance(system, Polytope):
         return system
     a, b = (np.concatenate([getattr(cell, name) for cell in system.cells]) for name in "AB")
@@ -129,6 +138,7 @@ def _frames(whole: Polytope, spec: Spec) -> Iterator[tuple[Frame, float]]:
     elif spec.l2 is not None:
         c, d = spec.l2.output, spec.l2.feedthrough
         effort = d.T @ d
+        # Without feedthrough the output gives no weight on the input; the frame's Riccati equation then takes R = I.
         definite = np.linalg.eigvalsh(effort)[0] > 1e-12 * np.trace(effort)
         weight = c.T @ c + 1e-8 * np.trace(c.T @ c) * np.eye(whole.order)
         yield from design_frames(whole, weight, effort if definite else np.eye(whole.inputs))
@@ -137,13 +147,15 @@ def _frames(whole: Polytope, spec: Spec) -> Iterator[tuple[Frame, float]]:
 def _attempt(
     system: Polytope | Schedule, whole: Polytope, spec: Spec, frame: Frame, solver: str, lower: float | None
 ) -> tuple[Design | None, str]:
-    """A design in one frame by one solver, and what is wrong with it, if anything."""
+    """Return a design by one solver in one frame, and the reason for its rejection (empty if there is no reason)."""
     program = DesignProgram(system, whole, spec, frame)
     c, best, status = program.objective(), None, "no answer"
+    # The input limit is no LMI in X, F and the level together: the level is fixed, and the best of a grid is taken.
     for level in INPUT_LIMIT_LEVELS * program.least_level() if spec.input else (1.0,):
         blocks = program.blocks(level)
         answer = lmi.solve_sdp(c, blocks, solver)
         status = answer.status
+        # The status of a solver is no criterion: the violation and the gap are computed from its numbers.
         if np.isfinite(answer.y).all() and answer.violation(blocks) < 1e-6:
             value = float(c @ answer.y)
             if best is None or value < best[0]:
@@ -164,16 +176,17 @@ def _attempt(
 
 
 def _residual(system: Polytope, k: np.ndarray, p: np.ndarray, spec: Spec) -> float:
-    """Largest eigenvalue of the Riccati inequality (29) over the vertices, relative to Q + K'RK."""
+    """Return the largest eigenvalue of the Riccati inequality (29) over the vertices, relative to Q + K'RK."""
     closed, weight = system.closed(k), spec.Q + k.T @ spec.R @ k
     discrete = system.period is not None
     left = weight + (np.swapaxes(closed, 1, 2) @ p @ closed - p if discrete else he(p @ closed))
-    root = np.linalg.inv(np.linalg.cholesky(p)).T  # judged where P is the unit matrix, as the solver saw it
+    # Evaluated in the coordinates of P = I, where the solver worked.
+    root = np.linalg.inv(np.linalg.cholesky(p)).T
     return float(np.linalg.eigvalsh(root.T @ left @ root).max() / np.linalg.eigvalsh(root.T @ weight @ root).max())
 
 
 def _rejection_reason(found: Design, spec: Spec, scheduled: bool) -> str:
-    """What is wrong with a design; nothing, if it may leave this module."""
+    """Return the reason to reject a design; empty if it passes all checks."""
     proof = found.certificate
     wanted = (
         {"scheduled"}
@@ -186,6 +199,7 @@ def _rejection_reason(found: Design, spec: Spec, scheduled: bool) -> str:
     cost, lower, guaranteed = found.trace_cost, found.lower_bound, proof.guaranteed_cost
     if cost is not None and lower is not None and cost < lower * (1 - GAP):
         return f"cost {cost:.10g} is below its lower bound {lower:.10g}"
+    # The proof minimises the cost for the gain alone: a larger value shows that the solver's X is inaccurate.
     if cost is not None and guaranteed is not None and not scheduled and guaranteed > cost * (1 + 10 * GAP):
         return f"the gain guarantees {guaranteed:.10g}, not the cost {cost:.10g}"
     if not found.gap <= (ROUGH_GAP if scheduled or spec.Q is None else GAP):

@@ -1,12 +1,15 @@
-"""A saved certificate proved again, in fractions, by code that shares nothing with what made it. This file needs no
-other: whoever doubts the rest can take it out, read it and run it alone.
+"""An independent checker of saved certificates, in fractions, without any code that made them.
 
-Floats are the rationals that they are, and nothing is rounded: what is proved is about the stored matrices A, B and
-everything in their hull, C = A + B K. A file's words are not believed: names of corners and states are not read, and
-what a claim must contain, in which range, is part of what is checked. In discrete time V falls by factor^2 a period.
+The file imports only the standard library: it can be read and run on its own.
+
+Every float is the rational number that it represents, and nothing is rounded. The proof holds for the stored matrices
+A, B and everything in their hull, with C = A + B K.
+
+The checker trusts no text of a file: it does not read the names of corners and states. It also checks the fields of a
+claim and their ranges. In discrete time V falls by factor^2 a period.
 
     decay       P > 0, -He(P C) - 2 rate P > 0                      infeasible  W >= 0, sum He(C W) + 2 rate W > 0
-    cost        the same without a rate, and with -Q - K'RK         damping, l2, input, scheduled: as in `exact`
+    cost        the same without a rate, and with -Q - K'RK         damping, l2, input, scheduled: see `proof.exact`
 """
 
 import contextvars
@@ -23,16 +26,15 @@ from fractions import Fraction
 from typing import Any, NamedTuple
 
 Matrix = list[list[Fraction]]
-MAX_CERTIFICATE_BYTES, MAX_STATES_OR_INPUTS, MAX_LIST_ENTRIES = (
-    2**24,
-    64,
-    2**12,
-)  # bytes; states or inputs; vertices, cells, points
-MAX_SECONDS = 6.0  # s, so that the command answers within 10
+# Limits of a file: bytes; states or inputs; vertices, cells or points.
+MAX_CERTIFICATE_BYTES, MAX_STATES_OR_INPUTS, MAX_LIST_ENTRIES = 2**24, 64, 2**12
+MAX_SECONDS = 6.0  # s, so that the command answers within 10 s
 _deadline: contextvars.ContextVar[tuple[float, float]] = contextvars.ContextVar(
     "deadline", default=(math.inf, math.inf)
 )
-FIELD_SHAPES = {  # an axis a letter: n states, m inputs, V vertices, N nodes; "?" need not be there
+# A letter for each axis: n states, m inputs, V vertices, N nodes, others free; "|" separates alternatives. A field with
+# "?" is optional.
+FIELD_SHAPES = {
     "decay": {"P": "nn", "rate?": "", "factor?": ""},
     "cost": {"P": "nn", "Q": "nn", "R": "mm", "x0?": "n"},
     "damping": {"P": "nn", "cot": "", "zeta": ""},
@@ -55,7 +57,7 @@ FIELD_RANGES = {
 
 
 class ClaimVerdict(NamedTuple):
-    """What a claim says, and why it is not proved; an empty reason if it is."""
+    """The statement of a claim, and the reason why it is not proved; the reason of a proved claim is empty."""
 
     kind: str
     says: str
@@ -70,7 +72,15 @@ class Cell(NamedTuple):
 
 
 class StoredCertificate(NamedTuple):
-    """A file: cells (one, without nodes, of a polytope), the gain (or one for each node), the claims' numbers."""
+    """The content of a certificate file.
+
+    Attributes:
+        cells: Cells of a schedule; a polytope is one cell.
+        nodes: Nodes of a schedule; empty for a polytope.
+        gains: Gain at each node; one gain for a polytope.
+        discrete: Whether the system is in discrete time.
+        claims: Kind and data of each claim.
+    """
 
     cells: list[Cell]
     nodes: list[Fraction]
@@ -80,12 +90,17 @@ class StoredCertificate(NamedTuple):
 
 
 def verify_file(path: str | os.PathLike[str], seconds: float = MAX_SECONDS) -> list[ClaimVerdict]:
-    """A verdict for each claim of a file.
+    """Return a verdict for each claim of a certificate file.
 
-    path: of the file; seconds: after which an undecided file is refused
-    Raises ValueError, in one line that names the field, for what is no certificate: not readable, not of the format, a
-    claim that does not fit its system or is outside of its range; and for one that is not decided in time.
+    Args:
+        path: Path of the file.
+        seconds: Time [s] after which an undecided file is refused.
+
+    Raises:
+        ValueError: A file that is not readable, not of the format, or not decided in time; or a claim that does not fit
+            its system or is out of range. The message is one line that names the field.
     """
+    # A context variable carries the deadline through the recursion, and keeps calls in other threads apart.
     given = _deadline.set((time.monotonic() + seconds, seconds))
     try:
         stored = _certificate_from_json(_read_json(pathlib.Path(path)))
@@ -104,7 +119,7 @@ def verify_file(path: str | os.PathLike[str], seconds: float = MAX_SECONDS) -> l
 
 
 def _check_time() -> None:
-    """Raises ValueError where the time for this file is over."""
+    """Raise ValueError after the deadline of this file."""
     end, seconds = _deadline.get()
     if time.monotonic() > end:
         raise ValueError(
@@ -123,8 +138,10 @@ def _read_json(path: pathlib.Path) -> Any:
     try:
         return json.loads(
             path.read_bytes(),
+            # Integers become floats: a certificate holds doubles only, and a long integer costs no time.
             parse_int=float,
             parse_constant=_reject_constant,
+            # json.loads keeps the last of two equal names; another reader may keep the first and see another claim.
             object_pairs_hook=_reject_duplicate_names,
         )
     except UnicodeDecodeError:
@@ -165,7 +182,7 @@ def _certificate_from_json(value: Any) -> StoredCertificate:
 
 
 def _read_schedule(value: Any, sizes: dict[str, int]) -> tuple[list[Fraction], dict[str, Any]]:
-    """Nodes of a schedule, and its cells by name."""
+    """Return the nodes of a schedule and its cells by name."""
     system = _read_members(value, "system", "parameter", "nodes", "cells")
     nodes, cells = _read_tensor(system["nodes"], "N", sizes, "system.nodes"), system["cells"]
     if not isinstance(cells, list) or not 0 < len(cells) == len(nodes) - 1:
@@ -176,9 +193,9 @@ def _read_schedule(value: Any, sizes: dict[str, int]) -> tuple[list[Fraction], d
 
 
 def _read_cell(value: Any, where: str, sizes: dict[str, int]) -> tuple[Cell, float | None]:
-    """Vertices and period."""
+    """Return the vertices and the period of a cell."""
     part = _read_members(value, where, "A", "B", "period", "states", "corners")
-    sizes.pop("V", None)  # each cell has its own number of vertices
+    sizes.pop("V", None)  # every cell has its own number of vertices
     a, b = (
         _read_tensor(part[name], f"Vn{columns}", sizes, f"{where}.{name}") for name, columns in (("A", "n"), ("B", "m"))
     )
@@ -200,6 +217,7 @@ def _read_claim(
     if (kind == "scheduled") != scheduled or (discrete and kind in ("damping", "scheduled")):
         raise ValueError(f"{where}: a claim of kind {kind} does not fit the system")
     fields = {name.rstrip("?"): shape for name, shape in FIELD_SHAPES[kind].items()}
+    # A claim has a rate in continuous time and a factor in discrete time, never both.
     fields.pop("rate" if discrete else "factor", None)
     needed = {name for name in fields if name in FIELD_SHAPES[kind]}
     for name in sorted((set(data) - set(fields)) | (needed - set(data))):
@@ -226,7 +244,7 @@ def _depth(value: Any) -> int:
 
 
 def _read_tensor(value: Any, letters: str, sizes: dict[str, int], where: str) -> Any:
-    """Fractions in nested lists whose axes have the sizes of the letters; one not seen yet gets its size."""
+    """Return fractions in nested lists whose axes have the sizes of the letters; a new letter gets its size here."""
     if not letters:
         if type(value) is not float or not math.isfinite(value):
             raise ValueError(f"{where} must be a finite number")
@@ -243,7 +261,11 @@ def _read_tensor(value: Any, letters: str, sizes: dict[str, int], where: str) ->
 
 
 def multiply_matrices(*factors: Matrix) -> Matrix:
-    """A B ..., each product in integers over a common denominator."""
+    """Return the product of matrices, each product in integers over a common denominator.
+
+    Args:
+        factors: Matrices in the order of the product.
+    """
     a, *rest = factors
     for b in rest:
         (rows, below), (columns, under) = _integers(a), _integers(transpose_matrix(b))
@@ -252,7 +274,7 @@ def multiply_matrices(*factors: Matrix) -> Matrix:
 
 
 def _integers(m: Matrix) -> tuple[list[list[int]], int]:
-    """M times the common denominator of its entries, and that."""
+    """Return M times the common denominator of its entries, and that denominator."""
     below = math.lcm(*(x.denominator for row in m for x in row))
     return [[x.numerator * (below // x.denominator) for x in row] for row in m], below
 
@@ -263,38 +285,65 @@ def _quotient(terms: Iterable[int], below: int) -> Fraction:
 
 
 def transpose_matrix(a: Matrix) -> Matrix:
-    """A'."""
+    """Return A'.
+
+    Args:
+        a: Matrix.
+    """
     return [list(row) for row in zip(*a, strict=True)]
 
 
 def weighted_sum(*terms: tuple[Any, Matrix]) -> Matrix:
-    """Sum of number times matrix."""
+    """Return the sum of number times matrix.
+
+    Args:
+        terms: Pairs of a number and a matrix.
+    """
     first = terms[0][1]
     return [[sum((k * m[i][j] for k, m in terms), Fraction(0)) for j in range(len(row))] for i, row in enumerate(first)]
 
 
 def he(a: Matrix) -> Matrix:
-    """A + A'."""
+    """Return A + A'.
+
+    Args:
+        a: Square matrix.
+    """
     return weighted_sum((1, a), (1, transpose_matrix(a)))
 
 
 def identity_matrix(n: int) -> Matrix:
-    """I."""
+    """Return the unit matrix I.
+
+    Args:
+        n: Size.
+    """
     return [[Fraction(int(i == j)) for j in range(n)] for i in range(n)]
 
 
 def bordered_matrix(a: Matrix, b: Matrix, d: Matrix) -> Matrix:
-    """[[A, B], [B', D]]."""
+    """Return [[A, B], [B', D]].
+
+    Args:
+        a: Block A.
+        b: Block B.
+        d: Block D.
+    """
     return [[*x, *y] for x, y in zip(a, b, strict=True)] + [
         [*x, *y] for x, y in zip(transpose_matrix(b), d, strict=True)
     ]
 
 
 def is_positive_definite(m: Matrix, semi: bool = False) -> bool:
-    """Whether M is symmetric and its pivots positive; of a semidefinite matrix, a zero pivot's row is zero.
+    """Return whether M is symmetric and all its pivots are positive.
 
-    Elimination in integers (Bareiss, 1968): `rows` are those of the upper triangle, every entry a minor of M times the
-    common denominator, so divisions leave no rest, and no number grows beyond a minor."""
+    The method is elimination in integers (Bareiss, 1968). `rows` holds the upper triangle. Every entry is a minor of M
+    times the common denominator. Divisions therefore leave no remainder, and no number grows beyond a minor.
+
+    Args:
+        m: Square matrix.
+        semi: Whether to test for positive semidefiniteness: a zero pivot then needs a zero row.
+    """
     if m != transpose_matrix(m):
         return False
     whole, last = _integers(m)[0], 1
@@ -315,7 +364,7 @@ def _eliminate_row(pivot: int, first: int, above: list[int], row: list[int], las
 
 
 def _failed_inequality(kind: str, d: Mapping[str, Any], stored: StoredCertificate) -> str:
-    """The first inequality that does not hold; empty if all do."""
+    """Return the first inequality that does not hold; empty if all hold."""
     if kind == "scheduled":
         conditions = _schedule_conditions(d, stored)
     else:
@@ -330,20 +379,25 @@ def _failed_inequality(kind: str, d: Mapping[str, Any], stored: StoredCertificat
 
 
 def _decrease_matrix(p: Matrix, c: Matrix, d: Mapping[str, Any], discrete: bool) -> Matrix:
-    """-V' - 2 rate V for V = x'Px, or factor^2 V - V+."""
+    """Return -V' - 2 rate V for V = x'Px, or factor^2 V - V+."""
     if discrete:
         return weighted_sum((d.get("factor", 1) ** 2, p), (-1, multiply_matrices(transpose_matrix(c), p, c)))
     return weighted_sum((-1, he(multiply_matrices(p, c))), (-2 * d.get("rate", 0), p))
 
 
 def _infeasibility_conditions(d: Mapping[str, Any], loops: list[Matrix], discrete: bool) -> Iterator[tuple[str, bool]]:
-    """That no P > 0 decreases at all vertices: it would have 0 >= sum tr(W He(P C)) = tr(P sum He(C W)) > 0."""
+    """Yield the conditions that no P > 0 decreases at all vertices.
+
+    Such a P gives the contradiction 0 >= sum tr(W He(P C)) = tr(P sum He(C W)) > 0.
+    """
     yield "W", all(is_positive_definite(w, semi=True) for w in d["W"])
     yield (
         "the sum over the vertices",
         is_positive_definite(
             weighted_sum(
                 *(
+                    # _decrease_matrix with C' in place of C gives -He(C W) - 2 rate W, or factor^2 W - C W C': the same
+                    # code for the dual.
                     (-1, _decrease_matrix(w, transpose_matrix(c), d, discrete))
                     for w, c in zip(d["W"], loops, strict=True)
                 )
@@ -355,17 +409,19 @@ def _infeasibility_conditions(d: Mapping[str, Any], loops: list[Matrix], discret
 def _quadratic_conditions(
     kind: str, d: Mapping[str, Any], loops: list[Matrix], k: Matrix, stored: StoredCertificate
 ) -> Iterator[tuple[str, bool]]:
-    """What a claim about one P says, vertex by vertex."""
+    """Yield the conditions of a claim about one P, vertex by vertex."""
     p, discrete = d["P"], stored.discrete
     yield "P", is_positive_definite(p)
     for i, c in enumerate(loops):
         falls = _decrease_matrix(p, c, d, discrete)
+        # V also has to fall without the cost: then V -> 0, and the bound needs no sign of Q.
         yield f"vertex {i}: what V falls by", is_positive_definite(falls)
         if kind == "cost":
             spent = (-1, d["Q"]), (-1, multiply_matrices(transpose_matrix(k), d["R"], k))
             yield f"vertex {i}: what V falls by beyond the cost", is_positive_definite(weighted_sum((1, falls), *spent))
         if kind == "damping":
             m = multiply_matrices(p, c)
+            # M + M' and cot (M - M') describe the cone of the poles (Chilali and Gahinet 1996).
             skew = weighted_sum((-d["cot"], m), (d["cot"], transpose_matrix(m)))
             yield f"vertex {i}: the cone of the damping", is_positive_definite(bordered_matrix(falls, skew, falls))
         if kind == "l2":
@@ -391,7 +447,7 @@ def _quadratic_conditions(
 def _l2_matrix(
     p: Matrix, c: Matrix, w: Matrix, falls: Matrix, d: Mapping[str, Any], k: Matrix, discrete: bool
 ) -> Matrix:
-    """-V' - |z|^2 + gamma^2 |w|^2 as a matrix of (x, w)."""
+    """Return -V' - |z|^2 + gamma^2 |w|^2 as a matrix of (x, w)."""
     z = weighted_sum((1, d["C"]), (1, multiply_matrices(d["D"], k)))
     supply = weighted_sum(
         (d["gamma"] ** 2, identity_matrix(len(w[0]))),
@@ -404,7 +460,7 @@ def _l2_matrix(
 
 
 def _schedule_conditions(d: Mapping[str, Any], stored: StoredCertificate) -> Iterator[tuple[str, bool]]:
-    """P(p) > 0 at the nodes, and in every cell the Bernstein coefficients of -V' - ..., times its width."""
+    """Yield P(p) > 0 at the nodes, and the Bernstein coefficients of -V' - ... times the width of each cell."""
     rate, nodes, p, k = d.get("rate", 0), stored.nodes, d["P"], stored.gains
     yield "P", all(map(is_positive_definite, p))
     for i, cell in enumerate(stored.cells):
@@ -412,6 +468,8 @@ def _schedule_conditions(d: Mapping[str, Any], stored: StoredCertificate) -> Ite
         for a, b in zip(cell.A, cell.B, strict=True):
             ends = [(p[j], weighted_sum((1, a), (1, multiply_matrices(b, k[j]))), k[j]) for j in (i, i + 1)]
             for (px, cx, kx), (py, cy, ky) in ((ends[0], ends[0]), (ends[0], ends[1]), (ends[1], ends[1])):
+                # Twice the coefficient: (X_a Y_b + X_b Y_a)/2 for a product of linear functions, which covers both ends
+                # with X = Y.
                 flow = he(weighted_sum((1, multiply_matrices(px, cy)), (1, multiply_matrices(py, cx))))
                 falls = weighted_sum((-width / 2, flow), (-rate * width, px), (-rate * width, py))
                 spent = [(-width, d["Q"])] if "Q" in d else []
@@ -425,7 +483,7 @@ def _schedule_conditions(d: Mapping[str, Any], stored: StoredCertificate) -> Ite
 
 
 def _describe_claim(kind: str, d: Mapping[str, Any], discrete: bool) -> str:
-    """A claim in words, with its own numbers."""
+    """Return the statement of a claim in words, with its numbers."""
     number = {name: float(value) for name, value in d.items() if isinstance(value, Fraction)}
     pace = f"{number.get('rate', 0.0):.9g} 1/s"
     if discrete:

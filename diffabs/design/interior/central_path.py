@@ -6,14 +6,16 @@
     S_i = [ (1 + s) X - X Q X - F'R F   . ]
           [ A_i X + B_i F               X ]                                discrete time
 
-With s = 0 these are eqs. (30) and (32) of Maeda and Sugiura after elimination of Z: its minimum costs at most
-(V + 2) n mu (discrete time: 2 (V + 1) n mu) more than the least trace X^-1. Where there is no solution yet, a shift
-s > 0 makes one. The function is self-concordant, so the step 1/(1 + decrement) is always admitted, and a small
-decrement at the end proves, but for rounding, that the point is there (Nesterov and Nemirovskii 1994; Boyd and El
-Ghaoui 1993 for the shift, "method of centres").
+With s = 0 these are eqs. (30) and (32) of Maeda and Sugiura after elimination of Z. At the minimum of phi, trace X^-1
+exceeds the smallest one by at most (V + 2) n mu. In discrete time that bound is 2 (V + 1) n mu. A shift s > 0 makes a
+point feasible that is no solution yet.
 
-**Coordinates follow the point.** Each Newton step is made for x = T z, T T' = X, K = F X^-1, where X is the unit matrix
-and the gain is in the closed loops. No weight or gain is too far from 1 for it, and no other scaling is needed.
+The function is self-concordant, so the step 1/(1 + decrement) is always admissible. A small decrement at the end
+proves, up to rounding, that the point is at the centre (Nesterov and Nemirovskii 1994). The shift follows Boyd and El
+Ghaoui (1993), "method of centres".
+
+**Coordinates follow the point.** Each Newton step uses x = T z, T T' = X, K = F X^-1. There X is the unit matrix and
+the closed loops contain the gain. Weights and gains of any size need no other scaling.
 """
 
 from collections.abc import Callable
@@ -25,13 +27,13 @@ import numpy as np
 from jax import lax
 
 MAX_PATH_STEPS = 600  # steps; the rig with weights over ten decades takes 30 to 90, at 1 kHz up to 340
-CENTRING_DECREMENT = 0.5  # decrement from which on the next centre is aimed at
-STEP_LENGTHS = (1.0, 0.5, 0.2, 0.1, 0.03, 0.01, 0.003, 0.001)  # lengths of the step, besides 1/(1 + decrement)
+CENTRING_DECREMENT = 0.5  # below this decrement the path goes on to the next centre
+STEP_LENGTHS = (1.0, 0.5, 0.2, 0.1, 0.03, 0.01, 0.003, 0.001)  # lengths of the step, with 1/(1 + decrement) as another
 FINAL_CENTRE_STEPS = 3  # steps at the last centre: the decrement is squared in each
 
 
 class GuaranteedCostProblem(NamedTuple):
-    """A (V, n, n), B (V, n, m), Q (n, n), R (m, m)."""
+    """The vertices A (V, n, n) and B (V, n, m) and the weights Q (n, n) and R (m, m) of a problem."""
 
     A: Any
     B: Any
@@ -40,15 +42,24 @@ class GuaranteedCostProblem(NamedTuple):
 
 
 class PathPoint(NamedTuple):
-    """T (n, n) with T T' = X, and K = F X^-1 (m, n)."""
+    """A point of the path: T (n, n) with T T' = X, and K = F X^-1 (m, n)."""
 
     T: Any
     K: Any
 
 
 class CentralPathState(NamedTuple):
-    """Where the path is: steps made, the point, shift s, mu, Newton's decrement, steps at the last centre, and whether
-    there is none."""
+    """State of the iteration along the path.
+
+    Attributes:
+        steps: Number of Newton steps.
+        point: Present point.
+        shift: Shift s.
+        mu: Weight of the barrier.
+        decrement: Newton decrement before the last step.
+        settled: Number of steps at the last centre.
+        stuck: Whether no last centre exists.
+    """
 
     steps: Any
     point: PathPoint
@@ -71,7 +82,13 @@ class LocalProblem(NamedTuple):
 
 
 def start_path(T: Any, K: Any, mu: Any) -> CentralPathState:
-    """The path from a point; its shift is set by the first step."""
+    """Return the initial state of the path; `follow_path` sets its shift.
+
+    Args:
+        T: T with T T' = X, shape (n, n).
+        K: Gain, shape (m, n).
+        mu: Initial weight of the barrier.
+    """
     zero = jnp.zeros((), T.dtype)
     return CentralPathState(0, PathPoint(T, K), zero - 1, zero + mu, zero, 0, zero > 0)
 
@@ -79,14 +96,23 @@ def start_path(T: Any, K: Any, mu: Any) -> CentralPathState:
 def follow_path(
     problem: GuaranteedCostProblem, path: CentralPathState, onwards: Callable, *, discrete: bool
 ) -> CentralPathState:
-    """Newton steps until `onwards(path, least shift, trace P)` says that the last centre is reached, or that there is
-    none (`stuck`)."""
+    """Return the state at the end of the path: at the last centre, or `stuck` if there is no such centre.
+
+    Args:
+        problem: Vertices and weights.
+        path: Initial state.
+        onwards: Function (path, smallest shift, trace P) that returns the state with the next shift and mu.
+        discrete: Whether the system is in discrete time.
+    """
     here = localise_problem(problem, path.point)
     first = least_shift(here, discrete=discrete)
-    rounding = jnp.finfo(first.dtype).eps ** 0.5 * jnp.max(jnp.abs(here.c))  # a Riccati solution has a first of 0
+    # A Riccati solution satisfies its inequality with equality: `first` is 0 up to rounding, and the start needs a
+    # margin.
+    rounding = jnp.finfo(first.dtype).eps ** 0.5 * jnp.max(jnp.abs(here.c))
     path = path._replace(shift=jnp.maximum(2 * first, 0.0) + 1e-3 * jnp.abs(first) + rounding)
 
     def going(path: CentralPathState) -> Any:
+        """Return whether another Newton step is necessary."""
         return (
             (path.steps < MAX_PATH_STEPS)
             & (path.settled < FINAL_CENTRE_STEPS)
@@ -95,35 +121,56 @@ def follow_path(
         )
 
     def step(path: CentralPathState) -> CentralPathState:
+        """Return the state after a Newton step, with the next shift and mu if the step began near the centre."""
         point, decrement = _newton(problem, path, discrete=discrete)
         path = path._replace(steps=path.steps + 1, point=point, decrement=decrement)
         here = localise_problem(problem, point)
         after = onwards(path, least_shift(here, discrete=discrete), jnp.trace(here.w))
+        # Shift and mu change only near the centre, where the full Newton step converges quadratically.
         return jax.tree.map(lambda new, old: jnp.where(decrement < CENTRING_DECREMENT, new, old), after, path)
 
     return lax.while_loop(going, step, path)
 
 
 def localise_problem(problem: GuaranteedCostProblem, point: PathPoint) -> LocalProblem:
-    """The problem in a point's coordinates."""
+    """Return the problem in a point's coordinates.
+
+    Args:
+        problem: Vertices and weights.
+        point: Point of the path.
+    """
     t, inverse = point.T, jnp.linalg.inv(point.T)
     closed = inverse @ (problem.A + problem.B @ point.K) @ t
     return LocalProblem(closed, inverse @ problem.B, point.K @ t, t.T @ problem.Q @ t, problem.R, inverse @ inverse.T)
 
 
 def least_shift(here: LocalProblem, *, discrete: bool) -> Any:
-    """The least s for which no S_i has a negative eigenvalue, at the point itself."""
+    """Return the smallest s for which no S_i has a negative eigenvalue at the point itself.
+
+    Args:
+        here: Problem in the coordinates of the point.
+        discrete: Whether the system is in discrete time.
+    """
+    # At X = I the Schur complement of the discrete block matrix is (1 + s) I - Q - K'RK - C'C.
     flow = _t(here.c) @ here.c - jnp.eye(len(here.q)) if discrete else he(here.c)
     return jnp.max(jnp.linalg.eigvalsh(flow + here.q + here.k.T @ here.r @ here.k))
 
 
 def gradient_and_hessian(here: LocalProblem, shift: Any, mu: Any, *, discrete: bool) -> tuple[Any, Any]:
-    """Gradient (d,) and Hessian (d, d) of phi in (X, F) at the point itself, in the basis of `directions`."""
+    """Return gradient (d,) and Hessian (d, d) of phi in (X, F) at the point itself, in the basis of `directions`.
+
+    Args:
+        here: Problem in the coordinates of the point.
+        shift: Shift s.
+        mu: Weight of the barrier.
+        discrete: Whether the system is in discrete time.
+    """
     n = len(here.q)
     y, g = directions(n, len(here.k))
     f = here.k @ y + g
     cost = he(here.q @ y + here.k.T @ here.r @ f)
     inverse = jnp.linalg.inv(_slacks(here, jnp.zeros((n, n)), jnp.zeros_like(here.k), shift, discrete=discrete))
+    # First derivatives of S_i at the point; the quadratic terms enter the Hessian through `curved`.
     change = _linear_part(here, y, g, discrete=discrete) + _pad_to_block(shift * y - cost, n, discrete)[:, None]
     moved, pushed, total = inverse @ change, here.w @ y, jnp.sum(inverse, 0)[:n, :n]
     gradient = -_trace(pushed) / mu - _trace(y) - jnp.sum(_trace(moved), 1)
@@ -134,7 +181,14 @@ def gradient_and_hessian(here: LocalProblem, shift: Any, mu: Any, *, discrete: b
 
 
 def directions(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """A basis of the changes (Y, G), X = I + Y and F = K + K Y + G: (d, n, n), (d, m, n), d = n(n + 1)/2 + m n."""
+    """Return a basis of the changes (Y, G), shapes (d, n, n) and (d, m, n), with d = n(n + 1)/2 + m n.
+
+    The changed point is X = I + Y and F = K + K Y + G.
+
+    Args:
+        n: Number of states.
+        m: Number of inputs.
+    """
     pairs = [(i, j) for i in range(n) for j in range(i + 1)]
     y, g = np.zeros((len(pairs) + m * n, n, n)), np.zeros((len(pairs) + m * n, m, n))
     for d, (i, j) in enumerate(pairs):
@@ -144,35 +198,44 @@ def directions(n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def solve_newton_system(hessian: Any, right: Any) -> Any:
-    """H^-1 b, H positive definite and scaled to a unit diagonal."""
+    """Return H^-1 b for a positive definite H, solved with a unit diagonal.
+
+    Args:
+        hessian: H, shape (d, d).
+        right: b, shape (d,).
+    """
+    # Scaling the diagonal to 1 lowers the condition number: directions of X and F differ by many decades.
     unit = 1 / jnp.sqrt(jnp.diagonal(hessian))
     return unit * jnp.linalg.solve(hessian * unit * unit[:, None], unit * right)
 
 
 def _newton(problem: GuaranteedCostProblem, path: CentralPathState, *, discrete: bool) -> tuple[PathPoint, Any]:
-    """The point after the best of a few lengths of Newton's step, and the decrement before it."""
+    """Return the point after the best of several lengths of Newton's step, and the decrement before it."""
     here = localise_problem(problem, path.point)
     gradient, hessian = gradient_and_hessian(here, path.shift, path.mu, discrete=discrete)
     step = -solve_newton_system(hessian, gradient)
     decrement = jnp.sqrt(jnp.maximum(-gradient @ step, 0.0))
     y, g = (jnp.tensordot(step, basis, 1) for basis in directions(len(here.q), len(here.k)))
+    # Several lengths are tried at once, without a line search: a batch under vmap needs no loop of its own.
     lengths = jnp.concatenate([1 / (1 + decrement)[None], jnp.asarray(STEP_LENGTHS)])[:, None, None]
     values = _phi(here, lengths * y, lengths * g, path.shift, path.mu, discrete=discrete)
+    # Outside the domain logdet is NaN, and such a length is never the best.
     best = lengths[jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))]
     x = jnp.eye(len(y)) + best * y
     t, k = path.point
+    # T T' = T_old X T_old' makes X the unit matrix of the new coordinates.
     return PathPoint(t @ jnp.linalg.cholesky(x), k + best * g @ jnp.linalg.inv(t @ x)), decrement
 
 
 def _phi(here: LocalProblem, y: Any, g: Any, shift: Any, mu: Any, *, discrete: bool) -> Any:
-    """phi at changes (Y, G), stacks of them."""
+    """Return phi at changes (Y, G), or stacks of them."""
     x = jnp.eye(y.shape[-1]) + y
     inside = logdet(_slacks(here, y, g, shift, discrete=discrete))
     return _trace(jnp.linalg.inv(x) @ here.w) / mu - logdet(x) - jnp.sum(inside, -1)
 
 
 def _slacks(here: LocalProblem, y: Any, g: Any, shift: Any, *, discrete: bool) -> Any:
-    """S_i (..., V, n, n); in discrete time the matrix (2n, 2n) whose Schur complement it is."""
+    """Return S_i (..., V, n, n), or in discrete time the block matrix (..., V, 2n, 2n) above."""
     x = jnp.eye(y.shape[-1]) + y
     f = here.k @ x + g
     rest = shift * x - x @ here.q @ x - _t(f) @ here.r @ f
@@ -180,7 +243,7 @@ def _slacks(here: LocalProblem, y: Any, g: Any, shift: Any, *, discrete: bool) -
 
 
 def _linear_part(here: LocalProblem, x: Any, g: Any, *, discrete: bool) -> Any:
-    """What is linear in (X, G): -He[c X + b G], or [[X, .], [c X + b G, X]]."""
+    """Return the part that is linear in (X, G): -He[c X + b G], or [[X, .], [c X + b G, X]]."""
     x = x[..., None, :, :]
     flow = here.c @ x + here.b @ g[..., None, :, :]
     if not discrete:
@@ -190,7 +253,7 @@ def _linear_part(here: LocalProblem, x: Any, g: Any, *, discrete: bool) -> Any:
 
 
 def _pad_to_block(x: Any, n: int, discrete: bool) -> Any:
-    """x in the first rows and columns of a block."""
+    """Return x in the first rows and columns of a block matrix, in discrete time only."""
     return jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(0, n)] * 2) if discrete else x
 
 
@@ -199,7 +262,11 @@ def _t(x: Any) -> Any:
 
 
 def he(x: Any) -> Any:
-    """He[M] = M + M'."""
+    """Return He[M] = M + M'.
+
+    Args:
+        x: Square matrices, shape (..., n, n).
+    """
     return x + _t(x)
 
 
@@ -208,5 +275,9 @@ def _trace(x: Any) -> Any:
 
 
 def logdet(x: Any) -> Any:
-    """log det, of positive definite matrices; NaN for others."""
+    """Return log det of positive definite matrices; NaN for other matrices.
+
+    Args:
+        x: Symmetric matrices, shape (..., n, n).
+    """
     return 2 * jnp.sum(jnp.log(jnp.diagonal(jnp.linalg.cholesky(x), axis1=-2, axis2=-1)), -1)

@@ -1,12 +1,12 @@
 """Derivatives through a robust design, and through a robustness proof: for tuning by gradients, inside compiled code.
 
-    robust_gain       the gain of `synthesis` with the least guaranteed cost, differentiable in the weights
+    robust_gain       the gain of `synthesis` with the smallest guaranteed cost, differentiable in the weights
     robust_design     the same from matrices, with P, differentiable in the vertices too
     certified_decay   the fastest decay that a common P proves for a gain, differentiable in the gain
 
-All are pure JAX: they follow the central path of `centre` and end with Newton's method, so that they are compiled,
-batched, and differentiated by the implicit function theorem instead of through their iterations. What they return is
-floating point and not proved; `design` and `certify` prove it.
+All are pure JAX. They follow the central path of `central_path` and end with Newton's method. They can be compiled and
+batched, and the implicit function theorem gives their derivatives instead of the iterations. The results are floating
+point and not proved; `design` and `certify` prove them.
 """
 
 from functools import partial
@@ -22,40 +22,65 @@ from diffabs.design.polytopes import Polytope
 from diffabs.linear.lyapunov import as_float_arrays
 from diffabs.linear.riccati import care, dare
 
-FINAL_MU = 1e-8  # relative: the cost is at most (V + 2) n MU, in discrete time 2 (V + 1) n MU, above its optimum
-CENTRE_REDUCTION = 0.1  # mu, and a shift's distance from the least, from one centre to the next
-SHIFT_TOLERANCE = 1e-8  # relative: a shift this close to the least, and positive, will not go to zero
+# Relative mu at the end: the cost exceeds its optimum by at most (V + 2) n mu, in discrete time by 2 (V + 1) n mu.
+FINAL_MU = 1e-8
+CENTRE_REDUCTION = 0.1  # factor of mu, and of the distance of the shift from the smallest, from one centre to the next
+# Relative distance: a shift this close to a positive smallest shift means that no solution exists.
+SHIFT_TOLERANCE = 1e-8
 
 
 class RobustFeedback(NamedTuple):
-    """Gain K (m, n), u = K x, and P (n, n): x'P x is the cost that is guaranteed from x, its trace that of `design`."""
+    """Gain K (m, n) of u = K x, and its P (n, n).
+
+    x'P x is the guaranteed cost from x, and trace P is the cost of `design`.
+    """
 
     gain: Any
     P: Any
 
 
 def robust_gain(system: Polytope, Q: Any, R: Any) -> Any:
-    """The gain (m, n) with the least guaranteed cost over a polytope, for weights Q (n, n) and R (m, m), R > 0. NaN
-    where there is none; see `robust_design`."""
+    """Return the gain with the smallest guaranteed cost over a polytope, shape (m, n).
+
+    It is NaN if no such gain exists; see `robust_design`.
+
+    Args:
+        system: Polytope.
+        Q: State weight, shape (n, n).
+        R: Input weight, shape (m, m), R > 0.
+    """
     return robust_design(system.A, system.B, Q, R, discrete=system.period is not None).gain
 
 
 def robust_design(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool = False) -> RobustFeedback:
-    """The gain that minimises trace P over the vertices A (V, n, n), B (V, n, m): eqs. (29)-(32) of Maeda and Sugiura.
+    """Return the gain that minimises trace P over the vertices, and P: eqs. (29)-(32) of Maeda and Sugiura.
 
-    Works under jit, vmap and both modes of differentiation, in all arguments. Everything is of the point of the central
-    path at MU, whose cost is above the optimum by less than a millionth, and that satisfies the inequalities strictly.
-    Errors, measured on the rig as d ln K/d ln weight: 1e-5 at the published weights; over eight decades below 1e-4 for
-    nine weights of ten and 5e-4 for the worst, where input is dear and the cost hardly depends on K1. Where the optimal
-    gain has a kink (an inequality becomes active or ceases to be: strict complementarity fails), there is no
-    derivative, and what is returned is that of the central path, which rounds the kink off. Of Q and R the symmetric
-    part counts.
+    The function works under jit, vmap and both modes of differentiation, in all arguments. Only the symmetric parts of
+    Q and R count.
 
-    NaN without a solution: a vertex without a stabilising Riccati solution, no gain with a common P, Q that does not
-    see every mode, R that is not positive definite, input that is not finite.
+    The result is the point of the central path at FINAL_MU. Its cost exceeds the optimum by less than a millionth, and
+    it satisfies the inequalities strictly. Errors of the derivative, measured on the rig as d ln K/d ln weight, are
+    1e-5 at the published weights. Over eight decades they are below 1e-4 for nine weights of ten. The worst error is
+    5e-4, where input is expensive and the cost hardly depends on K1.
+
+    The optimal gain has a kink where an inequality becomes active or inactive (strict complementarity fails). There is
+    no derivative there: the function returns that of the central path, which rounds off the kink.
+
+    The result is NaN without a solution or with invalid input:
+
+    - A vertex has no stabilising Riccati solution, or no gain has a common P.
+    - Q does not see every mode, or R is not positive definite.
+    - Input is not finite.
+
+    Args:
+        A: State matrices of the vertices, shape (V, n, n).
+        B: Input matrices of the vertices, shape (V, n, m).
+        Q: State weight, shape (n, n).
+        R: Input weight, shape (m, m).
+        discrete: Whether the system is in discrete time.
 
     Raises:
-        ValueError: shapes that do not fit.
+        ValueError: Shapes that do not fit.
     """
     A, B, Q, R = as_float_arrays(A, B, Q, R)
     n, m = B.shape[-2:]
@@ -68,7 +93,7 @@ def robust_design(A: Any, B: Any, Q: Any, R: Any, *, discrete: bool = False) -> 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 @partial(jax.jit, static_argnums=0)
 def _solve_central_path(discrete: bool, problem: GuaranteedCostProblem) -> tuple[Any, Any, Any]:
-    """K, P, mu of the last centre; NaN where it was not reached."""
+    """Return K, P and mu of the last centre; NaN if the path does not reach it."""
     path = central_path.follow_path(
         problem, _start_from_riccati(problem, discrete), _advance_parameters, discrete=discrete
     )
@@ -80,9 +105,10 @@ def _solve_central_path(discrete: bool, problem: GuaranteedCostProblem) -> tuple
 
 @_solve_central_path.defjvp
 def _solve_central_path_jvp(discrete: bool, primals: Any, tangents: Any) -> Any:
-    """H dx + d(gradient of phi at constant x) = 0, in the coordinates of the point."""
+    """Return the implicit derivative: H dx + d(gradient of phi at constant x) = 0, in the coordinates of the point."""
     (problem,), (change,) = primals, tangents
     K, P, mu = _solve_central_path(discrete, problem)
+    # T from P: the primal's own T is no output, and any T with T T' = P^-1 gives the same derivative.
     T = jnp.linalg.inv(jnp.linalg.cholesky(P).T)
 
     def gradient(problem: GuaranteedCostProblem) -> Any:
@@ -90,6 +116,7 @@ def _solve_central_path_jvp(discrete: bool, primals: Any, tangents: Any) -> Any:
             central_path.localise_problem(problem, PathPoint(T, K)), 0.0, mu, discrete=discrete
         )
 
+    # One jvp gives both: the Hessian as a primal, and the change of the gradient at constant (X, F) as a tangent.
     (_, hessian), (by_problem, _) = jax.jvp(gradient, (problem,), (change,))
     step = -central_path.solve_newton_system(hessian, by_problem)
     y, g = (jnp.tensordot(step, basis, 1) for basis in central_path.directions(len(P), len(K)))
@@ -98,11 +125,14 @@ def _solve_central_path_jvp(discrete: bool, primals: Any, tangents: Any) -> Any:
 
 
 def _start_from_riccati(problem: GuaranteedCostProblem, discrete: bool) -> CentralPathState:
-    """The path from the Riccati solution of the vertex whose P and gain come nearest to serving all; NaN if one vertex
-    has no solution."""
+    """Return the path's start: the Riccati solution of the vertex with the smallest shift over all vertices.
+
+    It is NaN if one vertex has no solution.
+    """
     A, B, Q, R = problem
 
     def alone(a: Any, b: Any) -> tuple[Any, PathPoint, Any]:
+        """Return the shift, the point and trace P of one vertex's Riccati solution."""
         P = (dare if discrete else care)(a, b, Q, R).P
         K = -jnp.linalg.solve(R + b.T @ P @ b, b.T @ P @ a) if discrete else -jnp.linalg.solve(R, b.T @ P)
         point = PathPoint(jnp.linalg.inv(jnp.linalg.cholesky(P).T), K)
@@ -114,13 +144,15 @@ def _start_from_riccati(problem: GuaranteedCostProblem, discrete: bool) -> Centr
 
     shift, points, traces = jax.vmap(alone)(A, B)
     best = jnp.argmin(shift)
+    # `0 * sum(shift)` is NaN if any vertex has no solution, and makes the whole path NaN.
     return central_path.start_path(points.T[best], points.K[best], traces[best] + 0 * jnp.sum(shift))
 
 
 def _advance_parameters(path: CentralPathState, least: Any, cost: Any) -> CentralPathState:
-    """First the shift goes to zero, then mu to its last value."""
+    """Return the state with the next shift, or with the next mu once the shift is zero."""
     found, last = path.shift == 0, path.mu <= 1.01 * FINAL_MU * cost
     return path._replace(
+        # As soon as the smallest shift is negative, the point is feasible without a shift.
         shift=jnp.where(least < 0, 0.0, least + CENTRE_REDUCTION * (path.shift - least)),
         mu=jnp.where(found & ~last, jnp.maximum(CENTRE_REDUCTION * path.mu, FINAL_MU * cost), path.mu),
         settled=path.settled + (found & last & (path.decrement < 0.1)),

@@ -1,7 +1,8 @@
-"""A robust design with its proofs: what is claimed about which matrices, kept in a file anyone can check again.
+"""Certificates: claims about the closed loops of a gain with the numbers that prove them, saved in a verifiable file.
 
-A verdict is never stored: `Certificate.load` reads matrices and claims, `verify` proves them exactly (`exact`), and so
-does `verify`, which shares no code with the rest of this package. Claims and their data, by kind:
+A file stores no verdict. `Certificate.load` reads matrices and claims, and `Certificate.verify` proves them exactly
+(`design.proof.exact`). `design.verify` also proves them and shares no code with the rest of this package. Claims and
+their data, by kind:
 
     decay       P, rate (factor in discrete time)   V = x' P x falls like exp(-2 rate t), by factor^2 a period
     cost        P, Q, R, maybe x0                   the cost from x0 is at most x0' P x0; trace P on average
@@ -33,13 +34,13 @@ QUADRATIC_KINDS = ("decay", "cost", "damping", "l2", "input")  # each has one P 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Claim:
-    """One of the inequalities above and the numbers that prove it; arrays are copied and read-only."""
+    """One inequality of a kind listed above and the numbers that prove it; arrays are copied and read-only."""
 
     kind: str
     data: Mapping[str, float | np.ndarray]
 
     def __post_init__(self) -> None:
-        """Numbers as floats."""
+        """Convert the numbers to floats."""
         data = {name: as_read_only_array(value) for name, value in self.data.items()}
         data = {name: value if value.ndim else float(value) for name, value in data.items()}
         object.__setattr__(self, "data", MappingProxyType(data))
@@ -47,9 +48,17 @@ class Claim:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Certificate:
-    """Claims about the loops A + B K of a polytope, or of a schedule with gain (m, n) or one for each node (N, m, n).
+    """Claims about the loops A + B K of a polytope or of a schedule.
 
-    Holds copies that are read-only, so a verdict once found stays true. Raises ValueError for claims that do not fit.
+    The certificate holds read-only copies, so a verdict stays true.
+
+    Attributes:
+        system: A polytope or a schedule.
+        gain: Gain K, shape (m, n), or one gain for each node, shape (N, m, n).
+        claims: Claims of the certificate.
+
+    Raises:
+        ValueError: Claims that do not fit.
     """
 
     system: Polytope | Schedule
@@ -57,7 +66,7 @@ class Certificate:
     claims: tuple[Claim, ...]
 
     def __post_init__(self) -> None:
-        """Copies, and shapes and ranges of the claims."""
+        """Copy the data, and check shapes and ranges of the claims."""
         gain = as_read_only_array(self.gain)
         object.__setattr__(self, "gain", as_read_only_array(gain[None]) if gain.ndim == 1 else gain)
         object.__setattr__(self, "system", as_read_only_system(self.system))
@@ -67,7 +76,7 @@ class Certificate:
             schema.check_claim(claim.kind, self.system, self.gain, claim.data)
 
     def verify(self) -> tuple[bool, ...]:
-        """For each claim whether it is proved: exactly, and with every vertex off by up to 2^-40 of each entry."""
+        """Return for each claim whether it is proved, exactly and for relative errors of 2^-40 in the vertices."""
         return self._verdicts
 
     @functools.cached_property
@@ -76,42 +85,44 @@ class Certificate:
 
     @property
     def verified_exactly(self) -> bool:
-        """Whether there is a claim and all are proved."""
+        """Whether the certificate has a claim and all its claims are proved."""
         return bool(self.claims) and all(self.verify())
 
     def proved(self, *kinds: str) -> Iterator[Mapping[str, Any]]:
-        """Data of the proved claims of these kinds."""
+        """Yield the data of the proved claims of these `kinds`."""
         for claim, verdict in zip(self.claims, self.verify(), strict=True):
             if verdict and claim.kind in kinds:
                 yield claim.data
 
     @property
     def period(self) -> float | None:
-        """[s] of a discrete-time system."""
+        """Sampling period [s] of a discrete-time system; None for continuous time."""
         return self.cells[0].period
 
     @property
     def cells(self) -> tuple[Polytope, ...]:
-        """The polytopes of a schedule; a polytope is one."""
+        """Polytopes of a schedule; a polytope is its own single cell."""
         return self.system.cells if isinstance(self.system, Schedule) else (self.system,)
 
     @property
     def quadratically_stable(self) -> bool | None:
-        """True if one P is proved to decrease at all vertices, False if it is proved that none does, None if open."""
+        """True if one P is proved to decrease at all vertices, False if a proof excludes such a P, otherwise None."""
+        # A scheduled claim with equal P at all nodes is a proof for one P.
         one = [data["P"] for data in self.proved("scheduled") if (data["P"] == data["P"][0]).all()]
         if one or any(self.proved(*QUADRATIC_KINDS)):
             return True
+        # Only a witness against the rate 0 excludes stability; a witness against a faster decay leaves it open.
         refuted = (data.get("rate", 0.0) <= 0 and data.get("factor", 1.0) >= 1 for data in self.proved("infeasible"))
         return False if any(refuted) else None
 
     @property
     def stable(self) -> bool | None:
-        """True if stability is proved, by one P or by one that depends on the parameter of a schedule; else None."""
+        """True if stability is proved, with one P or with a P that depends on a schedule's parameter; else None."""
         return True if any(self.proved(*QUADRATIC_KINDS, "scheduled")) else None
 
     @property
     def decay_rate(self) -> float | None:
-        """The best proved, of |x| [1/s]."""
+        """Largest proved decay rate of |x| [1/s]."""
         rates = [data.get("rate", 0.0) for data in self.proved("decay", "scheduled")]
         if self.period is not None:
             rates = [-math.log(data.get("factor", 1.0)) / self.period for data in self.proved("decay")]
@@ -119,11 +130,11 @@ class Certificate:
 
     @property
     def guaranteed_cost(self) -> float | None:
-        """trace P of the first cost claim that is proved, rounded up; of a scheduled one the largest over the nodes."""
+        """Trace P of the first proved cost claim, rounded up; for a scheduled claim the largest over the nodes."""
         return self._cost(self.proved("cost", "scheduled"))
 
     def _cost(self, claims: Iterator[Mapping[str, Any]]) -> float | None:
-        """trace P of the first of these claims that is about cost."""
+        """Return trace P of the first of these claims that has a cost."""
         for data in claims:
             if "Q" in data or "R" in data:
                 return max(
@@ -133,26 +144,27 @@ class Certificate:
 
     @property
     def cost_from_start(self) -> float | None:
-        """x0' P x0 of the first proved cost claim that has x0, rounded up."""
+        """Cost x0' P x0 of the first proved cost claim that has x0, rounded up."""
         for data in self.proved("cost"):
             if "x0" in data:
+                # Fractions, so that the sum is rounded once, upwards.
                 x, P = np.vectorize(Fraction, [object])(data["x0"]), np.vectorize(Fraction, [object])(data["P"])
                 return round_up(x @ P @ x)
         return None
 
     @property
     def damping(self) -> float | None:
-        """The best damping ratio proved for all fixed systems of the hull."""
+        """Largest damping ratio [1] proved for all fixed systems of the hull."""
         return max((data["zeta"] for data in self.proved("damping")), default=None)
 
     @property
     def l2_gain(self) -> float | None:
-        """The bound of the first l2 claim that is proved."""
+        """Bound of the L2 gain in the first proved l2 claim."""
         return next((data["gamma"] for data in self.proved("l2")), None)
 
     @property
     def input_limit(self) -> np.ndarray | None:
-        """The bounds (m,) of the first input claim that is proved."""
+        """Bounds of the inputs (m,) in the first proved input claim."""
         return next((data["limit"] for data in self.proved("input")), None)
 
     @functools.cached_property
@@ -163,7 +175,7 @@ class Certificate:
 
     @property
     def margins(self) -> dict[str, float]:
-        """For each kind the smallest margin, relative and in floats, over its claims and the vertices."""
+        """Smallest margin of each kind over its claims and the vertices, relative and in floats."""
         found: dict[str, float] = {}
         for kind, margins in self._margins:
             found[kind] = min(found.get(kind, math.inf), *margins.values())
@@ -171,7 +183,7 @@ class Certificate:
 
     @property
     def worst_vertex(self) -> dict[str, Any] | None:
-        """Where the margin is smallest: index (of all cells one after the other), cell, corner, claim and margin."""
+        """The vertex with the smallest margin: index (over all cells in order), cell, corner, claim and margin."""
         all_of = [
             (value, i, kind) for kind, each in self._margins for i, value in each.items() if i != exact.ALL_VERTICES
         ]
@@ -186,10 +198,11 @@ class Certificate:
 
     @property
     def frozen(self) -> tuple[float, ...]:
-        """For each vertex the spectral abscissa of A + B K (radius in discrete time), in floats; not a proof.
+        """Spectral abscissa of A + B K at each vertex (spectral radius in discrete time), in floats; not a proof.
 
-        In a schedule with the worse gain of the cell's two nodes.
+        For a schedule it is the worse value of the gains at the cell's two nodes.
         """
+        # Within a cell K is linear between its two nodes: each vertex is checked with both gains.
         gains = (
             self.gain if self.gain.ndim == 3 else np.broadcast_to(self.gain, (len(self.cells) + 1, *self.gain.shape))
         )
@@ -201,7 +214,7 @@ class Certificate:
         return tuple(found)
 
     def summary(self) -> dict[str, Any]:
-        """What is proved, for JSON. `trace_cost` is claimed, `guaranteed_cost` proved."""
+        """Return the proved properties for JSON: `trace_cost` is claimed, `guaranteed_cost` is proved."""
         limit = self.input_limit
         return {
             "gain": self.gain.tolist(),
@@ -221,7 +234,7 @@ class Certificate:
         }
 
     def __str__(self) -> str:
-        """A line for each claim, and the worst vertex."""
+        """Return one line for each claim, and the worst vertex."""
         size = f"{sum(cell.vertices for cell in self.cells)} vertices of order {self.cells[0].order}"
         lines = [f"certificate for {size}, gain {' '.join(str(self.gain.tolist()).split())}"]
         for claim, verdict in zip(self.claims, self.verify(), strict=True):
@@ -233,13 +246,22 @@ class Certificate:
         return "\n".join(lines)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the file whole or not at all. Raises OSError."""
+        """Write the certificate to the file at `path`, complete or not at all.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
         claims = ((claim.kind, claim.data) for claim in self.claims)
         files.write_file(pathlib.Path(path), serialise.format_certificate(self.system, self.gain, claims).encode())
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Certificate":
-        """What `save` wrote, nothing proved yet. Raises OSError, or ValueError in one line that names the field."""
+        """Return the certificate saved at `path`, with nothing proved yet.
+
+        Raises:
+            OSError: The file cannot be read.
+            ValueError: A file that is no certificate; the message is one line that names the field.
+        """
         try:
             system, gain, claims = serialise.read_certificate(path)
             return Certificate(system, gain, tuple(Claim(kind, data) for kind, data in claims))
@@ -248,14 +270,22 @@ class Certificate:
 
 
 def as_read_only_array(value: Any) -> np.ndarray:
-    """A copy as floats that cannot be written to."""
+    """Return a copy as floats that cannot be written to.
+
+    Args:
+        value: Number or array.
+    """
     array = np.array(value, float)
     array.setflags(write=False)
     return array
 
 
 def as_read_only_system(system: Polytope | Schedule) -> Any:
-    """A copy whose arrays cannot be written to."""
+    """Return a copy whose arrays cannot be written to.
+
+    Args:
+        system: A polytope or a schedule.
+    """
     if isinstance(system, Schedule):
         copy = dataclasses.replace(system, cells=tuple(map(as_read_only_system, system.cells)))
         copy.nodes.setflags(write=False)
@@ -267,6 +297,10 @@ def as_read_only_system(system: Polytope | Schedule) -> Any:
 
 
 def round_up(value: Any) -> float:
-    """The least float that is not below a rational number."""
+    """Return the smallest float that is not below a rational number.
+
+    Args:
+        value: Rational number.
+    """
     near = float(value)
     return near if Fraction(near) >= value else math.nextafter(near, math.inf)

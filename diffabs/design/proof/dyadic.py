@@ -1,7 +1,7 @@
-"""Integers that floats are, times a power of two, with bounds on what they may be off by; arithmetic without rounding.
+"""Exact arithmetic on floats as integers times a power of two, with bounds on their errors.
 
-An array of floats is an array of integers and one scale (`Dyadic`), and so are sums and products. Positive definiteness
-is Sylvester's criterion, by Bareiss's elimination.
+An array of floats is an array of integers with one scale (`Dyadic`). So are sums and products, without rounding.
+Positive definiteness is tested by Sylvester's criterion with Bareiss's elimination.
 """
 
 import functools
@@ -11,41 +11,44 @@ from typing import Any
 
 import numpy as np
 
-RELATIVE_ERROR_BITS = 40  # 2^-40
+RELATIVE_ERROR_BITS = 40  # a relative error of 2^-40 covers the rounding in computing the matrices from a model
 Matrix = Any  # an array of floats, or Dyadic
 
 
 class Dyadic:
-    """`ints` 2^-bits, off by at most `error` 2^-bits (None: 0): arrays of Python integers that add and multiply."""
+    """The numbers `ints` 2^-bits, each with an error of at most `error` 2^-bits (None: 0).
+
+    `ints` and `error` are arrays of Python integers.
+    """
 
     __slots__ = ("bits", "error", "ints")
-    __array_ufunc__ = None  # array * Dyadic is for Dyadic to compute, not element by element
+    __array_ufunc__ = None  # makes NumPy leave array * Dyadic to __rmul__ instead of an element-wise product
 
     def __init__(self, ints: Any, bits: int, error: Any = None) -> None:
-        """Takes them as they are; `exactly` and `about` make one of floats."""
+        """Store `ints`, `bits` and `error` unchanged; `as_dyadic` and `as_uncertain_dyadic` convert floats."""
         self.ints, self.bits, self.error = ints, bits, error
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the array."""
+        """Shape of the array."""
         return np.shape(self.ints)
 
     @property
     def mT(self) -> "Dyadic":
-        """The last two axes exchanged."""
+        """The array with its last two axes exchanged."""
         return self.each(lambda array: array.mT)
 
     def each(self, function: Callable[[Any], Any], bits: int = 0) -> "Dyadic":
-        """`function` of integers and errors, at a scale finer by `bits`."""
+        """Apply `function` to integers and errors, and make the scale finer by `bits`."""
         return Dyadic(function(self.ints), self.bits + bits, None if self.error is None else function(self.error))
 
     def at(self, bits: int) -> "Dyadic":
-        """The same at a finer scale."""
+        """Return the same numbers at the finer scale 2^-bits, `bits` >= the present one."""
         finer = bits - self.bits
         return self.each(lambda array: array * (1 << finer), finer) if finer else self
 
     def product(self, other: Any, times: Callable[[Any, Any], Any]) -> "Dyadic":
-        """Errors of a product: |a| db + da |b| + da db."""
+        """Return the product with `other` by the bilinear `times`, with its error |a| db + da |b| + da db."""
         other = as_dyadic(other)
         a, b, da, db = self.ints, other.ints, self.error, other.error
         errors = [] if db is None else [times(abs(a), db)]
@@ -82,7 +85,14 @@ class Dyadic:
 
 
 def as_dyadic(value: Any) -> Dyadic:
-    """The numbers of `value`, a float, an int or an array of floats. Raises ValueError where one is not finite."""
+    """Return the numbers of `value` as integers times a power of two, without error.
+
+    Args:
+        value: Float, int or array of floats; a Dyadic is returned unchanged.
+
+    Raises:
+        ValueError: A number that is not finite.
+    """
     if isinstance(value, Dyadic):
         return value
     if isinstance(value, int):
@@ -91,27 +101,39 @@ def as_dyadic(value: Any) -> Dyadic:
     if not np.isfinite(value).all():
         raise ValueError("a number in an exact computation is not finite")
     fraction, exponent = np.frexp(value)
+    # 53 bits hold the mantissa of every double; object arrays hold Python integers of any length.
     ints = np.asarray(fraction * 2.0**53).astype(np.int64).astype(object)
+    # Zeros do not count: their exponent would set a needlessly fine scale.
     lowest = int(np.min(exponent, where=value != 0, initial=1024))
     shift = np.where(value != 0, exponent - lowest, 0).astype(object)
     return Dyadic(np.left_shift(ints, shift), 53 - lowest)
 
 
 def as_uncertain_dyadic(value: Any) -> Dyadic:
-    """The numbers of `value`, each off by at most a relative 2^-RHO."""
+    """Return the numbers of `value` with a relative error of at most 2^-RELATIVE_ERROR_BITS each.
+
+    Args:
+        value: Float, int or array of floats.
+    """
     ints = as_dyadic(value)
+    # At a scale finer by 2^40, an error of |ints| units is a relative error of 2^-40.
     return Dyadic(ints.ints * (1 << RELATIVE_ERROR_BITS), ints.bits + RELATIVE_ERROR_BITS, abs(ints.ints))
 
 
 def is_positive_definite(matrix: list[list[int]], strict: bool = True) -> bool:
-    """Whether a symmetric matrix of integers is positive definite (semidefinite where not `strict`).
+    """Return whether a symmetric matrix of integers is positive definite, or semidefinite if not `strict`.
 
-    Bareiss: the pivots are the leading minors, and every division leaves no remainder. A zero pivot of a semidefinite
-    matrix has a zero row, which is left out. Works in place, in the lower triangle.
+    The method is Bareiss's elimination: the pivots are the leading minors, and every division leaves no remainder. A
+    zero pivot of a semidefinite matrix has a zero row, which is skipped. It works in place, in the lower triangle.
+
+    Args:
+        matrix: Symmetric matrix of Python integers; its lower triangle is overwritten.
+        strict: Whether to test for definiteness.
     """
     n, last = len(matrix), 1
     for k in range(n):
         pivot, below = matrix[k][k], [matrix[i][k] for i in range(n)]
+        # A semidefinite matrix with a zero on its diagonal has zeros in that row and column.
         if pivot < 0 or (pivot == 0 and (strict or any(below[k:]))):
             return False
         if pivot == 0:

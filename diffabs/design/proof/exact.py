@@ -1,12 +1,15 @@
 """Proofs of matrix inequalities about the stated numbers, without rounding.
 
-Each kind of claim is written once, over matrices that are either float arrays (how much is left: `margins`) or exact,
-`Dyadic` (is it true: `verify`).
+Each kind of claim is written once, over matrices of two types: float arrays for its margins, `Dyadic` for its proof.
 
-Rounded outward: entries of A, B and Bw may be off by a relative RHO = 2^-40, which covers the rounding in computing
-them from a model. Sums and products carry the error along: of A + B K at most RHO (|A| + |B| |K|) = RHO Abar, of P C
-at most RHO |P| Abar. If M may so change by a symmetric D with |D| <= E entrywise, it stays positive definite if
-M - diag_i(sum_j E_ij s_i / s_j) > 0 for some s > 0, since 2 |x_i x_j| <= (s_i/s_j) x_i^2 + (s_j/s_i) x_j^2.
+Rounded outward: each entry of A, B and Bw may have a relative error of RHO = 2^-40. That covers the rounding in
+computing them from a model. Sums and products propagate the error:
+
+    |error of A + B K| <= RHO (|A| + |B| |K|) = RHO Abar,       |error of P C| <= RHO |P| Abar
+
+Let M have a symmetric error D with |D| <= E entrywise. M + D is positive definite if for some s > 0
+
+    M - diag_i(sum_j E_ij s_i / s_j) > 0,       since 2 |x_i x_j| <= (s_i/s_j) x_i^2 + (s_j/s_i) x_j^2
 
 He(M) = M + M', C = A + B K.
 """
@@ -24,10 +27,10 @@ from diffabs.design.proof.schema import check_claim
 
 
 class Inequality(NamedTuple):
-    """sum(terms) > 0 (>= 0 where not `strict`), all of (..., k, k).
+    """The inequality sum(terms) > 0 (>= 0 if not `strict`) over terms of shape (..., k, k).
 
-    `vertex` is the number of the first vertex where there is one for each vertex, ALL where it is about them together,
-    None for a side condition such as P > 0.
+    `vertex` is the number of the first vertex of an inequality for each vertex. It is ALL_VERTICES if the inequality
+    concerns all vertices together, and None for a side condition such as P > 0.
     """
 
     terms: tuple[Matrix, ...]
@@ -39,7 +42,7 @@ ALL_VERTICES = -1
 
 
 class ClosedLoop(NamedTuple):
-    """Gain and C of the vertices, as floats or Dyadic."""
+    """Gain K and closed loops C of the vertices, as floats or Dyadic."""
 
     K: Matrix
     C: Matrix
@@ -47,16 +50,25 @@ class ClosedLoop(NamedTuple):
 
 
 def he(M: Matrix) -> Matrix:
-    """M + M'."""
+    """Return M + M'.
+
+    Args:
+        M: Square matrices, shape (..., n, n).
+    """
     return M + M.mT
 
 
 def block_matrix(rows: list[list[Matrix]]) -> Matrix:
-    """The matrices put together; those without leading axes are the same for every vertex."""
+    """Return the block matrix of the rows; blocks without leading axes are the same for every vertex.
+
+    Args:
+        rows: Rows of blocks, each of shape (..., r, c).
+    """
     flat = [each for row in rows for each in row]
     lead = np.broadcast_shapes(*(each.shape[:-2] for each in flat))
 
     def joined(get: Callable[[Matrix], Any]) -> Any:
+        """Return the block matrix of one array of each block."""
         return np.block([[np.broadcast_to(get(each), (*lead, *each.shape[-2:])) for each in row] for row in rows])
 
     if not isinstance(flat[0], Dyadic):
@@ -70,7 +82,13 @@ def block_matrix(rows: list[list[Matrix]]) -> Matrix:
 
 
 def decrease_terms(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> tuple[Matrix, ...]:
-    """Terms of -He(P C) - 2 rate P, in discrete time of factor^2 P - C' P C."""
+    """Return the terms of -He(P C) - 2 rate P, or in discrete time of factor^2 P - C' P C.
+
+    Args:
+        loop: Closed loops of the vertices.
+        P: Lyapunov matrix, shape (n, n).
+        data: Data of the claim, with `rate` [1/s] or `factor` if they are not 0 or 1.
+    """
     if loop.discrete:
         factor = data.get("factor", 1)
         return factor * factor * P, -(loop.C.mT @ P @ loop.C)
@@ -78,26 +96,43 @@ def decrease_terms(loop: ClosedLoop, P: Matrix, data: Mapping[str, Matrix]) -> t
 
 
 def decay_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
-    """V = x' P x falls at least like exp(-2 rate t), in discrete time by factor^2 a period."""
+    """Yield the conditions that V = x' P x falls at least like exp(-2 rate t), or by factor^2 a period.
+
+    Args:
+        loop: Closed loops of the vertices.
+        data: Data of the claim.
+    """
     yield Inequality((data["P"],))
     yield Inequality(decrease_terms(loop, data["P"], data), 0)
 
 
 def cost_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
-    """V' <= -x' (Q + K' R K) x: the integral (sum) of the right side from x0 is at most x0' P x0.
+    """Yield the conditions for V' <= -x' (Q + K' R K) x.
 
-    V falls without Q and R too, so that V -> 0 and the bound need no sign of Q, which may have been rounded.
+    The integral (sum) of x' (Q + K' R K) x from x0 is then at most x0' P x0. V falls without Q and R too. V therefore
+    goes to 0, and the bound needs no sign of Q, which may have rounding errors.
+
+    Args:
+        loop: Closed loops of the vertices.
+        data: Data of the claim.
     """
     terms = decrease_terms(loop, data["P"], {})
     yield Inequality((data["P"],))
+    # No vertex number: this is a side condition, and the margin is that of the next line.
     yield Inequality(terms)
     yield Inequality((*terms, -data["Q"], -(loop.K.mT @ data["R"] @ loop.K)), 0)
 
 
 def damping_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
-    """With M = P C, -[[He(M), cot (M - M')], [cot (M' - M), He(M)]] > 0, cot >= zeta / sqrt(1 - zeta^2).
+    """Yield the conditions for a damping of at least zeta, with M = P C and cot >= zeta / sqrt(1 - zeta^2).
+
+        -[[He(M), cot (M - M')], [cot (M' - M), He(M)]] > 0
 
     Eigenvalues of every fixed system of the hull then lie in |Im| < |Re| / cot, left of 0 (Chilali and Gahinet 1996).
+
+    Args:
+        loop: Closed loops of the vertices.
+        data: Data of the claim.
     """
     M, cot, zeta = data["P"] @ loop.C, data["cot"], data["zeta"]
     skew = cot * (M - M.mT)
@@ -107,14 +142,20 @@ def damping_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator
 
 
 def l2_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
-    """V' + |z|^2 - gamma^2 |w|^2 < 0 with x' = C x + Bw w, z = (C + D K) x: the gain from w to z is below gamma.
+    """Yield the conditions for V' + |z|^2 - gamma^2 |w|^2 < 0: the gain from w to z is below gamma.
 
-    Bounded real lemma; in discrete time V' is the difference V(x+) - V(x).
+    Here x' = C x + Bw w and z = (C + D K) x with C and D of the claim. The method is the bounded real lemma. In
+    discrete time V' is the difference V(x+) - V(x).
+
+    Args:
+        loop: Closed loops of the vertices.
+        data: Data of the claim.
     """
     P, Bw, Z = data["P"], data["Bw"], data["C"] + data["D"] @ loop.K
     none, supply = np.zeros((P.shape[-1], Bw.shape[-1])), data["gamma"] * data["gamma"] * np.eye(Bw.shape[-1])
     yield Inequality((P,))
     if loop.discrete:
+        # V(x+) = (C x + Bw w)' P (C x + Bw w): one product, so that its error is propagated once.
         F = block_matrix([[loop.C, Bw]])
         yield Inequality((block_matrix([[P - Z.mT @ Z, none], [none.T, supply]]), -(F.mT @ P @ F)), 0)
     else:
@@ -123,8 +164,15 @@ def l2_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Ineq
 
 
 def input_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
-    """|u_j| <= limit_j for ever from the hull of `points`: they lie in {x' P x <= 1}, which no x leaves, and there
-    (K_j x)^2 <= K_j P^-1 K_j' < limit_j^2, by [[P, K_j'], [K_j, limit_j^2]] > 0."""
+    """Yield the conditions for |u_j| <= limit_j for ever from the hull of `points`.
+
+    The points lie in {x' P x <= 1}, which no trajectory leaves. There (K_j x)^2 <= K_j P^-1 K_j' < limit_j^2, by [[P,
+    K_j'], [K_j, limit_j^2]] > 0.
+
+    Args:
+        loop: Closed loops of the vertices.
+        data: Data of the claim.
+    """
     P, limit, points = data["P"], data["limit"], data["points"]
     yield Inequality((P,))
     yield Inequality(decrease_terms(loop, P, {}), 0)
@@ -136,10 +184,15 @@ def input_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[I
 
 
 def infeasibility_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> Iterator[Inequality]:
-    """No P > 0 has He(P (C_i + rate I)) <= 0 at all vertices: W_i >= 0 and S = sum_i He((C_i + rate I) W_i) > 0.
+    """Yield the conditions that no P > 0 has He(P (C_i + rate I)) <= 0 at all vertices.
 
-    Such a P would give 0 >= sum_i tr(W_i He(P (C_i + rate I))) = tr(P S) > 0. In discrete time C_i' P C_i <= factor^2 P
-    and S = sum_i (C_i W_i C_i' - factor^2 W_i).
+    They are W_i >= 0 and S = sum_i He((C_i + rate I) W_i) > 0. Such a P gives the contradiction 0 >= sum_i tr(W_i He(P
+    (C_i + rate I))) = tr(P S) > 0. In discrete time C_i' P C_i <= factor^2 P and S = sum_i (C_i W_i C_i' - factor^2
+    W_i).
+
+    Args:
+        loop: Closed loops of the vertices.
+        data: Data of the claim.
     """
     W, factor = data["W"], data.get("factor", 1)
     yield Inequality((W,), strict=False)
@@ -152,13 +205,23 @@ def infeasibility_conditions(loop: ClosedLoop, data: Mapping[str, Matrix]) -> It
 def schedule_conditions(
     cells: list[tuple[Matrix, Matrix]], nodes: Matrix, gain: Matrix, data: Mapping[str, Matrix]
 ) -> Iterator[Inequality]:
-    """V = x' P(p) x with V' <= -2 rate V - x' (Q + K' R K) x, P and K linear in the parameter p between nodes.
+    """Yield the conditions for V = x' P(p) x with V' <= -2 rate V - x' (Q + K' R K) x.
 
-    In a cell, p = a + l (b - a), V' + ... is x' G(l) x with G quadratic in l, affine in (A, B) and in p' in `rates`.
-    G(l) is (1-l)^2 G_aa + 2 l (1-l) G_ab + l^2 G_bb with Bernstein coefficients that for a product X Y of linear
-    functions are X_a Y_a, (X_a Y_b + X_b Y_a)/2 and X_b Y_b; the weights are not negative, so coefficients < 0 make
-    G(l) < 0. Vertices and ends of `rates` suffice because G is affine in (A, B) and p', which may depend on l: in a
-    cell they are anywhere in its hull. V is continuous, so its kinks at nodes do no harm. Shown is -(b - a) G > 0.
+    P and K are linear in the parameter p between nodes. In a cell, p = a + l (b - a). V' + ... is x' G(l) x with G
+    quadratic in l, and affine in (A, B) and in p', which lies in `rates`.
+
+    G(l) is (1-l)^2 G_aa + 2 l (1-l) G_ab + l^2 G_bb. Its Bernstein coefficients for a product X Y of linear functions
+    are X_a Y_a, (X_a Y_b + X_b Y_a)/2 and X_b Y_b. The weights are not negative, so negative definite coefficients make
+    G(l) < 0.
+
+    Vertices and ends of `rates` suffice because G is affine in (A, B) and p'. Both may depend on l: in a cell they are
+    anywhere in its hull. V is continuous, so its kinks at nodes do no harm. The inequality is stated as -(b - a) G > 0.
+
+    Args:
+        cells: A and B of the vertices of each cell.
+        nodes: Nodes of the parameter, shape (N,).
+        gain: Gain, shape (m, n), or one for each node, shape (N, m, n).
+        data: Data of the claim.
     """
     P, vertex = data["P"], 0
     yield Inequality((P,))
@@ -185,14 +248,25 @@ CLAIM_CONDITIONS = {
     "input": input_conditions,
     "infeasible": infeasibility_conditions,
 }
-# a letter for each axis: n states, m inputs, V vertices, N nodes, others free; "?" need not be there
 
 
 def conditions(
     kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any], proof: bool
 ) -> Iterator[Inequality]:
-    """What a claim of `kind` says, for `proof` in exact numbers. Raises ValueError for data that do not fit."""
+    """Yield the inequalities of a claim.
+
+    Args:
+        kind: Kind of the claim.
+        system: A polytope or a schedule.
+        gain: Gain of the certificate.
+        data: Data of the claim.
+        proof: Whether to use exact numbers with errors of the vertices, or floats.
+
+    Raises:
+        ValueError: Data that do not fit.
+    """
     check_claim(kind, system, gain, data)
+    # The gain, P and the bounds are exact as stored; only the system's matrices come from a computation with rounding.
     known, vertex = (as_dyadic, as_uncertain_dyadic) if proof else (np.asarray, np.asarray)
     lifted = {name: (vertex if name == "Bw" else known)(value) for name, value in data.items()}
     K = known(gain)
@@ -205,7 +279,11 @@ def conditions(
 
 
 def is_satisfied(inequality: Inequality) -> bool:
-    """Whether an inequality over Dyadic matrices holds, errors included. Matrices that are not symmetric do not."""
+    """Return whether an inequality over Dyadic matrices holds, errors included; False without symmetry.
+
+    Args:
+        inequality: Inequality with Dyadic terms.
+    """
     total = functools.reduce(operator.add, inequality.terms)
     k = total.shape[-1]
     matrices = total.ints.reshape(-1, k, k)
@@ -218,11 +296,18 @@ def is_satisfied(inequality: Inequality) -> bool:
 
 
 def is_robustly_positive(matrix: np.ndarray, error: np.ndarray, bits: int) -> bool:
-    """Whether integers 2^-bits `matrix` - diag_i(sum_j error_ij s_i / s_j) > 0, s_i a power of 2 near sqrt(M_ii).
+    """Return whether 2^-bits `matrix` - diag_i(sum_j error_ij s_i / s_j) > 0, with s_i a power of 2 near sqrt(M_ii).
 
-    Multiplied from both sides by 1 / s, times a power of 2 that leaves integers: rows of unlike size lose alike. The
-    bound carried for C' P C is not symmetric; the error is, so that either of error_ij and error_ji bounds it.
+    Both sides are multiplied by 1 / s and by a power of 2 that leaves integers, so that rows of unlike size lose
+    equally. The propagated bound of C' P C is not symmetric. The error itself is symmetric, so either of error_ij and
+    error_ji bounds it.
+
+    Args:
+        matrix: Symmetric matrix of Python integers, shape (n, n).
+        error: Bounds of its errors in the same units, shape (n, n).
+        bits: Scale of both: one unit is 2^-bits.
     """
+    # bit_length needs positive numbers, and no definite matrix has another diagonal.
     diagonal = np.diagonal(matrix)
     if (diagonal <= 0).any():
         return False
@@ -236,14 +321,33 @@ def is_robustly_positive(matrix: np.ndarray, error: np.ndarray, bits: int) -> bo
 
 
 def is_proved(kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any]) -> bool:
-    """Whether a claim is proved, exactly and rounded outward. Raises ValueError for data that do not fit (`SHAPES`)."""
+    """Return whether a claim is proved, exactly and rounded outward.
+
+    Args:
+        kind: Kind of the claim.
+        system: A polytope or a schedule.
+        gain: Gain of the certificate.
+        data: Data of the claim.
+
+    Raises:
+        ValueError: Data that do not fit (`schema.FIELD_SHAPES`).
+    """
     return all(map(is_satisfied, conditions(kind, system, gain, data, proof=True)))
 
 
 def vertex_margins(kind: str, system: Polytope | Schedule, gain: Any, data: Mapping[str, Any]) -> dict[int, float]:
-    """For each vertex the least eigenvalue of a claim's inequality relative to the largest of its terms, in floats.
+    """Return for each vertex the smallest eigenvalue of a claim's inequality relative to its largest term, in floats.
 
-    One under ALL where the inequality is about all vertices together. Side conditions are left out.
+    The margin of an inequality about all vertices together has the key ALL_VERTICES. Side conditions are left out.
+
+    Args:
+        kind: Kind of the claim.
+        system: A polytope or a schedule.
+        gain: Gain of the certificate.
+        data: Data of the claim.
+
+    Raises:
+        ValueError: Data that do not fit.
     """
     left: dict[int, float] = {}
     for each in conditions(kind, system, gain, data, proof=False):

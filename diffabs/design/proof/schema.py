@@ -1,4 +1,4 @@
-"""What the data of each kind of claim look like."""
+"""Names, shapes and ranges of the data of each kind of claim."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -7,6 +7,8 @@ import numpy as np
 
 from diffabs.design.polytopes import Polytope, Schedule
 
+# A letter for each axis: n states, m inputs, V vertices, N nodes, others free; "|" separates alternatives. A field with
+# "?" is optional.
 FIELD_SHAPES = {
     "decay": {"P": "nn", "rate?": "", "factor?": ""},
     "cost": {"P": "nn", "Q": "nn", "R": "mm", "x0?": "n"},
@@ -25,13 +27,22 @@ FIELD_RANGES: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "limit": ("be positive", lambda value: value > 0),
     "rates": ("increase", lambda value: value[0] <= value[1]),
 }
-INFEASIBLE_RANGES = {
-    "factor": ("be positive", FIELD_RANGES["gamma"][1])
-}  # that nothing proves a rate may be said of growth, too
+# A disproof may also concern growth: a factor above 1 or a negative rate.
+INFEASIBLE_RANGES = {"factor": ("be positive", FIELD_RANGES["gamma"][1])}
 
 
 def check_claim(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: Mapping[str, Any]) -> None:
-    """Raises ValueError, in one line that names the field, for a claim that does not fit the system and gain."""
+    """Raise ValueError for a claim that does not fit the system and gain.
+
+    Args:
+        kind: Kind of the claim.
+        system: A polytope or a schedule.
+        gain: Gain, shape (m, n), or (N, m, n) for a schedule.
+        data: Data of the claim.
+
+    Raises:
+        ValueError: A claim that does not fit; the message is one line that names the field.
+    """
     cell = system.cells[0] if isinstance(system, Schedule) else system
     if (kind == "scheduled") != isinstance(system, Schedule) or kind not in FIELD_SHAPES:
         raise ValueError(
@@ -61,8 +72,15 @@ def check_claim(kind: str, system: Polytope | Schedule, gain: np.ndarray, data: 
 
 
 def check_gain(system: Polytope | Schedule, gain: np.ndarray) -> dict[str, int]:
-    """Return sizes by letter (`FIELD_SHAPES`). Raises ValueError for a gain that is not (m, n), or (N, m, n) of a
-    schedule."""
+    """Return sizes by letter (`FIELD_SHAPES`) after a check of the gain.
+
+    Args:
+        system: A polytope or a schedule.
+        gain: Gain, shape (m, n), or (N, m, n) for a schedule.
+
+    Raises:
+        ValueError: A gain of another shape, or not finite.
+    """
     cell = system.cells[0] if isinstance(system, Schedule) else system
     sizes = {"n": cell.order, "m": cell.inputs, "2": 2}
     sizes |= {"N": len(system.nodes)} if isinstance(system, Schedule) else {"V": system.vertices}
@@ -73,7 +91,13 @@ def check_gain(system: Polytope | Schedule, gain: np.ndarray) -> dict[str, int]:
 
 
 def matches_shape(value: Any, letters: str, sizes: dict[str, int]) -> bool:
-    """Whether the axes of `value` have the sizes of the letters; a letter not seen yet gets its size."""
+    """Return whether the axes of `value` have the sizes of the letters.
+
+    Args:
+        value: Number or array.
+        letters: One letter for each axis.
+        sizes: Sizes by letter; a new letter is added with its size.
+    """
     shape = np.shape(value)
     return len(shape) == len(letters) and all(
         0 < size == sizes.setdefault(letter, size) for letter, size in zip(letters, shape, strict=True)

@@ -1,4 +1,4 @@
-"""The file of a certificate: JSON that round-trips exactly, and of which nothing is believed."""
+"""The file of a certificate: JSON that round-trips exactly, with a check of every field on reading."""
 
 import json
 import math
@@ -16,12 +16,20 @@ MAX_CERTIFICATE_BYTES, MAX_STATES_PLUS_INPUTS = 2**24, 64  # bytes; states and i
 
 
 def listed(value: float | np.ndarray) -> Any:
-    """For JSON."""
+    """Return a number or nested lists for JSON.
+
+    Args:
+        value: Number or array.
+    """
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def describe_system(system: Polytope | Schedule) -> dict[str, Any]:
-    """For JSON; `coverage`, which no claim rests on, is left out."""
+    """Return a system for JSON, without `coverage`, which no claim needs.
+
+    Args:
+        system: A polytope or a schedule.
+    """
     if isinstance(system, Schedule):
         cells = [describe_system(cell) for cell in system.cells]
         return {"parameter": system.parameter, "nodes": system.nodes.tolist(), "cells": cells}
@@ -31,7 +39,14 @@ def describe_system(system: Polytope | Schedule) -> dict[str, Any]:
 
 
 def reject_duplicate_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object. Raises ValueError for a name that comes twice: two readers may take different ones."""
+    """Return a JSON object from its members, if their names differ.
+
+    Args:
+        pairs: Names and values of the members.
+
+    Raises:
+        ValueError: A name that occurs twice: two readers may take different values.
+    """
     found = dict(pairs)
     if len(found) != len(pairs):
         raise ValueError(f"a name comes twice among {', '.join(name for name, _ in pairs)}")
@@ -39,7 +54,16 @@ def reject_duplicate_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def read_members(value: Any, where: str, *names: str) -> list[Any]:
-    """The values of an object with exactly these members. Raises ValueError."""
+    """Return the values of an object with exactly these members, in their order.
+
+    Args:
+        value: JSON value.
+        where: Name of the value for messages.
+        names: Names of the members.
+
+    Raises:
+        ValueError: Not an object, or other members.
+    """
     if not isinstance(value, dict) or set(value) != set(names):
         has = ", ".join(value) if isinstance(value, dict) else type(value).__name__
         raise ValueError(f"{where} must have the members {', '.join(names)} and no other; has {has}")
@@ -47,14 +71,31 @@ def read_members(value: Any, where: str, *names: str) -> list[Any]:
 
 
 def read_list(value: Any, where: str, kind: type = dict) -> list[Any]:
-    """A list of JSON values of one type. Raises ValueError."""
+    """Return a list of JSON values of one type, after a check.
+
+    Args:
+        value: JSON value.
+        where: Name of the value for messages.
+        kind: Type of the entries.
+
+    Raises:
+        ValueError: Not a list, or an entry of another type.
+    """
     if not isinstance(value, list) or not all(type(each) is kind for each in value):
         raise ValueError(f"{where} must be a list of {kind.__name__}")
     return value
 
 
 def read_numbers(value: Any, where: str = "a number") -> Any:
-    """A finite number or lists of them of equal lengths, as an array. Raises ValueError."""
+    """Return a finite number, or lists of them of equal lengths, as an array.
+
+    Args:
+        value: JSON value.
+        where: Name of the value for messages.
+
+    Raises:
+        ValueError: A value that is not finite or no number, or lists of different lengths.
+    """
     array = np.array(value, object)
     if not all(type(each) is float and math.isfinite(each) for each in array.flat):
         raise ValueError(f"{where} must be finite numbers, in lists of equal lengths")
@@ -64,7 +105,13 @@ def read_numbers(value: Any, where: str = "a number") -> Any:
 def format_certificate(
     system: Polytope | Schedule, gain: np.ndarray, claims: Iterable[tuple[str, Mapping[str, Any]]]
 ) -> str:
-    """The file of a certificate."""
+    """Return the content of a certificate's file.
+
+    Args:
+        system: A polytope or a schedule.
+        gain: Gain of the certificate.
+        claims: Kind and data of each claim.
+    """
     data = {
         "format": CERTIFICATE_FORMAT,
         "version": CERTIFICATE_VERSION,
@@ -78,18 +125,34 @@ def format_certificate(
 def read_certificate(
     path: str | os.PathLike[str],
 ) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, Any]]]]:
-    """System, gain, and (kind, data) of the claims in a file. Raises OSError, or ValueError that names the field."""
+    """Return system, gain, and (kind, data) of the claims in a file.
+
+    Args:
+        path: Path of the file.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: A file that is no certificate; the message names the field.
+    """
     raw = files.read_content(path, MAX_CERTIFICATE_BYTES + 1)
     if len(raw) > MAX_CERTIFICATE_BYTES:
         raise ValueError(f"the file is larger than {MAX_CERTIFICATE_BYTES} bytes")
     content = raw.decode()
     return certificate_from_json(
+        # Integers become floats, as in the arrays of the certificate; NaN and Infinity are rejected.
         json.loads(content, parse_int=float, parse_constant=read_numbers, object_pairs_hook=reject_duplicate_names)
     )
 
 
 def certificate_from_json(value: Any) -> tuple[Polytope | Schedule, np.ndarray, list[tuple[str, dict[str, Any]]]]:
-    """The same from JSON. Raises ValueError that names the field."""
+    """Return system, gain, and (kind, data) of the claims in a JSON value.
+
+    Args:
+        value: JSON value.
+
+    Raises:
+        ValueError: A value that is no certificate; the message names the field.
+    """
     kind, version, system, gain, claims = read_members(
         value, "the file", "format", "version", "system", "gain", "claims"
     )
@@ -109,7 +172,14 @@ def certificate_from_json(value: Any) -> tuple[Polytope | Schedule, np.ndarray, 
 
 
 def read_system(value: Any) -> Polytope | Schedule:
-    """A polytope or a schedule from JSON. Raises ValueError that names the field."""
+    """Return a polytope or a schedule from a JSON value.
+
+    Args:
+        value: JSON value.
+
+    Raises:
+        ValueError: A value that is no system; the message names the field.
+    """
     if isinstance(value, dict) and "cells" in value:
         parameter, nodes, cells = read_members(value, "system", "parameter", "nodes", "cells")
         if not isinstance(parameter, str):
@@ -122,9 +192,16 @@ def read_system(value: Any) -> Polytope | Schedule:
 
 
 def read_polytope(value: Any, where: str) -> Polytope:
-    """A polytope from JSON. Raises ValueError that names the field.
+    """Return a polytope from a JSON value, without its corners.
 
-    Its corners stay behind: nothing ties the labels of a file to its matrices, so they are not shown beside a proof.
+    Nothing ties the labels of a file to its matrices, so no output shows them beside a proof.
+
+    Args:
+        value: JSON value.
+        where: Name of the value for messages.
+
+    Raises:
+        ValueError: A value that is no polytope; the message names the field.
     """
     A, B, period, states, corners = read_members(value, where, "A", "B", "period", "states", "corners")
     if period is not None and not (isinstance(period, float) and 0 < period < math.inf):

@@ -1,1 +1,1 @@
-"""Semidefinite programs of a design: inequalities, scaling, the solver. The only importer of cvxpy."""
+"""Semidefinite programs of a design: inequalities, scaling and the solver. No other package imports cvxpy."""

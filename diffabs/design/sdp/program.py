@@ -12,15 +12,17 @@ from diffabs.design.sdp.scaling import Frame, whitening_matrix
 from diffabs.design.sdp.solver import SdpBlock, Unknowns, group_blocks
 from diffabs.design.spec import Spec
 
-L2_TRACE_WEIGHT = (
-    1e-4  # weight of trace Z where an L2 gain is minimised: its infimum is often that of infinite feedback
-)
-SPECIFICATION_TIGHTENING = 1e-6  # relative: a design aims past the specification, so that the proof has room
+# Weight of trace Z in the minimisation of an L2 gain: without it the infimum often needs infinite feedback.
+L2_TRACE_WEIGHT = 1e-4
+SPECIFICATION_TIGHTENING = 1e-6  # relative tightening of each specification, so that the exact proof has a margin
 Values = Mapping[str, np.ndarray]
 
 
 class VertexAtNode(NamedTuple):
-    """A vertex (A, B), and E, seen from a node; dX/dt there is the sum of rate times X over `drift`."""
+    """A vertex (A, B) and E in scaled coordinates, at a node of the schedule.
+
+    dX/dt is the sum of rate times X[node] over the pairs (node, rate) of `drift`.
+    """
 
     A: np.ndarray
     B: np.ndarray
@@ -30,13 +32,14 @@ class VertexAtNode(NamedTuple):
 
 
 class DesignProgram:
-    """Minimise the mean over the nodes of trace Z, or the squared L2 gain g, under the specification.
+    """A program that minimises the mean of trace Z over the nodes, or the squared L2 gain g, under the specification.
 
-    Unknown: X, F, Z for each node (a polytope has one), and g. `level` bounds V on the set of starts of an input limit.
+    The unknowns are X, F, Z for each node (a polytope has one), and g. `level` bounds V on the set of starts of an
+    input limit.
     """
 
     def __init__(self, system: Polytope | Schedule, whole: Polytope, spec: Spec, frame: Frame):
-        """Lay out the unknowns; `whole` has all vertices of the system."""
+        """Lay out the unknowns for `system` under `spec` in `frame`; `whole` has all vertices of the system."""
         self.system, self.spec, self.frame, self.period = system, spec, frame, whole.period
         self.nodes = len(system.nodes) if isinstance(system, Schedule) else 1
         n, m = whole.order, whole.inputs
@@ -47,34 +50,37 @@ class DesignProgram:
             shapes |= {"g": (1, 1)} if spec.l2.bound is None else {"s": (1, 1)}
         self.unknowns = Unknowns(**shapes)
         weight = frame.trace_weight()
+        # Trace Z of the original coordinates is a weighted trace of the scaled Z. `scale` keeps the solver's objective
+        # near 1.
         self.scale = float(np.trace(weight)) if spec.Q is not None else 1.0
         self.weight = weight / np.trace(weight)
         self.output, self.disturbance = self._sizes(whole)
         self.root, self.even = np.zeros((0, n)), np.eye(n)
         if spec.Q is not None:
+            # In the frame P = I and R = I, so K = -B' is the gain of the Riccati solution.
             k, weight = -frame.inputs(whole.B[0]).T, frame.weight(spec.Q)
             self.root, self.even = _root(weight), whitening_matrix(weight + k.T @ k)
         self.common = list(self._common())
 
     def objective(self) -> np.ndarray:
-        """c, so that c'y times `scale` is what is minimised."""
+        """Return c, with c'y times `scale` as the objective."""
         trace = self.unknowns.row(
             lambda v: sum(np.einsum("ij,dji->d", self.weight, v[f"Z{i}"]) for i in range(self.nodes)) / self.nodes
         )
         return trace if self.spec.Q is not None else L2_TRACE_WEIGHT * trace + self.unknowns.row(lambda v: v["g"])
 
     def blocks(self, level: float) -> list[SdpBlock]:
-        """All inequalities, grouped by size."""
+        """Return all inequalities for a `level` of V, grouped by size."""
         return group_blocks([*self.common, *self._input(level)])
 
     def least_level(self) -> float:
-        """The least V of the frame's own solution that holds the starts of the input limit."""
+        """Return the smallest V of the frame's own solution that holds the starts of the input limit."""
         if self.spec.input is None:
             return 1.0
         return float(((self.frame.inverse @ self.spec.input.points.T) ** 2).sum(axis=0).max())
 
     def _sizes(self, whole: Polytope) -> tuple[float, float]:
-        """Units of z and w in which the gain of the frame's closed loop, K = -B', is about 1."""
+        """Return units of z and w in which the gain of the frame's closed loop, K = -B', is about 1."""
         l2, frame = self.spec.l2, self.frame
         if l2 is None:
             return 1.0, 1.0
@@ -84,21 +90,25 @@ class DesignProgram:
         return float(z) or 1.0, float(np.linalg.norm(frame.inverse @ e)) / np.sqrt(frame.tau) or 1.0
 
     def read(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gains (nodes, m, n) and forms P = X^-1 (nodes, n, n) in the original coordinates."""
+        """Return gains (nodes, m, n) and forms P = X^-1 (nodes, n, n) of `y`, in the original coordinates."""
         v = self.unknowns.values(y)
         inverses = [np.linalg.inv(v[f"X{i}"]) for i in range(self.nodes)]
         gains = [self.frame.gain(v[f"F{i}"] @ inverse) for i, inverse in enumerate(inverses)]
         return np.array(gains), np.array([self.frame.form(inverse) for inverse in inverses])
 
     def _common(self) -> Iterator[SdpBlock]:
+        """Yield the inequalities that do not depend on the level of V."""
         for place in self._vertices_at_nodes():
             yield from self._at(place)
         for i in range(self.nodes):
             yield self.unknowns.affine(lambda v, i=i: inequalities.trace_lmi(v[f"X{i}"], v[f"Z{i}"]))
 
     def _vertices_at_nodes(self) -> Iterator[VertexAtNode]:
-        """Where an inequality has to hold. In a cell X and F are linear in the parameter and the system is any of the
-        cell's polytope, so the ends of the cell and of the rates suffice."""
+        """Yield the vertices at the nodes where an inequality has to hold.
+
+        In a cell X and F are linear in the parameter, and the system is anywhere in the cell's polytope. The ends of
+        the cell and of the rates therefore suffice.
+        """
         cells = self.system.cells if isinstance(self.system, Schedule) else (self.system,)
         frame, l2 = self.frame, self.spec.l2
         for i, cell in enumerate(cells):
@@ -110,11 +120,12 @@ class DesignProgram:
                     continue
                 width = self.system.nodes[i + 1] - self.system.nodes[i]
                 for node, rate in itertools.product((i, i + 1), sorted(set(self.spec.rates or ()))):
+                    # dX/dt = rate (X_b - X_a)/width, in the frame's unit of time.
                     slope = rate / width / frame.tau
                     yield VertexAtNode(*scaled, node, ((i, -slope), (i + 1, slope)))
 
     def _at(self, place: VertexAtNode) -> Iterator[SdpBlock]:
-        """Every inequality that a vertex has to satisfy."""
+        """Yield every inequality that a vertex has to satisfy."""
         spec, frame, discrete = self.spec, self.frame, self.period is not None
 
         def seen(v: Values) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -132,6 +143,7 @@ class DesignProgram:
             return inequalities.decay_lmi(x, flow, drift, rate, discrete=discrete)
 
         def damping(v: Values) -> np.ndarray:
+            # Tightened in 1 - zeta, so that zeta stays below 1.
             zeta = 1 - (1 - spec.damping) * (1 - SPECIFICATION_TIGHTENING)
             return inequalities.damping_lmi(seen(v)[2], zeta / np.sqrt(1 - zeta**2))
 
@@ -139,6 +151,7 @@ class DesignProgram:
             (x, f, flow, drift), l2 = seen(v), spec.l2
             assert l2 is not None
             z = (l2.output @ frame.T @ x + l2.feedthrough @ frame.U @ f) / np.sqrt(frame.tau)
+            # g is then near 1, as are the other unknowns.
             z, e = z / self.output, place.E / self.disturbance
             if l2.bound is None:
                 return inequalities.l2_gain_lmi(x, flow, drift, z, e, v["g"], 1.0, discrete=discrete)
@@ -149,6 +162,7 @@ class DesignProgram:
         yield from (self.unknowns.affine(formula) for asked, formula in wanted if asked)
 
     def _input(self, level: float) -> Iterator[SdpBlock]:
+        """Yield the inequalities of the input limit for a level of V."""
         limit = self.spec.input
         if limit is None:
             return
@@ -162,6 +176,7 @@ class DesignProgram:
 
 
 def _root(q: np.ndarray) -> np.ndarray:
-    """Qh with Qh'Qh = Q."""
+    """Return Qh with Qh'Qh = Q."""
+    # An eigenvalue of a semidefinite Q may be below 0 by rounding.
     values, vectors = np.linalg.eigh(q)
     return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T

@@ -2,9 +2,9 @@
 
     x = T z,  u = U v,  t = s/tau
 
-The rig's weights span eight decades and its states three; unscaled, Clarabel fails or returns a destabilising gain as
-optimal. In the coordinates of a Riccati solution P = T^-T T^-1 (or a Lyapunov solution) the unknown is near the unit
-matrix, and so are the weights of the input and, with tau, the closed loop.
+The rig's weights span eight decades and its states three. Without scaling, Clarabel fails or returns a destabilising
+gain as optimal. The coordinates of a Riccati solution P = T^-T T^-1 (or a Lyapunov solution) bring the unknown near the
+unit matrix. The weights of the input and, with tau, the closed loop are then near it too.
 """
 
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from diffabs.design.polytopes import Polytope
 
 
 class Frame(NamedTuple):
-    """T (n, n) and its inverse, U (m, m), tau [1/s] (1 in discrete time)."""
+    """A change of coordinates: T (n, n) and its inverse, U (m, m), and tau [1/s] (1 in discrete time)."""
 
     T: np.ndarray
     inverse: np.ndarray
@@ -24,56 +24,79 @@ class Frame(NamedTuple):
     tau: float
 
     def states(self, a: np.ndarray) -> np.ndarray:
-        """A, or stacks of it."""
+        """Return the scaled state matrix of `a`, shape (..., n, n)."""
         return self.inverse @ a @ self.T / self.tau
 
     def inputs(self, b: np.ndarray) -> np.ndarray:
-        """B."""
+        """Return the scaled input matrix of `b`, shape (n, m)."""
         return self.inverse @ b @ self.U / self.tau
 
     def weight(self, q: np.ndarray) -> np.ndarray:
-        """Q, or any quadratic form of x per unit of time."""
+        """Return the scaled weight of `q`, a quadratic form of x per unit of time."""
         return self.T.T @ q @ self.T / self.tau
 
     def form(self, p: np.ndarray) -> np.ndarray:
-        """P of the original coordinates from P of these."""
+        """Return P in the original coordinates from `p` in the scaled ones."""
         whole = self.inverse.T @ p @ self.inverse
         return (whole + np.swapaxes(whole, -1, -2)) / 2
 
     def gain(self, k: np.ndarray) -> np.ndarray:
-        """K of the original coordinates from K of these."""
+        """Return K in the original coordinates from `k` in the scaled ones."""
         return self.U @ k @ self.inverse
 
     def trace_weight(self) -> np.ndarray:
-        """W with trace P = trace(W P of these coordinates)."""
+        """Return W with trace P = trace(W P'), where P is in the original coordinates and P' in the scaled ones."""
         return self.inverse @ self.inverse.T
 
 
 def whitening_matrix(weight: np.ndarray) -> np.ndarray:
-    """D with D' weight D = I, but for directions that weigh less than a trillionth of the largest.
+    """Return D with D' `weight` D = I, except in directions with less than 1e-12 of the largest weight.
 
-    A slow closed loop beside a fast one has little cost per unit of time; D M D' makes a solver's tolerance relative.
+    A slow closed loop beside a fast one has a small cost per unit of time. The congruence D M D' makes a solver's
+    tolerance relative.
+
+    Args:
+        weight: Symmetric positive semidefinite matrix, shape (n, n).
     """
     values, vectors = np.linalg.eigh(weight)
     return vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1]))
 
 
 def lyapunov_frame(p: np.ndarray, a: np.ndarray, r: np.ndarray, *, discrete: bool) -> Frame:
-    """The frame in which P is the unit matrix, the closed loops A (V, n, n) have norms about 1, and R is the unit
-    matrix. Raises LinAlgError for a P that is not positive definite."""
+    """Return the frame in which P and R are unit matrices and the closed loops have norms of about 1.
+
+    Args:
+        p: P, shape (n, n).
+        a: Closed loops, shape (V, n, n).
+        r: Input weight R, shape (m, m).
+        discrete: Whether the system is in discrete time.
+
+    Raises:
+        LinAlgError: P is not positive definite.
+    """
     lower = np.linalg.cholesky((p + p.T) / 2)
     inverse = lower.T
     t = np.linalg.inv(inverse)
+    # The geometric mean of the norms; 1e-300 keeps the logarithm of a zero loop finite.
     tau = 1.0 if discrete else float(np.exp(np.mean(np.log(np.linalg.norm(inverse @ a @ t, axis=(1, 2)) + 1e-300))))
     u = np.linalg.inv(np.linalg.cholesky(r)).T * np.sqrt(tau)
     return Frame(t, inverse, u, tau)
 
 
 def design_frames(system: Polytope, q: np.ndarray, r: np.ndarray) -> Iterator[tuple[Frame, float]]:
-    """Frames for a design with weights Q, R, from the Riccati solutions of the vertices, the dearest first, with the
-    trace of that solution, a lower bound of every guaranteed cost. Raises ValueError for a vertex without a solution.
+    """Yield frames for a design from the vertices' Riccati solutions P, in decreasing order of trace P.
+
+    Each frame comes with this trace, a lower bound of every guaranteed cost.
+
+    Args:
+        system: Polytope.
+        q: State weight Q, shape (n, n).
+        r: Input weight R, shape (m, m).
+
+    Raises:
+        ValueError: A vertex without a stabilising Riccati solution.
     """
-    # a weight in every state, so that P is definite; relative, and too small to matter
+    # A small weight on every state keeps P definite. It is relative, and too small to change the result.
     regular = q + 1e-12 * np.diag(np.maximum(np.diag(q), 1e-6 * np.trace(q) / len(q)))
     solutions = [_riccati(a, b, regular, r, i, system) for i, (a, b) in enumerate(zip(system.A, system.B, strict=True))]
     traces = np.array([np.trace(p) for p in solutions])
@@ -87,6 +110,7 @@ def design_frames(system: Polytope, q: np.ndarray, r: np.ndarray) -> Iterator[tu
 
 
 def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, i: int, system: Polytope) -> np.ndarray:
+    """Return the stabilising Riccati solution of vertex i, or raise ValueError with its parameters."""
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
     try:
@@ -106,15 +130,21 @@ def _riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray, i: int,
 
 
 def _solve_by_hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray | None:
-    """The Riccati solution from the stable eigenvectors of the Hamiltonian matrix and a Newton step; None where its
-    residual is not small. A thirtieth of the time of SciPy's, whose BLAS may start threads for such small matrices."""
+    """Return the Riccati solution from the stable eigenvectors of the Hamiltonian matrix and one Newton step.
+
+    A large residual makes the result None. The method takes a thirtieth of the time of SciPy's solver, whose BLAS may
+    start threads for such small matrices.
+    """
     n, push = len(a), b @ np.linalg.solve(r, b.T)
+    # Scaling by `size` gives both off-diagonal blocks of the Hamiltonian matrix the same norm, for accurate
+    # eigenvectors.
     size = np.sqrt(np.linalg.norm(q) / np.linalg.norm(push)) if push.any() else 1.0
     modes, vectors = np.linalg.eig(np.block([[a, -push * size], [-q / size, -a.T]]))
     stable = vectors[:, np.argsort(np.real(modes))[:n]]
     try:
         p = size * np.real(stable[n:] @ np.linalg.inv(stable[:n]))
         closed = a - push @ p
+        # Newton's step for the Riccati equation is a Lyapunov equation of the closed loop.
         left = np.kron(closed.T, np.eye(n)) + np.kron(np.eye(n), closed.T)
         p = -np.linalg.solve(left, (q + p @ push @ p).ravel()).reshape(n, n)
     except np.linalg.LinAlgError:
@@ -127,8 +157,15 @@ def _solve_by_hamiltonian(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.nda
 
 
 def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | None = None) -> Frame:
-    """A frame for closed loops (V, n, n): the mean of their Lyapunov solutions for a cost rate `weight`, or, stable or
-    not, for shifted ones in balanced units."""
+    """Return a frame for the analysis of closed loops from the mean of their Lyapunov solutions.
+
+    For an unstable loop the Lyapunov equation is shifted. All equations are in balanced units.
+
+    Args:
+        closed: Closed loops, shape (V, n, n).
+        discrete: Whether the system is in discrete time.
+        weight: Cost rate on the right side of the Lyapunov equations, shape (n, n); None for the unit matrix.
+    """
     from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_discrete_lyapunov
 
     n = closed.shape[1]
@@ -139,10 +176,13 @@ def analysis_frame(closed: np.ndarray, *, discrete: bool, weight: np.ndarray | N
         if discrete:
             a = a / max(1.0, 1.02 * np.abs(modes).max())
         else:
+            # An unstable loop is shifted until its slowest mode is just stable: only then has the Lyapunov equation a
+            # solution P > 0.
             a = a - (max(0.0, 1.02 * modes.real.max()) + 1e-6 * np.abs(modes).max() + 1e-300) * np.eye(n)
         a = a * units / units[:, None]
         q = np.eye(n) if weight is None else weight * units * units[:, None]
         p = solve_discrete_lyapunov(a.T, q) if discrete else solve_continuous_lyapunov(a.T, -q)
+        # Without a weight all solutions count equally: each is divided by its trace.
         mean += p / units / units[:, None] / (np.trace(p) if weight is None else len(closed))
     try:
         return lyapunov_frame(mean, closed, np.eye(1), discrete=discrete)

@@ -1,12 +1,12 @@
-"""Linear matrix inequalities: the only place that knows cvxpy.
+"""Linear matrix inequalities as semidefinite programs; the only module that imports cvxpy.
 
     minimise c'y   subject to   h_b + sum_d y_d G_bd >= 0   for every block b
 
-A formula such as eq. (30) of Maeda and Sugiura is written once, in NumPy, for unknown matrices X, F; `affine` reads off
-h and G by putting in unit matrices. The program is parametrised by c, h and G, so that cvxpy compiles one for each
-pattern of sizes and a new weight, vertex or gain costs only the solution.
+A formula such as eq. (30) of Maeda and Sugiura is written once, in NumPy, for unknown matrices X, F. `Unknowns.affine`
+reads off h and G by inserting unit matrices. The program is parametrised by c, h and G, so cvxpy compiles one program
+for each pattern of sizes. A new weight, vertex or gain then costs only the solution.
 
-A solver's status is not believed: `Answer` carries the multipliers, and `gap` and `violation` are worked out here.
+The status of a solver is no criterion: `Answer` carries the multipliers, and `gap` and `violation` are computed here.
 """
 
 import functools
@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-SOLVERS = ("CLARABEL", "MOSEK", "CVXOPT")  # in this order, of those installed; SCS is wrong by 1e-3 and never asked
+SOLVERS = ("CLARABEL", "MOSEK", "CVXOPT")  # in order of preference; SCS has errors of 1e-3 and is not used
 OPTIONS = {"CLARABEL": {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}}
 HINT = 'pip install ".[design]" in a clone'
-SOLVER_LOCK = threading.Lock()  # a compiled program is shared, and holds its parameters
+SOLVER_LOCK = threading.Lock()  # threads share a compiled program, which holds the values of its parameters
 
 
 class SdpBlock(NamedTuple):
@@ -31,29 +31,37 @@ class SdpBlock(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """Unknowns y, multipliers of each group of blocks (b, k, k), and what the solver says of itself."""
+    """Unknowns y, multipliers of each group of blocks (b, k, k), and the solver's status."""
 
     y: np.ndarray
     multipliers: list[np.ndarray]
     status: str
 
     def violation(self, blocks: list[SdpBlock]) -> float:
-        """How far the least eigenvalue of any block is below 0; 0 if none is."""
+        """Return the amount by which the smallest eigenvalue of any of the `blocks` is below 0, at least 0."""
         values = (b.h + np.einsum("d,bdij->bij", self.y, b.G) for b in blocks)
         return max(0.0, *(-float(np.linalg.eigvalsh(value).min()) for value in values))
 
     def gap(self, c: np.ndarray, blocks: list[SdpBlock]) -> float:
-        """Bound on how far c'y is above the optimum: duality gap, and the multipliers' residual times the unknowns."""
+        """Return a bound on c'y - optimum: the duality gap plus the multipliers' residual times the unknowns.
+
+        `c` and `blocks` are those of the program.
+        """
+        # Weak duality with multipliers W >= 0 that satisfy the dual equation only approximately: |c - found| |y| covers
+        # the rest.
         bound = -sum(float(np.sum(b.h * w)) for b, w in zip(blocks, self.multipliers, strict=True))
         found = sum(np.einsum("bdij,bij->d", b.G, w) for b, w in zip(blocks, self.multipliers, strict=True))
         return float(c @ self.y) - bound + float(np.abs(c - found) @ np.abs(self.y))
 
 
 class Unknowns:
-    """Unknown matrices by name: a shape (r, c), or a number n for a symmetric (n, n); packed into one vector y."""
+    """Unknown matrices by name, packed into one vector y.
+
+    A shape (r, c) stands for a matrix, a number n for a symmetric (n, n) matrix.
+    """
 
     def __init__(self, **shapes: tuple[int, int] | int):
-        """Lay the matrices out one after the other."""
+        """Lay out the matrices of the given `shapes` in order."""
         self.basis: dict[str, np.ndarray] = {}
         units = {name: _units(shape) for name, shape in shapes.items()}
         self.size, at = sum(map(len, units.values())), 0
@@ -61,29 +69,31 @@ class Unknowns:
             whole = np.zeros((self.size, *unit.shape[1:]))
             whole[at : at + len(unit)] = unit
             self.basis[name], at = whole, at + len(unit)
+        # The first entry of a stack is the zero matrix: the formula gives h there, and h + G_d at the unit matrices.
         self.stacked = {name: np.concatenate([np.zeros((1, *b.shape[1:])), b]) for name, b in self.basis.items()}
 
     def values(self, y: np.ndarray) -> dict[str, np.ndarray]:
-        """The matrices in a vector."""
+        """Return the matrices in a vector `y`."""
         return {name: np.tensordot(y, unit, 1) for name, unit in self.basis.items()}
 
     def blocks(self, formulas: Callable[[Mapping[str, np.ndarray]], list[Any]]) -> list[SdpBlock]:
-        """The blocks h + sum y_d G_d of formulas that are affine in the unknowns and work on stacks of them."""
+        """Return the blocks h + sum y_d G_d of `formulas`, which are affine in the unknowns and accept stacks."""
         values = formulas(self.stacked)
+        # A formula without unknowns gives one matrix, with G = 0.
         wholes = [np.broadcast_to(value, (self.size + 1, *value.shape[-2:])) for value in values]
         return [SdpBlock(whole[:1], (whole[1:] - whole[0])[None]) for whole in wholes]
 
     def affine(self, formula: Callable[[Mapping[str, np.ndarray]], Any]) -> SdpBlock:
-        """The block of one formula."""
+        """Return the block of one affine `formula`."""
         return self.blocks(lambda v: [formula(v)])[0]
 
     def row(self, formula: Callable[[Mapping[str, np.ndarray]], Any]) -> np.ndarray:
-        """The coefficients c of a formula that is linear in the unknowns."""
+        """Return the coefficients c of a `formula` that is linear in the unknowns."""
         return np.asarray(formula(self.basis), float).reshape(self.size)
 
 
 def _units(shape: tuple[int, int] | int) -> np.ndarray:
-    """The unit matrices that span all matrices of a shape."""
+    """Return the unit matrices that span all matrices of a shape."""
     if isinstance(shape, tuple):
         return np.eye(shape[0] * shape[1]).reshape(-1, *shape)
     pairs = [(i, j) for i in range(shape) for j in range(i + 1)]
@@ -94,12 +104,20 @@ def _units(shape: tuple[int, int] | int) -> np.ndarray:
 
 
 def he(m: np.ndarray) -> np.ndarray:
-    """He[M] = M + M'."""
+    """Return He[M] = M + M'.
+
+    Args:
+        m: Square matrices, shape (..., n, n).
+    """
     return m + np.swapaxes(m, -1, -2)
 
 
 def symmetric_from_blocks(rows: list[list[Any]]) -> np.ndarray:
-    """A symmetric matrix, or a stack of them, from the blocks on and below its diagonal; None is zero."""
+    """Return a symmetric matrix, or a stack of them, from the blocks on and below its diagonal.
+
+    Args:
+        rows: Rows of blocks; None stands for zero.
+    """
     stack = np.broadcast_shapes(*(np.shape(x)[:-2] for row in rows for x in row if x is not None))
     sizes = [np.shape(row[-1])[-1] for row in rows]
     ends = np.cumsum([0, *sizes])
@@ -114,7 +132,11 @@ def symmetric_from_blocks(rows: list[list[Any]]) -> np.ndarray:
 
 
 def group_blocks(blocks: Iterable[SdpBlock]) -> list[SdpBlock]:
-    """Blocks of equal size in one group, each scaled so that its largest coefficient is 1."""
+    """Return groups of blocks of equal size, each block scaled to a largest coefficient of 1.
+
+    Args:
+        blocks: Blocks of any sizes.
+    """
     groups: dict[int, list[SdpBlock]] = {}
     for block in blocks:
         size = max(float(np.abs(block.G).max()), float(np.abs(block.h).max()))
@@ -123,13 +145,21 @@ def group_blocks(blocks: Iterable[SdpBlock]) -> list[SdpBlock]:
 
 
 def stack_blocks(blocks: list[SdpBlock]) -> SdpBlock:
-    """Blocks of one size as one group."""
+    """Return blocks of one size as one group.
+
+    Args:
+        blocks: Blocks of one size.
+    """
     return SdpBlock(*(np.concatenate(parts) for parts in zip(*blocks, strict=True)))
 
 
 @functools.cache
 def solvers() -> tuple[str, ...]:
-    """Those of `SOLVERS` that are installed. Raises ModuleNotFoundError where there is none."""
+    """Return the installed solvers among `SOLVERS`, in that order.
+
+    Raises:
+        ModuleNotFoundError: cvxpy or every solver is missing.
+    """
     try:
         import cvxpy
     except ModuleNotFoundError as error:
@@ -142,7 +172,13 @@ def solvers() -> tuple[str, ...]:
 
 
 def solve_sdp(c: np.ndarray, blocks: list[SdpBlock], solver: str = "CLARABEL") -> Answer:
-    """Minimise c'y under grouped blocks. An answer that a solver fails to give has NaN in y."""
+    """Minimise c'y under grouped blocks and return the answer; NaN in y stands for a failure.
+
+    Args:
+        c: Coefficients of the objective, shape (unknowns,).
+        blocks: Groups of blocks.
+        solver: Name of the solver.
+    """
     shapes = tuple(b.h.shape[:2] for b in blocks)
     with SOLVER_LOCK:
         program = _program(len(c), shapes)
@@ -153,6 +189,7 @@ def solve_sdp(c: np.ndarray, blocks: list[SdpBlock], solver: str = "CLARABEL") -
         status = _run(program.problem, solver)
         known = program.y.value is not None
         y = np.array(program.y.value) if known else np.full(len(c), np.nan)
+        # Read inside the lock: another thread would overwrite the values of the shared program.
         duals = [[w.dual_value for w in group] for group in program.constraints]
     multipliers = [
         np.array([np.full((k, k), np.nan) if w is None else w for w in group])
@@ -172,7 +209,10 @@ class _Program(NamedTuple):
 
 @functools.lru_cache(maxsize=64)
 def _program(unknowns: int, shapes: tuple[tuple[int, int], ...]) -> _Program:
-    """The parametrised program (disciplined, so that cvxpy compiles it once) for groups of (count, size) blocks."""
+    """Return the parametrised program for groups of (count, size) blocks.
+
+    It follows the rules for disciplined parametrised programs, so cvxpy compiles it once.
+    """
     import cvxpy as cp
 
     y, cost = cp.Variable(unknowns), cp.Parameter(unknowns)
@@ -188,13 +228,14 @@ def _program(unknowns: int, shapes: tuple[tuple[int, int], ...]) -> _Program:
 
 
 def _run(problem: Any, solver: str) -> str:
-    """Solve; what goes wrong inside a solver becomes a status."""
+    """Solve a program and return its status; an exception in the solver becomes a status."""
     import cvxpy as cp
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a doubtful answer is judged by its numbers
+        warnings.simplefilter("ignore")  # the numbers of an inaccurate answer decide, not its warning
         try:
-            # no warm start: Clarabel would keep the scaling of other data, and an answer depend on what came before
+            # No warm start: Clarabel would keep the scaling of other data, and an answer would depend on earlier
+            # programs.
             problem.solve(solver=solver, warm_start=False, **OPTIONS.get(solver, {}))
         except (cp.SolverError, ArithmeticError, ValueError) as error:
             return f"failed: {' '.join(str(error).split())}"
