@@ -188,8 +188,8 @@ def replace_nan(signal: Any) -> Any:
 class _AlwaysWaits(Sampled):
     """A sampled controller whose output is applied in an event after any delay, including 0.
 
-    With delay 0 it has the derivative from the right with respect to the delay; the stored sample at such an instant is
-    the previous output.
+    With delay 0, the derivative with respect to the delay is the derivative from the right. The stored sample at such
+    an instant is the previous output.
     A run that needs only values uses `Sampled`, because one event in every period makes a run several times slower.
     """
 

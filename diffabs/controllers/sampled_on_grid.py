@@ -2,8 +2,8 @@
 
     u(t) = u_k for t_k + delay <= t < t_(k+1) + delay,   t_k = k period
 
-These are the times of `Sampled`. If u changes inside a step [t, t + h], at t + theta h, the step uses the mean theta
-u_(k-1) + (1 - theta) u_k.
+These are the times of `Sampled`. If u changes inside a step [t, t + h], at t + theta h, the step uses the mean `theta
+u_(k-1) + (1 - theta) u_k`.
 The impulse of the control is exact. Behind a lag T > h the torque error at the end of such a step is at most h^2/(8
 T^2) of the change of u.
 No step is cut; a run with an event in every period takes four to five times as long.
@@ -49,8 +49,8 @@ class SampledOnGrid:
     """
 
     controller: Block = part(default=PID)
-    # The name is not `period`, because a block with a `period` ticks only at its multiples; this one ticks at every grid
-    # instant.
+    # The name is not `period`: for a block with a `period`, steps end only at its multiples, but this block must tick at
+    # every grid instant.
     sampling_period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
 
