@@ -49,8 +49,8 @@ class SampledOnGrid:
     """
 
     controller: Block = part(default=PID)
-    # The name is not `period`: for a block with a `period`, steps end only at its multiples, but this block must tick at
-    # every grid instant.
+    # The name is not `period`: for a block with a `period`, steps end only at its multiples, but this block must tick
+    # at every grid instant.
     sampling_period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
 

@@ -239,21 +239,22 @@ class ArmBalance:
         return self.torque(state.psi_rate, control) * state.psi_rate, self.damping * state.phi_rate**2
 
     def limits(self, gain: Any) -> np.ndarray:
-        """Return the rows of the motor's linear range, shape (..., 1, 6): under u = gain x, |row x| <= 1 keeps the
-        current within its limit.
+        """Return the rows of the motor's linear range, shape (..., 1, 6): the current is within its limit where |row x|
+        <= 1.
 
         Args:
-            gain: K, shape (..., 6) [V/rad, V s/rad]. The plant's parameters may be NumPy arrays of shape (...).
+            gain: K of the feedback u = K x, shape (..., 6) [V/rad, V s/rad]. The plant's parameters may be NumPy arrays
+                of shape (...).
         """
         current = np.array(gain, float) / np.asarray(self.resistance)[..., None]
         current[..., 4] -= self.gear * self.back_emf / self.resistance
         return (current / np.asarray(self.current_max)[..., None])[..., None, :]
 
     def remainder(self, linear: Any, extent: Callable[[Any], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Return D (..., 6, 3) and the bound Y (..., 3) of the nonlinear remainder: x' = linear x + D y with |y| <= Y.
+        """Return D (..., 6, 3) and the bound Y (..., 3) of the nonlinear remainder D y, |y| <= Y.
 
-        The bound holds wherever |row x| <= extent(row) for all rows. If all extents shrink by a factor, Y shrinks by at
-        least the same factor.
+        The equations are x' = linear x + D y. The bound holds wherever |row x| <= extent(row) for all rows.
+        If all extents shrink by a factor, Y shrinks by at least the same factor.
 
             y = -(M(q) - M(0)) q'' - h - (G - G'(0) q)      D = (0, M(0)^-1)
 
