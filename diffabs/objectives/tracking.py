@@ -1,8 +1,8 @@
 """Objectives of tracking: peak, overshoot, settling, and integrals of the error.
 
 They read the first signal y that the plant shows: a brake's slip, a servo's angle.
-The error is e = y - setpoint, where the setpoint is the final value of the reference and not a filtered target on its
-way there.
+The error is e = y - setpoint. The setpoint is the final value of the reference and not a filtered target on its way
+there.
 """
 
 import math
@@ -371,7 +371,8 @@ class Quadratic(NamedTuple):
 
 @pytree
 class QuadraticCost:
-    """Integral of q1 x1^2 + q2 x2^2 + r (u - ff)^2 dt, with x1 = integral of e, x2 = e, and the actuator's output u.
+    """Integral of q1 x1^2 + q2 x2^2 + r (u - ff)^2 dt. Here x1 is the integral of e, x2 = e, and u is the actuator's
+    output.
 
     Source: eq. (24) of Maeda and Sugiura with eps = 0.
     """

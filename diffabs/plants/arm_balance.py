@@ -223,7 +223,7 @@ class ArmBalance:
         return self.kinetic_energy(state) + self.potential_energy(state)
 
     def audit(self, initial: BalanceStart) -> BalanceAudit:
-        """Return the audit of runs from `initial`: a run whose energy exceeds the motor's work is numerically unstable."""
+        """Return the audit of runs from `initial`: an energy gain beyond the motor's work is a numerical instability."""
         lumps, start = self.lumps(), self.start(initial)
         fall = self.gravity * (lumps.b1 + abs(lumps.b2) + abs(lumps.b3))
         scale = fall + self.kinetic_energy(start) + 0.5 * self.stiffness * start.phi**2
@@ -284,8 +284,8 @@ class ArmBalance:
         loop = np.abs(inverse) @ changes
         accelerations = _columns(*(extent(np.asarray(linear)[..., 3 + i, :]) for i in range(3)))
         accelerations = accelerations + (np.abs(inverse) @ forces[..., None])[..., 0]
-        # |q''| <= accelerations + loop |q''|. With an infinity norm of `loop` below 1, I - loop has a nonnegative inverse,
-        # and the inequality can be solved for |q''|.
+        # |q''| <= accelerations + loop |q''|. If the infinity norm of `loop` is below 1, I - loop has a nonnegative
+        # inverse, and the inequality can be solved for |q''|.
         held = loop.sum(axis=-1).max(axis=-1) < 1
         safe = np.where(held[..., None, None], loop, 0.0)
         most = np.linalg.solve(np.eye(3) - safe, accelerations[..., None])[..., 0]

@@ -12,9 +12,10 @@ tau_1 = Mg + M1 + M10 + d1 omega1.
 That paper confirms the radii, J1 and the friction curve. The other constants are as commonly published and were not
 verified against the manual.
 
-A stopped wheel sticks: the brake then carries the friction torque of the road, T = r1 mu Mg/(L (sin phi - mu cos phi) -
-r1 mu).
-The wheel sticks while T < M1 + M10. Where r1 mu exceeds L (sin phi - mu cos phi), no torque holds the wheel.
+A stopped wheel sticks while the road's torque T is below M1 + M10; the brake then carries exactly T. Where r1 mu
+exceeds L (sin phi - mu cos phi), no torque holds the wheel.
+
+    T = r1 mu Mg/(L (sin phi - mu cos phi) - r1 mu)
 
 At mu = tan phi the lever locks itself: no finite normal force balances it. `rules` refuses such a road. A run that
 meets such friction later has diverged.
