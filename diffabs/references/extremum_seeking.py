@@ -7,7 +7,7 @@
     (ln s)' = k e g,   g = clamp(|ln(s/end)|/ln(1 + band), 0, 1)        end: the greatest slip if e > 0, or the least
 
 Krstic and Wang multiply by the dither itself. Here the deceleration is correlated with the measured slip.
-There are no dynamics between the two (a = mu(slip) g), so the slope is correct for any phase lag of the loop behind the
+There are no dynamics between them, a = mu(slip) g. The slope is therefore correct for any phase lag of the loop behind the
 dither.
 Any movement of the slip contributes to the estimate. Slope and step are relative, so one gain fits ice and asphalt.
 On a straight line through any point c = (da/ds) q. Noise of the deceleration has zero mean in c, and a constant bias

@@ -138,18 +138,18 @@ class FilterMemory(NamedTuple):
 
 @pytree
 class PeakRobust:
-    """The latch for noisy and biased sensors: it filters the signals, waits for `arming`, and latches after a fall by
-    the fraction `threshold` of the maximum.
+    """The latch for noisy and biased sensors: it filters the signals and latches after a fall by the fraction
+    `threshold` of the maximum.
 
     Deceleration and slip pass the same low-pass filter, so their delays cancel. The deceleration keeps its sign,
     because the absolute value of noise has a nonzero mean.
-    No maximum below `arming` counts.
+    No maximum up to `arming` latches.
 
     Attributes:
         slip: Target before the latch [1].
         time_constant: Time constant of both low-pass filters [s], > 0.
         threshold: Fraction of the maximum by which the deceleration must fall [1].
-        arming: Least maximum [m/s^2].
+        arming: Bound that the maximum must exceed for a latch [m/s^2].
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
