@@ -25,8 +25,8 @@ import jax.numpy as jnp
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree
 
-# A later maximum counts only if it exceeds the greatest by this fraction. A controller that holds the best slip keeps the
-# deceleration equal to its maximum up to rounding; comparisons of equal numbers would then decide the derivatives.
+# A later maximum counts only if it exceeds the greatest by this fraction. A controller that holds the best slip keeps
+# the deceleration equal to its maximum up to rounding; comparisons of equal numbers would then decide the derivatives.
 SLIP_MARGIN = 1e-6
 MIN_DECELERATION = 1e-3  # m/s^2, least maximum: a smaller deceleration of a free wheel is rounding
 

@@ -83,7 +83,12 @@ class Tabulated:
 
 @pytree
 class PiecewiseCubic:
-    """mu(s) = c0 + z (c1 + z (c2 + z c3)), z = s - x_i, between knots; rows of (x_i, c0, c1, c2, c3)."""
+    """mu(s) = c0 + z (c1 + z (c2 + z c3)), z = s - x_i, between knots.
+
+    Attributes:
+        knots: Knots x_i, shape (n,).
+        rows: Rows (x_i, c0, c1, c2, c3), shape (n - 1, 5).
+    """
 
     knots: Vector = param(unit="1")
     rows: Vector = param(unit="1")

@@ -37,7 +37,7 @@ A wheel that is locked on the road has f >= rest and is not trusted for any dura
 On the rig m is at least 6.8 m/s^2 from a slip of 0.1 on, and m^-1(1 m/s^2) is a slip of 0.8 %.
 
 The assumption is a road that gives `rest`: with mu < rest/g the filter would trust a locked wheel.
-f rises at once, so there is no restart between two actuations of the brake. It decays from g to rest in hold
+Because f rises at once, there is no restart between two actuations of the brake. It decays from g to rest in hold
 ln(g/rest), 46 ms.
 For this time there is no restart after the start either, when the brake is about to act.
 """
