@@ -1,18 +1,16 @@
 """Pure delay: control(t) = command(t - time), and 0 until the first command arrives.
 
 The delay stores one `Piece` for each past step, of any length: the times of both ends and a cubic Hermite polynomial of
-the command.
-The polynomial interpolates value and rate at both ends, so a smooth command keeps the order of the method.
+the command. The polynomial interpolates value and rate at both ends, so a smooth command keeps the order of the method.
 
-The command breaks where value or rate at the end of one piece differ from those at the start of the next.
-A step of the integration ends where the break leaves the delay. The time of this event carries the tangents of the
-break's entry time and of `time`.
-If the delay equals one step, the exit time of a break is a grid instant, and no event is needed.
-For derivatives with respect to `time`, the next step then starts with an event (`_InEvents`).
+The command breaks where value or rate at the end of one piece differ from those at the start of the next. A step of the
+integration ends where the break leaves the delay. The time of this event carries the tangents of the break's entry time
+and of `time`. If the delay equals one step, the exit time of a break is a grid instant, and no event is needed. For
+derivatives with respect to `time`, the next step then starts with an event (`_InEvents`).
 
-Inside the Runge-Kutta stages of a step the delayed command must be smooth, also beyond the next break.
-A step therefore reads only the pieces between two breaks. They come from a window of the pieces that leave next; a tick
-moves the window after each step.
+Inside the Runge-Kutta stages of a step the delayed command must be smooth, also beyond the next break. A step therefore
+reads only the pieces between two breaks. They come from a window of the pieces that leave next; a tick moves the window
+after each step.
 """
 
 import dataclasses
@@ -228,7 +226,8 @@ def _piece(window: Any, place: Any) -> Piece:
 
     A gather at a computed index would prevent XLA from fusing the stages of a step.
     """
-    row, place = [window[0, j] for j in range(window.shape[1])], place.astype(int)  # comparisons of integers are no events
+    # Comparisons of integers are no events.
+    row, place = [window[0, j] for j in range(window.shape[1])], place.astype(int)
     for i in range(1, WINDOW_PIECES):
         row = [jnp.where(place >= i, window[i, j], x) for j, x in enumerate(row)]
     return Piece.of(row)

@@ -42,6 +42,7 @@ class Lag:
 
     def start(self, signal: Scalar) -> Memory:
         """Return the memory of a released brake: control 0."""
+        # 0.0 * signal has type and shape of the signal, so a loop carry keeps its type.
         return Memory(flow=0.0 * signal)
 
     def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:

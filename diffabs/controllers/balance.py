@@ -4,8 +4,7 @@
     ObserverFeedback    x^- = A x^ + B clamp(u),   x^ = x^- + L (y - C x^-),   u = K x^,   y = (theta, psi)
 
 The sign convention is u = +K x, as in all of diffabs. `Sampled` runs the observer as a computer does; A and B are the
-discrete-time matrices of one period.
-`diffabs.linear.lqg` computes K and L.
+discrete-time matrices of one period. `diffabs.linear.lqg` computes K and L.
 """
 
 from collections.abc import Iterator

@@ -3,8 +3,7 @@
     u = clamp(ff + K(v) x, u_min, u_max),   x = (integral of (slip - target), slip - target)
 
 K is linear in v between nodes and constant beyond them. `diffabs.design.design` returns such gains for a `Schedule`,
-and its certificate holds for them.
-The sign convention is that of `StateFeedback`.
+and its certificate holds for them. The sign convention is that of `StateFeedback`.
 
 Source: gain scheduling by a parameter-dependent Lyapunov function: W. J. Rugh and J. S. Shamma, Research on gain
 scheduling, Automatica 36 (2000).
@@ -85,8 +84,7 @@ class ProportionalFeedback:
     """u = clamp(ff + (v/v0) (k1 x1 + k2 x2), torque_min, torque_max): gains proportional to the measured speed.
 
     At a frozen speed the gain from torque to slip of a braked wheel is proportional to 1/v, eq. (16) of Maeda and
-    Sugiura.
-    The factor v/v0 cancels this, so the loop is equally fast at every speed.
+    Sugiura. The factor v/v0 cancels this, so the loop is equally fast at every speed.
 
     Attributes:
         gain: (k1, k2) at v0 [control/signal/s, control/signal].

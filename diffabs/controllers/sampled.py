@@ -5,8 +5,8 @@
 Forward Euler advances the inner controller's continuous memory at the sampling period, as is usual in such code. The
 output changes in an event at the end of the delay.
 
-The controller skips a sample if a number that it reads is NaN, or if its memory or output would not be finite.
-Memory and output then keep the values of the previous sample.
+The controller skips a sample if a number that it reads is NaN, or if its memory or output would not be finite. Memory
+and output then keep the values of the previous sample.
 """
 
 from collections.abc import Iterator
@@ -137,8 +137,8 @@ class Sampled:
     def _until(self, t: Scalar) -> Any:
         """Return the time at which the output sampled at time t is applied [s].
 
-        The time is a rounding early. An event exactly on a grid instant would not end a step.
-        The maximum of a run at this instant would then have the derivative for a fixed time.
+        The time is a rounding early. An event exactly on a grid instant would not end a step. The maximum of a run at
+        this instant would then have the derivative for a fixed time.
         """
         rounding = PERIOD_EPS * jnp.finfo(jnp.result_type(t, self.period)).eps * (t + self.period)
         early = jnp.maximum(jnp.minimum(rounding, self.delay), self.delay - (self.period - rounding))
@@ -189,8 +189,8 @@ class _AlwaysWaits(Sampled):
     """A sampled controller whose output is applied in an event after any delay, including 0.
 
     With delay 0, the derivative with respect to the delay is the derivative from the right. The stored sample at such
-    an instant is the previous output.
-    A run that needs only values uses `Sampled`, because one event in every period makes a run several times slower.
+    an instant is the previous output. A run that needs only values uses `Sampled`, because one event in every period
+    makes a run several times slower.
     """
 
     def _waits(self) -> Any:

@@ -3,10 +3,9 @@
     u(t) = u_k for t_k + delay <= t < t_(k+1) + delay,   t_k = k period
 
 These are the times of `Sampled`. If u changes inside a step [t, t + h], at t + theta h, the step uses the mean `theta
-u_(k-1) + (1 - theta) u_k`.
-The impulse of the control is exact. Behind a lag T > h the torque error at the end of such a step is at most h^2/(8
-T^2) of the change of u.
-No step is cut; a run with an event in every period takes four to five times as long.
+u_(k-1) + (1 - theta) u_k`. The impulse of the control is exact. Behind a lag T > h the torque error at the end of such
+a step is at most h^2/(8 T^2) of the change of u. No step is cut; a run with an event in every period takes four to five
+times as long.
 """
 
 from collections.abc import Iterator
@@ -82,6 +81,7 @@ class SampledOnGrid:
         left = m.until - clock.t
         # A change exactly on the grid belongs to the step after it, so that only one step carries its derivative.
         within = (left >= -close) & (left < clock.h - close)
+        # `waits` is the step's share of the previous output. Only a change inside the step gives it a derivative.
         fixed = jax.lax.stop_gradient(left)
         waits = clamp(fixed / clock.h, 0.0, 1.0) + jnp.where(within, (left - fixed) / clock.h, 0.0)
         applied = waits * m.last + (1 - waits) * m.next

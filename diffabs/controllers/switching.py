@@ -31,8 +31,8 @@ class ConstantTorque:
 class Relay:
     """torque_max until slip > target + band, then torque_min until slip < target - band.
 
-    An event locates each switch where the slip crosses the edge of the band, also between grid instants.
-    The memory is 1 while the brake is applied, else 0.
+    An event locates each switch where the slip crosses the edge of the band, also between grid instants. The memory is
+    1 while the brake is applied, else 0.
     """
 
     band: Scalar = param(default=0.02, unit="signal", above=0.0, below=1.0)

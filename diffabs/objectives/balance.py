@@ -18,6 +18,7 @@ ANGLE_NAMES = ("theta", "psi", "phi")
 def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Any:
     """Return |x| weighted by `weights`, with slope 0 at x = 0."""
     square = sum(w * getattr(output, name) ** 2 for w, name in zip(weights, ANGLE_NAMES + RATE_NAMES, strict=True))
+    # Two selects: the square root has an infinite slope at 0, and 0 * inf in the branch not taken would be NaN.
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
@@ -66,6 +67,7 @@ def _greatest_angle(name: str) -> tuple[Any, Any, Any, Any]:
         """Return the greatest |angle| up to the end of the step."""
         del self
         angle = segment.output(lambda output: getattr(output, name))
+        # `falls` is about |angle|: for a negative angle it is that of -angle.
         falls = jnp.where(angle.start >= 0, angle.falls, angle.times(-1.0).falls)
         return later_of_larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()), falls)
 
@@ -150,8 +152,8 @@ class PeakTorque:
 class SoftLoss:
     """1/(1 + (radius/|x|)^(1/softness)) of the last state [1], |x|^2 = sum of weight x^2 in rad and rad/s.
 
-    It is near 0 for a run that comes to rest, near 1 for one that diverges, and smooth between.
-    Its mean over starts is one minus a soft share of the region of attraction; see `diffabs.design.attraction`.
+    It is near 0 for a run that comes to rest, near 1 for one that diverges, and smooth between. Its mean over starts is
+    one minus a soft share of the region of attraction; see `diffabs.design.attraction`.
     """
 
     unit = "1"
@@ -172,7 +174,7 @@ class SoftLoss:
 
 @pytree
 class RestTime:
-    """Time after which every angle stays within `band` of upright [s]; infinite for a run that ends outside the band."""
+    """Time after which every angle stays within `band` of upright [s]; infinite for a run that ends outside it."""
 
     unit = "s"
     physical = (0.0, math.inf)
@@ -191,13 +193,14 @@ class RestTime:
         entered = memory.held
         for name in ANGLE_NAMES:
             angle = segment.output(lambda output, name=name: getattr(output, name))
+            # Only the sign of the angle matters, so it carries no derivative.
             beyond = angle.times(sign(jax.lax.stop_gradient(angle.start))).minus(self.band)
             entry = segment.start.t + segment.h * beyond.root()
             entered = larger(entered, jnp.where(beyond.start > 0, entry, 0.0))
         return entered
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Return the last entry [s]; infinity if an angle of the last sample is outside the band."""
+        """Return the last entry [s]; infinity if an angle of the last sample is outside."""
         angles = jnp.stack([jnp.abs(getattr(ending.sample.output, name)) for name in ANGLE_NAMES])
         return jnp.where(jnp.all(angles <= self.band), memory.held, self.unreached)
 

@@ -1,8 +1,7 @@
 """Objectives of tracking: peak, overshoot, settling, and integrals of the error.
 
-They read the first signal y that the plant shows: a brake's slip, a servo's angle.
-The error is e = y - setpoint. The setpoint is the final value of the reference and not a filtered target on its way
-there.
+They read the first signal y that the plant shows: a brake's slip, a servo's angle. The error is e = y - setpoint. The
+setpoint is the final value of the reference and not a filtered target on its way there.
 """
 
 import math
@@ -217,6 +216,7 @@ class Overshoot:
         """Return the overshoot [1]."""
         side, greatest = memory.held
         setpoint = side * ending.sample.setpoint
+        # A small denominator is replaced: a division by 0 in the branch not taken would put NaN into the derivatives.
         usual = setpoint >= MIN_SETPOINT
         fraction = greatest / jnp.where(usual, setpoint, MIN_SETPOINT) - 1
         excess = jnp.where(usual, fraction, (greatest - setpoint) / MIN_SETPOINT)
@@ -239,10 +239,10 @@ class Settling(NamedTuple):
 class SettlingTime:
     """Time [s] after which |y - setpoint| stays within a band; infinite for a run that ends outside the band.
 
-    The band is `share` of the step from the first value to the setpoint (2 % by default), or `band` if this is wider.
-    A run that starts on its setpoint has no step: it settles only if `band` is given.
-    The entry is the root of the step's cubic. The method misses an excursion that begins and ends within one step.
-    The time jumps where a local extremum just touches the band.
+    The band is `share` of the step from the first value to the setpoint (2 % by default), or `band` if this is wider. A
+    run that starts on its setpoint has no step: it settles only if `band` is given. The entry is the root of the step's
+    cubic. The method misses an excursion that begins and ends within one step. The time jumps where a local extremum
+    just touches the band.
     """
 
     unit = "s"
@@ -261,6 +261,7 @@ class SettlingTime:
     def update(self, memory: Memory, segment: Segment) -> Settling:
         """Return the memory with the last entry into the band."""
         first, entered = memory.held
+        # The band is one-sided for the error at the start of the step; the sign has no derivative.
         side = sign(jax.lax.stop_gradient(segment.error().start))
         excess = segment.shown(lambda shown: side * (shown.output[0] - shown.setpoint) - self._width(shown, first))
         entry = segment.start.t + segment.h * excess.root()
@@ -330,6 +331,7 @@ def at_limits(loop: Any) -> ShareAtLimit:
     pending = [loop.controller, loop.actuator]
     while pending:
         one = pending.pop()
+        # Controllers may contain controllers (`Sampled`), so the search descends into all parts.
         pending.extend(parts(one))
         if hasattr(one, "limits"):
             below, above = one.limits()

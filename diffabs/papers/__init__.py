@@ -3,9 +3,8 @@
 `compact` returns the short form of a summary that the command line prints.
 
 A reproduction is a function (folder, progress) -> summary. It writes its figures and `summary.json` into the existing
-folder.
-It calls progress(sentence) before each long computation. It needs float64 and matplotlib, so its module is imported
-only on use.
+folder. It calls progress(sentence) before each long computation. It needs float64 and matplotlib, so its module is
+imported only on use.
 """
 
 import importlib

@@ -1,10 +1,9 @@
 """Fumita, attitude stabilisation of a two-wheeler by an arm: Fig. 3, its refutation, and a machine that works.
 
-The paper leans frame and rider by 0.5 and 0.2 rad and shows that everything returns to 0.
-This holds for its printed linear equations, which no mechanism obeys. The reproduction runs the same start in the
-printed and in the correct equations.
-It then bounds the recoverable starts of any control and repeats the study for the same machine with a hanging arm.
-An independent solution gives the numbers for comparison.
+The paper leans frame and rider by 0.5 and 0.2 rad and shows that everything returns to 0. This holds for its printed
+linear equations, which no mechanism obeys. The reproduction runs the same start in the printed and in the correct
+equations. It then bounds the recoverable starts of any control and repeats the study for the same machine with a
+hanging arm. An independent solution gives the numbers for comparison.
 """
 
 import dataclasses
@@ -35,7 +34,7 @@ from diffabs.simulate.solution import Adaptive, FixedStep, Run, describe_solver
 
 TITLE = "Fumita: a two-wheeler balanced by an arm"
 SOLVER = FixedStep(step=1e-3, duration=10.0)
-LONG_SOLVER = Adaptive(rtol=1e-6, duration=600.0)  # for counts; a run ends as soon as it is decided
+LONG_SOLVER = Adaptive(rtol=1e-6, duration=600.0)  # for counts: a run ends when its outcome is decided
 FINE = FixedStep(step=1e-5, duration=0.1, every=10)  # for the start at which the controller applies 14 kV
 PAPER_START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # start of Fig. 3 [rad, rad/s]
 HANGING = ArmBalance(arm_length=-0.5)

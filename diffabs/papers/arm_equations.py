@@ -15,7 +15,8 @@ from diffabs.papers import record
 from diffabs.plants import ArmBalance
 
 Energy = Callable[[ArmBalance, Any, Any], Any]
-RODS = {"body": "body_height", "arm": "arm_length", "rider": "rider_height"}  # half the length of a uniform rod with this inertia
+# Half the length of a uniform rod with the inertia of each body.
+RODS = {"body": "body_height", "arm": "arm_length", "rider": "rider_height"}
 
 
 def kinetic(p: ArmBalance, q: Any, v: Any) -> Any:

@@ -15,15 +15,12 @@
 The kinetic energy is that of Fumita, section 2, eqs. (1), (3), (5). All equations here follow from one Lagrangian.
 
 The paper's potential energy uses theta1 - theta2 and theta1 - theta3, but its kinetic energy uses the sums: two
-conventions in one Lagrangian.
-Eqs. (4) and (6) also lack g in their first terms, and eq. (8) lacks l in the term with theta2'^2. The centrifugal terms
-of (9), (10) have the opposite sign.
-`PrintedArm` is the paper's own linear model.
+conventions in one Lagrangian. Eqs. (4) and (6) also lack g in their first terms, and eq. (8) lacks l in the term with
+theta2'^2. The centrifugal terms of (9), (10) have the opposite sign. `PrintedArm` is the paper's own linear model.
 
-Without a rider (mass, stiffness and damping 0) this is the Acrobot of Spong.
-The paper has no gear. Here a gear of ratio N and a rotor of inertia Jr act as N Kt, N Kb and N^2 Jr about the arm's
-joint.
-The model neglects the reaction of the spinning rotor on the frame.
+Without a rider (mass, stiffness and damping 0) this is the Acrobot of Spong. The paper has no gear. Here a gear of
+ratio N and a rotor of inertia Jr act as N Kt, N Kb and N^2 Jr about the arm's joint. The model neglects the reaction of
+the spinning rotor on the frame.
 """
 
 from collections.abc import Callable, Iterator
@@ -223,7 +220,7 @@ class ArmBalance:
         return self.kinetic_energy(state) + self.potential_energy(state)
 
     def audit(self, initial: BalanceStart) -> BalanceAudit:
-        """Return the audit of runs from `initial`: an energy gain beyond the motor's work is a numerical instability."""
+        """Return the audit of runs from `initial`: more energy than the motor's work is instability."""
         lumps, start = self.lumps(), self.start(initial)
         fall = self.gravity * (lumps.b1 + abs(lumps.b2) + abs(lumps.b3))
         scale = fall + self.kinetic_energy(start) + 0.5 * self.stiffness * start.phi**2
@@ -253,8 +250,8 @@ class ArmBalance:
     def remainder(self, linear: Any, extent: Callable[[Any], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return D (..., 6, 3) and the bound Y (..., 3) of the nonlinear remainder D y, |y| <= Y.
 
-        The equations are x' = linear x + D y. The bound holds wherever |row x| <= extent(row) for all rows.
-        If all extents shrink by a factor, Y shrinks by at least the same factor.
+        The equations are x' = linear x + D y. The bound holds wherever |row x| <= extent(row) for all rows. If all
+        extents shrink by a factor, Y shrinks by at least the same factor.
 
             y = -(M(q) - M(0)) q'' - h - (G - G'(0) q)      D = (0, M(0)^-1)
 

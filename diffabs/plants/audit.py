@@ -3,13 +3,12 @@
     energy     E(t + h) - E(t) <= work that the control may have done on the vehicle in that step; of a balance in all
     braked     distance does not fall, and grows no faster than the speed; friction alone changes the speed
 
-An audit is an objective with a value of at most 1 for a physically possible run.
-The value is the unexplained gain of energy divided by the tolerance, 1 % of the energy scale at the start.
+An audit is an objective with a value of at most 1 for a physically possible run. The value is the unexplained gain of
+energy divided by the tolerance, 1 % of the energy scale at the start.
 
 The bound of the work takes the greatest control and speed at both ends of the step, times 2. Both may be greater inside
-the step.
-A nonnegative brake torque does no work on the vehicle.
-The bound thus covers legitimate gains: a negative torque that drives the wheel, or a motor that rights a two-wheeler.
+the step. A nonnegative brake torque does no work on the vehicle. The bound thus covers legitimate gains: a negative
+torque that drives the wheel, or a motor that rights a two-wheeler.
 """
 
 from typing import Any

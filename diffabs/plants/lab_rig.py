@@ -6,11 +6,9 @@
     M1' = c31 (b(u) - M1),   b(u) = max(b1 u + b2, 0) for u >= u0, else 0
 
 The braked upper wheel hangs on a lever of length L and presses on the lower wheel, the "road", at the angle phi. Its
-brake torque adds to the normal force.
-mu is odd in the slip and so contains the manual's sign s of the slip. This is eq. (1) of Maeda and Sugiura with tau_b +
-tau_1 = Mg + M1 + M10 + d1 omega1.
-That paper confirms the radii, J1 and the friction curve. The other constants are as commonly published and were not
-verified against the manual.
+brake torque adds to the normal force. mu is odd in the slip and so contains the manual's sign s of the slip. This is
+eq. (1) of Maeda and Sugiura with tau_b + tau_1 = Mg + M1 + M10 + d1 omega1. That paper confirms the radii, J1 and the
+friction curve. The other constants are as commonly published and were not verified against the manual.
 
 A stopped wheel sticks while the road's torque T is below M1 + M10; the brake then carries exactly T. Where r1 mu
 exceeds L (sin phi - mu cos phi), no torque holds the wheel.

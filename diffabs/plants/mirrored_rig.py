@@ -4,10 +4,9 @@ wheel.
     J1 omega1' = Fn r1 mu(slip) - tau1,   J2 omega2' = -Fn r2 mu(slip),   Fn = m g,   J2 = c m r2^2
     slip = (r2 omega2 - r1 omega1)/(r2 omega2)
 
-Maeda and Sugiura, eqs. (2)-(5), (12). Their eq. (3) takes the body for a disk, c = 1/2.
-Eq. (9) then decelerates it at 2 mu g, twice their eq. (8) for a car; c = 1 is the inertia that gives the car's mu g.
-The default is 1/2, because their numbers use it.
-Eq. (12) holds only for omega2 r2 >= omega1 r1; beyond this the slip is relative to the faster wheel.
+Maeda and Sugiura, eqs. (2)-(5), (12). Their eq. (3) takes the body for a disk, c = 1/2. Eq. (9) then decelerates it at
+2 mu g, twice their eq. (8) for a car; c = 1 is the inertia that gives the car's mu g. The default is 1/2, because their
+numbers use it. Eq. (12) holds only for omega2 r2 >= omega1 r1; beyond this the slip is relative to the faster wheel.
 """
 
 from typing import NamedTuple

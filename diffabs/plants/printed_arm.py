@@ -5,8 +5,8 @@
     (p2 + c2) theta'' + p2 psi'' = tau + g b2 (theta - psi)
     (p3 + c3) theta'' + p3 phi'' = -K phi - d phi' + g b3 (theta - phi)
 
-The gravity matrix d(right sides)/dq is not symmetric. These forces have no potential, so no machine has them.
-In these equations the arm falls to the side that lifts the frame.
+The gravity matrix d(right sides)/dq is not symmetric. These forces have no potential, so no machine has them. In these
+equations the arm falls to the side that lifts the frame.
 
 Source: Fumita, eqs. (8)-(10), for small angles.
 """

@@ -2,11 +2,10 @@
 
     m v' = -mu(slip) m g,   J omega' = r mu(slip) m g - u,   x' = v,   slip = (v - r omega)/v
 
-Aoki and Nakamura, eqs. (1) and (7)-(12); the same equations are eqs. (6)-(11) of Maeda and Sugiura.
-Aoki and Nakamura's brake torque is negative; here u >= 0 brakes. Their eq. (9) drops the brake from a stopped wheel, so
-that the wheel starts to turn again at once.
-Here a stopped wheel stays stopped while the brake torque exceeds the road's torque. The model neglects rolling and air
-resistance.
+Aoki and Nakamura, eqs. (1) and (7)-(12); the same equations are eqs. (6)-(11) of Maeda and Sugiura. Aoki and Nakamura's
+brake torque is negative; here u >= 0 brakes. Their eq. (9) drops the brake from a stopped wheel, so that the wheel
+starts to turn again at once. Here a stopped wheel stays stopped while the brake torque exceeds the road's torque. The
+model neglects rolling and air resistance.
 """
 
 from typing import NamedTuple

@@ -92,8 +92,7 @@ def probes(self: Any, initial: BrakeStart, setpoint: Scalar, stop: Any) -> Brake
     """Return k starts at which the loop may be stiffest, as a `BrakeStart` of arrays (k,).
 
     The speeds go down to the stop's speed. Some slips are close to the setpoint, where the controller is not at a
-    limit.
-    Other slips cover the friction curve, which is steepest near 0.
+    limit. Other slips cover the friction curve, which is steepest near 0.
 
     Args:
         self: The plant; it has no effect.

@@ -3,10 +3,9 @@
     T a_f' = a - a_f,   target = slips(a_f), linear between nodes and constant beyond them
 
 A car that brakes near the peak of its friction curve decelerates at mu g, so the deceleration measures the road's
-friction.
-A table gives the slip of the peak for each deceleration, if roads of equal friction share their peak slip.
-There is no search, and the only memory is the low-pass filter against noise.
-A steep table can cause positive feedback: more slip, more deceleration, more slip.
+friction. A table gives the slip of the peak for each deceleration, if roads of equal friction share their peak slip.
+There is no search, and the only memory is the low-pass filter against noise. A steep table can cause positive feedback:
+more slip, more deceleration, more slip.
 """
 
 from collections.abc import Iterator

@@ -3,10 +3,9 @@
     target+ = target + min[(1 - exp(-h v0/(T v))) (slip - target),  h rate v0/v]          every period h
 
 The slip rate of a braked wheel under torque is proportional to 1/v: r tau/(J v). A target with a rate proportional to
-1/v therefore needs the same torque at every speed.
-`rate`, the greatest rate at the speed v0, keeps this torque within the limits. Near its final value the target settles
-with the time constant T v/v0.
-The target starts at the measured slip. At t = 0 it has already made its first step.
+1/v therefore needs the same torque at every speed. `rate`, the greatest rate at the speed v0, keeps this torque within
+the limits. Near its final value the target settles with the time constant T v/v0. The target starts at the measured
+slip. At t = 0 it has already made its first step.
 """
 
 from collections.abc import Iterator
@@ -59,6 +58,7 @@ class LimitedSlip:
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
         """Return the memory after one step of the target at an instant of the period."""
         now, _ = clock.ticks(self.period)
+        # h is the period scaled by v0/v: in this time the target behaves equally at every speed.
         h = self.period * self.reference_speed / jnp.maximum(signal.speed, self.floor)
         left = self.slip - memory.held
         step = smaller(-jnp.expm1(-h / self.time_constant) * left, h * self.rate)

@@ -1,19 +1,15 @@
 """References that find the best slip: the slip of the greatest measured deceleration.
 
 Aoki and Nakamura, sec. 4, fig. 5, keep a running maximum of the deceleration |a|. When |a| exceeds it, the target
-becomes the present slip.
-Read literally, this rule cannot brake. While friction rises, the target equals the slip, the error is zero, and the car
-rolls on. `PeakLiteral` shows this.
+becomes the present slip. Read literally, this rule cannot brake. While friction rises, the target equals the slip, the
+error is zero, and the car rolls on. `PeakLiteral` shows this.
 
 `PeakLatch` is the reading that reproduces the paper's table 2: brake with the first target until |a| first falls below
-its maximum. Then take the slip at this maximum.
-`PeakRobust` is the latch for a noisy accelerometer.
+its maximum. Then take the slip at this maximum. `PeakRobust` is the latch for a noisy accelerometer.
 
 The maximum is an event. It occurs where the rate of the deceleration falls through zero, or where the deceleration
-itself jumps down.
-The noise of a sampled accelerometer causes such jumps. A step of the integration ends at the event, and the slip is the
-slip there.
-The run therefore does not depend on the grid and is differentiable.
+itself jumps down. The noise of a sampled accelerometer causes such jumps. A step of the integration ends at the event,
+and the slip is the slip there. The run therefore does not depend on the grid and is differentiable.
 """
 
 from collections.abc import Callable
@@ -101,8 +97,8 @@ class PeakLatch:
     """target = slip until |a| first falls, then the slip at the maximum of |a|; a later, greater maximum moves the
     target.
 
-    It needs an exact accelerometer. Noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip.
-    A forward bias does the same, because |a| falls through zero before it rises.
+    It needs an exact accelerometer. Noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip. A forward bias
+    does the same, because |a| falls through zero before it rises.
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
@@ -142,8 +138,7 @@ class PeakRobust:
     `threshold` of the maximum.
 
     Deceleration and slip pass the same low-pass filter, so their delays cancel. The deceleration keeps its sign,
-    because the absolute value of noise has a nonzero mean.
-    No maximum up to `arming` latches.
+    because the absolute value of noise has a nonzero mean. No maximum up to `arming` latches.
 
     Attributes:
         slip: Target before the latch [1].

@@ -3,8 +3,8 @@
     mu(s, v, x) = f(x) mu_0(s, v, x),   f(x) = sum_i c_i B(x/d - i),   i = 0 ... n - 1
 
 B is the cubic B-spline on the knots -2 ... 2. It is positive with sum 1, so f lies between the least and the greatest
-factor c and is C2.
-|f'| is at most the greatest |c_(i+1) - c_i|/d. The first and the last factor continue before 0 and beyond (n - 1) d.
+factor c and is C2. Its slope |f'| is at most the greatest |c_(i+1) - c_i|/d. The first and the last factor continue
+before 0 and beyond (n - 1) d.
 
 Source: C. de Boor, A Practical Guide to Splines, ch. IX, XI.
 """

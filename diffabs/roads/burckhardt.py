@@ -2,9 +2,9 @@
 
     mu(s, v) = (c1 (1 - exp(-c2 s)) - c3 s) exp(-c4 s v)        for s >= 0, odd in s
 
-Kiencke and Nielsen give c1..c3 for each surface, and 0.02 to 0.04 s/m as the range of c4 on all surfaces.
-The named roads use the middle of this range, c4 = 0.03 s/m. The value 0 gives the curve at walking speed, which is the
-curve usually plotted.
+Kiencke and Nielsen give c1..c3 for each surface, and 0.02 to 0.04 s/m as the range of c4 on all surfaces. The named
+roads use the middle of this range, c4 = 0.03 s/m. The value 0 gives the curve at walking speed, which is the curve
+usually plotted.
 
 Source: M. Burckhardt, Fahrwerktechnik: Radschlupf-Regelsysteme, Vogel 1993. Coefficients as tabulated by Kiencke and
 Nielsen, Automotive Control Systems, Springer 2005, ch. 8.

@@ -15,8 +15,8 @@ class MagicFormula:
     """mu(s) = D sin(C arctan(x - E (x - arctan x))), x = B s. The factors are stiffness B, shape C, peak D and
     curvature E.
 
-    The defaults reproduce Tables 1 and 2 of Aoki and Nakamura within 0.01 s and 0.06 m.
-    They were identified from these tables with J = 1.0539 kg m^2, because the paper does not give its curve.
+    The defaults reproduce Tables 1 and 2 of Aoki and Nakamura within 0.01 s and 0.06 m. They were identified from these
+    tables with J = 1.0539 kg m^2, because the paper does not give its curve.
 
     >>> from diffabs.roads import MagicFormula
     >>> print(f"{MagicFormula(D=0.5).friction(0.1):.3f}")

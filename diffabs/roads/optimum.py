@@ -24,10 +24,9 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     """Return the first local maximum of mu over slip in (0, 1]; slip 1 where mu only rises (ice).
 
     A braking wheel meets the first maximum first. It is not always the greatest: the rig's curve rises again towards
-    lock.
-    A grid brackets the maximum, and bisection of the slope locates it. Two Newton steps s - mu'/mu'' polish it and
-    carry its derivative by the implicit function theorem.
-    Slip and mu are thus differentiable in every parameter of the road.
+    lock. A grid brackets the maximum, and bisection of the slope locates it. Two Newton steps s - mu'/mu'' polish it
+    and carry its derivative by the implicit function theorem. Slip and mu are thus differentiable in every parameter of
+    the road.
 
     >>> from diffabs.roads import DRY_ASPHALT, peak
     >>> slip, mu = peak(DRY_ASPHALT)

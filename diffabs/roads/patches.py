@@ -32,8 +32,8 @@ class Patches:
         mu = mu_0 + sum_i S((x - edge_i)/width) (mu_(i+1) - mu_i),  S(z) = 3 y^2 - 2 y^3,  y = clamp(z + 1/2, 0, 1)
 
     A width of about 0.1 m is the length of a tyre's contact patch. With width 0 the jump is sharp. The values are then
-    exact, but derivatives through the run miss the movement of the jump time.
-    For derivatives, use a width of a few steps.
+    exact, but derivatives through the run miss the movement of the jump time. For derivatives, use a width of a few
+    steps.
 
     >>> from diffabs.roads import DRY_ASPHALT, ICE, Patches
     >>> road = Patches(roads=(DRY_ASPHALT, ICE), edges=(10.0,))
@@ -54,6 +54,7 @@ class Patches:
         if np.shape(self.edges) != (len(self.roads) - 1,):
             raise ValueError(f"edges has shape {np.shape(self.edges)}; {len(self.roads)} roads need one less")
         mus = [road.friction(slip, speed, distance) for road in self.roads]
+        # A width of 0 is replaced by 1: a division by 0 in the branch not taken would put NaN into the derivatives.
         smooth = jnp.greater(self.width, 0)
         width = jnp.where(smooth, self.width, 1.0)
         total = mus[0]

@@ -3,8 +3,8 @@
     mu(s) = w4 s^q / (a + s^q) + w3 s^3 + w2 s^2 + w1 s        for s >= 0, odd in s
 
 The paper's statement "0.2 is the slip of greatest friction" is not true of this curve. Its local peak is at slip
-0.18754, and a locked wheel (slip 1) has more friction than either.
-The printed equation is undefined for s < 0; the odd extension is an addition of diffabs.
+0.18754, and a locked wheel (slip 1) has more friction than either. The printed equation is undefined for s < 0; the odd
+extension is an addition of diffabs.
 
 Source: Maeda and Sugiura, eq. (13), after INTECO, The Laboratory Anti-lock Braking System, user's manual.
 """

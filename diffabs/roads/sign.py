@@ -11,7 +11,8 @@ from jax.tree_util import Partial
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
 from diffabs.core.rules import Rule
 
-SLIPS = np.linspace(0.05, 1.0, 20)  # at smaller slips a fitted polynomial may be negative by a millionth, as the rig's is
+# At smaller slips a fitted polynomial may be negative by a millionth, as the rig's is.
+SLIPS = np.linspace(0.05, 1.0, 20)
 
 
 def opposes(friction: Partial) -> Rule:
@@ -55,5 +56,5 @@ def _at_slips(friction: Partial) -> Any:
 
 @compile_once(options=QUICK_COMPILE_OPTIONS)
 def _along(friction: Partial, slips: Any) -> Any:
-    """Return the friction at these slips, compiled as one program: each operation alone would take as long to compile."""
+    """Return the friction at these slips, compiled as one program: one operation alone takes as long to compile."""
     return jax.vmap(friction)(slips)

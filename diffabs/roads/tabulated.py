@@ -6,8 +6,8 @@ This is the interpolant of SciPy's PchipInterpolator. It is exact at the knots, 
 C1.
 
 Source: F. N. Fritsch and J. Butland, A method for constructing local monotone piecewise cubic interpolants, SIAM J.
-Sci. Stat. Comput. 5 (1984).
-The three-point end slopes are those of C. Moler, Numerical Computing with MATLAB, sec. 3.6.
+Sci. Stat. Comput. 5 (1984). The three-point end slopes are those of C. Moler, Numerical Computing with MATLAB, sec.
+3.6.
 """
 
 from collections.abc import Iterator
@@ -32,9 +32,9 @@ KNOTS = (  # slip and friction at the knots of the identified spline
 class Tabulated:
     """Monotone cubic through (slip, mu); the knots start at (0, 0), increase, and end at slip 1.
 
-    The defaults are the spline identified from Tables 1 and 2 of Aoki and Nakamura, with J = 1.04456 kg m^2.
-    This spline reproduces all twenty numbers to the printed digit. The paper does not give its curve, so the true curve
-    is unknown.
+    The defaults are the spline identified from Tables 1 and 2 of Aoki and Nakamura, with J = 1.04456 kg m^2. This
+    spline reproduces all twenty numbers to the printed digit. The paper does not give its curve, so the true curve is
+    unknown.
 
     >>> from diffabs.roads import Tabulated
     >>> wet = Tabulated(slip=(0.0, 0.1, 0.3, 1.0), mu=(0.0, 0.7, 0.6, 0.5))

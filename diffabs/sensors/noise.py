@@ -20,8 +20,8 @@ class Noise:
     """Gaussian noise of these standard deviations, drawn every `period` and held. It needs a random key: `rollout(...,
     key=)`.
 
-    The k-th draw is a function of (key, k), so a run is deterministic and differentiable in the deviations.
-    A channel with deviation 0 draws nothing, because drawing would take most of the run's time.
+    The k-th draw is a function of (key, k), so a run is deterministic and differentiable in the deviations. A channel
+    with deviation 0 draws nothing, because drawing would take most of the run's time.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0)
@@ -51,6 +51,7 @@ class Noise:
             raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
         now, draw = clock.ticks(self.period)
         deviations = (self.slip, self.speed, self.wheel_speed, self.deceleration)
+        # Every channel has its own draw number, so channels are independent.
         noise = [drawn(jnp.asarray(d), clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
         held = BrakeOutput(noise[0], noise[1], noise[2], noise[3], 0.0 * signal.distance)
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), held, memory.held))
@@ -104,8 +105,7 @@ class PlayedWheelNoise:
     entry of `noise` (n,), cyclically.
 
     The entries of `noise` are parameters in place of the draws of `WheelNoise`: a recorded sequence, or the result of a
-    search.
-    A repeating sequence models the teeth of a wheel.
+    search. A repeating sequence models the teeth of a wheel.
     """
 
     noise: Vector = param(default=(0.0,), unit="1", free=True)
@@ -183,8 +183,8 @@ class Bias:
 class Quantisation:
     """measured = q round(true/q) for each channel; q = 0 leaves the channel unchanged.
 
-    The derivative with respect to the signal is 0, as on the treads of a staircase; it does not contain the jumps.
-    A run does not depend smoothly on q: a derivative with respect to q raises a ValueError.
+    The derivative with respect to the signal is 0, as on the treads of a staircase; it does not contain the jumps. A
+    run does not depend smoothly on q: a derivative with respect to q raises a ValueError.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0, tunable=False)
@@ -208,6 +208,7 @@ class Quantisation:
 
 
 def _rounded(x: Scalar, q: Scalar) -> Any:
+    # For q = 0 the divisor is 1, so that the branch not taken holds no NaN.
     fine = jnp.greater(q, 0)
     q = jnp.where(fine, q, 1.0)
     return jnp.where(fine, q * jnp.round(x / q), x)

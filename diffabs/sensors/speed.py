@@ -34,8 +34,8 @@ class IntegratedAccelerometer:
     """Vehicle speed as the integral of an accelerometer, v' = -deceleration + bias, and the slip computed with it.
 
     The bias is that of the signed forward acceleration. A positive bias makes the estimated speed too high and the slip
-    too large, which releases the brake.
-    The `floor` on the speed in the slip's denominator limits this effect near standstill.
+    too large, which releases the brake. The `floor` on the speed in the slip's denominator limits this effect near
+    standstill.
 
     Source: Aoki and Nakamura, sec. 4: "obtained by integrating the acceleration sensors".
     """
@@ -64,8 +64,8 @@ class IntegratedAccelerometer:
 class SpeedScale:
     """A vehicle speed with a relative error, v = factor * true, and the slip computed with it, (v - w)/v.
 
-    A wrong rolling radius has this effect on a speed that is estimated from another wheel.
-    A factor below 1 hides slip: at a measured slip s, the wheel slips by 1 - factor (1 - s).
+    A wrong rolling radius has this effect on a speed that is estimated from another wheel. A factor below 1 hides slip:
+    at a measured slip s, the wheel slips by 1 - factor (1 - s).
     """
 
     factor: Scalar = param(default=1.0, unit="1", above=0.0)

@@ -37,8 +37,8 @@ class SpeedReached:
 class Standstill:
     """The run ends at a small `speed`; its rest to standstill is extrapolated at the last deceleration: v/a, v^2/(2 a).
 
-    Slip is stiff near standstill (its rate is proportional to 1/v), so the last centimetres are not integrated.
-    The result does not depend on the speed between 0.01 and 1 m/s.
+    Slip is stiff near standstill (its rate is proportional to 1/v), so the last centimetres are not integrated. The
+    result does not depend on the speed between 0.01 and 1 m/s.
     """
 
     speed: Scalar = param(default=0.05, unit="m/s", above=0.0)
