@@ -28,7 +28,7 @@ from diffabs.core.pytree import Scalar, param, pytree, static
 from diffabs.core.rules import Rule, as_rule_array
 
 TIME_ROUNDING = 1e-6  # relative rounding of single precision
-WINDOW_PIECES = 6  # a step that spans more of them is cut
+WINDOW_PIECES = 6  # pieces; a step that spans more is cut
 TIME_EPS = 16.0  # in machine epsilons of t: closer instants count as equal
 SMOOTH_CHANGE_SHARE = 0.5  # exponent of the machine epsilon: a smaller relative difference is no jump
 SPARE, CUTS = 16, 4  # room for cut steps: SPARE pieces and one more for every CUTS steps

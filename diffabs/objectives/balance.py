@@ -67,7 +67,7 @@ def _greatest_angle(name: str) -> tuple[Any, Any, Any, Any]:
         """Return the greatest |angle| up to the end of the step."""
         del self
         angle = segment.output(lambda output: getattr(output, name))
-        # `falls` is about |angle|: for a negative angle it is that of -angle.
+        # `falls` refers to |angle|, so a negative angle is mirrored.
         falls = jnp.where(angle.start >= 0, angle.falls, angle.times(-1.0).falls)
         return later_of_larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()), falls)
 
