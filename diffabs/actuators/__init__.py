@@ -1,4 +1,4 @@
-"""Actuators: command -> control."""
+"""Actuators: blocks that map the controller's command to the plant's control."""
 
 from diffabs.actuators.delay import Delay as Delay
 from diffabs.actuators.lag import Lag as Lag

@@ -1,14 +1,17 @@
-"""Pure delay: control(t) = command(t - time), and 0 before the first command has come through.
+"""Pure delay: control(t) = command(t - time), and 0 until the first command arrives.
 
-Of each past step, whatever its length, the delay keeps the times of both ends and the cubic of the command between
-them, from values and rates there. So a smooth command comes out to the order of the method. Where one step's end and
-the next one's beginning are not the same, in value or in rate, the command has jumped or bent: a step of the run ends
-where that comes out, and the moment of it carries the derivatives of the moment at which it went in, and of `time`.
-To a delay of exactly one step the jump is known when it comes out. Where a derivative by `time` is asked for, the next
-step begins with that event (`_InEvents`).
+The delay stores one `Piece` for each past step, of any length: the times of both ends and a cubic Hermite polynomial of
+the command. The polynomial interpolates value and rate at both ends, so a smooth command keeps the order of the method.
 
-In Runge-Kutta stages the delayed command must be smooth, also beyond such an end. So a step uses the pieces between
-two ends alone, from a window of those that come out next, which is moved on after every step."""
+The command breaks where value or rate at the end of one piece differ from those at the start of the next. A step of the
+integration ends where the break leaves the delay. The time of this event carries the tangents of the break's entry time
+and of `time`. If the delay equals one step, the exit time of a break is a grid instant, and no event is needed. For
+derivatives with respect to `time`, the next step then starts with an event (`_InEvents`).
+
+Inside the Runge-Kutta stages of a step the delayed command must be smooth, also beyond the next break. A step therefore
+reads only the pieces between two breaks. They come from a window of the pieces that leave next; a tick moves the window
+after each step.
+"""
 
 import dataclasses
 from collections.abc import Iterator
@@ -24,16 +27,22 @@ from diffabs.core.protocols import Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree, static
 from diffabs.core.rules import Rule, as_rule_array
 
-TIME_ROUNDING = 1e-6  # relative, of single precision
-WINDOW_PIECES = 6  # pieces: a step that spans more is cut
-TIME_EPS = 16.0  # precisions of the time: instants that are one
-SMOOTH_CHANGE_SHARE = 0.5  # power of the precision: a relative difference that is no jump
-SPARE, CUTS = 16, 4  # pieces beyond the capacity, and one more for so many steps: for steps that are cut
+TIME_ROUNDING = 1e-6  # relative rounding of single precision
+WINDOW_PIECES = 6  # pieces; a step that spans more is cut
+TIME_EPS = 16.0  # in machine epsilons of t: closer instants count as equal
+SMOOTH_CHANGE_SHARE = 0.5  # exponent of the machine epsilon: a smaller relative difference is no jump
+SPARE, CUTS = 16, 4  # room for cut steps: SPARE pieces and one more for every CUTS steps
 
 
 class Piece(NamedTuple):
-    """A past step: times of its ends [s], the cubic of the command between them, and 1 where the command does not go on
-    smoothly from the piece before."""
+    """A past step of the integration, with the command as a cubic.
+
+    Attributes:
+        start: Time of the step's start [s].
+        end: Time of the step's end [s].
+        command: Cubic of the command between both times.
+        breaks: 1 where the command does not continue smoothly from the previous piece, else 0.
+    """
 
     start: Scalar
     end: Scalar
@@ -42,21 +51,30 @@ class Piece(NamedTuple):
 
     @classmethod
     def of(cls, row: Any) -> "Piece":
-        """The piece of a row."""
+        """Return the piece stored in `row`, a row of the ring or of the window."""
         start, end, *command, breaks = row
         return cls(start, end, Cubic(*command), breaks)
 
     @property
     def rate(self) -> Any:
-        """Of the command, at the end."""
+        """Rate of the command at the end of the piece [control/s]."""
         return self.command.end_slope / (self.end - self.start)
 
 
 class DelayMemory(NamedTuple):
-    """A ring of past steps, a row for each `Piece`. The window: rows of the pieces that come out next, how many of them
-    there are; between `place` and `last`, those of which the present step may use; and until when [s] it may, less the
-    delay. Where the window begins in the ring, and how many pieces there are from there on; the newest of them. Whole
-    numbers are of the type of the signal."""
+    """The ring of past steps and the window of pieces that leave next. Integers have the floating type of the signal.
+
+    Attributes:
+        ring: Past steps, one row for each `Piece`.
+        window: Rows of the pieces that leave next, shape (WINDOW_PIECES, columns).
+        known: Number of valid pieces in the window.
+        place: Index in the window of the first piece that the present step may read.
+        last: Index in the window of the last piece that the present step may read.
+        until: Time up to which the present step may read, minus the delay [s].
+        first: Index in the ring of the window's first piece.
+        count: Number of pieces in the ring from `first` on.
+        newest: Row of the newest piece.
+    """
 
     ring: Log
     window: Any
@@ -71,8 +89,15 @@ class DelayMemory(NamedTuple):
 
 @pytree
 class Delay:
-    """control(t) = command(t - time). The delay is at least one step and at most capacity - 2 of them. There is room
-    for events that cut every fourth of these steps; a run with more of them within one delay has diverged."""
+    """A pure delay, control(t) = command(t - time), between one step and capacity - 2 steps long.
+
+    The ring has spare rows for events that cut every fourth of these steps. A run with more events within one delay has
+    diverged.
+
+    Attributes:
+        time: Delay [s], > 0.
+        capacity: Number of steps that the ring holds, without the spare rows.
+    """
 
     time: Scalar = param(default=0.01, unit="s", above=0.0)
     capacity: int = static(default=1024)
@@ -80,7 +105,7 @@ class Delay:
     flow = no_flow
 
     def start(self, signal: Scalar) -> Memory:
-        """Nothing on the way yet: one piece that is 0, until t = 0."""
+        """Return a memory with one piece: the command 0 until t = 0."""
         zero = 0.0 * jnp.asarray(signal)
         row = _row(Piece(zero - self.time, zero, Cubic(zero, zero, zero, zero), zero))
         window = jnp.broadcast_to(row, (WINDOW_PIECES, *row.shape))
@@ -89,7 +114,7 @@ class Delay:
         return Memory((), self._aimed(DelayMemory(ring, window, zero + 1, zero, zero, zero, zero, zero + 1, row)))
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Any:
-        """The delayed command; beyond a break that has not come out, straight on."""
+        """Return the delayed command; beyond the next break, its linear extrapolation."""
         del signal
         m: DelayMemory = memory.held
         piece = _piece(m.window, self._place(t, m))
@@ -98,19 +123,19 @@ class Delay:
         return piece.command(within) + (x - within) * piece.command.end_slope
 
     def margins(self, t: Scalar, memory: Memory, signal: Scalar, rate: Any) -> tuple[Any]:
-        """The time until the command that comes out breaks, or until more must be known of it."""
+        """Return the time until the next break leaves the delay, or until the step needs pieces beyond the window."""
         del signal, rate
         return (memory.held.until + self.time - t,)
 
     def event(self, t: Scalar, memory: Memory, signal: Scalar, fired: tuple[Any]) -> Memory:
-        """The break has come out."""
+        """Return the memory after a break has left the delay: the next pieces may be read."""
         del t, signal
         m: DelayMemory = memory.held
         out = fired[0] & (m.last + 1 < m.known)
         return memory._replace(held=self._aimed(m._replace(place=jnp.where(out, m.last + 1, m.place))))
 
     def record(self, memory: Memory, passage: Passage) -> Memory:
-        """Store the step that is over; one without a length is none."""
+        """Return the memory with the finished step stored; a step of zero length is not stored."""
         m: DelayMemory = memory.held
         h, free = passage.end - passage.start, _ring_place(m.first + m.count, m.ring.size)
         before = Piece.of(jax.lax.stop_gradient(m.newest))
@@ -124,47 +149,50 @@ class Delay:
         return memory._replace(held=m._replace(ring=m.ring.put(free, row), newest=newest, count=count))
 
     def tick(self, clock: Clock, memory: Memory, signal: Scalar) -> Memory:
-        """The window from here. After a delay of one step, what breaks at this very instant has come out."""
+        """Return the memory with the window moved to time t. If the delay is one step, a break at t itself has left the
+        delay.
+        """
         del signal
         m: DelayMemory = memory.held
         size, over = m.ring.size, self._place(clock.t, m)
         first, count = _ring_place(m.first + over, size), m.count - over
         rows = m.ring.read(_ring_place(first.astype(int) + jnp.arange(WINDOW_PIECES), size))
-        window = jnp.where(count < size, rows, jnp.nan)  # else a piece that is still to come out is overwritten
+        window = jnp.where(count < size, rows, jnp.nan)  # else the ring has overwritten a piece that has not left yet
         known, none = jnp.minimum(count, WINDOW_PIECES), jnp.zeros_like(count)
         new = self._aimed(DelayMemory(m.ring, window, known, none, none, none, first, count, m.newest))
         return memory._replace(held=self._at_once(new, clock.t))
 
     def _at_once(self, m: DelayMemory, t: Scalar) -> DelayMemory:
-        """What breaks at time t or before has come out."""
+        """Return the memory after the breaks that leave the delay at time t or earlier."""
         out = (m.last + 1 < m.known) & (m.until + self.time <= t)
         return self._aimed(m._replace(place=jnp.where(out, m.last + 1, m.place)))
 
     def differentiated(self, names: set[str]) -> "Delay":
-        """Return the same delay for derivatives by these of its parameters."""
+        """Return the delay to use for derivatives with respect to the parameters in `names`."""
         return _InEvents(time=self.time, capacity=self.capacity) if "time" in names else self
 
     def _place(self, t: Scalar, m: DelayMemory) -> Any:
-        """Which piece of the window comes out at time t, up to the next break."""
+        """Return the window index of the piece that leaves at time t, limited to the pieces before the next break."""
         return _count([m.window[i, 1] for i in range(WINDOW_PIECES)], t - self.time, m.place, m.last)
 
     def _aimed(self, m: DelayMemory) -> DelayMemory:
-        """With the last piece before the next break, and the time of that."""
+        """Return the memory with `last` and `until` set for the present `place`."""
         last = m.known - 1
         for i in reversed(range(1, WINDOW_PIECES)):
             last = jnp.where((i > m.place) & (i < m.known) & (m.window[i, -1] > 0.5), i - 1.0, last)
         breaks = last + 1 < m.known
         until = jnp.where(breaks, _piece(m.window, last + 1).start, _piece(m.window, last).end)
-        # Before what happens on the grid, or the moment would lose its derivatives; but no step is cut at its own end.
+        # The event comes a rounding before the grid instant: on the grid its time would lose its derivatives. If the
+        # newest piece limits the step, the event comes a rounding after its end, so that it does not cut the next step.
         newest = ~breaks & (m.known == m.count)
         return m._replace(last=last, until=until + jnp.where(newest, 1.0, -1.0) * _rounding(until + self.time))
 
     def refined(self, times: int) -> "Delay":
-        """The same delay in so many more steps."""
+        """Return the delay with capacity for a step that is `times` times shorter."""
         return dataclasses.replace(self, capacity=times * self.capacity)  # pyright: ignore[reportArgumentType]
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
-        """The ring holds the delay, to the rounding of single precision."""
+        """Yield the rule that the ring holds the delay, up to the rounding of single precision."""
         most, time = (self.capacity - 2) * step, as_rule_array(self.time)
         outside = f"outside [{step:g}, {most:g}] s, one step to capacity - 2 steps"
         yield Rule(
@@ -176,11 +204,14 @@ class Delay:
 
 @pytree
 class _InEvents(Delay):
-    """A delay whose command breaks in an event, also after a delay of one step: at the beginning of the next one. The
-    moment then has a derivative, and the sample kept at that instant is the command before."""
+    """A delay whose breaks always leave in an event; after a delay of one step, at the start of the next step.
+
+    The event time then has a derivative. The sample stored at that instant is the command before the break.
+    """
 
     def _at_once(self, m: DelayMemory, t: Scalar) -> DelayMemory:
-        # A break that is over has come out: a repeated run may see one that, to rounding, it did not see before.
+        # Breaks more than a few roundings in the past have left already: when the solver repeats a step, rounding may
+        # reveal a break that the first try did not see.
         m = Delay._at_once(self, m, t - 4 * _rounding(t))
         late = jnp.where(m.last + 1 < m.known, t + _rounding(t) - (m.until + self.time), 0.0)
         return m._replace(until=m.until + jnp.maximum(jax.lax.stop_gradient(late), 0.0))
@@ -191,20 +222,24 @@ def _row(piece: Piece) -> Any:
 
 
 def _piece(window: Any, place: Any) -> Piece:
-    """The piece at a place. By selections: a slice whose place is computed would take the stages of a step apart."""
-    row, place = [window[0, j] for j in range(window.shape[1])], place.astype(int)  # whole numbers have no kinks
+    """Return the piece at a place of the window, by selects.
+
+    A gather at a computed index would prevent XLA from fusing the stages of a step.
+    """
+    # Comparisons of integers are no events.
+    row, place = [window[0, j] for j in range(window.shape[1])], place.astype(int)
     for i in range(1, WINDOW_PIECES):
         row = [jnp.where(place >= i, window[i, j], x) for j, x in enumerate(row)]
     return Piece.of(row)
 
 
 def _ring_place(place: Any, size: int) -> Any:
-    """A place in a ring of this size, for one less than twice as far."""
+    """Return a place wrapped into a ring of `size` rows, for place < 2 size."""
     return jnp.where(place >= size, place - size, place)
 
 
 def _differ(before: tuple[Any, Any], after: tuple[Any, Any]) -> Any:
-    """Whether a command does not go on as a smooth one does: value, and change within the delay, at one instant."""
+    """Return whether value, or rate times delay, jumps between `before` and `after` by more than rounding."""
     size = jnp.abs(before[0]) + jnp.abs(before[1]) + jnp.abs(after[0]) + jnp.abs(after[1])
     jumps = [
         jnp.abs(x - y) > jnp.finfo(size.dtype).eps ** SMOOTH_CHANGE_SHARE * size
@@ -214,16 +249,17 @@ def _differ(before: tuple[Any, Any], after: tuple[Any, Any]) -> Any:
 
 
 def _rounding(t: Any) -> Any:
-    """By how much two computations of the time t may differ."""
+    """Return the bound on the difference of two computations of the time t [s]."""
     return TIME_EPS * jnp.finfo(jnp.result_type(t)).eps * jax.lax.stop_gradient(t)
 
 
-# Rules of their own, so that nobody looks for the places where these change: the command does not break there.
+# Custom JVPs hide the comparisons in these functions from the event detection: the command does not break where they
+# change. Their tangents are exact away from the thresholds.
 
 
 @jax.custom_jvp
 def _count(ends: list[Any], t: Any, low: Any, high: Any) -> Any:
-    """How many pieces are over at t, within these limits."""
+    """Return the number of pieces that are over at time t, clamped to [low, high]."""
     over = sum(jnp.where((i < high) & (t >= end), 1.0, 0.0) for i, end in enumerate(ends))
     return jnp.maximum(jnp.minimum(jnp.asarray(over, t.dtype), high), low)
 

@@ -1,4 +1,4 @@
-"""Actuators that are a gain or a differential equation: limits, lag, rate limit."""
+"""Actuators that are a gain or a first-order differential equation: limits, lag and rate limit."""
 
 from collections.abc import Iterator
 
@@ -12,7 +12,7 @@ from diffabs.core.rules import Rule, order_rule
 
 @pytree
 class Limits:
-    """control = clamp(command, low, high), without limits by default."""
+    """control = clamp(command, low, high); by default both limits are infinite."""
 
     low: Scalar = param(default=-np.inf, unit="control", infinite=True)
     high: Scalar = param(default=np.inf, unit="control", infinite=True)
@@ -21,36 +21,37 @@ class Limits:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """Control: a brake's torque [N m]."""
+        """Return the control, for a brake its torque [N m]."""
         del t, memory
         return clamp(signal, self.low, self.high)
 
     def limits(self) -> tuple[Scalar, Scalar]:
-        """Between which the control stays."""
+        """Return the lower and the upper limit of the control."""
         return self.low, self.high
 
     def rules(self) -> Iterator[Rule]:
-        """Limits that do not exclude each other."""
+        """Yield the rule low <= high."""
         yield order_rule(("low", self.low), ("high", self.high), "{control}")
 
 
 @pytree
 class Lag:
-    """time_constant control' = command - control, control(0) = 0: a brake that has to build up pressure."""
+    """time_constant control' = command - control, control(0) = 0: a brake that builds up pressure."""
 
     time_constant: Scalar = param(default=0.01, unit="s", above=0.0)
 
     def start(self, signal: Scalar) -> Memory:
-        """Brake released."""
+        """Return the memory of a released brake: control 0."""
+        # 0.0 * signal has type and shape of the signal, so a loop carry keeps its type.
         return Memory(flow=0.0 * signal)
 
     def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """control'."""
+        """Return control', in the control's unit per second."""
         del t
         return quotient(signal - memory.flow, self.time_constant)
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """Control: a brake's torque [N m]."""
+        """Return the control, for a brake its torque [N m]."""
         del t, signal
         return memory.flow
 
@@ -59,7 +60,7 @@ class Lag:
 class RateLimit:
     """control' = clamp((command - control)/time_constant, -rate, rate), control(0) = 0.
 
-    A servo whose speed saturates; the ideal rate limiter is the limit of a small time constant.
+    This models a servo whose speed saturates. As time_constant goes to 0, the model becomes the ideal rate limiter.
     """
 
     rate: Scalar = param(default=1000.0, unit="control/s", above=0.0)
@@ -69,6 +70,6 @@ class RateLimit:
     output = Lag.output
 
     def flow(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """control'."""
+        """Return control', in the control's unit per second."""
         del t
         return clamp(quotient(signal - memory.flow, self.time_constant), -self.rate, self.rate)

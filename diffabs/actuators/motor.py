@@ -1,4 +1,4 @@
-"""The supply of a motor: what voltage it can give."""
+"""Voltage limit of a motor's supply."""
 
 from diffabs.core.numerics import clamp
 from diffabs.core.protocols import Memory, no_flow, no_memory
@@ -15,6 +15,6 @@ class VoltageLimit:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Scalar) -> Scalar:
-        """Voltage [V]."""
+        """Return the voltage at the motor [V]."""
         del t, memory
         return clamp(signal, -self.voltage_max, self.voltage_max)

@@ -1,4 +1,4 @@
-"""Controllers: (target, measured, feedforward) -> command."""
+"""Controllers: blocks that map (target, measured, feedforward) to the command."""
 
 from diffabs.controllers.antiwindup import BackCalculation as BackCalculation
 from diffabs.controllers.antiwindup import Clamping as Clamping

@@ -1,6 +1,6 @@
-"""What an integrator does while the output is at a limit.
+"""Anti-windup strategies: the rate of an integrator while the controller's output is at a limit.
 
-Each strategy gives I', the rate of the integral of the error, for a controller whose output is limit(... + gain * I).
+Each strategy returns I', the rate of the integral of the error, for a controller with the output limit(... + gain * I).
 """
 
 import jax.numpy as jnp
@@ -11,35 +11,44 @@ from diffabs.core.pytree import Scalar, param, pytree
 
 @pytree
 class NoAntiWindup:
-    """I' = e: the integral goes on."""
+    """I' = e: the integration continues while the output is at a limit."""
 
     def rate(self, error: Scalar, gain: Scalar, raw: Scalar, limited: Scalar) -> Scalar:
-        """I'."""
+        """Return I' = `error`; `gain`, `raw` and `limited` have no effect."""
         del gain, raw, limited
         return error
 
 
 @pytree
 class Clamping:
-    """I' = e, but 0 while the output is at a limit and gain * e would push it further out (conditional integration)."""
+    """Conditional integration: I' = e, but I' = 0 while the output is at a limit and gain * e would push it further
+    out.
+    """
 
     jumps = True
 
     def rate(self, error: Scalar, gain: Scalar, raw: Scalar, limited: Scalar) -> Scalar:
-        """I'."""
+        """Return I' from the `error`, the integral's `gain`, and the output before (`raw`) and after the limit
+        (`limited`).
+        """
         outward = (raw - limited) * gain * error > 0
         return jnp.where(outward, 0.0, error)
 
 
 @pytree
 class BackCalculation:
-    """I' = e + (limited - raw)/(gain * Tt): the excess drains with the tracking time Tt.
+    """I' = e + (limited - raw)/(gain * Tt): the excess over the limit decays with the tracking time Tt.
 
-    Astrom and Hagglund, PID Controllers, 2nd ed., sec. 3.5.
+    Source: Astrom and Hagglund, PID Controllers, 2nd ed., sec. 3.5.
     """
 
     tracking_time: Scalar = param(default=0.05, unit="s", above=0.0)
 
     def rate(self, error: Scalar, gain: Scalar, raw: Scalar, limited: Scalar) -> Scalar:
-        """I'; with gain 0 there is nothing to drain."""
+        """Return I' from the `error`, the integral's `gain`, and the output before (`raw`) and after the limit
+        (`limited`).
+
+        With gain 0 the integral has no effect on the output, so the correction term is 0.
+        """
+        # `ratio` is 0 with zero derivatives where its denominator is 0: a PID without integral action has gain 0.
         return error + ratio(limited - raw, gain * self.tracking_time)

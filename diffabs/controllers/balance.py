@@ -1,10 +1,10 @@
-"""Feedback that holds a two-wheeler upright: of the whole state, or of the two angles that a vehicle can measure.
+"""Feedback that balances a two-wheeler: of the whole state, or of the two angles that a vehicle can measure.
 
     BalanceFeedback     u = K x,   x = (theta, psi, phi, theta', psi', phi')
     ObserverFeedback    x^- = A x^ + B clamp(u),   x^ = x^- + L (y - C x^-),   u = K x^,   y = (theta, psi)
 
-The sign is that of the rest of the package: u = +K x. An observer is a computer's: `Sampled` runs it, and A, B are
-those of one period. `diffabs.linear.lqg` computes K and L.
+The sign convention is u = +K x, as in all of diffabs. `Sampled` runs the observer as a computer does; A and B are the
+discrete-time matrices of one period. `diffabs.linear.lqg` computes K and L.
 """
 
 from collections.abc import Iterator
@@ -20,19 +20,24 @@ from diffabs.core.pytree import Matrix, Scalar, Vector, param, pytree
 
 STATE_NAMES = ("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate")
 MEASURED_NAMES = ("theta", "psi")
-# K of the paper's machine for Q = I, R = 1, and the machine at rest, so that an observer has a default.
+# LQR gain of the paper's machine for Q = I, R = 1. The observer shares it as its default.
 DEFAULT_BALANCE_GAIN = (24208.064, 2293.1921, 7667.1, 8683.2995, 889.36867, 2860.7285)
 
 
 def state_of(output: BalanceOutput) -> Any:
-    """x (6,)."""
+    """Return the state x = (theta, psi, phi, theta', psi', phi') of a plant output, shape (6,).
+
+    Args:
+        output: Output of the plant, angles in rad and rates in rad/s.
+    """
     return jnp.stack([getattr(output, name) for name in STATE_NAMES])
 
 
 @pytree
 class BalanceFeedback:
-    """u = K x [V]: every angle and every rate is measured. The default gain is an LQR's (Q = I, R = 1) for the paper's
-    machine."""
+    """u = K x [V], with every angle and every rate measured. The default gain is an LQR's (Q = I, R = 1) for the
+    paper's machine.
+    """
 
     gain: Vector = param(default=DEFAULT_BALANCE_GAIN, unit="V/rad, V s/rad")
 
@@ -40,18 +45,23 @@ class BalanceFeedback:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Voltage [V]."""
+        """Return the voltage [V]."""
         del t, memory
         terms = [k * getattr(signal.measured, name) for k, name in zip(self.gain, STATE_NAMES, strict=True)]
         return sum(terms[1:], terms[0])
 
     def problems(self) -> Iterator[str]:
-        """A gain of the wrong length."""
+        """Yield a message if the gain does not have shape (6,)."""
         yield from _shape_problems(self, gain=(6,))
 
 
 class ObserverMemory(NamedTuple):
-    """Estimated state (6,), and the voltage that was asked for at it."""
+    """Memory of the observer.
+
+    Attributes:
+        state: Estimated state, shape (6,).
+        voltage: Voltage u = K x^ for this estimate, before its limit [V].
+    """
 
     state: Any
     voltage: Scalar
@@ -59,8 +69,18 @@ class ObserverMemory(NamedTuple):
 
 @pytree
 class ObserverFeedback:
-    """u = K x^, x^ from theta and psi by a steady Kalman filter in discrete time; it knows the voltage's limit. It
-    computes in every step of the integration unless it is `Sampled`."""
+    """u = K x^, where a steady-state Kalman filter in discrete time estimates x^ from theta and psi. The prediction
+    uses the voltage after its limit.
+
+    Without `Sampled`, the observer computes in every step of the integration.
+
+    Attributes:
+        gain: K, shape (6,) [V/rad, V s/rad].
+        transition: A, shape (6, 6).
+        entry: B, shape (6,) [rad/V, rad/(s V)].
+        correction: L, shape (6, 2) [1, 1/s].
+        voltage_max: Limit of the voltage in the prediction [V], > 0.
+    """
 
     gain: Vector = param(default=DEFAULT_BALANCE_GAIN, unit="V/rad, V s/rad")
     transition: Matrix = param(default=np.eye(6), unit="1")
@@ -72,20 +92,21 @@ class ObserverFeedback:
     flow = no_flow
 
     def start(self, signal: Tracking) -> Memory:
-        """At the measured angles, the rest zero."""
+        """Return the measured angles as the first estimate; phi and all rates are 0."""
         zero = 0.0 * signal.target
         angles = [getattr(signal.measured, name) if name in MEASURED_NAMES else zero for name in STATE_NAMES]
         return Memory(held=ObserverMemory(jnp.stack(angles), zero))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Voltage [V]."""
+        """Return the voltage [V]."""
         del t, signal
         return memory.held.voltage
 
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """Begin at the angles of the first sample; then predict from the last sample and correct by this one.
+        """Return the estimate after one sample; the first sample sets it to the measured angles.
 
-        The memory of `start` does not serve: a sensor has no noise before its first sample.
+        The memory from `start` cannot serve as the first estimate, because a sensor adds no noise before its first
+        sample.
         """
         now, number = clock.ticks()
         estimate: ObserverMemory = memory.held
@@ -99,7 +120,7 @@ class ObserverFeedback:
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, estimate))
 
     def problems(self) -> Iterator[str]:
-        """Arrays of the wrong shape."""
+        """Yield a message for every array of the wrong shape."""
         yield from _shape_problems(self, gain=(6,), transition=(6, 6), entry=(6,), correction=(6, 2))
 
 

@@ -2,7 +2,9 @@
 
     u = clamp(ff + K x, u_min, u_max),   x = (integral of (slip - target), slip - target)
 
-Maeda and Sugiura, eqs. (18), (19), (23): tau1 = tau1* + K x. Note the sign: u = +K x, so a stabilising K is negative.
+The sign convention is u = +K x, so a stabilising K is negative.
+
+Source: Maeda and Sugiura, eqs. (18), (19), (23): tau1 = tau1* + K x.
 """
 
 from collections.abc import Iterator
@@ -19,7 +21,7 @@ from diffabs.core.rules import Rule, order_rule
 
 @pytree
 class StateFeedback:
-    """u = clamp(ff + k1 x1 + k2 x2, torque_min, torque_max); the default gain is the paper's, from its section 4."""
+    """u = clamp(ff + k1 x1 + k2 x2, torque_min, torque_max). The default gain is the paper's (section 4)."""
 
     gain: Vector = param(default=(-11753.0, -48.0), unit="control/signal/s, control/signal")
     torque_min: Scalar = param(default=-np.inf, unit="control", infinite=True)
@@ -27,17 +29,17 @@ class StateFeedback:
     antiwindup: Any = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:
-        """x1(0) = 0."""
+        """Return the memory x1(0) = 0."""
         return Memory(flow=0.0 * signal.measured[0])
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """x1' = slip - target, unless the anti-windup says otherwise."""
+        """Return x1' = slip - target, as modified by the anti-windup strategy."""
         raw, limited = self._torque(memory, signal)
         error = signal.measured[0] - signal.target
         return self.antiwindup.rate(error, self.gain[0], raw, limited)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Control: a brake's torque [N m]."""
+        """Return the control, for a brake its torque [N m]."""
         return self._torque(memory, signal)[1]
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
@@ -46,14 +48,14 @@ class StateFeedback:
         return raw, clamp(raw, self.torque_min, self.torque_max)
 
     def limits(self) -> tuple[Scalar, Scalar]:
-        """Between which the control stays."""
+        """Return the lower and the upper limit of the control."""
         return self.torque_min, self.torque_max
 
     def problems(self) -> Iterator[str]:
-        """A gain of the wrong length."""
+        """Yield a message if the gain does not have shape (2,)."""
         if np.shape(self.gain) != (2,):
             yield f"gain has shape {np.shape(self.gain)}; it needs (2,): integral and proportional"
 
     def rules(self) -> Iterator[Rule]:
-        """Limits that do not exclude each other."""
+        """Yield the rule torque_min <= torque_max."""
         yield order_rule(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}")

@@ -1,4 +1,4 @@
-"""The input that feedback is added to."""
+"""Feed-forward inputs: the control to which a controller adds its feedback."""
 
 from typing import Any
 
@@ -8,21 +8,22 @@ from diffabs.core.pytree import Scalar, param, pytree
 
 @pytree
 class ConstantInput:
-    """A number: what a controller does that knows neither mass nor road."""
+    """A constant feed-forward: the input of a controller without a model of mass or road."""
 
     value: Scalar = param(default=0.0, unit="control")
 
     def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
-        """The number."""
+        """Return the constant, in the unit of the plant's control."""
         del plant, output, target
         return self.value
 
 
 @pytree
 class HoldingInput:
-    """The plant's own equilibrium input at the target: tau* of Maeda and Sugiura. It follows a swept mass or road, as a
-    controller does that knows them exactly."""
+    """The plant's own equilibrium input at the target: tau* of Maeda and Sugiura. It follows a swept mass or road, as
+    for a controller with exact parameters.
+    """
 
     def input(self, plant: Plant, output: BrakeOutput, target: Scalar) -> Any:
-        """tau*, in the unit of the plant's control."""
+        """Return tau*, in the unit of the plant's control."""
         return plant.holding(output, target)

@@ -1,10 +1,13 @@
-"""State feedback whose gain follows the measured speed.
+"""State feedback with a gain that depends on the measured speed.
 
     u = clamp(ff + K(v) x, u_min, u_max),   x = (integral of (slip - target), slip - target)
 
-K is linear in v between nodes and constant beyond them: the gains that `diffabs.design.design` gives for a `Schedule`,
-and what its certificate is about. Gain scheduling by a parameter-dependent Lyapunov function: W. J. Rugh and J. S.
-Shamma, Research on gain scheduling, Automatica 36 (2000). The sign is that of `StateFeedback`."""
+K is linear in v between nodes and constant beyond them. `diffabs.design.design` returns such gains for a `Schedule`,
+and its certificate holds for them. The sign convention is that of `StateFeedback`.
+
+Source: gain scheduling by a parameter-dependent Lyapunov function: W. J. Rugh and J. S. Shamma, Research on gain
+scheduling, Automatica 36 (2000).
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -22,7 +25,16 @@ from diffabs.core.rules import Rule, increase_rule
 
 @pytree
 class ScheduledFeedback:
-    """u = clamp(ff + k1(v) x1 + k2(v) x2, torque_min, torque_max); gains at increasing speeds."""
+    """u = clamp(ff + k1(v) x1 + k2(v) x2, torque_min, torque_max), with gains at increasing speeds.
+
+    Attributes:
+        speeds: Nodes v, increasing [m/s].
+        integral_gains: k1 at the nodes [control/signal/s].
+        gains: k2 at the nodes [control/signal].
+        torque_min: Lower limit of the control.
+        torque_max: Upper limit of the control.
+        antiwindup: Anti-windup strategy of the integral.
+    """
 
     speeds: Vector = param(default=(5 / 3.6, 50 / 3.6), unit="m/s", low=0.0, free=True)
     integral_gains: Vector = param(default=(-11753.0, -11753.0), unit="control/signal/s", free=True)
@@ -34,15 +46,19 @@ class ScheduledFeedback:
     start, limits = StateFeedback.start, StateFeedback.limits
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> Any:
-        """x1' = slip - target, unless the anti-windup says otherwise."""
+        """Return x1' = slip - target, as modified by the anti-windup strategy."""
         return self._here(signal).flow(t, memory, signal)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Any:
-        """Torque [N m]."""
+        """Return the control, for a brake its torque [N m]."""
         return self._here(signal).output(t, memory, signal)
 
     def _here(self, signal: Tracking) -> StateFeedback:
-        """The feedback at the measured speed. Raises ValueError for lists of different lengths."""
+        """Return the state feedback at the measured speed.
+
+        Raises:
+            ValueError: `speeds`, `integral_gains` and `gains` differ in shape.
+        """
         shapes = [np.shape(x) for x in (self.speeds, self.integral_gains, self.gains)]
         if len(set(shapes)) != 1:
             raise ValueError(f"speeds, integral_gains and gains have shapes {', '.join(map(str, shapes))}")
@@ -52,23 +68,27 @@ class ScheduledFeedback:
         return StateFeedback(gain=jnp.stack(list(rows)), **limits, antiwindup=self.antiwindup)
 
     def problems(self) -> Iterator[str]:
-        """Lists of different lengths."""
+        """Yield a message if `speeds`, `integral_gains` and `gains` differ in shape, or are empty."""
         shapes = {name: np.shape(getattr(self, name)) for name in ("speeds", "integral_gains", "gains")}
         if len(set(shapes.values())) != 1 or len(shapes["speeds"]) != 1 or not shapes["speeds"][0]:
             yield f"speeds, integral_gains and gains have shapes {', '.join(map(str, shapes.values()))}; they need one"
 
     def rules(self) -> Iterator[Rule]:
-        """Speeds that increase, limits that do not exclude each other."""
+        """Yield the rules that the speeds increase and that torque_min <= torque_max."""
         yield increase_rule("speeds", self.speeds, "do not increase", "m/s")
-        yield from StateFeedback.rules(self)  # pyright: ignore[reportArgumentType]  # has the same limits
+        yield from StateFeedback.rules(self)  # pyright: ignore[reportArgumentType]  # same fields of limits
 
 
 @pytree
 class ProportionalFeedback:
-    """u = clamp(ff + (v/v0) (k1 x1 + k2 x2), torque_min, torque_max): gains in proportion to the measured speed.
+    """u = clamp(ff + (v/v0) (k1 x1 + k2 x2), torque_min, torque_max): gains proportional to the measured speed.
 
-    At a frozen speed the slip of a braked wheel answers to torque with a gain that goes with 1/v, eq. (16) of Maeda and
-    Sugiura; this cancels it, and the loop is equally fast at every speed. `gain` is that at `reference_speed` v0.
+    At a frozen speed the gain from torque to slip of a braked wheel is proportional to 1/v, eq. (16) of Maeda and
+    Sugiura. The factor v/v0 cancels this, so the loop is equally fast at every speed.
+
+    Attributes:
+        gain: (k1, k2) at v0 [control/signal/s, control/signal].
+        reference_speed: v0 [m/s], > 0.
     """
 
     gain: Vector = param(default=(-11753.0, -158.0), unit="control/signal/s, control/signal")
@@ -82,7 +102,7 @@ class ProportionalFeedback:
     flow, output = ScheduledFeedback.flow, ScheduledFeedback.output
 
     def _here(self, signal: Tracking) -> StateFeedback:
-        """The feedback at the measured speed."""
+        """Return the state feedback at the measured speed."""
         gain = jnp.asarray(self.gain) * (signal.measured.speed / self.reference_speed)
         limits = {"torque_min": self.torque_min, "torque_max": self.torque_max}
         return StateFeedback(gain=gain, **limits, antiwindup=self.antiwindup)

@@ -1,9 +1,11 @@
-"""PID control of the first signal that a plant shows, with filtered derivative and limits.
+"""PID control of the plant's first signal, with filtered derivative and limits.
 
     u = clamp(ff + kp e + kI I + kD wc (e - d), low, high),   I' = e,   d' = wc (e - d),   e = target - signal
 
-Aoki and Nakamura, eq. (13): C(s) = kp + kI/s + kD s wc/(s + wc). Their u is the negative of this one, which brakes when
-positive. P, PI and PD are this with gains of zero.
+P, PI and PD controllers are special cases with gains of zero.
+
+Source: Aoki and Nakamura, eq. (13): C(s) = kp + kI/s + kD s wc/(s + wc). Their u has the opposite sign; here a positive
+u brakes.
 """
 
 from collections.abc import Iterator
@@ -19,7 +21,12 @@ from diffabs.core.rules import Rule, order_rule
 
 
 class PIDMemory(NamedTuple):
-    """Integral of the error [signal s], filtered error [signal]."""
+    """Continuous memory of the PID.
+
+    Attributes:
+        integral: I, integral of the error [signal s].
+        filtered: d, filtered error [signal].
+    """
 
     integral: Scalar
     filtered: Scalar
@@ -27,7 +34,7 @@ class PIDMemory(NamedTuple):
 
 @pytree
 class PID:
-    """u = clamp(ff + kp e + kI I + kD wc (e - d), low, high), without limits by default."""
+    """u = clamp(ff + kp e + kI I + kD wc (e - d), low, high); by default both limits are infinite."""
 
     kp: Scalar = param(default=3893.0, unit="control/signal", low=0.0)
     ki: Scalar = param(default=0.0, unit="control/signal/s", low=0.0)
@@ -38,19 +45,19 @@ class PID:
     antiwindup: Any = part(default=NoAntiWindup)
 
     def start(self, signal: Tracking) -> Memory:
-        """Integral and filter at zero."""
+        """Return the memory with integral and filter at zero."""
         zero = 0.0 * signal.measured[0]
         return Memory(flow=PIDMemory(zero, zero))
 
     def flow(self, t: Scalar, memory: Memory, signal: Tracking) -> PIDMemory:
-        """I' and d'."""
+        """Return I' and d'."""
         raw, limited = self._torque(memory, signal)
         error = signal.target - signal.measured[0]
         integral = self.antiwindup.rate(error, self.ki, raw, limited)
         return PIDMemory(integral, self.cutoff * (error - memory.flow.filtered))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Control, in the plant's unit."""
+        """Return the control, in the plant's unit."""
         return self._torque(memory, signal)[1]
 
     def _torque(self, memory: Memory, signal: Tracking) -> tuple[Scalar, Scalar]:
@@ -60,9 +67,9 @@ class PID:
         return raw, clamp(raw, self.low, self.high)
 
     def limits(self) -> tuple[Scalar, Scalar]:
-        """Between which the control stays."""
+        """Return the lower and the upper limit of the control."""
         return self.low, self.high
 
     def rules(self) -> Iterator[Rule]:
-        """Limits that do not exclude each other."""
+        """Yield the rule low <= high."""
         yield order_rule(("low", self.low), ("high", self.high), "{control}")

@@ -1,12 +1,13 @@
-"""Any controller as a computer runs it: sampled, computed for a while, held.
+"""A sampled controller: a computer runs any controller with a period, a computing delay and a hold.
 
     u(t) = u_k for t_k + delay <= t < t_(k+1) + delay,   t_k = k period,   I_(k+1) = I_k + period I'(t_k)
 
-The continuous memory of the inner controller is advanced by forward Euler at the sampling period, as such code is
-usually written. The change of the output after the delay is an event.
+Forward Euler advances the inner controller's continuous memory at the sampling period, as is usual in such code. The
+output changes in an event at the end of the delay.
 
-A sample is not used if a number that the controller reads is NaN, or if its memory or output would not be finite:
-memory and output stay those of the sample before."""
+The controller skips a sample if a number that it reads is NaN, or if its memory or output would not be finite. Memory
+and output then keep the values of the previous sample.
+"""
 
 from collections.abc import Iterator
 from functools import reduce
@@ -24,11 +25,19 @@ from diffabs.core.rules import Rule, as_rule_array
 from diffabs.core.timing import whole_steps
 from diffabs.core.tracing import leaf_dependence
 
-PERIOD_EPS = 16.0  # precisions of the time: instants that are one
+PERIOD_EPS = 16.0  # in machine epsilons of the time: closer instants count as equal
 
 
 class SampledMemory(NamedTuple):
-    """Inner memory; output that is applied; output that waits, until when [s], and 1 while it does."""
+    """Memory of a sampled controller.
+
+    Attributes:
+        inner: Memory of the inner controller.
+        applied: Output that is applied.
+        next: Output that waits for the end of the delay.
+        until: Time at which `next` is applied [s].
+        waits: 1 while `next` waits, else 0.
+    """
 
     inner: Memory
     applied: Scalar
@@ -39,7 +48,14 @@ class SampledMemory(NamedTuple):
 
 @pytree
 class Sampled:
-    """`controller` evaluated every `period`, its output applied `delay` later. The period is a multiple of the step."""
+    """`controller` evaluated every `period`, with its output applied `delay` later. The period is a multiple of the
+    integration step.
+
+    Attributes:
+        controller: Controller that the computer runs.
+        period: Sampling period [s], > 0.
+        delay: Computing time [s], 0 <= delay <= period.
+    """
 
     controller: Block = part(default=PID)
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
@@ -48,18 +64,18 @@ class Sampled:
     flow = no_flow
 
     def start(self, signal: Tracking) -> Memory:
-        """Output zero until the first sample has been computed."""
+        """Return the memory with output zero until the first sample has been computed."""
         signal = replace_nan(signal)
         zero = 0.0 * signal.target
         return Memory(held=SampledMemory(self.controller.start(signal), zero, zero, zero, zero))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """The held output."""
+        """Return the held output."""
         del t, signal
         return memory.held.applied
 
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """At a sampling instant: compute. What still waits is applied."""
+        """Return the memory after a sampling instant: compute a new output, and apply an output that still waits."""
         m: SampledMemory = memory.held
         now, number = clock.ticks(self.period)
         inner, output, _ = self.guarded(clock._replace(h=self.period, k=number), m.inner, m.next, signal)
@@ -69,8 +85,13 @@ class Sampled:
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m))
 
     def computed(self, clock: Clock, memory: Memory, signal: Tracking) -> tuple[Memory, Scalar]:
-        """What the computer does with one sample: the inner controller's memory after it, and the output. `clock` is
-        that of the period."""
+        """Return the inner controller's memory after one sample, and its output.
+
+        Args:
+            clock: Clock of the sampling period: its h is the period.
+            memory: Inner controller's memory before the sample.
+            signal: The sample.
+        """
         inner = self._sampled(clock, memory, signal)
         output = self.controller.output(clock.t, inner, signal)
         flow = axpy(clock.h, self.controller.flow(clock.t, inner, signal), inner.flow)
@@ -79,12 +100,22 @@ class Sampled:
     def guarded(
         self, clock: Clock, memory: Memory, last: Scalar, signal: Tracking, lost: Any = False
     ) -> tuple[Memory, Scalar, Any]:
-        """What `computed` returns, and False; or, where the sample is `lost` or cannot be used, the memory and the
-        `last` output as they are, and True."""
-        # on numbers, also where there are none: nothing that is not defined for NaN is computed or differentiated
+        """Return the result of `computed` for a usable sample, else the old memory and output; and whether the sample
+        is skipped.
+
+        Args:
+            clock: Clock of the sampling period: its h is the period.
+            memory: Inner controller's memory before the sample.
+            last: Output of the previous sample.
+            signal: The sample.
+            lost: True skips the sample in any case.
+        """
+        # Compute with finite inputs even for a skipped sample. Otherwise NaN would reach the derivatives through the
+        # branch of `jnp.where` that is not taken.
         before = None if clock.before is None else replace_nan(clock.before)
         new = self.computed(clock._replace(before=before), memory, replace_nan(signal))
         read = leaf_dependence(lambda signal: self.computed(clock, memory, signal), signal)
+        # A NaN counts only in a number that the controller reads: an unused channel may be NaN.
         numbers = [x for x, on in zip(jax.tree.leaves(signal), read, strict=True) if on]
         results = [x for x in jax.tree.leaves(new) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
         missing = [jnp.any(jnp.isnan(x)) for x in numbers]
@@ -94,36 +125,41 @@ class Sampled:
         return inner, output, held
 
     def _waits(self) -> Any:
-        """Whether an output is computed for a while, so that an event applies it."""
+        """Return whether an output waits for the end of a delay, so that an event applies it."""
         return jnp.greater(self.delay, 0)
 
     def differentiated(self, names: set[str]) -> "Sampled":
-        """Return the same controller for derivatives by these of its parameters."""
+        """Return the controller to use for derivatives with respect to the parameters in `names`."""
         if "delay" not in names:
             return self
         return _AlwaysWaits(controller=self.controller, period=self.period, delay=self.delay)
 
     def _until(self, t: Scalar) -> Any:
-        """When what is sampled now is applied. A rounding early: an event exactly on an instant of the grid would end
-        no step, and the greatest value of a run there would have the derivative of the instant, which does not move."""
+        """Return the time at which the output sampled at time t is applied [s].
+
+        The time is a rounding early. An event exactly on a grid instant would not end a step. The maximum of a run at
+        this instant would then have the derivative for a fixed time.
+        """
         rounding = PERIOD_EPS * jnp.finfo(jnp.result_type(t, self.period)).eps * (t + self.period)
         early = jnp.maximum(jnp.minimum(rounding, self.delay), self.delay - (self.period - rounding))
         return t + self.delay - jax.lax.stop_gradient(early)
 
     def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: Any) -> tuple[Any]:
-        """The time until the output changes."""
+        """Return the time until the output changes."""
         del signal, rate
         return (jnp.where(memory.held.waits > 0.5, memory.held.until - t, 1.0),)
 
     def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[Any]) -> Memory:
-        """Apply what waits."""
+        """Return the memory after the waiting output is applied."""
         del t, signal
         m: SampledMemory = memory.held
         applied, waits = jnp.where(fired[0], m.next, m.applied), jnp.where(fired[0], 0.0, m.waits)
         return Memory(held=m._replace(applied=applied, waits=waits))
 
     def _sampled(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """The inner controller's memory after its tick, or after an event that it can only notice now."""
+        """Return the inner controller's memory after its tick and after the events that it can only detect at a
+        sampling instant.
+        """
         inner: Any = self.controller
         if offers(inner, "margins"):
             late = tuple(margin < 0 for margin in inner.margins(clock.t, memory, signal, None))
@@ -131,43 +167,65 @@ class Sampled:
         return inner.tick(clock, memory, signal) if offers(inner, "tick") else memory
 
     def rules(self) -> Iterator[Rule]:
-        """A computation takes no longer than the period; a filter follows its samples."""
+        """Yield the rules that the delay is at most the period and that a derivative filter is stable."""
         yield from within_period(self.controller, self.delay, self.period)
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
-        """The period is on the integration grid."""
+        """Yield the rule that the period is a multiple of the integration step."""
         yield whole_steps("period", self.period, step)
 
 
 def replace_nan(signal: Any) -> Any:
-    """Return a signal with 0 for NaN: a memory that begins on it is finite."""
+    """Return a signal with 0 in place of NaN, so that a memory that starts from it is finite.
+
+    Args:
+        signal: Pytree of arrays.
+    """
     return jax.tree.map(lambda x: jnp.where(jnp.isnan(x), 0.0, x), signal)
 
 
 @pytree
 class _AlwaysWaits(Sampled):
-    """A controller whose output is applied in an event after any delay. Without a delay, too, it then has a derivative
-    in it, that from the right; the sample kept at such an instant is the output before. Values do without, because an
-    event in every period makes a run some times as long."""
+    """A sampled controller whose output is applied in an event after any delay, including 0.
+
+    With delay 0, the derivative with respect to the delay is the derivative from the right. The stored sample at such
+    an instant is the previous output. A run that needs only values uses `Sampled`, because one event in every period
+    makes a run several times slower.
+    """
 
     def _waits(self) -> Any:
         return jnp.asarray(True)
 
 
 def inner_controller(controller: Any) -> Any:
-    """Return what a computer runs, or a controller that none runs itself."""
+    """Return the controller that a computer runs, or the controller itself if it is not `Sampled`.
+
+    Args:
+        controller: Any controller.
+    """
     return controller.controller if isinstance(controller, Sampled) else controller
 
 
 def within_period(controller: Any, delay: Scalar, period: Scalar) -> Iterator[Rule]:
-    """Yield what must hold between a period [s] and the controller that is computed in it, `delay` [s] long."""
+    """Yield the rules between a sampling period and the controller computed in it.
+
+    Args:
+        controller: Inner controller; a `cutoff` adds the rule for its filter.
+        delay: Computing time [s].
+        period: Sampling period [s].
+    """
     yield delay_within(delay, period)
     if hasattr(controller, "cutoff"):
         yield filter_within(controller.cutoff, period)
 
 
 def delay_within(delay: Scalar, period: Scalar) -> Rule:
-    """Return the rule that a delay [s] does not exceed the period [s]."""
+    """Return the rule that the delay is at most the period.
+
+    Args:
+        delay: Computing time [s].
+        period: Sampling period [s].
+    """
     return Rule(
         as_rule_array(delay) <= as_rule_array(period),
         "delay exceeds the period",
@@ -176,8 +234,12 @@ def delay_within(delay: Scalar, period: Scalar) -> Rule:
 
 
 def filter_within(cutoff: Scalar, period: Scalar) -> Rule:
-    """Return the rule that forward Euler, d_(k+1) = d_k + period cutoff (e - d_k), is stable: cutoff [rad/s] is below
-    2 / period [s]."""
+    """Return the rule that the filter d_(k+1) = d_k + period cutoff (e - d_k) is stable: cutoff < 2 / period.
+
+    Args:
+        cutoff: Cutoff of the derivative filter [rad/s].
+        period: Sampling period [s].
+    """
     return Rule(
         as_rule_array(cutoff) * as_rule_array(period) < 2,
         "controller.cutoff is too fast for the period",

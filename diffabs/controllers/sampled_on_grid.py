@@ -1,10 +1,11 @@
-"""Any controller as a computer runs it, without events: for many runs, where only their statistics count.
+"""A sampled controller without events, for statistics over many runs.
 
-    u(t) = u_k for t_k + delay <= t < t_(k+1) + delay,   t_k = k period,   as `Sampled`,
+    u(t) = u_k for t_k + delay <= t < t_(k+1) + delay,   t_k = k period
 
-but a step of the integration [t, t + h] in which u changes, at t + theta h, gets its mean theta u_(k-1) + (1 - theta)
-u_k. The impulse is right; behind a lag T > h the torque at the end of such a step is off by h^2/(8 T^2) of the change
-at most. No step has to be cut: a run with an event in every period takes four to five times as long.
+These are the times of `Sampled`. If u changes inside a step [t, t + h], at t + theta h, the step uses the mean `theta
+u_(k-1) + (1 - theta) u_k`. The impulse of the control is exact. Behind a lag T > h the torque error at the end of such
+a step is at most h^2/(8 T^2) of the change of u. No step is cut; a run with an event in every period takes four to five
+times as long.
 """
 
 from collections.abc import Iterator
@@ -23,7 +24,15 @@ from diffabs.core.timing import whole_steps
 
 
 class GridMemory(NamedTuple):
-    """Inner memory; the last output and the one before it; until when [s] that one is applied; what is applied now."""
+    """Memory of a sampled controller on the grid.
+
+    Attributes:
+        inner: Memory of the inner controller.
+        next: Latest output.
+        last: Output before the latest.
+        until: Time until which `last` is applied [s].
+        applied: Output in the present step.
+    """
 
     inner: Memory
     next: Scalar
@@ -34,11 +43,13 @@ class GridMemory(NamedTuple):
 
 @pytree
 class SampledOnGrid:
-    """`controller` evaluated every `sampling_period`, its output applied `delay` later; in the step in which that is,
-    the mean over the step."""
+    """`controller` evaluated every `sampling_period`, with its output applied `delay` later. In the step of the change
+    it applies the mean over the step.
+    """
 
     controller: Block = part(default=PID)
-    # not `period`, at whose instants alone steps would end: it ticks at every instant of the grid
+    # The name is not `period`: for a block with a `period`, steps end only at its multiples, but this block must tick
+    # at every grid instant.
     sampling_period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
     delay: Scalar = param(default=0.0, unit="s", low=0.0)
 
@@ -46,18 +57,20 @@ class SampledOnGrid:
     computed, guarded, _sampled = Sampled.computed, Sampled.guarded, Sampled._sampled
 
     def start(self, signal: Tracking) -> Memory:
-        """Output zero until the first sample has been computed."""
+        """Return the memory with output zero until the first sample has been computed."""
         signal = replace_nan(signal)
         zero = 0.0 * signal.target
         return Memory(held=GridMemory(self.controller.start(signal), zero, zero, zero, zero))
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """The mean over the present step."""
+        """Return the mean output over the present step."""
         del t, signal
         return memory.held.applied
 
     def tick(self, clock: Clock, memory: Memory, signal: Tracking) -> Memory:
-        """At a sampling instant: compute. At every instant of the grid: what is applied until the next."""
+        """Return the memory with a new output at a sampling instant, and with the mean output until the next grid
+        instant.
+        """
         m: GridMemory = memory.held
         now, number = clock.ticks(self.sampling_period)
         inner, output, _ = self.guarded(clock._replace(h=self.sampling_period, k=number), m.inner, m.next, signal)
@@ -66,17 +79,18 @@ class SampledOnGrid:
         new = GridMemory(inner, output, m.next, clock.t + self.delay - over, m.applied)
         m = jax.tree.map(lambda a, b: jnp.where(now, a, b), new, m)
         left = m.until - clock.t
-        # An output that changes on the grid belongs to the step after it, so that one step alone has the derivative.
+        # A change exactly on the grid belongs to the step after it, so that only one step carries its derivative.
         within = (left >= -close) & (left < clock.h - close)
+        # `waits` is the step's share of the previous output. Only a change inside the step gives it a derivative.
         fixed = jax.lax.stop_gradient(left)
         waits = clamp(fixed / clock.h, 0.0, 1.0) + jnp.where(within, (left - fixed) / clock.h, 0.0)
         applied = waits * m.last + (1 - waits) * m.next
         return Memory(held=m._replace(applied=jnp.where(clock.ticks()[0], applied, m.applied)))
 
     def rules(self) -> Iterator[Rule]:
-        """A computation takes no longer than the period; a filter follows its samples."""
+        """Yield the rules that the delay is at most the period and that a derivative filter is stable."""
         yield from within_period(self.controller, self.delay, self.sampling_period)
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
-        """The period is on the integration grid."""
+        """Yield the rule that the sampling period is a multiple of the integration step."""
         yield whole_steps("sampling_period", self.sampling_period, step)

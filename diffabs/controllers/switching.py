@@ -1,4 +1,4 @@
-"""Controllers without memory of the plant: constant torque, relay with hysteresis, sliding mode."""
+"""Controllers without a plant model: constant torque, relay with hysteresis, sliding mode."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -14,7 +14,7 @@ from diffabs.core.rules import Rule, order_rule
 
 @pytree
 class ConstantTorque:
-    """u = torque: a driver who stands on the brake, no anti-lock control."""
+    """u = torque: a driver who brakes fully, without anti-lock control."""
 
     torque: Scalar = param(default=90.0, unit="control")
 
@@ -22,7 +22,7 @@ class ConstantTorque:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Control: a brake's torque [N m]."""
+        """Return the control, for a brake its torque [N m]."""
         del t, memory, signal
         return self.torque
 
@@ -31,8 +31,9 @@ class ConstantTorque:
 class Relay:
     """torque_max until slip > target + band, then torque_min until slip < target - band.
 
-    Switches where the slip crosses the edge of the band: between the instants of the grid, too. It remembers 1 while
-    the brake is applied, else 0."""
+    An event locates each switch where the slip crosses the edge of the band, also between grid instants. The memory is
+    1 while the brake is applied, else 0.
+    """
 
     band: Scalar = param(default=0.02, unit="signal", above=0.0, below=1.0)
     torque_min: Scalar = param(default=0.0, unit="control")
@@ -41,28 +42,28 @@ class Relay:
     flow = no_flow
 
     def start(self, signal: Tracking) -> Memory:
-        """Applied if the slip is below the target."""
+        """Return 1 (brake applied) if the slip is below the target, else 0."""
         excess = signal.measured[0] - signal.target
         return Memory(held=jnp.where(excess < 0, 1.0, 0.0) + 0.0 * excess)
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Control: a brake's torque [N m]."""
+        """Return the control, for a brake its torque [N m]."""
         del t, signal
         return self.torque_min + memory.held * (self.torque_max - self.torque_min)
 
     def margins(self, t: Scalar, memory: Memory, signal: Tracking, rate: Any) -> tuple[Any]:
-        """How far the slip is from the far side of the band."""
+        """Return the distance from the slip to the edge of the band where the relay switches."""
         del t, rate
         excess = signal.measured[0] - signal.target
         return (self.band + jnp.where(memory.held > 0.5, -excess, excess),)
 
     def event(self, t: Scalar, memory: Memory, signal: Tracking, fired: tuple[Any]) -> Memory:
-        """Release the brake, or apply it."""
+        """Return the memory after a switch: the brake released or applied."""
         del t, signal
         return Memory(held=jnp.where(fired[0], 1.0 - memory.held, memory.held))
 
     def rules(self) -> Iterator[Rule]:
-        """A release torque below the applied one."""
+        """Yield the rule torque_min < torque_max."""
         yield order_rule(("torque_min", self.torque_min), ("torque_max", self.torque_max), "{control}", equal=False)
 
 
@@ -70,8 +71,9 @@ class Relay:
 class SlidingMode:
     """u = clamp(ff + gain sat((target - signal)/boundary), low, high), sat(z) = clamp(z, -1, 1).
 
-    First-order sliding mode with a boundary layer, without limits by default. Slotine and Li, Applied Nonlinear
-    Control, sec. 7.2.
+    First-order sliding mode with a boundary layer. By default both limits are infinite.
+
+    Source: Slotine and Li, Applied Nonlinear Control, sec. 7.2.
     """
 
     gain: Scalar = param(default=90.0, unit="control", low=0.0)
@@ -83,15 +85,15 @@ class SlidingMode:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Tracking) -> Scalar:
-        """Control: a brake's torque [N m]."""
+        """Return the control, for a brake its torque [N m]."""
         del t, memory
         inside = clamp((signal.target - signal.measured[0]) / self.boundary, -1.0, 1.0)
         return clamp(signal.feedforward + self.gain * inside, self.low, self.high)
 
     def limits(self) -> tuple[Scalar, Scalar]:
-        """Between which the control stays."""
+        """Return the lower and the upper limit of the control."""
         return self.low, self.high
 
     def rules(self) -> Iterator[Rule]:
-        """Limits that do not exclude each other."""
+        """Yield the rule low <= high."""
         yield order_rule(("low", self.low), ("high", self.high), "{control}")

@@ -1,5 +1,7 @@
-"""Objectives: what is measured on a run, streamed. `BRAKING` and `BALANCE` are those of every report on a plant
-that shows a `BrakeOutput` or a `BalanceOutput`."""
+"""Objectives: streamed measures of a run.
+
+Reports use `BRAKING` for a plant that shows a `BrakeOutput` and `BALANCE` for a plant that shows a `BalanceOutput`.
+"""
 
 from diffabs.core.protocols import Objective, Plant
 from diffabs.objectives.balance import BalanceCost as BalanceCost
@@ -27,7 +29,7 @@ from diffabs.objectives.tracking import SettlingTime as SettlingTime
 from diffabs.objectives.tracking import ShareAtLimit as ShareAtLimit
 from diffabs.objectives.tracking import at_limits as at_limits
 
-# The papers of the brakes take the band of +-0.01 in slip, whatever the target is.
+# The papers on brakes use a band of +-0.01 in slip for every target.
 BRAKING = {
     "stop_time": StopTime(),
     "stop_distance": StopDistance(),
@@ -53,7 +55,12 @@ TRACKING = {"overshoot": Overshoot(), "settling_time": SettlingTime(), "iae": IA
 
 
 def default_objectives(plant: Plant) -> dict[str, Objective]:
-    """Return the objectives, by name, of a run where none are named: what the plant says itself (`usual_objectives`),
-    else how well its first signal follows the setpoint."""
+    """Return the default objectives of a run on a plant, by name.
+
+    A plant without `usual_objectives` gets `TRACKING`: measures of its first signal against the setpoint.
+
+    Args:
+        plant: The plant of the run.
+    """
     own = getattr(plant, "usual_objectives", None)
     return own() if own else dict(TRACKING)

@@ -1,4 +1,4 @@
-"""What is measured of a balance: whether it fell, how soon it rests, what the arm and the motor had to do."""
+"""Objectives of a balance: fall, time to rest, and peaks of angles, voltage and torque."""
 
 import math
 from typing import Any
@@ -16,15 +16,17 @@ ANGLE_NAMES = ("theta", "psi", "phi")
 
 
 def _norm(output: BalanceOutput, weights: Vector = (1.0,) * 6) -> Any:
-    """|x|, with a finite slope at 0."""
+    """Return |x| weighted by `weights`, with slope 0 at x = 0."""
     square = sum(w * getattr(output, name) ** 2 for w, name in zip(weights, ANGLE_NAMES + RATE_NAMES, strict=True))
+    # Two selects: the square root has an infinite slope at 0, and 0 * inf in the branch not taken would be NaN.
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
 
 @pytree
 class Fell:
-    """1 if the run ended before its time, by a fall; else 0 [1], which does not say that it comes to rest: `attraction`
-    tells when that is sure."""
+    """1 if the run ended early by a fall, else 0 [1]. A value of 0 does not prove that the run comes to rest;
+    `attraction` gives a proof.
+    """
 
     unit = "1"
     failure = 0.0  # a fall
@@ -33,14 +35,14 @@ class Fell:
     start, flow, update = FinalError.start, no_integral, keep_memory
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Whether the stop was reached."""
+        """Return 1 if the run reached the stop, else 0."""
         del memory
         return jnp.where(ending.stopped, 1.0, 0.0) + 0.0 * ending.sample.t
 
 
 @pytree
 class FinalNorm:
-    """sqrt(x'x) at the end [1], x = (theta, psi, phi, theta', psi', phi') in rad and rad/s."""
+    """sqrt(x'x) at the end of the run [1], x = (theta, psi, phi, theta', psi', phi') in rad and rad/s."""
 
     unit = "1"
     physical = (0.0, math.inf)
@@ -48,23 +50,24 @@ class FinalNorm:
     start, flow, update = Fell.start, no_integral, keep_memory
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Of the last sample."""
+        """Return |x| of the last sample."""
         del memory
         return _norm(ending.sample.output)
 
 
 def _greatest_angle(name: str) -> tuple[Any, Any, Any, Any]:
-    """start, flow, update and value of the greatest |angle|, from the cubic of every step."""
+    """Return start, flow, update and value of the greatest |angle|, from the cubic of every step."""
 
     def start(self: Any, sample: Sample) -> Memory:
-        """The first."""
+        """Return the memory with the first |angle|."""
         del self
         return Memory(held=jnp.abs(getattr(sample.output, name)))
 
     def update(self: Any, memory: Memory, segment: Segment) -> Scalar:
-        """The greatest so far."""
+        """Return the greatest |angle| up to the end of the step."""
         del self
         angle = segment.output(lambda output: getattr(output, name))
+        # `falls` refers to |angle|, so a negative angle is mirrored.
         falls = jnp.where(angle.start >= 0, angle.falls, angle.times(-1.0).falls)
         return later_of_larger(memory.held, larger(angle.greatest(), angle.times(-1.0).greatest()), falls)
 
@@ -92,16 +95,19 @@ class PeakArmAngle:
 
 
 def _greatest_size(size: Any) -> tuple[Any, Any, Any, Any]:
-    """start, flow, update and value of the greatest size(sample): at either end of every step, and between where the
-    step would end on a limit. Where it would not, a cubic leaves limits."""
+    """Return start, flow, update and value of the greatest size(sample).
+
+    The search covers both ends of every step. It covers the inside only of a smooth step, in which no limit is reached:
+    otherwise the cubic may leave the limits.
+    """
 
     def start(self: Any, sample: Sample) -> Memory:
-        """The first."""
+        """Return the memory with the first size."""
         del self
         return Memory(held=size(sample))
 
     def update(self: Any, memory: Memory, segment: Segment) -> Scalar:
-        """The greater of what was, and of the greatest of the step."""
+        """Return the greatest size up to the end of the step."""
         del self
         ends, falls = later_of_larger(size(segment.start), size(segment.end)), False
         if segment.smooth is not False:
@@ -114,7 +120,7 @@ def _greatest_size(size: Any) -> tuple[Any, Any, Any, Any]:
 
 @pytree
 class PeakVoltage:
-    """Greatest |u| that the motor gets [V]."""
+    """Greatest |u| at the motor [V]."""
 
     unit = "V"
     physical = (0.0, math.inf)
@@ -123,14 +129,18 @@ class PeakVoltage:
 
 
 def motor_torque(sample: Sample) -> Any:
-    """What the motor gives [N m], without its friction."""
+    """Return the motor's torque without its friction [N m].
+
+    Args:
+        sample: Sample of a run whose plant shows a `BalanceOutput`; its control is the voltage [V].
+    """
     y = sample.output
     return y.constant * clamp((sample.control - y.emf) / y.resistance, -y.current_max, y.current_max)
 
 
 @pytree
 class PeakTorque:
-    """Greatest torque of the motor [N m], in absolute value and without its friction."""
+    """Greatest absolute torque of the motor, without its friction [N m]."""
 
     unit = "N m"
     physical = (0.0, math.inf)
@@ -140,9 +150,11 @@ class PeakTorque:
 
 @pytree
 class SoftLoss:
-    """1/(1 + (radius/|x|)^(1/softness)) of the last state [1], |x|^2 = sum of weight x^2 in rad and rad/s: near 0 for a
-    run that comes to rest, near 1 for one that runs away, and smooth between. Its mean over starts is one minus a soft
-    share of the region of attraction; see `diffabs.design.attraction`."""
+    """1/(1 + (radius/|x|)^(1/softness)) of the last state [1], |x|^2 = sum of weight x^2 in rad and rad/s.
+
+    It is near 0 for a run that comes to rest, near 1 for one that diverges, and smooth between. Its mean over starts is
+    one minus a soft share of the region of attraction; see `diffabs.design.attraction`.
+    """
 
     unit = "1"
     physical = (0.0, 1.0)
@@ -154,7 +166,7 @@ class SoftLoss:
     start, flow, update = Fell.start, no_integral, keep_memory
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """A sigmoid of log |x|."""
+        """Return the loss, a sigmoid of log |x|."""
         del memory
         size = jnp.maximum(_norm(ending.sample.output, self.weight), 1e-12)
         return jax.nn.sigmoid((jnp.log(size) - jnp.log(self.radius)) / self.softness)
@@ -162,7 +174,7 @@ class SoftLoss:
 
 @pytree
 class RestTime:
-    """Since when every angle has stayed within `band` of upright [s]; infinite for a run that ends outside of it."""
+    """Time after which every angle stays within `band` of upright [s]; infinite for a run that ends outside it."""
 
     unit = "s"
     physical = (0.0, math.inf)
@@ -173,28 +185,29 @@ class RestTime:
     flow = no_integral
 
     def start(self, sample: Sample) -> Memory:
-        """At rest from the start."""
+        """Return the memory of a run that rests from t = 0."""
         return Memory(held=0.0 * sample.t)
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
-        """The last of the angles' entries into the band, roots of the cubics of the step."""
+        """Return the time of the last entry of any angle into the band [s], from roots of the step's cubics."""
         entered = memory.held
         for name in ANGLE_NAMES:
             angle = segment.output(lambda output, name=name: getattr(output, name))
+            # Only the sign of the angle matters, so it carries no derivative.
             beyond = angle.times(sign(jax.lax.stop_gradient(angle.start))).minus(self.band)
             entry = segment.start.t + segment.h * beyond.root()
             entered = larger(entered, jnp.where(beyond.start > 0, entry, 0.0))
         return entered
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """The last entry; infinite if an angle of the last sample is outside."""
+        """Return the last entry [s]; infinity if an angle of the last sample is outside."""
         angles = jnp.stack([jnp.abs(getattr(ending.sample.output, name)) for name in ANGLE_NAMES])
         return jnp.where(jnp.all(angles <= self.band), memory.held, self.unreached)
 
 
 @pytree
 class BalanceCost:
-    """Integral of x'diag(q) x + r u^2 dt [rad^2 s], u the voltage that the motor gets [V]."""
+    """Integral of x'diag(q) x + r u^2 dt [rad^2 s], where u is the voltage at the motor [V]."""
 
     unit = "rad^2 s"
     physical = (0.0, math.inf)
@@ -205,11 +218,11 @@ class BalanceCost:
     update, value = keep_memory, integral_value
 
     def start(self, sample: Sample) -> Memory:
-        """Zero."""
+        """Return the memory with integral 0."""
         return Memory(flow=0.0 * sample.t)
 
     def flow(self, memory: Memory, sample: Sample) -> Scalar:
-        """The integrand."""
+        """Return the integrand."""
         del memory
         squares = [
             w * getattr(sample.output, name) ** 2 for w, name in zip(self.q, ANGLE_NAMES + RATE_NAMES, strict=True)

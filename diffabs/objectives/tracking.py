@@ -1,8 +1,8 @@
-"""How well a run follows its setpoint: peak, overshoot, settling, integrals of the error. They read the first signal
-that the plant shows, y: a brake's slip, a servo's angle.
+"""Objectives of tracking: peak, overshoot, settling, and integrals of the error.
 
-The error e = y - setpoint is against where the reference will settle, not against a filtered target on its way
-there."""
+They read the first signal y that the plant shows: a brake's slip, a servo's angle. The error is e = y - setpoint. The
+setpoint is the final value of the reference and not a filtered target on its way there.
+"""
 
 import math
 from collections.abc import Callable, Iterator
@@ -18,70 +18,117 @@ from diffabs.core.protocols import Ending, Memory, Sample, Segment
 from diffabs.core.pytree import Scalar, Vector, param, parts, pytree
 from diffabs.core.rules import Rule, order_rule
 
-MIN_SETPOINT = 0.01  # of the first signal, of which an overshoot is a fraction
+MIN_SETPOINT = 0.01  # least denominator of an overshoot, in the unit of the first signal
 
 
 def no_integral(self: Any, memory: Memory, sample: Sample) -> Any:
-    """`flow` of an objective without an integral."""
+    """Return (): the `flow` of an objective without an integral.
+
+    Args:
+        self: The objective; it has no effect.
+        memory: The accumulator; it has no effect.
+        sample: The present sample; it has no effect.
+    """
     del self, memory, sample
     return ()
 
 
 def keep_memory(self: Any, memory: Memory, segment: Segment) -> Any:
-    """`update` of an objective that is only an integral."""
+    """Return the held memory unchanged: the `update` of an objective that is only an integral.
+
+    Args:
+        self: The objective; it has no effect.
+        memory: The accumulator.
+        segment: The step; it has no effect.
+    """
     del self, segment
     return memory.held
 
 
 def integral_value(self: Any, memory: Memory, ending: Ending) -> Scalar:
-    """`value` of an objective that is only an integral."""
+    """Return the integral: the `value` of an objective that is only an integral.
+
+    Args:
+        self: The objective; it has no effect.
+        memory: The accumulator.
+        ending: End of the run; it has no effect.
+    """
     del self, ending
     return memory.flow
 
 
 def start_integral(self: Any, sample: Sample) -> Memory:
-    """`start` of an objective that is only an integral."""
+    """Return the integral 0: the `start` of an objective that is only an integral.
+
+    Args:
+        self: The objective; it has no effect.
+        sample: First sample; it sets shape and type.
+    """
     del self
     return Memory(flow=0.0 * sample.output[0])
 
 
 def tracking_error(sample: Sample) -> Scalar:
-    """The first signal - setpoint."""
+    """Return the first signal minus its setpoint.
+
+    Args:
+        sample: A sample of the run, or another tuple with `output` and `setpoint`.
+    """
     return sample.output[0] - sample.setpoint
 
 
 def highest_signal(output: Any) -> float:
-    """The greatest value that the first signal can have; infinite where the output does not say."""
+    """Return the greatest possible value of the first signal; infinity if the output has no `highest`.
+
+    Args:
+        output: Output of the plant.
+    """
     return getattr(output, "highest", math.inf)
 
 
 def _side(sample: Sample) -> Any:
-    """-1 below a setpoint of 0, else 1."""
+    """Return -1 for a negative setpoint, else 1."""
     return jnp.where(sample.setpoint < 0, -1.0, 1.0)
 
 
 def absolute_integral(cubic: Cubic, integral: Callable[[Any], Any]) -> Any:
-    """The integral of |p| over [0, 1], where `integral(x)` is that of p, or of p times something positive, to x."""
+    """Return the integral of |p| over [0, 1], for a cubic p with at most one sign change.
+
+    Args:
+        cubic: p; a sign change counts if p(0) and p(1) differ in sign.
+        integral: Function of x that returns the integral from 0 to x of p, or of p times a positive weight.
+    """
     whole = integral(1.0)
     left = integral(cubic.root())
     return jnp.where(cubic.start * cubic.end < 0, jnp.abs(left) + jnp.abs(whole - left), jnp.abs(whole))
 
 
 def held_value(self: Any, memory: Memory, ending: Ending) -> Scalar:
-    """`value` of an objective that is what it remembers."""
+    """Return the held memory: the `value` of an objective that is its memory.
+
+    Args:
+        self: The objective; it has no effect.
+        memory: The accumulator.
+        ending: End of the run; it has no effect.
+    """
     del self, ending
     return memory.held
 
 
 def start_held(self: Any, sample: Sample) -> Memory:
-    """`start` of an objective that adds up what it sees."""
+    """Return the held sum 0: the `start` of an objective that sums over steps.
+
+    Args:
+        self: The objective; it has no effect.
+        sample: First sample; it sets shape and type.
+    """
     del self
     return Memory(held=0.0 * sample.output[0])
 
 
 @pytree
 class IAE:
-    """Integral of |e| dt, e = y - setpoint: for a slip [s]. The cubic of e is integrated on either side of its zero."""
+    """Integral of |e| dt, e = y - setpoint; for a slip [s]. The cubic of e is integrated on both sides of its zero."""
 
     unit = "signal s"
     physical = (0.0, math.inf)
@@ -89,14 +136,14 @@ class IAE:
     start, flow, value = start_held, no_integral, held_value
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
-        """Add |e| over the step."""
+        """Return the sum with the integral of |e| over the step."""
         e = segment.error()
         return memory.held + segment.h * absolute_integral(e, e.integral)
 
 
 @pytree
 class ITAE:
-    """Integral of t |e| dt, by the method of IAE: for a slip [s^2]."""
+    """Integral of t |e| dt, by the method of IAE; for a slip [s^2]."""
 
     unit = "signal s^2"
     physical = (0.0, math.inf)
@@ -104,13 +151,18 @@ class ITAE:
     start, flow, value = start_held, no_integral, held_value
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
-        """Add t |e| over the step."""
+        """Return the sum with the integral of t |e| over the step."""
         e, t, h = segment.error(), segment.start.t, segment.h
         return memory.held + h * absolute_integral(e, lambda x: t * e.integral(x) + h * e.moment(x))
 
 
 class Sided(NamedTuple):
-    """1, or -1 below a setpoint of 0; and the greatest value on that side."""
+    """Greatest value on the setpoint's side.
+
+    Attributes:
+        side: -1 for a negative setpoint, else 1.
+        greatest: Greatest side * y.
+    """
 
     side: Scalar
     greatest: Scalar
@@ -118,7 +170,7 @@ class Sided(NamedTuple):
 
 @pytree
 class MaxSlip:
-    """Greatest slip of the run [1], at most 1. Where the greatest of two maxima changes, its derivative jumps."""
+    """Greatest slip of the run [1], at most 1. Its derivative jumps where two maxima are equal."""
 
     unit = "1"
     physical = (-1.0, 1.0)
@@ -126,19 +178,21 @@ class MaxSlip:
     flow, value = no_integral, held_value
 
     def start(self, sample: Sample) -> Memory:
-        """The first slip."""
+        """Return the first slip."""
         return Memory(held=sample.output.slip)
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
-        """The greatest of the step, from its cubic."""
+        """Return the greatest slip up to the end of the step, from the step's cubic."""
         slip = segment.output(lambda output: output.slip)
         return later_of_larger(memory.held, smaller(slip.greatest(), 1.0), slip.falls)
 
 
 @pytree
 class Overshoot:
-    """max(0, max y/setpoint - 1), a fraction of the final setpoint [1], or of 0.01 where that is more: an estimator may
-    end at a slip of 0. Where the first setpoint is negative, it is the same of -y. Zero derivative where there is none.
+    """max(0, max y/setpoint - 1), a fraction of the final setpoint [1]. It is a fraction of 0.01 where the setpoint is
+    smaller, because an estimator may end at slip 0.
+
+    If the first setpoint is negative, -y takes the place of y. A run without overshoot has derivative 0.
     """
 
     unit = "1"
@@ -147,21 +201,22 @@ class Overshoot:
     flow = no_integral
 
     def start(self, sample: Sample) -> Memory:
-        """The first value, and the side on which it shall not go too far."""
+        """Return the side of the setpoint and the first value on this side."""
         side = _side(sample)
         return Memory(held=Sided(side, side * sample.output[0]))
 
     def update(self, memory: Memory, segment: Segment) -> Sided:
-        """The greatest of the step, from its cubic."""
+        """Return the greatest value up to the end of the step, from the step's cubic."""
         side, greatest = memory.held
         signal = segment.output().times(side)
         value = smaller(signal.greatest(), highest_signal(segment.end.output))
         return Sided(side, later_of_larger(greatest, value, signal.falls))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Overshoot."""
+        """Return the overshoot [1]."""
         side, greatest = memory.held
         setpoint = side * ending.sample.setpoint
+        # A small denominator is replaced: a division by 0 in the branch not taken would put NaN into the derivatives.
         usual = setpoint >= MIN_SETPOINT
         fraction = greatest / jnp.where(usual, setpoint, MIN_SETPOINT) - 1
         excess = jnp.where(usual, fraction, (greatest - setpoint) / MIN_SETPOINT)
@@ -169,7 +224,12 @@ class Overshoot:
 
 
 class Settling(NamedTuple):
-    """The first value of the signal, and the last entry into the band [s]."""
+    """Memory of a settling time.
+
+    Attributes:
+        first: First value of the signal.
+        entered: Time of the last entry into the band [s].
+    """
 
     first: Scalar
     entered: Scalar
@@ -177,12 +237,12 @@ class Settling(NamedTuple):
 
 @pytree
 class SettlingTime:
-    """Time [s] after which |y - setpoint| stays within a band; infinite for a run that ends outside of it.
+    """Time [s] after which |y - setpoint| stays within a band; infinite for a run that ends outside the band.
 
-    The band is `share` of the step from the first value to the setpoint (2 % by default), or `band` where that is more.
-    A run that starts on its setpoint has no step: it settles only if `band` is given. The entry is the root of the
-    cubic of a step. A visit outside that begins and ends within one step is not seen. The time jumps where a lobe just
-    touches the band.
+    The band is `share` of the step from the first value to the setpoint (2 % by default), or `band` if this is wider. A
+    run that starts on its setpoint has no step: it settles only if `band` is given. The entry is the root of the step's
+    cubic. The method misses an excursion that begins and ends within one step. The time jumps where a local extremum
+    just touches the band.
     """
 
     unit = "s"
@@ -195,37 +255,40 @@ class SettlingTime:
     flow = no_integral
 
     def start(self, sample: Sample) -> Memory:
-        """Settled from the start."""
+        """Return the memory of a run that is settled from t = 0."""
         return Memory(held=Settling(sample.output[0], 0.0 * sample.t))
 
     def update(self, memory: Memory, segment: Segment) -> Settling:
-        """Note the last entry into the band."""
+        """Return the memory with the last entry into the band."""
         first, entered = memory.held
+        # The band is one-sided for the error at the start of the step; the sign has no derivative.
         side = sign(jax.lax.stop_gradient(segment.error().start))
         excess = segment.shown(lambda shown: side * (shown.output[0] - shown.setpoint) - self._width(shown, first))
         entry = segment.start.t + segment.h * excess.root()
         return Settling(first, jnp.where(excess.start > 0, entry, entered))
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """The last entry; infinite if the last sample is outside."""
+        """Return the last entry [s]; infinity if the last sample is outside the band."""
         last = ending.sample
         outside = jnp.abs(tracking_error(last)) > self._width(last, memory.held.first)
         return jnp.where(outside, self.unreached, memory.held.entered)
 
     def _width(self, seen: Any, first: Scalar) -> Any:
-        """Half the width of the band; `seen` has a setpoint."""
+        """Return half the width of the band, for a sample or another tuple with a `setpoint`."""
         return larger(self.share * jnp.abs(seen.setpoint - first), self.band)
 
     def problems(self) -> Iterator[str]:
-        """A band without width."""
+        """Yield a message if `share` and `band` are both 0."""
         if np.all(np.asarray(self.share) == 0) and np.all(np.asarray(self.band) == 0):
             yield "share and band are both 0; a settling time needs a band of some width"
 
 
 @pytree
 class ShareAtLimit:
-    """Share of the run's time [1] for which the command stands at `low` or `high`, or beyond. A step with one end there
-    counts by half. `at_limits` gives one with the limits of a loop."""
+    """Share of the run's time [1] during which the command is at or beyond `low` or `high`.
+
+    A step with one end at a limit counts by half. `at_limits` returns this objective with the limits of a loop.
+    """
 
     unit = "1"
     physical = (0.0, 1.0)
@@ -236,25 +299,22 @@ class ShareAtLimit:
     start, flow = start_held, no_integral
 
     def update(self, memory: Memory, segment: Segment) -> Scalar:
-        """Add the step, or half of it."""
+        """Return the sum with the step, half the step, or 0 [s]."""
         ends = [(x.command <= self.low) | (x.command >= self.high) for x in (segment.start, segment.end)]
         return memory.held + segment.h * sum(jnp.where(end, 0.5, 0.0) for end in ends)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """The share; 0 for a run without length."""
+        """Return the share [1]; 0 for a run of zero length."""
         t = ending.sample.t
         return jnp.where(t > 0, memory.held / jnp.where(t > 0, t, 1.0), 0.0)
 
     def rules(self) -> Iterator[Rule]:
-        """Limits that do not exclude each other."""
+        """Yield the rule low <= high."""
         yield order_rule(("low", self.low), ("high", self.high), "{control}")
 
 
 def at_limits(loop: Any) -> ShareAtLimit:
-    """Return the objective that measures for which share of a run the control of a loop is limited.
-
-    loop: whose controller and actuator say their limits with a method `limits()`; the tightest count. A relay's two
-        torques are levels, not limits.
+    """Return the objective that measures the share of a run in which the command of a loop is at its limits.
 
     >>> import diffabs as d
     >>> from diffabs.objectives import at_limits
@@ -262,11 +322,16 @@ def at_limits(loop: Any) -> ShareAtLimit:
     >>> run = d.measure(loop, d.FixedStep(1e-3, 4.0), {"at a limit": at_limits(loop)})
     >>> print(f"{run.metrics['at a limit']:.2f}")
     0.00
+
+    Args:
+        loop: A loop; controller and actuator give their limits by a method `limits()`, and the tightest limits count.
+            The two torques of a relay are levels and not limits.
     """
     low, high = -math.inf, math.inf
     pending = [loop.controller, loop.actuator]
     while pending:
         one = pending.pop()
+        # Controllers may contain controllers (`Sampled`), so the search descends into all parts.
         pending.extend(parts(one))
         if hasattr(one, "limits"):
             below, above = one.limits()
@@ -276,7 +341,7 @@ def at_limits(loop: Any) -> ShareAtLimit:
 
 @pytree
 class FinalError:
-    """|y - setpoint| at the end."""
+    """|y - setpoint| at the end of the run."""
 
     unit = "signal"
     physical = (0.0, math.inf)
@@ -284,18 +349,23 @@ class FinalError:
     flow, update = no_integral, keep_memory
 
     def start(self, sample: Sample) -> Memory:
-        """Nothing to remember."""
+        """Return an empty memory."""
         del sample
         return Memory()
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Final error."""
+        """Return the final error."""
         del memory
         return jnp.abs(tracking_error(ending.sample))
 
 
 class Quadratic(NamedTuple):
-    """Integral of the error, and of the cost."""
+    """Integrals of a quadratic cost.
+
+    Attributes:
+        error: Integral of the error.
+        cost: Integral of the cost.
+    """
 
     error: Scalar
     cost: Scalar
@@ -303,10 +373,10 @@ class Quadratic(NamedTuple):
 
 @pytree
 class QuadraticCost:
-    """Integral of q1 x1^2 + q2 x2^2 + r (u - ff)^2 dt, x1 = integral of e, x2 = e: eq. (24) of Maeda and Sugiura with
-    eps = 0.
+    """Integral of q1 x1^2 + q2 x2^2 + r (u - ff)^2 dt. Here x1 is the integral of e, x2 = e, and u is the actuator's
+    output.
 
-    u is what the actuator delivers.
+    Source: eq. (24) of Maeda and Sugiura with eps = 0.
     """
 
     unit = ""
@@ -318,20 +388,20 @@ class QuadraticCost:
     update = keep_memory
 
     def start(self, sample: Sample) -> Memory:
-        """Zero."""
+        """Return the memory with both integrals 0."""
         return Memory(flow=Quadratic(*(0.0 * sample.output[0],) * 2))
 
     def flow(self, memory: Memory, sample: Sample) -> Quadratic:
-        """e, and the integrand."""
+        """Return e and the integrand of the cost."""
         x1, x2, u = memory.flow.error, tracking_error(sample), sample.control - sample.feedforward
         return Quadratic(x2, self.q[0] * x1**2 + self.q[1] * x2**2 + self.r * u**2)
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Cost."""
+        """Return the cost."""
         del ending
         return memory.flow.cost
 
     def problems(self) -> Iterator[str]:
-        """Weights of the wrong length."""
+        """Yield a message if q does not have shape (2,)."""
         if np.shape(self.q) != (2,):
             yield f"q has shape {np.shape(self.q)}; it needs (2,): integral and error"

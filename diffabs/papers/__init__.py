@@ -1,10 +1,10 @@
-"""The papers, reproduced: every figure as PNG, every number with its published value and the difference.
+"""Reproductions of the papers: every figure as PNG, every number with its published value and the difference.
 
-`compact` makes of a summary what a person is shown of it.
+`compact` returns the short form of a summary that the command line prints.
 
-A reproduction is a function (folder, progress) -> summary. It writes its figures and `summary.json` into the folder,
-which exists, and calls progress(sentence) before whatever takes long. It needs float64 and matplotlib, which is why the
-modules are imported only when they are asked for.
+A reproduction is a function (folder, progress) -> summary. It writes its figures and `summary.json` into the existing
+folder. It calls progress(sentence) before each long computation. It needs float64 and matplotlib, so its module is
+imported only on use.
 """
 
 import importlib
@@ -21,7 +21,7 @@ Reproduction = Callable[[pathlib.Path, Progress], dict[str, Any]]
 
 def _paper(module: str) -> Reproduction:
     def reproduce(folder: pathlib.Path, progress: Progress) -> dict[str, Any]:
-        """Write figures and `summary.json` into the folder; returns the summary."""
+        """Write figures and `summary.json` into the folder, and return the summary."""
         return importlib.import_module(f"diffabs.papers.{module}").reproduce(folder, progress)
 
     return reproduce
@@ -32,5 +32,9 @@ PAPERS: dict[str, Reproduction] = {name: _paper(module) for name, module in MODU
 
 
 def compact(summary: Mapping[str, Any]) -> "Digest":
-    """The compact result of a summary that a reproduction wrote."""
+    """Return the digest of a summary that a reproduction wrote.
+
+    Args:
+        summary: Contents of `summary.json`.
+    """
     return importlib.import_module(f"diffabs.papers.{MODULES[summary['paper']]}").compact(summary)

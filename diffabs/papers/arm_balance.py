@@ -1,9 +1,9 @@
-"""Fumita, attitude stabilisation of a two-wheeler by an arm: its Fig. 3, why it is not so, and a machine that works.
+"""Fumita, attitude stabilisation of a two-wheeler by an arm: Fig. 3, its refutation, and a machine that works.
 
-The paper leans frame and rider by 0.5 and 0.2 rad and shows that everything returns to 0. That holds for its printed
-linear equations, which no mechanism obeys. Here they are, then the same start in the correct ones, then what any
-control could do about it, and the same machine with its arm turned over. Numbers are compared with an independent
-solution.
+The paper leans frame and rider by 0.5 and 0.2 rad and shows that everything returns to 0. This holds for its printed
+linear equations, which no mechanism obeys. The reproduction runs the same start in the printed and in the correct
+equations. It then bounds the recoverable starts of any control and repeats the study for the same machine with a
+hanging arm. An independent solution gives the numbers for comparison.
 """
 
 import dataclasses
@@ -34,19 +34,19 @@ from diffabs.simulate.solution import Adaptive, FixedStep, Run, describe_solver
 
 TITLE = "Fumita: a two-wheeler balanced by an arm"
 SOLVER = FixedStep(step=1e-3, duration=10.0)
-LONG_SOLVER = Adaptive(rtol=1e-6, duration=600.0)  # of what is counted: a run ends when it is decided
-FINE = FixedStep(step=1e-5, duration=0.1, every=10)  # where 14 kV meet the arm
-PAPER_START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # of Fig. 3
+LONG_SOLVER = Adaptive(rtol=1e-6, duration=600.0)  # for counts: a run ends when its outcome is decided
+FINE = FixedStep(step=1e-5, duration=0.1, every=10)  # for the start at which the controller applies 14 kV
+PAPER_START = np.array([0.5, 0.0, 0.2, 0.0, 0.0, 0.0])  # start of Fig. 3 [rad, rad/s]
 HANGING = ArmBalance(arm_length=-0.5)
-WEIGHTS, EFFORT = (1.0, 100.0, 1.0, 1.0, 1.0, 1.0), 0.01  # of the LQR for the hanging arm
+WEIGHTS, EFFORT = (1.0, 100.0, 1.0, 1.0, 1.0, 1.0), 0.01  # Q and R of the LQR for the hanging arm
 # From experiments/arm_weights.py: weights tuned by gradients for the largest region of attraction at 48 V.
 TUNED = (50466.024, -3214.2056, 20068.574, 17861.686, -92.413308, 7435.5672)
 VOLTAGES = (24.0, 48.0, 100.0)
 RIDERS = np.linspace(40.0, 100.0, 13)  # kg
-MULTIPLES = np.linspace(0.001, 0.12, 120)  # of the start, for the question how many are recovered
-BOX = Cells(-0.1, 0.1, 100)  # of a map [rad]
+MULTIPLES = np.linspace(0.001, 0.12, 120)  # multiples of the start that are tried for recovery
+BOX = Cells(-0.1, 0.1, 100)  # box of starts in a map [rad]
 
-# Computed without this package: SymPy, SciPy, DOP853.
+# Independent numbers, computed with SymPy and SciPy's DOP853.
 POLES = (-108.06522648, -2.79102448, 0.29783666, 2.78790563)
 ZERO = 2.6759
 PEAKS = (4.37, 479.0)  # of Fig. 3 with the LQR Q = I, R = 1: arm [rad], voltage [V]
@@ -87,21 +87,38 @@ SHOWN_QUANTITIES = (
     "recovered",
     "share",
     "peak_voltage",
-)  # first words of the quantities of the digest's table
+)  # first words of the quantities that the digest shows
 
 
 def upright_model(plant: Any) -> StateSpace:
-    """A, B about upright."""
+    """Return the linear model (A, B) of a plant about the upright position.
+
+    Args:
+        plant: A two-wheeler.
+    """
     return BalanceModel(plant=plant).matrices()
 
 
 def lqr_gain(plant: Any, weights: Any = (1.0,) * 6, effort: float = 1.0) -> np.ndarray:
-    """LQR gain K, u = K x."""
+    """Return the LQR gain K of u = K x about the upright position, shape (6,).
+
+    Args:
+        plant: A two-wheeler.
+        weights: Diagonal of Q, 6 numbers.
+        effort: R, > 0.
+    """
     return np.asarray(lqr(*upright_model(plant), np.diag(weights), effort * np.eye(1)).gain[0])
 
 
 def loop(plant: Any, gain: Any, start: Any = PAPER_START, voltage: float = 48.0) -> Loop:
-    """The closed loop from a start (6,)."""
+    """Return the closed loop from a start.
+
+    Args:
+        plant: A two-wheeler.
+        gain: K of u = K x, shape (6,).
+        start: Start (theta, psi, phi, ...), of which the angles count [rad].
+        voltage: Limit of the motor voltage [V].
+    """
     return dataclasses.replace(
         replace(balancing(), {"actuator.voltage_max": voltage}),
         plant=plant,
@@ -111,7 +128,7 @@ def loop(plant: Any, gain: Any, start: Any = PAPER_START, voltage: float = 48.0)
 
 
 def runs() -> dict[str, Run]:
-    """Fig. 3, the same in the correct model, and the hanging arm."""
+    """Return the runs by name: Fig. 3, its start in the correct model, and the hanging arm."""
     upright, hanging = lqr_gain(ArmBalance()), lqr_gain(HANGING, WEIGHTS, EFFORT)
     cases = {
         "printed": loop(PrintedArm(), lqr_gain(PrintedArm()), voltage=1e6),
@@ -127,13 +144,23 @@ def runs() -> dict[str, Run]:
 
 
 def recovered_multiples(one: Loop, rows: Mapping[str, Any]) -> list[Reach]:
-    """Of each of several values of a parameter, (path, values), the largest of MULTIPLES that is recovered."""
+    """Return the largest recovered one of MULTIPLES of the paper's start, for each parameter value.
+
+    Args:
+        one: Closed loop.
+        rows: Paths of parameters and their values.
+    """
     direction = {"initial.theta": PAPER_START[0], "initial.phi": PAPER_START[2]}
     return largest_recovered_multiples(one, rows, direction, MULTIPLES, LONG_SOLVER)
 
 
 def largest_possible_multiples(plant: ArmBalance, riders: Any) -> np.ndarray:
-    """The largest multiple of the start that any control at 48 V recovers, for each rider, in the linear model."""
+    """Return the largest multiple of the start that any control at 48 V recovers in the linear model, for each rider.
+
+    Args:
+        plant: A two-wheeler.
+        riders: Masses of the rider [kg].
+    """
     return np.array(
         [
             min(mode_bounds(*upright_model(replace(plant, {"rider_mass": m})), PAPER_START, 48.0).values())
@@ -143,7 +170,14 @@ def largest_possible_multiples(plant: ArmBalance, riders: Any) -> np.ndarray:
 
 
 def heaviest(plant: ArmBalance, gain: np.ndarray, low: float = 50.0, high: float = 200.0) -> float:
-    """Mass of the heaviest rider [kg] whom a gain holds upright, in the linear model, by halving; `low` is held."""
+    """Return the mass of the heaviest rider [kg] that a gain stabilises in the linear model, by bisection.
+
+    Args:
+        plant: A two-wheeler.
+        gain: K of u = K x, shape (6,).
+        low: Mass that the gain stabilises [kg].
+        high: Upper end of the search [kg].
+    """
     while high - low > 1e-3:
         mass = (low + high) / 2
         a, b = upright_model(replace(plant, {"rider_mass": mass}))
@@ -153,7 +187,11 @@ def heaviest(plant: ArmBalance, gain: np.ndarray, low: float = 50.0, high: float
 
 
 def maps(progress: Callable[[str], None]) -> dict[str, Basin]:
-    """Regions of attraction at 48 V."""
+    """Return the regions of attraction at 48 V by name of the gain.
+
+    Args:
+        progress: Function that receives a sentence before each long computation.
+    """
     gains, found = {"LQR": lqr_gain(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": TUNED}, {}
     for name, gain in gains.items():
         progress(f"arm-balance: {BOX.number**2} starts, {name}")
@@ -162,7 +200,12 @@ def maps(progress: Callable[[str], None]) -> dict[str, Basin]:
 
 
 def robust_gains(progress: Callable[[str], None]) -> dict[str, Any]:
-    """Gains over riders of 40 to 100 kg: LQR of one rider, LMI of all, tuned."""
+    """Return gains for riders of 40 to 100 kg with their recovered multiples: LQR of one rider, LMI of all, and tuned
+    weights.
+
+    Args:
+        progress: Function that receives a sentence before each long computation.
+    """
     gains = {"LQR for 50 kg": lqr_gain(HANGING, WEIGHTS, EFFORT), "weights tuned by gradients": np.array(TUNED)}
     progress("arm-balance: a gain for 40 to 100 kg")
     try:
@@ -182,7 +225,12 @@ def robust_gains(progress: Callable[[str], None]) -> dict[str, Any]:
 
 
 def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[dict[str, Any]]:
-    """Ours against the independent numbers."""
+    """Return the rows that compare our numbers with the independent ones.
+
+    Args:
+        seen: Runs by name.
+        basins: Regions of attraction by name.
+    """
     a, b = upright_model(ArmBalance())
     poles = np.sort_complex(np.linalg.eigvals(np.asarray(a)))
     real = poles[np.abs(poles.imag) < 1e-9].real
@@ -235,7 +283,11 @@ def table(seen: Mapping[str, Run], basins: Mapping[str, Basin]) -> list[dict[str
 
 
 def compact(summary: Mapping[str, Any]) -> Digest:
-    """What falls, what no control could do, what the hanging arm recovers."""
+    """Return the digest: falls, bounds of any control, and recovered starts of the hanging arm.
+
+    Args:
+        summary: Contents of `summary.json`.
+    """
     rows = summary["rows"]
     lines = []
     for row in rows:
@@ -251,7 +303,12 @@ def compact(summary: Mapping[str, Any]) -> Digest:
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Write figures and `summary.json` into the folder; returns the summary."""
+    """Write figures and `summary.json` into the folder, and return the summary.
+
+    Args:
+        folder: Existing folder.
+        progress: Function that receives a sentence before each long computation.
+    """
     progress("arm-balance: Fig. 3, printed and correct equations")
     seen = runs()
     basins = maps(progress)

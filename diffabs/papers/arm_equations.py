@@ -1,7 +1,7 @@
-"""Fumita's equations (1)-(10) as printed, each as a function of angles q, rates v and accelerations a (3,), and what
-Lagrange's equations make of the printed Lagrangian (7).
+"""Fumita's equations (1)-(10) as printed, and the equations of motion that follow from the printed Lagrangian (7).
 
-So every misprint is a difference of two functions, and not a matter of reading.
+Each is a function of angles q, rates v and accelerations a, shape (3,). Every misprint is thus a difference of two
+functions.
 """
 
 from collections.abc import Callable
@@ -15,11 +15,18 @@ from diffabs.papers import record
 from diffabs.plants import ArmBalance
 
 Energy = Callable[[ArmBalance, Any, Any], Any]
-RODS = {"body": "body_height", "arm": "arm_length", "rider": "rider_height"}  # half the length of a rod of that inertia
+# Half the length of a uniform rod with the inertia of each body.
+RODS = {"body": "body_height", "arm": "arm_length", "rider": "rider_height"}
 
 
 def kinetic(p: ArmBalance, q: Any, v: Any) -> Any:
-    """Eqs. (1), (3), (5) [J]."""
+    """Return the kinetic energy, the sum of eqs. (1), (3), (5) [J].
+
+    Args:
+        p: Machine.
+        q: Angles (3,) [rad].
+        v: Rates (3,) [rad/s].
+    """
     _, t2, t3 = q
     v1, v2, v3 = v
     l, lg, hg, m2, m3 = p.mount_height, p.arm_length, p.rider_height, p.arm_mass, p.rider_mass
@@ -36,7 +43,12 @@ def kinetic(p: ArmBalance, q: Any, v: Any) -> Any:
 
 
 def potentials(p: ArmBalance, q: Any) -> Any:
-    """Eqs. (2), (4), (6) as printed (3,); the second and third add kg m to J."""
+    """Return eqs. (2), (4), (6) as printed, shape (3,); the second and third add kg m to J.
+
+    Args:
+        p: Machine.
+        q: Angles (3,) [rad].
+    """
     t1, t2, t3 = q
     u1 = p.body_mass * p.body_height * p.gravity * jnp.cos(t1)
     u2 = p.arm_mass * p.mount_height * jnp.cos(t1) + p.arm_mass * p.arm_length * p.gravity * jnp.cos(t1 - t2)
@@ -45,7 +57,13 @@ def potentials(p: ArmBalance, q: Any) -> Any:
 
 
 def lagrangian(p: ArmBalance, q: Any, v: Any) -> Any:
-    """Eq. (7) [J]: the kinetic energy of the sums theta1 + theta2, a potential of the differences."""
+    """Return eq. (7) [J]: the kinetic energy of the sums theta1 + theta2, minus a potential of the differences.
+
+    Args:
+        p: Machine.
+        q: Angles (3,) [rad].
+        v: Rates (3,) [rad/s].
+    """
     t1, t2, t3 = q
     b1 = p.body_mass * p.body_height + (p.arm_mass + p.rider_mass) * p.mount_height
     heights = b1 * jnp.cos(t1) + p.arm_mass * p.arm_length * jnp.cos(t1 - t2)
@@ -53,13 +71,28 @@ def lagrangian(p: ArmBalance, q: Any, v: Any) -> Any:
 
 
 def euler_lagrange(energy: Energy, p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
-    """d/dt(dL/dv) - dL/dq (3,), by automatic differentiation."""
+    """Return d/dt(dL/dv) - dL/dq, shape (3,), by automatic differentiation.
+
+    Args:
+        energy: Lagrangian as a function of (p, q, v).
+        p: Machine.
+        q: Angles (3,) [rad].
+        v: Rates (3,) [rad/s].
+        a: Accelerations (3,) [rad/s^2].
+    """
     by_rate = jax.grad(energy, 2)
     return jax.jvp(lambda q, v: by_rate(p, q, v), (q, v), (v, a))[1] - jax.grad(energy, 1)(p, q, v)
 
 
 def printed_equations(p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
-    """Left sides of eqs. (8), (9), (10) (3,)."""
+    """Return the left sides of eqs. (8), (9), (10), shape (3,).
+
+    Args:
+        p: Machine.
+        q: Angles (3,) [rad].
+        v: Rates (3,) [rad/s].
+        a: Accelerations (3,) [rad/s^2].
+    """
     (t1, t2, t3), (v1, v2, v3) = q, v
     sin2, sin3 = jnp.sin(t2), jnp.sin(t3)
     l, lg, hg, m2, m3, g = p.mount_height, p.arm_length, p.rider_height, p.arm_mass, p.rider_mass, p.gravity
@@ -78,13 +111,21 @@ def printed_equations(p: ArmBalance, q: Any, v: Any, a: Any) -> Any:
 
 
 def gravity_stiffness(p: ArmBalance) -> np.ndarray:
-    """d(left sides of (8)-(10))/dq at rest (3, 3) [N m/rad]: symmetric for any potential."""
+    """Return d(left sides of (8)-(10))/dq at rest, shape (3, 3) [N m/rad]; any potential gives a symmetric matrix.
+
+    Args:
+        p: Machine.
+    """
     zero = jnp.zeros(3)
     return np.asarray(jax.jacfwd(lambda q: printed_equations(p, q, zero, zero))(zero))
 
 
 def judge_equations(p: ArmBalance) -> list[dict[str, Any]]:
-    """A row for each number."""
+    """Return the rows that judge the printed equations, one for each number.
+
+    Args:
+        p: Machine.
+    """
     upright = np.asarray(potentials(p, jnp.zeros(3)))
     height = p.arm_mass * p.gravity * (p.mount_height + p.arm_length)
     rows = [record.computed_row("eq. (4), everything upright", "potential energy", "J", upright[1], reference=height)]

@@ -1,23 +1,29 @@
-"""What a person is shown of a reproduction: a table that fits a terminal, how many numbers agree, what is refuted.
+"""Short form of a reproduction for the terminal: a table, counts of numbers that agree, and verdicts on claims.
 
-All of it is read off the summary, so that no sentence outlives the number it rests on:
+Everything is computed from the summary, so each sentence matches its number.
 
     a published number is reproduced if ours rounds to its printed digits
-    an independent one if ours differs by no more than 0.1 %, or rounds to the decimals given
-    a claim is refuted if the number that would bear it out does not
+    an independent number is reproduced if ours differs by at most 0.1 %, or rounds to the decimals given
+    a claim is refuted if the number that would support it contradicts it
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from decimal import Decimal
 from typing import Any, NamedTuple
 
-RELATIVE_TOLERANCE = 1e-3  # relative
+RELATIVE_TOLERANCE = 1e-3  # of independent numbers
 Row = Mapping[str, Any]
 
 
 class Refuted(NamedTuple):
-    """A claim of a paper, and why it is false: `because` with the numbers of `evidence`, (name, quantity) of rows, for
-    which `false` says whether they contradict the claim."""
+    """A claim of a paper, and the evidence against it.
+
+    Attributes:
+        claim: The claim.
+        because: Reason for the refutation, a format string of the numbers of `evidence`.
+        evidence: (name, quantity) of the rows with these numbers.
+        false: Function of these numbers that returns whether they contradict the claim.
+    """
 
     claim: str
     because: str
@@ -26,7 +32,16 @@ class Refuted(NamedTuple):
 
 
 class Digest(NamedTuple):
-    """A title, a table of headings and lines, sentences on agreement, claims with verdicts, and how many figures."""
+    """Short form of a reproduction.
+
+    Attributes:
+        title: Title.
+        headings: Headings of the table.
+        lines: Lines of the table.
+        agreement: Sentences on the numbers that agree.
+        verdicts: Verdicts and claims.
+        figures: Number of figures.
+    """
 
     title: str
     headings: Sequence[str]
@@ -44,7 +59,16 @@ def digest(
     printed: tuple[str, Sequence[Row]],
     independent: Sequence[Row],
 ) -> Digest:
-    """What all papers have in common. `printed`: where the published numbers stand, and their rows."""
+    """Return the digest of a paper from its table and the parts that all papers share.
+
+    Args:
+        summary: Contents of `summary.json`.
+        headings: Headings of the table.
+        lines: Lines of the table.
+        claims: Claims of the paper that may be refuted.
+        printed: Place of the published numbers in the paper, and their rows.
+        independent: Rows with an independent number.
+    """
     return Digest(
         title=summary["title"].split(" (")[0],
         headings=headings,
@@ -56,41 +80,75 @@ def digest(
 
 
 def our_number(rows: Iterable[Row], name: str, quantity: str) -> float | None:
-    """Our number in a row of the record; None where there is no such row."""
+    """Return our number in a row of the record; None if there is no such row.
+
+    Args:
+        rows: Rows of the record.
+        name: Name of the row.
+        quantity: Quantity of the row.
+    """
     return next((row["ours"] for row in rows if (row["name"], row["quantity"]) == (name, quantity)), None)
 
 
 def is_reproduced(row: Row) -> bool:
-    """Whether ours rounds to the printed digits: those that the row was judged by, or those of the number itself."""
+    """Return whether our number rounds to the printed digits.
+
+    Args:
+        row: Row with a published number; its `matches`, if present, decides.
+    """
     return row["matches"] if "matches" in row else rounds_to(row["ours"], row["published"])
 
 
 def rounds_to(number: float, given: float) -> bool:
-    """Whether a number rounds to one that is given with so many decimals."""
+    """Return whether a number rounds to another number at the other's decimals.
+
+    Args:
+        number: Number to round.
+        given: Number as printed.
+    """
     return round(number, decimals(given)) == given
 
 
 def decimals(given: float) -> int:
-    """How many a number has as it is written."""
+    """Return the number of decimals of a number as written.
+
+    Args:
+        given: Number as printed.
+    """
     exponent = Decimal(repr(given)).normalize().as_tuple().exponent
     return max(0, -int(exponent))
 
 
 def is_close(row: Row) -> bool:
-    """Whether ours agrees with an independent number. Without decimals, rounding would let 0.4 be 0."""
+    """Return whether our number agrees with the independent number.
+
+    Rounding counts only if the independent number has decimals; without decimals, 0.4 would agree with 0.
+
+    Args:
+        row: Row with an independent number.
+    """
     known, gap = row["reference"], abs(row["difference"])
     return gap <= RELATIVE_TOLERANCE * abs(known) or (decimals(known) > 0 and rounds_to(row["ours"], known))
 
 
 def count_published(where: str, rows: Sequence[Row]) -> str:
-    """How many of these published numbers are reproduced, which are not, and by what rule."""
+    """Return a sentence on the share of published numbers that are reproduced, the exceptions, and the rule.
+
+    Args:
+        where: Place of the numbers in the paper.
+        rows: Rows with a published number.
+    """
     if not rows:
         return f"The paper prints no number to compare with: {where}."
     return _share(rows, is_reproduced, f"published numbers reproduced ({where}: to the printed digit)")
 
 
 def count_computed(rows: Sequence[Row]) -> str:
-    """How many of these independent numbers are reproduced, and which are not."""
+    """Return a sentence on the share of independent numbers that are reproduced, and the exceptions.
+
+    Args:
+        rows: Rows with an independent number.
+    """
     return _share(rows, is_close, "independent numbers reproduced (to 0.1 % or the decimals given)")
 
 
@@ -101,7 +159,12 @@ def _share(rows: Sequence[Row], agrees: Callable[[Row], bool], words: str) -> st
 
 
 def verdict(rows: Sequence[Row], claim: Refuted) -> tuple[str, str] | None:
-    """ "refuted" or "holds", and the claim with the numbers why; None where the record does not have them."""
+    """Return "refuted" or "holds", and the claim with its numbers; None if the record lacks these numbers.
+
+    Args:
+        rows: Rows of the record.
+        claim: Claim of the paper.
+    """
     values = [our_number(rows, *place) for place in claim.evidence]
     if None in values:
         return None

@@ -1,7 +1,8 @@
-"""Aoki and Nakamura, what the text says of its figures: which controllers brake abruptly, where friction is gained, at
-which slip it is greatest.
+"""Judgement of Aoki and Nakamura's text on its figures: abrupt braking, gain of distance by friction, and the slip of
+greatest friction.
 
-The paper gives no number for any of it. These are numbers of the identified car, from the runs of its tables.
+The paper gives no number for these statements. The numbers here are those of the identified car, from the runs of its
+tables.
 """
 
 from collections.abc import Mapping
@@ -15,14 +16,21 @@ from diffabs.roads import peak
 from diffabs.simulate.solution import Run
 
 KMH = 3.6
-LATE_TIME = 0.45  # s, after which the torque has been built up in every run
+LATE_TIME = 0.45  # s; later the torque is built up in every run
 SLOW_SPEED = 20 / KMH  # m/s, for "even when the vehicle is slow"
 CONTROLLERS = ("P", "PD", "PI", "PID")
 COMPARED_METHODS = ("conventional", "proposed")
 
 
 def run_columns(run: Run) -> dict[str, np.ndarray]:
-    """Columns of a trajectory while it ran: time, torque, and what the plant shows."""
+    """Return the columns of a trajectory up to its end: time, torque, and the plant's outputs.
+
+    Args:
+        run: Run with a trajectory, as `rollout` returns it.
+
+    Raises:
+        ValueError: The run has no trajectory.
+    """
     if run.trajectory is None:
         raise ValueError("a run without a trajectory, as `measure` returns it: use `rollout`")
     sample = run.trajectory.sample
@@ -33,12 +41,21 @@ def run_columns(run: Run) -> dict[str, np.ndarray]:
 
 
 def variation(run: Run) -> float:
-    """Total variation of the torque between the samples that were kept [N m]."""
+    """Return the total variation of the torque between the stored samples [N m].
+
+    Args:
+        run: Run with a trajectory.
+    """
     return float(np.sum(np.abs(np.diff(run_columns(run)["torque"]))))
 
 
 def jerk(run: Run, after: float = LATE_TIME) -> float:
-    """Greatest |da/dt| of the vehicle between samples later than `after` [m/s^3]."""
+    """Return the greatest |da/dt| of the vehicle between stored samples [m/s^3].
+
+    Args:
+        run: Run with a trajectory.
+        after: Time from which samples count [s].
+    """
     one = run_columns(run)
     t = one["t"]
     rates = np.abs(np.diff(one["deceleration"]) / np.diff(t))
@@ -46,14 +63,24 @@ def jerk(run: Run, after: float = LATE_TIME) -> float:
 
 
 def rebounds(run: Run, begin: float = 0.3, end: float = 1.0) -> int:
-    """How often the wheel changes between slowing down and speeding up in this time."""
+    """Return the number of changes of the wheel between deceleration and acceleration.
+
+    Args:
+        run: Run with a trajectory.
+        begin: Start of the time window [s].
+        end: End of the time window [s].
+    """
     one = run_columns(run)
     rate = np.diff(one["wheel_speed"])[(one["t"][:-1] >= begin) & (one["t"][:-1] < end)]
     return int(np.sum(np.diff(np.sign(rate)) != 0))
 
 
 def slow_deceleration(run: Run) -> float:
-    """Mean deceleration from `SLOW_SPEED` down to the last sample, over the distance [m/s^2]."""
+    """Return the mean deceleration over the distance from `SLOW_SPEED` to the last sample [m/s^2].
+
+    Args:
+        run: Run with a trajectory.
+    """
     one = run_columns(run)
     slow = one["speed"] <= SLOW_SPEED
     v, x = one["speed"][slow], one["distance"][slow]
@@ -61,22 +88,32 @@ def slow_deceleration(run: Run) -> float:
 
 
 def braking_gain(slower: Run, faster: Run) -> tuple[float, float]:
-    """What one run brakes shorter than another, and the part of it that is gained below `SLOW_SPEED` [m].
+    """Return the difference of two stopping distances, and its part below `SLOW_SPEED` [m].
 
-    Distance is the integral of v dv/a(v), which tells at what speeds it is gained."""
+    The distance is the integral of v dv/a(v), so its integrand gives the gain at each speed.
+
+    Args:
+        slower: Run with the longer distance.
+        faster: Run with the shorter distance.
+    """
     one, other = run_columns(slower), run_columns(faster)
-    v = np.linspace(one["speed"][-1], one["speed"][1], 20_001)  # at the very first there is no friction yet
+    v = np.linspace(one["speed"][-1], one["speed"][1], 20_001)  # the first sample has no friction
     shorter = v * (1 / _at(v, one) - 1 / _at(v, other))
     return float(np.trapezoid(shorter, v)), float(np.trapezoid(np.where(v <= SLOW_SPEED, shorter, 0.0), v))
 
 
 def _at(v: np.ndarray, one: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Deceleration at these speeds; the speed only falls."""
+    """Return the deceleration at these speeds [m/s^2]; requires a speed that only falls."""
     return np.interp(v, one["speed"][::-1], one["deceleration"][::-1])
 
 
 def judge_estimator_claims(runs: Mapping[str, Run], roads: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """A row for each number, of the runs of Tables 1 and 2 on one car, and of the friction curves by name."""
+    """Return the rows that judge the statements, one for each number.
+
+    Args:
+        runs: Runs of Tables 1 and 2 on one car, by name.
+        roads: Friction curves by name.
+    """
     rows = []
     for name in (f"{method} {controller}" for method in COMPARED_METHODS for controller in CONTROLLERS):
         rows.append(record.computed_row(name, "variation of the torque", "N m", variation(runs[name])))

@@ -1,5 +1,8 @@
-"""Maeda and Sugiura, what the text says in passing: a car of a tonne as 5 kg, a cost that is small for any mass, and
-where the published gain may come from."""
+"""Judgement of Maeda and Sugiura's minor statements: the scaled mass, the cost for any mass, and the origin of the
+published gain.
+
+The paper models a car of a tonne by 5 kg.
+"""
 
 from typing import Any
 
@@ -15,27 +18,48 @@ CAR, PERSON, RIG = 1000.0, 60.0, 5.0  # kg
 
 
 def scaled_mass(people: int) -> float:
-    """The rig's mass with so many people, in proportion to a car of a tonne as 5 kg [kg]."""
+    """Return the rig's mass with passengers [kg], where 5 kg stand for a car of 1000 kg.
+
+    Args:
+        people: Number of people of 60 kg.
+    """
     return RIG + people * PERSON * RIG / CAR
 
 
 def rig_masses() -> tuple[float, float]:
-    """The mass that the laboratory rig's lower wheel has by eq. (3), 2 J2/r2^2, and the one whose weight presses the
-    wheels together at rest [kg]."""
+    """Return two masses of the laboratory rig [kg].
+
+    Returns:
+        The mass of the lower wheel by eq. (3), 2 J2/r2^2, and the mass whose weight presses the wheels together at
+        rest.
+    """
     rig = LabRig()
     by_inertia = 2 * float(rig.drum_inertia) / float(rig.drum_radius) ** 2
     return by_inertia, float(rig.weight_torque) / (float(rig.lever) * np.sin(float(rig.lever_angle)) * GRAVITY)
 
 
 def corner(system: Polytope, mass: float, speed: float) -> tuple[np.ndarray, np.ndarray]:
-    """A and B of the polytope's corner at this mass [kg] and speed [m/s]."""
+    """Return A and B at the polytope's vertex with this mass and speed.
+
+    Args:
+        system: Polytope over mass and speed.
+        mass: Mass of the vertex [kg].
+        speed: Speed of the vertex [m/s].
+    """
     away = [abs(c["plant.mass"] / mass - 1) + abs(c["speed"] / speed - 1) for c in system.corners]
     i = int(np.argmin(away))
     return np.asarray(system.A[i]), np.asarray(system.B[i])
 
 
 def cost(A: np.ndarray, B: np.ndarray, gain: Any, weights: tuple[float, float]) -> float:
-    """trace P of eq. (24)'s cost under a stabilising gain, R = 1; infinite under another."""
+    """Return trace P of the cost (24) with R = 1 under a stabilising gain; infinity under any other gain.
+
+    Args:
+        A: State matrix (2, 2).
+        B: Input matrix (2, 1).
+        gain: K of u = K x, 2 numbers.
+        weights: Diagonal of Q.
+    """
     K, Q = np.reshape(gain, (1, 2)), np.diag(weights)
     closed = A + B @ K
     if np.max(np.linalg.eigvals(closed).real) >= 0:
@@ -44,14 +68,26 @@ def cost(A: np.ndarray, B: np.ndarray, gain: Any, weights: tuple[float, float]) 
 
 
 def optimum(A: np.ndarray, B: np.ndarray, weights: tuple[float, float]) -> tuple[np.ndarray, float]:
-    """The gain of eq. (27) at one mass and speed, R = 1, and its cost."""
+    """Return the optimal gain of eq. (27) with R = 1 at one mass and speed, and its cost.
+
+    Args:
+        A: State matrix (2, 2).
+        B: Input matrix (2, 1).
+        weights: Diagonal of Q.
+    """
     P = solve_continuous_are(A, B, np.diag(weights), np.eye(1))
     return -(B.T @ P)[0], float(np.trace(P))
 
 
 def holding_mass(system: Polytope, gain: Any) -> float:
-    """The greatest mass [kg] at which a gain is stable: alpha, eq. (17), is affine in the mass, and the loop is stable
-    while alpha < beta |k2|."""
+    """Return the greatest mass [kg] at which a gain is stable at the top speed.
+
+    alpha, eq. (17), is affine in the mass, and the closed loop is stable while alpha < beta |k2|.
+
+    Args:
+        system: Polytope over mass and speed.
+        gain: K of u = K x, 2 numbers.
+    """
     low, high = DESIGN_BOX["plant.mass"]
     speed = DESIGN_BOX["speed"][1]
     (a, b), (c, _) = (corner(system, mass, speed) for mass in (low, high))
@@ -60,8 +96,13 @@ def holding_mass(system: Polytope, gain: Any) -> float:
 
 
 def nearest_speed(system: Polytope) -> float:
-    """The speed [m/s] whose LQ gain is the published one, with no weight on the slip error: alpha/beta does not depend
-    on the speed and omega_2/beta is in proportion to it."""
+    """Return the speed [m/s] at which the LQ gain without weight on the slip error is the published gain.
+
+    alpha/beta does not depend on the speed, and omega_2/beta is proportional to it.
+
+    Args:
+        system: Polytope over mass and speed.
+    """
     low = DESIGN_BOX["speed"][0]
     A, B = corner(system, DESIGN_BOX["plant.mass"][0], low)
     ratio = A[1, 1] / B[1, 0]
@@ -70,7 +111,12 @@ def nearest_speed(system: Polytope) -> float:
 
 
 def judge_lmi_claims(system: Polytope, gains: dict[tuple[float, float], np.ndarray]) -> list[dict[str, Any]]:
-    """A row for each number; `gains`: those of the inequalities by their weights."""
+    """Return the rows that judge the statements, one for each number.
+
+    Args:
+        system: Polytope over mass and speed.
+        gains: Gains of the matrix inequalities by their weights.
+    """
     (light, heavy), (slow, fast) = DESIGN_BOX["plant.mass"], DESIGN_BOX["speed"]
     rows = [record.computed_row(f"a car with {n} of 60 kg", "mass of the rig", "kg", scaled_mass(n)) for n in (1, 4)]
     names = ("the rig's lower wheel, 2 J2/r2^2", "weight on the rig's wheels at rest")

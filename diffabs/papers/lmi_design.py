@@ -1,7 +1,8 @@
-"""Maeda and Sugiura, section 4: the gain by linear matrix inequalities, what it proves, and why the slip overshoots.
+"""Maeda and Sugiura, section 4: the gain by linear matrix inequalities, its stability proofs, and the cause of the
+overshoot.
 
-Q, R and epsilon are not given in the paper, so its gain cannot be designed again; it can be judged. Its eq. (31) is
-compared with the corrected one, whose vertices are pairs (A, B) of one speed.
+The paper does not give Q, R and epsilon, so its gain cannot be recomputed, but it can be judged. The paper's eq. (31)
+is compared with the corrected inequality, whose vertices are pairs (A, B) of one speed.
 """
 
 from collections.abc import Mapping
@@ -20,21 +21,21 @@ from diffabs.simulate.solution import Run
 
 K1 = 11753.0
 PUBLISHED_GAIN = (-K1, -48.0)
-SAME_INTEGRAL = (-11752.95, -158.170)  # of the LMI with Q = diag(K1^2, 1)
+SAME_INTEGRAL = (-11752.95, -158.170)  # gain of the LMI with Q = diag(K1^2, 1)
 GENTLE = (-121.8, -158.2)
 KMH = 3.6
 DESIGN_BOX = {"plant.mass": (5.3, 6.2), "speed": (5 / KMH, 50 / KMH)}
 DECELERATION_RANGE = (-7.9, 0.0)  # m/s^2; no road friction slows the rig faster than 2 g 0.4
 SPEED_CELLS = 8
 
-# Computed without this package, by several solvers: weights, then gain and trace Z.
+# Independent numbers, by several solvers: weights, then gain and trace Z.
 REFERENCE_GAINS = {
     (K1**2, 1.0): ((-11752.95, -158.170), 1847633.09),
     (1e6, 1e4): ((-999.73, -111.072), 110129.870),
     (1.0, 1.0): ((-0.833855, -2.599026), 4.58876617),
 }
 REFERENCE_THRESHOLD = 76.63  # N m; beta |k2| - alpha > sqrt(beta |k1|)(sqrt(omega_max) - sqrt(omega_min))
-REFERENCE_POLE = (-22.5345, 103.3147, 0.213)  # of the published gain at 50 km/h and 5.3 kg; damping
+REFERENCE_POLE = (-22.5345, 103.3147, 0.213)  # pole and damping of the published gain at 50 km/h and 5.3 kg
 REFERENCE_OVERSHOOT = {"LMI, same k1": 0.205, "K = [-121.8, -158.2]": 0.0049}
 
 NOTES = [
@@ -84,10 +85,18 @@ CLAIMS = (
 
 
 class Designed:
-    """Everything that section 4 needs, computed once."""
+    """Results of section 4, computed once.
+
+    Attributes:
+        system: Polytope over mass and speed.
+        designs: Designs by their weights.
+        printed: Designs by eq. (31) as printed, by their weights.
+        verdicts: Certificates of gains with k1 = -11753, by k2.
+        varying: Certificate of the published gain for a speed with bounded rate.
+    """
 
     def __init__(self) -> None:
-        """The polytope, the gains for the reference weights, and the verdicts."""
+        """Compute the polytope, the gains for the reference weights, and the certificates."""
         model = SlipModel(plant=MirroredRig(), slip=0.2)
         self.system = polytope(model, DESIGN_BOX)
         self.designs = {weights: design(self.system, Spec(Q=weights, R=1.0)) for weights in REFERENCE_GAINS}
@@ -99,12 +108,13 @@ class Designed:
 
 
 def _printed(system: Polytope) -> Polytope:
-    """Eq. (31): blocks 3 and 4 have B of the other speed."""
+    """Return the vertices of eq. (31) as printed: blocks 3 and 4 have B of the other speed."""
     speeds = np.array([corner["speed"] for corner in system.corners])
     heavy = np.array([corner["plant.mass"] == DESIGN_BOX["plant.mass"][1] for corner in system.corners])
     low = speeds == speeds.min()
     other = {(mass, slow): i for i, (mass, slow) in enumerate(zip(heavy, low, strict=True))}
-    # (heavy, fast) and (light, slow) are right; (heavy, slow) gets B of the high speed, (light, fast) of the low one
+    # (heavy, fast) and (light, slow) are correct. (heavy, slow) gets B of the high speed, and (light, fast) gets B of
+    # the low speed.
     swap = [
         other[(mass, not slow)] if mass == slow else i for i, (mass, slow) in enumerate(zip(heavy, low, strict=True))
     ]
@@ -112,7 +122,12 @@ def _printed(system: Polytope) -> Polytope:
 
 
 def table(found: Designed, braked: Mapping[str, Run]) -> list[dict[str, Any]]:
-    """Gains and costs, verdicts, poles, overshoots."""
+    """Return the rows of gains, costs, certificates, poles and overshoots.
+
+    Args:
+        found: Results of section 4.
+        braked: Braking runs by name.
+    """
     rows = []
     for weights, (gain, trace) in REFERENCE_GAINS.items():
         name = f"LMI, Q = diag({weights[0]:.6g}, {weights[1]:g})"
@@ -154,21 +169,34 @@ def table(found: Designed, braked: Mapping[str, Run]) -> list[dict[str, Any]]:
 
 
 def _truth(proof: Certificate) -> float:
-    """1 for proved, 0 for disproved. Raises ValueError for undecided, which no row here is."""
+    """Return 1 for a proved and 0 for a disproved certificate.
+
+    Raises:
+        ValueError: The certificate is undecided.
+    """
     if proof.quadratically_stable is None or not proof.verified_exactly:
         raise ValueError(f"undecided: {proof}")
     return float(proof.quadratically_stable)
 
 
 def stability_threshold(system: Polytope) -> float:
-    """The least |k2| [N m] at k1 = -11753 for which a common Lyapunov matrix exists, in closed form."""
-    omega_beta = 1 / system.B[:, 1, 0]  # omega_2/beta, so that the closed form reads in these alone
+    """Return the least |k2| [N m] at k1 = -11753 for which a common Lyapunov matrix exists, in closed form.
+
+    Args:
+        system: Polytope over mass and speed.
+    """
+    omega_beta = 1 / system.B[:, 1, 0]  # omega_2/beta; the closed form needs only this and alpha/beta
     alpha_beta = system.A[:, 1, 1] * omega_beta
     return float(np.max(alpha_beta) + np.sqrt(K1) * np.ptp(np.sqrt(omega_beta)))
 
 
 def slowest_pole(system: Polytope, gain: tuple[float, float]) -> tuple[float, float, float]:
-    """Real and imaginary part of the pole at 50 km/h and 5.3 kg, and its damping."""
+    """Return real part, imaginary part and damping of the closed loop's eigenvalue at 50 km/h and 5.3 kg.
+
+    Args:
+        system: Polytope over mass and speed.
+        gain: K of u = K x.
+    """
     i = int(np.argmin([corner["plant.mass"] - corner["speed"] for corner in system.corners]))
     pole = np.linalg.eigvals(system.closed(gain)[i])
     pole = pole[np.argmax(np.imag(pole))]
@@ -176,7 +204,11 @@ def slowest_pole(system: Polytope, gain: tuple[float, float]) -> tuple[float, fl
 
 
 def design_summary(found: Designed) -> dict[str, Any]:
-    """For `summary.json`."""
+    """Return the part of `summary.json` on section 4.
+
+    Args:
+        found: Results of section 4.
+    """
 
     def one(answer: Design) -> dict[str, Any]:
         numbers = {name: getattr(answer, name) for name in ("trace_cost", "lower_bound", "gap", "residual")}
@@ -197,7 +229,12 @@ def design_summary(found: Designed) -> dict[str, Any]:
 
 
 def figures(found: Designed, braked: Mapping[str, Run]) -> dict[str, Any]:
-    """Poles and damping against speed, and trajectories, for the gains that explain the overshoot."""
+    """Return the figures of the gains that explain the overshoot: poles and damping over speed, and trajectories.
+
+    Args:
+        found: Results of section 4.
+        braked: Braking runs by name.
+    """
     gains = {"published": PUBLISHED_GAIN, "LMI, same k1": SAME_INTEGRAL, "K = [-121.8, -158.2]": GENTLE}
     speeds = np.geomspace(*DESIGN_BOX["speed"], 200)
     i = int(np.argmin([corner["plant.mass"] - corner["speed"] for corner in found.system.corners]))

@@ -1,4 +1,4 @@
-"""What a published result consists of: rows, figures, honest notes, and where the numbers come from."""
+"""Record of a published result: rows, figures, notes, and the origin of the numbers."""
 
 import dataclasses
 import json
@@ -19,14 +19,28 @@ from diffabs.simulate.solution import FixedStep, Run
 
 
 def lane(run: Run, i: int) -> Run:
-    """One run out of a batch, as NumPy arrays."""
+    """Return one run of a batch, as NumPy arrays.
+
+    Args:
+        run: Batch of runs.
+        i: Index of the run.
+    """
     return jax.tree.map(lambda x: np.asarray(x[i]), run)
 
 
 def computed_row(
     name: str, quantity: str, unit: str, ours: Any, *, published: float | None = None, reference: float | None = None
 ) -> dict[str, Any]:
-    """A line of a table, with the paper's number, or one that was computed independently, or neither."""
+    """Return a row of a table with our number and, if known, the paper's or an independent number.
+
+    Args:
+        name: Name of the row.
+        quantity: Quantity of the row.
+        unit: Unit of the quantity.
+        ours: Our number.
+        published: Number of the paper.
+        reference: Number of an independent computation.
+    """
     ours, expected = float(ours), reference if published is None else published
     difference = None if expected is None else ours - expected
     line = {"name": name, "quantity": quantity, "unit": unit, "ours": ours}
@@ -34,42 +48,78 @@ def computed_row(
 
 
 def printed_row(name: str, quantity: str, unit: str, ours: Any, published: float, digits: int = 2) -> dict[str, Any]:
-    """A line of a table whose published number has so many decimals; `matches` if ours rounds to it."""
+    """Return a row of a table whose published number is rounded; `matches` tells whether ours rounds to it.
+
+    Args:
+        name: Name of the row.
+        quantity: Quantity of the row.
+        unit: Unit of the quantity.
+        ours: Our number.
+        published: Number of the paper.
+        digits: Decimals of the paper's number.
+    """
     line = computed_row(name, quantity, unit, ours, published=published)
     return {**line, "matches": round(line["ours"], digits) == round(published, digits)}
 
 
 def format_time(time: Any) -> float | str:
-    """Return a time [s] as a summary has it: "never" where it is infinite."""
+    """Return a time [s] for a summary: "never" if it is infinite.
+
+    Args:
+        time: Time [s].
+    """
     return "never" if math.isinf(float(time)) else float(time)
 
 
 def solver_settings(step: FixedStep, **more: Any) -> dict[str, Any]:
-    """How it was integrated."""
+    """Return the settings of the integration for a summary.
+
+    Args:
+        step: Solver with a fixed step.
+        more: Further entries.
+    """
     dtype = str(jnp.result_type(float))
     return {"method": "RK4, fixed step", "step": step.step, "duration": step.duration, "dtype": dtype, **more}
 
 
 def origin_of_numbers() -> dict[str, str]:
-    """Of everything that can change a number, and the commit where there is one."""
+    """Return the versions of everything that can change a number, and the commit if there is one."""
     return provenance.describe_platform("jaxlib", "numpy", "matplotlib") | provenance.commit()
 
 
 def write_summary(folder: pathlib.Path, summary: dict[str, Any], name: str = "summary.json") -> dict[str, Any]:
-    """Write a summary, whole or not at all, and return it as a reader would get it. Raises ValueError for a number
-    that is not finite."""
+    """Write a summary atomically, and return it as a reader of the file gets it.
+
+    Args:
+        folder: Existing folder.
+        summary: Contents, as for JSON.
+        name: Name of the file.
+
+    Raises:
+        ValueError: A number is not finite.
+    """
     text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False)
     files.write_file(folder / name, f"{text}\n".encode())
     return json.loads(text)
 
 
 def save_figures(figures: Mapping[str, Any], folder: pathlib.Path) -> list[str]:
-    """Write figures into a folder, and return the names of their files."""
+    """Write figures into a folder, and return the names of their files.
+
+    Args:
+        figures: Figures by file name without suffix.
+        folder: Existing folder.
+    """
     return [plot.save_figure(figure, folder / f"{name}.png").name for name, figure in figures.items()]
 
 
 def print_rows(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print rows of equal keys as a table; floats with five significant digits or four decimals."""
+    """Print rows of equal keys as a table, with floats at five significant digits or four decimals.
+
+    Args:
+        title: Title of the table.
+        rows: Rows of equal keys.
+    """
     table = Table(title=title, title_justify="left")
     for name in rows[0]:
         table.add_column(name, justify="left" if isinstance(rows[0][name], str) else "right")
@@ -88,8 +138,13 @@ def _short(value: Any) -> str:
 
 
 def experiment(config: Any, results: Mapping[str, Any], figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Write an experiment's figures and `results.json` into its folder `config.out`, with config and versions; returns
-    what was written."""
+    """Write an experiment's figures and `results.json` with config and versions, and return the contents of this file.
+
+    Args:
+        config: Dataclass of the experiment's settings; `config.out` is the folder.
+        results: Results, as for JSON.
+        figures: Figures by file name without suffix.
+    """
     folder = pathlib.Path(config.out)
     folder.mkdir(parents=True, exist_ok=True)
     names = save_figures(figures, folder)

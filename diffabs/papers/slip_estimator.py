@@ -1,8 +1,8 @@
-"""Aoki and Nakamura, anti-lock braking at the slip that an accelerometer finds best: Tables 1 and 2, figures 1, 7-12.
+"""Aoki and Nakamura, anti-lock braking at the best slip by an accelerometer: Tables 1 and 2, figures 1, 7-12.
 
 A quarter car brakes from 100 km/h without anti-lock control, with a fixed target slip of 0.2 (conventional), and with
-the estimated one (proposed), each under P, PI, PD and PID control. The paper gives neither the wheel's inertia nor the
-friction curve: both were identified from its two tables, once as a spline and once as a Magic Formula.
+the estimated slip (proposed). Both targets run under P, PI, PD and PID control. The paper gives neither the wheel's
+inertia nor the friction curve. Both were identified from its two tables, once as a spline and once as a Magic Formula.
 """
 
 import math
@@ -31,13 +31,13 @@ from diffabs.simulate.solution import FixedStep, Run
 
 TITLE = "Aoki and Nakamura: anti-lock braking at the estimated best slip (quarter car, from 100 km/h)"
 SOLVER = FixedStep(step=5e-5, duration=3.6, every=20)
-COARSE = FixedStep(step=1e-4, duration=7.2, every=20)  # as many steps, so that it does not compile again
+COARSE = FixedStep(step=1e-4, duration=7.2, every=20)  # same number of steps, so one compilation serves both
 LITERAL = (FixedStep(step=1e-4, duration=10.0, every=100), FixedStep(step=1e-3, duration=100.0, every=100))
 CARS = {"spline B": QuarterCar(), "Magic Formula": QuarterCar(inertia=1.0539, road=MagicFormula())}
 PAPER_METHODS = ("conventional", "proposed")
 PID_GAINS = {"P": (0.0, 0.0), "PI": (5000.0, 0.0), "PD": (0.0, 5.67), "PID": (5000.0, 5.67)}  # kI, kD
 
-PUBLISHED_STOPS = {  # stopping time [s] and distance [m] of Tables 1 and 2; "no ABS" stands in both
+PUBLISHED_STOPS = {  # stopping time [s] and distance [m] of Tables 1 and 2; "no ABS" is in both
     "no ABS": (3.46, 46.50),
     "conventional P": (3.11, 43.85),
     "conventional PI": (3.20, 44.90),
@@ -48,8 +48,8 @@ PUBLISHED_STOPS = {  # stopping time [s] and distance [m] of Tables 1 and 2; "no
     "proposed PD": (3.01, 42.84),
     "proposed PID": (2.99, 42.86),
 }
-LOCKED_PUBLISHED = 1.4  # s, "about": from the lock to the stop, in the text on fig. 1
-BOUNDS = {"unlimited": 39.699, "90 N m": 42.1808}  # m, computed without this package (SciPy, DOP853), spline B
+LOCKED_PUBLISHED = 1.4  # s, "about 1.4 s" from the lock to the stop, in the text on fig. 1
+BOUNDS = {"unlimited": 39.699, "90 N m": 42.1808}  # m, independent numbers (SciPy, DOP853), spline B
 
 NOTES = [
     "The paper gives neither the wheel's inertia nor the friction curve. Both were identified from Tables 1 and 2, the "
@@ -74,8 +74,13 @@ NOTES = [
 
 
 class EstimatorResults(NamedTuple):
-    """Runs by row of the tables for each friction curve, the first curve's at the coarse step, the literal
-    estimator's."""
+    """Runs that the tables and figures need.
+
+    Attributes:
+        runs: Runs by friction curve and row of the tables.
+        coarse: Runs of the first friction curve at twice the step.
+        literal: Runs of the literal estimator.
+    """
 
     runs: dict[str, dict[str, Run]]
     coarse: dict[str, Run]
@@ -83,12 +88,23 @@ class EstimatorResults(NamedTuple):
 
 
 def loop(car: QuarterCar, reference: Reference, controller: Block) -> Loop:
-    """The closed loop of the paper's section 5."""
+    """Return the closed loop of the paper's section 5.
+
+    Args:
+        car: Plant.
+        reference: Reference of the slip.
+        controller: Controller of the slip.
+    """
     return braking(plant=car, reference=reference, controller=controller)
 
 
 def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
-    """All nine runs on one car, by row of the tables."""
+    """Return all nine runs on one car, by row of the tables.
+
+    Args:
+        car: Plant.
+        solver: Solver.
+    """
     locked = rollout(loop(car, FixedSlip(), ConstantTorque(torque=90.0)), solver, BRAKING)
     runs = {"no ABS": jax.tree.map(np.asarray, locked)}
     for method, reference in (("conventional", FixedSlip()), ("proposed", PeakLatch())):
@@ -101,13 +117,17 @@ def run(car: QuarterCar, solver: FixedStep = SOLVER) -> dict[str, Run]:
 
 
 def run_literal() -> list[Run]:
-    """The estimator as printed, under P control, at two sampling periods."""
+    """Return the runs of the estimator as printed, under P control, at two sampling periods."""
     printed = loop(CARS["spline B"], PeakLiteral(), PID(kp=3893.0, low=0.0, high=90.0))
     return [jax.tree.map(np.asarray, rollout(printed, solver, BRAKING)) for solver in LITERAL]
 
 
 def run_all(progress: Callable[[str], None]) -> EstimatorResults:
-    """Every run that the tables and figures need."""
+    """Return every run that the tables and figures need.
+
+    Args:
+        progress: Function that receives a sentence before each long computation.
+    """
     runs = {}
     for name, car in CARS.items():
         progress(f"slip-estimator: nine runs on {name}")
@@ -119,7 +139,11 @@ def run_all(progress: Callable[[str], None]) -> EstimatorResults:
 
 
 def table(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
-    """The twenty numbers of Tables 1 and 2. The row without control stands in both and is counted twice."""
+    """Return the rows of the twenty numbers of Tables 1 and 2; "no ABS" is in both tables and counts twice.
+
+    Args:
+        runs: Runs on one car, by row of the tables.
+    """
     rows = []
     for number, method in ((1, "conventional"), (2, "proposed")):
         for name in ("no ABS", *(f"{method} {controller}" for controller in PID_GAINS)):
@@ -131,19 +155,37 @@ def table(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
 
 
 def worst_difference(rows: list[dict[str, Any]], quantity: str) -> float:
-    """Largest difference from a published number."""
+    """Return the largest absolute difference from a published number.
+
+    Args:
+        rows: Rows of the tables.
+        quantity: Quantity of the rows that count.
+    """
     return max(abs(row["difference"]) for row in rows if row["quantity"] == quantity)
 
 
 def locked_time(run: Run) -> float:
-    """Time from the lock of the wheel to standstill [s]."""
+    """Return the time from the lock of the wheel to standstill [s].
+
+    Args:
+        run: Run with a trajectory.
+    """
     sample = _seen(run).sample
     still = np.argmax(sample.output.wheel_speed <= 0)
     return float(run.metrics["stop_time"] - sample.t[still])
 
 
 def shortest_distances(car: QuarterCar, locked: Run) -> dict[str, float]:
-    """Shortest distances [m]: at the greatest friction from the start; and with full torque up to that slip first."""
+    """Return two bounds of the stopping distance [m].
+
+    Args:
+        car: Plant.
+        locked: Run at full torque, with a trajectory.
+
+    Returns:
+        "unlimited": Distance at the greatest friction from the start. "90 N m": distance with full torque up to the
+        slip of greatest friction, and this friction from there.
+    """
     best = jax.jit(peak)(car.road)
     y = _seen(locked).sample.output
     i = int(np.argmax(y.slip >= float(best.slip)))
@@ -154,7 +196,11 @@ def shortest_distances(car: QuarterCar, locked: Run) -> dict[str, float]:
 
 
 def extra_rows(results: EstimatorResults) -> list[dict[str, Any]]:
-    """The Magic Formula's distance from the tables, the lock, the literal estimator, the bounds."""
+    """Return the rows of the Magic Formula, the locked time, the literal estimator and the bounds.
+
+    Args:
+        results: Runs that the rows need.
+    """
     spline, magic = results.runs.values()
     rows = [{**row, "name": f"{row['name']} (Magic Formula)"} for row in table(magic)]
     for quantity, unit in (("stopping time", "s"), ("stopping distance", "m")):
@@ -176,7 +222,11 @@ def extra_rows(results: EstimatorResults) -> list[dict[str, Any]]:
 
 
 def figures(results: EstimatorResults) -> dict[str, Any]:
-    """The figures, by file name."""
+    """Return the figures by file name.
+
+    Args:
+        results: Runs that the figures need.
+    """
     runs = results.runs["spline B"]
     seen = {name: _seen(one) for name, one in runs.items()}
     drawn = {
@@ -205,7 +255,12 @@ def figures(results: EstimatorResults) -> dict[str, Any]:
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Write figures and `summary.json` into the folder; returns the summary."""
+    """Write figures and `summary.json` into the folder, and return the summary.
+
+    Args:
+        folder: Existing folder.
+        progress: Function that receives a sentence before each long computation.
+    """
     results = run_all(progress)
     progress("slip-estimator: figures")
     names = record.save_figures(figures(results), folder)
@@ -256,7 +311,11 @@ CLAIMS = (
 
 
 def compact(summary: Mapping[str, Any]) -> Digest:
-    """Tables 1 and 2, ours beside the paper's."""
+    """Return the digest: Tables 1 and 2 with our numbers beside the paper's.
+
+    Args:
+        summary: Contents of `summary.json`.
+    """
     rows, columns = summary["rows"], ("stopping time", "stopping distance")
     printed = [row for row in rows if row["name"].startswith("Table ") and "Magic" not in row["name"]]
     by_place = {(row["name"].partition(": ")[2], row["quantity"]): row for row in printed}

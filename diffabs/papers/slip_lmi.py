@@ -1,7 +1,8 @@
 """Maeda and Sugiura, robust LQ control of an anti-lock brake in polytopic form: sections 4 and 5, figures 4-7.
 
 The mirrored rig brakes from 50 to 5 km/h under u = tau* + K x with the published gain, at 5.3 and 6.2 kg. The paper
-says in words that the slip overshoots and then follows 0.2, so the numbers are compared with an independent solution.
+states its result only in words: the slip overshoots and then follows 0.2. The numbers are therefore compared with an
+independent solution.
 """
 
 import dataclasses
@@ -30,16 +31,26 @@ from diffabs.simulate.solution import FixedStep, Run, Trajectory
 from diffabs.stops import SpeedReached
 
 TITLE = "Maeda and Sugiura: robust LQ control of an anti-lock brake (mirrored rig, 50 to 5 km/h)"
-STEP_S = 2e-5  # s; at the torque limits 5e-5 leaves more than 1e-6
+STEP_S = 2e-5  # s; 5e-5 gives relative errors above 1e-6 at the torque limits
 SOLVER = FixedStep(step=STEP_S, duration=3.4, every=50)
-HALVING_STEPS = 27_000  # as many at every step length, so that one compilation serves all
+HALVING_STEPS = 27_000  # same number at every step length, so one compilation serves all
 HALVINGS = tuple(4e-3 / 2**i for i in range(7))  # s
 FILTER = 0.035  # s, time constant of the reference filter
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A mass [kg], torque limits [N m], the fraction c in J2 = c m r2^2, and the slip at the start."""
+    """A braking run of the mirrored rig.
+
+    Attributes:
+        name: Name in the tables.
+        mass: Mass [kg].
+        torque_min: Lower torque limit [N m].
+        torque_max: Upper torque limit [N m].
+        gain: K of u = tau* + K x.
+        inertia_factor: c in J2 = c m r2^2.
+        slip: Slip at the start.
+    """
 
     name: str
     mass: float
@@ -65,13 +76,13 @@ GAIN_CASES = (
     Case("K = [-121.8, -158.2]", 5.3, gain=lmi_design.GENTLE),
 )
 
-CONVERGENCE = {  # expected order, and the step lengths above rounding and below the first, coarse ones
+CONVERGENCE = {  # expected order, and the step lengths of the fit: finer than the coarsest, with errors above rounding
     CASES[6]: (4.0, slice(0, 4)),
     CASES[0]: (3.1, slice(3, 7)),
     CASES[2]: (None, slice(0, 7)),
 }
 
-# Computed without this package: SciPy, DOP853 at rtol 3e-14; limits, band crossings and the stop located as events.
+# Independent numbers: SciPy, DOP853 at rtol 3e-14; limits, band crossings and the stop are located as events.
 COMPARED_QUANTITIES = ("max_slip", "settling_time", "stop_time", "stop_distance", "iae")
 REFERENCE_RUNS = {
     CASES[0].name: (0.308331266209, 0.122692335, 1.611940500246, 12.326404879818, 0.005443262785),
@@ -82,7 +93,7 @@ REFERENCE_RUNS = {
 REFERENCE_CAR = {CASES[4].name: (3.221814333307, 24.624170444040), CASES[5].name: (3.221788145339, 24.623806825348)}
 REFERENCE_PEAK = (0.187542005875, 0.395794085737)
 REFERENCE_MU = {0.2: 0.39575220833898, 1.0: 0.399595428169}
-Errors = dict[str, dict[str, list[float]]]  # by case and quantity, one for each step length
+Errors = dict[str, dict[str, list[float]]]  # by case and quantity, one error for each step length
 QUANTITY_UNITS = {"max_slip": "1", "settling_time": "s", "stop_time": "s", "stop_distance": "m", "iae": "s"}
 
 NOTES = [
@@ -106,7 +117,12 @@ NOTES = [
 
 
 def loop(case: Case, reference: Any = None) -> Loop:
-    """The closed loop of section 5."""
+    """Return the closed loop of section 5.
+
+    Args:
+        case: Settings of the run.
+        reference: Reference of the slip; None is a fixed slip.
+    """
     return braking(
         plant=MirroredRig(mass=case.mass, inertia_factor=case.inertia_factor),
         initial=BrakeStart(speed=50 / 3.6, slip=case.slip),
@@ -118,20 +134,24 @@ def loop(case: Case, reference: Any = None) -> Loop:
 
 
 def run() -> dict[str, Run]:
-    """Every case, by name."""
+    """Return the runs of all cases by name."""
     cases = CASES + GAIN_CASES
     done = run_batch(*stack_loops([loop(case) for case in cases]), SOLVER, BRAKING, trajectories=True, accepted=True)
     return {case.name: record.lane(done, i) for i, case in enumerate(cases)}
 
 
 def run_filtered() -> Run:
-    """The first case with a filtered reference."""
+    """Return the run of the first case with a filtered reference."""
     filtered = FilteredSlip(time_constant=FILTER)
     return jax.tree.map(np.asarray, rollout(loop(CASES[0], filtered), SOLVER, BRAKING))
 
 
 def convergence_errors(fine: Mapping[str, Run]) -> Errors:
-    """Relative errors against a finer run at each step length, by case and quantity."""
+    """Return the relative errors at each step length against a finer run, by case and quantity.
+
+    Args:
+        fine: Runs at a finer step, by name.
+    """
     lanes = stack_loops([loop(case) for case in CONVERGENCE])
     solvers = [FixedStep(step=step, duration=step * HALVING_STEPS) for step in HALVINGS]
     runs = [run_batch(*lanes, solver, BRAKING, together=True, accepted=True) for solver in solvers]
@@ -145,12 +165,21 @@ def convergence_errors(fine: Mapping[str, Run]) -> Errors:
 
 
 def convergence_order(errors: list[float], points: slice) -> float:
-    """Slope of log error over log step, through some of the points."""
+    """Return the slope of log error over log step length.
+
+    Args:
+        errors: Relative error for each step length.
+        points: Step lengths that count.
+    """
     return float(np.polyfit(np.log(HALVINGS[points]), np.log(errors[points]), 1)[0])
 
 
 def table(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
-    """The braking table, then the car's inertia, then the overshoot."""
+    """Return the rows of the braking runs and of the runs with the car's inertia.
+
+    Args:
+        runs: Runs by name.
+    """
     rows = []
     for name, expected in REFERENCE_RUNS.items():
         for quantity, exact in zip(COMPARED_QUANTITIES, expected, strict=True):
@@ -170,7 +199,12 @@ def table(runs: Mapping[str, Run]) -> list[dict[str, Any]]:
 
 
 def extra_rows(filtered: Run, errors: Errors) -> list[dict[str, Any]]:
-    """The cure, the friction curve, and the measured order of convergence."""
+    """Return the rows of the filtered reference, the friction curve and the measured order of convergence.
+
+    Args:
+        filtered: Run with a filtered reference.
+        errors: Relative errors by case and quantity.
+    """
     found = jax.jit(peak)(RIG)
     rows = [
         record.computed_row("reference filter, 35 ms", "overshoot", "1", filtered.metrics["overshoot"], reference=0.0),
@@ -189,7 +223,13 @@ def extra_rows(filtered: Run, errors: Errors) -> list[dict[str, Any]]:
 
 
 def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> dict[str, Any]:
-    """The figures, by file name."""
+    """Return the figures by file name.
+
+    Args:
+        runs: Runs by name.
+        filtered: Run with a filtered reference.
+        errors: Relative errors by case and quantity.
+    """
     seen: dict[str, Any] = {name: one.trajectory for name, one in runs.items()}
     drawn = {}
     for case, number in ((CASES[0], 4), (CASES[3], 6)):
@@ -217,7 +257,12 @@ def figures(runs: Mapping[str, Run], filtered: Run, errors: Errors) -> dict[str,
 
 
 def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Write figures and `summary.json` into the folder; returns the summary."""
+    """Write figures and `summary.json` into the folder, and return the summary.
+
+    Args:
+        folder: Existing folder.
+        progress: Function that receives a sentence before each long computation.
+    """
     progress(f"slip-lmi: braking {len(CASES)} cases at {STEP_S:g} s")
     runs = run()
     progress("slip-lmi: the same with a filtered reference")
@@ -245,7 +290,11 @@ def reproduce(folder: pathlib.Path, progress: Callable[[str], None]) -> dict[str
 
 
 def compact(summary: Mapping[str, Any]) -> Digest:
-    """The braking runs, and how far the worst of each is from the independent solution."""
+    """Return the digest: the braking runs, and the largest relative difference of each from the independent solution.
+
+    Args:
+        summary: Contents of `summary.json`.
+    """
     rows, columns = summary["rows"], ("max_slip", "settling_time", "stop_time", "stop_distance")
     lines = []
     for name in (*REFERENCE_RUNS, *REFERENCE_CAR):
@@ -260,7 +309,7 @@ def compact(summary: Mapping[str, Any]) -> Digest:
 
 
 def _designed(runs: Mapping[str, Run], filtered: Run) -> tuple[list[dict[str, Any]], dict[str, Any], dict[str, Any]]:
-    """Rows, figures, and what else section 4 has to say; only a note where its solver is not installed."""
+    """Return rows, figures and summary entries of section 4; only a note if its solver is not installed."""
     try:
         found = lmi_design.Designed()
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""A two-wheeler seen from behind: its frame on the ground contact line, an arm that a motor turns, and a rider.
+"""A two-wheeler seen from behind: a frame on the ground contact line, an arm that a motor turns, and a rider.
 
     theta1 = theta        frame, from the vertical       theta2 = psi, theta3 = phi     arm and rider, from the frame
 
@@ -12,13 +12,15 @@
     a = I1 + m1 lg^2 + (m2 + m3) l^2   p2 = I2 + m2 Lg^2   p3 = I3 + m3 hg^2   c2 = m2 l Lg   c3 = m3 l hg
     b1 = m1 lg + (m2 + m3) l           b2 = m2 Lg          b3 = m3 hg
 
-Fumita, section 2, whose kinetic energy, eqs. (1), (3), (5), this is. The paper's potential energy has theta1 - theta2
-and theta1 - theta3 where its kinetic energy has the sums: two conventions in one Lagrangian. Eqs. (4) and (6) also lack
-g in their first terms, eq. (8) lacks l in the term with theta2'^2, and the centrifugal terms of (9), (10) have the
-other sign. Here everything follows from one Lagrangian; `PrintedArm` is the paper's own linear model. Without a rider
-(mass, stiffness and damping 0) this is the Acrobot of Spong. A gear of ratio N and a rotor of inertia Jr, which the
-paper does not have, act as N Kt, N Kb and N^2 Jr about the arm's joint; what the spinning rotor does to the frame is
-left out.
+The kinetic energy is that of Fumita, section 2, eqs. (1), (3), (5). All equations here follow from one Lagrangian.
+
+The paper's potential energy uses theta1 - theta2 and theta1 - theta3, but its kinetic energy uses the sums: two
+conventions in one Lagrangian. Eqs. (4) and (6) also lack g in their first terms, and eq. (8) lacks l in the term with
+theta2'^2. The centrifugal terms of (9), (10) have the opposite sign. `PrintedArm` is the paper's own linear model.
+
+Without a rider (mass, stiffness and damping 0) this is the Acrobot of Spong. The paper has no gear. Here a gear of
+ratio N and a rotor of inertia Jr act as N Kt, N Kb and N^2 Jr about the arm's joint. The model neglects the reaction of
+the spinning rotor on the frame.
 """
 
 from collections.abc import Callable, Iterator
@@ -50,7 +52,7 @@ class ArmState(NamedTuple):
 
 
 class Lumps(NamedTuple):
-    """What the equations contain of masses and lengths: a, p2, p3, c2, c3 [kg m^2], b1, b2, b3 [kg m]."""
+    """Coefficients of masses and lengths in the equations: a, p2, p3, c2, c3 [kg m^2], b1, b2, b3 [kg m]."""
 
     a: Scalar
     p2: Scalar
@@ -75,21 +77,29 @@ class BalanceStart:
 
 
 def usual_parts(self: Any) -> dict[str, Any]:
-    """Return what surrounds a two-wheeler where nothing is said: feedback that holds it upright until it falls."""
+    """Return the default loop around a two-wheeler: feedback that holds it upright until it falls.
+
+    Args:
+        self: The plant; it has no effect.
+    """
     del self
     around = {"reference": Upright(), "controller": BalanceFeedback(), "actuator": VoltageLimit(), "stop": Fallen()}
     return {"initial": BalanceStart(), **around}
 
 
 def usual_objectives(self: Any) -> dict[str, Any]:
-    """Return what every run of a two-wheeler is measured by."""
+    """Return the default objectives of a two-wheeler, by name.
+
+    Args:
+        self: The plant; it has no effect.
+    """
     del self
     return dict(BALANCE)
 
 
 @pytree
 class ArmBalance:
-    """Frame, arm and rider under the voltage of the arm's motor. A negative `arm_length` is an arm that hangs."""
+    """Frame, arm and rider under the voltage of the arm's motor. A negative `arm_length` is a hanging arm."""
 
     body_mass: Scalar = param(default=30.0, unit="kg", above=0.0)
     arm_mass: Scalar = param(default=20.0, unit="kg", above=0.0)
@@ -118,7 +128,7 @@ class ArmBalance:
     usual_parts, usual_objectives = usual_parts, usual_objectives
 
     def lumps(self) -> Lumps:
-        """Masses and lengths as they enter the equations."""
+        """Return the coefficients of masses and lengths in the equations."""
         upper = self.arm_mass + self.rider_mass
         return Lumps(
             a=self.body_inertia + self.body_mass * self.body_height**2 + upper * self.mount_height**2,
@@ -132,23 +142,33 @@ class ArmBalance:
         )
 
     def torque(self, psi_rate: Scalar, control: Scalar) -> Any:
-        """tau [N m] under a voltage [V], eq. (11): N Kt i - fm psi', i = (u - N Kb psi')/Rm within its limit."""
+        """Return tau [N m], eq. (11): N Kt i - fm psi', with i = (u - N Kb psi')/Rm clamped to its limit.
+
+        Args:
+            psi_rate: Rate of the arm psi' [rad/s].
+            control: Motor voltage u [V].
+        """
         current = quotient(control - self.gear * self.back_emf * psi_rate, self.resistance)
         current = clamp(current, -self.current_max, self.current_max)
         return self.gear * self.torque_constant * current - self.friction * psi_rate
 
     def start(self, initial: BalanceStart) -> ArmState:
-        """The state with these angles and rates."""
+        """Return the state with the angles and rates of `initial`."""
         return ArmState(*(getattr(initial, name) for name in ArmState._fields))
 
     def derivative(self, t: Scalar, state: ArmState, control: Scalar) -> ArmState:
-        """dx/dt under the motor voltage `control` [V]. M is inverted by its Schur complement: p2 and p3 stand alone."""
+        """Return dx/dt under the motor voltage `control` [V]."""
         del t
         rates = (state.theta_rate, state.psi_rate, state.phi_rate)
         return ArmState(*rates, *self.accelerations(state, self.torque(state.psi_rate, control)))
 
     def accelerations(self, state: ArmState, torque: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-        """theta'', psi'', phi'' [rad/s^2] under a torque between frame and arm [N m]."""
+        """Return theta'', psi'', phi'' [rad/s^2], by the Schur complement of M: its lower block is diagonal.
+
+        Args:
+            state: Angles [rad] and rates [rad/s].
+            torque: Torque between frame and arm [N m].
+        """
         theta, psi, phi, v1, v2, v3 = state
         _, _, _, c2, c3, b1, b2, b3 = lumps = self.lumps()
         (sin1, cos1), (sin2, cos2), (sin3, cos3) = ((jnp.sin(x), jnp.cos(x)) for x in (theta, psi, phi))
@@ -159,33 +179,34 @@ class ArmBalance:
         r2 = torque - c2 * sin2 * v1**2 + arm
         r3 = -self.stiffness * phi - self.damping * v3 - c3 * sin3 * v1**2 + rider
         m11, m12, m13, m22, m33 = _mass(lumps, cos2, cos3, self.gear**2 * self.rotor_inertia)
+        # psi'' and phi'' are eliminated first: m23 = 0, so the lower block of M is diagonal.
         by2, by3 = m12 / m22, m13 / m33
         first = quotient(r1 - by2 * r2 - by3 * r3, m11 - by2 * m12 - by3 * m13)
         return first, r2 / m22 - by2 * first, r3 / m33 - by3 * first
 
     def project(self, state: ArmState) -> ArmState:
-        """Every state is admissible; that the vehicle has fallen is for the stop to say."""
+        """Return the state itself, because every state is admissible; the stop detects a fall."""
         return state
 
     def output(self, state: ArmState) -> BalanceOutput:
-        """Angles, rates, and what the motor makes of a voltage."""
+        """Return angles, rates, and the parameters from which the motor's torque follows."""
         like = 0.0 * state.theta
         motor = (self.gear * self.torque_constant, self.gear * self.back_emf * state.psi_rate, self.resistance)
         return BalanceOutput(*state, *(x + like for x in (*motor, self.current_max)))
 
     def holding(self, output: BalanceOutput, target: Scalar) -> Scalar:
-        """No voltage holds anything but the upright position, which needs none."""
+        """Return 0 V: only the upright position is an equilibrium without motion, and it needs no voltage."""
         del target
         return 0.0 * output.theta
 
     def kinetic_energy(self, state: ArmState) -> Scalar:
-        """q' M q'/2 [J]."""
+        """Return the kinetic energy q' M q'/2 of a `state` [J]."""
         _, psi, phi, v1, v2, v3 = state
         m11, m12, m13, m22, m33 = _mass(self.lumps(), jnp.cos(psi), jnp.cos(phi), self.gear**2 * self.rotor_inertia)
         return 0.5 * (m11 * v1**2 + m22 * v2**2 + m33 * v3**2) + (m12 * v2 + m13 * v3) * v1
 
     def potential_energy(self, state: ArmState) -> Scalar:
-        """Gravity, 0 at the ground, and the rider's spring [J]."""
+        """Return the energy of a `state` in gravity, 0 at the ground, and in the rider's spring [J]."""
         lumps = self.lumps()
         heights = (
             lumps.b1 * jnp.cos(state.theta)
@@ -195,36 +216,52 @@ class ArmBalance:
         return self.gravity * heights + 0.5 * self.stiffness * state.phi**2
 
     def energy(self, state: ArmState) -> Scalar:
-        """Kinetic and potential energy [J]. energy' = tau psi' - d phi'^2."""
+        """Return the kinetic and potential energy of a `state` [J]; energy' = tau psi' - d phi'^2."""
         return self.kinetic_energy(state) + self.potential_energy(state)
 
     def audit(self, initial: BalanceStart) -> BalanceAudit:
-        """A run that gains energy without the motor was not integrated stably."""
+        """Return the audit of runs from `initial`: more energy than the motor's work is instability."""
         lumps, start = self.lumps(), self.start(initial)
         fall = self.gravity * (lumps.b1 + abs(lumps.b2) + abs(lumps.b3))
         scale = fall + self.kinetic_energy(start) + 0.5 * self.stiffness * start.phi**2
         return BalanceAudit(plant=self, first=self.energy(start), scale=scale)
 
     def power(self, state: ArmState, control: Scalar) -> tuple[Scalar, Scalar]:
-        """What the motor puts in, tau psi', and what the rider's damper takes out, d phi'^2 [W]."""
+        """Return the motor's input tau psi' and the dissipation of the rider's damper d phi'^2 [W].
+
+        Args:
+            state: Angles [rad] and rates [rad/s].
+            control: Motor voltage [V].
+        """
         return self.torque(state.psi_rate, control) * state.psi_rate, self.damping * state.phi_rate**2
 
     def limits(self, gain: Any) -> np.ndarray:
-        """Rows (..., 1, 6): under u = gain x the motor is linear, its current within the limit, where |row x| <= 1.
-        Parameters may be stacked (...), in NumPy."""
+        """Return the rows of the motor's linear range, shape (..., 1, 6): the current is within its limit where |row x|
+        <= 1.
+
+        Args:
+            gain: K of the feedback u = K x, shape (..., 6) [V/rad, V s/rad]. The plant's parameters may be NumPy arrays
+                of shape (...).
+        """
         current = np.array(gain, float) / np.asarray(self.resistance)[..., None]
         current[..., 4] -= self.gear * self.back_emf / self.resistance
         return (current / np.asarray(self.current_max)[..., None])[..., None, :]
 
     def remainder(self, linear: Any, extent: Callable[[Any], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """What the equations add to their linearisation x' = linear x (..., 6, 6) under a feedback: x' = linear x + D y
-        with |y| <= Y, wherever |row x| <= extent(row) for all rows. D (..., 6, 3), Y (..., 3); parameters may be
-        stacked (...), in NumPy. If all extents become smaller by a factor, Y becomes so at least.
+        """Return D (..., 6, 3) and the bound Y (..., 3) of the nonlinear remainder D y, |y| <= Y.
+
+        The equations are x' = linear x + D y. The bound holds wherever |row x| <= extent(row) for all rows. If all
+        extents shrink by a factor, Y shrinks by at least the same factor.
 
             y = -(M(q) - M(0)) q'' - h - (G - G'(0) q)      D = (0, M(0)^-1)
 
-        by 1 - cos z <= z^2/2, |sin z - z| <= |z|^3/6, and |q''| <= |linear x| + |M(0)^-1| |y|. Y is infinite where
-        that last inequality bounds nothing.
+        Y follows from 1 - cos z <= z^2/2, |sin z - z| <= |z|^3/6, and |q''| <= |linear x| + |M(0)^-1| |y|. It is
+        infinite where the last inequality gives no bound.
+
+        Args:
+            linear: State matrix of the linearised closed loop, shape (..., 6, 6). The plant's parameters may be NumPy
+                arrays of shape (...).
+            extent: Function of a row (6,) that returns a bound of |row x|, shape (...).
         """
         _, _, _, c2, c3, b1, b2, b3 = (np.abs(x) for x in self.lumps())
         unit = np.eye(6)
@@ -244,14 +281,16 @@ class ArmBalance:
         loop = np.abs(inverse) @ changes
         accelerations = _columns(*(extent(np.asarray(linear)[..., 3 + i, :]) for i in range(3)))
         accelerations = accelerations + (np.abs(inverse) @ forces[..., None])[..., 0]
-        held = loop.sum(axis=-1).max(axis=-1) < 1  # then I - loop has a nonnegative inverse
+        # |q''| <= accelerations + loop |q''|. If the infinity norm of `loop` is below 1, I - loop has a nonnegative
+        # inverse, and the inequality can be solved for |q''|.
+        held = loop.sum(axis=-1).max(axis=-1) < 1
         safe = np.where(held[..., None, None], loop, 0.0)
         most = np.linalg.solve(np.eye(3) - safe, accelerations[..., None])[..., 0]
         amounts = forces + (changes @ most[..., None])[..., 0]
         return np.concatenate([np.zeros_like(inverse), inverse], axis=-2), np.where(held[..., None], amounts, np.inf)
 
     def cautions(self) -> Iterator[str]:
-        """A rider whom the spring cannot hold."""
+        """Yield a message if the spring cannot hold the rider on an upright frame."""
         least = self.rider_mass * self.gravity * self.rider_height
         if not self.stiffness > least:
             yield (
@@ -261,14 +300,14 @@ class ArmBalance:
 
 
 def _mass(lumps: Lumps, cos2: Scalar, cos3: Scalar, rotor: Scalar) -> tuple[Any, ...]:
-    """m11, m12, m13, m22, m33 of the mass matrix [kg m^2]; m23 is 0."""
+    """Return m11, m12, m13, m22, m33 of the mass matrix [kg m^2]; m23 is 0."""
     m12, m13 = lumps.p2 + lumps.c2 * cos2, lumps.p3 + lumps.c3 * cos3
     m11 = lumps.a + m12 + m13 + lumps.c2 * cos2 + lumps.c3 * cos3
     return m11, m12, m13, lumps.p2 + rotor, lumps.p3
 
 
 def _at_rest(lumps: Lumps, rotor: Any) -> np.ndarray:
-    """The mass matrix (..., 3, 3) upright."""
+    """Return the mass matrix of the upright position, shape (..., 3, 3) [kg m^2]."""
     m11, m12, m13, m22, m33 = _mass(lumps, 1.0, 1.0, rotor)
     zero = 0.0 * m11
     return np.stack([_columns(m11, m12, m13), _columns(m12, m22, zero), _columns(m13, zero, m33)], axis=-2)
@@ -295,5 +334,5 @@ ACROBOT = ArmBalance(
     friction=0.0,
     gravity=9.8,
 )
-"""Spong's Acrobot, driven by a torque [N m]. A rider without mass remains, who turns with his own inertia and touches
-nothing."""
+"""Spong's Acrobot, driven by a torque [N m]. The massless rider keeps its own inertia and moves without coupling to the
+rest."""

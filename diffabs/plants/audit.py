@@ -1,12 +1,15 @@
-"""What no vehicle can do, watched while it runs: an integration step that is not stable may leave every number finite.
+"""Energy audits of a run: they detect an unstable integration whose numbers all stay finite.
 
     energy     E(t + h) - E(t) <= work that the control may have done on the vehicle in that step; of a balance in all
     braked     distance does not fall, and grows no faster than the speed; friction alone changes the speed
 
-An audit is an objective whose value is at most 1 for a possible run: its unexplained gains of energy, in units of what
-is forgiven, a hundredth of the energy of the start. Work is bounded from the control and the speed at both ends of the
-step, each at its greatest, and twice that: within the step both may be greater. A brake's torque that is not negative
-does none. So legitimate gains (a negative torque that drives the wheel, a motor that rights a vehicle) are no alarm."""
+An audit is an objective with a value of at most 1 for a physically possible run. The value is the unexplained gain of
+energy divided by the tolerance, 1 % of the energy scale at the start.
+
+The bound of the work takes the greatest control and speed at both ends of the step, times 2. Both may be greater inside
+the step. A nonnegative brake torque does no work on the vehicle. The bound thus covers legitimate gains: a negative
+torque that drives the wheel, or a motor that rights a two-wheeler.
+"""
 
 from typing import Any
 
@@ -17,34 +20,43 @@ from diffabs.core.protocols import BalanceOutput, BrakeOutput, Ending, Memory, S
 from diffabs.core.pytree import Scalar, param, part, pytree, static
 from diffabs.objectives.tracking import no_integral
 
-FORGIVEN = 0.01  # of the energy of the start, in the whole run
-SPEED_ROUNDING = 1e-6  # of it in a step, 1e-5 of the distance: single precision
-MAX_STEP_RATIO = 2.0  # of the work, and of the way, that the ends of a step show
-SWING = 4.0  # of the decelerations at both ends: a slip may pass the friction's peak within the step
-MIN_STEP_ENERGY = 10.0  # m/s^2, and 1e-3 of the speed, that are no alarm at all
+FORGIVEN = 0.01  # tolerance for a whole run, as a fraction of the energy scale
+SPEED_ROUNDING = 1e-6  # single precision: fraction of the energy scale in one step; ten times as much of the distance
+MAX_STEP_RATIO = 2.0  # factor on the work and the distance that the ends of a step give
+SWING = 4.0  # factor on the decelerations at both ends: the slip may pass the friction's peak inside the step
+MIN_STEP_ENERGY = 10.0  # m/s^2, deceleration that is always accepted, as is 1e-3 of the speed
 
 
 def _driving_power(before: Any, after: Any) -> Any:
-    """The greatest value at either end, 0 where both are negative."""
+    """Return the greater of both values, and 0 where both are negative."""
     return jnp.maximum(jnp.maximum(before, after), 0.0)
 
 
 def _zero(self: Any, sample: Sample) -> Memory:
-    """No gain yet."""
+    """Return the memory with no gain of energy."""
     del self
     return Memory(held=0.0 * sample.t)
 
 
 def _excess(self: Any, memory: Memory, ending: Ending) -> Scalar:
-    """Unexplained gains of energy in units of what is forgiven."""
+    """Return the unexplained gain of energy relative to the tolerance [1]."""
     del ending
     return memory.held / (FORGIVEN * self.scale)
 
 
 @pytree
 class BrakeAudit:
-    """Of a braked vehicle: its kinetic energy is that of two masses, at the car's speed and at the wheel's rim, and of
-    `scale` [J] at the start. A negative control speeds the wheel up, unless it is a brake's command (`commanded`)."""
+    """Audit of a braked vehicle, whose kinetic energy is that of two masses: one at the car's speed and one at the
+    wheel's rim.
+
+    Attributes:
+        car: Mass at the car's speed [kg].
+        wheel: Mass at the speed of the wheel's rim [kg].
+        radius: Radius of the wheel [m].
+        scale: Energy at the start [J].
+        commanded: True if the control is the command of a brake. Otherwise the control is a torque, and a negative one
+            speeds the wheel up.
+    """
 
     car: Scalar = param(unit="kg", above=0.0)
     wheel: Scalar = param(unit="kg", above=0.0)
@@ -55,7 +67,8 @@ class BrakeAudit:
     start, flow, value = _zero, no_integral, _excess
 
     def update(self, memory: Memory, segment: Segment) -> Any:
-        """Add what a step gained without work; infinite for a step that no car makes."""
+        """Return the sum with the step's gain of energy without work; infinity after a step that no car can make."""
+        # An audit decides on validity only, so it needs no derivatives.
         before, sample, h = jax.lax.stop_gradient((segment.start, segment.end, segment.h))
         a, b = before.output, sample.output
         drive = 0.0 if self.commanded else _driving_power(-before.control, -sample.control)
@@ -65,10 +78,13 @@ class BrakeAudit:
 
 
 def _leaps(a: BrakeOutput, b: BrakeOutput, h: Scalar) -> Any:
-    """Whether no car goes from a to b in h: backwards, farther than its speed lets it, or with more deceleration than
-    friction gives."""
+    """Return whether no car can go from a to b in the time h.
+
+    Three conditions are impossible: to move backwards, to move farther than the speed allows, or to decelerate more
+    than friction allows.
+    """
     top = jnp.maximum(a.speed, b.speed)
-    way = 0.5 * MAX_STEP_RATIO * h * top  # give or take as much
+    way = 0.5 * MAX_STEP_RATIO * h * top  # the accepted interval is way - way to way + way
     far = jnp.abs(b.distance - a.distance - way) > way + 10 * SPEED_ROUNDING * (1.0 + jnp.abs(b.distance))
     friction = SWING * (jnp.abs(a.deceleration) + jnp.abs(b.deceleration)) + MIN_STEP_ENERGY
     return far | (jnp.abs(b.speed - a.speed) > h * friction + 1e-3 * top)
@@ -76,8 +92,15 @@ def _leaps(a: BrakeOutput, b: BrakeOutput, h: Scalar) -> Any:
 
 @pytree
 class BalanceAudit:
-    """Of a two-wheeler with a motor at one joint, whose torque and energy `plant` has: the energy at the end is at most
-    the `first`, of the size `scale`, and the motor's work. In between it would cost five cosines a step."""
+    """Audit of a two-wheeler with a motor at one joint: the energy at the end is at most `first` plus the motor's work.
+
+    The audit evaluates the energy only at the end of the run, because every evaluation costs five cosines.
+
+    Attributes:
+        plant: Plant with `torque` and `energy`.
+        first: Energy at the start [J].
+        scale: Energy scale of the tolerance [J].
+    """
 
     plant: Any = part()
     first: Scalar = param(unit="J")
@@ -86,7 +109,9 @@ class BalanceAudit:
     start, flow = _zero, no_integral
 
     def update(self, memory: Memory, segment: Segment) -> Any:
-        """Add the work that the motor may have done: of torques and rates in the same direction."""
+        """Return the sum with the work that the motor may have done in the step, from torques and rates of the same
+        sign.
+        """
         before, sample, h = jax.lax.stop_gradient((segment.start, segment.end, segment.h))
         w0, w1 = before.output.psi_rate, sample.output.psi_rate
         t0, t1 = self.plant.torque(w0, before.control), self.plant.torque(w1, sample.control)
@@ -95,7 +120,7 @@ class BalanceAudit:
         )
 
     def value(self, memory: Memory, ending: Ending) -> Scalar:
-        """Unexplained gain of energy in units of what is forgiven."""
+        """Return the unexplained gain of energy relative to the tolerance [1]."""
         y: BalanceOutput = ending.sample.output
         gain = self.plant.energy(self.plant.start(y)) - self.first - memory.held
         return gain / (FORGIVEN * self.scale)

@@ -1,20 +1,23 @@
-"""The laboratory anti-lock brake rig of INTECO, as its manual models it.
+"""The laboratory anti-lock brake rig of INTECO, as modelled in its manual.
 
     Fn = (Mg + s1 (M1 + M10) + d1 omega1)/(L (sin phi - mu cos phi))
     J1 omega1' = Fn r1 mu - d1 omega1 - s1 (M1 + M10)
     J2 omega2' = -(Fn r2 mu + d2 omega2 + s2 M20)
     M1' = c31 (b(u) - M1),   b(u) = max(b1 u + b2, 0) for u >= u0, else 0
 
-The braked upper wheel hangs on a lever of length L and presses on the lower wheel, the "road", at the angle phi: its
-brake torque adds to the normal force. mu is odd in the slip, so the manual's sign s of the slip is inside it. Eq. (1)
-of Maeda and Sugiura with tau_b + tau_1 = Mg + M1 + M10 + d1 omega1. Radii, J1 and the friction curve are confirmed by
-that paper; the other constants are as commonly published and were not verified against the manual.
+The braked upper wheel hangs on a lever of length L and presses on the lower wheel, the "road", at the angle phi. Its
+brake torque adds to the normal force. mu is odd in the slip and so contains the manual's sign s of the slip. This is
+eq. (1) of Maeda and Sugiura with tau_b + tau_1 = Mg + M1 + M10 + d1 omega1. That paper confirms the radii, J1 and the
+friction curve. The other constants are as commonly published and were not verified against the manual.
 
-A stopped wheel sticks: the brake then carries T = r1 mu Mg/(L (sin phi - mu cos phi) - r1 mu), what the road asks for,
-as long as that is below M1 + M10. Where r1 mu exceeds L (sin phi - mu cos phi) no torque holds the wheel.
+A stopped wheel sticks while the road's torque T is below M1 + M10; the brake then carries exactly T. Where r1 mu
+exceeds L (sin phi - mu cos phi), no torque holds the wheel.
 
-At mu = tan phi the lever locks itself: no finite normal force balances it. Such a road is refused; a run that meets one
-further on has diverged."""
+    T = r1 mu Mg/(L (sin phi - mu cos phi) - r1 mu)
+
+At mu = tan phi the lever locks itself: no finite normal force balances it. `rules` refuses such a road. A run that
+meets such friction later has diverged.
+"""
 
 import math
 from collections.abc import Iterator
@@ -45,7 +48,14 @@ from diffabs.roads.sign import stays_below
 
 
 class LabRigState(NamedTuple):
-    """Angular speeds of the braked and of the road wheel [rad/s], brake torque [N m], distance r2 * angle [m]."""
+    """State of the rig.
+
+    Attributes:
+        wheel: Angular speed of the braked wheel [rad/s].
+        drum: Angular speed of the road wheel [rad/s].
+        brake: Brake torque [N m].
+        distance: r2 * angle of the road wheel [m].
+    """
 
     wheel: Scalar
     drum: Scalar
@@ -56,7 +66,8 @@ class LabRigState(NamedTuple):
 @pytree
 class LabRig:
     """Two wheels, a lever, bearing friction, and a brake with a 49 ms lag. The control u in [0, 1] is the brake
-    command."""
+    command.
+    """
 
     wheel_radius: Scalar = param(default=0.0995, unit="m", above=0.0)
     drum_radius: Scalar = param(default=0.099, unit="m", above=0.0)
@@ -77,24 +88,24 @@ class LabRig:
     road: Road = part(default=RIG)
 
     shows = BrakeOutput
-    control_unit = "1"  # a command, where other plants take a torque in N m
+    control_unit = "1"  # a command; the other braked plants take a torque in N m
     frozen = FROZEN_OUTPUTS
 
     usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
     def start(self, initial: BrakeStart) -> LabRigState:
-        """State for a speed and a slip, brake released."""
+        """Return the state for a speed and a slip, with the brake released."""
         zero = 0.0 * initial.speed
         wheel = (1 - initial.slip) * initial.speed / self.wheel_radius
         return LabRigState(wheel, initial.speed / self.drum_radius, zero, zero)
 
     def derivative(self, t: Scalar, state: LabRigState, control: Scalar) -> LabRigState:
-        """dx/dt under the brake command `control` [1], limited to [0, 1]."""
+        """Return dx/dt under the brake command `control` [1], clamped to [0, 1]."""
         del t
         mu, normal, torque = self.contact(state)
         wheel = quotient(normal * self.wheel_radius * mu - torque, self.wheel_inertia)
         rests = (state.wheel <= 0) & (torque < state.brake + self.wheel_stiction)
-        wheel = jnp.where(rests, 0.0, wheel)  # and not the rounding of it, from which a stuck wheel would turn
+        wheel = jnp.where(rests, 0.0, wheel)  # exactly 0: from rounding a stuck wheel would turn
         drum = -quotient(self._drum_torque(state.drum, normal * mu), self.drum_inertia)
         u = clamp(control, 0.0, 1.0)
         brake = larger(self.brake_gain * u + self.brake_offset, 0.0)  # a brake does not drive
@@ -107,11 +118,18 @@ class LabRig:
         )
 
     def contact(self, state: LabRigState) -> tuple[Any, Any, Any]:
-        """Friction coefficient [1], normal force [N], and the torque that brakes the wheel [N m], bearing included."""
+        """Return the friction coefficient [1], the normal force [N], and the torque that brakes the wheel, with its
+        bearing's [N m].
+
+        Args:
+            state: State of the rig.
+        """
         slip = slip_ratio(self.drum_radius * state.drum, self.wheel_radius * state.wheel, self.crawl_speed)
         mu = self.road.friction(slip, self.drum_radius * state.drum, state.distance)
         arm = self.lever * (jnp.sin(self.lever_angle) - mu * jnp.cos(self.lever_angle))
         capacity = state.brake + self.wheel_stiction
+        # Denominators are replaced where they are not positive: a NaN in the branch that `where` does not take would
+        # reach the derivatives.
         held = arm > self.wheel_radius * mu
         spare = jnp.where(held, arm - self.wheel_radius * mu, 1.0)
         asked = quotient(self.wheel_radius * mu * self.weight_torque, spare)
@@ -122,18 +140,20 @@ class LabRig:
         return mu, normal, torque
 
     def project(self, state: LabRigState) -> LabRigState:
-        """Neither wheel turns backwards."""
+        """Return the state with no wheel turning backwards."""
         return LabRigState(forward_speed(state.wheel), forward_speed(state.drum), state.brake, state.distance)
 
     def output(self, state: LabRigState) -> BrakeOutput:
-        """Slip, rim speeds, deceleration of the road wheel's rim, distance."""
+        """Return slip, rim speeds, deceleration of the road wheel's rim, and distance."""
         v, w = self.drum_radius * state.drum, self.wheel_radius * state.wheel
         mu, normal, _ = self.contact(state)
         deceleration = self.drum_radius * quotient(self._drum_torque(state.drum, normal * mu), self.drum_inertia)
         return BrakeOutput(slip_ratio(v, w, self.crawl_speed), v, w, deceleration, state.distance)
 
     def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
-        """The brake command whose steady torque keeps the slip constant, from omega1' = (1 - slip) (r2/r1) omega2'."""
+        """Return the brake command whose steady torque keeps the slip constant, from omega1' = (1 - slip) (r2/r1)
+        omega2'.
+        """
         drum = output.speed / self.drum_radius
         spin = (1 - target) * output.speed / self.wheel_radius
         mu = self.road.friction(target, output.speed, output.distance)
@@ -145,17 +165,19 @@ class LabRig:
         return (brake - self.brake_offset) / self.brake_gain
 
     def audit(self, initial: BrakeStart) -> BrakeAudit:
-        """A run that gains energy was not integrated stably: this brake never drives."""
+        """Return the audit of runs from `initial`: this brake never drives, so any gain of energy is a numerical
+        instability.
+        """
         car, wheel = self.drum_inertia / self.drum_radius**2, self.wheel_inertia / self.wheel_radius**2
         scale = self.energy(self.start(initial))
         return BrakeAudit(car=car, wheel=wheel, radius=self.wheel_radius, scale=scale, commanded=True)
 
     def energy(self, state: LabRigState) -> Scalar:
-        """Kinetic energy of both wheels [J]."""
+        """Return the kinetic energy of both wheels in a `state` [J]."""
         return 0.5 * (self.wheel_inertia * state.wheel**2 + self.drum_inertia * state.drum**2)
 
     def rules(self) -> Iterator[Rule]:
-        """A lever that does not lock itself where the run begins: mu < tan(phi)."""
+        """Yield the rule that the lever does not lock itself at the start of a run: mu < tan(phi)."""
         friction = Partial(type(self.road).friction, self.road, speed=0.0, distance=0.0)
         angle = as_rule_array(self.lever_angle)
         limit = jnp.tan(angle) if isinstance(angle, jax.Array) else np.tan(angle)

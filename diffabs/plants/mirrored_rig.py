@@ -1,12 +1,12 @@
 """The laboratory rig turned upside down: the upper wheel is the car's body, of mass m, and presses on the lower, braked
-one.
+wheel.
 
     J1 omega1' = Fn r1 mu(slip) - tau1,   J2 omega2' = -Fn r2 mu(slip),   Fn = m g,   J2 = c m r2^2
     slip = (r2 omega2 - r1 omega1)/(r2 omega2)
 
-Maeda and Sugiura, eqs. (2)-(5), (12). Their eq. (3) takes the body for a disk, c = 1/2, and eq. (9) then decelerates it
-at 2 mu g, twice their eq. (8) for a car: c = 1 is the inertia that gives the car's mu g. Their numbers use 1/2, so that
-is the default. Eq. (12) is for omega2 r2 >= omega1 r1 only; beyond it the slip is taken relative to the faster wheel.
+Maeda and Sugiura, eqs. (2)-(5), (12). Their eq. (3) takes the body for a disk, c = 1/2. Eq. (9) then decelerates it at
+2 mu g, twice their eq. (8) for a car; c = 1 is the inertia that gives the car's mu g. The default is 1/2, because their
+numbers use it. Eq. (12) holds only for omega2 r2 >= omega1 r1; beyond this the slip is relative to the faster wheel.
 """
 
 from typing import NamedTuple
@@ -56,12 +56,12 @@ class MirroredRig:
     usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
     def start(self, initial: BrakeStart) -> RigState:
-        """State for a speed and a slip."""
+        """Return the state for a speed and a slip."""
         wheel = (1 - initial.slip) * initial.speed / self.wheel_radius
         return RigState(wheel, initial.speed / self.body_radius, 0.0 * initial.speed)
 
     def derivative(self, t: Scalar, state: RigState, control: Scalar) -> RigState:
-        """dx/dt under the brake torque tau1 = `control` [N m]."""
+        """Return dx/dt under the brake torque tau1 = `control` [N m]."""
         del t
         y = self.output(state)
         push = self.inertia_factor * self.mass * y.deceleration  # Fn mu [N]
@@ -70,28 +70,30 @@ class MirroredRig:
         return RigState(halt_at_zero(state.wheel, wheel), halt_at_zero(state.body, body), y.speed)
 
     def project(self, state: RigState) -> RigState:
-        """Neither wheel turns backwards."""
+        """Return the state with no wheel turning backwards."""
         return RigState(forward_speed(state.wheel), forward_speed(state.body), state.distance)
 
     def output(self, state: RigState) -> BrakeOutput:
-        """Slip, rim speeds, deceleration mu g/c of the body's rim, distance."""
+        """Return slip, rim speeds, deceleration mu g/c of the body's rim, and distance."""
         v, w = self.body_radius * state.body, self.wheel_radius * state.wheel
         slip = slip_ratio(v, w, self.crawl_speed)
         mu = self.road.friction(slip, v, state.distance)
         return BrakeOutput(slip, v, w, quotient(mu * GRAVITY, self.inertia_factor), state.distance)
 
     def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
-        """tau* = m g r1 mu + (1 - slip) J1 mu g/(c r1), the zero of eq. (14)."""
+        """Return tau* = m g r1 mu + (1 - slip) J1 mu g/(c r1) [N m], the zero of eq. (14)."""
         mu = self.road.friction(target, output.speed, output.distance)
         wheel = (1 - target) * self.wheel_inertia / (self.inertia_factor * self.wheel_radius)
         return mu * GRAVITY * (self.mass * self.wheel_radius + wheel)
 
     def audit(self, initial: BrakeStart) -> BrakeAudit:
-        """A run that gains energy without a negative torque was not integrated stably."""
+        """Return the audit of runs from `initial`: a gain of energy without a negative torque is a numerical
+        instability.
+        """
         car, wheel = self.inertia_factor * self.mass, self.wheel_inertia / self.wheel_radius**2
         return BrakeAudit(car=car, wheel=wheel, radius=self.wheel_radius, scale=self.energy(self.start(initial)))
 
     def energy(self, state: RigState) -> Scalar:
-        """Kinetic energy [J]."""
+        """Return the kinetic energy of a `state` [J]."""
         body = self.inertia_factor * self.mass * self.body_radius**2
         return 0.5 * (self.wheel_inertia * state.wheel**2 + body * state.body**2)

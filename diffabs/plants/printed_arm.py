@@ -1,12 +1,14 @@
-"""The two-wheeler as the paper's equations are printed, linear: only to show what its Fig. 3 shows.
+"""The two-wheeler by the paper's printed linear equations, only to reproduce its Fig. 3.
 
     (a + p2 + p3 + 2 c2 + 2 c3) theta'' + (p2 + c2) psi'' + (p3 + c3) phi''
                          = g (b1 theta + b2 (theta - psi) + b3 (theta - phi))
     (p2 + c2) theta'' + p2 psi'' = tau + g b2 (theta - psi)
     (p3 + c3) theta'' + p3 phi'' = -K phi - d phi' + g b3 (theta - phi)
 
-Fumita, eqs. (8)-(10), for small angles. The matrix of gravity, d(right sides)/dq, is not symmetric: these forces come
-from no potential, and no machine has them. In these equations the arm falls to the side that lifts the frame.
+The gravity matrix d(right sides)/dq is not symmetric. These forces have no potential, so no machine has them. In these
+equations the arm falls to the side that lifts the frame.
+
+Source: Fumita, eqs. (8)-(10), for small angles.
 """
 
 from diffabs.core.numerics import quotient
@@ -17,7 +19,9 @@ from diffabs.plants.arm_balance import ArmBalance, ArmState, BalanceStart, usual
 
 @pytree
 class PrintedArm:
-    """The paper's linear equations with the parameters of a machine. Not mechanics: a reproduction of a misprint."""
+    """The paper's linear equations with the parameters of a machine. They reproduce a misprint and are not valid
+    mechanics.
+    """
 
     machine: ArmBalance = part(default=ArmBalance)
 
@@ -27,11 +31,11 @@ class PrintedArm:
     usual_parts, usual_objectives = usual_parts, usual_objectives
 
     def start(self, initial: BalanceStart) -> ArmState:
-        """The state with these angles and rates."""
+        """Return the state with the angles and rates of `initial`."""
         return self.machine.start(initial)
 
     def derivative(self, t: Scalar, state: ArmState, control: Scalar) -> ArmState:
-        """dx/dt under the motor voltage `control` [V]."""
+        """Return dx/dt under the motor voltage `control` [V]."""
         del t
         m, (a, p2, p3, c2, c3, b1, b2, b3) = self.machine, self.machine.lumps()
         theta, psi, phi, *_ = state
@@ -46,13 +50,13 @@ class PrintedArm:
         return ArmState(*rates, first, r2 / m22 - by2 * first, r3 / p3 - by3 * first)
 
     def project(self, state: ArmState) -> ArmState:
-        """Every state is admissible."""
+        """Return the state itself, because every state is admissible."""
         return state
 
     def output(self, state: ArmState) -> BalanceOutput:
-        """Angles, rates, and what the motor makes of a voltage."""
+        """Return angles, rates, and the parameters from which the motor's torque follows."""
         return self.machine.output(state)
 
     def holding(self, output: BalanceOutput, target: Scalar) -> Scalar:
-        """Nothing is held but the upright position."""
+        """Return 0 V, the voltage of the upright position."""
         return self.machine.holding(output, target)

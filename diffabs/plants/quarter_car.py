@@ -2,10 +2,11 @@
 
     m v' = -mu(slip) m g,   J omega' = r mu(slip) m g - u,   x' = v,   slip = (v - r omega)/v
 
-Aoki and Nakamura, eqs. (1) and (7)-(12), which is also eqs. (6)-(11) of Maeda and Sugiura. Their brake torque is
-negative; here u >= 0 brakes. Their eq. (9) drops the brake from a stopped wheel, so that it starts to turn again at
-once; here a stopped wheel stays stopped while the brake torque exceeds the road's. Rolling and air resistance are
-neglected."""
+Aoki and Nakamura, eqs. (1) and (7)-(12); the same equations are eqs. (6)-(11) of Maeda and Sugiura. Aoki and Nakamura's
+brake torque is negative; here u >= 0 brakes. Their eq. (9) drops the brake from a stopped wheel, so that the wheel
+starts to turn again at once. Here a stopped wheel stays stopped while the brake torque exceeds the road's torque. The
+model neglects rolling and air resistance.
+"""
 
 from typing import NamedTuple
 
@@ -52,38 +53,40 @@ class QuarterCar:
     usual_parts, usual_objectives, probes = usual_parts, usual_objectives, probes
 
     def start(self, initial: BrakeStart) -> QuarterCarState:
-        """State for a speed and a slip."""
+        """Return the state for a speed and a slip."""
         spin = (1 - initial.slip) * initial.speed / self.radius
         return QuarterCarState(initial.speed, spin, 0.0 * initial.speed)
 
     def derivative(self, t: Scalar, state: QuarterCarState, control: Scalar) -> QuarterCarState:
-        """dx/dt under the brake torque `control` [N m]."""
+        """Return dx/dt under the brake torque `control` [N m]."""
         del t
         mu = self.output(state).deceleration / GRAVITY
         spin = quotient(self.radius * mu * self.mass * GRAVITY - control, self.inertia)
         return QuarterCarState(halt_at_zero(state.speed, -mu * GRAVITY), halt_at_zero(state.spin, spin), state.speed)
 
     def project(self, state: QuarterCarState) -> QuarterCarState:
-        """Neither car nor wheel moves backwards."""
+        """Return the state with neither car nor wheel moving backwards."""
         return QuarterCarState(forward_speed(state.speed), forward_speed(state.spin), state.distance)
 
     def output(self, state: QuarterCarState) -> BrakeOutput:
-        """Slip, speeds, deceleration mu g, distance."""
+        """Return slip, speeds, deceleration mu g, and distance."""
         v, w = state.speed, self.radius * state.spin
         slip = slip_ratio(v, w, self.crawl_speed)
         mu = self.road.friction(slip, v, state.distance)
         return BrakeOutput(slip, v, w, mu * GRAVITY, state.distance)
 
     def holding(self, output: BrakeOutput, target: Scalar) -> Scalar:
-        """tau* = mu (m g r + (1 - slip) J g/r): brakes the car and the wheel together at a constant slip."""
+        """Return tau* = mu (m g r + (1 - slip) J g/r) [N m], which brakes car and wheel together at a constant slip."""
         mu = self.road.friction(target, output.speed, output.distance)
         return mu * GRAVITY * (self.mass * self.radius + (1 - target) * self.inertia / self.radius)
 
     def audit(self, initial: BrakeStart) -> BrakeAudit:
-        """A run that gains energy without a negative torque was not integrated stably."""
+        """Return the audit of runs from `initial`: a gain of energy without a negative torque is a numerical
+        instability.
+        """
         wheel, scale = self.inertia / self.radius**2, self.energy(self.start(initial))
         return BrakeAudit(car=self.mass, wheel=wheel, radius=self.radius, scale=scale)
 
     def energy(self, state: QuarterCarState) -> Scalar:
-        """Kinetic energy [J]."""
+        """Return the kinetic energy of a `state` [J]."""
         return 0.5 * (self.mass * state.speed**2 + self.inertia * state.spin**2)

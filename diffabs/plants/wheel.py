@@ -1,4 +1,4 @@
-"""What braked wheels have in common: slip, standstill, and the start of a run."""
+"""Common functions of braked wheels: slip, standstill, the start of a run, and the default loop."""
 
 from typing import Any
 
@@ -12,44 +12,63 @@ from diffabs.objectives import BRAKING
 from diffabs.references import FixedSlip
 from diffabs.stops import Standstill
 
-PROBED_SPEEDS = 6  # between start and stop, in geometric progression: the ends decide
-PROBED_OFFSETS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)  # slip below and above the setpoint
-PROBED_SLIPS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # where a run may pass
+PROBED_SPEEDS = 6  # from start to stop, in geometric progression; the stiffest speed is at one of the ends
+PROBED_OFFSETS = (0.0, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)  # distances in slip below and above the setpoint
+PROBED_SLIPS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # slips that a run may pass
 
-FROZEN_OUTPUTS = ("speed", "distance")  # outputs that a linear model of the slip holds
-GRAVITY = 9.81  # m/s^2, the value behind every number of the papers
+FROZEN_OUTPUTS = ("speed", "distance")  # outputs that a linear model of the slip keeps constant
+GRAVITY = 9.81  # m/s^2, the value in all numbers of the papers
 
 
 @pytree
 class BrakeStart:
-    """A vehicle at `speed` whose wheel has `slip`, at distance 0."""
+    """A vehicle at `speed` [m/s] whose wheel has `slip` [1], at distance 0."""
 
     speed: Scalar = param(default=100 / 3.6, unit="m/s", above=0.0, high=200.0)
     slip: Scalar = param(default=0.0, unit="1", low=0.0, high=1.0)
 
 
 def slip_ratio(speed: Scalar, wheel_speed: Scalar, crawl: Scalar) -> Any:
-    """(v - w)/max(v, w, crawl): (v - w)/v in braking, (v - w)/w in driving, so that it lies in [-1, 1].
+    """Return the slip (v - w)/max(v, w, crawl) [1]: (v - w)/v in braking, (v - w)/w in driving, always in [-1, 1].
 
-    C1 at v = w. Below the crawl speed [m/s] the slip goes to zero with v - w instead of dividing by zero.
+    The slip is C1 at v = w. Below the crawl speed it goes to zero with v - w, so there is no division by zero.
+
+    Args:
+        speed: Vehicle speed v [m/s].
+        wheel_speed: Speed of the wheel's rim w [m/s].
+        crawl: Least denominator [m/s], > 0.
     """
     return quotient(speed - wheel_speed, larger(larger(speed, wheel_speed), crawl))
 
 
 def halt_at_zero(speed: Scalar, rate: Scalar) -> Any:
-    """The rate of a speed that cannot become negative: at standstill only what speeds up acts. Brake friction balances
-    the rest, as dry friction does."""
+    """Return the rate of a speed that cannot become negative: at standstill only a positive rate acts.
+
+    Brake friction balances a negative rate at standstill, as dry friction does.
+
+    Args:
+        speed: Speed or angular speed.
+        rate: Its rate without the constraint.
+    """
     return jnp.where(jnp.greater(speed, 0), rate, larger(rate, 0.0))
 
 
 def forward_speed(speed: Scalar) -> Any:
-    """The speed, or 0 where a step went past standstill."""
+    """Return the speed, or 0 where a step went past standstill.
+
+    Args:
+        speed: Speed or angular speed after a step.
+    """
     return jnp.where(jnp.greater(speed, 0), speed, 0.0)
 
 
 def usual_parts(self: Any) -> dict[str, Any]:
-    """Return what surrounds a brake where nothing is said: a PID of 0 to 90 N m that holds a fixed slip until
-    standstill."""
+    """Return the default loop around a brake: a PID with limits of 0 and 90 N m that holds a fixed slip until
+    standstill.
+
+    Args:
+        self: The plant; it has no effect.
+    """
     del self
     return {
         "initial": BrakeStart(),
@@ -60,14 +79,27 @@ def usual_parts(self: Any) -> dict[str, Any]:
 
 
 def usual_objectives(self: Any) -> dict[str, Any]:
-    """Return what every run of a brake is measured by."""
+    """Return the default objectives of a brake, by name.
+
+    Args:
+        self: The plant; it has no effect.
+    """
     del self
     return dict(BRAKING)
 
 
 def probes(self: Any, initial: BrakeStart, setpoint: Scalar, stop: Any) -> BrakeStart:
-    """Return where the loop may be stiffest, (k,) starts: at speeds down to the stop, at slips close to the setpoint,
-    where the controller is not at a limit, and all over the friction curve, which is steepest near 0."""
+    """Return k starts at which the loop may be stiffest, as a `BrakeStart` of arrays (k,).
+
+    The speeds go down to the stop's speed. Some slips are close to the setpoint, where the controller is not at a
+    limit. Other slips cover the friction curve, which is steepest near 0.
+
+    Args:
+        self: The plant; it has no effect.
+        initial: Start of the run; its speed is the greatest.
+        setpoint: Target slip [1].
+        stop: Stop of the run; its speed is the least.
+    """
     del self
     near = jnp.concatenate([setpoint - jnp.array(PROBED_OFFSETS), setpoint + jnp.array(PROBED_OFFSETS)])
     slips = jnp.concatenate([jnp.clip(near, 1e-4, 1.0), jnp.array(PROBED_SLIPS)])

@@ -1,4 +1,4 @@
-"""References: measured output -> target, of the first signal that the plant shows."""
+"""References: blocks that map the measured output to the target for the plant's first signal."""
 
 from diffabs.references.by_deceleration import SlipByDeceleration as SlipByDeceleration
 from diffabs.references.extremum_seeking import ExtremumSeeking as ExtremumSeeking

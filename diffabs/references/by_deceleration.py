@@ -1,10 +1,11 @@
-"""A target slip that follows the measured deceleration.
+"""A target slip that is a function of the measured deceleration.
 
     T a_f' = a - a_f,   target = slips(a_f), linear between nodes and constant beyond them
 
-A car that is braked near the peak of its friction curve decelerates by mu g, so the deceleration says how slippery the
-road is, and a table says at which slip such roads have their peak, if they have it in common. No search, no memory but
-the filter, which noise needs. A table that rises steeply feeds itself: more slip, more deceleration, more slip.
+A car that brakes near the peak of its friction curve decelerates at mu g, so the deceleration measures the road's
+friction. A table gives the slip of the peak for each deceleration, if roads of equal friction share their peak slip.
+There is no search, and the only memory is the low-pass filter against noise. A steep table can cause positive feedback:
+more slip, more deceleration, more slip.
 """
 
 from collections.abc import Iterator
@@ -21,39 +22,50 @@ from diffabs.core.rules import Rule, increase_rule
 
 @pytree
 class SlipByDeceleration:
-    """target = slips(a_f): slips at increasing decelerations, the deceleration behind a low-pass."""
+    """target = slips(a_f): a table of slips at increasing decelerations, read at the low-pass filtered deceleration
+    a_f.
+
+    Attributes:
+        decelerations: Nodes, increasing [m/s^2].
+        slips: Target slips at the nodes [1].
+        time_constant: T of the low-pass filter [s], > 0.
+    """
 
     decelerations: Vector = param(default=(1.0, 3.0, 6.0, 10.0), unit="m/s^2", free=True)
     slips: Vector = param(default=(0.08, 0.1, 0.13, 0.16), unit="1", above=0.0, high=1.0, free=True)
     time_constant: Scalar = param(default=0.05, unit="s", above=0.0)
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """The filter at the first sample."""
+        """Return the memory with the filter at the first sample."""
         return Memory(flow=signal.deceleration)
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """a_f'."""
+        """Return a_f'."""
         del t
         return (signal.deceleration - memory.flow) / self.time_constant
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Target slip [1]."""
+        """Return the target slip [1]."""
         del t, signal
         return self.setpoint(memory)
 
     def setpoint(self, memory: Memory) -> Any:
-        """The target as known now. Raises ValueError for lists of different lengths."""
+        """Return the present target slip [1].
+
+        Raises:
+            ValueError: `decelerations` and `slips` differ in shape.
+        """
         nodes, slips = jnp.asarray(self.decelerations), jnp.asarray(self.slips)
         if nodes.shape != slips.shape:
             raise ValueError(f"decelerations and slips have shapes {nodes.shape} and {slips.shape}")
         return interpolate_shares(interval_shares(memory.flow, nodes), slips)
 
     def problems(self) -> Iterator[str]:
-        """Lists of different lengths, or empty ones."""
+        """Yield a message if the two lists differ in shape, or are empty."""
         nodes, slips = np.shape(self.decelerations), np.shape(self.slips)
         if nodes != slips or len(nodes) != 1 or not nodes[0]:
             yield f"decelerations and slips have shapes {nodes} and {slips}; they need one"
 
     def rules(self) -> Iterator[Rule]:
-        """Decelerations that increase."""
+        """Yield the rule that the decelerations increase."""
         yield increase_rule("decelerations", self.decelerations, "do not increase", "m/s^2")

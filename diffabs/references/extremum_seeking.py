@@ -1,16 +1,19 @@
-"""A reference that climbs to the slip of greatest deceleration by its slope: extremum seeking.
+"""Extremum seeking: a reference that climbs along the slope of the deceleration to the slip of greatest deceleration.
 
-    target = s (1 + d sin(w t))                                         a dither around the slip s that is believed best
+    target = s (1 + d sin(w t))                                         a dither around the estimate s of the best slip
     T m' = slip - m,   T b' = a - b                                     means of the measured slip and deceleration
     T c' = (slip - m)(a - b) - c,   T q' = (slip - m)^2 - q             covariance and variance about them
     e = m c/((q + r^2) max(b, b0))                                      estimate of d ln a/d ln slip
     (ln s)' = k e g,   g = clamp(|ln(s/end)|/ln(1 + band), 0, 1)        end: the greatest slip if e > 0, or the least
 
-M. Krstic and H.-H. Wang, Stability of extremum seeking feedback for general nonlinear dynamic systems, Automatica 36
-(2000), multiply by the dither itself. Here the deceleration is correlated with the slip as measured: between them there
-is no dynamics (a = mu(slip) g), so the slope is right however much later than the dither the loop moves the slip, and
-whatever moves it counts. Slope and step are relative, so that one gain fits ice and asphalt. On a straight line through
-any point c = (da/ds) q; noise of the deceleration has no mean in c, a constant bias none in a - b.
+Krstic and Wang multiply by the dither itself. Here the deceleration is correlated with the measured slip. There are no
+dynamics between them, a = mu(slip) g. The slope is therefore correct for any phase lag of the loop behind the dither.
+Any movement of the slip contributes to the estimate. Slope and step are relative, so one gain fits ice and asphalt. On
+a straight line through any point c = (da/ds) q. Noise of the deceleration has zero mean in c, and a constant bias has
+none in a - b.
+
+Source: M. Krstic and H.-H. Wang, Stability of extremum seeking feedback for general nonlinear dynamic systems,
+Automatica 36 (2000).
 """
 
 from collections.abc import Iterator
@@ -25,8 +28,15 @@ from diffabs.core.rules import Rule, order_rule
 
 
 class SeekingMemory(NamedTuple):
-    """Logarithm of the slip believed best; means of slip [1] and deceleration [m/s^2], their covariance [m/s^2] and the
-    slip's variance [1]."""
+    """Continuous memory of the extremum seeking.
+
+    Attributes:
+        logarithm: ln s, with the estimate s of the best slip.
+        slip: Mean of the slip [1].
+        deceleration: Mean of the deceleration [m/s^2].
+        covariance: Covariance of slip and deceleration [m/s^2].
+        variance: Variance of the slip [1].
+    """
 
     logarithm: Scalar
     slip: Scalar
@@ -37,7 +47,7 @@ class SeekingMemory(NamedTuple):
 
 @pytree
 class ExtremumSeeking:
-    """target = s (1 + dither sin(frequency t)); s climbs the slope of the deceleration, between two limits."""
+    """target = s (1 + dither sin(frequency t)), where s climbs the slope of the deceleration between two limits."""
 
     slip: Scalar = param(default=0.12, unit="1", above=0.0, high=1.0)
     gain: Scalar = param(default=3.0, unit="1/s", low=0.0)
@@ -51,12 +61,12 @@ class ExtremumSeeking:
     band: Scalar = param(default=0.1, unit="1", above=0.0, tunable=False)
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """The first slip; means at the first sample, no covariance."""
+        """Return the memory at the first slip, with means at the first sample and covariance 0."""
         zero = 0.0 * signal.slip
         return Memory(flow=SeekingMemory(jnp.log(self.slip) + zero, signal.slip, signal.deceleration, zero, zero))
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> SeekingMemory:
-        """The rates of all five."""
+        """Return the rates of all five memories."""
         del t
         m: SeekingMemory = memory.flow
         slip, deceleration = signal.slip - m.slip, signal.deceleration - m.deceleration
@@ -65,16 +75,18 @@ class ExtremumSeeking:
         return SeekingMemory(self._climb(m), *means, *moments)
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Target slip [1]."""
+        """Return the target slip [1]."""
         del signal
         return self.setpoint(memory) * (1 + self.dither * jnp.sin(self.frequency * t))
 
     def setpoint(self, memory: Memory) -> Any:
-        """The slip believed best."""
+        """Return the estimate of the best slip [1]."""
         return jnp.exp(memory.flow.logarithm)
 
     def elasticity(self, memory: Memory) -> Any:
-        """The estimate of d ln(deceleration)/d ln(slip) [1]: positive below the peak, negative beyond it."""
+        """Return the estimate of d ln(deceleration)/d ln(slip) from `memory` [1]: positive below the peak, negative
+        beyond it.
+        """
         m: SeekingMemory = memory.flow
         return (
             m.slip
@@ -83,11 +95,12 @@ class ExtremumSeeking:
         )
 
     def rules(self) -> Iterator[Rule]:
-        """A first slip within limits that do not exclude each other."""
+        """Yield the rules least_slip <= slip <= greatest_slip."""
         yield order_rule(("least_slip", self.least_slip), ("slip", self.slip), "1")
         yield order_rule(("slip", self.slip), ("greatest_slip", self.greatest_slip), "1")
 
     def _climb(self, m: SeekingMemory) -> Any:
         e = self.elasticity(Memory(flow=m))
+        # The gain fades to 0 at a limit, so s never leaves the limits and no clamp kinks the rate there.
         room = jnp.where(e > 0, jnp.log(self.greatest_slip) - m.logarithm, m.logarithm - jnp.log(self.least_slip))
         return self.gain * e * clamp(room / jnp.log1p(self.band), 0.0, 1.0)

@@ -1,11 +1,11 @@
-"""A reference that the brake can follow: it asks for no more than the torque's limits leave.
+"""A reference that stays within the brake's torque limits.
 
     target+ = target + min[(1 - exp(-h v0/(T v))) (slip - target),  h rate v0/v]          every period h
 
-The slip of a braked wheel answers to torque with a rate that goes with 1/v, r tau/(J v): a target that is slow in
-proportion to the speed needs the same torque at every speed, and with `rate`, its greatest rate at the speed v0, no
-more than the limits have. Towards the end it settles with the time constant T v/v0. From the measured slip; at the
-first instant it has made its first step.
+The slip rate of a braked wheel under torque is proportional to 1/v: r tau/(J v). A target with a rate proportional to
+1/v therefore needs the same torque at every speed. `rate`, the greatest rate at the speed v0, keeps this torque within
+the limits. Near its final value the target settles with the time constant T v/v0. The target starts at the measured
+slip. At t = 0 it has already made its first step.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,16 @@ from diffabs.core.timing import whole_steps
 
 @pytree
 class LimitedSlip:
-    """A target that rises at `rate` v0/v at most, and settles with the time constant T v/v0."""
+    """A target that rises at most at `rate` v0/v and settles with the time constant T v/v0.
+
+    Attributes:
+        slip: Final target [1].
+        rate: Greatest rate of the target at v0 [1/s], > 0.
+        time_constant: T [s], > 0.
+        reference_speed: v0 [m/s], > 0.
+        period: Period h of the steps [s], > 0.
+        floor: Least speed in the denominator [m/s], > 0.
+    """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
     rate: Scalar = param(default=4.0, unit="1/s", above=0.0)
@@ -33,27 +42,28 @@ class LimitedSlip:
     flow = no_flow
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """The measured slip."""
+        """Return the memory with the measured slip."""
         return Memory(held=signal.slip)
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Target slip [1]."""
+        """Return the target slip [1]."""
         del t, signal
         return memory.held
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """Where the target settles."""
+        """Return the final target slip [1]."""
         del memory
         return self.slip
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """One step of the target at the instants of the period."""
+        """Return the memory after one step of the target at an instant of the period."""
         now, _ = clock.ticks(self.period)
+        # h is the period scaled by v0/v: in this time the target behaves equally at every speed.
         h = self.period * self.reference_speed / jnp.maximum(signal.speed, self.floor)
         left = self.slip - memory.held
         step = smaller(-jnp.expm1(-h / self.time_constant) * left, h * self.rate)
         return Memory(held=jnp.where(now, memory.held + step, memory.held))
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
-        """The period is on the integration grid."""
+        """Yield the rule that the period is a multiple of the integration step."""
         yield whole_steps("period", self.period, step)

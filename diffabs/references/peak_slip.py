@@ -1,14 +1,16 @@
-"""References that find the best slip: the slip at which the measured deceleration was greatest.
+"""References that find the best slip: the slip of the greatest measured deceleration.
 
-Aoki and Nakamura, sec. 4, fig. 5: a running maximum of the deceleration |a|; when it is exceeded, the target becomes
-the present slip. Read literally this cannot brake: while friction rises the target equals the slip, the error is zero,
-and the car rolls on. `PeakLiteral` shows that. `PeakLatch` is the reading that reproduces the paper's table 2: brake
-with the first target until |a| first falls below its maximum, then take the slip at that maximum. `PeakRobust` is the
-latch for a noisy accelerometer.
+Aoki and Nakamura, sec. 4, fig. 5, keep a running maximum of the deceleration |a|. When |a| exceeds it, the target
+becomes the present slip. Read literally, this rule cannot brake. While friction rises, the target equals the slip, the
+error is zero, and the car rolls on. `PeakLiteral` shows this.
 
-The maximum is an event: where the rate of the deceleration falls through zero, or where the deceleration itself jumps
-down, as the noise of a sampled accelerometer does. A step of the integration ends there, and the slip is the slip
-there: the run does not depend on the grid, and is differentiable."""
+`PeakLatch` is the reading that reproduces the paper's table 2: brake with the first target until |a| first falls below
+its maximum. Then take the slip at this maximum. `PeakRobust` is the latch for a noisy accelerometer.
+
+The maximum is an event. It occurs where the rate of the deceleration falls through zero, or where the deceleration
+itself jumps down. The noise of a sampled accelerometer causes such jumps. A step of the integration ends at the event,
+and the slip is the slip there. The run therefore does not depend on the grid and is differentiable.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,14 +21,21 @@ import jax.numpy as jnp
 from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree
 
-# A later maximum counts only if it exceeds the greatest by this fraction: a controller that holds the best slip keeps
-# the deceleration at its maximum to rounding, and comparisons of equal numbers would then decide on derivatives.
+# A later maximum counts only if it exceeds the greatest by this fraction. A controller that holds the best slip keeps
+# the deceleration equal to its maximum up to rounding; comparisons of equal numbers would then decide the derivatives.
 SLIP_MARGIN = 1e-6
-MIN_DECELERATION = 1e-3  # m/s^2, of a maximum: that of a wheel that still rolls, before the torque comes, is rounding
+MIN_DECELERATION = 1e-3  # m/s^2, least maximum: a smaller deceleration of a free wheel is rounding
 
 
 class PeakMemory(NamedTuple):
-    """1 once latched; greatest |a| [m/s^2] and the slip [1] there; target [1]."""
+    """Memory of the running maximum.
+
+    Attributes:
+        latched: 1 once latched, else 0.
+        greatest: Greatest |a| [m/s^2].
+        slip: Slip at the greatest |a| [1].
+        target: Target slip [1].
+    """
 
     latched: Scalar
     greatest: Scalar
@@ -35,8 +44,11 @@ class PeakMemory(NamedTuple):
 
 
 def _size(signal: BrakeOutput) -> Any:
-    """|a|, as the paper has it. It matters where the accelerometer has a forward bias: it shows an acceleration before
-    the wheel slips, whose size falls before it rises."""
+    """Return |a|, as in the paper.
+
+    The absolute value matters for an accelerometer with a forward bias. Such a sensor shows an acceleration before the
+    wheel slips, and |a| falls before it rises.
+    """
     return jnp.abs(signal.deceleration)
 
 
@@ -47,30 +59,31 @@ def _fresh_memory(target: Scalar, deceleration: Scalar, slip: Scalar) -> PeakMem
 
 @pytree
 class PeakLiteral:
-    """The estimator as printed: whenever |a| exceeds its maximum, target := slip. It does not brake; kept as
-    evidence."""
+    """The paper's estimator as printed: whenever |a| exceeds its maximum, target := slip. It does not brake and serves
+    as evidence.
+    """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
 
-    every_step = True  # how little it brakes is the delay of one sample
+    every_step = True  # ticks in every step: its braking comes only from the delay of one sample
     flow = no_flow
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Maximum so far: the first sample."""
+        """Return the memory with the first sample as the maximum."""
         size = _size(signal)
         return Memory(held=_fresh_memory(self.slip, size, signal.slip)._replace(greatest=size))
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Target slip [1]."""
+        """Return the target slip [1]."""
         del t, signal
         return memory.held.target
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """The target as known now."""
+        """Return the present target slip [1]."""
         return memory.held.target
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """Follow the slip while |a| rises."""
+        """Return the memory with the present slip as target if |a| exceeds its maximum."""
         m: PeakMemory = memory.held
         size = _size(signal)
         exceeds = clock.ticks()[0] & (size > m.greatest)
@@ -81,10 +94,11 @@ class PeakLiteral:
 
 @pytree
 class PeakLatch:
-    """target = slip until |a| first falls, then the slip at its maximum; a later, greater one moves the target there.
+    """target = slip until |a| first falls, then the slip at the maximum of |a|; a later, greater maximum moves the
+    target.
 
-    For an exact accelerometer: noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip. So does a forward
-    bias, under which |a| falls through zero before it rises.
+    It needs an exact accelerometer. Noise of 0.05 m/s^2 at 1 kHz latches at once and at the wrong slip. A forward bias
+    does the same, because |a| falls through zero before it rises.
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
@@ -94,17 +108,17 @@ class PeakLatch:
     setpoint = PeakLiteral.setpoint
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """No maximum yet."""
+        """Return the memory without a maximum."""
         return Memory(held=_fresh_memory(self.slip, _size(signal), signal.slip))
 
     def margins(self, t: Scalar, memory: Memory, signal: BrakeOutput, rate: Callable[[], BrakeOutput]) -> tuple[Any]:
-        """d|a|/dt where |a| is greater than ever, else its size."""
+        """Return d|a|/dt where |a| exceeds its maximum, else the absolute value of d|a|/dt."""
         del t
         m: PeakMemory = memory.held
         return (_falling_rate(_rate(_size, signal, rate()), _size(signal), m),)
 
     def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[Any]) -> Memory:
-        """Latch at a maximum greater than all before."""
+        """Return the memory latched at a new maximum."""
         del t
         m: PeakMemory = _record_peak(memory.held, fired[0], _size(signal), signal.slip)
         latched = jnp.where(fired[0], 1.0, m.latched)
@@ -112,7 +126,7 @@ class PeakLatch:
 
 
 class FilterMemory(NamedTuple):
-    """Low-passed deceleration [m/s^2] and slip [1]."""
+    """Low-pass filtered deceleration [m/s^2] and slip [1]."""
 
     deceleration: Scalar
     slip: Scalar
@@ -120,9 +134,18 @@ class FilterMemory(NamedTuple):
 
 @pytree
 class PeakRobust:
-    """The latch for noisy and biased sensors: deceleration (with its sign: the size of noise has a mean) and slip pass
-    the same low-pass (so their delays cancel), nothing happens below `arming`, and the fall must exceed the fraction
-    `threshold` of the maximum."""
+    """The latch for noisy and biased sensors: it filters the signals and latches after a fall by the fraction
+    `threshold` of the maximum.
+
+    Deceleration and slip pass the same low-pass filter, so their delays cancel. The deceleration keeps its sign,
+    because the absolute value of noise has a nonzero mean. No maximum up to `arming` latches.
+
+    Attributes:
+        slip: Target before the latch [1].
+        time_constant: Time constant of both low-pass filters [s], > 0.
+        threshold: Fraction of the maximum by which the deceleration must fall [1].
+        arming: Bound that the maximum must exceed for a latch [m/s^2].
+    """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
     time_constant: Scalar = param(default=0.02, unit="s", above=0.0)
@@ -133,12 +156,12 @@ class PeakRobust:
     setpoint = PeakLiteral.setpoint
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """Filters at the first sample."""
+        """Return the memory with both filters at the first sample."""
         flow = FilterMemory(signal.deceleration, signal.slip)
         return Memory(flow, _fresh_memory(self.slip, *flow))
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> FilterMemory:
-        """First-order low-pass of both signals."""
+        """Return the rates of both low-pass filters."""
         del t
         a, s = memory.flow
         return FilterMemory((signal.deceleration - a) / self.time_constant, (signal.slip - s) / self.time_constant)
@@ -146,8 +169,11 @@ class PeakRobust:
     def margins(
         self, t: Scalar, memory: Memory, signal: BrakeOutput, rate: Callable[[], BrakeOutput]
     ) -> tuple[Any, Any]:
-        """The rate of the filtered deceleration where that is greater than ever, else its size; and, until it has
-        latched, how far the filtered deceleration is above the threshold."""
+        """Return the margin of a new maximum, and the filtered deceleration's distance to the threshold.
+
+        Before the latch, the second margin is the filtered deceleration minus the threshold. Afterwards it is an
+        absolute value, so it causes no event.
+        """
         del rate
         m: PeakMemory = memory.held
         a = memory.flow.deceleration
@@ -157,7 +183,7 @@ class PeakRobust:
         return _falling_rate(moving, a, m), jnp.where(waits, level, jnp.abs(level))
 
     def event(self, t: Scalar, memory: Memory, signal: BrakeOutput, fired: tuple[Any, Any]) -> Memory:
-        """Record the maximum; latch at the threshold below it; follow a later, greater one."""
+        """Return the memory after a new maximum or the latch; once latched, a new maximum moves the target."""
         del t, signal
         a, s = memory.flow
         m: PeakMemory = _record_peak(memory.held, fired[0], a, s)
@@ -171,8 +197,10 @@ def _rate(size: Callable[[BrakeOutput], Any], signal: BrakeOutput, rate: BrakeOu
 
 
 def _falling_rate(rate: Scalar, deceleration: Scalar, m: PeakMemory) -> Any:
-    """The rate where the deceleration is greater than ever, else the size of the rate: a margin that falls through zero
-    at a new maximum only."""
+    """Return the rate where the deceleration exceeds its maximum, else its absolute value.
+
+    This margin falls through zero only at a new maximum.
+    """
     return jnp.where(deceleration > (1 + SLIP_MARGIN) * m.greatest, rate, jnp.abs(rate))
 
 

@@ -1,4 +1,4 @@
-"""References that know their target: a number of whatever the plant shows first; a slip, fixed or filtered."""
+"""References with a known target: a constant for the plant's first signal, or a slip, fixed or filtered."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from diffabs.core.pytree import Scalar, param, pytree
 
 @pytree
 class Setpoint:
-    """target = value, of the first signal that the plant shows."""
+    """target = value, for the first signal that the plant shows."""
 
     value: Scalar = param(default=1.0, unit="signal")
 
@@ -16,12 +16,12 @@ class Setpoint:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: Any) -> Scalar:
-        """The value."""
+        """Return the target."""
         del t, memory, signal
         return self.value
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """The same."""
+        """Return the target."""
         del memory
         return self.value
 
@@ -36,12 +36,12 @@ class FixedSlip:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Target slip [1]."""
+        """Return the target slip [1]."""
         del t, memory, signal
         return self.slip
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """The same."""
+        """Return the target slip [1]."""
         del memory
         return self.slip
 
@@ -50,27 +50,27 @@ class FixedSlip:
 class FilteredSlip:
     """time_constant target' = slip - target, from the measured slip at the start.
 
-    From rest this is slip (1 - exp(-t/T)): a step that the loop can follow without overshoot.
+    From slip 0 this is slip (1 - exp(-t/T)), which the loop can follow without overshoot.
     """
 
     slip: Scalar = param(default=0.2, unit="1", above=0.0, high=1.0)
     time_constant: Scalar = param(default=0.035, unit="s", above=0.0)
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """The measured slip."""
+        """Return the memory with the measured slip."""
         return Memory(flow=signal.slip)
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """target'."""
+        """Return target' [1/s]."""
         del t, signal
         return (self.slip - memory.flow) / self.time_constant
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """Target slip [1]."""
+        """Return the target slip [1]."""
         del t, signal
         return memory.flow
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """Where the filter settles."""
+        """Return the final value of the filter [1]."""
         del memory
         return self.slip

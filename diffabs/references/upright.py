@@ -1,4 +1,4 @@
-"""The reference of a balance: upright."""
+"""The reference of a balance: the upright position."""
 
 from diffabs.core.protocols import BalanceOutput, Memory, no_flow
 from diffabs.core.pytree import Scalar, pytree
@@ -6,19 +6,19 @@ from diffabs.core.pytree import Scalar, pytree
 
 @pytree
 class Upright:
-    """target = 0: every angle, every rate."""
+    """target = 0 for every angle and every rate."""
 
     flow = no_flow
 
     def start(self, signal: BalanceOutput) -> Memory:
-        """Zero, of the signal's type."""
+        """Return 0 in the signal's type."""
         return Memory(held=0.0 * signal.theta)
 
     def output(self, t: Scalar, memory: Memory, signal: BalanceOutput) -> Scalar:
-        """Target angle [rad]."""
+        """Return the target angle [rad]."""
         del t, signal
         return memory.held
 
     def setpoint(self, memory: Memory) -> Scalar:
-        """The same."""
+        """Return the target angle [rad]."""
         return memory.held

@@ -1,10 +1,12 @@
-"""A road whose friction changes along the way: another road times a cubic spline of the distance.
+"""A road whose friction changes along the distance: another road times a cubic spline of the distance.
 
     mu(s, v, x) = f(x) mu_0(s, v, x),   f(x) = sum_i c_i B(x/d - i),   i = 0 ... n - 1
 
-B is the cubic B-spline on the knots -2 ... 2, positive with sum 1, so that f lies between its least and its greatest
-factor c and is smooth to its second derivative. |f'| is at most the greatest |c_(i+1) - c_i|/d. Before 0 and beyond
-(n - 1) d the factors go on as the first and the last. C. de Boor, A Practical Guide to Splines, ch. IX, XI.
+B is the cubic B-spline on the knots -2 ... 2. It is positive with sum 1, so f lies between the least and the greatest
+factor c and is C2. Its slope |f'| is at most the greatest |c_(i+1) - c_i|/d. The first and the last factor continue
+before 0 and beyond (n - 1) d.
+
+Source: C. de Boor, A Practical Guide to Splines, ch. IX, XI.
 """
 
 from collections.abc import Iterator
@@ -19,12 +21,13 @@ from diffabs.core.protocols import Road
 from diffabs.core.pytree import Scalar, Vector, param, part, pytree
 from diffabs.roads.burckhardt import DRY_ASPHALT
 
-FIRST_NODE, LAST = 2, 1  # intervals before 0 and beyond the last factor, from where on the spline is constant
+FIRST_NODE, LAST = 2, 1  # intervals before 0 and beyond the last factor after which the spline is constant
 
 
 @pytree
 class ScaledAlong:
-    """f(x) mu of another road; `factors` (n,) of f, one every `spacing`.
+    """f(x) mu of another road, with a cubic spline f through the B-spline coefficients `factors` (n,), one every
+    `spacing`.
 
     >>> from diffabs.roads import RIG, ScaledAlong
     >>> road = ScaledAlong(road=RIG, factors=(1.0, 1.0, 1.0, 0.5, 0.5, 0.5), spacing=2.0)
@@ -37,15 +40,16 @@ class ScaledAlong:
     spacing: Scalar = param(default=1.0, unit="m", above=0.0)
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
-        """mu [1] at this distance [m]."""
+        """Return mu [1] at a `slip` [1], vehicle `speed` [m/s] and `distance` on the road [m]."""
         return self.factor(distance) * self.road.friction(slip, speed, distance)
 
     def factor(self, distance: Scalar) -> Any:
-        """f [1] at a distance [m]."""
+        """Return f [1] at a `distance` on the road [m]."""
         c = jnp.asarray(self.factors)
         ends = jnp.ones(FIRST_NODE + LAST)
         padded = jnp.concatenate([c[0] * ends, c, c[-1] * ends])
         place = clamp(distance / self.spacing, -1.0 * FIRST_NODE, 1.0 * (c.size - 1 + FIRST_NODE))
+        # The spline is C2 across nodes, so the jump of `floor` needs no derivative.
         whole = jax.lax.stop_gradient(jnp.floor(place))
         t = place - whole
         near = jax.lax.dynamic_slice_in_dim(padded, whole.astype(int) + FIRST_NODE, 4)
@@ -54,6 +58,6 @@ class ScaledAlong:
         return sum(w * near[i] for i, w in enumerate(weights)) / 6
 
     def problems(self) -> Iterator[str]:
-        """No factors."""
+        """Yield a message if `factors` is not a vector of at least one factor."""
         if np.ndim(self.factors) != 1 or np.size(self.factors) < 1:
             yield f"factors has shape {np.shape(self.factors)}; it needs (n,), n at least 1"

@@ -2,10 +2,13 @@
 
     mu(s, v) = (c1 (1 - exp(-c2 s)) - c3 s) exp(-c4 s v)        for s >= 0, odd in s
 
-M. Burckhardt, Fahrwerktechnik: Radschlupf-Regelsysteme, Vogel 1993; coefficients as tabulated by Kiencke and Nielsen,
-Automotive Control Systems, Springer 2005, ch. 8. They give c1..c3 for each surface and 0.02 to 0.04 s/m as the range of
-c4 on all of them; the named roads carry c4 = 0.03 s/m, the middle of it. Set c4 = 0 for the curve at walking speed,
-which is the one usually plotted."""
+Kiencke and Nielsen give c1..c3 for each surface, and 0.02 to 0.04 s/m as the range of c4 on all surfaces. The named
+roads use the middle of this range, c4 = 0.03 s/m. The value 0 gives the curve at walking speed, which is the curve
+usually plotted.
+
+Source: M. Burckhardt, Fahrwerktechnik: Radschlupf-Regelsysteme, Vogel 1993. Coefficients as tabulated by Kiencke and
+Nielsen, Automotive Control Systems, Springer 2005, ch. 8.
+"""
 
 from collections.abc import Iterator
 
@@ -33,7 +36,7 @@ class Burckhardt:
     c4: Scalar = param(default=0.03, unit="s/m", low=0.0)
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar = 0.0) -> Scalar:
-        """mu [1] at a slip [1] and a vehicle speed [m/s]."""
+        """Return mu [1] at a `slip` [1] and vehicle `speed` [m/s]; `distance` has no effect."""
         del distance
 
         def curve(s: Scalar) -> Scalar:
@@ -42,7 +45,7 @@ class Burckhardt:
         return odd(curve, slip)
 
     def rules(self) -> Iterator[Rule]:
-        """Friction that does not drive; the speed does not change its sign."""
+        """Yield the rule that friction is not negative; the sign does not depend on the speed."""
         yield opposes(Partial(type(self).friction, self, speed=0.0))
 
 

@@ -1,8 +1,8 @@
 """Pacejka's Magic Formula.
 
-    mu(s) = D sin(C arctan(x - E (x - arctan x))),  x = B s        odd in s as it stands
+    mu(s) = D sin(C arctan(x - E (x - arctan x))),  x = B s        odd in s without an extension
 
-H. B. Pacejka, Tire and Vehicle Dynamics, 3rd ed., eq. (4.49), without shifts, force divided by load.
+Source: H. B. Pacejka, Tire and Vehicle Dynamics, 3rd ed., eq. (4.49), without shifts, force divided by load.
 """
 
 import jax.numpy as jnp
@@ -12,10 +12,11 @@ from diffabs.core.pytree import Scalar, param, pytree
 
 @pytree
 class MagicFormula:
-    """mu(s) = D sin(C arctan(x - E (x - arctan x))), x = B s: stiffness, shape, peak and curvature factors.
+    """mu(s) = D sin(C arctan(x - E (x - arctan x))), x = B s. The factors are stiffness B, shape C, peak D and
+    curvature E.
 
-    The defaults reproduce Tables 1 and 2 of Aoki and Nakamura within 0.01 s and 0.06 m; they were identified from those
-    tables (with J = 1.0539 kg m^2), since the paper does not give its curve.
+    The defaults reproduce Tables 1 and 2 of Aoki and Nakamura within 0.01 s and 0.06 m. They were identified from these
+    tables with J = 1.0539 kg m^2, because the paper does not give its curve.
 
     >>> from diffabs.roads import MagicFormula
     >>> print(f"{MagicFormula(D=0.5).friction(0.1):.3f}")
@@ -28,7 +29,7 @@ class MagicFormula:
     E: Scalar = param(default=-1.08841, unit="1", high=1.0)
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
-        """mu [1]; does not depend on speed or distance."""
+        """Return mu [1] at a `slip` [1]; `speed` and `distance` have no effect."""
         del speed, distance
         x = self.B * slip
         return self.D * jnp.sin(self.C * jnp.arctan(x - self.E * (x - jnp.arctan(x))))

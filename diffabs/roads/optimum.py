@@ -1,4 +1,4 @@
-"""The best slip of a road: where its friction first peaks."""
+"""The best slip of a road: the first maximum of its friction over slip."""
 
 from typing import Any, NamedTuple
 
@@ -10,29 +10,33 @@ from diffabs.core.protocols import Road
 from diffabs.core.pytree import Scalar
 
 GRID = 1024  # intervals of (0, 1]: resolves the peak of every road with a peak slip above 0.001
-BISECTIONS = 50  # 2^-50 of an interval is below the spacing of float64
+BISECTIONS = 50  # 2^-50 of an interval is below the resolution of float64
 
 
 class Peak(NamedTuple):
-    """Best slip [1] and the friction [1] there."""
+    """Best slip [1] and the friction coefficient there [1]."""
 
     slip: Any
     mu: Any
 
 
 def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
-    """Return the first local maximum of mu over slip in (0, 1] of a road; slip 1 where mu only rises (ice).
+    """Return the first local maximum of mu over slip in (0, 1]; slip 1 where mu only rises (ice).
 
-    speed, distance: of the vehicle [m/s] and along the road [m], at which the curve is looked at
-
-    It is the first maximum that a braking wheel meets, not always the greatest: the rig's curve rises again towards
-    lock. Bracketed on a grid, bisected on the slope, and polished by one Newton step s - mu'/mu'' whose derivative is
-    that of the implicit function theorem, so slip and mu are differentiable in every parameter of the road.
+    A braking wheel meets the first maximum first. It is not always the greatest: the rig's curve rises again towards
+    lock. A grid brackets the maximum, and bisection of the slope locates it. Two Newton steps s - mu'/mu'' polish it
+    and carry its derivative by the implicit function theorem. Slip and mu are thus differentiable in every parameter of
+    the road.
 
     >>> from diffabs.roads import DRY_ASPHALT, peak
     >>> slip, mu = peak(DRY_ASPHALT)
     >>> print(f"{mu:.2f} at {slip:.2f}")
     1.17 at 0.17
+
+    Args:
+        road: Friction curve.
+        speed: Vehicle speed [m/s].
+        distance: Place on the road [m].
     """
 
     def mu(s: Any) -> Any:
@@ -58,5 +62,7 @@ def peak(road: Road, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Peak:
     s0 = jax.lax.stop_gradient(0.5 * (low + high))
     curvature = jax.lax.stop_gradient(jax.jvp(slope, (s0,), (jnp.ones_like(s0),))[1])
     near = s0 - ratio(slope(s0), curvature)
-    best = jnp.where(inside, clamp(near - ratio(slope(near), curvature), 0.0, 1.0), 1.0)  # each doubles the order
+    # The bracket carries no derivative. The first Newton step gives the first derivative of the maximum, and the second
+    # step doubles the order of derivatives that are exact.
+    best = jnp.where(inside, clamp(near - ratio(slope(near), curvature), 0.0, 1.0), 1.0)
     return Peak(best, mu(best))

@@ -1,4 +1,4 @@
-"""Roads made of roads: a friction scale, and patches along the distance."""
+"""Roads made of other roads: a friction scale, and patches along the distance."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -15,24 +15,24 @@ from diffabs.roads.burckhardt import DRY_ASPHALT, SNOW
 
 @pytree
 class Scaled:
-    """scale * mu of another road: wear, temperature, wetness in one number."""
+    """scale * mu of another road: one number for wear, temperature and wetness."""
 
     road: Road = part(default=DRY_ASPHALT)
     scale: Scalar = param(default=1.0, unit="1", above=0.0, high=10.0)
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
-        """scale * mu [1]."""
+        """Return scale * mu [1] at a `slip` [1], vehicle `speed` [m/s] and `distance` on the road [m]."""
         return self.scale * self.road.friction(slip, speed, distance)
 
 
 @pytree
 class Patches:
-    """Surfaces in a row, mu-jumps between them.
+    """Surfaces in sequence, with jumps of mu between them.
 
         mu = mu_0 + sum_i S((x - edge_i)/width) (mu_(i+1) - mu_i),  S(z) = 3 y^2 - 2 y^3,  y = clamp(z + 1/2, 0, 1)
 
-    A width of about 0.1 m is the length of a tyre's contact patch. With width 0 the jump is sharp: values are right,
-    but a derivative through the run misses what moving the moment of the jump does. Differentiate with a width of a few
+    A width of about 0.1 m is the length of a tyre's contact patch. With width 0 the jump is sharp. The values are then
+    exact, but derivatives through the run miss the movement of the jump time. For derivatives, use a width of a few
     steps.
 
     >>> from diffabs.roads import DRY_ASPHALT, ICE, Patches
@@ -46,10 +46,15 @@ class Patches:
     width: Scalar = param(default=0.1, unit="m", low=0.0)
 
     def friction(self, slip: Scalar, speed: Scalar, distance: Scalar) -> Scalar:
-        """mu [1] of the surface at this distance [m]. Raises ValueError where edges are missing or too many."""
+        """Return mu [1] of the surface at a `distance` [m], for a `slip` [1] and vehicle `speed` [m/s].
+
+        Raises:
+            ValueError: The number of edges is not the number of roads minus one.
+        """
         if np.shape(self.edges) != (len(self.roads) - 1,):
             raise ValueError(f"edges has shape {np.shape(self.edges)}; {len(self.roads)} roads need one less")
         mus = [road.friction(slip, speed, distance) for road in self.roads]
+        # A width of 0 is replaced by 1: a division by 0 in the branch not taken would put NaN into the derivatives.
         smooth = jnp.greater(self.width, 0)
         width = jnp.where(smooth, self.width, 1.0)
         total = mus[0]
@@ -61,11 +66,11 @@ class Patches:
         return total
 
     def problems(self) -> Iterator[str]:
-        """More or fewer edges than between the roads."""
+        """Yield a message if the number of edges is not the number of roads minus one."""
         edges = np.asarray(self.edges)
         if edges.shape != (len(self.roads) - 1,):
             yield f"edges has shape {edges.shape}; {len(self.roads)} roads need ({len(self.roads) - 1},)"
 
     def rules(self) -> Iterator[Rule]:
-        """Edges that increase."""
+        """Yield the rule that the edges increase."""
         yield increase_rule("edges", self.edges, "is not increasing", "m")

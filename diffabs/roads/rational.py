@@ -2,9 +2,12 @@
 
     mu(s) = w4 s^q / (a + s^q) + w3 s^3 + w2 s^2 + w1 s        for s >= 0, odd in s
 
-Maeda and Sugiura, eq. (13), after INTECO, The Laboratory Anti-lock Braking System, user's manual. The paper's "0.2 is
-the slip of greatest friction" is not true of this curve: its local peak lies at slip 0.18754 and a locked wheel (slip
-1) has more friction than either. The printed equation is undefined for s < 0; the odd extension is ours."""
+The paper's statement "0.2 is the slip of greatest friction" is not true of this curve. Its local peak is at slip
+0.18754, and a locked wheel (slip 1) has more friction than either. The printed equation is undefined for s < 0; the odd
+extension is an addition of diffabs.
+
+Source: Maeda and Sugiura, eq. (13), after INTECO, The Laboratory Anti-lock Braking System, user's manual.
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -29,12 +32,12 @@ class RationalCurve:
     q: Scalar = param(default=2.10, unit="1", above=1.0)
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
-        """mu [1]; does not depend on speed or distance."""
+        """Return mu [1] at a `slip` [1]; `speed` and `distance` have no effect."""
         del speed, distance
         return odd(self._curve, slip)
 
     def rules(self) -> Iterator[Rule]:
-        """Friction that does not drive."""
+        """Yield the rule that friction is not negative."""
         yield opposes(Partial(type(self).friction, self))
 
     def _curve(self, s: Any) -> Any:

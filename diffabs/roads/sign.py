@@ -1,4 +1,4 @@
-"""A friction curve that a car can meet: it never drives; and one that a machine can bear."""
+"""Rules on friction curves: friction is not negative, and it stays below a limit of the machine."""
 
 from typing import Any
 
@@ -11,11 +11,16 @@ from jax.tree_util import Partial
 from diffabs.core.compiling import QUICK_COMPILE_OPTIONS, compile_once
 from diffabs.core.rules import Rule
 
-SLIPS = np.linspace(0.05, 1.0, 20)  # below them a fitted polynomial may dip under 0 by a millionth, as the rig's does
+# At smaller slips a fitted polynomial may be negative by a millionth, as the rig's is.
+SLIPS = np.linspace(0.05, 1.0, 20)
 
 
 def opposes(friction: Partial) -> Rule:
-    """Return the rule that mu(s) >= 0 at slips of 0.05 to 1: friction of the other sign would speed the car up."""
+    """Return the rule that mu(s) >= 0 at slips of 0.05 to 1: negative friction would accelerate the car.
+
+    Args:
+        friction: Friction curve, mu as a function of slip.
+    """
     mu = _at_slips(friction)
 
     def says() -> str:
@@ -26,7 +31,14 @@ def opposes(friction: Partial) -> Rule:
 
 
 def stays_below(friction: Partial, limit: Any, name: str, then: str) -> Rule:
-    """Return the rule that mu(s) < limit at these slips; `name` is what the limit is, `then` what it means."""
+    """Return the rule that mu(s) < limit at slips of 0.05 to 1.
+
+    Args:
+        friction: Friction curve, mu as a function of slip.
+        limit: Upper limit of mu [1].
+        name: Name of the limit in messages.
+        then: Consequence of a violation in messages.
+    """
     mu = _at_slips(friction)
 
     def says() -> str:
@@ -37,12 +49,12 @@ def stays_below(friction: Partial, limit: Any, name: str, then: str) -> Rule:
 
 
 def _at_slips(friction: Partial) -> Any:
-    """Return mu at SLIPS, of the precision in force, decided by NumPy."""
+    """Return mu at SLIPS in the active precision, as a NumPy array unless traced."""
     mu = _along(friction, SLIPS.astype(jnp.result_type(float)))
     return mu if isinstance(mu, Tracer) else np.asarray(mu)
 
 
 @compile_once(options=QUICK_COMPILE_OPTIONS)
 def _along(friction: Partial, slips: Any) -> Any:
-    """Return the friction at these slips. Compiled as one: each operation by itself costs as much as all of them."""
+    """Return the friction at these slips, compiled as one program: one operation alone takes as long to compile."""
     return jax.vmap(friction)(slips)

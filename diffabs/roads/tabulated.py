@@ -2,9 +2,13 @@
 
     mu(s) = cubic Hermite between knots, with the slopes of Fritsch and Butland        for s >= 0, odd in s
 
-F. N. Fritsch and J. Butland, A method for constructing local monotone piecewise cubic interpolants, SIAM J. Sci. Stat.
-Comput. 5 (1984), with the three-point end slopes of C. Moler, Numerical Computing with MATLAB, sec. 3.6: the
-interpolant that SciPy calls PchipInterpolator. It is exact at the knots, has no extrema but at knots, and is C1."""
+This is the interpolant of SciPy's PchipInterpolator. It is exact at the knots, has no extrema except at knots, and is
+C1.
+
+Source: F. N. Fritsch and J. Butland, A method for constructing local monotone piecewise cubic interpolants, SIAM J.
+Sci. Stat. Comput. 5 (1984). The three-point end slopes are those of C. Moler, Numerical Computing with MATLAB, sec.
+3.6.
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -16,7 +20,7 @@ from diffabs.core.numerics import odd, ratio, searchsorted
 from diffabs.core.pytree import Scalar, Vector, param, pytree
 from diffabs.core.rules import Rule, as_rule_array, increase_rule
 
-KNOTS = (  # of the identified spline: slip and friction
+KNOTS = (  # slip and friction at the knots of the identified spline
     (0, 0.02108, 0.04215, 0.06323, 0.08431, 0.09696, 0.10539, 0.12039, 0.14539,
      0.17539, 0.19039, 0.20539, 0.23539, 0.28539, 0.40539, 0.60539, 1.0),
     (0, 0.51493, 0.72745, 0.86912, 0.96331, 0.98097, 0.99064, 0.98201, 0.95733,
@@ -28,8 +32,8 @@ KNOTS = (  # of the identified spline: slip and friction
 class Tabulated:
     """Monotone cubic through (slip, mu); the knots start at (0, 0), increase, and end at slip 1.
 
-    The defaults are the spline identified from Tables 1 and 2 of Aoki and Nakamura, with J = 1.04456 kg m^2, which
-    reproduces all twenty numbers to the printed digit. The paper does not give its curve, and the true one stays
+    The defaults are the spline identified from Tables 1 and 2 of Aoki and Nakamura, with J = 1.04456 kg m^2. This
+    spline reproduces all twenty numbers to the printed digit. The paper does not give its curve, so the true curve is
     unknown.
 
     >>> from diffabs.roads import Tabulated
@@ -42,12 +46,15 @@ class Tabulated:
     mu: Vector = param(default=KNOTS[1], unit="1", low=0.0, free=True)
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
-        """mu [1]; constant beyond the last knot; does not depend on speed or distance."""
+        """Return mu [1] at a `slip` [1], constant beyond the last knot; `speed` and `distance` have no effect."""
         return self.prepared().friction(slip, speed, distance)
 
     def prepared(self) -> "PiecewiseCubic":
-        """The same curve with the coefficients worked out, once for a whole run. Raises ValueError for columns of
-        different lengths, or shorter than 3."""
+        """Return the same curve with its coefficients computed once for a whole run.
+
+        Raises:
+            ValueError: `slip` and `mu` differ in length, or have fewer than 3 knots.
+        """
         x, y = jnp.asarray(self.slip), jnp.asarray(self.mu)
         if x.shape != y.shape or x.ndim != 1 or x.size < 3:
             raise ValueError(f"slip and mu have shapes {x.shape} and {y.shape}; both need one length of at least 3")
@@ -58,13 +65,13 @@ class Tabulated:
         return PiecewiseCubic(knots=x, rows=jnp.stack([x[:-1], y[:-1], d[:-1], c2, c3], axis=1))
 
     def problems(self) -> Iterator[str]:
-        """Columns of different lengths, or too short."""
+        """Yield a message if `slip` and `mu` differ in length, or have fewer than 3 knots."""
         x, y = np.asarray(self.slip), np.asarray(self.mu)
         if x.shape != y.shape or x.ndim != 1 or x.size < 3:
             yield f"slip and mu have shapes {x.shape} and {y.shape}; both need the same length of at least 3"
 
     def rules(self) -> Iterator[Rule]:
-        """Knots that increase from (0, 0) to slip 1."""
+        """Yield the rules that the slips increase and that the knots run from (0, 0) to slip 1."""
         x, y = as_rule_array(self.slip), as_rule_array(self.mu)
         yield increase_rule("slip", self.slip, "is not increasing", "1")
         yield Rule(
@@ -76,13 +83,18 @@ class Tabulated:
 
 @pytree
 class PiecewiseCubic:
-    """mu(s) = c0 + z (c1 + z (c2 + z c3)), z = s - x_i, between knots; rows of (x_i, c0, c1, c2, c3)."""
+    """mu(s) = c0 + z (c1 + z (c2 + z c3)), z = s - x_i, between knots.
+
+    Attributes:
+        knots: Knots x_i, shape (n,).
+        rows: Rows (x_i, c0, c1, c2, c3), shape (n - 1, 5).
+    """
 
     knots: Vector = param(unit="1")
     rows: Vector = param(unit="1")
 
     def friction(self, slip: Scalar, speed: Scalar = 0.0, distance: Scalar = 0.0) -> Scalar:
-        """mu [1]."""
+        """Return mu [1] at a `slip` [1]; `speed` and `distance` have no effect."""
         del speed, distance
         return odd(self._curve, slip)
 
@@ -94,10 +106,16 @@ class PiecewiseCubic:
 
 
 def slopes(x: Any, y: Any) -> Any:
-    """Slopes at the knots: the weighted harmonic mean of the neighbouring secants, 0 where they differ in sign.
+    """Return the slopes at the knots: the weighted harmonic mean of the neighbouring secants, 0 where they differ in
+    sign.
 
-    Differentiable in x and y. At a local extremum the slope is held at 0, so the derivative in the knot's value is
-    one-sided."""
+    The result is differentiable in x and y. At a local extremum the slope stays 0, so the derivative with respect to
+    the knot's value is one-sided.
+
+    Args:
+        x: Knots, increasing, shape (n,), n >= 3.
+        y: Values at the knots, shape (n,).
+    """
     h = jnp.diff(x)
     m = jnp.diff(y) / h
     w0, w1 = 2 * h[1:] + h[:-1], h[1:] + 2 * h[:-1]

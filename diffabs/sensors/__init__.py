@@ -1,4 +1,4 @@
-"""Sensors: output -> measured output."""
+"""Sensors: blocks that map the plant's output to the measured output."""
 
 from diffabs.sensors.angles import AngleSensor as AngleSensor
 from diffabs.sensors.noise import Bias as Bias

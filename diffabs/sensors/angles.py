@@ -1,4 +1,4 @@
-"""What a real vehicle measures of its balance: the frame's angle and the arm's, not the rider's."""
+"""The balance sensor of a real vehicle: it measures the angles of frame and arm, but not the rider's."""
 
 from collections.abc import Iterator
 
@@ -14,8 +14,11 @@ from diffabs.sensors.noise import drawn
 
 @pytree
 class AngleSensor:
-    """theta and psi with Gaussian noise of these standard deviations, drawn every `period` and held; everything else is
-    not measured and reads 0. Needs a key unless both deviations are 0: `rollout(..., key=)`."""
+    """theta and psi with Gaussian noise of the given standard deviations, drawn every `period` and held; all other
+    channels read 0.
+
+    It needs a random key unless both deviations are 0: `rollout(..., key=)`.
+    """
 
     theta: Scalar = param(default=0.0, unit="rad", low=0.0)
     psi: Scalar = param(default=0.0, unit="rad", low=0.0)
@@ -24,18 +27,22 @@ class AngleSensor:
     flow = no_flow
 
     def start(self, signal: BalanceOutput) -> Memory:
-        """No noise before the first draw."""
+        """Return the memory without noise."""
         zero = 0.0 * signal.theta
         return Memory(held=(zero, zero))
 
     def output(self, t: Scalar, memory: Memory, signal: BalanceOutput) -> BalanceOutput:
-        """Both angles with noise."""
+        """Return both angles with noise; all other channels are 0."""
         del t
         nothing = jax.tree.map(lambda x: 0.0 * x, signal)
         return nothing._replace(theta=signal.theta + memory.held[0], psi=signal.psi + memory.held[1])
 
     def tick(self, clock: Clock, memory: Memory, signal: BalanceOutput) -> Memory:
-        """Draw at the instants of the period. Raises ValueError without a key."""
+        """Return the memory with new noise at an instant of the period.
+
+        Raises:
+            ValueError: The run has no random key.
+        """
         del signal
         if clock.key is None:
             raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
@@ -47,5 +54,5 @@ class AngleSensor:
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), held, memory.held))
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
-        """The period is on the integration grid."""
+        """Yield the rule that the period is a multiple of the integration step."""
         yield whole_steps("period", self.period, step)

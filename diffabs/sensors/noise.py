@@ -1,4 +1,4 @@
-"""Sensor errors: noise, bias, quantisation. Each has one parameter per measured channel."""
+"""Sensor errors: noise, bias and quantisation, mostly with one parameter per measured channel."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -17,10 +17,11 @@ from diffabs.core.timing import whole_steps
 
 @pytree
 class Noise:
-    """Gaussian noise of these standard deviations, drawn every `period` and held. Needs a key: `rollout(..., key=)`.
+    """Gaussian noise of these standard deviations, drawn every `period` and held. It needs a random key: `rollout(...,
+    key=)`.
 
     The k-th draw is a function of (key, k), so a run is deterministic and differentiable in the deviations. A channel
-    whose deviation is 0 draws nothing, which would take most of the time.
+    with deviation 0 draws nothing, because drawing would take most of the run's time.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0)
@@ -32,35 +33,42 @@ class Noise:
     flow = no_flow
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """No noise before the first draw."""
+        """Return the memory without noise."""
         return Memory(held=jax.tree.map(lambda x: 0.0 * x, signal))
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Signal plus noise."""
+        """Return the signal plus noise."""
         del t
         return axpy(1.0, memory.held, signal)
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """Draw at the instants of the period. Raises ValueError without a key."""
+        """Return the memory with new noise at an instant of the period.
+
+        Raises:
+            ValueError: The run has no random key.
+        """
         if clock.key is None:
             raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
         now, draw = clock.ticks(self.period)
         deviations = (self.slip, self.speed, self.wheel_speed, self.deceleration)
+        # Every channel has its own draw number, so channels are independent.
         noise = [drawn(jnp.asarray(d), clock.key, len(deviations) * draw + i) for i, d in enumerate(deviations)]
         held = BrakeOutput(noise[0], noise[1], noise[2], noise[3], 0.0 * signal.distance)
         return Memory(held=jax.tree.map(lambda a, b: jnp.where(now, a, b), held, memory.held))
 
     def grid_rules(self, step: float) -> Iterator[Rule]:
-        """The period is on the integration grid."""
+        """Yield the rule that the period is a multiple of the integration step."""
         yield whole_steps("period", self.period, step)
 
 
 @pytree
 class WheelNoise:
-    """Gaussian noise of the wheel's speed in proportion to the vehicle's, w_seen = w - v n, drawn every `period` and
-    held, so that the measured slip has the noise n of this standard deviation at any speed. Needs a key.
+    """Gaussian noise of the wheel speed, proportional to the vehicle speed: w_seen = w - v n, with n drawn every
+    `period` and held.
 
-    That is what teeth of unequal width do; whoever estimates the vehicle's speed from the wheel's sees it, too."""
+    The measured slip thus has the noise n, of standard deviation `slip`, at any speed. The sensor needs a random key.
+    Teeth of unequal width cause such noise. It also enters an estimate of the vehicle speed from the wheel speed.
+    """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0)
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
@@ -69,17 +77,21 @@ class WheelNoise:
     grid_rules = Noise.grid_rules
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """No noise before the first draw."""
+        """Return the memory without noise."""
         return Memory(held=0.0 * signal.slip)
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Wheel speed and slip with noise."""
+        """Return the signal with noise in wheel speed and slip."""
         del t
         noise = memory.held
         return signal._replace(slip=signal.slip + noise, wheel_speed=signal.wheel_speed - signal.speed * noise)
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """Draw at the instants of the period. Raises ValueError without a key."""
+        """Return the memory with new noise at an instant of the period.
+
+        Raises:
+            ValueError: The run has no random key.
+        """
         del signal
         if clock.key is None:
             raise ValueError("a noisy sensor needs a random key: rollout(..., key=jax.random.key(seed))")
@@ -89,11 +101,12 @@ class WheelNoise:
 
 @pytree
 class PlayedWheelNoise:
-    """A given error of the wheel's speed in proportion to the vehicle's, w_seen = w - v n: an entry of `noise` (n,) for
-    each period, held, and again from the first after the last.
+    """A given error of the wheel speed, proportional to the vehicle speed: w_seen = w - v n. Each period holds one
+    entry of `noise` (n,), cyclically.
 
-    What `WheelNoise` draws, as parameters: a recorded sequence, or one that is looked for. One that repeats is what
-    the teeth of a wheel do."""
+    The entries of `noise` are parameters in place of the draws of `WheelNoise`: a recorded sequence, or the result of a
+    search. A repeating sequence models the teeth of a wheel.
+    """
 
     noise: Vector = param(default=(0.0,), unit="1", free=True)
     period: Scalar = param(default=1e-3, unit="s", above=0.0, tunable=False)
@@ -102,7 +115,7 @@ class PlayedWheelNoise:
     grid_rules, start, output = Noise.grid_rules, WheelNoise.start, WheelNoise.output
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """The next entry at the instants of the period."""
+        """Return the memory with the next entry at an instant of the period."""
         del signal
         now, played = clock.ticks(self.period)
         noise = jnp.asarray(self.noise)
@@ -110,14 +123,22 @@ class PlayedWheelNoise:
         return Memory(held=jnp.where(now, entry, memory.held))
 
     def problems(self) -> Iterator[str]:
-        """No noise."""
+        """Yield a message if `noise` is not a vector of at least one entry."""
         if np.ndim(self.noise) != 1 or np.size(self.noise) < 1:
             yield f"noise has shape {np.shape(self.noise)}; it needs (n,), n at least 1"
 
 
 @jax.custom_jvp
 def drawn(deviation: Any, key: Any, number: Any) -> Any:
-    """deviation z: z is drawn only where it counts, or where it is the derivative."""
+    """Return deviation * z with a standard normal z, drawn only if the deviation is nonzero or has a tangent.
+
+    The tangent is z times the deviation's tangent, also at deviation 0.
+
+    Args:
+        deviation: Standard deviation.
+        key: Random key of the run.
+        number: Number of the draw, folded into the key.
+    """
     return jax.lax.cond(deviation != 0, lambda: deviation * _normal(deviation, key, number), lambda: 0.0 * deviation)
 
 
@@ -126,6 +147,7 @@ def _rule(primals: Any, tangents: Any) -> tuple[Any, Any]:
     return value, tangents[0] * _normal(*primals) if moving else jnp.zeros_like(value)
 
 
+# Symbolic zeros let the rule skip the draw for a deviation that is not differentiated.
 drawn.defjvp(_rule, symbolic_zeros=True)
 
 
@@ -135,7 +157,7 @@ def _normal(like: Any, key: Any, number: Any) -> Any:
 
 @pytree
 class Bias:
-    """measured = true + bias."""
+    """measured = true + bias, for each channel."""
 
     slip: Scalar = param(default=0.0, unit="1")
     speed: Scalar = param(default=0.0, unit="m/s")
@@ -146,7 +168,7 @@ class Bias:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Signal plus bias."""
+        """Return the signal plus bias."""
         del t, memory
         return BrakeOutput(
             signal.slip + self.slip,
@@ -159,10 +181,10 @@ class Bias:
 
 @pytree
 class Quantisation:
-    """measured = q round(true/q) for each channel; q = 0 leaves the channel alone.
+    """measured = q round(true/q) for each channel; q = 0 leaves the channel unchanged.
 
-    The derivative in the signal is that of a staircase, 0: it says nothing of the jumps. A run does not depend smoothly
-    on q: differentiating it by q raises a ValueError.
+    The derivative with respect to the signal is 0, as on the treads of a staircase; it does not contain the jumps. A
+    run does not depend smoothly on q: a derivative with respect to q raises a ValueError.
     """
 
     slip: Scalar = param(default=0.0, unit="1", low=0.0, tunable=False)
@@ -174,7 +196,7 @@ class Quantisation:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """The nearest multiples."""
+        """Return the nearest multiples of q."""
         del t, memory
         return BrakeOutput(
             _rounded(signal.slip, self.slip),
@@ -186,6 +208,7 @@ class Quantisation:
 
 
 def _rounded(x: Scalar, q: Scalar) -> Any:
+    # For q = 0 the divisor is 1, so that the branch not taken holds no NaN.
     fine = jnp.greater(q, 0)
     q = jnp.where(fine, q, 1.0)
     return jnp.where(fine, q * jnp.round(x / q), x)

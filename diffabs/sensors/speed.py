@@ -1,4 +1,4 @@
-"""How slip is really measured: from the wheel's speed, and from a vehicle speed that nobody measures directly."""
+"""Slip sensors with realistic errors: slip from a wheel-speed sensor, and from a vehicle speed that is estimated."""
 
 import jax.numpy as jnp
 
@@ -14,16 +14,16 @@ class WheelSpeed:
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """The filter at the true speed."""
+        """Return the memory with the filter at the true speed."""
         return Memory(flow=signal.wheel_speed)
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """w'."""
+        """Return w' [m/s^2]."""
         del t
         return (signal.wheel_speed - memory.flow) / self.time_constant
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Filtered wheel speed, and the slip computed with it."""
+        """Return the signal with the filtered wheel speed and the slip computed from it."""
         del t
         slip = (signal.speed - memory.flow) / jnp.maximum(signal.speed, self.floor)
         return signal._replace(slip=slip, wheel_speed=memory.flow)
@@ -33,24 +33,27 @@ class WheelSpeed:
 class IntegratedAccelerometer:
     """Vehicle speed as the integral of an accelerometer, v' = -deceleration + bias, and the slip computed with it.
 
-    Aoki and Nakamura, sec. 4: "obtained by integrating the acceleration sensors". The bias is that of the signed
-    forward acceleration: a positive one makes the vehicle seem too fast, the slip too large, and releases the brake.
-    The `floor` on the speed in the slip's denominator limits what this does near standstill."""
+    The bias is that of the signed forward acceleration. A positive bias makes the estimated speed too high and the slip
+    too large, which releases the brake. The `floor` on the speed in the slip's denominator limits this effect near
+    standstill.
+
+    Source: Aoki and Nakamura, sec. 4: "obtained by integrating the acceleration sensors".
+    """
 
     bias: Scalar = param(default=0.0, unit="m/s^2")
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """The speed at which braking starts is known: the wheel still rolls."""
+        """Return the memory with the true speed: it is known at the start of braking, because the wheel still rolls."""
         return Memory(flow=signal.speed)
 
     def flow(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> Scalar:
-        """v'."""
+        """Return v' [m/s^2]."""
         del t, memory
         return self.bias - signal.deceleration
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Estimated speed, biased deceleration, slip."""
+        """Return the signal with estimated speed, biased deceleration, and the slip computed with this speed."""
         del t
         v = memory.flow
         slip = (v - signal.wheel_speed) / jnp.maximum(v, self.floor)
@@ -59,10 +62,11 @@ class IntegratedAccelerometer:
 
 @pytree
 class SpeedScale:
-    """A vehicle speed that is off by a factor, v = factor * true, and the slip computed with it, (v - w)/v.
+    """A vehicle speed with a relative error, v = factor * true, and the slip computed with it, (v - w)/v.
 
-    What a wrong rolling radius does to a speed that is estimated from another wheel. A speed seen low hides slip: held
-    at a slip s as measured, the wheel slips by 1 - factor (1 - s)."""
+    A wrong rolling radius has this effect on a speed that is estimated from another wheel. A factor below 1 hides slip:
+    at a measured slip s, the wheel slips by 1 - factor (1 - s).
+    """
 
     factor: Scalar = param(default=1.0, unit="1", above=0.0)
     floor: Scalar = param(default=0.05, unit="m/s", above=0.0)
@@ -71,7 +75,7 @@ class SpeedScale:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Scaled speed, and the slip computed with it and the true wheel's speed."""
+        """Return the signal with the scaled speed, and the slip computed with it and the measured wheel speed."""
         del t, memory
         v = self.factor * signal.speed
         return signal._replace(slip=(v - signal.wheel_speed) / jnp.maximum(v, self.floor), speed=v)
@@ -79,11 +83,12 @@ class SpeedScale:
 
 @pytree
 class DriftingSpeed:
-    """A vehicle speed whose relative error drifts, and the slip computed with it and the wheel's speed as it is seen.
+    """A vehicle speed whose relative error drifts, and the slip computed with it and the measured wheel speed w.
 
         v_seen = (1 + e) v,   e = last + (first - last) exp(-t/T),   slip = (v_seen - w)/v_seen
 
-    Held at the slip s as measured, the wheel slips by s - e (1 - s): a speed that is seen low (e < 0) hides slip."""
+    At a measured slip s, the wheel slips by s - e (1 - s): an error e < 0 hides slip.
+    """
 
     first: Scalar = param(default=0.0, unit="1", above=-1.0)
     last: Scalar = param(default=0.0, unit="1", above=-1.0)
@@ -94,7 +99,7 @@ class DriftingSpeed:
     flow = no_flow
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """The speed that is off, and the slip computed with it."""
+        """Return the signal with the erroneous speed and the slip computed with it."""
         del memory
         error = self.last + (self.first - self.last) * jnp.exp(-t / self.time_constant)
         v = (1 + error) * signal.speed

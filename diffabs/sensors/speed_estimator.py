@@ -1,36 +1,38 @@
-"""The vehicle's speed from what a car has: the wheel's speed, noisy, and an accelerometer, noisy and biased.
+"""Estimator of the vehicle speed from a noisy wheel speed and a noisy, biased accelerometer: a scalar Kalman filter
+with a gate.
 
-A scalar Kalman filter with a gate. Every period h, from the deceleration a and the wheel's speed w as measured,
+Every period h, from the measured deceleration a and wheel speed w:
 
     p = v - h a,                 P- = P + h q^2           prediction, and its variance
-    s = (p - w)/p                                         the slip that it means
-    open = 1 for s <= 0, 1 - s/gate, 0 beyond it          a wheel that slips says nothing of the vehicle
-    L = open P-/(P- + R),        R = (noise p)^2          gain; the wheel's noise goes with the speed
+    s = (p - w)/p                                         the slip of this prediction
+    open = 1 for s <= 0, 1 - s/gate, 0 beyond it          a wheel that slips does not measure the vehicle speed
+    L = open P-/(P- + R),        R = (noise p)^2          gain; the wheel's noise is proportional to the speed
     v = p + L (w - p),           P = (1 - L) P-
-    f = max(a, f exp(-h/hold))                            the deceleration of late: at once up, slowly down
+    f = max(a, f exp(-h/hold))                            recent deceleration: rises at once, decays slowly
 
-from v = w, P = R and f = g; and from there again where s >= gate and f < rest. While the wheel still rolls the first
-samples are averaged (L = 1/2, 1/3, ...); once it is braked or locked the accelerometer alone is believed, and P grows,
-so that a wheel that rolls again is believed the sooner. A wheel faster than the estimate is always believed: a braked
-wheel is not faster than the car. A bias of the accelerometer is no state of the filter: in the first milliseconds of
-braking nothing tells it from the noise.
+The filter starts from v = w, P = R and f = g. It restarts where s >= gate and f < rest. While the wheel still rolls, it
+averages the first samples (L = 1/2, 1/3, ...). Once the wheel is braked or locked, the filter uses the accelerometer
+alone and P grows. It then trusts a rolling wheel the sooner. The filter always trusts a wheel that is faster than the
+estimate, because a braked wheel is not faster than the car. The accelerometer's bias is no state of the filter: in the
+first milliseconds of braking it cannot be distinguished from noise.
 
-**A wheel that seems to slip and does not push.** With an accelerometer whose bias b is negative, v_seen - v grows by
-|b| t. A controller that holds the slip it sees at s* turns the wheel at w = (1 - s*) v_seen; where v_seen comes to
-v/(1 - s*) that is w = v: the wheel rolls, seems to slip by s*, and the brake is let go. Now nothing slows the car, the
-slip that is seen does not end, and the gate never opens. But a slip has a force. A wheel that is slower than the car,
-locked or not, decelerates it by mu(s) g (twice that on the mirrored rig), and an accelerometer shows just that, on a
-slope as well:
+**False slip of a rolling wheel.** With an accelerometer bias b < 0, v_seen - v grows by |b| t. A controller that holds
+the estimated slip at s* sets the wheel speed to w = (1 - s*) v_seen. When v_seen reaches v/(1 - s*), this is w = v: the
+wheel rolls, its estimated slip is s*, and the controller releases the brake. Then nothing slows the car, the estimated
+slip does not end, and the gate never opens. Real slip causes a force, which tells the two cases apart. A wheel slower
+than the car, locked or not, decelerates it by mu(s) g (twice this on the mirrored rig). The accelerometer shows exactly
+this, also on a slope:
 
     f >= a >= min of mu(s') g over s' >= s      so, with m(s) for that minimum,      f < m(s_0)  proves  s < s_0.
 
-m rises from m(0) = 0 to that of a wheel that locks, or of the least friction beyond the peak. With `rest` above bias
-and noise and below that, f < rest says that the wheel rolls but for a slip of m^-1(rest), whatever s says, and the
-filter begins anew with its speed; a wheel that locks on the road has f >= rest and stays unbelieved, however long. On
-the rig m is at least 6.8 m/s^2 from a slip of 0.1 on, and m^-1(1 m/s^2) is a slip of 0.8 %. What is assumed is a road
-that gives `rest`: on one with mu < rest/g a locked wheel would be believed. f rises at once, so nothing begins anew
-between two bites of the brake, and falls from g to rest in hold ln(g/rest), 46 ms: for so long the start is left alone
-as well, when a brake is about to bite.
+m rises from m(0) = 0 to its value for a locked wheel, or for the least friction beyond the peak. `rest` must lie above
+bias and noise and below this value. Then f < rest proves that the wheel's slip is at most m^-1(rest), for any estimated
+s, and the filter restarts from the wheel speed. A wheel that is locked on the road has f >= rest and is not trusted for
+any duration. On the rig m is at least 6.8 m/s^2 from a slip of 0.1 on, and m^-1(1 m/s^2) is a slip of 0.8 %.
+
+The assumption is a road that gives `rest`: with mu < rest/g the filter would trust a locked wheel. Because f rises at
+once, there is no restart between two actuations of the brake. It decays from g to rest in hold ln(g/rest), 46 ms. For
+this time there is no restart after the start either, when the brake is about to act.
 """
 
 from typing import NamedTuple
@@ -43,11 +45,18 @@ from diffabs.core.protocols import BrakeOutput, Clock, Memory, no_flow
 from diffabs.core.pytree import Scalar, param, pytree
 from diffabs.sensors.noise import Noise
 
-BRAKED = 9.81  # m/s^2, the deceleration before the first sample, as if there had been one
+BRAKED = 9.81  # m/s^2, recent deceleration f that the filter assumes at its start
 
 
 class EstimatorMemory(NamedTuple):
-    """Speed [m/s], its variance [m^2/s^2], deceleration of late [m/s^2], and 1 once there was a sample."""
+    """Memory of the speed estimator.
+
+    Attributes:
+        speed: Estimate v [m/s].
+        variance: Its variance P [m^2/s^2].
+        braked: Recent deceleration f [m/s^2].
+        begun: 1 after the first sample, else 0.
+    """
 
     speed: Scalar
     variance: Scalar
@@ -57,9 +66,17 @@ class EstimatorMemory(NamedTuple):
 
 @pytree
 class SpeedEstimator:
-    """Gated Kalman filter: `noise` of the wheel's speed, relative; `growth` q of the uncertainty, by noise and bias of
-    the accelerometer; `gate`, the slip from which on the wheel is not believed, unless the deceleration, forgotten with
-    the time constant `hold`, has fallen below `rest`."""
+    """A gated Kalman filter of the vehicle speed from wheel speed and accelerometer, for a wheel that slips at times.
+
+    Attributes:
+        noise: Relative noise of the wheel speed [1].
+        growth: Growth q of the uncertainty, from noise and bias of the accelerometer [m/s/s^0.5].
+        gate: Slip from which on the wheel is not trusted [1], unless the recent deceleration is below `rest`.
+        rest: Recent deceleration below which the filter restarts from the wheel speed [m/s^2].
+        hold: Time constant with which the recent deceleration decays [s].
+        period: Sampling period h [s].
+        floor: Least estimate of the speed [m/s].
+    """
 
     noise: Scalar = param(default=0.005, unit="1", above=0.0)
     growth: Scalar = param(default=0.05, unit="m/s/s^0.5", above=0.0)
@@ -73,18 +90,18 @@ class SpeedEstimator:
     grid_rules = Noise.grid_rules
 
     def start(self, signal: BrakeOutput) -> Memory:
-        """At the wheel's speed."""
+        """Return the memory with the wheel speed as the estimate."""
         w = jnp.maximum(signal.wheel_speed, self.floor)
         return Memory(held=EstimatorMemory(w, (self.noise * w) ** 2, BRAKED + 0.0 * w, 0.0 * w))
 
     def output(self, t: Scalar, memory: Memory, signal: BrakeOutput) -> BrakeOutput:
-        """Estimated speed, and the slip computed with it."""
+        """Return the signal with the estimated speed and the slip computed with it."""
         del t
         v = memory.held.speed
         return signal._replace(slip=(v - signal.wheel_speed) / v, speed=v)
 
     def tick(self, clock: Clock, memory: Memory, signal: BrakeOutput) -> Memory:
-        """A step of the filter at the instants of the period, or its first one."""
+        """Return the memory after a step of the filter, or after its start, at an instant of the period."""
         now, _ = clock.ticks(self.period)
         m: EstimatorMemory = memory.held
         first = self.start(signal).held

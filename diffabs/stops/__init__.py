@@ -1,4 +1,4 @@
-"""Stops: when a run ends."""
+"""Stops: conditions that end a run."""
 
 from diffabs.stops.stops import Fallen as Fallen
 from diffabs.stops.stops import NoStop as NoStop

@@ -1,4 +1,4 @@
-"""When a run ends, and what is left after its last sample."""
+"""Stops of a run, and the time and distance that remain after the last sample."""
 
 import math
 from typing import Any
@@ -9,12 +9,14 @@ from diffabs.core.protocols import BalanceOutput, BrakeOutput, Sample
 from diffabs.core.pytree import Scalar, param, pytree
 
 EXTRAPOLATED = "stop_time and stop_distance are extrapolated with the last deceleration"
-LEAST_DECELERATION = 1e-3  # m/s^2, so that a car that only rolls gets a finite, very long, stopping distance
+LEAST_DECELERATION = 1e-3  # m/s^2; a car that only rolls gets a finite, very long stopping distance
 
 
 @pytree
 class SpeedReached:
-    """The run ends at this speed. If it is not reached in time, the rest is braked at the last deceleration."""
+    """The run ends at `speed`. A run that does not reach it in time continues at its last deceleration, by
+    extrapolation.
+    """
 
     speed: Scalar = param(default=5 / 3.6, unit="m/s", above=0.0)
 
@@ -22,21 +24,22 @@ class SpeedReached:
     otherwise = EXTRAPOLATED
 
     def margin(self, output: BrakeOutput) -> Scalar:
-        """Speed above the end [m/s]."""
+        """Return the speed above the stop's speed [m/s]."""
         return output.speed - self.speed
 
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
-        """Nothing after a stop; else (v - v_end)/a and (v^2 - v_end^2)/(2 a)."""
+        """Return 0 and 0 after a stop, else (v - v_end)/a [s] and (v^2 - v_end^2)/(2 a) [m]."""
         time, distance = _braked(sample, self.speed, False)
         return jnp.where(stopped, 0.0, time), jnp.where(stopped, 0.0, distance)
 
 
 @pytree
 class Standstill:
-    """The run is integrated to a small speed and braked from there to rest at the last deceleration: v/a, v^2/(2 a).
+    """The run ends at a small `speed`; its rest to standstill is extrapolated at the last deceleration: v/a, v^2/(2 a).
 
-    Slip is stiff near standstill (its rate goes with 1/v), so the last centimetres are not integrated. The result does
-    not depend on the speed between 0.01 and 1 m/s."""
+    Slip is stiff near standstill (its rate is proportional to 1/v), so the last centimetres are not integrated. The
+    result does not depend on the speed between 0.01 and 1 m/s.
+    """
 
     speed: Scalar = param(default=0.05, unit="m/s", above=0.0)
 
@@ -45,13 +48,13 @@ class Standstill:
     margin = SpeedReached.margin
 
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
-        """v/a and v^2/(2 a)."""
+        """Return v/a [s] and v^2/(2 a) [m]."""
         return _braked(sample, 0.0, stopped)
 
 
 @pytree
 class Fallen:
-    """The run of a two-wheeler ends where its frame leans by `angle`: pi/2 is the ground."""
+    """The run of a two-wheeler ends where its frame leans by `angle`; pi/2 is the ground."""
 
     angle: Scalar = param(default=math.pi / 2, unit="rad", above=0.0, high=math.pi)
 
@@ -59,30 +62,33 @@ class Fallen:
     otherwise = "FELL: the frame reached the stop's angle"
 
     def margin(self, output: BalanceOutput) -> Scalar:
-        """angle^2 - theta^2 [rad^2]."""
+        """Return angle^2 - theta^2 [rad^2]."""
         return self.angle**2 - output.theta**2
 
     def remainder(self, sample: Sample, stopped: Any) -> tuple[Scalar, Scalar]:
-        """Nothing is left."""
+        """Return 0 s and 0 m."""
         del stopped
         return 0.0 * sample.t, 0.0 * sample.t
 
 
 @pytree
 class NoStop:
-    """No stop: the run goes on for the whole duration of the solver."""
+    """No stop: the run lasts for the whole duration of the solver."""
 
     success = False
     remainder = Fallen.remainder
 
     def margin(self, output: Any) -> Scalar:
-        """1: never crossed."""
+        """Return 1, which never crosses zero."""
         return 1.0 + 0.0 * output[0]
 
 
 def _braked(sample: Sample, end: Scalar, stopped: Any) -> tuple[Any, Any]:
-    """Braked to `end` at the last deceleration. For a run that stopped, at no less than half its mean deceleration:
-    slip may chatter at the very end, and the last instant then says little."""
+    """Return time [s] and distance [m] to the speed `end` at the last deceleration.
+
+    For a run that stopped, the deceleration is at least half its mean. Slip may chatter at the very end, and the last
+    instant is then not representative.
+    """
     output, t = sample.output, jnp.maximum(sample.t, 1e-9)
     mean = 2 * (output.distance / t - output.speed) / t
     a = jnp.where(stopped, jnp.maximum(output.deceleration, 0.5 * mean), output.deceleration)
