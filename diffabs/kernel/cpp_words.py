@@ -60,7 +60,7 @@ def literal(node: Node) -> str:
         return f"all({'true' if x else 'false'})"
     name = CPP_TYPES[node.dtype.name]
     if not is_real(node.dtype):
-        # C++ parses the literal of the least integer as a negated number that is out of range, so a macro stands for it.
+        # C++ parses -2147483648 as the negative of a number out of range, so a macro stands for the least integer.
         ends = {"i32": "", "u32": "u", "i64": "ll", "u64": "ull"}[name]
         number = (
             f"INT{x.itemsize * 8}_MIN" if node.dtype.kind == "i" and x == np.iinfo(x.dtype).min else f"{int(x)}{ends}"

@@ -9,7 +9,8 @@ from typing import NamedTuple
 from diffabs.kernel.cpp import LaunchShape, Text
 from diffabs.kernel.program import ScalarProgram
 
-THREADS_PER_BLOCK = 128  # few, so that several blocks share a multiprocessor's registers
+# A thread uses up to 255 registers (the maximum) and a multiprocessor has 65,536: two blocks of 128 threads fill it.
+THREADS_PER_BLOCK = 128
 COUNTER = 64  # bytes reserved for the number of the next lane
 
 
