@@ -127,7 +127,7 @@ class Graph:
         no = no.args[1] if no.op == "select" and no.args[0] is which else no
         if no is yes:
             return yes
-        # `lower` and `higher` are the processor's min and max. Both return the second operand for NaN, as selected here.
+        # `lower` and `higher` are the processor's min and max. They return the second operand for NaN, as here.
         if which.op == "lt" and {yes, no} == set(which.args):
             return self._make("lower" if yes is which.args[0] else "higher", (yes, no), yes.dtype)
         return self._make("select", (which, no, yes), yes.dtype)
