@@ -193,7 +193,7 @@ def _reached_arrays(
         _tangent_results(program, functions, differentiable),
     )
     nodes = live_nodes([node for nodes in ends.values() for node in nodes])
-    # while True:
+    # A fixed point: arrays that one step reaches may reach more arrays in the next.
     moved_arrays = seeded
     while True:
         starts = {
@@ -203,7 +203,6 @@ def _reached_arrays(
         }
         found = dependents(nodes, {node.id for p, node in program.inputs.items() if (p.level, p.array) in starts})
         reached = tuple(
-            # A fixed point: arrays that one step reaches may reach more arrays in the next.
             i for i, nodes in ends.items() if i in moved_arrays[UpdateLevel.STEP] or any(x.id in found for x in nodes)
         )
         if reached == moved_arrays[UpdateLevel.STEP]:
