@@ -18,7 +18,7 @@ def difference_equations(loop: Loop, target: Any = None) -> dict[str, Any]:
 
     Args:
         loop: Closed loop whose controller is sampled.
-        target: Target at rest, None for the loop's own.
+        target: Setpoint, in the unit of the plant's first output; None for the loop's own.
 
     Returns:
         A dictionary with F (n, n), G (n, m), H (n,), J (m,), the names of y ("inputs") and the period [s].
