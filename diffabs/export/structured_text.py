@@ -214,7 +214,7 @@ class _Block:
         return self._real(x)
 
     def _real(self, x: float) -> str:
-        """Return the literal of a real number, with infinity as the largest finite number; raise Unsupported for NaN."""
+        """Return the literal of a real number; infinity becomes the largest finite number, NaN raises Unsupported."""
         if np.isnan(x):
             raise Unsupported("nan", "there is no such number in it")
         limit = np.finfo(self.device.dtype).max

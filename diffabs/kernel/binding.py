@@ -21,7 +21,7 @@ from diffabs.kernel.graph import UpdateLevel, is_real
 from diffabs.kernel.program import ScalarProgram, TracedFunctions
 from diffabs.kernel.tangents import INPUT_LEVELS, ArrayKey, DerivativeProgram
 
-MAX_TANGENTS_PER_LAUNCH = 8
+MAX_TANGENTS_PER_LAUNCH = 8  # more tangents take several launches
 NO_REVERSE_MODE = (
     "a kernel has no reverse mode: forward mode (jax.jvp, jax.jacfwd) has its derivatives, engine = 'xla' both"
 )

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from diffabs.kernel.cpp import LaunchShape, Text
 from diffabs.kernel.program import ScalarProgram
 
-# A thread uses up to 255 registers (the maximum) and a multiprocessor has 65,536: two blocks of 128 threads fill it.
+# Two blocks in double precision, or three in single, fill the 65,536 registers of a multiprocessor (`threads.h`).
 THREADS_PER_BLOCK = 128
 COUNTER = 64  # bytes reserved for the number of the next lane
 
