@@ -100,7 +100,7 @@ class Words:
     def _expression(self, node: Node) -> str:
         args = [self.name(x) for x in node.args]
         suffix = "f" if self.single else ""
-        # A compiler warns of x != x. isnan gives any nonzero value, hence != 0.
+        # isnan returns an int: any nonzero value means NaN.
         if node.op == "ne" and node.args[0] is node.args[1]:
             return f"isnan({args[0]}) != 0"
         if node.op in C_INFIX:

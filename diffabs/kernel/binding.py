@@ -132,7 +132,7 @@ def _shapes(*arrays: Any, lanes: LanePrograms, begins: Any, many: int, as_lanes:
 
     def shape(key: ArrayKey) -> Any:
         x = carry[key.number]
-        # A kernel's results have fixed types: a weak type would change the type of a `while_loop` carry.
+        # Results have fixed types, also where the initial carry is weakly typed.
         return x.update(shape=(x.shape[0], many, *x.shape[1:])) if key.tangent else x.update(weak_type=False)
 
     return [shape(key) for key in lanes.ends(begins)]

@@ -131,7 +131,6 @@ def constant_array(graph: Graph, x: Any, dtype: Any = None) -> Array:
         dtype: Type, None for the type of `x`.
     """
     x = np.asarray(x, dtype)
-    # Map over indices, because entries of `x` would lose their NumPy type in an object array.
     return map_entries(lambda i: graph.const(x.reshape(-1)[i]), np.arange(x.size).reshape(x.shape))
 
 
@@ -141,7 +140,6 @@ def scalar_array(node: Node) -> Array:
     Args:
         node: Number.
     """
-    # np.array(node) would ask the node for a sequence protocol; assignment stores it as an object.
     out = np.empty((), object)
     out[()] = node
     return out
