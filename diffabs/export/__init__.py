@@ -1,5 +1,4 @@
-"""What was tuned, for where it shall run: the computer's part of a loop as C, Structured Text or difference equations;
-and the plant as an FMU."""
+"""Export of a tuned loop: the controller as C99, Structured Text or difference equations, and the plant as an FMU."""
 
 from diffabs.export.c99 import c_source as c_source
 from diffabs.export.device import ComputerProgram as ComputerProgram

@@ -1,4 +1,4 @@
-"""A device as one file of C99: structs of memory and parameters, a function for the start, one for a sample."""
+"""A controller as one file of C99: structs of memory and parameters, a start function and a step function."""
 
 from collections.abc import Iterator, Sequence
 
@@ -14,16 +14,24 @@ from diffabs.kernel.program import live_nodes
 
 
 def c_source(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
-    """Return a device as C99: `NAME_state`, `NAME_input`, `NAME_parameters` with `NAME_defaults`, `NAME_start`,
-    `NAME_step`, and the type `NAME_real` of their numbers. Under `#ifdef NAME_MAIN`, with the name in capitals, a main
-    for tests reads a line of inputs for each sample and writes the command.
+    """Return a controller as C99.
 
-    name: an identifier; notes: lines of the comment at its head
+    The file has the number type `NAME_real`, the structs `NAME_state`, `NAME_input` and `NAME_parameters` with
+    `NAME_defaults`, and the functions `NAME_start` and `NAME_step`.
+    Under `#ifdef NAME_MAIN`, with the name in capitals, it has a main function for tests.
+    That function reads a line of inputs for each sample and writes the command.
+
+    Args:
+        found: The computer's part of a loop.
+        name: Prefix of the names in C, an identifier.
+        notes: Lines for the comment at the head of the file.
+
     Raises:
-        NotExported: an operation that has no translation.
+        NotExported: The name is no identifier, or an operation has no translation.
     """
     if not is_name(name):
         raise NotExported(f"{name!r} is no name that C has for a function: letters, digits and _")
+    # Integers of 64 bits are in the traced program, even if the reals are of single precision.
     with jax.enable_x64(True):
         try:
             return "\n".join(_Text(found, name, notes).parts()) + "\n"
@@ -32,6 +40,8 @@ def c_source(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> st
 
 
 class _Text:
+    """A writer of the file."""
+
     def __init__(self, found: ComputerProgram, name: str, notes: Sequence[str]):
         self.device, self.name, self.notes = found, name, notes
         self.real = f"{name}_real"
@@ -43,10 +53,11 @@ class _Text:
         self.words = Words(self.real, self._place, single=found.dtype == np.float32)
 
     def _place(self, where: str, path: str) -> str:
+        """Return the C expression of an input, memory entry or parameter; the loop counter has no struct."""
         return f"{where}->{self.fields[where][path]}" if where else path
 
     def parts(self) -> Iterator[str]:
-        """Yield the text, block after block."""
+        """Yield the blocks of the text."""
         yield from self._head()
         yield f"typedef {'float' if self.device.dtype == np.float32 else 'double'} {self.real};\n"
         yield from self._structs()
@@ -63,6 +74,7 @@ class _Text:
         yield from self._main()
 
     def _head(self) -> Iterator[str]:
+        """Yield the comment at the head, the includes and the check of compiler flags."""
         delay = f", output it {float(self.device.delay)!r} s after that" if self.device.delay else ""
         yield f"/* {self.name}: the controller, to be called every {float(self.device.period)!r} s{delay}."
         for line in [*self.notes, *map(str, self.device.numbers)]:
@@ -74,11 +86,12 @@ class _Text:
             "   Nothing is allocated and nothing changes that is global; two states are two controllers. */"
         )
         yield "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>\n"
+        # With -ffast-math a compiler may assume that no NaN exists and remove the check for lost samples.
         yield "#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__ > 0)"
         yield "#error compile without -ffast-math and -ffinite-math-only: a NaN must be seen\n#endif\n"
 
     def _structs(self) -> Iterator[str]:
-        """Inputs, parameters and memory."""
+        """Yield the structs of inputs, parameters and memory."""
         program, real = self.program, self.real
         specs = {name: spec for number in self.device.numbers for name, spec in number.named()}
         inputs, numbers, memory = (self.fields[where] for where in (INPUTS, NUMBERS, MEMORY))
@@ -91,12 +104,13 @@ class _Text:
         yield from self._struct("What is remembered from one sample to the next.", "state", [*kept, held])
 
     def _struct(self, about: str, name: str, members: Sequence[str]) -> Iterator[str]:
+        """Yield a struct with a comment; an empty one gets a placeholder, because C99 has no empty structs."""
         yield f"/* {about} */\ntypedef struct {{"
         yield from (f"  {member}" for member in members or ["char none;"])
         yield f"}} {self.name}_{name};\n"
 
     def _defaults(self) -> Iterator[str]:
-        """The parameters of the scenario."""
+        """Yield the parameter values of the scenario."""
         names, values = self.fields[NUMBERS], self.program.values
         rows = [f".{names[x]} = {self.words.literal(self.device.dtype.type(values[x]))}" for x in self.program.used]
         yield f"const {self.name}_parameters {self.name}_defaults = {{"
@@ -104,13 +118,15 @@ class _Text:
         yield "};\n"
 
     def _body(self, stored: dict[str, Node], more: Sequence[Node]) -> Iterator[str]:
-        """Yield the statements that compute `stored` and `more`, and store them in the memory."""
+        """Yield the statements that compute `stored` and `more` and store them in the memory."""
         nodes = live_nodes([*stored.values(), *more])
         moving = self.program.moving if more else {}
         used = {node.id for node in nodes} | {node.id for node in live_nodes(list(moving.values()))}
         for struct, names in ((INPUTS, self.program.inputs), (NUMBERS, self.program.numbers)):
+            # A cast to void avoids a warning for an unused argument.
             if not any(node.id in used for node in names.values()):
                 yield f"  (void){struct};"
+        # All operations come before the first store, because they read the memory's old values.
         yield from self.words.operations(nodes, "  ")
         if moving:
             yield from self._moves(moving)
@@ -119,7 +135,7 @@ class _Text:
                 yield f"  s->{self.fields[MEMORY][name]} = {self.words.name(node)};"
 
     def _moves(self, moving: dict[str, Node]) -> Iterator[str]:
-        """What moves by itself until the next sample, by as many steps as the simulation takes."""
+        """Yield the loop that advances the reference to the next sample in the simulation's Runge-Kutta steps."""
         yield f"  for (int i = 0; i < {self.device.moves}; i++) {{"
         yield from self.words.operations(live_nodes(list(moving.values())), "    ")
         for name, node in moving.items():
@@ -128,6 +144,7 @@ class _Text:
         yield "  }"
 
     def _main(self) -> Iterator[str]:
+        """Yield a main function for tests."""
         scan = "%f" if self.device.dtype == np.float32 else "%lf"
         count = len(self.program.read)
         yield f"#ifdef {self.name.upper()}_MAIN"
@@ -141,5 +158,6 @@ class _Text:
             yield "  in.none = 0;\n  while (getchar() == '\\n') {"
         yield f"    if (first)\n      {self.name}_start(&s, &{self.name}_defaults, &in);"
         yield "    first = false;"
+        # Seventeen digits identify a double.
         yield f'    printf("%.17g\\n", (double){self.name}_step(&s, &{self.name}_defaults, &in));\n  }}'
         yield "  return 0;\n}\n#endif"

@@ -1,6 +1,7 @@
-"""Operations on single numbers as C99: what a controller and a plant have in common.
+"""C99 for operations on single numbers, shared by the exports of controllers and plants.
 
-An operation that C has no word for is an objection that names it."""
+An operation without a translation raises Unsupported with its name.
+"""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -29,21 +30,32 @@ C_KEYWORDS_TEXT = (
     "bool true false"
 )
 C_KEYWORDS = set(C_KEYWORDS_TEXT.split())
-TAKEN = {*C_FUNCTIONS.values(), "s", "p", "in", "i", "m", "t", "h"}  # which a variable must not hide
+TAKEN = {*C_FUNCTIONS.values(), "s", "p", "in", "i", "m", "t", "h"}  # names that a variable must not hide
 
 
 class Words:
-    """C for numbers of a type, `real` (`single`: in single precision), where `place(where, path)` says where an input
-    of the graph stands."""
+    """A writer of C99 for the nodes of a graph.
+
+    Attributes:
+        real: C type of the real numbers.
+        place: Function (where, path) -> C expression of an input of the graph.
+        single: Whether real numbers have single precision.
+    """
 
     def __init__(self, real: str, place: Callable[[str, str], str], single: bool = False):
-        """Nothing is written yet."""
+        """Create a writer without variables.
+
+        Args:
+            real: C type of the real numbers.
+            place: Function (where, path) -> C expression of an input of the graph.
+            single: Whether real numbers have single precision.
+        """
         self.real, self.place, self.single = real, place, single
         self._names: dict[int, str] = {}
         self._taken = {*TAKEN, real}
 
     def operations(self, nodes: Sequence[Node], indent: str) -> Iterator[str]:
-        """The lines that work these out, arguments first."""
+        """Yield the declarations that compute `nodes`, operands first, each line after `indent`."""
         for node in nodes:
             if node.op in ("const", "input"):
                 continue
@@ -53,11 +65,11 @@ class Words:
             yield f"{indent}const {self.type(node)} {self.name(node)} = {self._expression(node)};"
 
     def type(self, node: Node) -> str:
-        """Of a number."""
+        """Return the C type of the number `node`."""
         return self.real if is_real(node.dtype) else C_TYPES[node.dtype.name]
 
     def name(self, node: Node) -> str:
-        """What stands for a number: a literal, a variable, a place."""
+        """Return the C expression of `node`: a literal, a variable, or the place of an input."""
         if node.op == "const":
             return self._literal(node)
         if node.op == "input":
@@ -67,13 +79,14 @@ class Words:
         return self._names[node.id]
 
     def _literal(self, node: Node) -> str:
+        """Return the C literal of a constant."""
         x = node.attr
         if node.dtype.kind == "b":
             return "true" if x else "false"
         return self.literal(x) if is_real(node.dtype) else f"(({C_TYPES[node.dtype.name]}){int(x)})"
 
     def literal(self, x: Any) -> str:
-        """A real number, of NumPy, as it is written."""
+        """Return the C literal of the real number `x` (a NumPy scalar): the shortest decimal that reads back as `x`."""
         if np.isnan(x):
             return "NAN"
         if np.isinf(x):
@@ -81,18 +94,21 @@ class Words:
         short = 1e-4 <= abs(x) < 1e7 or x == 0
         text = np.format_float_positional(x, trim="0") if short else np.format_float_scientific(x, trim="0")
         text += "f" if self.single else ""
+        # Parentheses, so that a - (-1.0) does not become a--1.0. signbit, so that -0.0 keeps its sign.
         return f"({text})" if np.signbit(x) else text
 
     def _expression(self, node: Node) -> str:
         args = [self.name(x) for x in node.args]
         suffix = "f" if self.single else ""
+        # isnan returns an int: any nonzero value means NaN.
         if node.op == "ne" and node.args[0] is node.args[1]:
             return f"isnan({args[0]}) != 0"
         if node.op in C_INFIX:
             return f"{args[0]} {C_INFIX[node.op]} {args[1]}"
         if node.op in CLAMP_COMPARISONS:
             return f"{args[0]} {CLAMP_COMPARISONS[node.op]} {args[1]} ? {args[0]} : {args[1]}"
-        if node.op in EXTREMES:  # NaN where either is
+        # a != a detects NaN in a. For NaN in b the comparison is false, so b is returned: the result is NaN either way.
+        if node.op in EXTREMES:
             a, b = args
             return f"{a} != {a} || {a} {EXTREMES[node.op]} {b} ? {a} : {b}"
         if node.op in C_FUNCTIONS and is_real(node.dtype):
@@ -118,25 +134,42 @@ class Words:
 
 
 def is_name(name: str) -> bool:
-    """Return whether C has such a name for a function."""
+    """Return whether a name is an identifier in C that may name a function.
+
+    Args:
+        name: Text to test.
+    """
     return bool(re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII)) and name not in C_KEYWORDS
 
 
 def identifier(path: str) -> str:
-    """Return a path as a name of C; empty where nothing of it can be in one."""
+    """Return a path as an identifier of C; empty if no character of the path is allowed in one.
+
+    Args:
+        path: Text such as a path in a pytree.
+    """
     name = re.sub(r"\W+", "_", path, flags=re.ASCII).strip("_")
     name = f"x{name}" if name[:1].isdigit() else name
     return f"{name}_" if name in C_KEYWORDS else name
 
 
 def identifiers(paths: Iterable[str]) -> dict[str, str]:
-    """Return paths as names of C, each another."""
+    """Return unique identifiers of C, by path.
+
+    Args:
+        paths: Texts such as paths in a pytree.
+    """
     taken: set[str] = set()
     return {path: fresh_name(identifier(path) or "x", taken) for path in paths}
 
 
 def fresh_name(name: str, taken: set[str]) -> str:
-    """Return a name that is not taken, with a number where it must be; it is taken then."""
+    """Return a name that is not in `taken`, with a number if necessary, and add it to `taken`.
+
+    Args:
+        name: Preferred name.
+        taken: Names in use; the function adds the new name.
+    """
     number, new = 2, name
     while new in taken:
         number, new = number + 1, f"{name}_{number}"
@@ -145,6 +178,10 @@ def fresh_name(name: str, taken: set[str]) -> str:
 
 
 def comment_text(text: str) -> str:
-    """Return a text as it may stand in a comment of any language: on one line, of an alphabet in which no comment ends,
-    begins or goes on."""
+    """Return a text in a form that is safe in a comment of any language: one line, all unsafe characters as `_`.
+
+    Args:
+        text: Text of a comment.
+    """
+    # The alphabet lacks * and the backslash: no block comment can begin or end, and no line can continue.
     return re.sub(r"[^A-Za-z0-9 .,:;=+_/()\[\]<>'^%&|-]", "_", " ".join(text.split()))

@@ -1,11 +1,13 @@
-"""The computer's part of a loop: what it does once a period, from what is measured to the command.
+"""The computer's part of a loop: the calculation from measurements to command that runs once a period.
 
     memory, measured --> target, feed-forward, controller --> memory, command
 
-It is the loop's own code, traced: reference, feed-forward and the controller within `Sampled` (`Sampled.guarded`). The
-parameters of these three can be changed; those of the plant, period and delay are constants. A target that moves by
-itself, such as a filtered one, is advanced by the Runge-Kutta steps that the simulation takes. Sensors and actuators
-are the machine's, not the computer's."""
+The functions are the loop's own code, traced: reference, feed-forward and the controller within `Sampled`
+(`Sampled.guarded`).
+The parameters of these three remain variables. Those of the plant, period and delay become constants.
+A target that moves by itself, such as a filtered one, is advanced by the Runge-Kutta steps of the simulation.
+Sensors and actuators belong to the machine, not to the computer.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -25,22 +27,34 @@ from diffabs.core.pytree import Spec, as_arrays, canonical_dtypes, parameters, p
 from diffabs.core.tracing import depends_on_signal, leaf_dependence
 from diffabs.simulate.rk4 import rk4_step
 
-MAX_STEPS_PER_SAMPLE = 64  # of the simulation in a period, for a target that moves by itself
+MAX_STEPS_PER_SAMPLE = 64  # simulation steps in a period, for a target that moves by itself
 
 
 class NotExported(ValueError):
-    """What of a loop cannot be exported, and why, in one line."""
+    """An error: a loop cannot be exported. The message says why, in one line."""
 
 
 class Input(NamedTuple):
-    """What the computer is given in each period: what is measured, and the target if somebody else says it."""
+    """The input of one period.
+
+    Attributes:
+        measured: Measured outputs.
+        target: Target, if it comes from outside.
+    """
 
     measured: Any
     target: Any = ()
 
 
 class State(NamedTuple):
-    """What it remembers: of the controller, how many samples there were, the last command, and of the reference."""
+    """The memory of the computer.
+
+    Attributes:
+        controller: Memory of the controller.
+        samples: Number of samples so far.
+        command: Last command.
+        reference: Memory of the reference.
+    """
 
     controller: Memory
     samples: Any
@@ -49,7 +63,7 @@ class State(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """The parts whose parameters can be changed; no reference where the target is given."""
+    """The parts with variable parameters; the reference is empty if the target comes from outside."""
 
     controller: Any
     feedforward: Any
@@ -57,19 +71,27 @@ class Parts(NamedTuple):
 
 
 class DeviceParameter(NamedTuple):
-    """A parameter of a part: its path in the loop, value (...), and what it may be."""
+    """A parameter of a part.
+
+    Attributes:
+        path: Path in the loop.
+        value: Value, (...).
+        spec: Unit and range.
+    """
 
     path: str
     value: np.ndarray
     spec: Spec
 
     def __str__(self) -> str:
-        """One line for the head of a file."""
+        """Return one line for the head of a file: path, value and unit."""
+        # Nine digits if they identify the value, else all seventeen.
         values = " ".join(f"{x:.17g}" if float(f"{x:.9g}") != x else f"{x:.9g}" for x in self.value.flat)
         return f"{self.path} = {values}{'' if self.spec.unit in ('', '1') else f' {self.spec.unit}'}"
 
     def named(self) -> Iterator[tuple[str, str]]:
-        """Each of its numbers as the code has it, by name, with what is said of it."""
+        """Yield name and description (unit and range) of each number, as in the exported code."""
+        # Twice: the controller stands within `Sampled`, which itself is the loop's controller.
         path = self.path.removeprefix("controller.").removeprefix("controller.")
         units = [unit.strip() for unit in self.spec.unit.split(",")]
         for k, at in enumerate(np.ndindex(self.value.shape)):
@@ -79,13 +101,27 @@ class DeviceParameter(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ComputerProgram:
-    """What a computer works out, as functions to trace. start(parts, input) -> state, before the first sample. At each
-    sample step(parts, state, input) -> (controller's memory, samples, command, whether they are held because the sample
-    cannot be used), and then `moves` times move(parts, state, i) -> reference's memory, i = 0, 1, ...
+    """The computer's part of a loop as functions to trace.
 
-    units: of the inputs, by name; input, state: shapes, of numbers of `dtype`; parts: with the numbers that they begin
-    with; period, delay: of sampling and computing [s]; numbers: all parameters, those of the plant only where the
-    feed-forward is made of them"""
+    A program calls `start` once before the first sample, `step` at each sample, and then `move` `moves` times.
+    Shapes are those of numbers of `dtype`.
+
+    Attributes:
+        start: start(parts, input) -> state.
+        step: step(parts, state, input) -> (controller's memory, samples, command, held).
+            `held` is true if the sample cannot be used, so that memory and command stay.
+        move: move(parts, state, i) -> reference's memory, for i = 0, 1, ...
+        moves: Number of calls of `move` after each sample.
+        units: Units of the inputs by name.
+        input: Shapes of the input.
+        state: Shapes of the state.
+        parts: Parts with the initial values of their parameters.
+        dtype: Type of the real numbers.
+        period: Sampling period [s].
+        delay: Computing delay [s].
+        control_unit: Unit of the command.
+        numbers: All parameters; those of the plant only if the feed-forward depends on them.
+    """
 
     start: Callable[[Parts, Input], State]
     step: Callable[[Parts, State, Input], tuple[Memory, Any, Any, Any]]
@@ -107,11 +143,16 @@ def computer_program(
 ) -> ComputerProgram:
     """Return the computer's part of a loop whose controller is `Sampled`.
 
-    step: of the simulation [s], which a target that moves by itself is advanced by; by default the period
-    given_target: the target is an input
+    Args:
+        loop: Closed loop.
+        step: Step of the simulation [s], by which a target that moves by itself is advanced; by default the period.
+        dtype: Type of the real numbers.
+        given_target: Whether the target is an input.
+
     Raises:
-        NotExported: a controller in continuous time; a reference that follows what is measured, unless the target is
-            given.
+        NotExported: The controller runs in continuous time, the reference follows measurements without `given_target`,
+            or
+            a period has more than MAX_STEPS_PER_SAMPLE steps.
     """
     loop = with_sampled_controller(loop)
     controller: Any = loop.controller
@@ -119,6 +160,7 @@ def computer_program(
         typed: Loop = jax.tree.map(lambda x: jnp.asarray(x, dtype), canonical_dtypes(as_arrays(loop)))
         computer: Any = typed.controller
         parts = Parts(computer.controller, typed.feedforward, () if given_target else typed.reference)
+        # `parts` holds the raw parameters: derived values are traced from them, so they follow a changed parameter.
         typed = prepare_parts(typed)
         shapes = jax.eval_shape(lambda: _start_input(typed, given_target))
         if not given_target:
@@ -138,7 +180,7 @@ def computer_program(
 
 
 def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Iterator[DeviceParameter]:
-    """The parameters of what the computer works out."""
+    """Yield the parameters that the computer's calculation depends on."""
     measured = given.measured
 
     def ahead(plant: Any) -> Any:
@@ -154,10 +196,13 @@ def _numbers(loop: Loop, typed: Loop, given: Input, given_target: bool) -> Itera
 
 
 def with_sampled_controller(loop: Loop) -> Loop:
-    """Return the loop with its controller as `Sampled`; `SampledOnGrid` is the same on a computer.
+    """Return the loop with its controller as `Sampled`; `SampledOnGrid` is equivalent on a computer.
+
+    Args:
+        loop: Closed loop.
 
     Raises:
-        NotExported: a controller in continuous time.
+        NotExported: The controller runs in continuous time.
     """
     controller: Any = loop.controller
     if isinstance(controller, SampledOnGrid):
@@ -170,13 +215,14 @@ def with_sampled_controller(loop: Loop) -> Loop:
 
 
 def _start_input(loop: Loop, target: bool) -> Input:
-    """The input at the loop's start."""
+    """Return the input at the loop's start."""
     state = loop.start()
     measured = loop.sensor.output(0.0, state.sensor, loop.plant.output(state.plant))
     return Input(measured, measured[0] if target else ())
 
 
 def _steps(period: float, step: float | None) -> int:
+    """Return the simulation's steps in a period; raise NotExported above MAX_STEPS_PER_SAMPLE."""
     count = round(period / step) if step else 1
     if count > MAX_STEPS_PER_SAMPLE:
         raise NotExported(
@@ -186,7 +232,7 @@ def _steps(period: float, step: float | None) -> int:
 
 
 def _check_reference(loop: Loop, measured: Any) -> None:
-    """Raises NotExported for a target that depends on what is measured, or changes at instants."""
+    """Raise NotExported for a target that depends on measurements between samples, ticks, or has events."""
     reference, name = loop.reference, type(loop.reference).__name__
     memory = reference.start(measured)
     moves = depends_on_signal(lambda y: (reference.flow(0.0, memory, y), reference.output(0.0, memory, y)), measured)
@@ -195,7 +241,7 @@ def _check_reference(loop: Loop, measured: Any) -> None:
 
 
 class _Work:
-    """What the computer does, of a loop whose numbers are of one type."""
+    """The computer's calculation for a loop whose real numbers have one type."""
 
     def __init__(self, loop: Loop, count: int, given_target: bool, given: Input):
         self.loop, self.count, self.given_target, self.given = loop, count, given_target, given
@@ -203,7 +249,7 @@ class _Work:
         self.sampled = loop.controller
 
     def start(self, parts: Parts, given: Input) -> State:
-        """The memories at the first sample."""
+        """Return the memory at the first sample."""
         loop, given = self._with(parts), replace_nan(given)
         reference = Memory() if self.given_target else loop.reference.start(given.measured)
         tracking, _ = self._tracking(loop, reference, given, 0.0)
@@ -211,8 +257,7 @@ class _Work:
         return State(loop.controller.controller.start(tracking), jnp.zeros((), jnp.int64), zero, reference)
 
     def step(self, parts: Parts, state: State, given: Input) -> tuple[Memory, Any, Any, Any]:
-        """The controller's memory after a sample, how many samples there were, the command, and whether memory and
-        command are held."""
+        """Return the controller's memory after a sample, the number of samples, the command, and the truth `held`."""
         loop, t = self._with(parts), self._time(state)
         tracking, lost = self._tracking(loop, state.reference, given, t)
         clock = Clock(t, loop.controller.period, state.samples, None, before=tracking)
@@ -220,9 +265,10 @@ class _Work:
         return inner, state.samples + 1, command, held
 
     def move(self, parts: Parts, state: State, i: Any) -> Memory:
-        """The reference's memory after the i-th step of the simulation in a period."""
+        """Return the reference's memory after the i-th simulation step in a period."""
         loop = self._with(parts)
         h, memory = loop.controller.period / self.count, state.reference
+        # `_check_reference` has shown that the reference ignores measurements, so zeros stand for them.
         zero = jax.tree.map(jnp.zeros_like, self.given.measured)
 
         def rate(t: Any, x: Any) -> Any:
@@ -231,18 +277,18 @@ class _Work:
         return memory._replace(flow=rk4_step(rate, self._time(state) + i * h, memory.flow, h))
 
     def _with(self, parts: Parts) -> Any:
-        """The loop with these parts in it."""
+        """Return the loop with these parts in it."""
         controller = dataclasses.replace(self.sampled, controller=prepare_parts(parts.controller))
         loop = dataclasses.replace(self.loop, controller=controller, feedforward=prepare_parts(parts.feedforward))
         return loop if self.given_target else dataclasses.replace(loop, reference=prepare_parts(parts.reference))
 
     def _time(self, state: State) -> Any:
-        """Of the sample [s]."""
+        """Return the time of the sample [s]."""
         period = self.sampled.period
         return state.samples.astype(jnp.result_type(period)) * period
 
     def _tracking(self, loop: Loop, reference: Memory, given: Input, t: Any) -> tuple[Tracking, Any]:
-        """What the controller is given, and whether the feed-forward would be made of a NaN."""
+        """Return the controller's input, and whether a NaN enters the feed-forward."""
         measured = replace_nan(given.measured)
         if self.given_target:
             target, setpoint = given.target, replace_nan(given.target)
@@ -253,6 +299,7 @@ class _Work:
         def ahead(measured: Any) -> Any:
             return loop.feedforward.input(loop.plant, measured, setpoint)
 
+        # Only measurements that the feed-forward depends on can spoil it. The controller checks the others itself.
         followed = zip(jax.tree.leaves(given.measured), leaf_dependence(ahead, measured), strict=True)
         lost = reduce(jnp.logical_or, [jnp.isnan(x) for x, on in followed if on], False)
         return Tracking(target, given.measured, ahead(measured)), lost

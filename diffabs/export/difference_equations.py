@@ -1,4 +1,4 @@
-"""A sampled controller as linear difference equations with their coefficients, valid inside all limits."""
+"""A sampled controller as linear difference equations, valid while no limit is active."""
 
 from typing import Any
 
@@ -8,15 +8,23 @@ from diffabs.core.loop import Loop
 from diffabs.export.device import NotExported, with_sampled_controller
 from diffabs.linear.opened_loop import open_loop
 
-ENTRY_ROUNDING = 1e-12  # relative to the greatest coefficient of a matrix: less is none
+ENTRY_ROUNDING = 1e-12  # relative to a matrix's largest coefficient; smaller coefficients are rounding errors
 
 
 def difference_equations(loop: Loop, target: Any = None) -> dict[str, Any]:
-    """Return the linear controller at rest on the setpoint: x(k+1) = F x(k) + G y(k), u(k) = H x(k) + J y(k), all
-    of them differences from rest; by name F (n, n), G (n, m), H (n,), J (m,), the names of y, and the period [s].
+    """Return the coefficients of the controller, linearized at rest on the setpoint.
+
+    x(k+1) = F x(k) + G y(k) and u(k) = H x(k) + J y(k), all as differences from rest.
+
+    Args:
+        loop: Closed loop whose controller is sampled.
+        target: Setpoint, in the unit of the plant's first output; None for the loop's own.
+
+    Returns:
+        A dictionary with F (n, n), G (n, m), H (n,), J (m,), the names of y ("inputs") and the period [s].
 
     Raises:
-        NotExported: a controller in continuous time, or a loop without a linear model.
+        NotExported: The controller runs in continuous time, or the loop has no linear model.
     """
     loop = with_sampled_controller(loop)
     try:
@@ -25,6 +33,7 @@ def difference_equations(loop: Loop, target: Any = None) -> dict[str, Any]:
         raise NotExported(str(error)) from None
     found = found._replace(**{name: _round_entries(getattr(found, name)) for name in "ABCD"})
     names = ["target", *loop.plant.shows._fields, "feedforward"]
+    # Inputs without any coefficient are left out, such as an unused feed-forward.
     used = (np.abs(found.B).max(axis=0, initial=0) > 0) | (np.abs(found.D[0]) > 0)
     kept = [i for i, one in enumerate(used) if one]
     return {
@@ -34,4 +43,5 @@ def difference_equations(loop: Loop, target: Any = None) -> dict[str, Any]:
 
 
 def _round_entries(matrix: Any) -> np.ndarray:
+    """Return a matrix with entries that are rounding errors set to 0."""
     return np.where(np.abs(matrix) > ENTRY_ROUNDING * np.max(np.abs(matrix), initial=0.0), matrix, 0.0)

@@ -1,7 +1,7 @@
-/* FMI 2.0 for co-simulation around a plant: the struct `model`, plant_start, plant_step and plant_show stand before this,
-   with GUID, VARIABLES, OUTPUTS, STATES, STEP, and of the variables `begun`, the values before anything is set, and
-   `low` and `high`, between which they may be set. What is called out of order, or with a value out of range, is an
-   error that changes nothing; after a step that failed only a reset, another state or the end are left. */
+/* FMI 2.0 for co-simulation of a plant. The text before this file defines the struct `model`, plant_start, plant_step,
+   plant_show, GUID, VARIABLES, OUTPUTS, STATES and STEP. It also defines arrays for the variables: `begun` (values
+   before anything is set) and `low` and `high` (limits). A call out of order or with a value out of range returns an
+   error and changes nothing. After a failed step only a reset, another state or termination is allowed. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -110,7 +110,7 @@ EXPORT fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference at[], si
   for (size_t i = 0; i < n; i++)
     if (at[i] >= VARIABLES)
       return fmi2Error;
-  if (m->phase < RUNNING) { /* what is shown before the start is that of the parameters set so far */
+  if (m->phase < RUNNING) { /* before the start, outputs follow from the parameters set so far */
     plant_start(m);
     plant_show(m);
   }
@@ -127,7 +127,7 @@ EXPORT fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference at[], si
   for (size_t i = 0; i < n; i++)
     if (at[i] >= VARIABLES || at[i] < OUTPUTS || (m->phase == RUNNING && at[i] != OUTPUTS) ||
         !(value[i] >= low[at[i]] && value[i] <= high[at[i]]))
-      return fmi2Error; /* only the control is an input; parameters are fixed once it runs */
+      return fmi2Error; /* only the control is an input; parameters are fixed after initialization */
   for (size_t i = 0; i < n; i++)
     m->v[at[i]] = value[i];
   return fmi2OK;
@@ -155,7 +155,7 @@ EXPORT fmi2Status fmi2DoStep(fmi2Component c, double from, double length, fmi2Bo
   return fmi2OK;
 }
 
-/* A state is known by its GUID: that of another model has another meaning. */
+/* The GUID in a state guards against a state of another model, whose numbers mean something else. */
 static fmi2Status copied(model *to, const model *from)
 {
   if (to == NULL || from == NULL || strcmp(from->guid, GUID) != 0)
@@ -213,7 +213,7 @@ EXPORT fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[
   return copied(*state, &read);
 }
 
-/* What FMI asks every FMU to have, and this one has nothing of. */
+/* Functions that FMI demands for types that this FMU has no variables of. */
 #define NONE(kind, type)                                                                                               \
   EXPORT fmi2Status fmi2Get##kind(fmi2Component c, const fmi2ValueReference at[], size_t n, type value[])              \
   {                                                                                                                    \
@@ -267,7 +267,7 @@ EXPORT fmi2Status fmi2GetRealStatus(fmi2Component c, int kind, double *value)
 {
   if (c == NULL || value == NULL)
     return fmi2Error;
-  if (kind != 2) /* the last time that was reached */
+  if (kind != 2) /* fmi2LastSuccessfulTime */
     return fmi2Discard;
   *value = ((model *)c)->time;
   return fmi2OK;

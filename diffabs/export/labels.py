@@ -1,8 +1,10 @@
-"""Names for the numbers of a traced program: those of the variables in the source that it was traced from.
+"""Names for the numbers of a traced program, taken from the variables of its source.
 
-JAX notes with each operation the lines of the source that asked for it. The innermost line of a part, below which are
-only JAX and this package's own helpers, either assigns a variable, whose name is taken, or returns, and then the
-function's is. A program whose source cannot be read gets the names of its operations."""
+JAX records with each operation the source lines that it comes from.
+The innermost line outside JAX and this package's helpers decides: if it assigns a variable, that name is used.
+If it does not, such as a return statement, the function's name is used.
+If the source is not readable, the numbers get the names of their operations.
+"""
 
 import ast
 import functools
@@ -19,29 +21,40 @@ ANONYMOUS = ("<lambda>", "<listcomp>", "<genexpr>", "<module>")
 
 
 class Labelled(Graph):
-    """A graph whose nodes are called as their source calls them; `labels` are those of the program that is translated,
-    by the id of its operations. What is within an operation, such as a call, has the label of the whole."""
+    """A graph whose nodes have labels from the source.
+
+    All nodes of one operation, such as a call, have the label of that operation.
+
+    Attributes:
+        labels: Labels of the traced program's operations, by the id of the equation.
+    """
 
     def __init__(self) -> None:
-        """Without nodes."""
+        """Create an empty graph."""
         super().__init__()
         self.labels: dict[int, str] = {}
         self._label = ""
 
     def begins(self, eqn: Any) -> None:
-        """Take its label for what follows."""
+        """Use the label of the operation `eqn` for the following nodes."""
+        # Equations of an inner program have no label of their own: the one of the call stays.
         self._label = self.labels.get(id(eqn), self._label)
 
     def _make(
         self, op: str, args: tuple[Node, ...], dtype: Any, attr: Any = None, level: UpdateLevel | None = None
     ) -> Node:
         node = super()._make(op, args, dtype, attr, level)
+        # Equal nodes are one, so the first use names it.
         node.label = node.label or self._label
         return node
 
 
 def source_label(eqn: Any) -> str:
-    """Return what the source calls the result of an operation; empty where that cannot be told."""
+    """Return the name that the source gives to the result of an operation; empty if unknown.
+
+    Args:
+        eqn: Equation of a jaxpr.
+    """
     traceback = getattr(getattr(eqn, "source_info", None), "traceback", None)
     for frame in getattr(traceback, "frames", ()):
         place = pathlib.Path(frame.file_name)
@@ -54,7 +67,7 @@ def source_label(eqn: Any) -> str:
 
 @functools.cache
 def _assigned_variables(file: str) -> dict[int, str]:
-    """The variables that the statements of a file assign, by the number of each of their lines."""
+    """Return the variables that a file's statements assign, by the number of each of their lines."""
     try:
         tree = ast.parse(pathlib.Path(file).read_bytes())
     except (OSError, SyntaxError, ValueError):

@@ -1,7 +1,8 @@
-"""A device as single operations on single numbers, for any language to write down.
+"""A controller as operations on single numbers, in a form that every target language can write.
 
-They are made from the jaxprs of what the loop itself does, by the rules of package `kernel`, so no part needs a rule
-for a language."""
+The operations come from the jaxprs of the loop's own functions, by the rules of package `kernel`.
+So a part needs no code for any language.
+"""
 
 import re
 from typing import Any
@@ -15,21 +16,36 @@ from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel
 from diffabs.kernel.primitives import constant_array, lower_jaxpr
 from diffabs.kernel.program import RULE_MODULES, live_nodes
 
-assert RULE_MODULES is not None  # registered where they are imported
+assert RULE_MODULES is not None  # keeps the import, which registers the rules
 
-MEMORY, INPUTS, NUMBERS = "s", "in", "p"  # where an input of the graph is, the first word of its `attr`
+MEMORY, INPUTS, NUMBERS = "s", "in", "p"  # origins of the graph's inputs, the first entry of a node's `attr`
 
 
 class Lowered:
-    """A device whose memory, inputs and parameters are numbers with names. By name: `inputs`, `numbers` and `state`, as
-    they come in; `begun`, the memory before the first sample; `after`, what a sample makes of it; `moving`, what it
-    becomes by itself, `moves` times a sample, with the counter `place`; then the `command`, and whether it is `held`.
-    What a command depends on, now or later, is `kept` of the memory, `read` of the inputs and `used` of the parameters.
+    """A controller whose memory, inputs and parameters are numbers with names.
 
-    Raises Unsupported for an operation that has no rule."""
+    Attributes:
+        inputs, numbers, state: Input nodes of measurements, parameters and memory, by name.
+        values: Initial values of the parameters, by name.
+        begun: Memory before the first sample, by name.
+        after: Memory after a sample, by name.
+        moving: Memory after one simulation step of the reference, by name; it repeats `moves` times a sample.
+        place: Counter of these steps.
+        command: Node of the command.
+        held: Node of the truth that the sample cannot be used.
+        kept, read, used: Names of memory, inputs and parameters that a command depends on, at once or later.
+        stored: Memory after a sample for the names in `kept`, without `moving`.
+    """
 
     def __init__(self, found: ComputerProgram):
-        """Trace start, step and move."""
+        """Trace and lower start, step and move.
+
+        Args:
+            found: The computer's part of a loop.
+
+        Raises:
+            Unsupported: An operation has no lowering rule.
+        """
         self.device = found
         graph = Labelled()
         self.inputs = number_leaves(found.input, graph, INPUTS, lambda path: path.removeprefix("measured."))
@@ -47,6 +63,7 @@ class Lowered:
             place, count = np.full((), self.place, object), jax.ShapeDtypeStruct((), np.int64)
             shapes = (found.parts, found.state, count)
             moved = trace_outputs(graph, lambda all: found.move(*all), shapes, [*parts, *held, place])
+        # The reference's memory comes last in the state, and only `move` changes it.
         moving = dict(zip([*self.state][len(after) :], moved, strict=bool(moved)))
         self.after = dict(zip(self.state, after, strict=False)) | moving
         self.command = self.after["command"]
@@ -60,11 +77,12 @@ class Lowered:
         self.used = [name for name, node in self.numbers.items() if node.id in seen]
 
     def _kept(self) -> list[str]:
-        """What of memory the command depends on, from one sample to the next."""
+        """Return the names of the memory that the command depends on, from one sample to the next."""
         kept = {"command"}
         roots = [self.command, self.held]
         while True:
             needed = {node.id for node in live_nodes(roots)}
+            # A fixed point: memory that the command reads depends on further memory one sample earlier.
             more = {name for name, node in self.state.items() if node.id in needed} - kept
             if not more:
                 break
@@ -74,7 +92,14 @@ class Lowered:
 
 
 def number_leaves(shape: Any, graph: Graph, where: str, flat: Any) -> dict[str, Node]:
-    """Return a number for each entry of a pytree of shapes, by its path."""
+    """Return an input node for each number of a pytree, by name.
+
+    Args:
+        shape: Pytree of shapes and types.
+        graph: Graph that receives the nodes.
+        where: Origin of the inputs, the first entry of a node's `attr`.
+        flat: Function path -> name.
+    """
     found: dict[str, Node] = {}
     for path, leaf in jax.tree_util.tree_leaves_with_path(shape):
         words = [str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in path]
@@ -85,7 +110,12 @@ def number_leaves(shape: Any, graph: Graph, where: str, flat: Any) -> dict[str, 
 
 
 def fill_shapes(shape: Any, nodes: dict[str, Node]) -> list[Array]:
-    """Return the numbers as arrays of the shapes of a pytree's leaves."""
+    """Return some nodes as arrays in the shapes of a pytree's leaves.
+
+    Args:
+        shape: Pytree of shapes.
+        nodes: Nodes in the order of the leaves' entries.
+    """
     left, arrays = iter(nodes.values()), []
     for leaf in jax.tree.leaves(shape):
         out = np.empty(leaf.shape, object)
@@ -96,7 +126,14 @@ def fill_shapes(shape: Any, nodes: dict[str, Node]) -> list[Array]:
 
 
 def trace_outputs(graph: Labelled, function: Any, shape: Any, inputs: list[Array]) -> list[Node]:
-    """Return what a function returns, number by number; what it closes over is known."""
+    """Return the results of a function, number by number; arrays it closes over become constants.
+
+    Args:
+        graph: Graph that receives the nodes.
+        function: Function of one pytree.
+        shape: Pytree of shapes and types of its argument.
+        inputs: Arrays of nodes for the leaves of the argument.
+    """
     closed = jax.make_jaxpr(function)(shape)
     graph.labels = {id(eqn): source_label(eqn) for eqn in closed.jaxpr.eqns}
     constants = [constant_array(graph, np.asarray(x)) for x in closed.consts]
@@ -104,10 +141,10 @@ def trace_outputs(graph: Labelled, function: Any, shape: Any, inputs: list[Array
 
 
 def _numbers_of(parts: Any) -> list[float]:
-    """The numbers of parts, one by one, in the order of `named`."""
+    """Return the numbers of some parts in the order of their leaves."""
     return [float(x) for leaf in jax.tree.leaves(parts) for x in np.asarray(leaf, float).flat]
 
 
 def _short_path(path: str) -> str:
-    """A path in the memory without what says nothing to a reader."""
+    """Return a memory path without the field names flow and held, which tell a reader nothing."""
     return re.sub(r"\.(flow|held)(?=\.|$)", "", path)

@@ -1,7 +1,8 @@
-"""A plant as an FMU: FMI 2.0 for co-simulation, compiled C that needs neither Python nor this package where it runs.
+"""A plant as an FMU (FMI 2.0 for co-simulation): compiled C that needs neither Python nor this package at run time.
 
-Libraries that make FMUs of Python code put Python, and here JAX, behind every step of the importing tool. The plant is
-C already (`plant_c`), so an FMU is its library, its source and a description."""
+Libraries that make FMUs of Python code run Python, and here JAX, in every step of the importing tool.
+`plant_c` writes the plant as C, so the FMU consists of its library, its source and a description.
+"""
 
 import hashlib
 import importlib.resources
@@ -25,8 +26,8 @@ from diffabs.export.plant_c import FmuVariable, PlantSource, plant_source
 from diffabs.kernel.compilers import NoCompiler, find_compiler
 
 FMU_COMPILER_FLAGS = ("-x", "c", "-std=c99", "-O2", "-ffp-contract=off", "-fvisibility=hidden", "-shared", "-fPIC")
-COMPILE_TIMEOUT_S = 600  # s
-LONG_AGO = (1980, 1, 1, 0, 0, 0)  # of every file in the archive: the same plant is the same bytes
+COMPILE_TIMEOUT_S = 600
+LONG_AGO = (1980, 1, 1, 0, 0, 0)  # date of every file in the archive, so that equal plants give equal bytes
 SYSTEMS = {"linux": ("linux", "so"), "darwin": ("darwin", "dylib"), "win32": ("win", "dll")}
 CAUSES = {
     "output": {"causality": "output", "variability": "continuous", "initial": "calculated"},
@@ -36,18 +37,26 @@ CAUSES = {
 
 
 def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, about: str = "") -> bytes:
-    """Return the plant of a loop as the bytes of an FMU: its control is the input, what it shows are the outputs, and
-    every number of plant and start is a parameter that the importing tool may set.
+    """Return the plant of a loop as the bytes of an FMU.
 
-    name: an identifier of C; step: of its Runge-Kutta method, at most [s]; duration: of an experiment by default [s];
-    about: a line of description
+    The control is the input, and the signals that the plant shows are the outputs.
+    Every number of the plant and its start is a parameter that the importing tool may set.
+
+    Args:
+        loop: Closed loop.
+        name: Name of the model, an identifier of C.
+        step: Largest step of the plant's Runge-Kutta method [s].
+        duration: Default duration of an experiment [s].
+        about: Description, one line.
+
     Raises:
-        NotExported: an operation that has no translation, or no C compiler that works.
+        NotExported: The name is no identifier, an operation has no translation, or no C compiler works.
     """
     if not is_name(name):
         raise NotExported(f"{name!r} is no name that C has for a function: letters, digits and _")
     about = make_printable(about)
     plant = plant_source(loop)
+    # A digest instead of a random identifier: the same plant has the same GUID, and any change gives another one.
     guid = str(uuid.UUID(hashlib.sha256(f"{plant} {name} {step} {about}".encode()).hexdigest()[:32]))
     source = _source(plant, guid, step)
     system, ending = SYSTEMS.get(sys.platform, SYSTEMS["linux"])
@@ -65,7 +74,7 @@ def build_fmu(loop: Loop, name: str, *, step: float, duration: float = 1.0, abou
 
 
 def _source(plant: PlantSource, guid: str, step: float) -> str:
-    """All of its C in one file."""
+    """Return all C of the FMU as one file."""
     outputs = sum(one.role == "output" for one in plant.variables)
     begun = ", ".join(_number(one.value) for one in plant.variables)
     struct = "double v[VARIABLES], x[STATES], time;\n  int phase, ready;\n  char guid[sizeof GUID];"
@@ -83,11 +92,12 @@ def _source(plant: PlantSource, guid: str, step: float) -> str:
 
 
 def _number(value: float) -> str:
+    """Return the C literal of a number."""
     return {"inf": "INFINITY", "-inf": "-INFINITY", "nan": "NAN"}.get(str(value), repr(value))
 
 
 def _compile_library(source: str) -> bytes:
-    """A library of this machine. Raises NotExported."""
+    """Return a library for this machine; raise NotExported if there is no compiler or compilation fails."""
     with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
         text, result = pathlib.Path(folder) / "fmu.c", pathlib.Path(folder) / "fmu.lib"
         text.write_text(source, encoding="utf-8")
@@ -102,7 +112,7 @@ def _compile_library(source: str) -> bytes:
 
 
 def _description(plant: PlantSource, name: str, guid: str, step: float, duration: float, about: str) -> bytes:
-    """modelDescription.xml."""
+    """Return modelDescription.xml."""
     root = xml.Element("fmiModelDescription", {
         **{"fmiVersion": "2.0", "modelName": name, "guid": guid, "generationTool": "diffabs", "description": about},
         "variableNamingConvention": "structured",
@@ -128,11 +138,13 @@ def _description(plant: PlantSource, name: str, guid: str, step: float, duration
 
 
 def _variable(parent: Any, one: FmuVariable, reference: int) -> None:
+    """Add a ScalarVariable to the description."""
     scalar = xml.SubElement(parent, "ScalarVariable", {
         "name": one.name, "valueReference": str(reference), **CAUSES[one.role],
     })  # fmt: skip
     start = {} if one.role == "output" else {"start": repr(one.value).replace("inf", "INF")}
     limits = {"min": one.low, "max": one.high} if one.role == "parameter" else {}
+    # A limit of the largest double means no limit, and FMI's readers need no such attribute.
     shown = {name: repr(limit) for name, limit in limits.items() if abs(limit) < sys.float_info.max}
     xml.SubElement(
         scalar, "Real", {**shown, **start, **({} if one.unit in ("", "1") else {"unit": make_printable(one.unit)})}
@@ -140,7 +152,7 @@ def _variable(parent: Any, one: FmuVariable, reference: int) -> None:
 
 
 def _unknowns(structure: Any, variables: Sequence[FmuVariable]) -> None:
-    """The outputs, which are of the state alone; before the start, of the parameters."""
+    """Add the model structure: every output depends on the state, and in initialization on the parameters."""
     outputs = [k for k, one in enumerate(variables, 1) if one.role == "output"]
     for tag in ("Outputs", "InitialUnknowns"):
         parent = xml.SubElement(structure, tag)

@@ -1,6 +1,7 @@
-"""A plant as C99: its start, a Runge-Kutta step, and what it shows, with every parameter as a variable.
+"""A plant as C99: its start, a Runge-Kutta step and its outputs, with every parameter as a variable.
 
-The text is that of the functions which the simulation calls, traced, as for a controller (`lowered`)."""
+The text comes from the functions that the simulation calls, traced as for a controller (`lowered`).
+"""
 
 import math
 import sys
@@ -26,8 +27,15 @@ CONTROL = "control"
 
 
 class FmuVariable(NamedTuple):
-    """A number that is seen from outside: what is shown ("output"), the control ("input"), or a parameter, with its
-    value before anything is set; its unit, and the least and the greatest value that it may be set to."""
+    """A variable of the FMU.
+
+    Attributes:
+        name: Name, with the path of a parameter.
+        role: "output", "input" (the control) or "parameter".
+        value: Value before anything is set.
+        unit: Unit.
+        low, high: Least and greatest value that may be set.
+    """
 
     name: str
     role: str
@@ -38,8 +46,14 @@ class FmuVariable(NamedTuple):
 
 
 class PlantSource(NamedTuple):
-    """C functions `plant_start(m)`, `plant_step(m, t, h)` and `plant_show(m)`, of a struct `m` of arrays `v` of the
-    variables, in their order, and `x` of so many states; the text lacks the struct."""
+    """A plant as C, without the struct that the functions take.
+
+    Attributes:
+        text: C functions `plant_start(m)`, `plant_step(m, t, h)` and `plant_show(m)` of a struct `m`, which has the
+            arrays `v` (variables, in their order) and `x` (states).
+        variables: Variables of the FMU.
+        states: Number of states.
+    """
 
     text: str
     variables: tuple[FmuVariable, ...]
@@ -49,8 +63,11 @@ class PlantSource(NamedTuple):
 def plant_source(loop: Loop) -> PlantSource:
     """Return the plant of a loop, at the loop's start, as C.
 
+    Args:
+        loop: Closed loop.
+
     Raises:
-        NotExported: an operation that has no translation, or a state that is no real number.
+        NotExported: An operation has no translation, or a state is not a real number.
     """
     with jax.enable_x64(True):
         typed = jax.tree.map(lambda x: jnp.asarray(x, float), canonical_dtypes((loop.plant, loop.initial)))
@@ -64,7 +81,7 @@ def plant_source(loop: Loop) -> PlantSource:
 
 
 def _variables(loop: Loop) -> tuple[FmuVariable, ...]:
-    """Outputs, the control, the parameters of plant and start, number by number."""
+    """Return the variables: outputs, control, then each number of the parameters of plant and start."""
     plant = loop.plant
     found = [FmuVariable(name, "output", 0.0, plant.shows.units[name]) for name in plant.shows._fields]
     found.append(FmuVariable(CONTROL, "input", 0.0, plant.control_unit))
@@ -80,7 +97,10 @@ def _variables(loop: Loop) -> tuple[FmuVariable, ...]:
 
 
 def _limits(spec: Spec) -> tuple[float, float]:
-    """The least and the greatest number of a range; below an open end the nearest one, above 0 the least normal one."""
+    """Return the least and greatest double of a range.
+
+    An open end gives the next double inside; next to 0 that is the least normal number, not a subnormal one.
+    """
     low, high = spec.low, spec.high
     if spec.open_low:
         low = sys.float_info.min if low == 0 else math.nextafter(low, math.inf)
@@ -91,6 +111,8 @@ def _limits(spec: Spec) -> tuple[float, float]:
 
 
 class _Written:
+    """A writer of the plant's functions."""
+
     def __init__(self, typed: tuple[Any, Any], variables: Sequence[FmuVariable]):
         self.places = {one.name: k for k, one in enumerate(variables)}
         self.words = Words("double", self._place)
@@ -103,6 +125,7 @@ class _Written:
                 part, number_leaves(part, graph, "v", lambda path, where=where: f"{where}.{path}")
             )
         ]
+        # The first leaves are the plant's. The start's parameters matter only in `plant_start`.
         own = given[: len(jax.tree.leaves(plant))]
         state = jax.eval_shape(lambda both: prepare_parts(both[0]).start(both[1]), typed)
         held = fill_shapes(state, number_leaves(state, graph, "x", str))
@@ -121,26 +144,28 @@ class _Written:
         self.shown = trace_outputs(graph, lambda both: prepare_parts(both[0]).output(both[1]), shown, [*own, *held])
 
     def _place(self, where: str, path: str) -> str:
+        """Return the C expression of an input of the graph."""
         return f"m->v[{self.places[path]}]" if where == "v" else f"m->x[{self.order[path]}]" if where == "x" else path
 
     def parts(self) -> Iterator[str]:
-        """The lines of the text."""
+        """Yield the functions of the text."""
         yield from self._function("plant_start(model *m)", "x", dict(enumerate(self.begun)))
         yield from self._function("plant_step(model *m, double t, double h)", "x", dict(enumerate(self.moved)), "th")
         yield from self._function("plant_show(model *m)", "v", dict(enumerate(self.shown)))
 
     def _function(self, head: str, array: str, results: Mapping[int, Node], unused: str = "") -> Iterator[str]:
-        """Results are stored when all are known: one may be what another is made of."""
+        """Yield a function that computes `results` and stores them in an array of the model."""
         yield f"static void {head}\n{{"
         yield from (f"  (void){name};" for name in unused)
         yield from self.words.operations(live_nodes(list(results.values())), "  ")
         for k, node in results.items():
             yield f"  const double n{k} = {self.words.name(node)};"
+        # Store last: a result may read the old value of another one.
         yield from (f"  m->{array}[{k}] = n{k};" for k in results)
         yield "}\n"
 
 
 def _moved(plant: Any, state: Any, control: Any, t: Any, h: Any) -> Any:
-    """The state after a step in which the control is held, as `FixedStep` makes it."""
+    """Return the state after a step with constant control, as `FixedStep` computes it."""
     plant = prepare_parts(plant)
     return plant.project(rk4_step(lambda t, x: plant.derivative(t, x, control), t, state, h))

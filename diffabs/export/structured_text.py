@@ -1,8 +1,10 @@
-"""A device as a function block in Structured Text (IEC 61131-3), for a PLC: the same operations as in C.
+"""A controller as a function block in Structured Text (IEC 61131-3) for a PLC, with the same operations as in C.
 
-Every operation is an assignment to a variable with a type, so no order of evaluation and no mixing of types is left to
-a compiler. What is not finite has no literal in this language: infinite limits become the largest finite number, and a
-NaN is an objection. Comparisons with a NaN are false, as in C, if the machine follows IEEE 754.
+Every operation is an assignment to a typed variable. This leaves no order of evaluation and no type mixing to a
+compiler.
+The language has no literals for infinity and NaN: infinite limits become the largest finite number, and a NaN raises
+NotExported.
+Comparisons with NaN are false, as in C, if the PLC follows IEEE 754.
 """
 
 import re
@@ -31,7 +33,7 @@ HYPERBOLIC = {
     "cosh": "(EXP({0}) + EXP(-{0})) / {2}",
     "tanh": "{1} - {2} / (EXP({2} * {0}) + {1})",
 }
-LINE = 110  # columns of a list of variables
+LINE = 110  # width of a list of variables
 ST_KEYWORDS_TEXT = (
     "abs acos action and any array asin at atan atan2 begin bool by byte case configuration constant cos date "
     "dint do dt dword else elsif end exit exp expt extends false final for from function function_block global if "
@@ -42,17 +44,22 @@ ST_KEYWORDS_TEXT = (
     "usint var while with word wstring write xor le ge gt eq ne add sub mul div r s n p l d sd ds sl"
 )
 ST_KEYWORDS = set(ST_KEYWORDS_TEXT.split())
-OWN = {"command", "held", "reset", "started", "i"}  # names of the block itself
+OWN = {"command", "held", "reset", "started", "i"}  # names that the block itself uses
 
 
 def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()) -> str:
-    """Return a device as a FUNCTION_BLOCK with an input for each measurement and `reset`, the parameters as variables,
-    and the outputs `command` and `held`; it is to be called once a period, and begins with its first call or where
-    `reset` is true.
+    """Return a controller as a FUNCTION_BLOCK.
 
-    name: an identifier; notes: lines of the comment at its head
+    The inputs are the measurements and `reset`, the outputs `command` and `held`. The parameters are variables.
+    Call the block once a period. It starts at its first call, and again whenever `reset` is true.
+
+    Args:
+        found: The computer's part of a loop.
+        name: Name of the block, an identifier.
+        notes: Lines for the comment at the head of the text.
+
     Raises:
-        NotExported: an operation that has no translation.
+        NotExported: The name is no identifier, or an operation has no translation.
     """
     if not re.fullmatch(r"[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in ST_KEYWORDS:
         raise NotExported(f"{name!r} is no name that Structured Text has for a block: letters, digits and single _")
@@ -65,6 +72,8 @@ def structured_text(found: ComputerProgram, name: str, notes: Sequence[str] = ()
 
 
 class _Block:
+    """A writer of the function block."""
+
     def __init__(self, found: ComputerProgram, name: str, notes: Sequence[str]):
         self.device, self.name, self.notes = found, name, notes
         self.program = program = Lowered(found)
@@ -74,13 +83,13 @@ class _Block:
         self.names |= {(NUMBERS, path): _fresh(path, taken) for path in program.used}
         self.names |= {(MEMORY, path): _fresh(f"m_{path}", taken) for path in program.kept if path != "command"}
         self.names[MEMORY, "command"] = "command"
-        self.temporary: dict[str, str] = {}  # its type, by name
-        self.called: dict[int, str] = {}  # variables of numbers
+        self.temporary: dict[str, str] = {}  # types by name
+        self.called: dict[int, str] = {}  # variables by the id of the node
 
     def parts(self) -> Iterator[str]:
-        """The lines of the text."""
+        """Yield the lines of the text."""
         program, units = self.program, self.device.units
-        body = list(self._body())  # makes the temporaries
+        body = list(self._body())  # first, because it creates the temporaries that the head declares
         yield from self._head()
         yield f"FUNCTION_BLOCK {self.name}"
         yield "VAR_INPUT"
@@ -121,7 +130,7 @@ class _Block:
         yield f"(* {text} *)"
 
     def _declared(self) -> Iterator[str]:
-        """The temporaries, many of a type in a line."""
+        """Yield declarations of the temporaries, several of a type in a line."""
         for kind in dict.fromkeys(self.temporary.values()):
             line = ""
             for name in (name for name, of in self.temporary.items() if of == kind):
@@ -139,7 +148,7 @@ class _Block:
         yield from self._assigned(program.stored, [program.held], "")
 
     def _assigned(self, stored: dict[str, Node], more: Sequence[Node], indent: str) -> Iterator[str]:
-        """The operations that these need, the command, and the memory's new values."""
+        """Yield the operations that these nodes need, then assignments to the command and the memory."""
         yield from self._operations(live_nodes([*stored.values(), *more]), indent)
         for node in more:
             yield f"{indent}held := {self._value(node)};"
@@ -150,7 +159,7 @@ class _Block:
                 yield f"{indent}{self.names[MEMORY, name]} := {self._value(node)};"
 
     def _moves(self, indent: str) -> Iterator[str]:
-        """What moves by itself until the next sample, by as many steps as the simulation takes."""
+        """Yield the loop that advances the reference to the next sample in the simulation's Runge-Kutta steps."""
         moving = self.program.moving
         self.temporary["i"] = "INT"
         yield f"{indent}FOR i := 0 TO {self.device.moves - 1} DO"
@@ -173,13 +182,13 @@ class _Block:
             yield f"{indent}{self._new(node)} := {expression};"
 
     def _new(self, node: Node) -> str:
-        """A variable for a number, declared."""
+        """Return a new temporary for a number, and declare it."""
         name = self._variable(node)
         self.temporary[name] = self._type(node)
         return name
 
     def _variable(self, node: Node) -> str:
-        """The name of a number."""
+        """Return the variable of a number."""
         if node.id not in self.called:
             self.called[node.id] = _fresh(node.label or node.op, self.taken)
         return self.called[node.id]
@@ -205,6 +214,7 @@ class _Block:
         return self._real(x)
 
     def _real(self, x: float) -> str:
+        """Return the literal of a real number; infinity becomes the largest finite number, NaN raises Unsupported."""
         if np.isnan(x):
             raise Unsupported("nan", "there is no such number in it")
         limit = np.finfo(self.device.dtype).max
@@ -224,10 +234,12 @@ class _Block:
             return f"NOT {args[0]}"
         if op in ("lower", "higher"):
             return f"SEL({args[0]} {'<' if op == 'lower' else '>'} {args[1]}, {args[1]}, {args[0]})"
-        if op in ("min", "max"):  # NaN where either is
+        # a <> a detects NaN in a. For NaN in b the comparison is false, so b is returned: the result is NaN either way.
+        if op in ("min", "max"):
             a, b = args
             return f"SEL(({a} <> {a}) OR ({a} {'<' if op == 'min' else '>'} {b}), {b}, {a})"
         if op in ("select", "gate"):
+            # SEL(G, IN0, IN1) has the operands in the order of `select`: truth, no, yes.
             return f"SEL({', '.join(args)})"
         if op == "neg":
             return f"-{args[0]}"
@@ -244,13 +256,14 @@ class _Block:
         return self._function(node, args)
 
     def _function(self, node: Node, args: list[str]) -> str:
-        """Of the standard's functions, and what is made of them."""
+        """Return a call of a standard function, or a formula for one that the standard lacks."""
         op = node.op
         if op == "abs" or (op in ST_FUNCTIONS and is_real(node.dtype)):
             return f"{ST_FUNCTIONS[op]}({', '.join(args)})"
         if op in HYPERBOLIC:
             return HYPERBOLIC[op].format(args[0], "1.0", "2.0")
-        whole = f"LINT_TO_{self.real}({self.real}_TO_LINT({args[0]}))"  # the nearest, and of two the even one
+        # The conversion of IEC 61131-3 rounds to the nearest integer, half to even.
+        whole = f"LINT_TO_{self.real}({self.real}_TO_LINT({args[0]}))"
         if op == "rint":
             return whole
         if op in ("floor", "ceil"):
@@ -259,7 +272,7 @@ class _Block:
         raise Unsupported(op, "there is none")
 
     def _converted(self, node: Node, arg: str) -> str:
-        """A number as one of another type; to a whole one, cut off as C does."""
+        """Return a number converted to another type; to an integer by truncation, as in C."""
         before, after = self._type(node.args[0]), self._type(node)
         if before == after:
             return arg
@@ -278,7 +291,7 @@ def _scientific(x: float) -> str:
 
 
 def _fresh(path: str, taken: set[str]) -> str:
-    """A name that the language has, that no other is, whatever the case; which is then taken."""
+    """Return a new identifier for a path and add it to `taken`; identifiers ignore case, and `_table` is reserved."""
     name = re.sub(r"[\W_]+", "_", path, flags=re.ASCII).strip("_")
     name = f"x_{name}".strip("_") if name.lower() in ST_KEYWORDS or not name[:1].isalpha() else name
     number, fresh = 2, name

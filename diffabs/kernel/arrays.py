@@ -1,4 +1,4 @@
-"""Rules of what moves the entries of an array, or makes one number of several."""
+"""Lowering rules for primitives that move entries of an array (reshape, pad, split) or reduce them (sum, dot)."""
 
 import math
 from typing import Any
@@ -42,8 +42,9 @@ def _concatenate(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("pad", "padding_config")
 def _pad(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """Before, after and between the entries of each axis; less than none cuts off."""
+    """Pad before, after and between the entries of each axis; a negative width crops."""
     x, value = ins[0], ins[1].item()
+    # Order as in XLA: interior padding first, then a negative edge width crops the dilated array.
     for axis, (low, high, between) in enumerate(eqn.params["padding_config"]):
         rows = np.moveaxis(x, axis, 0)
         wide = np.full((max(0, len(rows) + between * (len(rows) - 1)), *rows.shape[1:]), value, object)
@@ -96,7 +97,7 @@ REDUCTION_OPERATIONS: dict[str, str] = {"sum": "add", "prod": "mul"}
 @lowering_rule("reduce_min", "axes out_sharding")
 @lowering_rule("reduce_and reduce_or", "axes")
 def _reduce(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """In pairs: a short chain."""
+    """Reduce by pairs, as a balanced tree: n entries give a dependency chain of about log2(n) operations."""
     kind, x = eqn.primitive.name.removeprefix("reduce_"), ins[0]
     name: Any = REDUCTION_OPERATIONS.get(kind, kind)
 
@@ -113,6 +114,7 @@ def _reduce(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 def _reduce_nothing(graph: Graph, eqn: Any, shape: Any) -> Array:
+    """Return the neutral element of a reduction over an empty axis."""
     whole = {"reduce_sum": 0, "reduce_prod": 1, "reduce_and": True, "reduce_or": False}
     if eqn.primitive.name not in whole:
         raise Unsupported(eqn.primitive.name, "of nothing")
@@ -122,6 +124,7 @@ def _reduce_nothing(graph: Graph, eqn: Any, shape: Any) -> Array:
 @lowering_rule("cumsum", "axis reverse")
 def _cumsum(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     order = slice(None, None, -1 if eqn.params["reverse"] else 1)
+    # A reversed sum runs over the flipped rows, and the result is flipped back.
     rows = list(np.moveaxis(ins[0], eqn.params["axis"], 0)[order])
     for i in range(1, len(rows)):
         rows[i] = map_entries(lambda a, b: graph.op("add", a, b), rows[i - 1], rows[i])
@@ -130,7 +133,7 @@ def _cumsum(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("argmin argmax", "axes index_dtype")
 def _first_extreme(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """The first of equal ones, or the first NaN."""
+    """Return the index of the first extreme entry, or of the first NaN if there is one, as JAX does."""
     if len(eqn.params["axes"]) != 1:
         raise Unsupported(eqn.primitive.name, "over several axes")
     beyond = "lt" if eqn.primitive.name == "argmin" else "gt"
@@ -138,6 +141,7 @@ def _first_extreme(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     dtype = eqn.params["index_dtype"]
 
     def first(*column: Node) -> Node:
+        # x != x detects NaN. A NaN replaces the best entry once, because no later comparison with it is true.
         place, best = graph.const(0, dtype), column[0]
         for i, x in enumerate(column[1:], 1):
             nan = graph.op("and", graph.op("ne", x, x), graph.op("eq", best, best))
@@ -158,6 +162,7 @@ def _dot(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     a = np.moveaxis(ins[0], left, range(len(left))).reshape(count, -1)
     b = np.moveaxis(ins[1], right, range(len(right))).reshape(count, -1)
     out: Any = np.empty((a.shape[1], b.shape[1]), object)
+    # Sequential sum: every product can fuse with its addition (FMA). A sum by pairs allows that at its leaves only.
     for i, j in np.ndindex(out.shape):
         terms = [graph.op("mul", a[k, i], b[k, j]) for k in range(count)]
         out[i, j] = terms[0]

@@ -1,7 +1,9 @@
-"""Compiled libraries in the user's cache folder, whose damage is found before they are loaded.
+"""A cache of compiled libraries in the user's cache folder, with a check for damage before a library is loaded.
 
-The name of a file has two digests: one of everything that the library is made of, one of the file's content. A file
-whose content is not what its name says (empty, cut off, changed, or another library) is removed and compiled again."""
+A file name holds two digests: one of every input of the compilation, and one of the file's content.
+If the content does not match its digest (empty, truncated, changed, or another library), the file is removed and the
+library is compiled again.
+"""
 
 import contextlib
 import errno
@@ -13,15 +15,18 @@ import sys
 
 from diffabs.core import files
 
-CACHE = "DIFFABS_KERNEL_CACHE"  # the folder of the libraries, if set
-MAX_CACHE_BYTES = 1 << 28  # bytes of libraries, some 800; beyond, the half that was not used for longest goes
-CONTENT = 32  # hexadecimal digits of the content's digest in a name
+CACHE = "DIFFABS_KERNEL_CACHE"  # environment variable: folder of the compiled libraries
+MAX_CACHE_BYTES = 1 << 28  # about 800 libraries; a larger cache loses its least recently used half
+CONTENT = 32  # hexadecimal digits of the content digest in a file name
 log = logging.getLogger("diffabs")
 
 
 def cache_folder() -> pathlib.Path:
-    """Return the folder in which libraries are kept: $DIFFABS_KERNEL_CACHE, or the user's for caches. Raises OSError
-    for a user without a home folder."""
+    """Return the folder of the compiled libraries: $DIFFABS_KERNEL_CACHE, or a subfolder of the user's cache folder.
+
+    Raises:
+        OSError: The user has no home folder.
+    """
     if said := os.environ.get(CACHE):
         return pathlib.Path(said)
     try:
@@ -34,8 +39,11 @@ def cache_folder() -> pathlib.Path:
 
 
 def make_cache_folder() -> pathlib.Path:
-    """Return the cache folder, made if it is not there. Raises OSError if it cannot be made, or if other users may
-    write to it: they could put their code there."""
+    """Create the cache folder if it is missing, and return it.
+
+    Raises:
+        OSError: The folder cannot be created, or other users may write to it and so could place their own code there.
+    """
     folder = cache_folder()
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if files.others_may_write(folder):
@@ -44,21 +52,26 @@ def make_cache_folder() -> pathlib.Path:
 
 
 def find_library(made_of: str, suffix: str) -> pathlib.Path | None:
-    """Return the file of a library, or None where there is none. A damaged file is removed, with one line in the log.
-    Raises OSError for a file that cannot be read, and as `make_cache_folder`.
+    """Return the file of a library, or None if the cache does not hold it.
+
+    A damaged file is removed, with one line in the log.
 
     Args:
-        made_of: digest of everything that decides the library
-        suffix: end of the file's name
+        made_of: Digest of every input that decides the library.
+        suffix: End of the file's name, such as ".so".
+
+    Raises:
+        OSError: A file cannot be read, or `make_cache_folder` fails.
     """
     for path in sorted(make_cache_folder().glob(f"{made_of}-*{suffix}")):
         try:
             content = files.read_content(path)
-        except FileNotFoundError:  # another process has removed it
+        except FileNotFoundError:  # another process removed the file
             continue
         if _file_name(made_of, content, suffix) == path.name:
-            with contextlib.suppress(OSError):  # a folder that is only read
-                os.utime(path)  # the file was used
+            # The time stamp orders the files for eviction by last use. A read-only folder cannot store it.
+            with contextlib.suppress(OSError):
+                os.utime(path)
             return path
         log.warning("%s is damaged; it is compiled again", path)
         path.unlink(missing_ok=True)
@@ -66,7 +79,18 @@ def find_library(made_of: str, suffix: str) -> pathlib.Path | None:
 
 
 def write_library(made_of: str, suffix: str, content: bytes) -> pathlib.Path:
-    """Write a library and return its file, which is whole at every instant at which it is there. Raises OSError."""
+    """Write a library and return its file.
+
+    The write is atomic: a file with a library's name is always complete.
+
+    Args:
+        made_of: Digest of every input that decides the library.
+        suffix: End of the file's name, such as ".so".
+        content: Bytes of the library.
+
+    Raises:
+        OSError: The folder or the file cannot be written.
+    """
     folder = make_cache_folder()
     files.make_room(folder, f"*{suffix}", MAX_CACHE_BYTES)
     return files.write_synced(folder / _file_name(made_of, content, suffix), content)

@@ -1,7 +1,9 @@
-"""Lanes to their ends as an operation of JAX: under jit, a batch of it (vmap), and its derivatives, forward.
+"""The JAX primitive `run_lanes`: rules for jit, vmap and forward-mode derivatives of a kernel launch.
 
-A batch is more lanes: what was the same for all of them, and differs in the batch, is then each lane's own. A batch of
-tangents alone (`jax.jacfwd`) is one launch with so many tangents. The only module that knows how JAX is extended."""
+vmap adds lanes: a uniform array that differs within the batch becomes an array of each lane.
+If only tangents are batched, as in `jax.jacfwd`, the batch stays one launch with more tangents.
+Only this module uses JAX's interfaces for new primitives.
+"""
 
 import functools
 import math
@@ -19,14 +21,20 @@ from diffabs.kernel.graph import UpdateLevel, is_real
 from diffabs.kernel.program import ScalarProgram, TracedFunctions
 from diffabs.kernel.tangents import INPUT_LEVELS, ArrayKey, DerivativeProgram
 
-MAX_TANGENTS_PER_LAUNCH = 8  # tangents of one launch
+MAX_TANGENTS_PER_LAUNCH = 8  # more tangents take several launches
 NO_REVERSE_MODE = (
     "a kernel has no reverse mode: forward mode (jax.jvp, jax.jacfwd) has its derivatives, engine = 'xla' both"
 )
 
 
 class LanePrograms:
-    """Functions of one lane, and what was made of them so far. Equal only to itself."""
+    """Some functions of one lane with their plain program and, on demand, derivatives. Compares equal only to itself.
+
+    Attributes:
+        functions: The traced functions of one lane.
+        launch: Function (program, arrays before the carry, carry) -> carry that runs a program.
+        wanted: Numbers of the carry's arrays whose tangents matter at the end, None for all.
+    """
 
     def __init__(
         self,
@@ -34,14 +42,28 @@ class LanePrograms:
         launch: Callable[[ScalarProgram, list[Any], list[Any]], list[Any]],
         wanted: tuple[int, ...] | None = None,
     ):
-        """launch: of a program, the arrays before those of the carry, and these; returns the carry. wanted: arrays of
-        the carry whose tangents matter in the end, None for all. Translated at once: raises Unsupported."""
+        """Store the functions and lower them to the plain program, so that an error appears at once.
+
+        Args:
+            functions: The traced functions of one lane.
+            launch: Function (program, arrays before the carry, carry) -> carry that runs a program.
+            wanted: Numbers of the carry's arrays whose tangents matter at the end, None for all.
+
+        Raises:
+            Unsupported: A function uses an operation without a lowering rule.
+        """
         self.functions, self.launch, self.wanted = functions, launch, wanted
         self._derivatives: dict[Any, Any] = {}
         self.derivative(None)
 
     def derivative(self, begins: tuple[tuple[UpdateLevel, int], ...] | None) -> DerivativeProgram:
-        """Return the program in which these arrays have tangents, one each. Raises Unsupported."""
+        """Return the program with one tangent for each seeded array.
+
+        `begins` lists the seeded arrays as (level, number); None means the plain program without tangents.
+
+        Raises:
+            Unsupported: A derivative uses an operation without a lowering rule.
+        """
         if begins not in self._derivatives:
             moving = {level: tuple(i for one, i in begins or () if one == level) for level in INPUT_LEVELS}
             plain = begins is None
@@ -53,7 +75,13 @@ class LanePrograms:
         return self._derivatives[begins]
 
     def program(self, begins: Any, many: int, as_lanes: frozenset[int]) -> ScalarProgram:
-        """Return the program of so many tangents. Raises Unsupported."""
+        """Return the program with `many` tangents for each seeded array in `begins`.
+
+        `as_lanes` holds the numbers of uniform arrays that vmap has made arrays of each lane.
+
+        Raises:
+            Unsupported: The program has too many operations, or one without a lowering rule.
+        """
         one = self.derivative(begins)
         if begins is None and not as_lanes:
             return one.program
@@ -61,15 +89,15 @@ class LanePrograms:
 
     @functools.cached_property
     def keys(self) -> list[ArrayKey]:
-        """Arrays without their tangents, in the order of the operation's arguments."""
+        """Keys of the arrays without tangents, in the order of the primitive's arguments."""
         return [ArrayKey(level, i, False) for level in INPUT_LEVELS for i in range(len(self.functions.types[level]))]
 
     def slopes(self, begins: Any) -> list[ArrayKey]:
-        """Those that begin with tangents, which follow."""
+        """Return the keys of the seed tangents for the arrays in `begins`; these arguments follow the values."""
         return [ArrayKey(level, i, True) for level, i in begins or ()]
 
     def ends(self, begins: Any) -> list[ArrayKey]:
-        """The results: the carry, and those of it that have tangents."""
+        """Return the keys of the results for the seeds in `begins`: the carry's arrays, then the nonzero tangents."""
         carry = range(len(self.functions.types[UpdateLevel.STEP]))
         do = self.derivative(begins).moved_arrays[UpdateLevel.STEP]
         return [
@@ -83,12 +111,18 @@ run_lanes_primitive.multiple_results = True
 
 
 def bind_lanes(lanes: LanePrograms, arrays: Sequence[Any]) -> list[Any]:
-    """Return the carry of lanes that are all over; of the arrays of all lanes, the lanes and their carry, as words."""
+    """Return the final carry of all lanes.
+
+    Args:
+        lanes: The functions and their programs.
+        arrays: Uniform arrays, then arrays of the lanes, then the carry; random keys as their words (uint32).
+    """
     return run_lanes_primitive.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=frozenset())
 
 
 @run_lanes_primitive.def_impl
 def _run(*arrays: Any, **how: Any) -> list[Any]:
+    # The primitive has a lowering but no eager evaluation, so a call outside jit compiles as well.
     return jax.jit(functools.partial(run_lanes_primitive.bind, **how))(*arrays)
 
 
@@ -98,15 +132,17 @@ def _shapes(*arrays: Any, lanes: LanePrograms, begins: Any, many: int, as_lanes:
 
     def shape(key: ArrayKey) -> Any:
         x = carry[key.number]
+        # Results have fixed types, also where the initial carry is weakly typed.
         return x.update(shape=(x.shape[0], many, *x.shape[1:])) if key.tangent else x.update(weak_type=False)
 
     return [shape(key) for key in lanes.ends(begins)]
 
 
 def _launch_in_parts(*arrays: Any, lanes: LanePrograms, begins: Any, many: int, as_lanes: frozenset[int]) -> list[Any]:
-    """With some more zeros, if the tangents are many, so that each launch has as many."""
+    """Launch the tangents in groups of equal size <= MAX_TANGENTS_PER_LAUNCH; zeros fill the last group."""
     keys = [*lanes.keys, *lanes.slopes(begins)]
     launches = max(1, math.ceil(many / MAX_TANGENTS_PER_LAUNCH))
+    # Groups of one size share one compiled program. The padding tangents are zero and are cut off at the end.
     each = math.ceil(many / launches)
     given = dict(zip(keys, arrays, strict=True))
     if not many:
@@ -114,6 +150,7 @@ def _launch_in_parts(*arrays: Any, lanes: LanePrograms, begins: Any, many: int, 
 
     def part(first: int) -> list[Any]:
         def cut(key: ArrayKey, x: Any) -> Any:
+            # Tangents of arrays of lanes are (lanes, tangents, ...), of uniform arrays (tangents, ...).
             axis = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
             lacking = max(0, first + each - many)
             wide = [(0, lacking if i == axis else 0) for i in range(x.ndim)]
@@ -135,7 +172,7 @@ mlir.register_lowering(run_lanes_primitive, mlir.lower_fun(_launch_in_parts, mul
 def _launch_once(
     lanes: LanePrograms, begins: Any, many: int, as_lanes: frozenset[int], given: dict[ArrayKey, Any]
 ) -> list[Any]:
-    """The results of one launch; what begins without tangents has zeros."""
+    """Return the results of one launch; arrays that need tangents but have no seed get zeros."""
 
     def array(key: ArrayKey) -> Any:
         if key in given:
@@ -152,16 +189,18 @@ def _launch_once(
 def _jvp_rule(
     arrays: Sequence[Any], slopes: Sequence[Any], *, lanes: LanePrograms, begins: Any, many: int, as_lanes: Any
 ) -> Any:
-    """Values and tangents."""
+    """Return values and tangents of a kernel for `jax.jvp`."""
     if begins is not None:
         raise ValueError("a kernel has no second derivatives; engine = 'xla' has")
+    # Integers and truths have tangents of type float0 in JAX. They carry no derivative.
     moving = [type(x) is not ad.Zero and is_real(jax.typeof(x).dtype) for x in slopes]
     begins = tuple((key.level, key.number) for key, on in zip(lanes.keys, moving, strict=True) if on)
     if not begins:
         found = run_lanes_primitive.bind(*arrays, lanes=lanes, begins=None, many=0, as_lanes=as_lanes)
         return found, [_zero_tangent(x) for x in found]
 
-    lanes.derivative(begins)  # now: where JAX 0.12 asks for shapes nothing can be traced
+    # Build the derivative here: JAX 0.12 forbids tracing inside the abstract evaluation, where `ends` needs it.
+    lanes.derivative(begins)
 
     def alone(key: ArrayKey, x: Any) -> Any:
         return jnp.expand_dims(x, 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1)
@@ -185,10 +224,11 @@ def _zero_tangent(x: Any) -> Any:
 def _batching_rule(
     arrays: Sequence[Any], axes: Sequence[Any], *, lanes: LanePrograms, begins: Any, many: int, as_lanes: Any
 ) -> Any:
-    """More tangents, or more lanes."""
+    """Apply vmap: merge the batch axis into the tangent axis if only tangents are batched, else into the lane axis."""
     values = len(lanes.keys)
     size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
     how = {"lanes": lanes, "begins": begins}
+    # Only the seed tangents are batched, as in `jax.jacfwd`: the values run once, with size*many tangents.
     if all(axis is None for axis in axes[:values]):
         slopes = zip(lanes.slopes(begins), arrays[values:], axes[values:], strict=True)
         more = [_merge_tangent_axes(key, x, axis, size, as_lanes) for key, x, axis in slopes]
@@ -212,13 +252,14 @@ batching.primitive_batchers[run_lanes_primitive] = _batching_rule
 
 
 def _count(lanes: LanePrograms, arrays: Sequence[Any], axes: Sequence[Any]) -> int:
-    """Lanes before there were more."""
+    """Return the number of lanes without the batch axis."""
+    # The last of the values is an array of the carry, so it always has a lane axis.
     last = len(lanes.keys) - 1
     return arrays[last].shape[1 if axes[last] == 0 else 0]
 
 
 def _merge_tangent_axes(key: ArrayKey, x: Any, axis: int | None, size: int, as_lanes: frozenset[int]) -> Any:
-    """(batch, tangents) where there were tangents."""
+    """Return the seed tangents with the batch axis merged in front of the tangent axis: (batch*tangents, ...)."""
     at = 0 if key.level == UpdateLevel.UNIFORM and key.number not in as_lanes else 1
     x = jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
     x = jnp.moveaxis(x, 0, at)
@@ -228,7 +269,10 @@ def _merge_tangent_axes(key: ArrayKey, x: Any, axis: int | None, size: int, as_l
 def _merge_lane_axes(
     key: ArrayKey, x: Any, axis: int | None, size: int, own: set[int], as_lanes: frozenset[int], count: int
 ) -> Any:
-    """(batch, lanes) where there were lanes; and where what was the same for all of them is no more."""
+    """Return an array with the batch axis merged in front of the lane axis: (batch*lanes, ...).
+
+    A uniform array that is not batched stays as given. A batched one is repeated for every lane.
+    """
     shared = key.level == UpdateLevel.UNIFORM and key.number not in as_lanes
     if shared and key.number not in own:
         return x
@@ -239,7 +283,7 @@ def _merge_lane_axes(
 
 
 def _refuse_partial_evaluation(trace: Any, *tracers: Any, **how: Any) -> Any:
-    """A derivative is to be known only later, when it is transposed: reverse mode, or `jax.linearize`."""
+    """Raise ValueError: JAX linearizes the kernel (`jax.grad`, `jax.linearize`), and no reverse mode exists."""
     del trace, tracers, how
     raise ValueError(NO_REVERSE_MODE)
 

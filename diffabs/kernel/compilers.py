@@ -1,6 +1,7 @@
-"""C++ to a shared library, by a compiler of this machine, kept in the user's cache folder (`binaries`).
+"""Compilation of C++ to a shared library by a compiler of this machine, with the cache of `binaries`.
 
-A library is found by the digest of everything that it is made of: text, headers, compiler, flags, processor."""
+The digest of text, headers, compiler, flags and processor identifies a library.
+"""
 
 import contextlib
 import ctypes
@@ -24,24 +25,24 @@ from diffabs.core import stopwatch
 from diffabs.kernel.binaries import cache_folder, find_library, make_cache_folder, write_library
 
 NATIVE_FOLDER = pathlib.Path(__file__).parent / "native"
-COMPILER = "DIFFABS_KERNEL_COMPILER"  # the compiler's command; set but empty, no compiler is used
+COMPILER = "DIFFABS_KERNEL_COMPILER"  # environment variable: compiler command; empty means no compiler
 CANDIDATES = (["c++"], ["clang++"], ["g++"])
-# No flag may change NaN or infinity: of -ffast-math only no-math-errno and no-trapping-math. It must not be given at
-# linking either, where it changes how the whole process treats subnormal numbers.
+# Flags must preserve NaN and infinity, so -ffast-math is reduced to no-math-errno and no-trapping-math. Linking with
+# -ffast-math is wrong too: it makes the whole process flush subnormal numbers to zero.
 CPP_FLAGS = (
     *("-std=c++17", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fwrapv"),
     *("-fno-exceptions", "-fno-rtti", "-fPIC", "-shared", "-pthread", "-w"),
 )
-COMPILE_TIMEOUT_S = 300  # that a compiler may take for a kernel; the largest take some 20 s
-PROBE_TIMEOUT_S = 30  # and to say its version, or to make a library of one line
+COMPILE_TIMEOUT_S = 300  # for a kernel; the largest take about 20 s
+PROBE_TIMEOUT_S = 30  # for the version output, or for a library of one line
 
 
 class NoCompiler(Exception):
-    """No C++ compiler here makes a library. The message says why."""
+    """An error: no C++ compiler on this machine makes a library. The message says why."""
 
 
 class Compiler(NamedTuple):
-    """A command that works, and what it says it is."""
+    """A compiler command that works, with the first line of its version output."""
 
     command: tuple[str, ...]
     version: str
@@ -49,8 +50,11 @@ class Compiler(NamedTuple):
 
 @functools.cache
 def _probe_compiler(command: tuple[str, ...]) -> Compiler | str:
-    """The compiler of a command, or why it is none: it has to make a library that this process can load. That it did so
-    once is noted beside the libraries."""
+    """Return the compiler of a command, or a text that says why it does not work.
+
+    A compiler works if it makes a library that this process can load. A note in the cache folder records the success,
+    so that later processes skip the trial.
+    """
     try:
         version = _run_command([*command, "--version"], PROBE_TIMEOUT_S)
         made = Compiler(command, version.stdout.partition("\n")[0].strip())
@@ -65,16 +69,23 @@ def _probe_compiler(command: tuple[str, ...]) -> Compiler | str:
 
 
 def _check_loads(command: tuple[str, ...]) -> None:
-    """Make a library of one line and load it. Raises NoCompiler or OSError."""
+    """Compile a library of one function and load it; raise NoCompiler or OSError if that fails."""
     with tempfile.TemporaryDirectory(prefix="diffabs-") as folder:
         source, library = pathlib.Path(folder) / "one.cpp", pathlib.Path(folder) / "one.so"
+        # functions.h needs vector extensions and headers, so this line fails where a kernel would fail.
         source.write_text('#include "functions.h"\nextern "C" double one(double x) { return k_exp(all(x))[0]; }\n')
         _compile(command, source, library, PROBE_TIMEOUT_S)
         ctypes.CDLL(str(library))
 
 
 def find_compiler() -> Compiler:
-    """Return the first compiler that works: c++, clang++, g++, then that of the package ziglang. Raises NoCompiler."""
+    """Return the first compiler that works: c++, clang++, g++, then the one of the package ziglang.
+
+    $DIFFABS_KERNEL_COMPILER replaces this list by one command; if it is empty, no compiler is used.
+
+    Raises:
+        NoCompiler: No command works; the message gives a reason for each.
+    """
     said = os.environ.get(COMPILER)
     if said is not None and not said.strip():
         raise NoCompiler(f"{COMPILER} is empty")
@@ -91,13 +102,20 @@ def find_compiler() -> Compiler:
 
 
 def build_library(text: str) -> pathlib.Path:
-    """Return the file of the library of a text, which is compiled if it is not there yet. Raises NoCompiler, also for a
-    folder that cannot be written or that others may write to."""
+    """Return the file of the compiled library of a C++ text; a library in the cache is not compiled again.
+
+    Args:
+        text: C++ source.
+
+    Raises:
+        NoCompiler: No compiler works, compilation fails, or the cache folder is not writable or open to other users.
+    """
     made = find_compiler()
     digest = _digest(text, made)
     try:
         if path := find_library(digest, ".so"):
             return path
+        # Compile inside the cache folder, which only this user can write to.
         with tempfile.TemporaryDirectory(prefix=f".{digest[:16]}-", dir=make_cache_folder()) as own:
             source, result = pathlib.Path(own) / "kernel.cpp", pathlib.Path(own) / "kernel.so"
             source.write_text(text)
@@ -109,7 +127,11 @@ def build_library(text: str) -> pathlib.Path:
 
 
 def describe_compiler() -> dict[str, str]:
-    """Return what decides the bits besides the text: compiler, flags, processor. Raises NoCompiler."""
+    """Return compiler, flags and processor, which together with the text determine a kernel's numbers to the last bit.
+
+    Raises:
+        NoCompiler: No compiler works on this machine.
+    """
     return {"compiler": find_compiler().version, "flags": " ".join(CPP_FLAGS), "processor": _processor()}
 
 
@@ -123,14 +145,13 @@ def _compile(command: tuple[str, ...], source: pathlib.Path, result: pathlib.Pat
 
 
 def _run_command(words: list[str], longest: float) -> subprocess.CompletedProcess[str]:
-    """Run a command for at most so many seconds. Raises NoCompiler for one that takes longer, OSError where the
-    command does not exist."""
+    """Run a command for at most `longest` seconds; raise NoCompiler on timeout, OSError if there is no such command."""
     told = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(words, **told, start_new_session=True) as process:
         try:
             out, errors = process.communicate(timeout=longest)
         except BaseException as error:
-            # A compiler starts others, which hold the pipes: all of its session are ended, or `with` waits for them.
+            # A compiler starts child processes that hold the pipes. Kill the whole session, or `with` waits for them.
             with contextlib.suppress(OSError):
                 os.killpg(process.pid, signal.SIGKILL) if hasattr(os, "killpg") else process.kill()
             if isinstance(error, subprocess.TimeoutExpired):
@@ -140,6 +161,7 @@ def _run_command(words: list[str], longest: float) -> subprocess.CompletedProces
 
 
 def _digest(text: str, made: Compiler) -> str:
+    # The FFI header belongs to the digest: a new jaxlib may change the layout of the call frame.
     interface = pathlib.Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     headers = [path.read_bytes() for path in (*sorted(NATIVE_FOLDER.glob("*.h")), interface)]
     said = [text.encode(), *headers, repr((made, CPP_FLAGS, _processor())).encode()]
@@ -148,7 +170,7 @@ def _digest(text: str, made: Compiler) -> str:
 
 @functools.cache
 def _processor() -> str:
-    """The processor's kind: what -march=native makes of it differs."""
+    """Return a name for the processor with a digest of its features, because -march=native depends on them."""
     lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines() if os.path.exists("/proc/cpuinfo") else []
     wanted = [line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "flags", "Features"))]
     features = hashlib.sha256("\n".join(sorted(set(wanted))).encode()).hexdigest()[:12] if wanted else ""

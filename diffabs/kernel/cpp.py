@@ -1,7 +1,9 @@
-"""A program as C++: a block of a few vectors of lanes, from their start to their end.
+"""A scalar program as C++ text: each thread runs a block of a few SIMD vectors of lanes.
 
-Each line stands there once for every vector of the block, one after the other: while one waits for a result there is
-something to do for the next. A lane that has ended makes room for the next one, every so many steps."""
+A program's operation becomes one line per vector of the block, one after the other.
+The processor overlaps these independent lines, which hides the latency of each result.
+Between rounds, a lane that has ended hands its place to the next lane.
+"""
 
 import re
 from collections.abc import Iterator
@@ -14,12 +16,17 @@ from diffabs.kernel.graph import Node, UpdateLevel
 from diffabs.kernel.program import Branch, InputPlace, ScalarProgram, ScheduleBlock, live_nodes, schedule_nodes
 
 ONE_VECTOR = range(1)
-MIN_BRANCH_OPERATIONS = 24  # operations in a branch: fewer are worked out anyway
+MIN_BRANCH_OPERATIONS = 24  # a jump around fewer operations costs more than it saves
 
 
 class LaunchShape(NamedTuple):
-    """How a program is run: vectors in a block; steps between two calls of `renew`; of these, rounds between two looks
-    for lanes that have ended."""
+    """The loop structure of a launch.
+
+    Attributes:
+        vectors: SIMD vectors in a block.
+        steps: Calls of `step` after each call of `renew`.
+        rounds: Rounds of `renew` and `steps` between two checks for lanes that have ended.
+    """
 
     vectors: int
     steps: int
@@ -27,26 +34,43 @@ class LaunchShape(NamedTuple):
 
 
 def emit_cpp(program: ScalarProgram, shape: LaunchShape) -> str:
-    """Return the C++ of a program with the functions `renew`, `step` (carry to carry) and `running` (to one truth)."""
+    """Return a program's C++ text with the functions `renew` and `step` (carry to carry) and `running` (to one truth).
+
+    Args:
+        program: Operations and results.
+        shape: Loop structure of the launch.
+    """
     return "\n".join(Text(program, shape).parts()) + "\n"
 
 
 def operands_by_name(node: Node) -> tuple[Node, ...]:
-    """Return what an operation reads by name; the entries of a table lie in a column."""
+    """Return the operands that an expression refers to by variable name; a table's entries lie in a column instead.
+
+    Args:
+        node: Operation.
+    """
     return node.args[:1] if node.op == "table" else node.args
 
 
 class Text:
-    """The parts of a text, of which another back end has another first and last one, over the same names."""
+    """A writer of the text's parts. A subclass for another back end replaces HEAD and DRIVER and keeps the names
+    between.
+    """
 
     HEAD, DRIVER = '#include "functions.h"', '#include "drive.h"'
 
     def __init__(self, program: ScalarProgram, shape: LaunchShape):
-        """What of a program is worked out where."""
+        """Sort the program's nodes by the place that computes them: once for all lanes, once a lane, or in every step.
+
+        Args:
+            program: Operations and results.
+            shape: Loop structure of the launch.
+        """
         self.program, self.shape = program, shape
         self.roots = [node for nodes in program.results.values() for node in nodes]
         nodes = live_nodes(self.roots)
         self.alive = {node.id for node in nodes}
+        # Tables with the same entries share one column.
         self.columns: dict[tuple[int, ...], tuple[str, Node]] = {}
         for node in nodes:
             if node.op == "table":
@@ -60,14 +84,14 @@ class Text:
 
     @staticmethod
     def _read(readers: list[Node], roots: list[Node], level: UpdateLevel) -> set[int]:
-        """The numbers of a level's nodes that are read from elsewhere."""
+        """Return the ids of a level's nodes that faster levels or the results read."""
         read = {
             arg.id for node in readers if node.level > level for arg in operands_by_name(node) if arg.level == level
         }
         return read | {root.id for root in roots if root.level == level}
 
     def parts(self) -> Iterator[str]:
-        """The parts of the text, in their order."""
+        """Yield the parts of the text in their order."""
         single = "#define SINGLE\n" if self.program.dtype == np.float32 else ""
         yield f"{single}{self.HEAD}\nenum {{ VECTORS = {self.shape.vectors}, SLOTS = VECTORS*LANES }};"
         sizes = self.program.sizes
@@ -75,6 +99,7 @@ class Text:
         yield "enum { " + ", ".join(f"{name} = {count}" for name, count in counts) + " };"
         kinds = {place.array: scalar_type(node.dtype) for place, node in self._given(UpdateLevel.STEP)}
         widths = [f"{size}*sizeof({kinds.get(i, 'u8')})" for i, size in enumerate(sizes[UpdateLevel.STEP])]
+        # An array without entries has no node to take the type from. Its width is 0 in any type.
         yield f"static const i64 WIDTHS[] = {{{', '.join(map(str, widths))}}};"
         yield from self._structures()
         yield from self._prepare()
@@ -94,7 +119,9 @@ class Text:
         ]
 
     def _structures(self) -> Iterator[str]:
-        """What all lanes share, and a block of lanes: carry, inputs of the lanes, and what follows from these."""
+        """Yield the structs: `Shared` for all lanes, `Block` for the carry, the inputs of its lanes and their derived
+        values.
+        """
         shared = [f"{scalar_type(node.dtype)} v{node.id};" for node in self.shared]
         tables = [f"{scalar_type(n.args[1].dtype)} {name}[{len(n.args) - 1}];" for name, n in self.columns.values()]
         yield "struct Shared { " + " ".join([*shared, *tables]) + " int none; };"
@@ -104,7 +131,7 @@ class Text:
         yield "struct Block { " + " ".join([*carried, *own]) + " int none; };"
 
     def _prepare(self) -> Iterator[str]:
-        """static void prepare(Shared&, arrays): what is the same for all lanes."""
+        """Yield static void prepare(Shared&, arrays), which computes the values that all lanes share."""
         yield "PART void prepare(Shared& s, const Array* uniform) { (void)s; (void)uniform;"
         for place, node in self._given(UpdateLevel.UNIFORM):
             value = f"((const {scalar_type(node.dtype)}*)uniform[{place.array}].data)[{place.entry}]"
@@ -120,7 +147,9 @@ class Text:
         yield "}"
 
     def _begin(self) -> Iterator[str]:
-        """static void begin(Block&, const Shared&, int q): what follows from the inputs of the lanes of vector q."""
+        """Yield static void begin(Block&, const Shared&, int q), which computes the derived values of the lanes of
+        vector q.
+        """
         yield "PART void begin(Block& b, const Shared& s, int q) { (void)b; (void)s; (void)q;"
         yield from self._uniform([node for node in live_nodes(self.lanes) if node.level == UpdateLevel.LANE])
         for _, node in self._given(UpdateLevel.LANE):
@@ -132,8 +161,9 @@ class Text:
         yield "}"
 
     def _function(self, name: str) -> Iterator[str]:
-        """static void NAME(Block&, const Shared&): a function of the carry, of all vectors."""
+        """Yield static void NAME(Block&, const Shared&), which updates the carry of all vectors."""
         carried, results = self.program.carried(), self.program.results[name]
+        # Compute all results of all vectors before the first store: each may read the old carry.
         changed = [(c, r) for c, r in zip(carried, results, strict=True) if c is not r]
         yield f"BODY void {name}(Block& b, const Shared& s) {{ (void)b; (void)s;"
         yield from self._body([r for _, r in changed])
@@ -143,7 +173,7 @@ class Text:
         yield "}"
 
     def _running(self) -> Iterator[str]:
-        """static void running(const Block&, const Shared&, mask*): whether each lane goes on."""
+        """Yield static void running(const Block&, const Shared&, mask*), which tells for each lane if it continues."""
         (root,) = self.program.results["running"]
         yield "PART void running(const Block& b, const Shared& s, mask* on) { (void)b; (void)s;"
         yield from self._body([root])
@@ -167,14 +197,14 @@ class Text:
         yield from self._lines(schedule_nodes(roots, UpdateLevel.STEP), range(self.shape.vectors), "  ")
 
     def _uniform(self, readers: list[Node]) -> Iterator[str]:
-        """What all lanes share of what these read."""
+        """Yield declarations of the shared values that these nodes read."""
         shared = {node.id for node in self.shared}
         read = {x.id: x for node in readers for x in (node, *operands_by_name(node)) if x.id in shared}
         for node in read.values():
             yield "  " + _declare_uniform(node, f"s.v{node.id}")
 
     def _moves(self) -> Iterator[str]:
-        """Functions that put a lane into a place of the block, and take its carry out."""
+        """Yield functions that put a lane into a place of the block and that take its carry out."""
         yield "PART void put(Block& b, int p, i64 j, const Array* lanes, const Array* carry) {"
         yield "  const int i = p/LANES, q = p%LANES; (void)lanes;"
         for places, name, array in ((UpdateLevel.LANE, "l", "lanes"), (UpdateLevel.STEP, "c", "carry")):
@@ -194,7 +224,7 @@ class Text:
     # operations -------------------------------------------------------------------------------------------------------
 
     def _lines(self, block: ScheduleBlock, vectors: range, indent: str) -> Iterator[str]:
-        """The lines of a block, for these vectors."""
+        """Yield the lines of a schedule block for these vectors."""
         for item in block:
             if isinstance(item, Branch):
                 yield from self._branch(item, vectors, indent)
@@ -204,14 +234,18 @@ class Text:
                     yield f"{declared} = {self._expression(item, q)};"
 
     def _branch(self, branch: Branch, vectors: range, indent: str) -> Iterator[str]:
-        """A branch that is worth a jump, for each vector in which any lane goes there; in the lanes that do not, its
-        results do not count."""
+        """Yield a conditional, as a jump for each vector if it is long enough, else without a jump.
+
+        A vector takes the jump if any of its lanes does. The gates then discard the results of its other lanes.
+        """
         yield from self._lines(branch.no, vectors, indent)
+        # `size` includes the gates, which execute with or without a jump.
         if branch.size < MIN_BRANCH_OPERATIONS + len(branch.gates):
             yield from self._lines(branch.yes, vectors, indent)
             yield from self._gates(branch, vectors, indent + "const ")
             return
         for gate in branch.gates:
+            # Initialize the results with the branch not taken, so that a vector that skips the jump has valid values.
             names = ", ".join(f"{self._name(gate, q)} = {self._name(gate.args[1], q)}" for q in vectors)
             yield f"{indent}{vector_type(gate.dtype)} {names};"
         for q in vectors:
@@ -253,10 +287,15 @@ class Text:
 
 
 def _declare_uniform(node: Node, value: str) -> str:
-    """A number of all lanes, in every lane."""
+    """Return a declaration that copies a shared number into every lane."""
     return f"const {vector_type(node.dtype)} v{node.id} = all({'(bool)' if is_boolean(node.dtype) else ''}{value});"
 
 
 def count_operations(source: str) -> int:
-    """Return how many operations a text has for each vector of lanes."""
+    """Return the number of operations in a text, counted once for all vectors of a block.
+
+    Args:
+        source: C++ text.
+    """
+    # Vector 0 stands for all vectors, because every operation has one line for each.
     return len(re.findall(r"^ +(?:const )?\w+ v\d+_0 = ", source, re.MULTILINE))

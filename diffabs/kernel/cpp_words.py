@@ -1,5 +1,4 @@
-"""The words of C++ for single numbers in vectors of lanes: types, operators, functions (of `native/functions.h`),
-literals."""
+"""C++ types, operators, functions (of `native/functions.h`) and literals for numbers in vectors of lanes."""
 
 import numpy as np
 
@@ -24,27 +23,44 @@ CPP_FUNCTIONS = {
 
 
 def is_boolean(dtype: np.dtype) -> bool:
-    """Return whether numbers of this type are truths."""
+    """Return whether numbers of this type are truths.
+
+    Args:
+        dtype: NumPy type.
+    """
     return dtype.kind == "b"
 
 
 def scalar_type(dtype: np.dtype) -> str:
-    """Return the type of one number."""
+    """Return the C++ type of one number; a truth is a byte.
+
+    Args:
+        dtype: NumPy type.
+    """
     return "u8" if is_boolean(dtype) else CPP_TYPES[dtype.name]
 
 
 def vector_type(dtype: np.dtype) -> str:
-    """Return the type of a vector of them."""
+    """Return the C++ type of a vector with one number for each lane.
+
+    Args:
+        dtype: NumPy type.
+    """
     return "mask" if is_boolean(dtype) else "v" + CPP_TYPES[dtype.name]
 
 
 def literal(node: Node) -> str:
-    """Return a known number in every lane."""
+    """Return the C++ expression of a constant in every lane.
+
+    Args:
+        node: Constant.
+    """
     x = node.attr
     if is_boolean(node.dtype):
         return f"all({'true' if x else 'false'})"
     name = CPP_TYPES[node.dtype.name]
     if not is_real(node.dtype):
+        # C++ parses -2147483648 as the negative of a number out of range, so a macro stands for the least integer.
         ends = {"i32": "", "u32": "u", "i64": "ll", "u64": "ull"}[name]
         number = (
             f"INT{x.itemsize * 8}_MIN" if node.dtype.kind == "i" and x == np.iinfo(x.dtype).min else f"{int(x)}{ends}"
@@ -54,4 +70,5 @@ def literal(node: Node) -> str:
         return f"all(({name})NAN)"
     if np.isinf(x):
         return f"all(({name}){'-' if x < 0 else ''}INFINITY)"
+    # A hexadecimal literal is exact: the compiler does not round a decimal number.
     return f"all(({name}){float(x).hex()})"

@@ -1,4 +1,7 @@
-"""Random numbers, as JAX draws them: its own functions of a key, of which only the hash is written out here."""
+"""Lowering rules for random numbers (Threefry and erf_inv), with the same bits as in JAX.
+
+JAX's own functions of a key are traced and inlined. Only the hash is written out here.
+"""
 
 import math
 from typing import Any
@@ -11,13 +14,20 @@ import numpy as np
 from diffabs.kernel.graph import Array, Graph, Node
 from diffabs.kernel.primitives import Unsupported, constant_array, inline_program, lowering_rule, map_entries
 
-MAX_NUMBERS_PER_DRAW = 16  # numbers that are drawn at once, at most
-PARITY = 0x1BD11BDA  # of Threefry's key schedule
-THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # places by which its words are turned, in rounds of four
+MAX_NUMBERS_PER_DRAW = 16  # bound on the size of a draw, because each hash is inlined with about 120 operations
+PARITY = 0x1BD11BDA  # constant of Threefry's key schedule
+THREEFRY_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))  # bits by which a round rotates, alternating every four rounds
 
 
 def key_shape(aval: Any) -> tuple[tuple[int, ...], np.dtype]:
-    """Return shape and type of an array, of the data of a key if it is one. Raises Unsupported for other generators."""
+    """Return shape and type of an array; for a random key, shape and type of its words.
+
+    Args:
+        aval: Abstract value of an array or of keys.
+
+    Raises:
+        Unsupported: The key belongs to another generator than Threefry.
+    """
     if not jnp.issubdtype(aval.dtype, jax.dtypes.prng_key):
         return aval.shape, np.dtype(aval.dtype)
     if str(aval.dtype) != "key<fry>":
@@ -46,31 +56,42 @@ def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     width, shape = eqn.params["bit_width"], eqn.params["shape"]
     if key_shape(eqn.invars[0].aval)[0] != (2,) or math.prod(shape) > MAX_NUMBERS_PER_DRAW:
         raise Unsupported("random_bits", f"of {math.prod(shape)} numbers at once, or of several keys")
+    # Trace JAX's own function: the layout of the counters depends on width and shape, and stays JAX's.
     draw = jax.make_jaxpr(lambda key: jer.threefry_prng_impl.random_bits(key, width, shape))
     return inline_program(graph, draw(jax.ShapeDtypeStruct((2,), np.uint32)), ins)
 
 
 @lowering_rule("iota_2x32_shape", "shape")
 def _iota_words(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """The places of an array, in two words each."""
+    """Return the position of each entry in an array as two words of 32 bits, high word first."""
     places = np.arange(math.prod(eqn.params["shape"]), dtype=np.uint32).reshape(eqn.params["shape"])
     return [constant_array(graph, 0 * places), constant_array(graph, places)]
 
 
 @lowering_rule("threefry2x32")
 def _threefry(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """Salmon, Moraes, Dror and Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011), 20 rounds."""
+    """Return the two words of Threefry-2x32 with 20 rounds.
+
+    Source: Salmon, Moraes, Dror and Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011).
+    """
     return [map_entries(lambda *words, i=i: threefry(graph, *words)[i], *ins) for i in range(2)]
 
 
 def threefry(graph: Graph, k0: Node, k1: Node, x0: Node, x1: Node) -> tuple[Node, Node]:
-    """Return the two words that the key (k0, k1) makes of (x0, x1)."""
+    """Return the two words that Threefry-2x32 with 20 rounds makes of (x0, x1) under the key (k0, k1).
+
+    Args:
+        graph: Graph of the result.
+        k0, k1: Words of the key (uint32).
+        x0, x1: Words of the counter (uint32).
+    """
 
     def word(value: int) -> Node:
         return graph.const(value, np.uint32)
 
     keys = [k0, k1, graph.op("xor", graph.op("xor", k0, k1), word(PARITY))]
     x0, x1 = graph.op("add", x0, keys[0]), graph.op("add", x1, keys[1])
+    # Five groups of four rounds. Each group ends with a key injection: two of the three key words and a counter.
     for i in range(5):
         for places in THREEFRY_ROTATIONS[i % 2]:
             x0 = graph.op("add", x0, x1)
@@ -84,8 +105,8 @@ def threefry(graph: Graph, k0: Node, k1: Node, x0: Node, x1: Node) -> tuple[Node
     return x0, x1
 
 
-# M. Giles, Approximating the erfinv function (2012): polynomials in w = -log(1 - x^2), highest power first, each for a
-# range of w, in the variable of the range. These are those that XLA has.
+# M. Giles, Approximating the erfinv function (2012): polynomials in w = -log(1 - x^2), with XLA's coefficients. Each
+# row has the upper end of a range of w, the variable of that range, and the coefficients, highest power first.
 ERF_INV_SINGLE = (
     (5.0, lambda graph, w: graph.op("sub", w, graph.const(2.5, w.dtype)), (
         2.81022636e-08, 3.43273939e-07, -3.5233877e-06, -4.39150654e-06, 0.00021858087, -0.00125372503, -0.00417768164,
@@ -123,7 +144,14 @@ def _erf_inv(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 def erf_inv(graph: Graph, x: Node) -> Node:
-    """Return y with erf(y) = x: infinite at the ends of [-1, 1], NaN beyond."""
+    """Return y with erf(y) = x: infinite at x = 1 and x = -1, NaN outside [-1, 1].
+
+    Args:
+        graph: Graph of the result.
+        x: Real number.
+
+    Source: M. Giles, Approximating the erfinv function (2012), with XLA's coefficients.
+    """
     w = graph.op("neg", graph.op("log1p", graph.op("neg", graph.op("mul", x, x))))
     found: Node | None = None
     for most, shifted, powers in reversed(ERF_INV_SINGLE if x.dtype == np.float32 else ERF_INV_DOUBLE):
@@ -132,5 +160,6 @@ def erf_inv(graph: Graph, x: Node) -> Node:
             y = graph.op("add", graph.op("mul", y, at), graph.const(power, x.dtype))
         found = y if found is None else graph.select(graph.op("lt", w, graph.const(most, x.dtype)), found, y)
     assert found is not None
+    # At x = 1 and x = -1, w is infinite and the leading coefficient, not x, would decide the sign of the result.
     ends = graph.op("eq", graph.op("abs", x), graph.const(1, x.dtype))
     return graph.select(ends, graph.op("mul", found, x), graph.op("mul", x, graph.const(np.inf, x.dtype)))

@@ -1,4 +1,4 @@
-"""Rules of operations on arrays, number by number."""
+"""Lowering rules for elementwise primitives: arithmetic, functions, comparisons, conversions and bit operations."""
 
 from typing import Any
 
@@ -25,11 +25,16 @@ def _elementwise(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 def _integer_quotient(graph: Graph, x: Node, y: Node) -> Node:
-    """Of whole numbers, towards zero; as XLA has it by 0, where a processor ends the process, -1, and all bits."""
+    """Return an integer quotient rounded towards zero, without the cases that stop a process.
+
+    As in XLA, x/0 has all bits set.
+    """
     zero, one = graph.const(0, y.dtype), graph.const(1, y.dtype)
     nothing, turned = graph.op("eq", y, zero), graph.const(False)
     if y.dtype.kind == "i":
-        turned = graph.op("eq", y, graph.const(-1, y.dtype))  # of the least number that, too, ends the process
+        # The least integer divided by -1 overflows, which stops the process on x86. A negation wraps instead.
+        turned = graph.op("eq", y, graph.const(-1, y.dtype))
+    # The divisor is made valid first: both sides of a selection are computed in every lane.
     found = graph.op("quotient", x, graph.select(graph.op("or", nothing, turned), y, one))
     found = graph.select(turned, found, graph.op("neg", x) if y.dtype.kind == "i" else x)
     return graph.select(nothing, found, graph.op("not", zero))
@@ -48,12 +53,18 @@ def _identity(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("max min")
 def _max_min(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """NaN if either is."""
+    """Return the larger or smaller of two arrays, entry by entry; NaN if either is NaN."""
     return [map_entries(lambda x, y: max_or_min(graph, eqn.primitive.name, x, y), *ins)]
 
 
 def max_or_min(graph: Graph, name: str, x: Node, y: Node) -> Node:
-    """Return the larger or smaller of two numbers; NaN if either is."""
+    """Return the larger or smaller of two numbers; NaN if either is NaN.
+
+    Args:
+        graph: Graph of the result.
+        name: "max" or "min".
+        x, y: Numbers of one type; truths count as 0 and 1.
+    """
     if x is y:
         return x
     if x.dtype == bool:
@@ -68,11 +79,12 @@ def _abs(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("sign")
 def _sign(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """NaN and zeros are their own sign."""
+    """Return the sign; NaN, 0 and -0 stay themselves."""
 
     def sign(x: Node) -> Node:
         zero, one, less = (graph.const(value, x.dtype) for value in (0, 1, -1 if x.dtype.kind != "u" else 0))
         low = graph.select(graph.op("lt", x, zero), x, less)
+        # Both comparisons are false for NaN, 0 and -0, so x remains.
         return graph.select(graph.op("gt", x, zero), low, one)
 
     return [map_entries(sign, *ins)]
@@ -86,6 +98,7 @@ def _square(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 @lowering_rule("integer_pow", "y")
 def _integer_pow(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     def power(x: Node) -> Node:
+        # Binary powers as in XLA. A negative exponent inverts the final product.
         n, result = abs(eqn.params["y"]), None
         while n:
             if n & 1:
@@ -114,13 +127,14 @@ def _inverse(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("rem")
 def _rem(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
+    # A constant divisor other than 0 needs no guard.
     if ins[1].size and not is_real(ins[1].flat[0].dtype) and any(x.op != "const" or x.attr == 0 for x in ins[1].flat):
         return [map_entries(lambda x, y: _integer_remainder(graph, x, y), *ins)]
     return [map_entries(lambda x, y: graph.op("rem", x, y), *ins)]
 
 
 def _integer_remainder(graph: Graph, x: Node, y: Node) -> Node:
-    """By 0 the rest is the number itself, and not the end of the process."""
+    """Return an integer remainder with the sign of x; x itself for y = 0, where a processor would stop the process."""
     zero = graph.op("eq", y, graph.const(0, y.dtype))
     return graph.select(zero, graph.op("rem", x, graph.select(zero, y, graph.const(1, y.dtype))), x)
 
@@ -131,7 +145,8 @@ def _round(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         return [map_entries(lambda x: graph.op("rint", x), *ins)]
 
     def away(x: Node) -> Node:
-        """A half goes away from zero. What the size lacks to its whole part is exact, and its half plus 1/2 is not."""
+        """Round to the nearest integer, half away from zero."""
+        # size - floor(size) is exact. floor(size + 1/2) is not: for the number just below 1/2 the sum rounds to 1.
         size = graph.op("abs", x)
         down = graph.op("floor", size)
         up = graph.op("ge", graph.op("sub", size, down), graph.const(0.5, x.dtype))
@@ -169,12 +184,13 @@ def _bits(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("shift_left shift_right_logical")
 def _shift(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """By as many places as there are, or more, nothing is left."""
+    """Shift by a number of bits; a shift by the width or more gives 0, where C leaves it undefined."""
     name = eqn.primitive.name
 
     def shift(x: Node, by: Node) -> Node:
         if name == "shift_right_logical" and x.dtype.kind == "i":
             raise Unsupported(name, "of a number with a sign")
+        # The shift distance is made valid first: both sides of a selection are computed.
         count, zero = 8 * x.dtype.itemsize, graph.const(0, x.dtype)
         if by.op == "const":
             return graph.op(name, x, by) if 0 <= by.attr < count else zero
@@ -188,7 +204,7 @@ def _shift(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("population_count")
 def _population(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """The bits that are set: sums of neighbours, of pairs, of fours, and by a product of bytes."""
+    """Count the bits that are set: sums of pairs, of fours and of eights, then a product that adds the four bytes."""
 
     def count(x: Node) -> Node:
         if x.dtype != np.uint32:

@@ -1,7 +1,10 @@
-"""Which tangents are worked out: those with which the rest are the fewest operations.
+"""A choice of the tangents that a program computes: vertex elimination for the fewest operations.
 
-A chain of operations on a tangent is one product with the product of its factors, the same for all tangents. So
-vertices are eliminated from the graph of one tangent wherever so many tangents cost less without them."""
+A chain of linear operations on a tangent equals one product with the product of the factors, which is the same for all
+tangents.
+So a vertex is eliminated from the graph of one tangent wherever the given number of tangents costs fewer operations
+without it.
+"""
 
 from collections.abc import Callable, Iterable
 
@@ -12,24 +15,47 @@ from diffabs.kernel.linear import UNIT_FACTOR, Algebra, Factor, Sum, Vertex, cha
 
 
 class Elimination:
-    """The tangents of a program, made fewer."""
+    """The linear graph of one tangent of a program, reduced for several tangents.
+
+    Attributes:
+        graph: Graph of the factors.
+        many: Number of tangents.
+        algebra: Operations on sums of tangents.
+        vertices: Computed tangents by node id.
+        readers: For each tangent, the ids of the vertices that read it.
+        kept: Ids of tangents that nonlinear operations or results read, which must remain.
+        levels: For each tangent, how often its value changes.
+        any_factor: Placeholder for a factor whose value does not matter for a count of operations.
+    """
 
     def __init__(self, graph: Graph, many: int, dtype: np.dtype):
-        """For so many tangents of each number; factors are nodes of this graph."""
+        """Create an empty linear graph.
+
+        Args:
+            graph: Graph that the factors are nodes of.
+            many: Number of tangents.
+            dtype: Type of the tangents.
+        """
         self.graph, self.many, self.algebra = graph, many, Algebra(graph, dtype)
         self.vertices: dict[int, Vertex] = {}
         self.readers: dict[int, set[int]] = {}
-        self.kept: set[int] = set()  # as they are read by name
+        self.kept: set[int] = set()
         self.levels: dict[int, UpdateLevel] = {}
         self.any_factor = graph.input(dtype, UpdateLevel.STEP, "any factor")
 
     def begin(self, node: int, level: UpdateLevel) -> None:
-        """Add a tangent that is given."""
+        """Add a seeded tangent: `node` is its id, `level` tells how often its value changes."""
         self.levels[node] = level
         self.readers[node] = set()
 
     def add(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> None:
-        """Add an operation on tangents; `value`: what a number is that is none."""
+        """Add an operation on tangents.
+
+        Args:
+            node: Operation in the graph of one tangent.
+            moves: Function that says if a node is a nonzero tangent.
+            value: Function that returns the factor graph's node for any other number.
+        """
         new = self.vertices[node.id] = self.algebra.vertex(node, moves, value)
         self.readers[node.id] = set()
         reads = {x for sum in new.sums() for x in sum} | set(new.reads)
@@ -39,32 +65,41 @@ class Elimination:
         factors = [f.number.level for sum in new.sums() for f in sum.values() if f.number is not None]
         factors += [new.which.level] if new.which is not None else []
         self.levels[node.id] = max([UpdateLevel.UNIFORM, *factors, *(self.levels[x] for x in reads)])
+        # A nonlinear operation also changes as often as its operands that are no tangents.
         if new.reads and any(not moves(x) for x in node.args):
             self.levels[node.id] = max([self.levels[node.id], *(value(x).level for x in node.args if not moves(x))])
 
     # costs ------------------------------------------------------------------------------------------------------------
 
     def _cost(self, vertex: Vertex) -> int:
-        """Operations for all tangents, as it is or with a choice of factors."""
+        """Return the operations of a vertex for all tangents, by the cheaper of selecting tangents and selecting
+        factors.
+        """
         cost = self.many * (sum(map(count_terms, vertex.sums())) + (vertex.which is not None))
         return min(cost, self._factor_choice_cost(vertex)) if self._can_choose_factors(vertex) else cost
 
     def _can_choose_factors(self, vertex: Vertex) -> bool:
-        """Whether factors may be chosen in place of tangents. A tangent that is not chosen, and no number, must not
-        matter: 0 times it would. Only what is given to the steps is a number for certain: a try may lead anywhere."""
+        """Return whether a selection between tangents may become a selection between factors.
+
+        The factor 0 does not remove a NaN or infinity in the branch not taken.
+        So a tangent in one branch only must be an input that is constant over the steps: an iterate of a step may
+        diverge.
+        """
         once = set(vertex.sum) ^ set(vertex.others)
         return vertex.which is not None and all(
             x not in self.vertices and self.levels[x] < UpdateLevel.STEP for x in once
         )
 
     def _factor_choice_cost(self, vertex: Vertex) -> int:
+        """Return the operations of a vertex for all tangents with a selection between factors."""
         keys = set(vertex.sum) | set(vertex.others)
         chosen = [x for x in keys if vertex.sum.get(x) != vertex.others.get(x)]
+        # One term with the factor 1 starts the sum and needs no operation.
         units = any(x not in chosen and vertex.sum[x].number is None for x in keys)
         return self.many * (len(keys) - units) + len(chosen)
 
     def _saving_without(self, key: int, inner: Sum) -> int:
-        """How many operations are spared without a vertex that is this sum."""
+        """Return the number of operations saved if the readers of a vertex use its sum `inner` instead."""
         spared = self.many * count_terms(inner)
         for reader in self.readers[key]:
             old = self.vertices[reader]
@@ -77,7 +112,10 @@ class Elimination:
         return spared
 
     def _substituted_sum(self, outer: Sum, key: int, inner: Sum) -> tuple[Sum, int]:
-        """A sum with another one in the place of a vertex, whose factors are not worked out; operations on these."""
+        """Return `outer` with `inner` in place of a vertex, and the extra operations on factors.
+
+        The factors of the result are placeholders: only their number matters here.
+        """
         factor, more = outer[key], 0
         found = {x: one for x, one in outer.items() if x != key}
         for x, one in inner.items():
@@ -92,20 +130,23 @@ class Elimination:
                 )
         return found, more
 
-    # which are eliminated ---------------------------------------------------------------------------------------------
+    # elimination ------------------------------------------------------------------------------------------------------
 
     def reduce(self, roots: Iterable[int]) -> None:
-        """Eliminate what costs more than it spares."""
+        """Eliminate each vertex that costs more than it saves, except `roots`, the ids of the results."""
         self.kept.update(roots)
+        # An elimination changes the costs of its neighbours, so passes repeat until one removes nothing.
         left = True
         while left:
             before = len(self.vertices)
+            # From the results back: an eliminated vertex passes its sum to readers that are already reduced.
             for key in sorted(self.vertices, reverse=True):
                 self._try(key)
             left = len(self.vertices) < before
 
     def _try(self, key: int) -> None:
         vertex = self.vertices[key]
+        # Nonlinear operations stay. Work outside the steps is not worth a reduction.
         if vertex.reads or self.levels[key] < UpdateLevel.STEP:
             return
         if not self.readers[key] and key not in self.kept:
@@ -127,7 +168,7 @@ class Elimination:
             self._replace_by_sum(key, decided)
 
     def _join_choices(self, key: int) -> bool:
-        """Whether a choice of one thing or nothing was made one with those by which alone it is read."""
+        """Merge a selection of one tangent or zero into its readers if all are such selections; return success."""
         vertex = self.vertices[key]
         one = vertex.sum or vertex.others
         if vertex.which is None or len(one) != 1 or (vertex.sum and vertex.others):
@@ -136,6 +177,7 @@ class Elimination:
         readers = [self.vertices[reader] for reader in self.readers[key]]
         if any(r.which is None or any(side and side not in (one, whole) for side in r.sums()) for r in readers):
             return False
+        # Both selections pick the same tangent or zero, so one truth, the nested selection, describes each reader.
         sides = (self.graph.const(bool(side)) for side in vertex.sums())
         taken = self.graph.select(vertex.which, *sides)
         for reader in readers:
@@ -149,12 +191,14 @@ class Elimination:
         return True
 
     def _replace_by_sum(self, key: int, decided: Sum) -> None:
+        """Replace a vertex by a plain sum and update the readers of its former operands."""
         old = self.vertices[key]
         self.vertices[key] = Vertex(decided)
         for x in {x for sum in old.sums() for x in sum} - set(decided):
             self.readers[x].discard(key)
 
     def _eliminate(self, key: int) -> None:
+        """Remove a vertex: substitute its sum into each reader."""
         inner = self.vertices[key]
         for reader in self.readers.pop(key):
             vertex = self.vertices[reader]
@@ -162,6 +206,7 @@ class Elimination:
                 vertex.sum = self.algebra.within(vertex.sum, key, inner.sum)
             if key in vertex.others:
                 vertex.others = self.algebra.within(vertex.others, key, inner.sum)
+            # Terms may cancel in the merged sum, so operands are added to or removed from the reader lists.
             now = {x for sum in vertex.sums() for x in sum}
             for x in inner.sum:
                 (self.readers[x].add if x in now else self.readers[x].discard)(reader)

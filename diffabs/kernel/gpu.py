@@ -1,6 +1,7 @@
-"""Lanes on an NVIDIA GPU: machine code by `nvrtc`, started by the driver's own interface on XLA's stream.
+"""Launches on an NVIDIA GPU: machine code from `nvrtc`, started through the CUDA driver on XLA's stream.
 
-Only this module knows `jax.experimental.buffer_callback`, by which a start is an operation of XLA's, and the driver."""
+Only this module uses the driver and `jax.experimental.buffer_callback`, which makes a launch an operation of XLA.
+"""
 
 import ctypes
 import functools
@@ -18,40 +19,62 @@ from diffabs.kernel.cpp import LaunchShape
 from diffabs.kernel.graph import UpdateLevel
 from diffabs.kernel.program import ScalarProgram
 
-ORDINAL, MULTIPROCESSORS = 9, 16  # attributes of a pointer and of a device, by the driver's numbers
+# CUDA's enumerators CU_POINTER_ATTRIBUTE_DEVICE_ORDINAL and CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT.
+ORDINAL, MULTIPROCESSORS = 9, 16
 _lock = threading.Lock()
 
 
 class GpuDevice(Protocol):
-    """What compiles and starts kernels."""
+    """A GPU that compiles and starts kernels."""
 
     def compiled(self, text: str) -> pathlib.Path:
-        """Return the file of the machine code of a text. Raises NoCompiler."""
+        """Return the file with the machine code of a CUDA C++ `text`.
+
+        Raises:
+            NoCompiler: The text does not compile, or there is no compiler.
+        """
         ...
 
     def address(self, buffer: Any) -> int:
-        """Return where an array of XLA's lies."""
+        """Return the device address of a `buffer` of XLA."""
         ...
 
     def start(self, code: pathlib.Path, arrays: Any, room: int, count: int, context: Any) -> None:
-        """Start `begin_all`, then `run_all`, for so many lanes; `arrays` are those of `threads.h`, the context is XLA's
-        and has the stream."""
+        """Start the kernels `begin_all` and then `run_all` of a program.
+
+        Args:
+            code: File with the machine code.
+            arrays: The struct `Arrays` of `threads.h`.
+            room: Device address of the memory for the counter and the shared values.
+            count: Number of lanes.
+            context: XLA's execution context, which has the stream.
+        """
         ...
 
 
 def find_gpu() -> GpuDevice | None:
-    """Return the GPU that JAX runs on, or None if that is a processor. Raises NoCompiler for a GPU of another make."""
+    """Return the GPU that JAX runs on, or None if JAX runs on a processor.
+
+    Raises:
+        NoCompiler: JAX runs on a GPU that is not NVIDIA's.
+    """
     home = jax.config.jax_default_device or jax.devices()[0]  # pyright: ignore[reportAttributeAccessIssue]
     platform = home if isinstance(home, str) else home.platform
     return None if platform == "cpu" else _find_cuda_device(platform)
 
 
 def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[Any], results: list[Any]) -> list[Any]:
-    """Return what becomes of the carries: arrays as the `results` say.
+    """Return the final carry of all lanes, as an operation of XLA on the GPU.
 
-    given: arrays that all lanes share, of the lanes, and of the carry, the last two with a leading axis of lanes
+    Args:
+        program: Operations and results.
+        shape: Loop structure of the launch.
+        given: Uniform arrays, arrays of the lanes and arrays of the carry; the last two have a leading axis of lanes.
+        results: Shapes and types of the carry.
 
-    Raises NoCompiler."""
+    Raises:
+        NoCompiler: The program does not compile, or there is no compiler.
+    """
     on = find_gpu()
     assert on is not None
     source = cuda.emit_cuda(program, shape)
@@ -64,12 +87,18 @@ def call_kernel(program: ScalarProgram, shape: LaunchShape, given: list[Any], re
         if count:
             on.start(code, _pack_addresses([*map(on.address, ins), *found], [*sizes, sizes[-1]]), room, count, context)
 
+    # XLA allocates the kernels' own memory as one more result, which is dropped.
     whole = [*results, jax.ShapeDtypeStruct((source.room,), np.uint8)]
     return buffer_callback(start, whole)(*given)[:-1]
 
 
 def describe_gpu_compiler() -> dict[str, str]:
-    """Return what decides the bits besides the text. Raises NoCompiler."""
+    """Return compiler, flags and architecture, which together with the text determine a kernel's numbers to the last
+    bit.
+
+    Raises:
+        NoCompiler: There is no CUDA compiler.
+    """
     on = find_gpu()
     assert isinstance(on, CudaDevice)
     major, minor = nvrtc.nvrtc_version()
@@ -77,9 +106,10 @@ def describe_gpu_compiler() -> dict[str, str]:
 
 
 def _pack_addresses(addresses: list[int], sizes: list[int]) -> Any:
-    """`Arrays` of `threads.h`: in each group a place more than there are arrays."""
+    """Return the struct `Arrays` of `threads.h`: each group of addresses ends with one more entry, a null pointer."""
     rest, found = iter(addresses), []
     for size in sizes:
+        # C++ has no arrays of length 0, so every group has one more entry.
         found += [*(next(rest) for _ in range(size)), 0]
     return (ctypes.c_void_p * len(found))(*found)
 
@@ -96,7 +126,14 @@ def _find_cuda_device(platform: str) -> "CudaDevice":
 
 
 class _LoadedCode(NamedTuple):
-    """Machine code on a device: its context, the two kernels, and how many blocks of the second it holds at once."""
+    """Machine code in a device's memory.
+
+    Attributes:
+        context: The driver's context.
+        begin: Kernel `begin_all`.
+        run: Kernel `run_all`.
+        blocks: Blocks of `run_all` that the device holds at a time.
+    """
 
     context: Any
     begin: Any
@@ -105,28 +142,33 @@ class _LoadedCode(NamedTuple):
 
 
 class CudaDevice:
-    """NVIDIA's GPUs of this process, of one architecture (sm_90)."""
+    """The NVIDIA GPUs of this process, all of one architecture such as sm_90."""
 
     def __init__(self, architecture: str):
-        """The driver is loaded when something is started."""
+        """Store the architecture; the driver is loaded at the first launch."""
         self.architecture = architecture
         self._loaded: dict[tuple[pathlib.Path, int], _LoadedCode] = {}
 
     def compiled(self, text: str) -> pathlib.Path:
-        """As `GpuDevice` says."""
+        """Return the file with the machine code of a CUDA C++ `text`; see `GpuDevice.compiled`."""
         return nvrtc.build_cubin(text, self.architecture)
 
     def address(self, buffer: Any) -> int:
-        """As `GpuDevice` says."""
+        """Return the device address of a `buffer` of XLA."""
         return buffer.__cuda_array_interface__["data"][0]
 
     def start(self, code: pathlib.Path, arrays: Any, room: int, count: int, context: Any) -> None:
-        """As `GpuDevice` says; on the device that has the room."""
+        """Start `begin_all` and `run_all` on the device that holds `room`.
+
+        The arguments `code`, `arrays`, `room`, `count` and `context` are those of `GpuDevice.start`.
+        """
         ordinal = ctypes.c_int()
+        # Several devices may run this program: the memory tells which one to use.
         _call_driver("cuPointerGetAttribute", ctypes.byref(ordinal), ORDINAL, ctypes.c_uint64(room))
         one = self._loaded_on(code, ordinal.value)
         _call_driver("cuCtxPushCurrent_v2", one.context)
         try:
+            # At most as many blocks as run at a time: each thread takes further lanes from the counter.
             blocks = min(one.blocks, -(-count // cuda.THREADS_PER_BLOCK))
             shared, counter = ctypes.c_uint64(room + cuda.COUNTER), ctypes.c_uint64(room)
             threads, lanes = ctypes.c_int64(blocks * cuda.THREADS_PER_BLOCK), ctypes.c_int64(count)
@@ -143,7 +185,7 @@ class CudaDevice:
 
 
 def _load(code: pathlib.Path, ordinal: int) -> _LoadedCode:
-    """Into the context that XLA, too, uses: a device's first."""
+    """Load machine code into the primary context of a device, which XLA uses too."""
     context, module, number = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_int()
     begin, run = ctypes.c_void_p(), ctypes.c_void_p()
     _call_driver("cuDevicePrimaryCtxRetain", ctypes.byref(context), ordinal)
@@ -167,13 +209,14 @@ def _load(code: pathlib.Path, ordinal: int) -> _LoadedCode:
 
 
 def _launch(kernel: Any, blocks: int, threads: int, stream: int, *args: Any) -> None:
+    # cuLaunchKernel takes an array with the address of each argument.
     given = (ctypes.c_void_p * len(args))(*(ctypes.addressof(x) for x in args))
     nothing = ctypes.c_void_p()
     _call_driver("cuLaunchKernel", kernel, blocks, 1, 1, threads, 1, 1, 0, ctypes.c_void_p(stream), given, nothing)
 
 
 def _call_driver(name: str, *args: Any) -> None:
-    """Call the driver. Raises RuntimeError for what it objects to."""
+    """Call a function of the driver; raise RuntimeError with the name of the error it returns."""
     if failed := getattr(_load_driver(), name)(*args):
         said = ctypes.c_char_p()
         _load_driver().cuGetErrorName(failed, ctypes.byref(said))

@@ -1,7 +1,9 @@
-"""A program of single numbers: operations that are numbered by what they compute, so that nothing is computed twice.
+"""An expression graph of single numbers, without duplicates: equal operations on equal operands are one node.
 
-A node has a level: how often its value changes. What is known now is folded; what is the same for all lanes is worked
-out once, what belongs to a lane once when that begins, and only the rest in every step."""
+A node's level says how often its value changes.
+Constants are folded. Uniform values are computed once a launch, values of a lane once when it starts, and the rest in
+every step.
+"""
 
 import enum
 from collections.abc import Callable, Iterable
@@ -11,48 +13,63 @@ import numpy as np
 
 from diffabs.kernel.operations import COMPARISONS, FOLDABLE, MIRRORED, NEGATED, SYMMETRIC
 
-Array = Any  # of nodes, of NumPy
+Array = Any  # NumPy array of nodes
 
 
 class UpdateLevel(enum.IntEnum):
-    """How often a value changes: never, with the launch, with the lane, with the step."""
+    """The rate at which a value changes: never, with the launch, with the lane, or with the step."""
 
     KNOWN, UNIFORM, LANE, STEP = range(4)
 
 
 class Node:
-    """A number: an operation on others. `attr` is what is particular to it: a constant's value, an input's place."""
+    """A number: an operation on other numbers.
+
+    Attributes:
+        id: Number of the node in its graph; operands have smaller ones.
+        op: Name of the operation.
+        args: Operands.
+        dtype: Type.
+        attr: Data of the operation: a constant's value, an input's place, a conditional's `Gate`.
+        level: Rate at which the value changes.
+        label: Variable name in the source, for graphs that record it.
+    """
 
     __slots__ = ("args", "attr", "dtype", "id", "label", "level", "op")
 
     def __init__(self, id: int, op: str, args: tuple["Node", ...], dtype: np.dtype, attr: Any, level: UpdateLevel):
-        """Made by a `Graph` alone."""
+        """Store the fields. Only a `Graph` creates nodes."""
         self.id, self.op, self.args, self.dtype, self.attr, self.level = id, op, args, dtype, attr, level
-        self.label = ""  # what the source calls it, of a graph that asks
+        self.label = ""
 
     def is_number(self, value: float) -> bool:
-        """Whether it is known to be this number."""
+        """Return whether the node is a constant equal to `value`."""
         return self.op == "const" and bool(self.attr == value)
 
 
 class Gate(NamedTuple):
-    """A conditional: its number, and whether it is enough to know that any lane takes it."""
+    """A conditional.
+
+    Attributes:
+        number: Number of the conditional in its graph.
+        any: Whether only the truth over all lanes matters, as in `any`.
+    """
 
     number: int
     any: bool
 
 
 class Graph:
-    """Nodes, numbered from arguments to results; equal ones are one."""
+    """A list of nodes in topological order, operands first; equal nodes are one."""
 
     def __init__(self) -> None:
-        """Without nodes."""
+        """Create an empty graph."""
         self.nodes: list[Node] = []
         self._known: dict[Any, Node] = {}
         self._gates = 0
 
     def begins(self, eqn: Any) -> None:
-        """Be told that the nodes that follow are of this operation of JAX."""
+        """Note that the following nodes come from the JAX equation `eqn`; a subclass may record labels."""
 
     def _make(
         self, op: str, args: tuple[Node, ...], dtype: Any, attr: Any = None, level: UpdateLevel | None = None
@@ -66,8 +83,9 @@ class Graph:
         return self._known[key]
 
     def const(self, value: Any, dtype: Any = None) -> Node:
-        """Return a known number."""
+        """Return the constant `value` of type `dtype`."""
         x = np.asarray(value, dtype)[()]
+        # The key has the bytes, because 0 == -0 and NaN != NaN.
         key = ("const", x.dtype, x.tobytes())
         if key not in self._known:
             self.nodes.append(Node(len(self.nodes), "const", (), x.dtype, x, UpdateLevel.KNOWN))
@@ -75,13 +93,14 @@ class Graph:
         return self._known[key]
 
     def input(self, dtype: Any, level: UpdateLevel, place: Any) -> Node:
-        """Return a number that comes from outside, from this place."""
+        """Return a number from outside: type `dtype`, rate of change `level`, origin `place`."""
         return self._make("input", (), dtype, place, level)
 
     def op(self, name: str, *args: Node) -> Node:
-        """Return an operation on numbers of one type: one of `FOLDABLE`, or a function that a back end has."""
+        """Return the operation `name` on numbers `args` of one type: one of `FOLDABLE` or a back end's function."""
         boolean = name in COMPARISONS or name == "is_finite"
         dtype = np.dtype(bool) if boolean else args[0].dtype
+        # Folding may overflow or give NaN, as the operation itself does, so NumPy's warnings are off.
         if name in FOLDABLE and all(arg.op == "const" for arg in args):
             with np.errstate(all="ignore"):
                 return self.const(FOLDABLE[name](*(arg.attr for arg in args)), dtype)
@@ -90,28 +109,31 @@ class Graph:
         found = _SIMPLIFICATIONS[name](self, *args) if name in _SIMPLIFICATIONS else None
         if found is not None:
             return found
+        # One order of operands for commutative operations, so that x + y and y + x are one node.
         if name in SYMMETRIC and args[0].id > args[1].id:
             args = args[::-1]
         return self._make(name, args, dtype)
 
     def select(self, which: Node, no: Node, yes: Node) -> Node:
-        """Return yes where `which`, else no."""
+        """Return `yes` where `which` is true, else `no`."""
         if which.op == "const" or no is yes:
             return yes if no is yes or which.attr else no
         if which.op == "not":
             return self.select(which.args[0], yes, no)
         if no.dtype == bool:
             return self._select_boolean(which, no, yes)
+        # A nested selection on the same truth has only one reachable branch.
         yes = yes.args[2] if yes.op == "select" and yes.args[0] is which else yes
         no = no.args[1] if no.op == "select" and no.args[0] is which else no
         if no is yes:
             return yes
+        # `lower` and `higher` are the processor's min and max. They return the second operand for NaN, as here.
         if which.op == "lt" and {yes, no} == set(which.args):
             return self._make("lower" if yes is which.args[0] else "higher", (yes, no), yes.dtype)
         return self._make("select", (which, no, yes), yes.dtype)
 
     def _select_boolean(self, which: Node, no: Node, yes: Node) -> Node:
-        """A selection of truths is a truth."""
+        """Return a selection between truths, as logical operations."""
         if yes.op == "const":
             return self.op("or", which, no) if yes.attr else self.op("and", self.op("not", which), no)
         if no.op == "const":
@@ -119,7 +141,10 @@ class Graph:
         return self.op("or", self.op("and", which, yes), self.op("and", self.op("not", which), no))
 
     def gate(self, which: Node, no: Iterable[Node], yes: Iterable[Node]) -> list[Node]:
-        """Return a selection that a program may make by going one way only: `which`, or whether any lane does."""
+        """Return selections that a back end may compute as a conditional jump.
+
+        `no` and `yes` are the results of the two branches; `which` is a truth of a lane, or the node `any` of one.
+        """
         pairs = list(zip(no, yes, strict=True))
         asked = which.args[0] if which.op == "any" else which
         if asked.op == "const":
@@ -128,16 +153,17 @@ class Graph:
         return [b if a is b else self._gated(gate, asked, a, b) for a, b in pairs]
 
     def _gated(self, gate: Gate, which: Node, no: Node, yes: Node) -> Node:
-        if gate.any and no.op == "const":  # a placeholder: the lanes that ask get what is computed
+        # A constant in the other branch is a placeholder: only lanes with a true `which` use the result.
+        if gate.any and no.op == "const":
             return yes
         return self._make("gate", (which, no, yes), yes.dtype, gate)
 
     def any(self, which: Node) -> Node:
-        """Return a truth of a lane, of which it matters whether it is that of any lane."""
+        """Return a marker for the truth over all lanes of the truth `which`; its value in a lane is `which` itself."""
         return which if which.op in ("const", "any") else self._make("any", (which,), bool)
 
     def convert(self, x: Node, dtype: Any) -> Node:
-        """Return a number as one of another type; of a number, whether it is not 0."""
+        """Return the number `x` converted to `dtype`; to a truth, whether `x` differs from 0."""
         dtype = np.dtype(dtype)
         if x.dtype == dtype:
             return x
@@ -149,17 +175,17 @@ class Graph:
         return self._make("convert", (x,), dtype)
 
     def bits(self, x: Node, dtype: Any) -> Node:
-        """Return the same bits as a number of another type."""
+        """Return the bits of `x` as a number of the type `dtype`."""
         if x.dtype == np.dtype(dtype):
             return x
         return self.const(x.attr.view(dtype)) if x.op == "const" else self._make("bits", (x,), dtype)
 
     def table(self, index: Node, column: tuple[Node, ...]) -> Node:
-        """Return the entry of a column, the same for all lanes, at an index within."""
+        """Return the entry of `column` at a valid `index`; the column is the same for all lanes."""
         return self._make("table", (index, *column), column[0].dtype)
 
     def again(self, node: Node, args: list[Node]) -> Node:
-        """Return the operation of a node, of another graph, on these numbers."""
+        """Return the operation of `node`, which may belong to another graph, on the operands `args`."""
         match node.op:
             case "const":
                 return self.const(node.attr)
@@ -175,10 +201,15 @@ class Graph:
 
 
 def is_real(dtype: Any) -> bool:
-    """Return whether numbers of this type are real ones."""
+    """Return whether a type is real (floating point).
+
+    Args:
+        dtype: NumPy type.
+    """
     return np.issubdtype(dtype, np.floating)
 
 
+# x + 0 becomes x although -0 + 0 is +0.
 def _add(graph: Graph, x: Node, y: Node) -> Node | None:
     return y if x.is_number(0) else x if y.is_number(0) else None
 
@@ -187,6 +218,7 @@ def _sub(graph: Graph, x: Node, y: Node) -> Node | None:
     return x if y.is_number(0) else None
 
 
+# x*0 is not folded: it is NaN for an infinite x.
 def _mul(graph: Graph, x: Node, y: Node) -> Node | None:
     for a, b in ((x, y), (y, x)):
         if a.is_number(1):
@@ -197,12 +229,13 @@ def _mul(graph: Graph, x: Node, y: Node) -> Node | None:
 
 
 def _div(graph: Graph, x: Node, y: Node) -> Node | None:
-    """A divisor that does not change in a step is inverted before: one rounding more."""
+    """Multiply by the inverse of a divisor that is constant over the steps: faster, with one rounding more."""
     if y.is_number(1):
         return x
     if not is_real(x.dtype) or x.level < UpdateLevel.STEP or y.level == UpdateLevel.STEP:
         return None
     inverse = graph.op("div", graph.const(1, y.dtype), y)
+    # A subnormal or infinite inverse would lose digits.
     if inverse.op == "const" and not np.finfo(y.dtype).tiny <= abs(inverse.attr) < np.inf:
         return None
     return graph.op("mul", x, inverse)
@@ -245,7 +278,7 @@ def _not(graph: Graph, x: Node) -> Node | None:
 
 
 def _ne(graph: Graph, x: Node, y: Node) -> Node | None:
-    """A truth that was made a number, and is asked."""
+    """Simplify x != 0 for a truth that was converted to a number, and comparisons of a truth with a constant."""
     for a, b in ((x, y), (y, x)):
         if b.is_number(0) and a.op == "convert" and a.args[0].dtype == bool:
             return a.args[0]

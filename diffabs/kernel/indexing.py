@@ -1,4 +1,7 @@
-"""Rules of entries at places that a lane decides."""
+"""Lowering rules for entries at indices that a lane computes: slices, gather and scatter.
+
+A graph of single numbers has no memory, so an index is compared with every candidate. Uniform columns become tables.
+"""
 
 from typing import Any
 
@@ -8,7 +11,7 @@ from diffabs.kernel.elementwise import max_or_min
 from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel
 from diffabs.kernel.primitives import Unsupported, as_node_array, lowering_rule, map_entries
 
-MAX_COMPARED_ENTRIES = 64  # entries of which a lane chooses by comparing, or writes one
+MAX_COMPARED_ENTRIES = 64  # candidates of one read or write by comparison
 
 
 def _clamp_index(graph: Graph, index: Node, most: int) -> Node:
@@ -25,7 +28,7 @@ def _dynamic_slice(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 def _part(graph: Graph, x: Array, axis: int, place: Node, size: int) -> Array:
-    """So many entries along an axis, from a place, which is moved so that they lie within."""
+    """Return `size` entries along an axis from index `place`, which is clamped so that they lie inside."""
     most = x.shape[axis] - size
     if most == 0:
         return x
@@ -39,10 +42,12 @@ def _part(graph: Graph, x: Array, axis: int, place: Node, size: int) -> Array:
 
 
 def _entry(graph: Graph, index: Node, column: tuple[Node, ...]) -> Node:
+    """Return the entry of a column at an index, as a table if the column is uniform, else by comparisons."""
     if len(column) > 2 and all(x.level < UpdateLevel.LANE for x in column):
         return graph.table(index, column)
     if len(column) > MAX_COMPARED_ENTRIES:
         raise Unsupported("dynamic_slice", f"of {len(column)} entries that differ between lanes")
+    # The last entry needs no comparison, because the index is valid.
     (_, found), *others = reversed([*enumerate(column)])
     for i, x in others:
         found = graph.select(graph.op("eq", index, graph.const(i, index.dtype)), found, x)
@@ -51,7 +56,7 @@ def _entry(graph: Graph, index: Node, column: tuple[Node, ...]) -> Node:
 
 @lowering_rule("gather", "dimension_numbers slice_sizes indices_are_sorted unique_indices mode fill_value")
 def _gather(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """x[i] along the first axis, for each of some i."""
+    """Return x[i] along the first axis for each index i."""
     x, places = ins
     n, p = eqn.params["dimension_numbers"], eqn.params
     simple = (
@@ -61,6 +66,7 @@ def _gather(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         and n.offset_dims == tuple(range(places.ndim - 1, places.ndim - 2 + x.ndim))
         and p["slice_sizes"] == (1, *x.shape[1:])
     )
+    # Both modes allow `_part` to clamp the index. FILL_OR_DROP would need a fill value.
     mode = str(p["mode"]).rsplit(".", 1)[-1]
     if not simple or mode not in ("PROMISE_IN_BOUNDS", "CLIP"):
         raise Unsupported("gather", f"with {n}, {mode}")
@@ -78,6 +84,7 @@ def _dynamic_update(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     room = [a - b for a, b in zip(x.shape, new.shape, strict=True)]
     starts = [_clamp_index(graph, place, most) for place, most in zip(places, room, strict=True)]
     out = x.copy()
+    # One pass for each possible position: the block is written where all clamped indices match.
     for start in np.ndindex(*(most + 1 for most in room)):
         hits = [graph.op("eq", s, graph.const(o, s.dtype)) for s, o in zip(starts, start, strict=True)]
         hit, inside = (
@@ -90,7 +97,7 @@ def _dynamic_update(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("scatter", "dimension_numbers indices_are_sorted mode unique_indices update_consts update_jaxpr")
 def _scatter(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """x.at[i].set(value) of one i along the first axis; nothing where that is outside."""
+    """Return x.at[i].set(value) for one index i along the first axis; an index outside changes nothing."""
     x, places, new = ins
     n = eqn.params["dimension_numbers"]
     whole = n.update_window_dims == tuple(range(x.ndim - 1)) and n.inserted_window_dims == (0,)
@@ -101,6 +108,7 @@ def _scatter(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
         raise Unsupported("scatter", f"with the mode {mode}")
     _check_writable(eqn, len(x))
     index, out = places.ravel()[0], np.empty(x.shape, object)
+    # Without the clamp, an index outside matches no entry, so the array stays, as FILL_OR_DROP demands.
     index = _clamp_index(graph, index, len(x) - 1) if mode == "CLIP" else index
     for i in range(len(x)):
         hit = graph.op("eq", index, graph.const(i, index.dtype))
@@ -118,5 +126,6 @@ def _all_true(graph: Graph, truths: list[Node]) -> Node:
 
 
 def _check_writable(eqn: Any, count: int) -> None:
+    """Raise Unsupported for a write that compares an index with more than MAX_COMPARED_ENTRIES candidates."""
     if count > MAX_COMPARED_ENTRIES:
         raise Unsupported(eqn.primitive.name, f"into {count} entries; {MAX_COMPARED_ENTRIES} are the most")

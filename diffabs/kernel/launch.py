@@ -1,4 +1,4 @@
-"""Run functions of one lane as native code, for many lanes, each until it is over: a function as any other of JAX."""
+"""Execution of JAX functions of one lane as native code for many lanes, each until its own end."""
 
 import ctypes
 import functools
@@ -14,9 +14,9 @@ import numpy as np
 
 from diffabs.kernel import binding, compilers, cpp, gpu, program
 
-MAX_STEP_LINES = 10_000  # of a step; the blocks of a larger program are of fewer vectors, or compiling takes long
+MAX_STEP_LINES = 10_000  # lines of a step; a larger program gets fewer vectors a block, or compiling takes too long
 VECTORS_PER_BLOCK = 4
-LIBRARY_NAME_PREFIX = "diffabs_kernel_"  # begins the names of libraries
+LIBRARY_NAME_PREFIX = "diffabs_kernel_"
 _lock = threading.Lock()
 _loaded: dict[str, Any] = {}
 
@@ -32,16 +32,28 @@ def run_lanes(
     rounds: int,
     wanted: Any = None,
 ) -> Any:
-    """Return the carry (pytree, n lanes first) of lanes that are all over.
+    """Return the final carry (pytree, leading axis of n lanes) of lanes that all run to their ends.
 
-    renew, step: functions of one lane, (lane, carry) -> carry; `renew` is called before every so many `steps`
-    running: (lane, carry) -> whether it goes on; asked after so many `rounds` of these. Until then `step` must do
-        nothing that matters in a lane that is over
-    lane: what is a lane's own, (n, ...) each; what the functions close over is the same for all
-    wanted: truths as the carry, of which derivatives are asked for afterwards: those of the rest are zero; None for all
+    The function works under jit and vmap, with forward-mode derivatives.
+    Arrays that the functions close over are the same for all lanes.
 
-    Works under jit and vmap, with derivatives forward. Raises Unsupported for an operation that has no rule, NoCompiler
-    where there is none, ValueError for reverse mode."""
+    Args:
+        renew: Function of one lane, (lane, carry) -> carry, called before every `steps` steps.
+        step: Function of one lane, (lane, carry) -> carry. In a lane that has ended, it must change nothing that
+            matters.
+        running: Function of one lane, (lane, carry) -> truth: whether the lane continues.
+        lane: Pytree of each lane's constants, (n, ...) each.
+        carry: Pytree of each lane's initial values, (n, ...) each.
+        steps: Calls of `step` after each call of `renew`.
+        rounds: Rounds of `renew` and `steps` between two calls of `running`.
+        wanted: Pytree of truths like `carry`: arrays whose derivatives matter afterwards, None for all.
+            The derivatives of the other arrays are returned as zero.
+
+    Raises:
+        Unsupported: A function uses an operation without a lowering rule.
+        NoCompiler: There is no compiler for the processor or GPU.
+        ValueError: Reverse mode or a second derivative is requested.
+    """
     if not gpu.find_gpu():
         compilers.find_compiler()
     functions = program.trace_functions(
@@ -53,6 +65,7 @@ def run_lanes(
     given = [unwrap_key(x) for x in (*functions.uniform, *jax.tree.leaves(lane), *leaves)]
     launch = functools.partial(_launch_lanes, shape=cpp.LaunchShape(VECTORS_PER_BLOCK, steps, rounds))
     which = None if wanted is None else tuple(i for i, on in enumerate(jax.tree.leaves(wanted)) if on)
+    # Drop the traced arrays: this object outlives the trace, and a tracer must not leak. They are arguments instead.
     lanes = binding.LanePrograms(functions._replace(uniform=[]), launch, which)
     found = binding.bind_lanes(lanes, given)
     return tree.unflatten([_like(x, leaf) for x, leaf in zip(found, leaves, strict=True)])
@@ -61,21 +74,31 @@ def run_lanes(
 def _launch_lanes(
     made: program.ScalarProgram, before: list[Any], carry: list[Any], shape: cpp.LaunchShape
 ) -> list[Any]:
-    """The carry of lanes that are all over; `before`: what is the same for all lanes, and what is a lane's own."""
+    """Return the final carry of all lanes; `before` holds the uniform arrays and the arrays of the lanes."""
     first, results = len(before), [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in carry]
     if gpu.find_gpu():
         return gpu.call_kernel(made, shape, [*before, *carry], results)
     call = jax.ffi.ffi_call(
         build_target(made, shape),
         results,
+        # The carry is updated in place, because result i shares its buffer with the argument.
         input_output_aliases={first + i: i for i in range(len(carry))},
     )
     return list(call(*before, *carry, threads=np.int64(thread_count())))
 
 
 def build_target(made: program.ScalarProgram, shape: cpp.LaunchShape) -> str:
-    """Return the name under which XLA knows a program; compiled, if it was not before. Raises NoCompiler."""
-    shape = shape._replace(vectors=max(1, shape.vectors // max(1, made.tangents)))  # tangents do not wait, either
+    """Return the name under which XLA has a program's library, after compiling it if necessary.
+
+    Args:
+        made: Operations and results.
+        shape: Loop structure of the launch.
+
+    Raises:
+        NoCompiler: No compiler works, or the library does not load.
+    """
+    # Tangents are independent of each other too and hide latency, so they replace vectors of the block.
+    shape = shape._replace(vectors=max(1, shape.vectors // max(1, made.tangents)))
     source = cpp.emit_cpp(made, shape)
     while cpp.count_operations(source) * shape.vectors > MAX_STEP_LINES and shape.vectors > 1:
         shape = shape._replace(vectors=shape.vectors // 2)
@@ -84,15 +107,27 @@ def build_target(made: program.ScalarProgram, shape: cpp.LaunchShape) -> str:
 
 
 def describe_kernel_build() -> dict[str, str]:
-    """Return what decides the bits of a kernel besides its text: compiler, flags, processor. Raises NoCompiler."""
+    """Return compiler, flags and processor, which together with the text determine a kernel's numbers to the last bit.
+
+    Raises:
+        NoCompiler: There is no compiler for the processor or GPU.
+    """
     return gpu.describe_gpu_compiler() if gpu.find_gpu() else compilers.describe_compiler()
 
 
 def register_library(path: pathlib.Path) -> str:
-    """Return the name under which XLA knows a library from now on. Raises NoCompiler for one that is not there."""
+    """Register a library with XLA and return its name there.
+
+    Args:
+        path: File of the library.
+
+    Raises:
+        NoCompiler: The library does not load.
+    """
     name = f"{LIBRARY_NAME_PREFIX}{path.stem[:32]}"
     with _lock:
         if name not in _loaded:
+            # The table keeps the handler alive: XLA holds only its address.
             handler = _handler(path)
             jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
             _loaded[name] = handler, path
@@ -100,17 +135,23 @@ def register_library(path: pathlib.Path) -> str:
 
 
 def library_names() -> list[str]:
-    """Return the names under which XLA knows libraries."""
+    """Return the names of all registered libraries."""
     return list(_loaded)
 
 
 def library_path(name: str) -> pathlib.Path:
-    """Return the library of a name."""
+    """Return the file of a registered library.
+
+    Args:
+        name: Name of the library in XLA.
+    """
     return _loaded[name][1]
 
 
 def _handler(path: pathlib.Path) -> Any:
-    """Raises NoCompiler for a library that this process cannot load: a folder from which nothing may be run."""
+    """Return the library's entry point; raise NoCompiler if it does not load, as from a folder without execution
+    rights.
+    """
     try:
         return ctypes.CDLL(str(path)).diffabs_kernel
     except (OSError, AttributeError) as error:
@@ -118,7 +159,8 @@ def _handler(path: pathlib.Path) -> Any:
 
 
 def thread_count() -> int:
-    """Return how many processors a device may use: those of this process, shared by all that run at the same time."""
+    """Return the number of threads for a launch: this process's processors divided among JAX's CPU devices."""
+    # JAX may run a program on each of its CPU devices at the same time.
     return max(1, _processors() // max(1, jax.local_device_count("cpu")))
 
 
@@ -128,12 +170,16 @@ def _processors() -> int:
 
 
 def _lane_type(x: Any) -> Any:
-    """A lane of an array."""
+    """Return shape and type of one lane of an array."""
     return jax.ShapeDtypeStruct(jnp.shape(x)[1:], x.dtype)
 
 
 def unwrap_key(x: Any) -> Any:
-    """Return an array, of a key its words."""
+    """Return an array, or the words (uint32) of random keys.
+
+    Args:
+        x: Array or random keys.
+    """
     if is_key(x):
         return jax.random.key_data(x)
     return x if isinstance(x, jax.Array) else jnp.asarray(x)
@@ -144,5 +190,9 @@ def _like(x: Any, leaf: Any) -> Any:
 
 
 def is_key(x: Any) -> bool:
-    """Return whether these are keys."""
+    """Return whether an array holds random keys.
+
+    Args:
+        x: Array or random keys.
+    """
     return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

@@ -1,6 +1,7 @@
-"""Tangents as what they are: sums of products of other tangents with numbers.
+"""Tangents as linear combinations of other tangents, with factors that are the same for all tangents.
 
-What they are multiplied with is worked out once for all tangents."""
+A factor is a number of the program, such as a partial derivative. It is computed once for all tangents.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,48 +10,84 @@ import numpy as np
 
 from diffabs.kernel.graph import Graph, Node, UpdateLevel
 
-TANGENT_OPERANDS = {"add": (0, 1), "sub": (0, 1), "select": (1, 2)}  # operands that are tangents, or zero
+TANGENT_OPERANDS = {"add": (0, 1), "sub": (0, 1), "select": (1, 2)}  # operands that must be tangents or zero
 
 
 class Factor(NamedTuple):
-    """A number, None for 1, and whether it counts negative."""
+    """A signed factor of a tangent.
+
+    Attributes:
+        negative: Whether the factor is -`number`.
+        number: Node of the factor, None for 1.
+    """
 
     negative: bool
     number: Node | None
 
 
 UNIT_FACTOR = Factor(False, None)
-Sum = dict[int, Factor]  # of tangents, by the numbers of their nodes
+Sum = dict[int, Factor]  # factors by the id of their tangents
 
 
 class Vertex:
-    """A tangent: a sum; or where `which` another one; or an operation of its own, of which it matters what it reads."""
+    """A tangent: a sum of other tangents, a selection between two sums, or a nonlinear operation.
+
+    Attributes:
+        sum: Factors by the id of their tangents.
+        which: Truth of a selection, None without one.
+        others: The sum where `which` is true.
+        reads: Ids of the tangents that a nonlinear operation reads.
+    """
 
     __slots__ = ("others", "reads", "sum", "which")
 
     def __init__(self, sum: Sum, which: Node | None = None, others: Sum | None = None, reads: tuple[int, ...] = ()):
-        """`others` is the sum where `which`."""
+        """Store a tangent.
+
+        Args:
+            sum: Factors by the id of their tangents.
+            which: Truth of a selection, None without one.
+            others: The sum where `which` is true.
+            reads: Ids of the tangents that a nonlinear operation reads.
+        """
         self.sum, self.which, self.others, self.reads = sum, which, others or {}, reads
 
     def sums(self) -> tuple[Sum, ...]:
-        """All that it is made of."""
+        """Return the sum, or both sums of a selection."""
         return (self.sum,) if self.which is None else (self.sum, self.others)
 
 
 class Algebra:
-    """What is done with sums; factors are nodes of a graph, of one type."""
+    """Operations on sums of tangents.
+
+    Attributes:
+        graph: Graph that the factors are nodes of.
+        dtype: Type of the factors.
+    """
 
     def __init__(self, graph: Graph, dtype: np.dtype):
-        """Of this graph, which grows."""
+        """Store the graph, which grows with new factors.
+
+        Args:
+            graph: Graph that the factors are nodes of.
+            dtype: Type of the factors.
+        """
         self.graph, self.dtype = graph, dtype
 
     def vertex(self, node: Node, moves: Callable[[Node], bool], value: Callable[[Node], Node]) -> Vertex:
-        """Return an operation on tangents; `value`: what a number is that is none."""
+        """Return the vertex of an operation on tangents.
+
+        Args:
+            node: Operation in the graph of one tangent.
+            moves: Function that says if a node is a nonzero tangent.
+            value: Function that returns the factor graph's node for any other number.
+        """
         on, args = [moves(x) for x in node.args], node.args
 
         def alone(i: int, negative: bool = False) -> Sum:
             return {args[i].id: Factor(negative, None)} if on[i] else {}
 
+        # A tangent plus a number other than 0 is no linear combination, so it remains as an operation of its own.
         linear = all(on[i] or _is_zero_tangent(value(args[i])) for i in TANGENT_OPERANDS.get(node.op, ()))
         match node.op:
             case "add" | "sub" if linear:
@@ -60,6 +97,7 @@ class Algebra:
             case "mul" if not all(on):
                 x, y = args if on[0] else args[::-1]
                 return Vertex({x.id: _factor(value(y))})
+            # A division by a factor becomes a product: the inverse is computed once for all tangents.
             case "div" if on == [True, False]:
                 inverse = self.graph.op("div", self.graph.const(1, node.dtype), value(args[1]))
                 return Vertex({args[0].id: _factor(inverse)})
@@ -71,15 +109,18 @@ class Algebra:
         return self.graph.const(1, self.dtype) if factor.number is None else factor.number
 
     def _times(self, x: Factor, y: Factor) -> Factor:
+        """Return the product of two factors."""
         negative = x.negative != y.negative
         if x.number is None or y.number is None:
             return Factor(negative, x.number or y.number)
         for a, b in ((x.number, y.number), (y.number, x.number)):
-            if a.op == "select" and a.args[1].is_number(0):  # the zero stays one whatever it is multiplied with
+            # The product moves into the branch of the selection, so that its zero remains an exact zero.
+            if a.op == "select" and a.args[1].is_number(0):
                 return Factor(negative, self.graph.select(a.args[0], a.args[1], self.graph.op("mul", b, a.args[2])))
         return Factor(negative, self.graph.op("mul", x.number, y.number))
 
     def _plus(self, sum: Sum, more: Sum) -> Sum:
+        """Return the sum of two sums."""
         found = dict(sum)
         for key, new in more.items():
             old = found.pop(key, None)
@@ -87,19 +128,20 @@ class Algebra:
                 found[key] = new
             elif old.negative == new.negative:
                 found[key] = Factor(old.negative, self.graph.op("add", self._number(old), self._number(new)))
+            # Equal terms of opposite sign cancel: the tangent leaves the sum.
             elif old.number is not new.number:
                 first, second = (new, old) if old.negative else (old, new)
                 found[key] = Factor(False, self.graph.op("sub", self._number(first), self._number(second)))
         return found
 
     def within(self, sum: Sum, key: int, inner: Sum) -> Sum:
-        """Return a sum with another one in the place of a tangent."""
+        """Return `sum` with the sum `inner` in place of the tangent `key`."""
         factor = sum[key]
         more = {x: self._times(factor, one) for x, one in inner.items()}
         return self._plus({x: one for x, one in sum.items() if x != key}, more)
 
     def decided(self, vertex: Vertex) -> Sum:
-        """Return a choice of sums as a sum."""
+        """Return the selection of `vertex` as one sum whose factors are selections."""
         assert vertex.which is not None
         found = {}
         for x in [*vertex.sum, *(x for x in vertex.others if x not in vertex.sum)]:
@@ -107,6 +149,7 @@ class Algebra:
             if no == yes:
                 found[x] = no
                 continue
+            # A sign that both branches share stays outside of the selection.
             signs = {one.negative for one in (no, yes) if one is not None}
             sides = []
             for one in (no, yes):
@@ -124,18 +167,26 @@ def _factor(node: Node) -> Factor:
 
 
 def _is_zero_tangent(node: Node) -> bool:
-    """Whether a number is that of a tangent that is zero."""
+    """Return whether a number is a zero tangent: the constant 0, a product with it, or a sum of zeros."""
     if node.op in ("mul", "neg", "div"):
         return any(_is_zero_tangent(x) for x in node.args[: 1 if node.op == "div" else None])
     return node.is_number(0) or (node.op in ("add", "sub") and all(map(_is_zero_tangent, node.args)))
 
 
 def changes_in_step(factor: Factor) -> bool:
-    """Return whether a factor is a number that changes in a step."""
+    """Return whether a factor changes within a step.
+
+    Args:
+        factor: Factor of a tangent.
+    """
     return factor.number is not None and factor.number.level == UpdateLevel.STEP
 
 
 def count_terms(sum: Sum) -> int:
-    """Return the operations of a sum for each tangent: a product and a sum are one."""
+    """Return the operations of a sum for each tangent; a product with the following addition counts as one (FMA).
+
+    Args:
+        sum: Sum of tangents.
+    """
     alone = len(sum) == 1 and next(iter(sum.values())) == UNIT_FACTOR
     return 0 if alone or not sum else max(1, len(sum) - any(one == UNIT_FACTOR for one in sum.values()))

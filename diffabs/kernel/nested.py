@@ -1,4 +1,4 @@
-"""Rules of programs within a program: calls, conditionals, loops of a known length."""
+"""Lowering rules for programs within a program: calls, conditionals and loops of known length."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ from diffabs.kernel.primitives import (
     scalar_array,
 )
 
-MAX_UNROLLED_STEPS = 64  # steps of a scan, which is written out
+MAX_UNROLLED_STEPS = 64  # bound on the length of a scan, because its steps are unrolled
 
 
 @lowering_rule(
@@ -32,7 +32,7 @@ def _call(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 @lowering_rule("custom_vmap_call", "call rule in_tree out_tree")
 def _custom_vmap_any(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
-    """A rule of its own for batches may be anything; it is known if it says of truths whether any is."""
+    """Lower a call with a custom rule for vmap, if that rule is `any` of a truth; raise Unsupported for other rules."""
     call = eqn.params["call"].jaxpr
     truth = len(ins) == 1 and eqn.invars[0].aval.dtype == bool and ins[0].ndim == 0
     if not truth or call.eqns or call.invars != call.outvars or not _is_any_rule(eqn):
@@ -41,9 +41,11 @@ def _custom_vmap_any(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
 
 
 def _is_any_rule(eqn: Any) -> bool:
+    """Return whether a custom rule for vmap computes `any` over the batch, by evaluation of three batches of two."""
     told = jex.DebugInfo("kernel", "any", None, None)
     body = jex.Jaxpr((), list(eqn.invars), list(eqn.outvars), [eqn], eqn.effects, told)
     found = jax.vmap(lambda x: jex.jaxpr_as_fun(jex.ClosedJaxpr(body, ()))(x)[0])
+    # The lowering may itself run under a trace. The test needs numbers.
     with jax.ensure_compile_time_eval():
         return all(bool(found(np.array(x)).all()) == any(x) for x in ([False, False], [False, True], [True, True]))
 
@@ -52,7 +54,9 @@ def _is_any_rule(eqn: Any) -> bool:
 def _cond(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     which, rest, branches = ins[0].item(), ins[1:], eqn.params["branches"]
     if which.op == "const":
+        # XLA clamps an index that is out of range.
         return inline_program(graph, branches[int(np.clip(which.attr, 0, len(branches) - 1))], rest)
+    # A chain of conditionals: branch i replaces the result so far where the index is at least i.
     taken = inline_program(graph, branches[0], rest)
     for i, branch in enumerate(branches[1:], 1):
         asked = graph.convert(which, bool)
@@ -77,12 +81,15 @@ def _scan(graph: Graph, eqn: Any, ins: list[Array]) -> list[Array]:
     for i in order:
         outs = inline_program(graph, p["jaxpr"], [*fixed, *carry, *(as_node_array(row[i]) for row in rows)])
         carry, seen[i] = outs[:many], outs[many:]
+    # A reversed scan fills its outputs from the end, so they are sorted by index.
     return [*carry, *(np.stack(column) for column in zip(*(seen[i] for i in sorted(seen)), strict=True))]
 
 
 def _scan_input_counts(params: Any, inputs: int) -> tuple[int, int]:
-    """How many inputs of a scan are constants, and how many are carried: numbers until JAX 0.10, then a structure of
-    three groups of inputs, in their order."""
+    """Return how many inputs of a scan are constants and how many are carried.
+
+    Until JAX 0.10 these are numbers. Later versions store a structure with three groups of inputs, in their order.
+    """
     if "num_carry" in params:
         return params["num_consts"], params["num_carry"]
     try:

@@ -1,6 +1,8 @@
-"""CUDA C++ to machine code of a named architecture, by NVIDIA's runtime compiler, which comes with JAX for GPUs.
+"""Compilation of CUDA C++ to machine code of a given architecture by NVRTC, NVIDIA's runtime compiler.
 
-It needs neither a GPU nor a driver. Kept in the user's cache folder as libraries of the processor are (`compilers`)."""
+NVRTC comes with JAX for GPUs. It needs neither a GPU nor a driver.
+The user's cache folder keeps the machine code, like the libraries of `compilers`.
+"""
 
 import ctypes
 import functools
@@ -15,7 +17,7 @@ from diffabs.kernel import binaries
 from diffabs.kernel.compilers import NATIVE_FOLDER, NoCompiler
 
 HEADERS = ("lane.h", "threads.h")
-# Nothing that changes what is finite: the smallest numbers stay, division and roots are IEEE's. The last two only tell.
+# Flags must preserve subnormal numbers and IEEE division and roots. The last two only control messages.
 NVRTC_FLAGS = (
     *("-std=c++17", "-default-device", "-fmad=true", "-ftz=false", "-prec-div=true", "-prec-sqrt=true"),
     *("-Xptxas=-v", "-diag-suppress=177"),
@@ -23,10 +25,17 @@ NVRTC_FLAGS = (
 
 
 def build_cubin(text: str, architecture: str) -> pathlib.Path:
-    """Return the file of the machine code of a text, compiled if it is not there yet; beside it (`.log`) what the
-    assembler said of registers. Raises NoCompiler.
+    """Return the file with the machine code of a CUDA C++ text; code in the cache is not compiled again.
 
-    architecture: as in sm_90"""
+    A file `.log` beside it holds the assembler's messages on register usage.
+
+    Args:
+        text: CUDA C++.
+        architecture: Name such as sm_90.
+
+    Raises:
+        NoCompiler: There is no NVRTC, the text does not compile, or the cache folder is not usable.
+    """
     headers = [(NATIVE_FOLDER / name).read_bytes() for name in HEADERS]
     said = [text.encode(), *headers, repr((NVRTC_FLAGS, nvrtc_version(), architecture)).encode()]
     digest = hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in said)).hexdigest()
@@ -42,7 +51,11 @@ def build_cubin(text: str, architecture: str) -> pathlib.Path:
 
 
 def parse_register_usage(log: str) -> dict[str, dict[str, int]]:
-    """Return, of each kernel that the assembler tells of, how many registers a thread has, and bytes that it spills."""
+    """Return the registers of a thread ("registers") and the bytes it spills ("spilled") by kernel name.
+
+    Args:
+        log: Messages of the assembler.
+    """
     found = {}
     for part in re.split(r"Compiling entry function", log)[1:]:
         name = re.search(r"'(\w+)'", part)
@@ -54,7 +67,11 @@ def parse_register_usage(log: str) -> dict[str, dict[str, int]]:
 
 @functools.cache
 def nvrtc_version() -> tuple[int, int]:
-    """Return the compiler's version. Raises NoCompiler."""
+    """Return NVRTC's major and minor version.
+
+    Raises:
+        NoCompiler: There is no NVRTC.
+    """
     major, minor = ctypes.c_int(), ctypes.c_int()
     _load_nvrtc().nvrtcVersion(ctypes.byref(major), ctypes.byref(minor))
     return major.value, minor.value
@@ -62,7 +79,7 @@ def nvrtc_version() -> tuple[int, int]:
 
 @functools.cache
 def _load_nvrtc() -> Any:
-    """Of the packages nvidia-cuda-nvrtc (CUDA 13) and nvidia-cuda-nvrtc-cu12, or of the system."""
+    """Load NVRTC from the package nvidia-cuda-nvrtc (CUDA 13) or nvidia-cuda-nvrtc-cu12, or from the system."""
     found = importlib.util.find_spec("nvidia")
     folders = [*(found.submodule_search_locations or ())] if found else []
     paths = [
@@ -94,6 +111,7 @@ def _compile_cubin(text: str, architecture: str, headers: list[bytes]) -> tuple[
 
 
 def _part(nvrtc: Any, name: str, program: ctypes.c_void_p) -> bytes:
+    """Return an output of NVRTC, such as the log or the machine code."""
     size = ctypes.c_size_t()
     getattr(nvrtc, f"nvrtcGet{name}Size")(program, ctypes.byref(size))
     out = ctypes.create_string_buffer(size.value)

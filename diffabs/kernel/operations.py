@@ -1,4 +1,4 @@
-"""The operations that can be folded: NumPy's function of each, and which of them are others with operands exchanged."""
+"""NumPy's function for each operation that the graph folds, and the algebraic symmetries of operations."""
 
 from typing import Any
 
@@ -18,6 +18,7 @@ FOLDABLE: dict[str, Any] = COMPARISONS | {
     "mul": np.multiply,
     "div": np.divide,
     "rem": np.fmod,
+    # Rounded towards zero as in C, unlike NumPy's //.
     "quotient": lambda x, y: (np.abs(x) // np.abs(y)) * np.sign(x) * np.sign(y),
     "max": np.maximum,
     "min": np.minimum,
@@ -38,5 +39,5 @@ FOLDABLE: dict[str, Any] = COMPARISONS | {
     "shift_right_logical": np.right_shift,
 }
 SYMMETRIC = {"add", "mul", "and", "or", "xor", "eq", "ne"}
-MIRRORED = {"gt": "lt", "ge": "le"}  # of the other operands in turn
-NEGATED = {"eq": "ne", "ne": "eq"}  # of the ordered ones NaN is not the contrary
+MIRRORED = {"gt": "lt", "ge": "le"}  # the same comparison with the operands exchanged
+NEGATED = {"eq": "ne", "ne": "eq"}  # not "lt" and "ge": both are false for NaN

@@ -1,8 +1,10 @@
-"""JAX's operations on arrays as operations on single numbers: a rule for each primitive.
+"""The translation of JAX primitives on arrays into operations on single numbers, by one lowering rule for each
+primitive.
 
-An array has a known shape, so it is an array of nodes, and whatever only moves its entries costs nothing. A rule names
-the parameters that it knows. A primitive without a rule, or with another parameter (a later JAX may have one), is an
-objection, never a guess."""
+Shapes are known, so an array becomes a NumPy array of nodes, and moving its entries costs nothing.
+A rule lists the parameters it handles. A primitive without a rule, or with an unknown parameter (as in a later JAX),
+raises Unsupported.
+"""
 
 import pathlib
 from collections.abc import Callable, Sequence
@@ -19,20 +21,31 @@ INTERNAL_FOLDERS = [pathlib.Path(__file__).parents[1] / name for name in ("core"
 
 
 class Unsupported(Exception):
-    """What cannot be translated: the primitive, why, and, where it can be told, the method of the part that asks."""
+    """An error: an operation cannot be translated.
+
+    Attributes:
+        primitive: Name of the primitive.
+        reason: The reason, to be read after the primitive's name.
+        method: Method of the part that uses the primitive, empty if unknown.
+    """
 
     def __init__(self, primitive: str, reason: str):
-        """`reason` goes on where the primitive's name stands."""
+        """Store `primitive` and `reason`; the text of `reason` continues after the primitive's name."""
         super().__init__(primitive, reason)
         self.primitive, self.reason, self.method = primitive, reason, ""
 
     def __str__(self) -> str:
-        """One line."""
+        """Return the message, one line."""
         return f"{self.primitive}: {self.reason}" + (f" (in {self.method})" if self.method else "")
 
 
 class LoweringRule(NamedTuple):
-    """apply(graph, eqn, inputs) -> outputs, and the names of the parameters that it knows."""
+    """A rule for a primitive.
+
+    Attributes:
+        apply: Function (graph, eqn, inputs) -> outputs.
+        known: Names of the parameters that the function handles.
+    """
 
     apply: Callable[[Graph, Any, list[Array]], Sequence[Array]]
     known: frozenset[str]
@@ -42,7 +55,12 @@ LOWERING_RULES: dict[str, LoweringRule] = {}
 
 
 def lowering_rule(names: str, known: str = "") -> Callable[[Any], Any]:
-    """Register a function of (graph, eqn, inputs) for these primitives, with these parameters."""
+    """Return a decorator that registers a function (graph, eqn, inputs) -> outputs as the rule of some primitives.
+
+    Args:
+        names: Names of the primitives, separated by blanks.
+        known: Names of the parameters that the rule handles, separated by blanks.
+    """
 
     def decorate(apply: Any) -> Any:
         LOWERING_RULES.update({name: LoweringRule(apply, frozenset(known.split())) for name in names.split()})
@@ -52,7 +70,17 @@ def lowering_rule(names: str, known: str = "") -> Callable[[Any], Any]:
 
 
 def lower_jaxpr(graph: Graph, jaxpr: Any, constants: Sequence[Array], inputs: Sequence[Array]) -> list[Array]:
-    """Return the outputs of a jaxpr as arrays of nodes. Raises Unsupported."""
+    """Return the outputs of a jaxpr as arrays of nodes.
+
+    Args:
+        graph: Graph that receives the nodes.
+        jaxpr: Program to lower.
+        constants: Arrays of nodes for its constants.
+        inputs: Arrays of nodes for its inputs.
+
+    Raises:
+        Unsupported: A primitive has no rule, or a parameter that its rule does not handle.
+    """
     at = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*constants, *inputs], strict=True))
 
     def read(atom: Any) -> Array:
@@ -73,16 +101,18 @@ def _apply_rule(graph: Graph, eqn: Any, inputs: list[Array]) -> Sequence[Array]:
     try:
         if name not in LOWERING_RULES:
             raise Unsupported(name, "there is no rule for it")
+        # An unknown parameter may change the meaning of the primitive.
         if new := sorted(set(eqn.params) - LOWERING_RULES[name].known):
             raise Unsupported(name, f"its parameter {new[0]} is not known")
         return LOWERING_RULES[name].apply(graph, eqn, inputs)
     except Unsupported as error:
+        # The innermost equation names the method first. Outer calls keep that name.
         error.method = error.method or _calling_method(eqn)
         raise
 
 
 def _calling_method(eqn: Any) -> str:
-    """The innermost method from which this comes, of a class that is not JAX's nor of what carries parts; or none."""
+    """Return the innermost method that the equation comes from, JAX and this package's helpers apart; empty if none."""
     traceback = getattr(getattr(eqn, "source_info", None), "traceback", None)
     for frame in getattr(traceback, "frames", ()):
         place = pathlib.Path(frame.file_name)
@@ -93,20 +123,35 @@ def _calling_method(eqn: Any) -> str:
 
 
 def constant_array(graph: Graph, x: Any, dtype: Any = None) -> Array:
-    """Return an array of known numbers."""
+    """Return an array of constants.
+
+    Args:
+        graph: Graph that receives the nodes.
+        x: Numbers, any shape.
+        dtype: Type, None for the type of `x`.
+    """
     x = np.asarray(x, dtype)
     return map_entries(lambda i: graph.const(x.reshape(-1)[i]), np.arange(x.size).reshape(x.shape))
 
 
 def scalar_array(node: Node) -> Array:
-    """Return a node as an array of no dimension."""
+    """Return a node as an array of shape ().
+
+    Args:
+        node: Number.
+    """
     out = np.empty((), object)
     out[()] = node
     return out
 
 
 def map_entries(function: Callable[..., Node], *arrays: Any) -> Array:
-    """Return a function of numbers, entry by entry."""
+    """Return a function of numbers, applied entry by entry with broadcasting.
+
+    Args:
+        function: Function of nodes.
+        arrays: Arrays of nodes.
+    """
     arrays = np.broadcast_arrays(*arrays) if len(arrays) > 1 else arrays
     out = np.empty(arrays[0].shape, object)
     for i in np.ndindex(out.shape):
@@ -115,11 +160,24 @@ def map_entries(function: Callable[..., Node], *arrays: Any) -> Array:
 
 
 def inline_program(graph: Graph, program: Any, inputs: Sequence[Array]) -> list[Array]:
-    """Return the outputs of a program within one."""
+    """Return the outputs of a program (jaxpr, closed or not) that another one calls.
+
+    Args:
+        graph: Graph that receives the nodes.
+        program: Program to lower.
+        inputs: Arrays of nodes for its inputs.
+
+    Raises:
+        Unsupported: A primitive has no rule, or a parameter that its rule does not handle.
+    """
     jaxpr, constants = (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, ())
     return lower_jaxpr(graph, jaxpr, [constant_array(graph, x) for x in constants], inputs)
 
 
 def as_node_array(x: Any) -> Array:
-    """Return what indexing an array of nodes gives, as an array."""
+    """Return the result of indexing an array of nodes as an array, also if it is a single node.
+
+    Args:
+        x: Array of nodes, or a node.
+    """
     return x if isinstance(x, np.ndarray) else scalar_array(x)

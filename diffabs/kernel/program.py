@@ -1,6 +1,7 @@
-"""A few functions of one lane, lane and carry to carry, traced into one program of single numbers.
+"""JAX functions of one lane, (lane, carry) to carry, traced and lowered to one program of single numbers.
 
-What the functions close over is the same for all lanes, and comes in from outside: new numbers are no new program."""
+Values that the functions close over are inputs, the same for all lanes. So new values need no new compilation.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
@@ -13,12 +14,18 @@ from diffabs.kernel import arrays, draws, elementwise, indexing, nested
 from diffabs.kernel.graph import Array, Graph, Node, UpdateLevel, is_real
 from diffabs.kernel.primitives import Unsupported, constant_array, lower_jaxpr
 
-RULE_MODULES = (arrays, draws, elementwise, indexing, nested)  # which they register
-MAX_OPERATIONS = 60_000  # operations of a step; a compiler would take minutes
+RULE_MODULES = (arrays, draws, elementwise, indexing, nested)  # imported because each registers its rules
+MAX_OPERATIONS = 60_000  # of a step; a compiler takes minutes for more
 
 
 class InputPlace(NamedTuple):
-    """Where an input comes from: the number of an array, of those of its level, and the entry in it of one lane."""
+    """The origin of an input.
+
+    Attributes:
+        level: Rate of change of the array.
+        array: Number of the array among those of its level.
+        entry: Index of the number within one lane's flat array.
+    """
 
     level: UpdateLevel
     array: int
@@ -27,9 +34,16 @@ class InputPlace(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ScalarProgram:
-    """inputs: numbers of the carry, of the lanes, and uniform ones, by place; results: for each function by name its
-    outputs, number by number; uniform: arrays that all lanes share; sizes: how many numbers of a lane the arrays of
-    each level have; dtype: of the real numbers; tangents: how many there are of each number that has one"""
+    """A program of single numbers.
+
+    Attributes:
+        inputs: Nodes of the carry, the lanes and the uniform arrays, by place.
+        results: For each function, by name, its outputs as single numbers.
+        uniform: Arrays that all lanes share.
+        sizes: Numbers of one lane in each array, by level.
+        dtype: Type of the real numbers.
+        tangents: Number of tangents of each number that has any.
+    """
 
     inputs: dict[InputPlace, Node]
     results: dict[str, list[Node]]
@@ -39,13 +53,18 @@ class ScalarProgram:
     tangents: int = 0
 
     def carried(self) -> list[Node]:
-        """The numbers of the carry, in their order."""
+        """Return the nodes of the carry in their order."""
         return [node for place, node in self.inputs.items() if place.level == UpdateLevel.STEP]
 
 
 class TracedFunction(NamedTuple):
-    """A function of one lane as a jaxpr of lane and carry, which closes over arrays of `Functions.uniform`, by their
-    numbers, and then over known constants."""
+    """A function of one lane as a jaxpr of the arrays of lane and carry.
+
+    Attributes:
+        jaxpr: Jaxpr; its constvars are first the uniform arrays, then constants.
+        closed: Numbers of the arrays in `TracedFunctions.uniform` that the function closes over.
+        constants: Further constants that it closes over.
+    """
 
     jaxpr: Any
     closed: tuple[int, ...]
@@ -53,8 +72,13 @@ class TracedFunction(NamedTuple):
 
 
 class TracedFunctions(NamedTuple):
-    """Functions by name; the types of what they are of, array by array: what is the same for all lanes, lane, carry;
-    and the arrays of the first, which may be traced."""
+    """Traced functions of one lane with the arrays they share.
+
+    Attributes:
+        each: Functions by name.
+        types: Shapes and types of the arrays of each level: uniform, lane, carry.
+        uniform: The uniform arrays, which may be tracers.
+    """
 
     each: dict[str, TracedFunction]
     types: dict[UpdateLevel, list[Any]]
@@ -62,13 +86,20 @@ class TracedFunctions(NamedTuple):
 
 
 def trace_functions(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any) -> TracedFunctions:
-    """Return functions of (lane, carry), of pytrees of these shapes, as jaxprs."""
+    """Return functions of (lane, carry) as jaxprs.
+
+    Args:
+        functions: Functions by name.
+        lane: Pytree with shapes and types of a lane's constants.
+        carry: Pytree with shapes and types of a lane's carry.
+    """
     uniform: list[Any] = []
     numbers: dict[int, int] = {}
     each: dict[str, TracedFunction] = {}
     for name, function in functions.items():
         closed = jax.make_jaxpr(function)(lane, carry)
         for x in closed.consts:
+            # Functions that close over the same array share one input. Equal values in two arrays stay two inputs.
             if id(x) not in numbers:
                 numbers[id(x)] = len(uniform)
                 uniform.append(x)
@@ -82,12 +113,28 @@ def trace_functions(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, 
 
 
 def build_program(functions: dict[str, Callable[[Any, Any], Any]], lane: Any, carry: Any) -> ScalarProgram:
-    """Return the program of functions of (lane, carry), of pytrees of these shapes. Raises Unsupported."""
+    """Return the program of functions of (lane, carry).
+
+    Args:
+        functions: Functions by name.
+        lane: Pytree with shapes and types of a lane's constants.
+        carry: Pytree with shapes and types of a lane's carry.
+
+    Raises:
+        Unsupported: A function uses an operation without a lowering rule, or there are too many operations.
+    """
     return lower_functions(trace_functions(functions, lane, carry))
 
 
 def lower_functions(functions: TracedFunctions) -> ScalarProgram:
-    """Return the program of functions. Raises Unsupported."""
+    """Return the program of traced functions.
+
+    Args:
+        functions: Traced functions.
+
+    Raises:
+        Unsupported: A function uses an operation without a lowering rule, or there are too many operations.
+    """
     graph, inputs = Graph(), {}
     sizes: dict[UpdateLevel, list[int]] = {level: [] for level in functions.types}
 
@@ -111,14 +158,22 @@ def lower_functions(functions: TracedFunctions) -> ScalarProgram:
 
 
 def check_size(program: ScalarProgram, operations: int) -> ScalarProgram:
-    """Return the program. Raises Unsupported for one of too many operations."""
+    """Return the program if its size is within MAX_OPERATIONS.
+
+    Args:
+        program: Program to return.
+        operations: Number of its operations.
+
+    Raises:
+        Unsupported: There are too many operations.
+    """
     if operations > MAX_OPERATIONS:
         raise Unsupported("step", f"of {operations} operations; {MAX_OPERATIONS} are the most")
     return program
 
 
 def _real_type(inputs: dict[InputPlace, Node]) -> np.dtype:
-    """The type of the real numbers of the carry. Raises Unsupported for several."""
+    """Return the type of the carry's real numbers; raise Unsupported unless it is the only one, of 32 or 64 bits."""
     kinds = {
         np.dtype(node.dtype)
         for place, node in inputs.items()
@@ -130,13 +185,17 @@ def _real_type(inputs: dict[InputPlace, Node]) -> np.dtype:
 
 
 def _type(x: Any) -> Any:
-    """Of one lane's program, so not on which devices it lies."""
+    """Return shape and type of an array without its sharding, because the program is for one lane."""
     aval = x if isinstance(x, jax.ShapeDtypeStruct) else jax.typeof(x)
     return jax.ShapeDtypeStruct(aval.shape, aval.dtype, weak_type=getattr(aval, "weak_type", False))
 
 
 def live_nodes(roots: Sequence[Node]) -> list[Node]:
-    """Return the nodes on which these depend, themselves included, arguments first."""
+    """Return the nodes that the roots depend on, the roots included, operands first.
+
+    Args:
+        roots: Nodes.
+    """
     found: dict[int, Node] = {}
     left = list(roots)
     while left:
@@ -144,43 +203,56 @@ def live_nodes(roots: Sequence[Node]) -> list[Node]:
         if node.id not in found:
             found[node.id] = node
             left.extend(node.args)
+    # Node ids grow from operands to results, so sorting is a topological order.
     return [found[i] for i in sorted(found)]
 
 
 class Branch:
-    """A conditional in the order of a program: what is worked out in either case, and the gates that select."""
+    """A conditional in a schedule.
+
+    Attributes:
+        gates: Selections of the conditional's results.
+        yes: Operations that only the true branch needs.
+        no: Operations that only the false branch needs.
+        which: Truth that decides.
+    """
 
     def __init__(self, gates: list[Node], yes: "ScheduleBlock", no: "ScheduleBlock"):
-        """Of gates of one number."""
+        """Create the conditional of `gates`, which share one number, with the blocks `yes` and `no`."""
         self.gates, self.yes, self.no = gates, yes, no
         self.which = gates[0].args[0]
 
     @property
     def size(self) -> int:
-        """How many operations lie in it."""
+        """Number of operations in both branches, gates included."""
         return self.yes.size + self.no.size + len(self.gates)
 
 
 class ScheduleBlock:
-    """Operations in their order; a branch stands where its first gate does."""
+    """Operations in their order; a branch stands in the place of its first gate."""
 
     def __init__(self, outer: "ScheduleBlock | None" = None):
-        """Within another one, or outermost."""
+        """Create an empty block inside the block `outer`, or an outermost block."""
         self.outer, self.depth = outer, (outer.depth + 1 if outer else 0)
         self.items: dict[int, Node | Branch] = {}
 
     @property
     def size(self) -> int:
-        """How many operations lie in it and its branches."""
+        """Number of operations in the block and its branches."""
         return sum(item.size if isinstance(item, Branch) else 1 for item in self.items.values())
 
     def __iter__(self) -> Iterator[Node | Branch]:
-        """Operations and branches, arguments first."""
+        """Yield operations and branches, operands first."""
         return (self.items[i] for i in sorted(self.items))
 
 
 def schedule_nodes(roots: Sequence[Node], level: UpdateLevel) -> ScheduleBlock:
-    """Return the operations of a level that the roots need, each in the innermost branch that needs it."""
+    """Return the operations of a level that the roots need, each in the innermost branch that contains all its readers.
+
+    Args:
+        roots: Nodes to compute.
+        level: Level of the operations.
+    """
     nodes = [node for node in live_nodes(roots) if node.level == level and node.op not in ("input", "const")]
     gates: dict[int, list[Node]] = {}
     for node in nodes:
@@ -193,6 +265,7 @@ def schedule_nodes(roots: Sequence[Node], level: UpdateLevel) -> ScheduleBlock:
 
     for root in roots:
         use(root, outermost)
+    # Readers first: when a node is placed, the blocks of all its readers are known.
     for node in reversed(nodes):
         if node.op != "gate":
             used[node.id].items[node.id] = node
@@ -200,6 +273,7 @@ def schedule_nodes(roots: Sequence[Node], level: UpdateLevel) -> ScheduleBlock:
                 use(arg, used[node.id])
         elif (group := gates[node.attr.number])[-1] is node:
             block = used[node.id]
+            # The gates of a conditional are created in a row, so here the readers of all of them are placed.
             for gate in group[:-1]:
                 block = _common(block, used[gate.id])
             branch = Branch(group, ScheduleBlock(block), ScheduleBlock(block))
@@ -212,6 +286,7 @@ def schedule_nodes(roots: Sequence[Node], level: UpdateLevel) -> ScheduleBlock:
 
 
 def _common(a: ScheduleBlock, b: ScheduleBlock) -> ScheduleBlock:
+    """Return the innermost block that contains both blocks."""
     while a is not b:
         a, b = (a.outer, b) if a.depth >= b.depth else (a, b.outer)  # pyright: ignore[reportAssignmentType]
     return a

@@ -1,4 +1,4 @@
-"""The program of several tangents of one of one tangent: what does not move as it is, of each tangent so many."""
+"""The step from a program with one tangent to a program with several: values stay single, tangents are repeated."""
 
 from collections.abc import Iterable
 
@@ -11,14 +11,24 @@ from diffabs.kernel.program import live_nodes
 
 
 def dependents(nodes: Iterable[Node], first: set[int]) -> set[int]:
-    """Return what is made of these, themselves included; nodes with arguments first."""
+    """Return the ids of some nodes and of all nodes that depend on them.
+
+    Args:
+        nodes: Nodes, operands first.
+        first: Ids to start from.
+    """
     found = set(first)
     found.update(node.id for node in nodes if any(x.id in found for x in node.args))
     return found
 
 
 def tangent_copy(nodes: list[Node], k: int) -> Node:
-    """Return the k-th of so many, or of all of them the one that there is."""
+    """Return the k-th tangent of a number, or its only node if it is the same for all tangents.
+
+    Args:
+        nodes: One node, or one for each tangent.
+        k: Number of the tangent.
+    """
     return nodes[k if len(nodes) > 1 else 0]
 
 
@@ -29,12 +39,20 @@ def replicate_nodes(
     slopes: set[int],
     size: tuple[int, np.dtype],
 ) -> dict[int, list[Node]]:
-    """Return what becomes of each node of a program of one tangent that these need: itself, some tangents, or zero.
+    """Return, for each node id that the roots need, its nodes in a program of several tangents.
 
-    given: inputs, of this graph; slopes: the inputs that are tangents, of which those that are not given are zero
-    size: how many tangents, of what type"""
+    A value has one node, a nonzero tangent has several, a zero tangent the constant 0.
+
+    Args:
+        graph: Graph that receives the nodes.
+        roots: Results of the program of one tangent.
+        given: Inputs of the new program by node id of the old one.
+        slopes: Ids of the inputs that are tangents; a tangent without an entry in `given` is zero.
+        size: Number and type of the tangents.
+    """
     nodes = live_nodes(roots)
     moving = dependents(nodes, {i for i in slopes if i in given})
+    # Nodes that depend only on tangents without a seed are in `slopes` but not in `moving`: they are zero.
     slopes = dependents(nodes, slopes)
     factors = Graph()
     values = _values(factors, nodes, given, slopes, moving)
@@ -53,7 +71,7 @@ def replicate_nodes(
 def _values(
     graph: Graph, nodes: list[Node], given: dict[int, list[Node]], slopes: set[int], moving: set[int]
 ) -> dict[int, Node]:
-    """What does not move, by node; what would follow from tangents that are zero is zero."""
+    """Return the factor graph's nodes for everything but nonzero tangents; every result of zero tangents is 0."""
     found: dict[int, Node] = {}
     for node in nodes:
         if node.id in moving:
@@ -69,7 +87,7 @@ def _values(
 
 
 class _ReplicaWriter:
-    """A plan as nodes of a program: numbers in their order, tangents behind those that they are made of."""
+    """A writer of an eliminated program as nodes: values in their order, tangents after their operands."""
 
     def __init__(self, graph: Graph, plan: Elimination, values: dict[int, Node], given: dict[int, list[Node]]):
         self.graph, self.plan, self.values = graph, plan, values
@@ -86,7 +104,8 @@ class _ReplicaWriter:
         return found | self.tangents
 
     def _number(self, node: Node) -> Node:
-        """A number of the plan in this program."""
+        """Return a number of the factor graph as a node of the new program."""
+        # A stack instead of recursion: a chain of operations may be longer than Python's limit.
         left = [node]
         while left:
             one = left[-1]
@@ -114,8 +133,10 @@ class _ReplicaWriter:
         return [self.graph.select(which, *(tangent_copy(x, k) for x in sums)) for k in range(self.plan.many)]
 
     def _sum(self, sum: Sum, node: Node) -> list[Node]:
+        """Return a sum for each tangent; terms with the factor 1 and positive terms come first."""
         if not sum:
             return [self.graph.const(0, node.dtype)]
+        # The first term needs no addition. A positive one saves the negation.
         ordered = sorted(sum, key=lambda x: (sum[x].number is not None, sum[x].negative))
         found: list[Node] = []
         for i, x in enumerate(ordered):

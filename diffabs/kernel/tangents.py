@@ -1,8 +1,10 @@
-"""Derivatives of functions of one lane, forward: a program of the values, and of several tangents of each number.
+"""Forward-mode derivatives of functions of one lane: one program of the values and several tangents of each number.
 
-The program is that of `jax.jvp` of the functions, traced for one tangent of everything that could have one. In its
-graph it is then seen what has: what begins with one, and what that leads to from step to step. Of each there are as
-many as are asked for; the other tangents are zero, and so is everything that follows from them alone."""
+The program comes from `jax.jvp`, traced with one tangent for every array that could have one.
+Reachability in its graph then shows which arrays have nonzero tangents: the seeded ones, and everything they reach from
+step to step.
+Only these tangents are repeated, as often as requested. All other tangents are zero, and so are their results.
+"""
 
 from collections.abc import Iterable
 from typing import Any, NamedTuple
@@ -23,12 +25,18 @@ from diffabs.kernel.program import (
 from diffabs.kernel.replicate import dependents, replicate_nodes, tangent_copy
 
 INPUT_LEVELS = (UpdateLevel.UNIFORM, UpdateLevel.LANE, UpdateLevel.STEP)
-RUNNING_FUNCTION = "running"  # the function that has no tangents: a truth
-TangentArrays = dict[UpdateLevel, tuple[int, ...]]  # the arrays, of each level, that have tangents
+RUNNING_FUNCTION = "running"  # returns a truth, which has no tangents
+TangentArrays = dict[UpdateLevel, tuple[int, ...]]  # numbers of the arrays with tangents, by level
 
 
 class ArrayKey(NamedTuple):
-    """An array: of which level it was when the functions were traced, its number there; or its tangents."""
+    """The identity of an array or of its tangents.
+
+    Attributes:
+        level: Level of the array when the functions were traced.
+        number: Number of the array in that level.
+        tangent: Whether the key means the array's tangents.
+    """
 
     level: UpdateLevel
     number: int
@@ -36,8 +44,13 @@ class ArrayKey(NamedTuple):
 
 
 class DerivativeProgram(NamedTuple):
-    """A program in which the arrays of each level are followed by their tangents, one each: of those that `could` have
-    them. Which `do`: of the carry more than what begins with one."""
+    """A program with one tangent, whose arrays of each level are followed by their tangents.
+
+    Attributes:
+        program: Operations and results.
+        differentiable: Arrays that have a tangent in the program.
+        moved_arrays: Arrays whose tangents can be nonzero: the seeded ones, and in the carry all that depend on them.
+    """
 
     program: ScalarProgram
     differentiable: TangentArrays
@@ -47,8 +60,16 @@ class DerivativeProgram(NamedTuple):
 def differentiate_functions(
     functions: TracedFunctions, seeded: TangentArrays, outputs_needed: Iterable[int] | None = None
 ) -> DerivativeProgram:
-    """Return the derivative of functions where these arrays have tangents to begin with; `wanted`: arrays of the carry
-    whose tangents matter in the end, None for all. Raises Unsupported."""
+    """Return the derivative program of functions, with one tangent.
+
+    Args:
+        functions: Traced functions.
+        seeded: Arrays that have nonzero tangents at the start.
+        outputs_needed: Arrays of the carry whose tangents matter at the end, None for all.
+
+    Raises:
+        Unsupported: A derivative uses an operation without a lowering rule, or there are too many operations.
+    """
     differentiable = seeded | {
         UpdateLevel.STEP: tuple(i for i, x in enumerate(functions.types[UpdateLevel.STEP]) if is_real(x.dtype))
     }
@@ -56,12 +77,20 @@ def differentiate_functions(
     reached = _reached_arrays(program, functions, differentiable, seeded)
     if outputs_needed is not None:
         needed = _needed_arrays(program, functions, differentiable, set(outputs_needed))
+        # A tangent that no requested result needs is set to zero and costs nothing.
         reached = tuple(i for i in reached if i in needed)
     return DerivativeProgram(program, differentiable, seeded | {UpdateLevel.STEP: reached})
 
 
 def lower_without_tangents(functions: TracedFunctions) -> DerivativeProgram:
-    """Return the functions without tangents. Raises Unsupported."""
+    """Return the program of functions without tangents.
+
+    Args:
+        functions: Traced functions.
+
+    Raises:
+        Unsupported: A function uses an operation without a lowering rule, or there are too many operations.
+    """
     none: TangentArrays = dict.fromkeys(INPUT_LEVELS, ())
     return DerivativeProgram(lower_functions(functions), none, none)
 
@@ -69,8 +98,13 @@ def lower_without_tangents(functions: TracedFunctions) -> DerivativeProgram:
 def arrange_arrays(
     functions: TracedFunctions, moved_arrays: TangentArrays, per_lane_uniforms: frozenset[int]
 ) -> dict[UpdateLevel, list[ArrayKey]]:
-    """Return the arrays of a program, of each level, in their order; `as_lanes` are those that were the same for all
-    lanes when the functions were traced, and now are not."""
+    """Return the keys of a program's arrays by level, in the order of its arguments: values, then tangents.
+
+    Args:
+        functions: Traced functions.
+        moved_arrays: Arrays that have tangents.
+        per_lane_uniforms: Arrays that were uniform in the trace and that vmap has made arrays of each lane.
+    """
     found: dict[UpdateLevel, list[ArrayKey]] = {level: [] for level in INPUT_LEVELS}
     for tangent in (False, True):
         for level in INPUT_LEVELS:
@@ -83,8 +117,17 @@ def arrange_arrays(
 def replicate_tangents(
     functions: TracedFunctions, one: DerivativeProgram, many: int, per_lane_uniforms: frozenset[int] = frozenset()
 ) -> ScalarProgram:
-    """Return a derivative as a program of so many tangents of each array that has one, (many, ...) each. Raises
-    Unsupported for one of too many operations."""
+    """Return the program with several tangents; a tangent array has the shape (many, ...).
+
+    Args:
+        functions: Traced functions.
+        one: Program with one tangent.
+        many: Number of tangents.
+        per_lane_uniforms: Arrays that were uniform in the trace and that vmap has made arrays of each lane.
+
+    Raises:
+        Unsupported: There are too many operations.
+    """
     graph, old = Graph(), one.program
     inputs: dict[InputPlace, Node] = {}
     given: dict[int, list[Node]] = {}
@@ -99,9 +142,11 @@ def replicate_tangents(
                         old.inputs[InputPlace(key.level, number, entry)],
                         InputPlace(level, array, k * size + entry),
                     )
+                    # A uniform array that is now an array of lanes changes its level here, not the functions.
                     inputs[place] = graph.input(node.dtype, level, place)
                     given.setdefault(node.id, []).append(inputs[place])
             sizes[level].append(size * copies)
+    # In each level the tangents follow the values, so their array numbers start at the number of values.
     slopes = {node.id for place, node in old.inputs.items() if place.array >= len(functions.types[place.level])}
     ends = {name: _results(functions, one, name) for name in old.results}
     roots = [node for arrays in ends.values() for nodes, _ in arrays for node in nodes]
@@ -116,14 +161,13 @@ def replicate_tangents(
 
 
 def _number(functions: TracedFunctions, one: DerivativeProgram, key: ArrayKey) -> int:
-    """The number of an array in the program of one tangent."""
+    """Return the number of an array in the program with one tangent."""
     first = len(functions.types[key.level])
     return first + one.differentiable[key.level].index(key.number) if key.tangent else key.number
 
 
 def _results(functions: TracedFunctions, one: DerivativeProgram, name: str) -> list[tuple[list[Node], bool]]:
-    """What a function of the program of several tangents returns, array by array: those that it has of one tangent, and
-    whether they are tangents."""
+    """Return a function's results, array by array, as nodes of one tangent and a truth: whether they are tangents."""
     if name == RUNNING_FUNCTION:
         return [(one.program.results[name], False)]
     arrays = _arrays(functions, one, name)
@@ -135,7 +179,7 @@ def _results(functions: TracedFunctions, one: DerivativeProgram, name: str) -> l
 
 
 def _arrays(functions: TracedFunctions, one: DerivativeProgram, name: str) -> list[list[Node]]:
-    """The results of a function that changes the carry, array by array."""
+    """Return the results of a function that updates the carry, array by array."""
     rest = iter(one.program.results[name])
     return [[next(rest) for _ in range(size)] for size in one.program.sizes[UpdateLevel.STEP]]
 
@@ -143,12 +187,13 @@ def _arrays(functions: TracedFunctions, one: DerivativeProgram, name: str) -> li
 def _reached_arrays(
     program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays, seeded: TangentArrays
 ) -> tuple[int, ...]:
-    """The arrays of the carry that have tangents in the end."""
+    """Return the arrays of the carry whose tangents can be nonzero after any number of steps."""
     one, ends = (
         DerivativeProgram(program, differentiable, differentiable),
         _tangent_results(program, functions, differentiable),
     )
     nodes = live_nodes([node for nodes in ends.values() for node in nodes])
+    # A fixed point: arrays that one step reaches may reach more arrays in the next.
     moved_arrays = seeded
     while True:
         starts = {
@@ -168,7 +213,7 @@ def _reached_arrays(
 def _needed_arrays(
     program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays, outputs_needed: set[int]
 ) -> set[int]:
-    """The arrays of the carry whose tangents lead to those that are wanted."""
+    """Return the arrays of the carry whose tangents influence the requested ones after any number of steps."""
     ends, found = _tangent_results(program, functions, differentiable), set(outputs_needed)
     first = len(functions.types[UpdateLevel.STEP])
     numbers = {first + at: i for at, i in enumerate(differentiable[UpdateLevel.STEP])}
@@ -184,7 +229,7 @@ def _needed_arrays(
 def _tangent_results(
     program: ScalarProgram, functions: TracedFunctions, differentiable: TangentArrays
 ) -> dict[int, list[Node]]:
-    """What becomes of the tangents of each array of the carry."""
+    """Return, for each differentiable array of the carry, the tangents that all functions assign to it."""
     one = DerivativeProgram(program, differentiable, differentiable)
     arrays = [_arrays(functions, one, name) for name in program.results if name != RUNNING_FUNCTION]
     return {
@@ -194,7 +239,7 @@ def _tangent_results(
 
 
 def _jvp_functions(functions: TracedFunctions, differentiable: TangentArrays) -> TracedFunctions:
-    """The functions of values and tangents: of each level its arrays, then tangents of those that could have one."""
+    """Return the functions of values and tangents; each level has its arrays, then tangents of differentiable ones."""
     types = {level: [*all, *(all[i] for i in differentiable[level])] for level, all in functions.types.items()}
     uniform = len(types[UpdateLevel.UNIFORM])
     each: dict[str, TracedFunction] = {}
@@ -202,6 +247,7 @@ def _jvp_functions(functions: TracedFunctions, differentiable: TangentArrays) ->
         push = _jvp_function(functions, function, differentiable, name != RUNNING_FUNCTION)
         closed = jax.make_jaxpr(push)(*(x for level in INPUT_LEVELS for x in types[level]))
         shared, rest = closed.jaxpr.invars[:uniform], closed.jaxpr.invars[uniform:]
+        # The uniform inputs become constvars, as in a traced function: `lower_functions` passes them by number.
         jaxpr = closed.jaxpr.replace(constvars=[*shared, *closed.jaxpr.constvars], invars=rest)
         each[name] = TracedFunction(jaxpr, tuple(range(uniform)), tuple(closed.consts))
     return TracedFunctions(each, types, functions.uniform)
@@ -210,6 +256,8 @@ def _jvp_functions(functions: TracedFunctions, differentiable: TangentArrays) ->
 def _jvp_function(
     functions: TracedFunctions, function: TracedFunction, differentiable: TangentArrays, moves: bool
 ) -> Any:
+    """Return a function of values and tangents that computes values and tangents; without `moves`, values alone."""
+
     def called(arrays: dict[UpdateLevel, list[Any]]) -> list[Any]:
         shared = [*(arrays[UpdateLevel.UNIFORM][i] for i in function.closed), *function.constants]
         closed = jex.ClosedJaxpr(function.jaxpr, shared)

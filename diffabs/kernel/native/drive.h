@@ -1,5 +1,5 @@
-/* Runs all lanes to their ends, in blocks, on some threads; called by XLA through its C interface. A lane's numbers do
-   not depend on the thread, nor on the lanes beside it. */
+/* The launch on a processor: threads run blocks of lanes until every lane has ended. XLA calls it through its C
+   interface. A lane's numbers depend neither on the thread nor on the other lanes of its block. */
 #pragma once
 #include <pthread.h>
 #include <string.h>
@@ -18,7 +18,7 @@ static void* work(void* given) {
   const Shared& s = *job->shared;
   Block b;
   memset((void*)&b, 0, sizeof b);
-  i64 lane[SLOTS];
+  i64 lane[SLOTS];   /* number of the lane in each place, -1 for none */
   int left = 0;
   for (int p = 0; p < SLOTS; p++) {
     const i64 j = taken(job);
@@ -27,6 +27,7 @@ static void* work(void* given) {
     put(b, p, j < job->count ? j : job->count - 1, job->lanes, job->carry);
   }
   for (int q = 0; q < VECTORS; q++) begin(b, s, q);
+  /* A place without a lane computes with a copy of the last one: no branch and no invalid numbers in the vectors. */
   while (left) {
     for (int k = 0; k < ROUNDS; k++) {
       renew(b, s);
@@ -62,9 +63,10 @@ static void run(const Array* uniform, const Array* lanes, const Array* carry, i6
   for (int i = 0; i < started; i++) pthread_join(others[i], 0);
 }
 
-/* The arrays: UNIFORM of all lanes, OF_LANES and CARRIED with a leading axis of lanes. The results are the last. */
+/* The arguments: UNIFORM arrays, then OF_LANES and CARRIED arrays with a leading axis of lanes. The results are the
+   carry, in place if XLA gives the same buffer. */
 extern "C" XLA_FFI_Error* diffabs_kernel(XLA_FFI_CallFrame* call) {
-  auto* more = call->extension_start;   // its name differs between versions of jaxlib
+  auto* more = call->extension_start;   // the type's name differs between versions of jaxlib
   if (more && more->type == XLA_FFI_Extension_Metadata) {
     XLA_FFI_Metadata* told = ((XLA_FFI_Metadata_Extension*)more)->metadata;
     told->api_version.major_version = XLA_FFI_API_MAJOR;

@@ -1,10 +1,11 @@
-/* Elementary functions of vectors, without branches, to about one unit in the last place (tests/test_kernel_native.py).
-   Polynomials are Taylor's, whose coefficients are seen to be right, but for the inverse tangent. */
+/* Elementary functions of vectors, without branches, accurate to about one unit in the last place
+   (tests/kernel/test_kernel_native.py). Polynomials are Taylor's, so that their coefficients can be checked by eye.
+   Only the inverse tangent has a Chebyshev polynomial. */
 #pragma once
 #include "lanes.h"
 
-/* Without an instruction for it. x * 2^n, n a whole number: in two halves, so that what is beyond the normal numbers is
-   rounded, or infinite, once. */
+/* x * 2^n for an integer n, without AVX-512's instruction: two factors, so that a subnormal result is rounded once and
+   an overflow gives infinity. `parted` splits x into its part m between 3/4 and 3/2 and the exponent n. */
 #if !defined(WIDE) || defined(SINGLE)
 FN vf64 scaled(vf64 x, vf64 n) {
   const vi64 k = CAST(vi64, n), half = k >> 1;
@@ -55,7 +56,8 @@ FN vf32 reduced_exp(vf32 x, vf32& n, vf32& low) {
   const vf32 high = x - n*0x1.62e0p-1f, part = n*0x1.0bfbe8p-15f, r = high - part;
   low = (high - r) - part;
   return r; }
-/* Between where nothing is left and where it is infinite; NaN is the second of two numbers, and stays. */
+/* x is clamped to the range where exp is neither 0 nor infinite. `higher` and `lower` return their second operand for
+   NaN, so x stands second and NaN stays. */
 template<class V, class T> FN V exp_of(V x, T least, T most) {
   V n, low;
   const V r = reduced_exp(lower(all(most), higher(all(least), x)), n, low);
@@ -63,7 +65,7 @@ template<class V, class T> FN V exp_of(V x, T least, T most) {
 FN vf64 k_exp(vf64 x) { return exp_of(x, -750.0, 710.0); }
 FN vf32 k_exp(vf32 x) { return exp_of(x, -105.f, 89.f); }
 
-FN vf64 k_expm1(vf64 x) {   /* (2^n - 1) + 2^n r, what its rounding lost, and 2^n (e^r - 1 - r) */
+FN vf64 k_expm1(vf64 x) {   /* (2^n - 1) + 2^n r, its rounding error `lost`, and 2^n (e^r - 1 - r) */
   vf64 n, low;
   const vf64 y = lower(sel(lt(all(-50.0), x), x, all(-50.0)), all(50.0)), r = reduced_exp(y, n, low);
   const vf64 power = scaled(all(1.0), n), whole = power - 1.0, sum = whole + power*r, lost = (whole - sum) + power*r;
@@ -87,20 +89,20 @@ FN vf64 log_parts(vf64 m, vf64 e, vf64 error) {
 FN vf32 log_parts(vf32 m, vf32 e, vf32 error) {
   const vf32 f = m - 1.f, s = f/(m + 1.f), half = 0.5f*f*f, p = series_of_log(s*s);
   return e*0x1.62e0p-1f - ((half - (s*(half + p) + (e*0x1.0bfbe8p-15f + error))) - f); }
-/* Of 0 and of infinity the part is 1 and n infinite, and so is the sum. */
+/* For 0 and infinity `parted` gives m = 1 and an infinite n, so the logarithm is infinite too. */
 template<class V, class T> FN V log_of(V x, T nan) {
   V e;
   const V m = parted(x, e), found = log_parts(m, e, V{});
   return sel(le(V{}, x), found, all(nan)); }
 FN vf64 k_log(vf64 x) { return log_of(x, (f64)NAN); }
 FN vf32 k_log(vf32 x) { return log_of(x, (f32)NAN); }
-FN vf64 k_log1p(vf64 x) {   /* what 1 + x lost is put back by the slope there */
+FN vf64 k_log1p(vf64 x) {   /* the rounding error of 1 + x is corrected by the derivative, lost/u */
   const vf64 u = 1.0 + x, lost = sel(lt(x, all(1.0)), x - (u - 1.0), 1.0 - (u - x));
   vf64 e;
   const vf64 m = parted(u, e), found = log_parts(m, e, sel(lt(vf64{}, u) & finite(u), lost/u, vf64{}));
   return sel(eq(x, vf64{}), x, sel(le(vf64{}, u), found, all((f64)NAN))); }
 
-/* sine and cosine: x = n pi/2 + r; of large x by the C library */
+/* sine and cosine: x = n pi/2 + r; the C library computes large x */
 FN vf64 sin_series(vf64 r, vf64 low) {
   const vf64 z = r*r;
   vf64 p = z*(1/355687428096000.0) - 1/1307674368000.0;
@@ -159,8 +161,8 @@ FN vf64 k_tanh(vf64 x) {
   const vf64 found = sel(lt(y, all(0.5)), t/(t + 2.0), 1.0 - 2.0/(t + 2.0));
   return sel(ne(x, x), x, (vf64)((vu64)found | ((vu64)x & 0x8000000000000000ull))); }
 
-/* atan(x) = atan(c) + atan((x - c)/(1 + c x)), c of 0, 1/2, 1, 3/2 and infinity, so that no quotient is above 7/16,
-   where a Chebyshev polynomial of the square is off by 4e-18 */
+/* atan(x) = atan(c) + atan((x - c)/(1 + c x)) with c = 0, 1/2, 1, 3/2 or infinity: no quotient exceeds 7/16. There a
+   Chebyshev polynomial of the square has an error of 4e-18. */
 FN vf64 k_atan(vf64 x) {
   const vf64 y = size(x);
   vf64 top = y, bottom = all(1.0), high = vf64{}, low = vf64{};
@@ -180,10 +182,10 @@ FN vf64 k_atan(vf64 x) {
   const vf64 found = high + (t + (p*z*t + low));
   return sel(ne(x, x), x, (vf64)((vu64)found | ((vu64)x & 0x8000000000000000ull))); }
 
-/* in single precision by way of double */
+/* single precision, computed in double */
 #define WIDENED(f) FN vf32 f(vf32 x) { return CAST(vf32, f(CAST(vf64, x))); }
 WIDENED(k_expm1) WIDENED(k_log1p) WIDENED(k_tanh) WIDENED(k_atan)
 
-/* what is rare */
+/* rare functions, one lane after the other by the C library */
 ALONE(k_tan, tan) ALONE(k_asin, asin) ALONE(k_acos, acos) ALONE(k_sinh, sinh) ALONE(k_cosh, cosh)
 IN_PAIRS(k_atan2, atan2) IN_PAIRS(k_pow, pow)

@@ -1,5 +1,5 @@
-/* Numbers of one lane, under the names that lanes.h has for vectors of them: on a GPU a thread has one lane. CUDA's own
-   elementary functions; without CUDA, those of C. */
+/* Numbers of one lane under the vector names of lanes.h, because a thread of a GPU has one lane. The elementary
+   functions are CUDA's, and without CUDA the C library's. */
 #pragma once
 #ifdef __CUDACC_RTC__
 #define FN static __device__ __forceinline__
@@ -42,7 +42,7 @@ typedef i64 vi64;
 typedef u32 vu32;
 typedef u64 vu64;
 
-/* truths: a type of their own, of which ~ is the contrary */
+/* truths: a type of their own, so that ~ negates them */
 struct mask { bool m; };
 FN mask operator&(mask a, mask b) { return mask{a.m && b.m}; }
 FN mask operator|(mask a, mask b) { return mask{a.m || b.m}; }
@@ -94,7 +94,7 @@ OF_ONE(k_exp, exp) OF_ONE(k_log, log) OF_ONE(k_log1p, log1p) OF_ONE(k_expm1, exp
 OF_ONE(k_tan, tan) OF_ONE(k_tanh, tanh) OF_ONE(k_atan, atan) OF_ONE(k_asin, asin) OF_ONE(k_acos, acos)
 OF_ONE(k_sinh, sinh) OF_ONE(k_cosh, cosh) OF_TWO(k_atan2, atan2) OF_TWO(k_pow, pow)
 
-/* Types. A real number beyond what a whole one can be becomes the nearest of these, NaN becomes 0, as in XLA. */
+/* Conversions. As in XLA, a real number outside the integers' range becomes the nearest integer, and NaN becomes 0. */
 template<class V, class T> FN V to(T x, V) { return (V)x; }
 template<class V> FN V to(mask a, V) { return (V)(a.m ? 1 : 0); }
 template<class V, class T> FN V bounded(T x, T low, T high, V least, V greatest) {
@@ -113,7 +113,7 @@ template<class V, class T> FN V bits_as(T x, V) {
   both.from = x;
   return both.to; }
 
-/* An entry of a column that all lanes have, at an index within. */
+/* The entry of a shared column at a valid index. */
 template<class T, class I> FN T entry(const T* column, I at) { return column[at]; }
 
 struct Array { void* data; };

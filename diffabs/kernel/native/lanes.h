@@ -1,8 +1,7 @@
-/* Numbers of LANES lanes at a time, by the vector types of GCC and Clang: a lane's number is one element of a vector.
-   Comparisons make masks. With AVX-512 a mask is a bit for each lane; elsewhere, and with -DPLAIN, a vector of whole
-   numbers, 0 or -1.
+/* Vectors with one number for each of LANES lanes, by the vector types of GCC and Clang. Comparisons return masks. With
+   AVX-512 a mask has a bit for each lane; otherwise, and with -DPLAIN, it is a vector of integers 0 or -1.
 
-   Defined before: SINGLE, if vectors of float fill a register, and not those of double. */
+   To be defined before: SINGLE, if a vector of float fills a register, instead of a vector of double. */
 #pragma once
 #include <math.h>
 #include <stdint.h>
@@ -35,11 +34,11 @@ typedef uint32_t u32;
 typedef uint64_t u64;
 typedef uint8_t u8;
 #define VECTOR(type) typedef type v##type __attribute__((vector_size(LANES*sizeof(type)))); \
-  FN v##type all(type x) { return x - v##type{}; }   /* one number in every lane; -0 stays what it is */
+  FN v##type all(type x) { return x - v##type{}; }   /* one number in every lane; x - 0 keeps -0, x + 0 would not */
 VECTOR(f32) VECTOR(f64) VECTOR(i32) VECTOR(i64) VECTOR(u32) VECTOR(u64)
 #define CAST(V, x) __builtin_convertvector(x, V)
 
-/* what comparing vectors makes */
+/* the integer vector that a comparison returns */
 template<int size> struct Whole;
 template<> struct Whole<4> { typedef vi32 type; };
 template<> struct Whole<8> { typedef vi64 type; };
@@ -103,7 +102,7 @@ FN vf64 size(vf64 x) { return (vf64)((vu64)x & 0x7fffffffffffffffull); }
 FN mask eq(mask a, mask b) { return ~(a ^ b); }
 FN mask ne(mask a, mask b) { return a ^ b; }
 
-/* Of vectors that fill a register these are one instruction each, which a compiler does not see. */
+/* For vectors that fill a register, one instruction each: compilers do not find these themselves. */
 #ifdef WIDE
 #define COMPARED(V, T, I) \
   FN mask lt(V a, V b) { return mask{I(cmplt)((T)a, (T)b)}; } FN mask le(V a, V b) { return mask{I(cmple)((T)a, (T)b)}; } \
@@ -140,7 +139,7 @@ FN vreal root(vreal x) { return (vreal)REALLY(sqrt)((register_of_reals)x); }
 FN vreal whole(vreal x) { return (vreal)REALLY(roundscale)((register_of_reals)x, 8); }
 FN vreal down(vreal x) { return (vreal)REALLY(roundscale)((register_of_reals)x, 9); }
 FN vreal up(vreal x) { return (vreal)REALLY(roundscale)((register_of_reals)x, 10); }
-/* x * 2^n; the part of x between 3/4 and 3/2, NaN below zero, and n so that it is that part * 2^n */
+/* `scaled` is x * 2^n. `parted` returns the part m of x between 3/4 and 3/2, and n with x = m * 2^n; NaN for x < 0. */
 FN vreal scaled(vreal x, vreal n) { return (vreal)REALLY(scalef)((register_of_reals)x, (register_of_reals)n); }
 FN vreal parted(vreal x, vreal& n) {
   const vreal m = (vreal)REALLY(getmant)((register_of_reals)x, _MM_MANT_NORM_p75_1p5, _MM_MANT_SIGN_src);
@@ -154,7 +153,7 @@ template<class V> FN V lower(V a, V b) { return sel(lt(a, b), a, b); }
 template<class V> FN V most(V a, V b) { return sel(eq(a, a), higher(a, b), a); }   /* NaN where either is */
 template<class V> FN V least(V a, V b) { return sel(eq(a, a), lower(a, b), a); }
 
-/* each lane by itself */
+/* one lane after the other */
 template<class V> FN V root(V x) { for (int q = 0; q < LANES; q++) x[q] = sqrt(x[q]); return x; }
 template<class V> FN V whole(V x) { for (int q = 0; q < LANES; q++) x[q] = rint(x[q]); return x; }
 template<class V> FN V down(V x) { for (int q = 0; q < LANES; q++) x[q] = floor(x[q]); return x; }
@@ -179,7 +178,7 @@ template<class V> FN auto at(V x, int q) -> decltype(x[0] + 0*x[0]) { return x[q
 template<class V, class T> FN void place(V& x, int q, T value) { x[q] = value; }
 template<class V, class T> FN V bits_as(T x, V) { return (V)x; }
 
-/* Types. A real number beyond what a whole one can be becomes the nearest of these, NaN becomes 0, as in XLA. */
+/* Conversions. As in XLA, a real number outside the integers' range becomes the nearest integer, and NaN becomes 0. */
 template<class V, class T> FN V to(T x, V) { return CAST(V, x); }
 template<class V> FN V to(mask a, V) { return sel(a, V{} + 1, V{}); }
 template<class V, class T> FN V bounded(T x, T low, T high, V first, V last) {
@@ -193,13 +192,13 @@ template<class V, class T> FN V bounded(T x, T low, T high, V first, V last) {
   TO_WHOLE(T, u32, -1.0, 4294967296.0, 0, UINT32_MAX) TO_WHOLE(T, u64, -1.0, 18446744073709551616.0, 0, UINT64_MAX)
 TO_WHOLES(f32) TO_WHOLES(f64)
 
-/* An entry of a column that all lanes have, at an index within. */
+/* The entry of a shared column at a valid index. */
 template<class T, class I> FN auto entry(const T* column, I at) -> decltype(all(*column)) {
   decltype(all(*column)) x;
   for (int q = 0; q < LANES; q++) x[q] = column[at[q]];
   return x; }
 
-/* An array of XLA's, and a number that all lanes have. */
+/* An array of XLA, and the value of a number that all lanes share. */
 struct Array { void* data; };
 template<class V> FN auto first(V x) -> decltype(x[0] + 0*x[0]) { return x[0]; }
 FN u8 first(mask a) { return get(a, 0); }

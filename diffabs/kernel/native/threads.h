@@ -1,9 +1,9 @@
-/* Runs all lanes to their ends on a GPU: a thread for each; one whose lane has ended takes the next, while the others of
-   its warp go on. Two launches: what all lanes share is worked out by one thread first. */
+/* The launch on a GPU: each thread runs a lane and takes the next when it ends, while the rest of its warp goes on.
+   Two kernels: first one thread computes the values that all lanes share, then `run_all` runs the lanes. */
 #pragma once
 
 #ifdef SINGLE
-enum { BLOCKS = 3 };   /* that a multiprocessor holds at least, so that a thread has 168 registers, or 255 */
+enum { BLOCKS = 3 };   /* least blocks a multiprocessor: 168 registers a thread, for double 255 */
 #else
 enum { BLOCKS = 2 };
 #endif
