@@ -10,7 +10,7 @@ from diffabs.linear.robustness import frequencies
 from diffabs.linear.stability_margins import Margins
 from diffabs.plot.style import COLOURS, GREY, label_axes, make_logarithmic, sheet
 
-MAX_NYQUIST_RADIUS = 3.0  # ends of the Nyquist plot's axes; L beyond is of no interest for stability margins
+MAX_NYQUIST_RADIUS = 3.0  # largest real or imaginary part that the Nyquist plot shows
 LIGHT = 0.25  # opacity of the band
 LEAST_DB = -80.0  # lower end of the magnitude axis; half of it for the sensitivities
 
