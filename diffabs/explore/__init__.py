@@ -1,3 +1,4 @@
-"""A scenario in the browser: numbers are dragged, and curves, a fan, poles and a verdict follow.
+"""A scenario in the browser: sliders change its numbers, and curves, fan, poles and verdict follow.
 
-`session` is the whole computation, without a page; `server` shows it, and needs the extra `explore`."""
+`session` is the whole computation without a page. `server` shows it and needs the extra `explore`.
+"""

@@ -1,4 +1,4 @@
-"""A chart on the page, and what changes in it."""
+"""A chart on the page, and the messages that change it."""
 
 import json
 from typing import Any
@@ -7,24 +7,32 @@ from nicegui import ui  # pyright: ignore[reportMissingImports]  # the extra `ex
 
 
 class Canvas:
-    """A chart that is changed piece by piece: what is not named in a change stays as it is."""
+    """A chart that changes piece by piece: a change keeps everything that it does not name."""
 
     def __init__(self, options: dict[str, Any], classes: str, name: str = ""):
-        """Put it on the page, where something is open."""
+        """Put a chart with these `options` and CSS `classes` into the open element; `name` is its data-id."""
         self.element = ui.echart(options).classes(classes)
         if name:
             self.element.props(f"data-id={name}")
 
     def change(self, option: dict[str, Any], edit: int = 0) -> None:
-        """Change it; `edit` is the browser's number of what a person changed, if this shows it. A change that comes
-        before the browser has made the chart waits there."""
+        """Apply the change `option` to the chart.
+
+        `edit` is the browser's number of the user's edit that this change shows, or 0. A change that arrives before the
+        browser
+        has made the chart waits there.
+        """
         self.send(encode_change(option), edit)
 
     def send(self, change: str, edit: int = 0) -> None:
-        """Change it by what `encoded` has made, in whatever thread."""
+        """Apply a `change` encoded by `encode_change`, from any thread; `edit` is as in `change`."""
         ui.run_javascript(f"explorer.change({self.element.id}, {change}, {int(edit)})")
 
 
 def encode_change(option: dict[str, Any]) -> str:
-    """Return a change as text."""
+    """Return a change as JSON text.
+
+    Args:
+        option: Options of the chart that change.
+    """
     return json.dumps(option, separators=(",", ":"), allow_nan=False)

@@ -1,4 +1,7 @@
-"""Curves, fan and poles as options of Apache ECharts, which the page draws with. Numbers go in columns, once each."""
+"""Curves, fan and poles as options of Apache ECharts, which draws the page's charts.
+
+Numbers are stored in columns, once each.
+"""
 
 import math
 from typing import Any
@@ -10,18 +13,23 @@ from diffabs.explore.stability import Stability
 
 BLUE, RED, GREEN, GREY, INK = "#0072B2", "#D55E00", "#009E73", "#767676", "#1F2933"
 CURVE_COLOURS = (BLUE, RED, GREEN, "#CC79A7", "#E69F00", "#56B4E9")
-CHART_DIGITS = 5
+CHART_DIGITS = 5  # significant digits of the numbers that go to the browser
 QUANTITIES = {"rad": "angle", "rad/s": "rate", "km/h": "speed", "N m": "torque", "V": "voltage"}
+# Signals that the loop should follow, with their dashes.
 AIMS = {"target": "dashed", "setpoint": "dotted", "command": "dashed"}
 OUTER, INNER = "5 to 95 % of the fan", "25 to 75 %"
 BEFORE = "before"
 FONT = "'Inter', 'Roboto', system-ui, sans-serif"
-LIMIT_ROOM = 1.5  # of the control's range, in which its command is shown
-TOP, BOTTOM, BETWEEN = 6.0, 7.5, 6.5  # per cent of the height
+LIMIT_ROOM = 1.5  # the control's axis ends at this multiple of its largest magnitude
+TOP, BOTTOM, BETWEEN = 6.0, 7.5, 6.5  # margins and gaps of the panels in percent of the height
 
 
 def run_chart(found: Curves) -> dict[str, Any]:
-    """Return the chart of a run: axes, legends and lines, also those of what is not there yet."""
+    """Return the options of the chart of a run: axes, legends, and all lines, also those without data yet.
+
+    Args:
+        found: Curves of the run.
+    """
     shown, given = found.panels, change_curves(found)
     count = len(shown)
     height = (100 - TOP - BOTTOM - BETWEEN * (count - 1)) / count
@@ -41,13 +49,19 @@ def run_chart(found: Curves) -> dict[str, Any]:
         "axisPointer": {"link": [{"xAxisIndex": "all"}], "label": {"precision": 3}},
         "xAxis": [_x(i, last=i == count - 1) for i in range(count)],
         "yAxis": [_y(panel, i) | given["yAxis"][i] for i, panel in enumerate(shown)],
+        # Series refer to these datasets by id: a change replaces columns and leaves the series alone.
         "dataset": [*given["dataset"], *({"id": name, "source": {"t": []}} for name in ("before", "fan"))],
         "series": [line for i, panel in enumerate(shown) for line in _series(panel, i)],
     }
 
 
 def change_curves(found: Curves, which: str = "now") -> dict[str, Any]:
-    """Return the change of the chart that shows a run; `which` is "now" or "before"."""
+    """Return the change of the chart that shows a run.
+
+    Args:
+        found: Curves of the run.
+        which: "now" for the current run, "before" for the run to compare with.
+    """
     source = {"t": round_for_screen(found.t)}
     for i, panel in enumerate(found.panels):
         lines = panel.lines if which == "now" else panel.lines[:1]
@@ -59,19 +73,28 @@ def change_curves(found: Curves, which: str = "now") -> dict[str, Any]:
 
 
 def change_fan(found: Fan | None) -> dict[str, Any]:
-    """Return the change of the chart that shows a fan, or none."""
+    """Return the change of the chart that shows a fan.
+
+    Args:
+        found: Quantiles of the fan; None removes the fan.
+    """
     if found is None:
         return clear_curves("fan")
     source = {"t": round_for_screen(found.t)}
     for i, band in enumerate(found.bands):
         low, quarter, _, third, high = band
+        # Stacked areas: each entry is the distance to the quantile below.
         steps = (low, quarter - low, third - quarter, high - third)
         source |= {f"{i}.{j}": round_for_screen(values) for j, values in enumerate(steps)}
     return {"dataset": [{"id": "fan", "source": source}]}
 
 
 def change_time_axis(end: float | None) -> dict[str, Any]:
-    """Return the change of the chart that shows the time up to an instant [s], or the whole run."""
+    """Return the change of the chart that sets the time axis.
+
+    Args:
+        end: End of the axis [s]; None shows the whole run.
+    """
     return {
         "dataZoom": [
             {"start": 0, "end": 100} if end is None else {"startValue": 0, "endValue": round_for_screen([end])[0]}
@@ -80,12 +103,16 @@ def change_time_axis(end: float | None) -> dict[str, Any]:
 
 
 def clear_curves(which: str) -> dict[str, Any]:
-    """Return the change of the chart that takes curves away."""
+    """Return the change of the chart that removes curves.
+
+    Args:
+        which: "before" or "fan".
+    """
     return {"dataset": [{"id": which, "source": {"t": []}}]}
 
 
 def pole_chart() -> dict[str, Any]:
-    """Return the empty map of poles, in s: the left half plane is where they decay."""
+    """Return the options of the empty map of poles in the s-plane; modes decay in the left half plane."""
     axis = {
         "type": "value",
         "nameLocation": "middle",
@@ -115,7 +142,7 @@ def pole_chart() -> dict[str, Any]:
     }
 
 
-DASH = "path://M0,6 h18 v3 h-18 Z M0,0 h18 v0.01 h-18 Z M0,15 h18 v0.01 h-18 Z"  # a line in the middle of its place
+DASH = "path://M0,6 h18 v3 h-18 Z M0,0 h18 v0.01 h-18 Z M0,15 h18 v0.01 h-18 Z"  # empty rectangles centre the line
 CROSS = "path://M0,12 L12,0 L14,2 L2,14 Z M0,2 L2,0 L14,12 L12,14 Z"
 POLE = (
     "p => { const [x, y] = p.data, w = Math.hypot(x, y);"
@@ -125,7 +152,13 @@ POLE = (
 
 
 def change_poles(found: Stability | None) -> dict[str, Any]:
-    """Return the change of the map that shows the poles of a loop; those of a sampled one as ln(z)/T."""
+    """Return the change of the map that shows the poles of a loop.
+
+    Poles of a sampled loop are shown as ln(z)/T.
+
+    Args:
+        found: Stability of the loop; None empties the map.
+    """
     here = _points(found.poles, found.period) if found else []
     around = _points(found.corners, found.period) if found else []
     x, y = (np.array([point[i] for point in here + around] or [-1.0]) for i in (0, 1))
@@ -143,14 +176,19 @@ def change_poles(found: Stability | None) -> dict[str, Any]:
 def _points(values: np.ndarray, period: float | None) -> list[list[float]]:
     poles = np.asarray(values, complex)
     if period is not None:
-        poles = np.log(poles[np.abs(poles) > 1e-9]) / period  # those at z = 0 are delays
+        poles = np.log(poles[np.abs(poles) > 1e-9]) / period  # a pole at z = 0 is a delay; its logarithm is -inf
     return [[float(f"{p.real:.5g}"), float(f"{p.imag:.5g}")] for p in poles]
 
 
 def round_for_screen(values: Any) -> list[float | None]:
-    """Return numbers with as many digits as a screen can show; None where there is none."""
+    """Return numbers rounded to the digits that a screen can show, with None for numbers that are not finite.
+
+    Args:
+        values: Numbers, shape (n,).
+    """
     values = np.asarray(values, float)
     finite = np.isfinite(values)
+    # log10 needs numbers that are finite and not 0.
     safe = np.where(finite & (values != 0), values, 1.0)
     unit = 10.0 ** (np.floor(np.log10(np.abs(safe))) - CHART_DIGITS + 1)
     near = np.where(finite, np.round(np.where(finite, values, 0.0) / unit) * unit, np.nan)
@@ -195,7 +233,11 @@ def _y(panel: Panel, i: int) -> dict[str, Any]:
 
 
 def axis_label(panel: Panel) -> str:
-    """Return what an axis says of a panel: the quantity and its unit."""
+    """Return the label of a panel's vertical axis: quantity and unit.
+
+    Args:
+        panel: Panel of the chart.
+    """
     signals = [line.name for line in panel.lines if line.name not in AIMS]
     words = signals[0] if len(signals) == 1 and signals[0] != "control" else QUANTITIES.get(panel.unit, signals[0])
     return f"{words} [{panel.unit}]"
@@ -203,6 +245,7 @@ def axis_label(panel: Panel) -> str:
 
 def _series(panel: Panel, i: int) -> list[dict[str, Any]]:
     place = {"type": "line", "xAxisIndex": i, "yAxisIndex": i, "showSymbol": False, "symbol": "none"}
+    # The lowest band of the stack is transparent; it lifts the others to the 5 % quantile.
     hidden = {**place, "datasetId": "fan", "stack": f"fan {i}", "stackStrategy": "all", "silent": True}
     hidden |= {"lineStyle": {"width": 0}, "tooltip": {"show": False}, "z": 1}
     names = ("", OUTER, INNER, OUTER)
@@ -232,7 +275,10 @@ def _series(panel: Panel, i: int) -> list[dict[str, Any]]:
 
 
 def _limits(panel: Panel) -> dict[str, Any]:
-    """Ends of an axis: free, but those of a control, whose command may lie far beyond what can be given."""
+    """Return the limits of a control's axis from the delivered control, and nothing for other axes.
+
+    The command may lie far beyond the control's range.
+    """
     if panel.lines[-1].name != "command":
         return {}
     values = panel.lines[0].values[np.isfinite(panel.lines[0].values)]
@@ -245,12 +291,13 @@ def _limits(panel: Panel) -> dict[str, Any]:
 
 
 def _tick_interval(end: float) -> float:
-    """How far ticks are apart on an axis from 0 to one of the numbers of `_round_up_nicely`: three to five of them."""
+    """Return the tick distance of an axis from 0 to a number of `_round_up_nicely`, for three to five intervals."""
+    # Formatting gives exact keys: 0.3/0.1 is 2.9999... in binary.
     mantissa = float(f"{end:.1e}".partition("e")[0])
     return end / {1.0: 4, 1.5: 3, 2.0: 4, 3.0: 3, 4.0: 4, 5.0: 5, 6.0: 3, 8.0: 4}[mantissa]
 
 
 def _round_up_nicely(value: float) -> float:
-    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten."""
+    """Return the next larger of 1, 1.5, 2, 3, 4, 5, 6, 8, 10 times a power of ten."""
     unit = 10.0 ** math.floor(math.log10(value))
     return next(float(f"{n * unit:.12g}") for n in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if n * unit >= value * (1 - 1e-9))

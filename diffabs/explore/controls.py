@@ -1,4 +1,4 @@
-"""The left column: which scenario, road and controller, and a slider and a field for each number."""
+"""The left column: choice of scenario, road and controller, and a slider and a field for each number."""
 
 import html
 import pathlib
@@ -13,7 +13,7 @@ from diffabs.explore.knobs import SLIDER_STEPS, Knob, unit_words
 from diffabs.explore.session import AS_GIVEN, EXCHANGEABLE_FAMILIES, Session
 from diffabs.scenario.scenario import names
 
-CHANGE_INTERVAL_S = 0.016  # s between events of a slider, a frame of the screen
+CHANGE_INTERVAL_S = 0.016  # interval between events of a slider, one frame of the screen
 MASS, ROAD = "mass", "road"
 
 Turned = Callable[[str, Any, int], None]
@@ -21,29 +21,32 @@ Replaced = Callable[[Callable[[], None]], Awaitable[None]]
 
 
 class Controls:
-    """Sliders and fields of a session's numbers. `turned` hears of each change, `replaced` of what needs all anew."""
+    """Sliders and fields of a session's numbers.
+
+    `turned` is called for each changed number, `replaced` for a change that rebuilds all numbers.
+    """
 
     def __init__(self, session: Session, turned: Turned, replaced: Replaced):
-        """Nothing is on the page yet."""
+        """Prepare the controls of a `session` with the callbacks `turned` and `replaced`; the page stays unchanged."""
         self.session, self._turned, self._replaced = session, turned, replaced
         self.fields: dict[str, Any] = {}
         self.sliders: dict[str, Any] = {}
         self.sources = list(dict.fromkeys([session.source, *names()]))
 
     def build(self) -> None:
-        """Put it into the column that is open."""
+        """Put the controls into the open column."""
         self.message = ui.label().classes("refused").props("data-id=refused")
         self.message.set_visibility(False)
         self.inside = ui.element("div").classes("rows")
         self._fill()
 
     def rebuild(self) -> None:
-        """Show other numbers, or a choice that was refused as it was before."""
+        """Fill the column again from the session: with other numbers, or with the old choice after a refused one."""
         self.inside.clear()
         self._fill()
 
     def show(self, key: str) -> None:
-        """Show a number as it is now."""
+        """Show the current value of the number `key` in its field and slider."""
         knob, value = self.session.knobs[key], self.session.value(key)
         if key in self.fields:
             self.fields[key].props(remove="error")
@@ -52,22 +55,22 @@ class Controls:
             self.sliders[key].set_value(knob.place_of(value))
 
     def show_all(self) -> None:
-        """Show every number as it is now."""
+        """Show the current value of every number."""
         for key in self.fields:
             self.show(key)
 
     def refused(self, line: str) -> None:
-        """Say what cannot be; nothing for an empty line."""
+        """Show why an input was refused; an empty `line` hides the message."""
         self.message.set_text(line)
         self.message.set_visibility(bool(line))
 
     def wrong(self, key: str) -> None:
-        """Mark the field of a number that was refused."""
+        """Mark the field of the refused number `key`."""
         if key in self.fields:
             self.fields[key].props("error")
 
     def fan(self, found: Fan | None) -> None:
-        """Say what the fan is made of."""
+        """Show the number of runs in the fan `found`, and the parameters that differ between them."""
         if found is None:
             self.made.set_text("no fan: nothing differs between its runs")
             return
@@ -81,6 +84,7 @@ class Controls:
             self._spread()
             self._rows(self.session.first)
             rest = [key for key in self.session.knobs if key not in self.session.first]
+            # Rows of the other numbers are built on demand, to keep the page light.
             with (
                 ui.expansion(f"all other numbers ({len(rest)})").classes("w-full").props("dense data-id=others") as more
             ):
@@ -88,7 +92,7 @@ class Controls:
             more.on_value_change(lambda event: self._more(more, rest) if event.value else None)
 
     def _more(self, place: Any, keys: list[str]) -> None:
-        """The other numbers, when somebody looks for them the first time."""
+        """Build the rows of the other numbers when they are opened for the first time."""
         if not any(key in self.fields for key in keys):
             with place:
                 self._rows(keys)
@@ -155,6 +159,7 @@ class Controls:
     def _typed(self, key: str, text: Any) -> None:
         self._turned(key, str(text), 0)
 
+    # The arguments come from the browser, so their types are checked.
     def _dragged(self, key: str, place: Any, edit: Any) -> None:
         knob = self.session.knobs.get(key)
         if knob is None or knob.low is None or not isinstance(place, int | float) or not 0 <= place <= SLIDER_STEPS:

@@ -1,4 +1,4 @@
-"""What is drawn: the signals of a run, panel by panel, and a fan of many runs around them."""
+"""Curves of a run, panel by panel, and a fan of many runs around them."""
 
 import dataclasses
 import math
@@ -18,33 +18,41 @@ from diffabs.simulate.convert import trajectory_columns
 from diffabs.simulate.run import rollout
 from diffabs.simulate.solution import Adaptive, FixedStep, Run, Solver
 
-INSTANTS = 400  # of a curve
-DRAFT_INSTANTS = 200  # instants of a fan: the browser lays all of them out again with every redraw
-MAX_INSTANTS = 4 * INSTANTS  # steps, from which a draft is quicker
+INSTANTS = 400  # number of instants of a curve
+DRAFT_INSTANTS = 200  # number of instants of a fan, few because the browser lays all of them out with every redraw
+MAX_INSTANTS = 4 * INSTANTS  # number of steps above which a draft is quicker
 DRAFT_RTOL = 1e-3  # relative error of a draft's step
-MEMBERS = 200  # of a fan
+MEMBERS = 200  # number of runs of a fan
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-SETTLED_SHARE = 0.05  # of the greatest distance from the end: what is nearer from some instant on has settled
-TRANSIENT_MULTIPLE = 1.5  # times the transient is shown where the time axis is fitted to it
-MIN_TRANSIENT_SHARE = 0.1  # of the members must still run where a fan is drawn
+SETTLED_SHARE = 0.05  # settled: the distance from the target stays below this share of its largest value
+TRANSIENT_MULTIPLE = 1.5  # length of a fitted time axis in transients
+MIN_TRANSIENT_SHARE = 0.1  # a fan is drawn while this share of its runs goes on
 
 
 class Curve(NamedTuple):
-    """A curve: its name, and its values as they are shown, NaN where there is none."""
+    """A curve: its name, and its values in the displayed unit, NaN for missing ones."""
 
     name: str
     values: np.ndarray
 
 
 class Panel(NamedTuple):
-    """Curves of one unit, the first of which has the fan."""
+    """Curves of one unit; the fan belongs to the first curve."""
 
     unit: str
     lines: tuple[Curve, ...]
 
 
 class Curves(NamedTuple):
-    """A run: the instants [s], its panels, its metrics by name, how it ended; a `draft` is made by long steps."""
+    """The curves of a run.
+
+    Attributes:
+        t: Instants [s].
+        panels: Panels of the chart.
+        metrics: Metrics by name.
+        end: Sentence about the end of the run.
+        draft: True for a quick run with long steps.
+    """
 
     t: np.ndarray
     panels: tuple[Panel, ...]
@@ -54,8 +62,15 @@ class Curves(NamedTuple):
 
 
 class Fan(NamedTuple):
-    """Quantiles, (QUANTILES, instants), of the first curve of each panel; how many runs, how many of them diverged, and
-    what differs between them in words."""
+    """Quantiles of many runs.
+
+    Attributes:
+        t: Instants [s].
+        bands: Quantiles of the first curve of each panel, shape (QUANTILES, instants).
+        members: Number of runs.
+        diverged: Number of diverged runs.
+        words: Parameters that differ between the runs, with their spread.
+    """
 
     t: np.ndarray
     bands: tuple[np.ndarray, ...]
@@ -66,20 +81,35 @@ class Fan(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Spread:
-    """How far the members of a fan differ from the values shown, as a fraction: even between less and more."""
+    """Relative half widths of the uniform spread of a fan's members around the current values.
+
+    Attributes:
+        mass: Half width of the mass [1].
+        road: Half width of the friction factor [1].
+    """
 
     mass: float = 0.1
     road: float = 0.2
 
 
 def drawing_solver(chosen: Scenario, instants: int = INSTANTS) -> Solver:
-    """Return the scenario's solver, keeping as many instants as are drawn."""
+    """Return the scenario's solver, set to keep as many instants as are drawn.
+
+    Args:
+        chosen: Scenario.
+        instants: Number of instants to keep.
+    """
     return dataclasses.replace(chosen.solver, every=max(1, math.ceil(chosen.solver.steps / instants)))
 
 
 def draft_solver(chosen: Scenario) -> Solver | None:
-    """Return a solver that is quicker, to draw by while a value is dragged; None where the scenario's own is quick, or
-    a clock in the loop needs its grid."""
+    """Return a quicker solver for the curve during a drag, or None if there is no need or no way.
+
+    There is no need if the scenario's solver is quick. There is no way if a clock in the loop needs the solver's grid.
+
+    Args:
+        chosen: Scenario.
+    """
     own = chosen.solver
     if chosen.loop.ticks or not isinstance(own, FixedStep) or own.steps <= MAX_INSTANTS:
         return None
@@ -87,7 +117,12 @@ def draft_solver(chosen: Scenario) -> Solver | None:
 
 
 def run_curves(chosen: Scenario, by: Solver | None = None) -> Curves:
-    """Return the run of a scenario, by its own solver or another."""
+    """Return the curves of a scenario's run.
+
+    Args:
+        chosen: Scenario.
+        by: Solver of the run; None is the scenario's own.
+    """
     run: Run = jax.device_get(rollout(chosen.loop, by or drawing_solver(chosen), chosen.objectives, key=chosen.key()))
     t, panels = _panels(run, chosen.loop.plant)
     metrics = {name: float(run.metrics[name]) for name in chosen.objectives}
@@ -95,8 +130,15 @@ def run_curves(chosen: Scenario, by: Solver | None = None) -> Curves:
 
 
 def transient_end(found: Curves) -> float:
-    """Return the end [s] of a time axis that fits the transient: 1.5 times the instant after which the first signal
-    stays near its target, or near its last value without a target. A run that does not settle is shown whole."""
+    """Return the end [s] of a time axis that fits the transient.
+
+    It is 1.5 times the instant after which the first signal stays near its target, or without a target near its last
+    value.
+    A run that does not settle is shown whole.
+
+    Args:
+        found: Curves of the run.
+    """
     lines = {line.name: line.values for line in found.panels[0].lines}
     signal = found.panels[0].lines[0].values
     target = lines["target"]
@@ -111,17 +153,24 @@ def transient_end(found: Curves) -> float:
 
 
 def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
-    """Return the fan of many runs whose masses and roads differ, all at once; None where neither is there."""
+    """Return the quantiles of many runs with different masses and roads in one batch, or None if the loop has neither.
+
+    Args:
+        chosen: Scenario.
+        spread: Relative half widths of the spread.
+    """
     values, words = fan_members(chosen, spread)
     if not values:
         return None
     by = draft_solver(chosen) or drawing_solver(chosen, DRAFT_INSTANTS)
     batch = Batch(values, keys=np.arange(MEMBERS) + chosen.seed)
     run: Run = jax.device_get(run_batch(chosen.loop, batch, by, {}, trajectories=True))
+    # Samples after the end of a run, and diverged runs, are no part of the quantiles.
     lost = np.asarray(run.diverged)
     assert run.trajectory is not None
     going = np.asarray(run.trajectory.running) & ~lost[:, None]
     t = np.asarray(run.trajectory.sample.t)
+    # Runs end at different times. The longest one has all instants; few remaining runs give no useful quantiles.
     longest = int(np.argmax(going.sum(axis=1)))
     count = int(np.sum(going.mean(axis=0) >= MIN_TRANSIENT_SHARE * max(1e-9, going[:, 0].mean())))
     shown = [_first_signal(panel) for panel in _layout(run, chosen.loop.plant)]
@@ -130,7 +179,16 @@ def run_fan(chosen: Scenario, spread: Spread) -> Fan | None:
 
 
 def fan_members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray], str]:
-    """Return the values of a fan's members by path, always the same parts of the spread, and what they are in words."""
+    """Return the values of a fan's members by path, and a description of their spread.
+
+    Every call uses the same low-discrepancy points, so the fan does not flicker during a drag. The upper end is limited
+    by
+    the parameter's range.
+
+    Args:
+        chosen: Scenario.
+        spread: Relative half widths of the spread.
+    """
     there = {path: spec for path, spec, _ in parameters(chosen.loop)}
     wanted = {mass_path(chosen): spread.mass, FACTOR_PATH: spread.road}
     wanted = {path: part for path, part in wanted.items() if path in there and part > 0}
@@ -140,6 +198,7 @@ def fan_members(chosen: Scenario, spread: Spread) -> tuple[dict[str, np.ndarray]
         spec, here = there[path], float(get(chosen.loop, path))
         low, high = (here * (1 + sign * part) for sign in (-1, 1))
         middle, half = (low + min(high, spec.high)) / 2, (min(high, spec.high) - low) / 2
+        # unit is in [-1, 1]; a range that is cut at its upper end is filled evenly.
         values[path] = middle + half * unit[:, i]
         name = "friction" if path == FACTOR_PATH else path.rpartition(".")[2].replace("_", " ")
         words.append(f"{name} ± {100 * part:g} %")
@@ -153,7 +212,7 @@ def _quantiles(values: np.ndarray) -> np.ndarray:
 
 
 def _panels(run: Run, plant: Any) -> tuple[np.ndarray, tuple[Panel, ...]]:
-    """The instants of one run, and what is drawn of them."""
+    """Return the instants [s] of one run and its panels, cut at the end of the run."""
     count = len(trajectory_columns(run, plant)["t"][1])
     assert run.trajectory is not None
     cut = tuple(
@@ -164,8 +223,10 @@ def _panels(run: Run, plant: Any) -> tuple[np.ndarray, tuple[Panel, ...]]:
 
 
 def _layout(run: Run, plant: Any) -> list[Panel]:
-    """The first signal with target and setpoint, the next ones of one unit, the control with its command; in full
-    length, of one run or many."""
+    """Return the panels of one run or a batch, in full length.
+
+    They are the first signals with target and setpoint, the signals of the next unit, and the control with its command.
+    """
     assert run.trajectory is not None
     sample = run.trajectory.sample
     groups: dict[str, list[Curve]] = {}

@@ -1,7 +1,8 @@
-"""A factor on a road's friction as a parameter of its own: roads of every kind get slippery by the same slider.
+"""A factor on the friction of any road, as a parameter of its own with one slider.
 
-The road is put into `Scaled` with the factor 1, which changes no bit of a run; what the scenario says of the road's
-parameters then has paths that are one part deeper. A factor that was left at 1 is taken out again."""
+The road is wrapped in `Scaled` with the factor 1, which changes no bit of a run. The paths of the road's parameters in
+the scenario become one level deeper. A factor that stays at 1 is removed again on saving.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -15,8 +16,13 @@ FACTOR_PATH = "plant.road.scale"
 
 
 def with_factor(chosen: Scenario) -> Scenario:
-    """Return the scenario with a friction factor as `plant.road.scale`; the same where there is no road, or one that
-    has a factor."""
+    """Return the scenario with a friction factor at `plant.road.scale`.
+
+    A scenario without a road, or whose road has a factor already, is returned unchanged.
+
+    Args:
+        chosen: Scenario.
+    """
     road = getattr(chosen.loop.plant, "road", None)
     if road is None or isinstance(road, Scaled):
         return chosen
@@ -26,7 +32,12 @@ def with_factor(chosen: Scenario) -> Scenario:
 
 
 def without_factor(chosen: Scenario, given: Scenario) -> Scenario:
-    """Return the scenario without the factor that `with_factor` has put into `given`, if it still is 1."""
+    """Return the scenario without the factor that `with_factor` added, if the factor is still 1.
+
+    Args:
+        chosen: Scenario with current values.
+        given: Scenario from its file, before `with_factor`.
+    """
     road = getattr(chosen.loop.plant, "road", None)
     had = isinstance(getattr(given.loop.plant, "road", None), Scaled)
     if not isinstance(road, Scaled) or had or float(road.scale) != 1.0:

@@ -1,11 +1,12 @@
-"""Who may speak to the explorer: the pages that it has served itself, on this machine.
+"""Access control of the explorer: only pages that it serves itself, on this machine, get an answer.
 
-A server on loopback is reached by every page that the browser has open, and by a name that somebody lets point to
-127.0.0.1. So a request must come from this machine, name the explorer as its host, and if it says which page sent it
-(`Origin`, as every WebSocket of a browser does), that must be the explorer's.
+Every page in the browser can reach a server on loopback. A foreign host name can also point to 127.0.0.1 (DNS
+rebinding). So a request must come from this machine and name the explorer as its host. If it states the page that sent
+it (`Origin`, as every WebSocket of a browser does), this page must be the explorer's.
 
-Who else can log in to this machine could send all that, too. So the address that is printed ends in a token; it is
-exchanged for a cookie at once, and nothing is answered without."""
+Other users of this machine could forge all of this. So the printed address ends in a token. The token is exchanged for
+a cookie at once, and requests without the cookie are refused.
+"""
 
 import http.cookies
 import ipaddress
@@ -22,7 +23,7 @@ LOOPBACK_ADDRESS = "127.0.0.1"
 LOOPBACK_NAMES = (LOOPBACK_ADDRESS, "localhost")
 FOREIGN = "diffabs explore answers only its own page"
 STRANGER = "diffabs explore: the token is missing or wrong; open the whole address that the command has printed"
-# Nothing from elsewhere is loaded, whatever a page asks for; scripts in the page are those of the framework.
+# The browser loads nothing from other hosts. Inline scripts are allowed because the framework needs them.
 POLICY = (
     "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' ws://127.0.0.1:* ws://localhost:*; "
@@ -31,39 +32,42 @@ POLICY = (
 
 
 class Guard:
-    """An ASGI application that lets through to another what is allowed, and answers 403 to the rest."""
+    """An ASGI application that forwards allowed requests to another application and answers 403 to the rest."""
 
     def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], port: int, token: str):
-        """`port` is that of the explorer; `token` is what its user knows."""
+        """Protect `app`, served at `port`, with the secret `token` of its user."""
         self.app, self.hosts = app, {f"{name}:{port}" for name in LOOPBACK_NAMES}
-        self.token, self.cookie = token, f"diffabs-explore-{port}"  # a browser sends a cookie to every port of a host
+        # A browser sends a cookie to every port of a host, so the port is in its name.
+        self.token, self.cookie = token, f"diffabs-explore-{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
+        """Forward a request, exchange its token for the cookie, or refuse it."""
         if scope["type"] == "lifespan" or (self.allowed(scope) and self.known(scope)):
             await self.app(scope, receive, _with_policy(send) if scope["type"] == "http" else send)
         elif scope["type"] == "websocket":
+            # A close before the accept refuses the handshake with 403.
             await receive()
             await send({"type": "websocket.close", "code": 1008})
         elif not self.allowed(scope):
             await _answer(send, 403, FOREIGN)
         elif self._same(urllib.parse.parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [])):
             cookie = f"{self.cookie}={self.token}; Path=/; HttpOnly; SameSite=Lax"
-            # There is one page. The path of the request could name another host ("//name") or end the header.
+            # "/" is the only page. The request's own path is unsafe: "//name" is a host, a line break ends the header.
             await _answer(send, 303, "", (b"location", b"/"), (b"set-cookie", cookie.encode()))
         else:
             await _answer(send, 403, STRANGER)
 
     def allowed(self, scope: Mapping[str, Any]) -> bool:
-        """Whether a request comes from this machine and from a page of the explorer."""
+        """Return whether the request with this `scope` comes from this machine and from a page of the explorer."""
         given = _headers(scope)
         host, origin = given.get(b"host", []), given.get(b"origin", [])
         here = len(host) == 1 and host[0] in self.hosts
+        # Requests without Origin pass: a browser omits it for the navigation to the page.
         own = origin in ([], [f"http://{host[0]}"]) if here else False
         return here and own and _loopback(scope.get("client"))
 
     def known(self, scope: Mapping[str, Any]) -> bool:
-        """Whether a request has the cookie for which the token was exchanged."""
+        """Return whether the request with this `scope` has the cookie that replaces the token."""
         given = []
         for line in _headers(scope).get(b"cookie", []):
             try:
@@ -73,6 +77,7 @@ class Guard:
             given += [found.value] if found else []
         return self._same(given)
 
+    # compare_digest takes the same time for every guess, so timing does not reveal the token.
     def _same(self, given: list[str]) -> bool:
         return len(given) == 1 and secrets.compare_digest(given[0].encode(), self.token.encode())
 

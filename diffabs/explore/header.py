@@ -1,4 +1,4 @@
-"""The head of the page: its name, how long the last curve took, and what may be done with the run that is shown."""
+"""The head of the page: its name, the latency of the last curve, and the buttons for the current run."""
 
 from typing import TYPE_CHECKING
 
@@ -9,7 +9,11 @@ if TYPE_CHECKING:
 
 
 def add_header(page: "Page") -> None:
-    """Put it into the element that is open."""
+    """Put the header into the open element.
+
+    Args:
+        page: Page with the run that the buttons act on.
+    """
     with ui.element("header"):
         ui.label("diffabs").classes("brand")
         ui.label("explore").classes("brand thin")

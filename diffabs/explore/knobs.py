@@ -1,4 +1,4 @@
-"""What can be turned: every number of a loop, with a name, a unit, its range, and the ends of its slider."""
+"""Adjustable numbers of a loop, each with a name, a unit, a range, and the ends of its slider."""
 
 import dataclasses
 import math
@@ -15,24 +15,30 @@ from diffabs.scenario.parameter_paths import canonical_path
 from diffabs.scenario.registry import KMH
 from diffabs.scenario.scenario import Scenario
 
-SLIDER_STEPS = 1000  # of a slider, end to end
-LOGARITHMIC_RATIO = 10.0  # a slider over so many times its lower end is logarithmic
-SLIDER_RATIO = 2.0  # how many times more, and less, than its value a number without a range can be dragged to
-NARROW_RATIO = 1.25  # beyond the range of a scenario a slider goes on to so many times its value
-SPEED_FIELDS = ("speed", "reference_speed")  # of a vehicle, in km/h
-FILTERS = ("time_constant", "cutoff")
-LIMITS = ("torque_min", "torque_max", "low", "high", "reference_speed", "period")  # of a controller, hardly dragged
-MOST_FIRST = 14
+SLIDER_STEPS = 1000  # number of steps of a slider
+LOGARITHMIC_RATIO = 10.0  # a slider is logarithmic if its ends differ by this factor or more
+SLIDER_RATIO = 2.0  # a number without a range in the scenario can be dragged to its value times and over this factor
+NARROW_RATIO = 1.25  # a slider with a range also covers the value times and over this factor
+SPEED_FIELDS = ("speed", "reference_speed")  # fields of a vehicle that are shown in km/h
+FILTERS = ("time_constant", "cutoff")  # parameters of filters, shown at once
+LIMITS = ("torque_min", "torque_max", "low", "high", "reference_speed", "period")  # of controllers: rarely dragged
+MOST_FIRST = 14  # number of sliders that are shown at once
 
 
 @dataclasses.dataclass(frozen=True)
 class Knob:
     """A single number of the loop.
 
-    path: of the parameter in the loop; place: in it, if that is a list
-    name: as scenarios and messages have it; group, label: as the page has it
-    spec: unit and range as shown, `scale` times SI
-    low, high: ends of the slider, as shown; None where the number has no sensible ones
+    Attributes:
+        path: Path of the parameter in the loop.
+        place: Index in the parameter if it is a list, else None.
+        name: Name in scenarios and messages.
+        group: Heading on the page.
+        label: Label on the page.
+        spec: Displayed unit and range.
+        scale: Displayed value per SI value.
+        low: Lower end of the slider in the displayed unit, or None without a sensible one.
+        high: Upper end of the slider in the displayed unit, or None without a sensible one.
     """
 
     path: str
@@ -47,11 +53,15 @@ class Knob:
 
     @property
     def key(self) -> str:
-        """Its own path."""
+        """Path of this number, with its index in a list."""
         return self.path if self.place is None else f"{self.path}.{self.place}"
 
     def read(self, given: Any) -> float:
-        """Return what was typed or dragged, in SI. Raises ScenarioError that names the field, value, range and unit."""
+        """Return a typed or dragged value, `given` in the displayed unit, in SI.
+
+        Raises:
+            ScenarioError: The value is not a number in the range; the message names field, value, range and unit.
+        """
         if isinstance(given, str):
             try:
                 given = float(given.strip())
@@ -60,11 +70,11 @@ class Knob:
         return read_number_in_range(given, self.spec, self.name) / self.scale
 
     def text(self, value: float) -> str:
-        """Return a value [SI] as it is shown."""
+        """Return a `value` [SI] as text in the displayed unit."""
         return f"{value * self.scale:.6g}"
 
     def place_of(self, value: float) -> float:
-        """Return where on the slider, of `SLIDER_STEPS`, a value [SI] is, at an end for what is beyond."""
+        """Return the slider position, 0 to `SLIDER_STEPS`, of a `value` [SI]; values outside are put at an end."""
         if self.low is None or self.high is None or not math.isfinite(value):
             return 0.0
         low, high, at = self._line(self.low), self._line(self.high), value * self.scale
@@ -73,15 +83,16 @@ class Knob:
         return float(np.clip(SLIDER_STEPS * (self._line(at) - low) / (high - low), 0, SLIDER_STEPS))
 
     def value_at(self, place: float) -> float:
-        """Return the value [SI] at a place of the slider."""
+        """Return the value [SI] at a slider position `place`, 0 to `SLIDER_STEPS`."""
         assert self.low is not None
         assert self.high is not None
         part = place / SLIDER_STEPS
+        # The ends are exact: exp(log(x)) would round them out of the range.
         if part in (0.0, 1.0):
             return (self.high if part else self.low) / self.scale
         on = self._line(self.low) * (1 - part) + self._line(self.high) * part
         shown = math.copysign(math.exp(abs(on) if self.low > 0 else -on), self.low) if self._logarithmic else on
-        return float(f"{shown:.5g}") / self.scale  # what is shown is what is run
+        return float(f"{shown:.5g}") / self.scale  # rounded, so that the displayed value is the simulated one
 
     @property
     def _logarithmic(self) -> bool:
@@ -91,29 +102,49 @@ class Knob:
         return max(abs(low), abs(high)) >= LOGARITHMIC_RATIO * min(abs(low), abs(high))
 
     def _line(self, shown: float) -> float:
-        """Where a number lies on the line on which the slider is even."""
+        """Return the coordinate of a displayed value in which the slider is linear."""
         return math.copysign(math.log(abs(shown)), shown) if self._logarithmic else shown
 
 
 def knobs(chosen: Scenario) -> dict[str, Knob]:
-    """Return every number of a scenario's loop by its path."""
+    """Return every number of a scenario's loop by its key.
+
+    Args:
+        chosen: Scenario.
+    """
     found = (knob for path, spec, value in parameters(chosen.loop) for knob in _knob(chosen, path, spec, value))
     return {knob.key: knob for knob in found}
 
 
 def is_vehicle(plant: Any) -> bool:
-    """Return whether a plant shows the speed of a wheel, so that a person reads its speeds in km/h."""
+    """Return whether a plant shows the speed of a wheel; such a plant's speeds are displayed in km/h.
+
+    Args:
+        plant: Plant of a loop.
+    """
     return "wheel_speed" in plant.shows.units
 
 
 def unit_words(unit: str) -> str:
-    """Return a unit as the page shows it; nothing for plain numbers."""
+    """Return a unit as the page shows it, or "" for plain numbers.
+
+    Args:
+        unit: Unit as in `Spec`.
+    """
     return "" if unit == "1" else unit.replace("^2", "²")
 
 
 def first_knobs(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
-    """Return the numbers that are shown at once: mass, speed, friction, what the scenario tunes, filters, gains; then
-    what it varies."""
+    """Return the keys of the numbers that the page shows at once.
+
+    In order of priority they are mass, speed, friction, tuned parameters, filters, gains, and parameters that the
+    scenario
+    varies.
+
+    Args:
+        chosen: Scenario.
+        known: Numbers of its loop by key.
+    """
     tune, over = chosen.tune, [*chosen.design.over, *chosen.tune.over, *chosen.sweep.over]
     paths = [*filter(None, (mass_path(chosen),)), "initial.speed", FACTOR_PATH, *tune.free]
     paths += [knob.path for knob in known.values() if knob.path.rpartition(".")[2] in FILTERS]
@@ -128,8 +159,15 @@ def first_knobs(chosen: Scenario, known: Mapping[str, Knob]) -> list[str]:
 
 
 def mass_path(chosen: Scenario) -> str | None:
-    """Return the path of the mass that differs from one vehicle or rider to the next: one that the scenario varies,
-    else the plant's first, else its first moment of inertia; None where there is neither."""
+    """Return the path of the mass that differs between vehicles or riders, or None.
+
+    A mass that the scenario varies has priority over the plant's first one. A loop without a mass gives a moment of
+    inertia
+    by the same rule.
+
+    Args:
+        chosen: Scenario.
+    """
     over = {*chosen.design.over, *chosen.tune.over, *chosen.sweep.over}
     for unit in ("kg", "kg m^2"):
         there = [path for path, spec, value in parameters(chosen.loop) if spec.unit == unit and not np.ndim(value)]
@@ -139,6 +177,7 @@ def mass_path(chosen: Scenario) -> str | None:
 
 
 def _knob(chosen: Scenario, path: str, spec: Spec, value: Any) -> Iterator[Knob]:
+    """Yield the numbers of one parameter; a matrix has none."""
     tail = path.rpartition(".")[2]
     scale = KMH if spec.unit == "m/s" and tail in SPEED_FIELDS and is_vehicle(chosen.loop.plant) else 1.0
     name = canonical_path(path) + ("_kmh" if scale != 1.0 else "")
@@ -147,7 +186,7 @@ def _knob(chosen: Scenario, path: str, spec: Spec, value: Any) -> Iterator[Knob]
     label = "friction factor" if path == FACTOR_PATH else label
     values = np.asarray(value, float)
     if values.ndim > 1:
-        return  # nobody drags the entries of a matrix
+        return  # a matrix has no sliders
     for place in np.ndindex(values.shape):
         at = place[0] if place else None
         suffix = "" if at is None else f".{at}"
@@ -159,7 +198,7 @@ def _knob(chosen: Scenario, path: str, spec: Spec, value: Any) -> Iterator[Knob]
 
 
 def _range_in_scenario(chosen: Scenario, path: str, place: int | None, scale: float) -> tuple[float, float] | None:
-    """The range in which the scenario tunes or varies a parameter, as shown."""
+    """Return the range in which the scenario tunes or varies a parameter, in the displayed unit, or None."""
     tuned, varied = chosen.tune.free.get(path), chosen.design.over.get(path)
     values = chosen.tune.over.get(path)
     found = tuned or varied or ((min(values), max(values)) if values else None)
@@ -171,7 +210,7 @@ def _range_in_scenario(chosen: Scenario, path: str, place: int | None, scale: fl
 
 
 def _slider_ends(spec: Spec, value: float, given: tuple[float, float] | None) -> tuple[float | None, float | None]:
-    """Ends of a slider that has the value inside, and does not leave the range."""
+    """Return the ends of a slider that contains the value and stays in the range, or (None, None)."""
     if not math.isfinite(value):
         return None, None
     around = sorted((value / SLIDER_RATIO, value * SLIDER_RATIO)) if value else [-1.0, 1.0]
@@ -180,6 +219,7 @@ def _slider_ends(spec: Spec, value: float, given: tuple[float, float] | None) ->
     ends = [*around] if given is None else [*given, value * NARROW_RATIO, value / NARROW_RATIO]
     low, high = max(min(ends), spec.low), min(max(ends), spec.high)
     span = high - low
+    # An open end is no valid value, so the slider stops short of it.
     low = low + 1e-3 * span if spec.open_low and low == spec.low else low
     high = high - 1e-3 * span if spec.open_high and high == spec.high else high
     return (low, high) if low < high else (None, None)

@@ -1,4 +1,4 @@
-"""What the page looks like, and the few lines that run in the browser."""
+"""Style sheet of the page, and the script that runs in the browser."""
 
 STYLE = """
 body { background: #F3F5F7; color: #1F2933; font-family: 'Inter', 'Roboto', system-ui, sans-serif; font-size: 13px; }
@@ -66,7 +66,8 @@ body { background: #F3F5F7; color: #1F2933; font-family: 'Inter', 'Roboto', syst
 .nicegui-echart { padding: 0; }
 """
 
-# When a number is changed in the browser, and when a curve of that, or of a later change, has been painted.
+# Measures the latency of the page: from an edit in the browser until a curve of this edit, or a later one, is painted.
+# A message posted in requestAnimationFrame arrives after the paint of that frame.
 SCRIPT = """
 window.explorer = {
   edit: 0, at: {}, times: [], last: 0,

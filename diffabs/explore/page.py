@@ -1,4 +1,4 @@
-"""The page: sliders on the left, curves in the middle, what is known of the loop on the right. One for each tab."""
+"""The page of one tab: sliders on the left, curves in the middle, verdict, poles and metrics on the right."""
 
 import asyncio
 import math
@@ -23,27 +23,32 @@ from diffabs.explore.tuner import Tuner
 from diffabs.explore.work import NewestJobThread
 from diffabs.scenario.scenario import Scenario
 
-QUICK_JOB_S = 0.05  # s that a result may take to be followed while one drags
-TICK = 0.004  # s between two looks whether the curve is there
-REST = 0.15  # s without a change, after which everything is worked out
-PROVING = 0.35  # and after which a proof is looked for
+QUICK_JOB_S = 0.05  # s; quicker computations are repeated during a drag
+TICK = 0.004  # s between two checks for the curve
+REST = 0.15  # s without a change before all results are computed
+PROVING = 0.35  # s without a change before a proof is attempted
 
 
 class Page:
-    """What one tab shows. Everything but what is said to run in a thread runs in the server's."""
+    """The contents of one tab. All methods run in the server's thread, except the section at the end that is marked."""
 
     def __init__(self, session: Session, tools: Tools, folder: pathlib.Path, thread: str):
-        """Of a session; `thread` is the name of those that work."""
+        """Prepare the page of a `session`.
+
+        `tools` are the functions that need extras, `folder` is the folder for saved files, and `thread` is the name of
+        the
+        worker threads.
+        """
         self.session, self.tools = session, tools
         self.client, self.server = ui.context.client, asyncio.get_running_loop()
         self.version, self.turned_at = 0, 0.0
-        self.since = 0  # the first version of this scenario
+        self.since = 0  # first version of this scenario; results of earlier ones are dropped
         self.costs: dict[str, float] = {}
         self.shown: curves.Curves | None = None
-        self.objected = 0  # the version that followed a refusal, whose line stays
-        self.drawn = 0  # the newest version whose curve was made, or that was refused
-        self.around: stability.CornerLoops | None = None  # the corners that were looked at last
-        self.surrounded = False  # whether they belong to what is shown
+        self.objected = 0  # version after a refusal, whose message stays
+        self.drawn = 0  # newest version with a curve or a refusal
+        self.around: stability.CornerLoops | None = None  # corners computed last
+        self.surrounded = False  # whether they belong to the current loop
         self.drawer, self.thinker = (NewestJobThread(thread, self._failed) for _ in range(2))
         self.controls = Controls(session, self._turned, self._replaced)
         self.results = ResultsPanel()
@@ -53,7 +58,7 @@ class Page:
         self.client.on_delete(self.end)
 
     def build(self) -> None:
-        """Put everything on the page, and begin to compute."""
+        """Put all elements on the page, and start to compute."""
         with ui.element("div").classes("explorer") as self.body:
             add_header(self)
             with ui.element("main").classes("columns"):
@@ -81,8 +86,10 @@ class Page:
         self.redraw()
 
     def redraw(self, edit: int = 0, key: str = "") -> None:
-        """Compute anew, from the values as they are now; `edit` is the browser's number of what was changed, which was
-        `key` if it has not been judged."""
+        """Compute everything again from the current values.
+
+        `edit` is the browser's number of the user's edit. `key` is the edited number if it is not yet checked, else "".
+        """
         self.version += 1
         self.turned_at = time.monotonic()
         now = self.session.scenario()
@@ -91,47 +98,48 @@ class Page:
         self.thinker.ask(partial(self._think, now, self.version))
 
     def later(self, show: Callable[..., None], *given: Any) -> None:
-        """Show a result, from a thread."""
+        """Call show(*given) in the server's thread; for use in worker threads."""
 
         def do() -> None:
             if not self.client.is_deleted:
                 with self.client:
                     show(*given)
 
+        # The page's elements may be changed in the server's thread only.
         self.server.call_soon_threadsafe(do)
 
     def pin(self, found: curves.Curves | None) -> None:
-        """Keep a run as what there was before, or none."""
+        """Show the run `found` as the dashed curve to compare with; None removes it."""
         if self.chart is not None:
             change = charts.change_curves(found, "before") if found else charts.clear_curves("before")
             self.chart.change(change)
 
     def show_until_settled(self, *, whole: bool) -> None:
-        """Fit the time axis to the transient of the run that is shown, or to the whole run."""
+        """Fit the time axis to the transient of the current run, or with `whole` to the whole run."""
         if self.chart is not None and self.shown is not None:
             self.chart.change(charts.change_time_axis(None if whole else curves.transient_end(self.shown)))
 
     def refused(self, error: Exception | None) -> None:
-        """Say why something cannot be, or that all is well."""
+        """Show the message of an `error`; None hides it."""
         self.controls.refused("" if error is None else _sentence(error))
 
     def reset(self) -> None:
-        """All numbers as in the scenario."""
+        """Set all numbers back to the scenario's values."""
         self.session.reset()
         self.refused(None)
         self.controls.show_all()
         self.redraw()
 
     def end(self) -> None:
-        """The tab is gone."""
+        """Stop all threads of a closed tab."""
         self.version += 1
         self.drawer.end()
         self.thinker.end()
         self.tuner.end()
 
-    # In the server's thread.
+    # Methods that run in the server's thread.
     def _turned(self, key: str, given: Any, edit: int) -> None:
-        """A number was dragged or typed."""
+        """Apply a dragged or typed number."""
         try:
             self.session.put(key, given)
         except ScenarioError as error:
@@ -142,8 +150,10 @@ class Page:
         self.redraw(edit, key)
 
     def _objected(self, key: str, error: ScenarioError, version: int) -> None:
-        """A loop with this number must not be run: the last one that may is back, and with it numbers that were not
-        judged alone."""
+        """Refuse a number whose loop must not be run, and return to the last accepted numbers.
+
+        Edits after the last accepted numbers were not checked on their own; they are withdrawn, too.
+        """
         if version != self.version:
             return
         self.refused(error)
@@ -151,14 +161,15 @@ class Page:
         for other in self.session.withdraw():
             if other != key:
                 self.controls.show(other)
-        self.version += 1  # what is still to be worked out is that of the numbers that are back
+        # A new version discards pending results of the refused number.
+        self.version += 1
         self.objected = self.drawn = self.version
         if self.shown is not None and not self.shown.draft:
             self.results.metrics(self.shown.metrics, fresh=True)
         self.thinker.ask(partial(self._think, self.session.scenario(), self.version))
 
     async def _replaced(self, change: Callable[[], None]) -> None:
-        """Another scenario, another part, or another fan, with numbers of their own."""
+        """Apply a change of scenario, part or fan, and build the controls again."""
         try:
             await asyncio.to_thread(change)
         except ScenarioError as error:
@@ -204,13 +215,13 @@ class Page:
         if version == self.version:
             self.results.verdict(found)
 
-    # In threads.
+    # Methods that run in worker threads. They reach the page through `later` only.
     def _failed(self, error: Exception) -> None:
-        """Show once what nobody foresaw; nothing goes on computing."""
+        """Show an unexpected error once; its job ends."""
         self.later(self._gave_up, error)
 
     def _draw(self, now: Scenario, version: int, edit: int, key: str) -> None:
-        """The curve, if the number that was turned, `key`, may be."""
+        """Compute and send the curve, after a check of the edited number `key`."""
         try:
             if key:
                 self.session.judge(key, now)
@@ -218,13 +229,17 @@ class Page:
         except ScenarioError as error:
             self.later(self._objected, key, error, version)
         finally:
+            # Also after an error: `_think` waits for this version.
             self.drawn = version
 
     def _send(self, found: curves.Curves, now: Scenario, version: int, edit: int = 0) -> None:
         self.later(self._show_curves, found, now, encode_change(charts.change_curves(found)), version, edit)
 
     def _think(self, now: Scenario, version: int) -> None:
-        """Everything but the curve, which comes first: what is quick while one drags, the rest when one has stopped."""
+        """Compute everything except the curve: quick results during a drag, the others after a rest.
+
+        The curve is computed first, in another thread.
+        """
         if not self._curve_is_there(version):
             return
         steps = {"poles": self._poles, "fan": self._fan}
@@ -242,35 +257,38 @@ class Page:
             self._poles(now, version, corners=True)
         if self._rested(PROVING, version):
             self.later(self._show_verdict, self._proved(now), version)
-        objections(now)  # compiled now, while nobody waits
+        objections(now)  # compiles the check now, before the next edit needs it
 
     def _timed(self, name: str, step: Callable[[Scenario, int], bool], now: Scenario, version: int) -> None:
         begun = time.monotonic()
         useful = step(now, version)
+        # Without a result the step counts as slow, so that a drag does not repeat it.
         self.costs[name] = time.monotonic() - begun if useful else math.inf
 
     def _curve_is_there(self, version: int) -> bool:
-        """Wait until the curve is drawn; whether nothing was changed meanwhile."""
+        """Wait until the curve is drawn, and return whether nothing has changed in the meantime."""
         while version == self.version and self.drawn < version:
             time.sleep(TICK)
         return version == self.version
 
     def _rested(self, seconds: float, version: int) -> bool:
-        """Wait until nothing was changed for so long; whether nothing was."""
+        """Wait until nothing has changed for some seconds, and return whether this version is still the newest."""
         while version == self.version and (left := self.turned_at + seconds - time.monotonic()) > 0:
             time.sleep(min(left, 0.02))
         return version == self.version
 
     def _poles(self, now: Scenario, version: int, *, corners: bool = False) -> bool:
-        """Show poles and margins of this loop, with the corners that are known or, on request, with its own. Return
-        whether there were any."""
+        """Show poles and margins of this loop, and return whether there are any.
+
+        The corners are the cached ones, or with `corners` they are computed for this loop.
+        """
         found: Any
         try:
             if corners:
                 self.around = stability.linearise_corners(now, self.around)
             found = stability.linear_stability(now, self.around)
             self.surrounded = self.around is not None and self.around.of == stability.corners_of(now)
-        except Exception as error:  # whatever it is, the card shows it and computes no longer
+        except Exception as error:  # the card shows every error, and the thread goes on
             found, self.surrounded = _sentence(error), True
         self.later(self._show_stability, found, version, self.surrounded)
         return not isinstance(found, str)
@@ -283,18 +301,25 @@ class Page:
     def _proved(self, now: Scenario) -> ProofVerdict:
         try:
             return self.tools.prove(now)
-        except Exception as error:  # whatever it is, the card shows it and computes no longer
+        except Exception as error:  # the card shows every error, and the thread goes on
             return ProofVerdict(NOT_PROVED, _sentence(error))
 
 
 def _sentence(error: Exception) -> str:
-    """The message of an error in one line; of one that is no refusal with its kind, for a report of the fault."""
+    """Return an error's message in one line, with the type of an unexpected error for a bug report."""
     words = " ".join(str(error).split())
     return words if isinstance(error, (ValueError, ArithmeticError)) and words else f"{type(error).__name__}: {words}"
 
 
 async def show(source: str, tools: Tools, folder: pathlib.Path, thread: str) -> None:
-    """Fill the page of a tab that was just opened."""
+    """Fill the page of a newly opened tab.
+
+    Args:
+        source: Path or name of the scenario.
+        tools: Functions that need extras.
+        folder: Folder for saved files.
+        thread: Name of the worker threads.
+    """
     ui.add_css(STYLE)
     ui.add_head_html(f"<script>{SCRIPT}</script>")
     ui.colors(primary=charts.BLUE)
@@ -303,7 +328,7 @@ async def show(source: str, tools: Tools, folder: pathlib.Path, thread: str) -> 
     await client.connected()
     try:
         session = await asyncio.to_thread(Session, source)
-    except ScenarioError as error:  # of a file that has changed since the command began
+    except ScenarioError as error:  # the file has changed since the command started
         waiting.set_text(str(error))
         return
     if client.is_deleted:

@@ -1,4 +1,4 @@
-"""The right column: the verdict, the map of poles, margins, and what was measured on the run."""
+"""The right column: verdict, map of poles, margins, and metrics of the run."""
 
 import math
 from typing import Any
@@ -28,19 +28,23 @@ MARGINS = {
 
 
 NO_VALUE = "-"
-DISPLAY_ROUNDING = 1e-12
+DISPLAY_ROUNDING = 1e-12  # smaller magnitudes are shown as 0
 
 
 def format_metric(value: float) -> str:
-    """Return a metric as it is shown, without digits that are rounding errors."""
+    """Return a metric as text, without digits that are rounding errors.
+
+    Args:
+        value: Metric; NaN is shown as "-".
+    """
     return NO_VALUE if math.isnan(value) else "0" if abs(value) < DISPLAY_ROUNDING else f"{value:.5g}"
 
 
 class ResultsPanel:
-    """What is known of the loop as it is now; what is being computed is pale, and says so."""
+    """The current results of the loop; results that are being computed again are marked."""
 
     def build(self) -> None:
-        """Put it into the column that is open."""
+        """Put the panel into the open column."""
         self._verdict_card()
         self._pole_card()
         with ui.element("div").classes("card-title"):
@@ -50,7 +54,7 @@ class ResultsPanel:
         self.numbers.props("data-id=metrics")
 
     def begin(self, chosen: Scenario) -> None:
-        """Another scenario."""
+        """Prepare the panel for another scenario, `chosen`."""
         self.units = {name: unit_of(one, chosen.loop.plant) for name, one in chosen.objectives.items()}
         self.verdict_box.classes(replace="verdict stale")
         control = charts.QUANTITIES.get(chosen.loop.plant.control_unit, "control")
@@ -67,24 +71,27 @@ class ResultsPanel:
                 ui.label(unit_words(unit)).classes("note")
 
     def wait(self) -> None:
-        """Everything is out of date."""
+        """Mark all results as out of date."""
         for busy in (self.proving, self.solving, self.measuring):
             busy.set_visibility(True)
         self.verdict_box.classes(add="stale")
 
     def stop_waiting(self) -> None:
-        """Nothing is computed any more."""
+        """Remove the marks of computations that have ended."""
         for busy in (self.proving, self.solving, self.measuring):
             busy.set_visibility(False)
 
     def metrics(self, found: dict[str, float], *, fresh: bool) -> None:
-        """Show what was measured."""
+        """Show the metrics `found`; `fresh` says that they belong to the current numbers."""
         self.measuring.set_visibility(not fresh)
         for name, value in found.items():
             self.cells[name].set_text(format_metric(value))
 
     def stability(self, found: Stability | str, *, fresh: bool) -> None:
-        """Show poles and margins, or why there are none."""
+        """Show poles and margins, or the reason why there are none.
+
+        `found` is the stability or the reason as text. `fresh` says that it belongs to the current numbers.
+        """
         self.solving.set_visibility(not fresh)
         one = None if isinstance(found, str) else found
         self.map.change(charts.change_poles(one))
@@ -96,7 +103,7 @@ class ResultsPanel:
         self.loop.set_text("" if one is None else "stable" if one.stable else "NOT STABLE")
 
     def verdict(self, found: ProofVerdict) -> None:
-        """Show what can be proved."""
+        """Show the verdict `found` of the proof."""
         self.proving.set_visibility(False)
         self.verdict_box.classes(replace=f"verdict {found.word}")
         self.word.set_text(HEADS.get(found.word, "no verdict"))
@@ -133,7 +140,7 @@ class ResultsPanel:
 
     @staticmethod
     def _of_poles(found: Stability) -> str:
-        """What the map and the worst margins are about."""
+        """Return a line about the map: sampling, delay, and the corners behind the worst margins."""
         kind = f"sampled every {1e3 * found.period:g} ms, shown as ln(z)/T" if found.period else "continuous time"
         late = f", {1e3 * found.delay:g} ms of delay" if found.delay else ""
         lost = f", {found.unstable} NOT stable" if found.unstable else ""

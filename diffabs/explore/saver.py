@@ -1,4 +1,4 @@
-"""The dialog that saves."""
+"""The dialog that saves the explored scenario."""
 
 import pathlib
 import shlex
@@ -12,10 +12,10 @@ from diffabs.explore.session import Session
 
 
 class Saver:
-    """Asks for a name, and writes the scenario as it is shown into the folder of the command."""
+    """A dialog that asks for a file name and writes the current scenario into the folder of the command."""
 
     def __init__(self, session: Session, folder: pathlib.Path):
-        """Nothing is on the page yet."""
+        """Prepare the dialog for a `session`, whose files are written into `folder`; the page stays unchanged."""
         self.session, self.folder = session, folder
 
     def ask(self) -> None:

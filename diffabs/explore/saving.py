@@ -1,4 +1,4 @@
-"""A scenario as it was explored, as a file that the command line runs."""
+"""An explored scenario as a file that the command line runs."""
 
 import os
 import pathlib
@@ -7,27 +7,32 @@ from diffabs.core import files
 from diffabs.core.values import ScenarioError, format_given
 from diffabs.scenario.scenario import Scenario, dump, loads
 
-MAX_NAME_LENGTH = 120  # characters of a name
+MAX_NAME_LENGTH = 120  # characters, with the suffix
 
 
 def save_scenario(chosen: Scenario, folder: pathlib.Path, name: str, *, replacing: bool = False) -> pathlib.Path:
-    """Write a scenario to a file in a folder, whole or not at all, and return its path.
+    """Write a scenario to a file atomically, and return its path.
 
-    name: of the file; it ends in .toml and leads to no other folder
-    replacing: whether a file of that name may be replaced; else it is left as it is
+    Args:
+        chosen: Scenario with its current numbers.
+        folder: Folder of the file.
+        name: Name of the file, without folders, with the suffix .toml.
+        replacing: Whether a file of that name may be replaced; else it stays unchanged.
 
-    Raises ScenarioError for such a file, a name that is none, a scenario that would not run, a folder that cannot be
-    written."""
+    Raises:
+        ScenarioError: The file exists and must not be replaced, or the name is not valid.
+        ScenarioError: The command line would refuse the scenario, or the folder cannot be written.
+    """
     path = folder / _check_name(name)
     text = dump(chosen).encode()
-    loads(text, path.stem, path.name)  # as the command line would
+    loads(text, path.stem, path.name)  # raises ScenarioError if the command line would refuse the text
     try:
         if replacing and path.is_file():
             files.write_file(path, text)
         else:
             with files.temporary_path(path.with_name(f".{path.stem}.{os.getpid()}.tmp")) as temporary:
                 temporary.write_bytes(text)
-                os.link(temporary, path)  # unlike a rename it replaces nothing
+                os.link(temporary, path)  # a link fails if the path exists; a rename would replace it
     except FileExistsError:
         raise ScenarioError(
             f"file = {format_given(path.name)} exists: choose another name, or allow to replace it"
@@ -38,7 +43,12 @@ def save_scenario(chosen: Scenario, folder: pathlib.Path, name: str, *, replacin
 
 
 def free_name(folder: pathlib.Path, stem: str) -> str:
-    """Return a name that no file in the folder has."""
+    """Return a file name that does not exist in the folder.
+
+    Args:
+        folder: Folder to search.
+        stem: Beginning of the name.
+    """
     names = (f"{stem}{'' if i == 1 else f'-{i}'}.toml" for i in range(1, 10_000))
     return next(name for name in names if not (folder / name).exists())
 

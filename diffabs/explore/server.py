@@ -20,15 +20,22 @@ from diffabs.explore import page
 from diffabs.explore.guard import LOOPBACK_ADDRESS, Guard
 from diffabs.explore.session import Tools
 
-SHUTDOWN_S = 1  # s that open pages may take to say good-bye
+SHUTDOWN_S = 1  # s that open pages have to close their connections
 WORKER_NAME = "diffabs worker"
-THREAD_SWITCH_S = (
-    5e-4  # s that a thread that thinks keeps one that draws from Python; 5e-3 by default, many times for a curve
-)
+# Python's interval between thread switches. At the default of 5e-3 s a busy thread delays every curve several times.
+THREAD_SWITCH_S = 5e-4
 
 
 def listen_on_loopback(port: int) -> socket.socket:
-    """Return a socket that listens on loopback at a port, or at any free one for 0. Raises OSError if it is taken."""
+    """Return a socket that listens on the loopback address.
+
+    Args:
+        port: Port; 0 is any free one.
+
+    Raises:
+        OSError: The port is in use.
+    """
+    # The socket listens before the server starts, so that a port in use is reported at once.
     there = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         there.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -50,12 +57,20 @@ def serve(
     ready: Callable[[str], None] = lambda url: None,
     browser: bool = False,
 ) -> None:
-    """Show a scenario to whoever opens the page, a session for each tab, until the process is asked to end.
+    """Serve the page of a scenario, with one session for each tab, until the process is interrupted.
 
-    folder: into which is saved; thread: the name of threads that work
-    there: a socket that listens; ready: told the address when the server answers; browser: whether to open the page
+    Args:
+        source: Path or name of the scenario.
+        tools: Functions that need extras.
+        folder: Folder for saved files.
+        there: Socket that listens.
+        thread: Name of the worker threads.
+        ready: Callback with the address as soon as the server answers.
+        browser: Whether to open the page in the browser.
 
-    Raises OSError if the server does not start."""
+    Raises:
+        OSError: The server does not start.
+    """
     port, token = there.getsockname()[1], secrets.token_urlsafe(24)
     url = f"http://{LOOPBACK_ADDRESS}:{port}/?token={token}"
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
@@ -70,7 +85,7 @@ def serve(
         guarded, log_level="error", access_log=False, timeout_graceful_shutdown=SHUTDOWN_S, lifespan="on", ws="auto"
     )
     server = uvicorn.Server(config)
-    logging.getLogger("nicegui").setLevel(logging.ERROR)  # a page that is not there is the browser's to tell
+    logging.getLogger("nicegui").setLevel(logging.ERROR)  # hides messages about missing pages
     sys.setswitchinterval(THREAD_SWITCH_S)
 
     def announced() -> None:
@@ -89,8 +104,16 @@ def serve(
 
 
 def write_redirect_file(url: str, folder: pathlib.Path) -> pathlib.Path:
-    """Return a new file, of its owner only, which leads a browser to an address: the words by which the browser is
-    started are seen by everyone on the machine, and the address has the token."""
+    """Return the path of a new HTML file, readable by its owner only, that redirects a browser to an address.
+
+    The address has the token, and every user of the machine can see the command line that starts a browser. So the
+    browser
+    gets this file instead.
+
+    Args:
+        url: Address with the token.
+        folder: Folder of the file.
+    """
     path = folder / "explore.html"
     path.touch(mode=0o600, exist_ok=False)
     path.write_text(f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={html.escape(url)}">', "utf-8")

@@ -1,7 +1,8 @@
-"""What one person explores: a scenario, the values that were turned, and what follows from them. Knows no page.
+"""A session of the explorer: a scenario, the edited values, and the scenario that follows. Independent of any page.
 
-A session is changed by `turn`, `choose` and `adopt`; `scenario()` is what it stands for at that moment, a value that
-threads may compute with while one goes on turning."""
+`turn`, `choose` and `adopt` change a session. `scenario()` is a value: threads can compute with it during further
+edits.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -27,34 +28,53 @@ PERCENT = Spec("%", low=0.0, high=90.0)
 
 
 class ProofVerdict(NamedTuple):
-    """What can be proved of a loop: one of the four words above, and a sentence."""
+    """The verdict of a proof for a loop: one of the four words above, and a sentence."""
 
     word: str
     sentence: str
 
 
 class Tools(NamedTuple):
-    """What needs extras: a proof of a scenario; the lanes and constraints of its [tune]."""
+    """The functions that need extras.
+
+    Attributes:
+        prove: Returns the verdict of a scenario.
+        pose: Returns the runs and constraints of a scenario's [tune].
+    """
 
     prove: Callable[[Scenario], ProofVerdict]
     pose: Callable[[Scenario], tuning.TuningTask]
 
 
 class Session:
-    """A scenario with its numbers turned."""
+    """A scenario with edited numbers."""
 
     def __init__(self, source: str):
-        """The scenario in a file, or a packaged one. Raises ScenarioError."""
+        """Load the scenario from the path or name `source`.
+
+        Raises:
+            ScenarioError: The scenario cannot be loaded.
+        """
         self.spread = Spread()
         self.open(source)
 
     def open(self, source: str) -> None:
-        """Begin anew with another scenario. Raises ScenarioError, and then nothing has changed."""
+        """Start again with another scenario, from the path or name `source`.
+
+        Raises:
+            ScenarioError: The scenario cannot be loaded; the session stays unchanged.
+        """
         self._begin(source, {}, load(source))
 
     def choose(self, family: str, part: str) -> None:
-        """Put another road or controller into the loop, with its usual numbers, or that of the scenario; other numbers
-        stay as they were turned. Raises ScenarioError for one that does not fit, and then nothing has changed."""
+        """Replace the road or the controller (`family`) by the named `part` with default values, or by the scenario's
+        own.
+
+        Edits of all other numbers are kept.
+
+        Raises:
+            ScenarioError: The part does not fit; the session stays unchanged.
+        """
         chosen = {**self.parts, family: part}
         overrides = [f"{name}={kind}" for name, kind in chosen.items() if kind != AS_GIVEN]
         turned = self._turned()
@@ -65,13 +85,19 @@ class Session:
         self.accept(self.scenario().loop)
 
     def choices(self, family: str) -> list[str]:
-        """Return the parts that can be chosen, that of the scenario first; none where the loop has no such part."""
+        """Return the parts of a `family` that can be chosen, the scenario's own first.
+
+        The list is empty if the loop has no part of this family.
+        """
         there = family == "controller" or hasattr(self.given.loop.plant, family)
         return [AS_GIVEN, *sorted(registry.family_types(family))] if there else []
 
     def turn(self, key: str, given: Any) -> float:
-        """Give a number another value, as it is shown, and return it in SI. Raises ScenarioError that names the field,
-        and then nothing has changed."""
+        """Set the number `key` to a value `given` in its displayed unit, and return it in SI.
+
+        Raises:
+            ScenarioError: The value is refused; the message names the field and the session stays unchanged.
+        """
         value = self.put(key, given)
         now = self.scenario()
         try:
@@ -83,8 +109,14 @@ class Session:
         return value
 
     def put(self, key: str, given: Any) -> float:
-        """The same, but only look at the value itself; `judge` takes some milliseconds, and `accept` or `withdraw` must
-        follow it."""
+        """Set the number `key` to a value `given` in its displayed unit, and return it in SI, without a check of the
+        loop.
+
+        `judge` checks the loop and takes some milliseconds. `accept` or `withdraw` must follow it.
+
+        Raises:
+            ScenarioError: The loop has no such number, or the value is not in its range.
+        """
         if key not in self.knobs:
             raise unknown_name_error(f"{key!r} is no number of this loop", key, self.knobs)
         value = self.knobs[key].read(given)
@@ -92,25 +124,32 @@ class Session:
         return value
 
     def judge(self, key: str, chosen: Scenario) -> None:
-        """Raises ScenarioError for a scenario of this session that must not be run, which names the number that was
-        turned last."""
+        """Check that the scenario `chosen` of this session may be run.
+
+        Raises:
+            ScenarioError: It must not be run; the message names the last edited number, `key`.
+        """
         if lines := objections(chosen):
             knob = self.knobs[key]
             text = knob.text(_value(get(chosen.loop, knob.path), knob))
-            raise ScenarioError(f"{knob.name} = {text} {knob.spec.unit}: {lines[0]}".replace(" 1:", ":"))
+            raise ScenarioError(f"{knob.name} = {text} {knob.spec.unit}: {lines[0]}".replace(" 1:", ":"))  # no unit "1"
 
     def accept(self, loop: Loop) -> None:
-        """Let `withdraw` come back to these numbers."""
+        """Store the numbers of the `loop` as the state to which `withdraw` returns."""
         self._accepted = loop
 
     def withdraw(self) -> list[str]:
-        """Go back to what was accepted last, and return the numbers that changed by that."""
+        """Return to the last accepted numbers, and return the keys of the numbers that changed."""
         before = {key: self.value(key) for key in self.knobs}
         self.adopt(self._accepted)
         return [key for key, value in before.items() if value != self.value(key)]
 
     def widen(self, name: str, given: Any) -> None:
-        """Say how far the members of the fan differ in "mass" or "road" [%]. Raises ScenarioError."""
+        """Set the spread of the fan's members in `name` ("mass" or "road") to a value `given` in percent.
+
+        Raises:
+            ScenarioError: The value is not a number from 0 to 90.
+        """
         try:
             value = float(given)
         except (TypeError, ValueError):
@@ -120,23 +159,26 @@ class Session:
         )
 
     def adopt(self, loop: Loop) -> None:
-        """Take over the numbers of another loop of the same parts."""
+        """Take over the numbers of another `loop` with the same parts."""
         self.accept(loop)
         self._values = {knob.path: np.asarray(get(loop, knob.path), float) for knob in self.knobs.values()}
 
     def reset(self) -> None:
-        """Go back to the numbers of the scenario."""
+        """Return to the numbers of the scenario."""
         self._values = {}
         self.accept(self._base.loop)
 
     def scenario(self) -> Scenario:
-        """Return the scenario with the numbers as they were turned."""
+        """Return the scenario with the current numbers."""
         values = {path: value if value.ndim else float(value) for path, value in self._values.items()}
         return dataclasses.replace(self._base, loop=replace(self._base.loop, values)) if values else self._base
 
     def to_save(self) -> Scenario:
-        """Return the scenario as it is written to a file; a friction factor of one is left out. Raises ScenarioError
-        for one that must not be run."""
+        """Return the scenario for a file, without a friction factor of 1.
+
+        Raises:
+            ScenarioError: The scenario must not be run.
+        """
         now = self.scenario()
         if lines := objections(now):
             raise ScenarioError(lines[0])
@@ -144,7 +186,7 @@ class Session:
         return friction.without_factor(now.with_loop(now.loop, "explored") if changed else now, self.given)
 
     def value(self, key: str) -> float:
-        """Return a number in SI."""
+        """Return the current value of the number `key` in SI."""
         knob = self.knobs[key]
         value = self._values.get(knob.path)
         return _value(get(self._base.loop, knob.path) if value is None else value, knob)
@@ -163,10 +205,11 @@ class Session:
         there = self._values.get(knob.path)
         new = np.array(get(self._base.loop, knob.path) if there is None else there, float)
         new[() if knob.place is None else knob.place] = value
+        # A new dict and a new array: threads may still use the old ones.
         self._values = {**self._values, knob.path: new}
 
     def _turned(self) -> dict[str, float]:
-        """The numbers that are not the scenario's, by their paths."""
+        """Return the values [SI] that differ from the scenario's, by key."""
         loop = self._base.loop
         changed = {path for path, value in self._values.items() if not np.array_equal(value, get(loop, path))}
         return {key: self.value(key) for key, knob in self.knobs.items() if knob.path in changed}
@@ -177,6 +220,10 @@ def _value(value: Any, knob: Knob) -> float:
 
 
 def objections(chosen: Scenario) -> list[str]:
-    """Return why a scenario must not be run, a line each: as a file with these numbers would be refused."""
+    """Return the reasons why a scenario must not be run, one line each, as the command line would give them.
+
+    Args:
+        chosen: Scenario with its current numbers.
+    """
     lines = list(find_problems(chosen.loop)) or list(find_mismatches(chosen.loop, chosen.solver))
     return lines or list(find_unstable_step(chosen.loop, chosen.solver))

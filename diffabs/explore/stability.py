@@ -1,4 +1,4 @@
-"""Poles and margins of the linearised loop, here and at the corners of the ranges of [design.over]."""
+"""Poles and margins of the linearised loop, for the current values and at the corners of the [design.over] ranges."""
 
 import math
 from typing import Any, NamedTuple
@@ -11,19 +11,24 @@ from diffabs.linear.robustness import band
 from diffabs.linear.stability_margins import Margins, closed_loop_poles
 from diffabs.scenario.scenario import Scenario
 
-MOST_RANGES = 3  # whose corners are followed while one drags
+MOST_RANGES = 3  # three ranges have 8 corners, quick enough to follow a drag
 
 MARGIN_KEYS = ("gain_up", "gain_down", "phase", "delay", "modulus")
 
 
 class Stability(NamedTuple):
-    """A loop, linearised at rest on its setpoint.
+    """Poles and margins of a loop, linearised at rest on its setpoint.
 
-    period: of its controller [s], None in continuous time; delay: in the loop [s], which poles in continuous time are
-        without
-    poles: of the closed loop, in z where it is sampled, else in s; corners: those at the corners of the ranges
-    margins: as numbers by name, in SI; worst: over the corners, empty where there are none or one is not stable
-    stable: here; unstable, systems: how many corners are not, and how many there are
+    Attributes:
+        period: Sampling period of the controller [s], or None in continuous time.
+        delay: Delay in the loop [s]. In continuous time the poles do not include it.
+        poles: Poles of the closed loop, in z for a sampled loop, else in s.
+        corners: Poles at the corners of the ranges.
+        margins: Margins by name, in SI.
+        worst: Worst margins over the corners; empty without corners or with an unstable corner.
+        stable: Whether the loop with the current values is stable.
+        unstable: Number of unstable corners.
+        systems: Number of corners.
     """
 
     period: float | None
@@ -38,8 +43,17 @@ class Stability(NamedTuple):
 
 
 class CornerLoops(NamedTuple):
-    """The corners of the ranges of [design.over]. They do not depend on the values that have a range: `of` is what they
-    follow from. Poles, the worst margins, how many are not stable, how many there are."""
+    """Poles and worst margins at the corners of the ranges of [design.over].
+
+    The corners do not depend on the current values of the parameters that have a range.
+
+    Attributes:
+        of: Key that the corners follow from, for comparison.
+        poles: Poles of all corners.
+        worst: Worst margins by name.
+        unstable: Number of unstable corners.
+        systems: Number of corners.
+    """
 
     of: tuple[Any, ...]
     poles: np.ndarray
@@ -49,15 +63,27 @@ class CornerLoops(NamedTuple):
 
 
 def corners_of(chosen: Scenario) -> tuple[Any, ...]:
-    """Return what the corners follow from, to be compared: their ranges, and the loop without what has a range."""
+    """Return a key for the corners: their ranges, and the loop with each ranged parameter at its lower end.
+
+    Args:
+        chosen: Scenario.
+    """
     ranges = chosen.design.ranges(chosen.loop)
+    # With ranged parameters at fixed values, the key changes only if another parameter changes.
     rest = replace(chosen.loop, {path: low for path, (low, _) in ranges.items()})
     leaves, kind = jax.tree.flatten(rest)
     return kind, tuple(ranges.items()), *(np.asarray(leaf).tobytes() for leaf in leaves)
 
 
 def linearise_corners(chosen: Scenario, known: CornerLoops | None = None) -> CornerLoops:
-    """Return the corners of a scenario: `known` itself where they have not moved."""
+    """Return poles and worst margins at the corners of a scenario.
+
+    A scenario without ranges, or with more than three, has no corners here.
+
+    Args:
+        chosen: Scenario.
+        known: Earlier result, which is returned if the corners have not changed.
+    """
     of = corners_of(chosen)
     if known and known.of == of:
         return known
@@ -74,11 +100,11 @@ def linear_stability(chosen: Scenario, corners: CornerLoops | None) -> Stability
     """Return poles and margins of the linearised loop.
 
     Args:
-        chosen: the scenario
-        corners: those that are shown with it, or None where none are known yet
+        chosen: Scenario.
+        corners: Corners that are shown with it, or None if there are none yet.
 
     Raises:
-        ValueError: the loop has no linear model
+        ValueError: The loop has no linear model.
     """
     here = band(chosen.loop, {}, 0).systems[0]
     corners = corners or CornerLoops((), np.array([]), {}, 0, 0)
@@ -96,14 +122,23 @@ def linear_stability(chosen: Scenario, corners: CornerLoops | None) -> Stability
 
 
 def margin_values(found: Margins) -> dict[str, float]:
-    """Return the margins by name, in SI; NaN where the loop is not stable."""
+    """Return the margins by name, in SI; NaN for an unstable loop.
+
+    Args:
+        found: Margins of a loop.
+    """
     low, high = found.gain
     values = (high, low, found.phase, found.delay, found.modulus)
     return dict(zip(MARGIN_KEYS, values, strict=True))
 
 
 def format_margin(name: str, value: float) -> str:
-    """Return a margin as it is shown, with its unit."""
+    """Return a margin as text with its unit.
+
+    Args:
+        name: Name of the margin.
+        value: Value in SI.
+    """
     if math.isnan(value):
         return "none"
     if value == math.inf:

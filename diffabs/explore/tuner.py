@@ -1,4 +1,4 @@
-"""The dialog and the card of a tuning: what is free, how far it is, before and after."""
+"""The dialog and the card of a tuning: free parameters, progress, and values before and after."""
 
 import html
 from typing import TYPE_CHECKING, Any
@@ -16,8 +16,8 @@ from diffabs.scenario.scenario import Scenario
 if TYPE_CHECKING:
     from diffabs.explore.page import Page
 
-Fields = tuple[Any, Any, tuple[str, str]]  # of the low and the high end, and what they said at first
-MAX_LABEL_LENGTH = 20  # losses that differ by so much are drawn in decades
+Fields = tuple[Any, Any, tuple[str, str]]  # fields of the lower and the upper bound, and their initial texts
+MAX_LABEL_LENGTH = 20  # ratio of the largest to the smallest loss above which the axis is logarithmic
 LOSS = {
     "animation": False,
     "grid": {"left": 52, "right": 8, "top": 8, "bottom": 18},
@@ -28,28 +28,28 @@ LOSS = {
 
 
 class Tuner:
-    """One tuning at a time, in a thread of its own; what is turned meanwhile gives way to what was found."""
+    """One tuning at a time, in its own thread. Its result replaces all edits made during the tuning."""
 
     def __init__(self, page: "Page", thread: str):
-        """Nothing is on the page yet."""
+        """Prepare the tuner of a `page`; `thread` is the name of its thread. The page stays unchanged."""
         self.page = page
         self.worker = NewestJobThread(thread, self._failed)
         self.stopping, self.running = False, False
         self.origin: Scenario | None = None
 
     def build(self) -> None:
-        """Put the place of its card into the column that is open."""
+        """Put the hidden card into the open column."""
         self.card = ui.element("div").classes("tuning").props("data-id=tuning")
         self.card.set_visibility(False)
 
     def begin(self) -> None:
-        """Another scenario: nothing of the last one is kept."""
+        """Stop the tuning and hide its card, for another scenario."""
         self.stopping = True
         self.origin = None
         self.card.set_visibility(False)
 
     def end(self) -> None:
-        """The tab is gone."""
+        """Stop the tuning and its thread, for a closed tab."""
         self.stopping = True
         self.worker.end()
 
@@ -80,6 +80,7 @@ class Tuner:
                 def start() -> None:
                     dialog.close()
                     typed = {key: (low.value, high.value) for key, (low, high, _) in fields.items()}
+                    # Unchanged texts are rounded; the exact bounds are used instead.
                     bounded = {key: pair for key, pair in typed.items() if pair != fields[key][2]}
                     self._start(list(free.value or ()), str(small.value), bounded)
 
@@ -87,7 +88,7 @@ class Tuner:
         dialog.open()
 
     def _bounds(self, place: Any, now: Scenario, paths: list[str], fields: dict[str, Fields]) -> None:
-        """A low and a high end for each number that is free, between which the tuning stays."""
+        """Show fields for the lower and upper bound of each free number."""
         known = self.page.session.knobs
         place.clear()
         fields.clear()
@@ -143,7 +144,7 @@ class Tuner:
     def _stop(self) -> None:
         self.stopping = True
 
-    # In its thread.
+    # Methods that run in the tuning's thread.
     def _tune(self, chosen: Scenario) -> None:
         posed = self.page.tools.pose(chosen)
         before = curves.run_curves(chosen)
@@ -156,7 +157,7 @@ class Tuner:
     def _failed(self, error: Exception) -> None:
         self.page.later(self._gave_up, error)
 
-    # In the server's thread.
+    # Methods that run in the server's thread.
     def _told(self, iteration: int, loss: float) -> None:
         if self.origin is None:
             return
@@ -187,7 +188,7 @@ class Tuner:
         self.page.redraw()
 
     def _table(self, chosen: Scenario, found: tuning.TuningFound, before: curves.Curves, after: curves.Curves) -> None:
-        """Before and after: what was free, and what is measured on the run shown."""
+        """Show the free parameters and the metrics before and after the tuning."""
         knobs = self.page.session.knobs
         self.card.clear()
         with self.card:
@@ -229,7 +230,7 @@ class Tuner:
         self.card.set_visibility(False)
 
     def _go_back(self) -> None:
-        """The numbers before the tuning."""
+        """Return to the numbers before the tuning."""
         if self.origin is not None:
             self.page.session.adopt(self.origin.loop)
             self.page.controls.show_all()

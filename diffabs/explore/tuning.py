@@ -1,4 +1,4 @@
-"""Tuning from the values shown: what is free, what is made small, how far it is."""
+"""Tuning from the current values: free parameters, their bounds, the objective, and the progress."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -13,15 +13,21 @@ from diffabs.scenario.scenario import Scenario
 
 
 class TuningTask(NamedTuple):
-    """The lanes of a tuning, and its constraints."""
+    """The runs of a tuning, as a batch, and its constraints."""
 
     batch: Any
     constraints: Sequence[Any]
 
 
 class TuningFound(NamedTuple):
-    """What a tuning has found: the scenario, the loss at each iteration, whether the constraints are met, and why it
-    ended, in words."""
+    """The result of a tuning.
+
+    Attributes:
+        after: Tuned scenario.
+        losses: Loss at each iteration.
+        met: Whether all constraints are met.
+        reason: Reason for the end, in words.
+    """
 
     after: Scenario
     losses: tuple[float, ...]
@@ -30,8 +36,11 @@ class TuningFound(NamedTuple):
 
 
 def tunable_parameters(chosen: Scenario) -> list[str]:
-    """Return the parameters that can be tuned, by path: those of the scenario first, then those of its controller and
-    reference."""
+    """Return the paths of the tunable parameters: the scenario's own first, then those of controller and reference.
+
+    Args:
+        chosen: Scenario.
+    """
     there = [
         path
         for path, spec, value in parameters(chosen.loop)
@@ -41,7 +50,13 @@ def tunable_parameters(chosen: Scenario) -> list[str]:
 
 
 def default_tuning(chosen: Scenario) -> tuple[list[str], str]:
-    """Return what is tuned unless one says otherwise: the scenario's own, else the gains; and the metric."""
+    """Return the default free parameters and the default metric.
+
+    The parameters are those of the scenario's [tune], else the first tunable parameter of the controller.
+
+    Args:
+        chosen: Scenario.
+    """
     paths = (
         list(chosen.tune.free) or [path for path in tunable_parameters(chosen) if path.startswith("controller.")][:1]
     )
@@ -49,8 +64,18 @@ def default_tuning(chosen: Scenario) -> tuple[list[str], str]:
 
 
 def bounds_on_page(chosen: Scenario, path: str, known: Mapping[str, Knob]) -> dict[str, tuple[float, float]]:
-    """Return the bounds of a free parameter as the page shows them, by the key of each of its numbers: those of [tune],
-    else the ends of its sliders. Raises ScenarioError for a parameter without a range."""
+    """Return the bounds of a free parameter in displayed units, by the key of each of its numbers.
+
+    They are the bounds of [tune], else the ends of the sliders.
+
+    Args:
+        chosen: Scenario.
+        path: Path of the parameter.
+        known: Numbers of the loop by key.
+
+    Raises:
+        ScenarioError: The parameter has no range.
+    """
     mine = {key: knob for key, knob in known.items() if knob.path == path}
     given = chosen.tune.free.get(path)
     if given is None and any(knob.low is None or knob.high is None for knob in mine.values()):
@@ -72,18 +97,18 @@ def scenario_with_goal(
     known: Mapping[str, Knob],
     bounded: Mapping[str, tuple[Any, Any]] | None = None,
 ) -> Scenario:
-    """Return the scenario with these parameters free and this metric made small.
+    """Return the scenario with these free parameters and this metric as the objective.
 
     Args:
-        chosen: the scenario; its constraints stay
-        paths: of the free parameters
-        metric: name of the objective
-        known: the numbers of the loop by key
-        bounded: low and high end by key of a number, as typed on the page; without one those of `bounds`
+        chosen: Scenario; its constraints stay.
+        paths: Paths of the free parameters.
+        metric: Name of the metric that is minimised.
+        known: Numbers of the loop by key.
+        bounded: Typed bounds (low, high) by key of a number. The default is that of `bounds_on_page`.
 
     Raises:
-        ScenarioError: nothing is free; there is no such metric; a bound is not in the parameter's range; the low end is
-            not below the high one
+        ScenarioError: There is no free parameter, or no such metric.
+        ScenarioError: A bound is not in the parameter's range, or the lower bound is not below the upper one.
     """
     if not paths:
         raise ScenarioError("tune.free is empty: choose at least one parameter")
@@ -98,9 +123,18 @@ def scenario_with_goal(
 def tune_scenario(
     chosen: Scenario, posed: TuningTask, told: Callable[[int, float], None], stopping: Callable[[], bool]
 ) -> TuningFound:
-    """Return what `diffabs tune` finds for a scenario's [tune]. `told` hears iteration and loss.
+    """Return the result of `diffabs tune` for a scenario's [tune].
 
-    Raises ValueError for a start that cannot be left, ModuleNotFoundError without the extra `tune`."""
+    Args:
+        chosen: Scenario.
+        posed: Runs and constraints.
+        told: Callback with iteration and loss.
+        stopping: Callback that returns True to end the tuning.
+
+    Raises:
+        ValueError: The descent cannot leave its start.
+        ModuleNotFoundError: The extra `tune` is missing.
+    """
     from diffabs.tune import Method, Stopping, tune
 
     task = chosen.tune
@@ -124,7 +158,7 @@ def tune_scenario(
 def _range(
     chosen: Scenario, path: str, known: Mapping[str, Knob], bounded: Mapping[str, tuple[Any, Any]]
 ) -> tuple[Any, Any]:
-    """Low and high end of a parameter in SI, in its shape."""
+    """Return the lower and the upper bound of a parameter in SI, in its shape."""
     ends = {
         **bounds_on_page(chosen, path, known),
         **{key: ends for key, ends in bounded.items() if known[key].path == path},

@@ -1,4 +1,4 @@
-"""A thread that does the newest of what it is asked for."""
+"""A worker thread that runs only the newest of the waiting jobs."""
 
 import threading
 from collections.abc import Callable
@@ -7,11 +7,13 @@ Job = Callable[[], None]
 
 
 class NewestJobThread:
-    """Does jobs one after the other, in a thread of its own; one that is still waiting when another comes is dropped,
-    so that whoever asks faster than it works is never behind by more than one job."""
+    """A thread that runs jobs one after the other.
+
+    A new job replaces a job that still waits. So the results are never behind the requests by more than one job.
+    """
 
     def __init__(self, name: str, failed: Callable[[Exception], None]):
-        """`name` is the thread's; `failed` is told what a job raises."""
+        """Start a thread with this `name`; `failed` is called with the exception of a job."""
         self._job: Job | None = None
         self._ended = False
         self._there = threading.Condition()
@@ -19,17 +21,17 @@ class NewestJobThread:
         threading.Thread(target=self._work, name=name, daemon=True).start()
 
     def ask(self, job: Job) -> None:
-        """Do this next, in place of what waits."""
+        """Run the `job` next, in place of a job that waits."""
         with self._there:
             self._job = job
             self._there.notify()
 
     def waiting(self) -> bool:
-        """Whether a job waits: one that is under way may ask this to make room."""
+        """Return whether a job waits, so that the current job can end early."""
         return self._job is not None
 
     def end(self) -> None:
-        """Do nothing more; what is under way is finished."""
+        """End the thread after the current job."""
         with self._there:
             self._ended = True
             self._there.notify()
@@ -38,7 +40,7 @@ class NewestJobThread:
         while (job := self._next()) is not None:
             try:
                 job()
-            except Exception as error:
+            except Exception as error:  # an error must not end the thread
                 self._failed(error)
 
     def _next(self) -> Job | None:

@@ -1,4 +1,4 @@
-"""Parameters from measured runs, with their uncertainty. Needs SciPy."""
+"""Identification of parameters from measured runs, with their uncertainty. Needs SciPy."""
 
 from diffabs.identify.fit import Identified as Identified
 from diffabs.identify.fit import Tolerances as Tolerances

@@ -1,4 +1,4 @@
-"""What data are: something that can be compared with a loop."""
+"""Protocol of measured data that `identify` can compare with a loop."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -11,7 +11,14 @@ from diffabs.simulate.solution import Solver
 
 
 class Comparison(NamedTuple):
-    """Data against a loop: residuals(loop, *data), (n,); sigma (n,) or None; the batches of loops that are run."""
+    """A least-squares comparison of data with a loop.
+
+    Attributes:
+        residuals: Function residuals(loop, *data), which returns shape (n,).
+        data: Arrays that are passed to `residuals`.
+        sigma: Standard deviations of the residuals, shape (n,), or None if they are unknown.
+        loops: Function of a loop that returns the batches of loops to run.
+    """
 
     residuals: Residuals
     data: tuple[Any, ...]
@@ -20,14 +27,32 @@ class Comparison(NamedTuple):
 
 
 class Data(Protocol):
-    """`Traces`, `Table`."""
+    """Measured data: `Traces` or `Table`."""
 
     def against(self, loop: Loop, free: Sequence[str], solver: Solver) -> Comparison:
-        """Set up the comparison. Raises ValueError for data that do not fit the loop, the solver or each other."""
+        """Return the comparison of these data with a loop.
+
+        Args:
+            loop: Loop that is compared with the data.
+            free: Paths of the free parameters.
+            solver: Solver of every run.
+
+        Raises:
+            ValueError: The data do not fit the loop, the solver or each other.
+        """
         ...
 
 
 def check_positive(name: str, value: Any, unit: str) -> None:
-    """Raises ValueError for a standard deviation that is not positive and finite."""
+    """Check that a standard deviation is positive and finite.
+
+    Args:
+        name: Name for the message.
+        value: Standard deviation, a number or an array.
+        unit: Unit for the message; "1" is left out.
+
+    Raises:
+        ValueError: A value is not positive and finite.
+    """
     if not (np.isfinite(value) & (np.asarray(value) > 0)).all():
         raise ValueError(f"{name} = {np.min(value):g} is outside (0, inf) {'' if unit == '1' else unit}".rstrip())

@@ -1,11 +1,15 @@
-"""Nonlinear least squares over parameters of any part, by dotted path.
+"""Nonlinear least squares over parameters of any part, given by dotted path.
 
     minimise  sum_i |r_i(part)/sigma_i|^norm + sum_j prior_j(part)^2
 
-in the unbounded coordinates of `space`, so that no step leaves a range, by SciPy's trust-region method (M. A. Branch,
-T. F. Coleman and Y. Li, SIAM J. Sci. Comput. 21 (1999)) with the Jacobian in forward mode, through events and stops. A
-norm of 2 is least squares; 8 or more comes near to the least greatest residual. A point at which a number is not finite
-is too far: the trust region shrinks."""
+The fit works in the unbounded coordinates z of `parameter_space`, so no step leaves a parameter's range. SciPy's
+trust-region reflective method minimises the cost. The Jacobian is computed in forward mode, through events and stops.
+
+A norm of 2 is least squares. A norm of 8 or more approaches the minimum of the largest residual.
+A point with a number that is not finite is rejected, and the trust region shrinks.
+
+Source: M. A. Branch, T. F. Coleman and Y. Li, SIAM J. Sci. Comput. 21 (1999).
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -29,8 +33,14 @@ SCIPY_REASONS = {0: Reason.LIMIT, 1: Reason.GRADIENT, 2: Reason.CHANGE, 3: Reaso
 
 @dataclasses.dataclass(frozen=True)
 class Tolerances:
-    """When a fit ends: relative change of the cost and of z, greatest component of the scaled gradient, and the number
-    of evaluations, rejected ones included."""
+    """Stopping criteria of a fit.
+
+    Attributes:
+        cost: Relative change of the cost.
+        step: Relative change of the unbounded coordinates z.
+        gradient: Largest component of the scaled gradient.
+        evaluations: Maximum number of evaluations, rejected points included.
+    """
 
     cost: float = 1e-10
     step: float = 1e-10
@@ -40,16 +50,23 @@ class Tolerances:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Identified:
-    """The best fit.
+    """The best fit, with its uncertainty.
 
-    part: the given one with its free parameters changed; values: these, by path
-    residuals (n,), in their own units; sigma (n,); chi2: sum (residual/sigma)^2
-    cost: what was minimised: the norm, and the prior
-    uncertainty: covariance, standard deviations, correlation, and the directions that the data do not determine; always
-        that of least squares at this point, whatever the norm
-    history: cost at the start and after every accepted step; evaluations: with rejected ones
-    start: the values it began at
-    starts: the fits from all starts, in their order; diverged: starts that could not be used
+    Attributes:
+        part: The given part with its free parameters changed.
+        values: Values of the free parameters by path.
+        residuals: Residuals in their own units, shape (n,).
+        sigma: Standard deviations of the residuals, shape (n,).
+        chi2: sum (residual/sigma)^2.
+        cost: Minimised value: the norm of the weighted residuals plus the prior.
+        uncertainty: Covariance, standard deviations, correlation, and the directions that the data do not determine. It
+            is always that of least squares at this point, for every norm.
+        history: Cost at the start and after every accepted step.
+        evaluations: Number of evaluations, rejected points included.
+        reason: Reason for the end of the iteration.
+        start: Values at the start by path.
+        starts: Fits from all starts, in their order.
+        diverged: Starts that could not be used.
     """
 
     part: Any
@@ -67,7 +84,7 @@ class Identified:
     diverged: tuple[dict[str, Any], ...] = ()
 
     def table(self) -> Summary:
-        """What was found: parameters before and after, with their standard deviations."""
+        """Return a table of the parameters before and after the fit, with their standard deviations."""
         deviations = self.uncertainty.deviations
         rows = tuple((name, self.start.get(name), value, deviations.get(name)) for name, value in self.values.items())
         title = (
@@ -76,11 +93,11 @@ class Identified:
         return Summary(title, ("parameter", "before", "identified", "standard deviation"), rows)
 
     def __repr__(self) -> str:
-        """The table."""
+        """Return the table as text."""
         return str(self.table())
 
     def _repr_html_(self) -> str:
-        """The table for a notebook."""
+        """Return the table as HTML for a notebook."""
         return self.table()._repr_html_()
 
 
@@ -100,24 +117,30 @@ def fit(
     progress: Callable[[int, float], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> Identified:
-    """Return the free parameters of a part that fit residuals(part, *data), a JAX function that returns (n,).
+    """Return the free parameters of a part that minimise the weighted residuals, with their uncertainty.
 
-    free: paths, with a range each or None for the declared one
-    data: arrays that are handed on; with others of the same shape nothing is compiled again
-    sigma: standard deviations, a number or (n,). Without it all residuals weigh the same and s^2 is estimated
-    absolute: False if only the ratios of sigma are known, so that s^2 is estimated as well
-    prior: a JAX function of the part that returns deviations from what is known before, in standard deviations;
-        `gaussian` makes one; a penalty on roughness is another. Arguments in a `jax.tree_util.Partial` are traced
-    starts: values by path to begin at, instead of the part's own; the best fit is returned
-    norm: of the weighted residuals, 2 for least squares, more towards the greatest one
-    tolerances: at which an iteration ends, and how many evaluations it may take
-    usable: says on the host whether a part may be evaluated
-    progress: told the evaluations so far, of all starts, and the cost at each accepted point
-    stopping: asked before every evaluation; True ends the fit at the last accepted point, and no further start is tried
+    Args:
+        part: Part or loop whose parameters are fitted.
+        free: Paths of the free parameters, each with a range, or with None for the declared range.
+        residuals: JAX function residuals(part, *data) that returns shape (n,).
+        data: Arrays that are passed to `residuals`. Other arrays of the same shapes do not compile again.
+        sigma: Standard deviations, a number or shape (n,). Without it all residuals have equal weight and s^2 is
+            estimated.
+        absolute: False if only the ratios of sigma are known, so that s^2 is estimated as well.
+        prior: JAX function of the part that returns deviations from prior knowledge, in standard deviations. `gaussian`
+            makes one; a roughness penalty is another. Arguments in a `jax.tree_util.Partial` are traced.
+        starts: Initial values by path, instead of the part's own. The best fit is returned.
+        norm: Norm of the weighted residuals, >= 2: 2 is least squares, larger norms approach the largest residual.
+        tolerances: Stopping criteria, with the maximum number of evaluations.
+        usable: Function that tests on the host whether a part may be evaluated.
+        progress: Callback at each accepted point, with the number of evaluations over all starts so far and the cost.
+        stopping: Callback before every evaluation. True ends the fit at the last accepted point and skips further
+            starts.
 
     Raises:
-        ValueError: a path or range that does not fit, sigma <= 0, norm < 2, fewer residuals than parameters without a
-            prior, a prior without sigma, no start at which the residuals are finite.
+        ValueError: A path or range does not fit, sigma <= 0, or norm < 2.
+        ValueError: There are fewer residuals than parameters without a prior, or a prior without sigma.
+        ValueError: The residuals are not finite at any start.
     """
     part = canonical_dtypes(check_part(part))
     where = parameter_space(part, free)
@@ -132,12 +155,12 @@ def fit(
 
 
 class _FitInterrupted(Exception):
-    """Somebody has had enough."""
+    """The signal that ends SciPy's iteration when `stopping` returns True."""
 
 
 @dataclasses.dataclass
 class _FitMonitor:
-    """Who is told, who is asked, and the evaluations of the starts before."""
+    """The callbacks of a fit, and the number of evaluations of earlier starts."""
 
     progress: Callable[[int, float], None]
     stopping: Callable[[], bool]
@@ -154,6 +177,7 @@ def _check_fit(p: int, n: int, k: int, sigma: Any, norm: float, absolute: bool) 
     if k and sigma is None:
         raise ValueError("a prior needs sigma: nothing else says how much the data weigh against it")
     estimated = sigma is None or not absolute
+    # A prior makes up for missing data, but not for the estimate of s^2, which needs n > p.
     if n < p + estimated and not (k and n > 0 and not estimated):
         more = " and one more for the estimate of s^2" if estimated else ""
         raise ValueError(f"{n} data do not determine {p} parameters{more}: free fewer, or state a prior")
@@ -169,9 +193,14 @@ def _fit_all_starts(
     tolerances: Tolerances,
     watch: _FitMonitor,
 ) -> Identified:
-    """The best fit from these points, with all others. Raises ValueError where none can be used."""
+    """Return the best fit over these starting points, with the others in `starts`.
+
+    Raises:
+        ValueError: No starting point can be used.
+    """
     fits: list[Identified | None] = []
     for z in points:
+        # An interruption skips further starts only if there is a fit to return.
         if not (any(fits) and watch.stopping()):
             fits.append(_fit_start(problem, z, sigma, estimated, tolerances, watch))
     done = tuple(one for one in fits if one is not None)
@@ -189,12 +218,13 @@ def _fit_start(
     tolerances: Tolerances,
     watch: _FitMonitor,
 ) -> Identified | None:
-    """From one start; None if it cannot be used."""
+    """Return the fit from one start, or None if the start cannot be used."""
     problem.evaluations, problem.last = 0, None
     if problem.at(start) is None:
         return None
     end, reason, history = _minimise(problem, start, sigma, tolerances, watch)
-    evaluations = problem.evaluations  # the point found may have to be computed once more, which was not SciPy's wish
+    # Read the count first: the final point may be computed once more below, which is no evaluation of the fit.
+    evaluations = problem.evaluations
     watch.before += evaluations
     seen = _accepted_evaluation(problem, end)
     return Identified(
@@ -215,10 +245,9 @@ def _fit_start(
 def _minimise(
     problem: FitProblem, start: np.ndarray, sigma: np.ndarray, tolerances: Tolerances, watch: _FitMonitor
 ) -> tuple[np.ndarray, Reason, list[float]]:
-    """Where it ended and why, and the cost at every accepted point."""
-    rejected = np.full(
-        len(problem.vector(_accepted_evaluation(problem, start), sigma)), np.nan
-    )  # SciPy then shrinks the region
+    """Return the final z, the reason for the end, and the cost at every accepted point."""
+    # A residual that is not finite makes SciPy reject the step and shrink its trust region.
+    rejected = np.full(len(problem.vector(_accepted_evaluation(problem, start), sigma)), np.nan)
     history, accepted = [], [start]
 
     def value(z: np.ndarray) -> np.ndarray:
@@ -227,6 +256,7 @@ def _minimise(
         seen = problem.at(z)
         return rejected if seen is None else problem.vector(seen, sigma)
 
+    # SciPy calls for the Jacobian at the start and at accepted points only, so this function records the history.
     def jacobian(z: np.ndarray) -> np.ndarray:
         seen = _accepted_evaluation(problem, z)
         history.append(float(np.sum(problem.vector(seen, sigma) ** 2)))
@@ -238,7 +268,7 @@ def _minimise(
         found = least_squares(
             value,
             start,
-            jacobian,  # pyright: ignore[reportArgumentType]  # a function, whatever SciPy's default suggests
+            jacobian,  # pyright: ignore[reportArgumentType]  # SciPy's stub infers a string from the default
             method="trf",
             x_scale="jac",
             ftol=tolerances.cost,
@@ -252,7 +282,11 @@ def _minimise(
 
 
 def _accepted_evaluation(problem: FitProblem, z: np.ndarray) -> ResidualEvaluation:
-    """Of a point that was accepted before."""
+    """Return the evaluation of an accepted point, which is computed again if the cache holds another point.
+
+    Raises:
+        RuntimeError: The point is not finite the second time.
+    """
     seen = problem.at(z)
     if seen is None:
         raise RuntimeError("an accepted point is not finite when it is computed again")
@@ -262,8 +296,12 @@ def _accepted_evaluation(problem: FitProblem, z: np.ndarray) -> ResidualEvaluati
 def _parameter_uncertainty(
     free: FreeSpace, z: np.ndarray, seen: ResidualEvaluation, sigma: np.ndarray, estimated: bool
 ) -> Uncertainty:
-    """In the parameters themselves: dr/dp = dr/dz / (dp/dz), since each parameter has its own z. One that has arrived
-    at the end of its range (dp/dz = 0) is not determined."""
+    """Return the uncertainty in the parameters themselves.
+
+    Each parameter has its own z, so dr/dp = dr/dz / (dp/dz). A parameter at the end of its range has dp/dz = 0 and
+    counts as
+    not determined.
+    """
     slope = np.array([float(jax.grad(m.value)(x)) for m, x in zip(_maps(free), z, strict=True)])
     values = np.concatenate([np.ravel(x) for x in _values_by_path(free, z).values()])
     chi2 = float(np.sum((seen.residuals / sigma) ** 2))
@@ -271,6 +309,7 @@ def _parameter_uncertainty(
     size = np.maximum(np.abs(values), np.abs(slope))
     over = np.divide(1.0, slope, out=np.zeros_like(slope), where=slope != 0)
     data, prior = seen.slopes[0] / sigma[:, None] * over, seen.slopes[1] * over
+    # An exact fit has s = 0; the smallest normal number avoids 0/0 below.
     return uncertainty(free.names, size, data, prior, scale or float(np.finfo(float).tiny))
 
 

@@ -1,10 +1,11 @@
-"""Parameters of a loop from measurements: time traces of one or several runs, or tables of what runs were measured at.
+"""Identification of a loop's parameters from time traces of one or several runs, or from tables of measured metrics.
 
     found = identify(loop, Traces(t=t, columns={"wheel_speed": w}, sigma={"wheel_speed": 0.05}),
                      {"plant.inertia": (0.2, 5.0), "plant.road.scale": None}, solver=FixedStep(1e-3, 4.0))
 
-The data are compared with the loop's measured outputs, behind its sensor; nothing is drawn at random. What is fitted,
-and how, is in `fit`; what is known afterwards, and what is not, in `uncertainty`."""
+The data are compared with the loop's measured outputs, behind its sensor. No random numbers are drawn. `fit` describes
+the cost and the method, `uncertainty` the covariance and the directions that the data leave open.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -37,17 +38,25 @@ def identify(
     progress: Callable[[int, float], None] | None = None,
     stopping: Callable[[], bool] = lambda: False,
 ) -> Identified:
-    """Return the parameters of a loop, by dotted path, that fit the data best, with their uncertainty.
+    """Return the parameters of a loop that fit the data best, with their uncertainty.
 
-    data: measured traces, or a table of metrics
-    free: paths, with a range each or None for the declared one
-    solver: of every run
-    absolute, prior, starts, norm, tolerances, progress, stopping: as in `fit`
+    A point is rejected if a run diverges or is not admissible: see `batch_admissibility`.
 
-    A point is rejected where a run diverges, or must not be run: see `batch_admissibility`.
+    Args:
+        loop: Loop whose parameters are identified.
+        data: Measured traces, or a table of metrics.
+        free: Dotted paths of the free parameters, each with a range, or with None for the declared range.
+        solver: Solver of every run.
+        absolute: As in `fit`.
+        prior: As in `fit`.
+        starts: As in `fit`.
+        norm: As in `fit`.
+        tolerances: As in `fit`.
+        progress: As in `fit`.
+        stopping: As in `fit`.
 
     Raises:
-        ValueError: what `fit` and the data object to; a run that must not be run at the start.
+        ValueError: `fit` or the data refuse their arguments, or a run is not admissible at a start.
     """
     check_part(loop)
     comparison = data.against(loop, list(free), solver)
@@ -70,7 +79,11 @@ def identify(
 
 
 def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], comparison: Comparison, solver: Solver) -> None:
-    """Raises ValueError for a start from which a run must not be run, with the longest step that may."""
+    """Check that every run is admissible at each start.
+
+    Raises:
+        ValueError: A run is not admissible. If the step is too long, the message gives the longest stable one.
+    """
     for start in starts:
         if why := _describe_refusal(first := replace(loop, dict(start)), comparison, solver):
             most = min(float(stable_steps(canonical_dtypes(batch)).min()) for batch in comparison.loops(first))
@@ -78,7 +91,7 @@ def _check_starts(loop: Loop, starts: Sequence[Mapping[str, Any]], comparison: C
 
 
 def _describe_refusal(loop: Any, comparison: Comparison, solver: Solver) -> str | None:
-    """Why the first run that must not be run must not."""
+    """Return the reason why the first refused run is not admissible, or None if all runs are."""
     asked = (
         batch_admissibility(None, jax.device_get(canonical_dtypes(batch)), solver) for batch in comparison.loops(loop)
     )

@@ -1,4 +1,4 @@
-"""What a least-squares fit evaluates: residuals, prior and their Jacobians, compiled once, at one z after the other."""
+"""Residuals, prior and Jacobians of a least-squares fit, compiled once and evaluated at one z after the other."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -19,22 +19,31 @@ Prior = Callable[[Any], Any]  # part -> (k,), in standard deviations
 
 @dataclasses.dataclass(frozen=True)
 class _GaussianPrior:
-    """Independent normal distributions of these parameters."""
+    """Independent normal distributions of the parameters at `paths`."""
 
     paths: tuple[str, ...]
 
     def __call__(self, means: Any, deviations: Any, part: Any) -> Any:
-        """(p - mean)/deviation, concatenated."""
+        """Return (p - mean)/deviation, concatenated over the parameters."""
         known = zip(self.paths, means, deviations, strict=True)
         return jnp.concatenate([jnp.ravel((get(part, path) - m) / s) for path, m, s in known])
 
 
 def gaussian(known: Mapping[str, tuple[Any, Any]]) -> Prior:
-    """Return the prior in which the parameters `known` are {path: (mean, standard deviation)}; other numbers do not
-    compile again. Raises ValueError for a deviation that is not positive."""
+    """Return a prior of independent normal distributions.
+
+    Other means and deviations do not compile again.
+
+    Args:
+        known: Parameters as {path: (mean, standard deviation)}.
+
+    Raises:
+        ValueError: A standard deviation is not positive.
+    """
     for path, (_, deviation) in known.items():
         if not (np.asarray(deviation, float) > 0).all():
             raise ValueError(f"{path}: the prior's standard deviation is {np.min(deviation):g}; it must be positive")
+    # np.float64 gives every number one strong type: an int or a weak Python float would compile again.
     means, deviations = zip(*known.values(), strict=True)
     return Partial(
         _GaussianPrior(tuple(known)), *(list(map(jnp.asarray, map(np.float64, x))) for x in (means, deviations))
@@ -42,7 +51,11 @@ def gaussian(known: Mapping[str, tuple[Any, Any]]) -> Prior:
 
 
 def as_partial(prior: Prior | None) -> Prior:
-    """As a pytree that can be called: a `Partial`, whose arguments are traced, stays one."""
+    """Return a prior as a callable pytree; a `Partial` is returned unchanged, so that its arguments are traced.
+
+    Args:
+        prior: Prior of a fit; None is the empty prior.
+    """
     return prior if isinstance(prior, Partial) else Partial(prior or _empty_prior)
 
 
@@ -52,14 +65,20 @@ def _empty_prior(part: Any) -> Any:
 
 
 class ResidualEvaluation(NamedTuple):
-    """At one z: residuals (n,), prior (k,), and their derivatives in z (n, p) and (k, p)."""
+    """Residuals and prior at one z.
+
+    Attributes:
+        residuals: Residuals, shape (n,).
+        prior: Deviations from prior knowledge, shape (k,).
+        slopes: Derivatives of both in z, shapes (n, p) and (k, p).
+    """
 
     residuals: Any
     prior: Any
     slopes: tuple[Any, Any]
 
     def finite(self) -> bool:
-        """Whether every number is."""
+        """Return whether every number is finite."""
         return all(bool(np.isfinite(x).all()) for x in jax.tree.leaves(self))
 
 
@@ -67,39 +86,43 @@ class ResidualEvaluation(NamedTuple):
 def _evaluate_residuals(
     free: FreeSpace, residuals: Residuals, prior: Prior, part: Any, data: Any, z: Any
 ) -> ResidualEvaluation:
-    """Compiled once for equal functions, spaces and structures."""
+    """Return residuals, prior and derivatives at z; compiled once for equal functions, spaces and structures."""
 
     def both(z: Any) -> tuple[Any, Any]:
         at = free.at(part, z)
         values = jnp.ravel(residuals(at, *data)), prior(at)
         return values, values
 
+    # has_aux returns the values of the same pass; a second call would run the simulation twice.
     slopes, values = jax.jacfwd(both, has_aux=True)(z)
     return ResidualEvaluation(values[0], values[1], slopes)
 
 
 @dataclasses.dataclass(eq=False)
 class FitProblem:
-    """Remembers the last point, since SciPy asks for value and Jacobian one after the other."""
+    """A least-squares problem that caches its last point.
+
+    SciPy calls for the value and the Jacobian one after the other, so the cache saves half of the evaluations.
+    """
 
     space: FreeSpace
     part: Any
     residuals: Residuals
     data: tuple[Any, ...]
-    prior: Prior  # a pytree: see `traced`
+    prior: Prior  # a pytree: see `as_partial`
     norm: float
     usable: Callable[[Any], bool] | None
     evaluations: int = 0
     last: tuple[np.ndarray, ResidualEvaluation | None] | None = None
 
     def shapes(self) -> tuple[int, int]:
-        """n and k, without a run."""
+        """Return the number of residuals n and of prior terms k, without a run."""
         r = jax.eval_shape(lambda part, data: self.residuals(part, *data), self.part, self.data)
         k = jax.eval_shape(lambda part: self.prior(part), self.part).size
         return r.size, k
 
     def at(self, z: np.ndarray) -> ResidualEvaluation | None:
-        """None where a number is not finite, or the part not usable."""
+        """Return the evaluation at `z`, or None if a number is not finite or the part is not usable."""
         if self.last is None or not np.array_equal(self.last[0], z):
             self.last = z.copy(), self._evaluate_at(z)
             self.evaluations += 1
@@ -113,11 +136,17 @@ class FitProblem:
         return seen if seen.finite() else None
 
     def vector(self, seen: ResidualEvaluation, sigma: np.ndarray) -> np.ndarray:
-        """sgn(r) |r/sigma|^(norm/2), and the prior: the sum of squares is the cost. (n + k,)."""
+        """Return sgn(r) |r/sigma|^(norm/2) followed by the prior, shape (n + k,).
+
+        Its sum of squares is the cost. `seen` is the evaluation, `sigma` the standard deviations, shape (n,).
+        """
         x = seen.residuals / sigma
         return np.concatenate([np.sign(x) * np.abs(x) ** (self.norm / 2), seen.prior])
 
     def jacobian(self, seen: ResidualEvaluation, sigma: np.ndarray) -> np.ndarray:
-        """Derivative of the vector in z (n + k, p)."""
+        """Return the derivative of `vector` in z, shape (n + k, p).
+
+        `seen` is the evaluation, `sigma` the standard deviations, shape (n,).
+        """
         x = (self.norm / 2) * np.abs(seen.residuals / sigma) ** (self.norm / 2 - 1) / sigma
         return np.concatenate([x[:, None] * seen.slopes[0], seen.slopes[1]])

@@ -1,4 +1,4 @@
-"""Tables of what runs were measured at, against the metrics of simulated ones."""
+"""Tables of measured metrics, compared with the metrics of simulated runs."""
 
 import dataclasses
 import math
@@ -21,12 +21,13 @@ from diffabs.simulate.solution import Solver
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Table:
-    """Published or measured results of runs, the free parameters the same in all of them.
+    """Published or measured metrics of runs that share the free parameters.
 
-    loops: by row; their structures may differ, those of equal structure are run together
-    values: {row: {metric: value}}, a row may lack some metrics
-    sigma: standard deviation by metric, in its unit; None where unknown, with one metric only
-    measured: the objectives by metric
+    Attributes:
+        loops: Loops by row. Their structures may differ; loops of equal structure run together.
+        values: Measured values as {row: {metric: value}}. A row may lack some metrics.
+        sigma: Standard deviation by metric, in its unit. None if unknown, with one metric only.
+        measured: Objectives by metric.
     """
 
     loops: Mapping[str, Loop]
@@ -36,11 +37,21 @@ class Table:
 
     @property
     def labels(self) -> list[tuple[str, str]]:
-        """(row, metric) of each residual."""
+        """Pairs (row, metric), one for each residual."""
         return [(row, metric) for row, line in self.values.items() for metric in line]
 
     def against(self, loop: Loop, free: Sequence[str], solver: Solver) -> Comparison:
-        """Compare with the metrics of every row's loop."""
+        """Return the comparison with the metrics of every row's loop.
+
+        Args:
+            loop: Loop with the free parameters.
+            free: Paths of the parameters that all rows share.
+            solver: Solver of every run.
+
+        Raises:
+            ValueError: A row has no loop, a parameter is missing in a loop, or a metric is not measured.
+            ValueError: A value is not finite, or sigma is missing or not positive.
+        """
         self._check(loop, free)
         loops = [self.loops[row] for row in self.values]
         groups = group_by_structure(loops)
@@ -85,14 +96,14 @@ class Table:
 
 @dataclasses.dataclass(frozen=True)
 class _MetricResiduals:
-    """Metrics of rows of loops minus data. Equal ones are compiled once."""
+    """Simulated minus measured metrics. Equal instances compile once."""
 
     solver: Solver
     shared: tuple[str, ...]
     objectives: tuple[tuple[str, Objective], ...]
 
     def each(self, part: Any, batches: Any, function: Callable[[Any], Any]) -> list[Any]:
-        """`function` of the rows of each batch, with the parameters that they share."""
+        """Return `function` of the rows of each batch, with the shared parameters taken from `part`."""
         values = {path: get(part, path) for path in self.shared}
         return [Batch(rows).each(loop, lambda row, key: function(replace(row, values))) for loop, rows in batches]
 

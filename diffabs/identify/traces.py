@@ -1,4 +1,4 @@
-"""Measured signals over time, against simulated ones."""
+"""Measured signals over time, compared with simulated ones."""
 
 import dataclasses
 import math
@@ -23,16 +23,20 @@ from diffabs.simulate.solution import Solver
 class Traces:
     """Measured signals over time.
 
-    t (n,): instants [s], increasing, from the start of braking; not necessarily equally spaced
-    columns: (n,) by the name of a field of the plant's output; with several runs (runs, n)
-    sigma: standard deviation of each column's noise, in its unit: a number, or of the column's shape. None where it is
-        not known, with one column only
-    over: what differs between runs: parameters by path, one row per run
-    until: the last instant [s] of each run that is compared, a number or (runs,); None is all
+    The simulated outputs are interpolated linearly between the instants that the solver keeps (`solver.every`).
+    A run that ends before its data stays at its last sample. If the rest was left out, an early end would lower the
+    cost.
+    If the loop's stop ends a run other than at rest, cut longer data with `until`.
 
-    The simulated outputs are interpolated linearly between the instants that the solver keeps (`solver.every`). A run
-    that ends before the data do stays at its last sample: were the rest left out, ending early would pay. So cut data,
-    with `until`, that go on where the loop's stop ends the run, other than at rest.
+    Attributes:
+        t: Instants [s] from the start of braking, shape (n,), increasing, not necessarily equally spaced.
+        columns: Measured values by the name of a field of the plant's output, shape (n,), or (runs, n) for several
+            runs.
+        sigma: Standard deviation of each column's noise, in its unit: a number, or of the column's shape. None if
+            unknown,
+            with one column only.
+        over: Parameters that differ between runs, by path, with one row for each run.
+        until: Last instant [s] of each run that is compared, a number or shape (runs,). None compares all instants.
     """
 
     t: Any
@@ -43,11 +47,21 @@ class Traces:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Runs and instants."""
+        """Number of runs and of instants."""
         return Batch(self.over).size, np.size(self.t)
 
     def against(self, loop: Loop, free: Sequence[str], solver: Solver) -> Comparison:
-        """Compare with runs of the loop."""
+        """Return the comparison with runs of the loop.
+
+        Args:
+            loop: Loop that is run.
+            free: Paths of the free parameters.
+            solver: Solver of every run.
+
+        Raises:
+            ValueError: A parameter is both free and in `over`, or `t` leaves the solver's duration.
+            ValueError: A column is not an output, or a shape, a value or sigma is wrong.
+        """
         self._check(loop, free, solver)
         kept = np.flatnonzero(self._kept())
         over = {path: np.asarray(rows, float) for path, rows in self.over.items()}
@@ -67,7 +81,10 @@ class Traces:
         )
 
     def residuals(self, found: Identified) -> dict[str, np.ndarray]:
-        """Simulated minus measured by column, (runs, n); NaN where nothing was compared."""
+        """Return simulated minus measured values of the fit `found` by column, shape (runs, n).
+
+        Instants after `until` are NaN.
+        """
         whole = np.full(len(self.columns) * math.prod(self.shape), np.nan)
         whole[np.flatnonzero(self._kept())] = found.residuals
         return dict(zip(self.columns, whole.reshape(len(self.columns), *self.shape), strict=True))
@@ -113,7 +130,7 @@ class Traces:
 
 
 def _output_names(loop: Loop) -> tuple[str, ...]:
-    """What the plant shows of itself."""
+    """Return the names of the plant's output signals."""
     return jax.eval_shape(
         lambda loop: loop.plant.output(loop.plant.start(loop.initial)), canonical_dtypes(loop)
     )._fields
@@ -121,7 +138,7 @@ def _output_names(loop: Loop) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class _TraceResiduals:
-    """Traces of a loop minus data. Equal ones are compiled once."""
+    """Simulated minus measured signals. Equal instances compile once."""
 
     solver: Solver
     fields: tuple[str, ...]
@@ -131,12 +148,14 @@ class _TraceResiduals:
         return jnp.swapaxes(seen, 0, 1).ravel()[kept] - target
 
     def _columns(self, loop: Any, t: Any) -> Any:
-        """(columns, n)."""
+        """Return the simulated columns of one run at the instants t, shape (columns, n); NaN if the run diverged."""
         run = rollout(loop, self.solver)
         assert run.trajectory is not None
         times, stride = run.trajectory.sample.t, self.solver.step * self.solver.every
+        # Kept instants are equally spaced up to the end of the run, so the index needs no search.
         i = jnp.clip(jnp.floor(t / stride).astype(int), 0, len(times) - 2)
-        part = clamp(ratio(t - times[i], times[i + 1] - times[i]), 0.0, 1.0)  # 0 after the end, where times repeat
+        # The last sample repeats after the end of a run. Its zero interval makes `ratio` return 0, not NaN.
+        part = clamp(ratio(t - times[i], times[i + 1] - times[i]), 0.0, 1.0)
         columns = [getattr(run.trajectory.measured, name) for name in self.fields]
         seen = jnp.stack([x[i] + part * (x[i + 1] - x[i]) for x in columns])
         return jnp.where(run.diverged, jnp.nan, seen)

@@ -1,14 +1,17 @@
-"""How well data determine parameters: covariance, and the combinations that they leave open.
+"""Covariance of identified parameters, and the combinations of parameters that the data leave open.
 
     A = diag(1/sigma) dr/dp,   P = d(prior)/dp,   C = (A'A/s^2 + P'P)^-1,   s^2 = |r/sigma|^2/(n - p)
 
-with s = 1 where sigma is known absolutely. Linearised at the parameters found: it says nothing of other minima, and
-nothing of what the model itself gets wrong (which s^2 only averages).
+with s = 1 if sigma is known absolutely. The model is linearised at the identified parameters. The covariance therefore
+does not cover other minima. It does not cover errors of the model either, which s^2 only averages.
 
-The directions are the right singular vectors of A diag(size)/s, data alone: along the k-th one standard deviation of
-the data is a relative change by 1/(singular value). `size` of a parameter is |p|, or dp/dz of its unbounded coordinate
-(its distance from the end of a half-open range, at most a quarter of a finite one) where that is greater, so that a
-parameter that happens to be zero has a size, too."""
+The directions are the right singular vectors of A diag(size)/s, from the data alone. Along the k-th direction, one
+standard deviation of the data is a relative change by 1/(singular value).
+
+The `size` of a parameter is |p|, or dp/dz of its unbounded coordinate if that is larger. So a parameter that happens
+to be zero has a size, too. On a half-open range dp/dz is the distance from the end, on a finite range at most a quarter
+of the width.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -16,21 +19,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-MAX_RELATIVE_SPREAD = (
-    1.0  # relative spread beyond which a direction counts as not determined: as wide as the parameters are large
-)
+# A direction with a larger relative spread counts as not determined: it is as wide as the parameters are large.
+MAX_RELATIVE_SPREAD = 1.0
 
 
 class Direction(NamedTuple):
-    """A unit vector of relative changes, by name, its largest one positive; the singular value, and the spread
-    1/(singular value), infinite where that is zero to rounding."""
+    """A unit vector of relative parameter changes.
+
+    Attributes:
+        spread: 1/(singular value), infinite if the singular value is zero to rounding.
+        singular: Singular value.
+        components: Components by parameter name; the largest one is positive.
+    """
 
     spread: float
     singular: float
     components: dict[str, float]
 
     def shown(self, least: float = 0.1) -> str:
-        """The components that matter: `0.83 plant.mass + 0.55 plant.inertia`."""
+        """Return the components of magnitude `least` or more as text.
+
+        Example: `0.83 plant.mass + 0.55 plant.inertia`.
+        """
         terms = sorted(self.components.items(), key=lambda item: -abs(item[1]))
         text = " ".join(f"{'-' if x < 0 else '+'} {abs(x):.2f} {name}" for name, x in terms if abs(x) >= least)
         return text.removeprefix("+ ")
@@ -38,12 +48,17 @@ class Direction(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """What is known about the parameters, one row for each of `names`.
+    """Covariance and directions of the identified parameters, with one row for each of `names`.
 
-    covariance, correlation (p, p): with the prior; a direction that nothing determines gets a huge, finite variance
-    deviations: standard deviations, by name
-    scale: s; degrees: n - p
-    directions: p of them, the best determined first; from the data alone
+    Attributes:
+        names: Names of the parameters, p of them.
+        covariance: Covariance with the prior, shape (p, p). A direction that neither data nor prior determine has a
+            huge, finite variance.
+        deviations: Standard deviations by name.
+        correlation: Correlation with the prior, shape (p, p).
+        scale: s.
+        degrees: Degrees of freedom n - p.
+        directions: p directions from the data alone, the best determined first.
     """
 
     names: Sequence[str]
@@ -55,18 +70,27 @@ class Uncertainty:
     directions: list[Direction]
 
     def undetermined(self, beyond: float = MAX_RELATIVE_SPREAD) -> list[Direction]:
-        """The directions that the data leave open: those with a relative spread beyond a threshold."""
+        """Return the directions that the data leave open: their relative spread is larger than `beyond`."""
         return [one for one in self.directions if not one.spread <= beyond]
 
     @property
     def singular(self) -> np.ndarray:
-        """Singular values (p,), descending."""
+        """Singular values, shape (p,), descending."""
         return np.array([one.singular for one in self.directions])
 
 
 def uncertainty(names: Sequence[str], size: np.ndarray, data: Any, prior: Any, scale: float) -> Uncertainty:
-    """From sizes (p,), A (n, p), P (k, p) and s."""
+    """Return covariance, correlation and directions from scaled Jacobians.
+
+    Args:
+        names: Names of the parameters, p of them.
+        size: Sizes of the parameters, shape (p,).
+        data: A, shape (n, p).
+        prior: P, shape (k, p).
+        scale: s.
+    """
     degrees, known = len(data) - len(names), data * size / scale
+    # An SVD of the Jacobian avoids the normal equations, whose condition number is squared.
     _, values, vectors = _padded_svd(np.concatenate([known, prior * size]))
     spread = vectors.T / np.maximum(values, _zero_threshold(values, len(data)))  # a root of the relative covariance
     covariance = size[:, None] * (spread @ spread.T) * size
@@ -86,6 +110,7 @@ def _directions(names: Sequence[str], known: np.ndarray) -> list[Direction]:
     _, values, vectors = _padded_svd(known)
     zero, found = _zero_threshold(values, len(known)), []
     for value, vector in zip(values, vectors, strict=True):
+        # The SVD leaves the sign open.
         vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
         spread = 1 / float(value) if value > zero else float("inf")
         found.append(Direction(spread, float(value), dict(zip(names, vector.tolist(), strict=True))))
@@ -93,11 +118,11 @@ def _directions(names: Sequence[str], known: np.ndarray) -> list[Direction]:
 
 
 def _padded_svd(matrix: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
-    """Singular values and right vectors, p of each: zeros for directions beyond the number of rows."""
+    """Return p singular values and right singular vectors, with zeros for directions beyond the number of rows."""
     missing = max(0, matrix.shape[1] - matrix.shape[0])
     return np.linalg.svd(np.concatenate([matrix, np.zeros((missing, matrix.shape[1]))]), full_matrices=False)
 
 
 def _zero_threshold(values: np.ndarray, rows: int) -> float:
-    """What counts as zero among singular values; positive even where all are zero."""
+    """Return the threshold below which a singular value counts as zero, positive even if all are zero."""
     return max(float(values[0]) * max(rows, len(values)) * np.finfo(float).eps, float(np.finfo(float).tiny))

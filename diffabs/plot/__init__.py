@@ -1,4 +1,4 @@
-"""Figures of runs, sweeps and tunings. The only importer of matplotlib (the extra `plot`)."""
+"""Figures of runs, sweeps and tunings. Only this package imports matplotlib (the extra `plot`)."""
 
 from diffabs.plot.runs import draw_angle_lines as draw_angle_lines
 from diffabs.plot.runs import draw_balance as draw_balance

@@ -1,4 +1,4 @@
-"""A loop in the frequency domain: Bode, Nyquist, sensitivities, with the band of its box behind."""
+"""Figure of a loop in the frequency domain: Bode and Nyquist plots and sensitivities, with the band of its box."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,16 +10,22 @@ from diffabs.linear.robustness import frequencies
 from diffabs.linear.stability_margins import Margins
 from diffabs.plot.style import COLOURS, GREY, label_axes, make_logarithmic, sheet
 
-MAX_NYQUIST_RADIUS = 3.0  # how far from 0 the Nyquist plot looks
-LIGHT = 0.25
-LEAST_DB = -80.0
+MAX_NYQUIST_RADIUS = 3.0  # largest real or imaginary part that the Nyquist plot shows
+LIGHT = 0.25  # opacity of the band
+LEAST_DB = -80.0  # lower end of the magnitude axis; half of it for the sensitivities
 
 
 def loop_shape(loop: OpenLoop, found: Margins, band: Sequence[OpenLoop] = (), *, title: str = "") -> Any:
-    """Return a figure: magnitude and phase of the open loop, its Nyquist plot with the circle of its sensitivity, and
-    the sensitivities |S| and |T|.
+    """Return a figure of the open loop L with its sensitivities.
 
-    band: loops whose curves lie behind, from the least to the greatest at each frequency
+    The panels are the magnitude and phase of L, its Nyquist plot, and |S| and |T|. The Nyquist plot has the circle of
+    radius 1/Ms about -1, which L does not enter.
+
+    Args:
+        loop: Open loop whose curves are drawn.
+        found: Margins of this loop.
+        band: Loops drawn as a band behind the curves, from the smallest to the largest value at each frequency.
+        title: Title of the figure.
     """
     w = frequencies([loop, *band])
     figure, (magnitude, nyquist, phase, closed) = sheet(2, 2, title=title, size=(5.6, 3.4))
@@ -52,26 +58,27 @@ def _response(loop: OpenLoop, w: np.ndarray) -> Any:
 
 
 def _db(values: np.ndarray) -> np.ndarray:
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore"):  # a zero of the loop has -inf dB, which matplotlib leaves out
         return 20 * np.log10(np.abs(values))
 
 
 def _degrees(values: np.ndarray) -> np.ndarray:
-    """Continuous, and between -360 and 0 where |L| is closest to 1."""
+    """Return the phase [degrees], continuous, and in (-360, 0] at the frequency where |L| is closest to 1."""
+    # unwrap leaves a multiple of 2 pi open; the frequency nearest to the crossover fixes it.
     angles = np.unwrap(np.angle(values))
     near = angles[np.argmin(np.abs(np.log(np.abs(values))))]
     return np.degrees(angles - 2 * np.pi * np.ceil(near / (2 * np.pi)))
 
 
 def _draw_band(ax: Any, w: np.ndarray, main: np.ndarray, around: np.ndarray, colour: str, name: str) -> None:
-    """A curve, and what lies between the least and the greatest of others."""
+    """Draw a curve over the band between the smallest and the largest value of the other curves."""
     if len(around):
         ax.fill_between(w, around.min(axis=0), around.max(axis=0), color=colour, alpha=LIGHT, linewidth=0)
     ax.plot(w, main, color=colour, label=name)
 
 
 def _nyquist(ax: Any, main: Any, around: Any, found: Margins) -> None:
-    """L in the complex plane, with the point -1 and the circle that L does not enter."""
+    """Draw L in the complex plane, with the point -1 and the circle that L does not enter."""
     for values in around:
         ax.plot(values.real, values.imag, color=COLOURS[0], alpha=LIGHT, linewidth=0.7)
     ax.plot(main.real, main.imag, color=COLOURS[0], label="L")

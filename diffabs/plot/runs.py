@@ -1,4 +1,4 @@
-"""Figures of runs: one at a glance, several side by side, friction and convergence."""
+"""Figures of runs: an overview of one run, several runs side by side, friction curves and convergence."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -27,8 +27,16 @@ from diffabs.simulate.solution import Run, Trajectory
 
 
 def draw_braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
-    """A run at a glance: slip with target and setpoint, speeds, control in its `unit`, deceleration. Raises ValueError
-    for a run without a trajectory, as `measure` returns it."""
+    """Return an overview of a braking run: slip with target and setpoint, speeds, control and deceleration.
+
+    Args:
+        run: Run with a trajectory, as `rollout` returns it.
+        title: Title of the figure.
+        unit: Unit of the control.
+
+    Raises:
+        ValueError: The run has no trajectory, as from `measure`.
+    """
     seen = _trajectory(run)
     figure, (top, speed, torque, brake) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
     t, sample = np.asarray(seen.sample.t), seen.sample
@@ -45,8 +53,16 @@ def draw_braking(run: Run, *, title: str = "", unit: str = "N m") -> Figure:
 
 
 def draw_balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
-    """A run of a two-wheeler at a glance: angles, rates, control in its `unit`, torque. Raises ValueError for a run
-    without a trajectory, as `measure` returns it."""
+    """Return an overview of a two-wheeler's run: angles, rates, control and motor torque.
+
+    Args:
+        run: Run with a trajectory, as `rollout` returns it.
+        title: Title of the figure.
+        unit: Unit of the control.
+
+    Raises:
+        ValueError: The run has no trajectory, as from `measure`.
+    """
     seen = _trajectory(run)
     figure, (angles, rates, voltage, torque) = sheet(2, 2, title=title, size=(5.6, 3.0), sharex=True)
     t, sample = np.asarray(seen.sample.t), seen.sample
@@ -55,16 +71,27 @@ def draw_balance(run: Run, *, title: str = "", unit: str = "V") -> Figure:
     draw_angle_lines(rates, seen, "_rate")
     label_axes(rates, "", "rate [rad/s]", legend=False)
     _control(voltage, seen, unit)
+    # The axis follows the delivered control: a command far beyond the supply would flatten it.
     most = np.max(np.abs(sample.control))
-    voltage.set_ylim(-1.5 * most - 1e-9, 1.5 * most + 1e-9)  # a command far beyond the supply says no more
+    voltage.set_ylim(-1.5 * most - 1e-9, 1.5 * most + 1e-9)  # 1e-9: limits that differ at zero control
     torque.plot(t, motor_torque(sample), color=COLOURS[0])
     label_axes(torque, "time [s]", "motor torque [N m]")
     return figure
 
 
 def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
-    """A run of whatever plant at a glance: its signals, a panel for each unit, the first with target and setpoint; and
-    control in its `unit`. Raises ValueError for a run without a trajectory, as `measure` returns it."""
+    """Return an overview of a run of any plant: one panel for each unit of its signals, and one for the control.
+
+    The first panel also shows target and setpoint.
+
+    Args:
+        run: Run with a trajectory, as `rollout` returns it.
+        title: Title of the figure.
+        unit: Unit of the control.
+
+    Raises:
+        ValueError: The run has no trajectory, as from `measure`.
+    """
     seen = _trajectory(run)
     t, sample = np.asarray(seen.sample.t), seen.sample
     groups: dict[str, list[str]] = {}
@@ -84,41 +111,63 @@ def draw_signals(run: Run, *, title: str = "", unit: str = "1") -> Figure:
     _control(axes[count - 1], seen, unit)
     for ax in axes[count:]:
         ax.set_visible(False)
-    for ax in axes[max(0, count - 2) : count]:  # the lowest of each column; a hidden one keeps no labels for it
+    # With a shared time axis only the last row has labels; above a hidden panel they must be shown again.
+    for ax in axes[max(0, count - 2) : count]:
         ax.set_xlabel("time [s]", fontsize=11)
         ax.tick_params(labelbottom=True)
     return figure
 
 
 def _control(ax: Axes, seen: Trajectory, unit: str) -> None:
-    """What the controller asked for, and what the actuator delivered."""
+    """Draw the controller's command and the control that the actuator delivers."""
     t, sample = np.asarray(seen.sample.t), seen.sample
     ax.plot(t, sample.command, "--", color=COLOURS[1], linewidth=1, label="command")
     ax.plot(t, sample.control, color=COLOURS[0], label="control")
     label_axes(ax, "time [s]", control_label(unit))
 
 
-FIGURE_BY_SIGNALS = {  # of runs, by the signals that they draw
+FIGURE_BY_SIGNALS = {  # figures of one run by the signals that they draw
     frozenset(("slip", "speed", "wheel_speed", "deceleration")): draw_braking,
     frozenset(("theta", "psi", "phi", "theta_rate", "psi_rate", "phi_rate", "constant", "emf")): draw_balance,
 }
 
 
 def figure_for(plant: Plant) -> Callable[..., Figure]:
-    """Return the figure of one run that suits a plant: the one that draws just such signals, else that of any."""
+    """Return the function that draws an overview of one run of a plant.
+
+    `draw_braking` or `draw_balance` is returned if the plant shows all signals of that figure, else `draw_signals`.
+
+    Args:
+        plant: Plant of the run.
+    """
     return next((figure for drawn, figure in FIGURE_BY_SIGNALS.items() if drawn <= {*plant.shows.units}), draw_signals)
 
 
 def draw_angle_lines(ax: Axes, seen: Trajectory, suffix: str = "") -> None:
-    """Draw frame, arm and rider into an axes; their rates with the suffix `_rate`."""
+    """Draw the angles of frame, arm and rider into an axes, or their rates.
+
+    Args:
+        ax: Axes to draw into.
+        seen: Trajectory of the run.
+        suffix: "" for angles [rad], "_rate" for rates [rad/s].
+    """
     for i, (name, words) in enumerate({"theta": "frame", "psi": "arm", "phi": "rider"}.items()):
         values = getattr(seen.sample.output, name + suffix)
         ax.plot(np.asarray(seen.sample.t), values, DASHES[i], color=COLOURS[i], label=f"{words} {name}")
 
 
 def shade_region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = None) -> list[Patch]:
-    """Shade the cells of a grid, given their centres, first axis to the right: those whose value is true, those that
-    are `unknown`, and the rest. Return a patch of each shade, in this order, for a legend."""
+    """Shade the cells of a grid by a Boolean value, and return a patch of each shade for a legend.
+
+    The patches are in this order: true, unknown, false.
+
+    Args:
+        ax: Axes to draw into.
+        first: Cell centres along the horizontal axis, shape (n,).
+        second: Cell centres along the vertical axis, shape (m,).
+        inside: Value of each cell, shape (n, m).
+        unknown: Cells without a value, shape (n, m), or None. `inside` takes precedence.
+    """
     shades = (COLOURS[0], "#9A9A9A", "#F3E3D7")
     value = np.where(inside, 0, 2 if unknown is None else np.where(unknown, 1, 2))
     colours = ListedColormap(shades)
@@ -127,7 +176,13 @@ def shade_region(ax: Axes, first: Any, second: Any, inside: Any, unknown: Any = 
 
 
 def draw_slips(runs: Mapping[str, Trajectory], *, title: str = "", until: float | None = None) -> Figure:
-    """Slip over time, one curve per run, and the setpoint of the first."""
+    """Return a figure of slip over time, with one curve per run and the setpoint of the first run.
+
+    Args:
+        runs: Trajectories by name.
+        title: Title of the figure.
+        until: End of the time axis [s]; None is automatic.
+    """
     figure, (ax,) = sheet(title=title, size=(6.4, 3.8))
     draw_slip_lines(ax, runs)
     label_axes(ax, "time [s]", "slip [1]")
@@ -136,7 +191,12 @@ def draw_slips(runs: Mapping[str, Trajectory], *, title: str = "", until: float 
 
 
 def draw_slip_lines(ax: Axes, runs: Mapping[str, Trajectory]) -> None:
-    """Draw slips and the setpoint of the first run into an axes."""
+    """Draw the slips of all runs and the setpoint of the first run into an axes.
+
+    Args:
+        ax: Axes to draw into.
+        runs: Trajectories by name.
+    """
     for i, (name, seen) in enumerate(runs.items()):
         ax.plot(np.asarray(seen.sample.t), seen.sample.output.slip, DASHES[i], color=COLOURS[i], label=name)
     first = next(iter(runs.values())).sample
@@ -144,14 +204,20 @@ def draw_slip_lines(ax: Axes, runs: Mapping[str, Trajectory]) -> None:
 
 
 def draw_speeds(runs: Mapping[str, Trajectory], *, title: str = "") -> Figure:
-    """Vehicle and wheel speed over time, one panel per run, side by side."""
+    """Return a figure of vehicle and wheel speed [km/h] over time, with one panel per run, side by side.
+
+    Args:
+        runs: Trajectories by name.
+        title: Title of the figure.
+    """
     figure, axes = sheet(1, len(runs), title=title, size=(5.2 if len(runs) > 1 else 6.4, 3.6), sharex=True, sharey=True)
     for i, (ax, (name, seen)) in enumerate(zip(axes, runs.items(), strict=True)):
         _speeds(ax, seen)
         words = f"{name}: {float(seen.sample.t[-1]):.2f} s" if name else ""
         label_axes(ax, "time [s]", "" if i else "speed [km/h]", words)
         ax.set_xlim(0, None)
-    axes[0].set_ylim(min(axes[0].get_ylim()[0], 0.0), None)  # below 0 where a locked wheel's line would hide the axis
+    # The automatic end below 0 keeps the line of a locked wheel off the axis.
+    axes[0].set_ylim(min(axes[0].get_ylim()[0], 0.0), None)
     return figure
 
 
@@ -164,8 +230,13 @@ def _speeds(ax: Axes, seen: Trajectory) -> None:
 def draw_positions(
     panels: Sequence[Mapping[str, Trajectory]], *, title: str = "", zoom: tuple[float, float] | None = None
 ) -> Figure:
-    """Position over time, one panel per group of runs; with `zoom`, one more panel that shows the last group over these
-    times [s]."""
+    """Return a figure of position [m] over time, with one panel per group of runs.
+
+    Args:
+        panels: Groups of trajectories by name.
+        title: Title of the figure.
+        zoom: First and last time [s] of one more panel with the last group, or None.
+    """
     groups = list(panels) + ([panels[-1]] if zoom else [])
     figure, axes = sheet(1, len(groups), title=title, size=(5.2, 3.6), sharey=zoom is None)
     for i, (ax, runs) in enumerate(zip(axes, groups, strict=True)):
@@ -192,12 +263,21 @@ def draw_friction(
     speed: float = 0.0,
     title: str = "",
 ) -> Figure:
-    """Friction over slip, with points marked by name; `zoom` = (slip, slip, mu, mu) adds a panel with that window."""
+    """Return a figure of the friction coefficient over slip, with named points.
+
+    Args:
+        roads: Roads by name.
+        marks: Points (slip, friction coefficient) by name.
+        zoom: Window (slip, slip, mu, mu) of a second panel, or None.
+        speed: Speed [m/s] at which friction is evaluated.
+        title: Title of the figure.
+    """
     figure, axes = sheet(1, 2 if zoom else 1, title=title, size=(5.6, 3.8))
     for ax in axes:
         limits = zoom[:2] if zoom and ax is axes[-1] else (0.0, 1.0)
         s = np.linspace(*limits, 1001)
         for i, (name, road) in enumerate(roads.items()):
+            # road=road binds the road of this iteration.
             mu = jax.vmap(lambda x, road=road: road.friction(x, speed, 0.0))(s)
             ax.plot(s, np.asarray(mu), DASHES[i], color=COLOURS[i], label=name)
         for i, (name, (x, y)) in enumerate((marks or {}).items()):
@@ -213,13 +293,21 @@ def draw_friction(
 def draw_convergence(
     panels: Mapping[str, Mapping[str, Any]], steps: Sequence[float], *, orders: Sequence[int], title: str = ""
 ) -> Figure:
-    """Error over step length in logarithmic axes, one panel per case, with a guide line for each order."""
+    """Return a figure of error over step length in logarithmic axes, with one panel per case.
+
+    Args:
+        panels: Relative errors as {case: {quantity: values}}, values of shape (steps,).
+        steps: Step lengths [s], shape (steps,).
+        orders: Order of the guide line of each case.
+        title: Title of the figure.
+    """
     figure, axes = sheet(1, len(panels), title=title, size=(5.2, 3.8), sharey=True)
     h = np.asarray(steps)
     for i, (ax, order, (name, curves)) in enumerate(zip(axes, orders, panels.items(), strict=True)):
         for j, (quantity, errors) in enumerate(curves.items()):
             words = "IAE" if quantity == "iae" else spaced_name(quantity)
             ax.loglog(h, errors, "o" + DASHES[j], color=COLOURS[j], markersize=4.5, label=words)
+        # The guide line has the slope of the order and starts a factor of 3 above the largest error.
         top = 3.0 * np.max([np.max(e) for e in curves.values()])
         ax.loglog(h, top * (h / h.max()) ** order, color=GREY, linewidth=0.9, label=f"slope {order}")
         make_logarithmic(ax, "x")

@@ -1,4 +1,4 @@
-"""What a figure shows, as numbers: for readers who look closer (`diffabs report`)."""
+"""Numbers behind a figure, for readers who look closer (`diffabs report`)."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -10,14 +10,24 @@ from matplotlib.patches import StepPatch
 
 from diffabs.plot.style import Axes, Figure
 
-AXES_DIGITS = 6
+AXES_DIGITS = 6  # significant digits
 MAX_SERIES_POINTS = 1000  # points of a curve or cloud; more are thinned out evenly, with both ends
 
 
 def describe_axes(figure: Figure) -> list[dict[str, Any]]:
-    """Return the axes of a figure that was drawn: their `box` (left, top, right, bottom, as shares of the figure),
-    ends, whether each is logarithmic, names, and `series` of points in the axes' units. Axes with another scale are
-    left out, and areas."""
+    """Return a description of each axes of a drawn figure.
+
+    - `box`: left, top, right and bottom as shares of the figure.
+    - `x`, `y`: ends of the axes.
+    - `log`: for both axes, whether they are logarithmic.
+    - `names`: labels of the axes.
+    - `series`: points in the axes' units.
+
+    Filled areas, invisible axes and axes with a scale other than linear or logarithmic are left out.
+
+    Args:
+        figure: Figure that is already drawn, so that its axes have their final places.
+    """
     return [one for ax in figure.axes if (one := _axes(ax))]
 
 
@@ -39,6 +49,7 @@ def _axes(ax: Axes) -> dict[str, Any] | None:
 
 def _series(ax: Axes) -> Iterator[dict[str, Any]]:
     for line in ax.lines:
+        # Guide lines such as axhline use another transform: their points are not in the axes' units.
         if line.get_visible() and line.get_transform() == ax.transData:
             yield from _points(line.get_label(), line.get_color(), line.get_xdata(), line.get_ydata())
     for patch in ax.patches:
@@ -53,11 +64,12 @@ def _series(ax: Axes) -> Iterator[dict[str, Any]]:
 
 
 def _points(name: Any, colour: Any, x: Any, y: Any) -> Iterator[dict[str, Any]]:
-    """A series, or none: of its finite points."""
+    """Yield a series of the finite points, or nothing if there are none."""
     x, y = (np.ma.filled(np.ma.asarray(values, float), np.nan).ravel() for values in (x, y))
     there = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(there):
         some = there[np.unique(np.linspace(0, len(there) - 1, min(MAX_SERIES_POINTS, len(there))).round().astype(int))]
+        # matplotlib gives a line without a label a name that starts with an underscore.
         name = "" if str(name).startswith("_") else str(name)
         yield {"name": name, "colour": to_hex(colour), "x": _short(x[some]), "y": _short(y[some])}
 

@@ -1,8 +1,9 @@
-"""The look of all figures: sheets, axes and their words. The only importer of matplotlib (the extra
-`plot`); it keeps no global state.
+"""Style of all figures: sheets, axes and their labels. It keeps no global state of matplotlib (the extra `plot`).
 
-Speeds are drawn in km/h, everything else in SI units. Colours are those of M. Okabe and K. Ito, Color Universal Design
-(2008), which colour-blind readers can tell apart; curves that lie close differ in their dashes as well.
+Speeds are drawn in km/h, everything else in SI units. The colours are safe for colour-blind readers. Curves that lie
+close to each other differ in their dashes as well.
+
+Source: M. Okabe and K. Ito, Color Universal Design (2008).
 """
 
 import json
@@ -30,25 +31,34 @@ DASHES = ("-", "--", "-.", ":", "-", "--", "-.")
 GREY = "#767676"
 KMH = 3.6  # km/h per m/s
 DPI = 150
-FEW_DECADES, PLAIN = 2.0, 4  # fewer have labels between them; powers of ten that are written out
+FEW_DECADES, PLAIN = 2.0, 4  # below FEW_DECADES 2 and 5 have labels, too; powers of ten up to PLAIN are written out
 RAISED = str.maketrans("-0123456789", "\u207b\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079")
 TITLE_SIZE = 9  # characters per inch, with room to spare
 
 
 class Sheet(Figure):
-    """A figure that shows every text as it stands: a dollar sign, of a title or a name, begins no formula."""
+    """A figure that shows every text literally: a dollar sign in a title or a name starts no formula."""
 
     def draw(self, renderer: Any) -> None:
-        """Draw it."""
+        """Draw the figure with the `renderer`, without formulas in its texts."""
         for ax in self.axes:
-            _ = ax.get_xticklabels() + ax.get_yticklabels()  # made where they are asked for
+            # matplotlib makes tick labels on access; without it findobj would miss them.
+            _ = ax.get_xticklabels() + ax.get_yticklabels()
         for words in self.findobj(Text):
             words.set_parse_math(False)  # pyright: ignore[reportAttributeAccessIssue]
         super().draw(renderer)
 
 
 def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float, float] = (5.4, 3.4), **kwargs: Any):
-    """An empty figure in the house's look, and its axes, a list in reading order. `size` [inch] is that of one axes."""
+    """Return an empty figure in the common style, and its axes as a list in reading order.
+
+    Args:
+        rows: Number of rows.
+        columns: Number of columns.
+        title: Title of the figure; long lines are wrapped.
+        size: Width and height of one axes [inch].
+        kwargs: Further arguments of `Figure.subplots`.
+    """
     figure = Sheet(figsize=(size[0] * columns, size[1] * rows), dpi=DPI, layout="constrained")
     axes = list(figure.subplots(rows, columns, squeeze=False, **kwargs).flat)
     for ax in axes:
@@ -65,7 +75,15 @@ def sheet(rows: int = 1, columns: int = 1, *, title: str = "", size: tuple[float
 
 
 def label_axes(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True) -> None:
-    """Name the axes, with units, and show the legend if there is something in it."""
+    """Label the axes, and show the legend if it has entries.
+
+    Args:
+        ax: Axes to label.
+        x: Label of the horizontal axis, with unit.
+        y: Label of the vertical axis, with unit.
+        title: Title of the axes, or "".
+        legend: Whether to show the legend.
+    """
     ax.set_xlabel(x, fontsize=11)
     ax.set_ylabel(y, fontsize=11)
     if title:
@@ -75,8 +93,15 @@ def label_axes(ax: Axes, x: str, y: str, title: str = "", *, legend: bool = True
 
 
 def make_logarithmic(ax: Axes, axis: str) -> None:
-    """Make an axis, "x" or "y", logarithmic, with as many labels as have room: over less than two decades 1, 2 and 5
-    of each, as plain numbers, over more the decades."""
+    """Make an axis logarithmic, with as many labels as have room.
+
+    Over less than two decades the labels are 1, 2 and 5 of each decade, as plain numbers. Over more they are the
+    decades.
+
+    Args:
+        ax: Axes to change.
+        axis: "x" or "y".
+    """
     (ax.set_xscale if axis == "x" else ax.set_yscale)("log")
     one = ax.xaxis if axis == "x" else ax.yaxis
     one.set_major_locator(_Decades())
@@ -85,10 +110,10 @@ def make_logarithmic(ax: Axes, axis: str) -> None:
 
 
 class _Decades(LogLocator):
-    """Decades, and 2 and 5 of each where there are few."""
+    """A locator of decades, with 2 and 5 of each over less than two decades."""
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
-        """Where labels are."""
+        """Return the places of the labels between `vmin` and `vmax`."""
         decades = np.log10(vmax / vmin) if vmin > 0 else np.inf
         self.set_params(subs=(1.0, 2.0, 5.0) if decades < FEW_DECADES else (1.0,))
         found = np.asarray(super().tick_values(vmin, vmax))
@@ -96,15 +121,16 @@ class _Decades(LogLocator):
 
 
 class _Powers(Formatter):
-    """Powers of ten over many decades, plain numbers over few, unless they are long."""
+    """A formatter with powers of ten over two decades or more, and plain numbers over less unless they are long."""
 
     def __call__(self, x: float, pos: int | None = None) -> str:
-        """The label of a place."""
+        """Return the label of the place x."""
         del pos
         low, high = np.sort(self.axis.get_view_interval())  # pyright: ignore[reportOptionalMemberAccess]
         few = low > 0 and np.log10(high / low) < FEW_DECADES
         if few and 10.0**-PLAIN <= x < 10.0 ** (PLAIN + 1):
             return f"{x:g}"
+        # 1e-9 keeps the exponent if the logarithm of a power of ten is rounded down.
         power = int(np.floor(np.log10(x) + 1e-9)) if x > 0 else 0
         mantissa = x / 10.0**power
         head = "" if abs(mantissa - 1) < 1e-9 else f"{mantissa:.0f}\N{MULTIPLICATION SIGN}"
@@ -112,8 +138,14 @@ class _Powers(Formatter):
 
 
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
-    """Write a figure in the format of the path's suffix, atomically: readers see the old file or the whole new one. A
-    PNG has the numbers that it shows in it (`plot.shown`)."""
+    """Write a figure to a file atomically, and return its path.
+
+    Readers see the old file or the whole new one. A PNG contains the numbers that it shows (`plot.shown`).
+
+    Args:
+        figure: Figure to write.
+        path: Path of the file; its suffix is the format, PNG without a suffix.
+    """
     path = pathlib.Path(path)
     with files.new_file(path) as temporary:
         write_figure(figure, temporary, path.suffix.lstrip(".") or "png")
@@ -121,26 +153,45 @@ def save_figure(figure: Figure, path: str | os.PathLike[str]) -> pathlib.Path:
 
 
 def write_figure(figure: Figure, path: pathlib.Path, kind: str) -> None:
-    """Write a figure in a format."""
+    """Write a figure in a given format; a PNG also gets the numbers that it shows.
+
+    Args:
+        figure: Figure to write.
+        path: Path of the file.
+        kind: Format, such as "png" or "svg".
+    """
     from diffabs.plot import shown
 
     figure.savefig(path, format=kind, dpi=DPI)
-    if kind == "png":  # drawing has set the places of the axes
+    # Only after savefig: drawing sets the final places of the axes.
+    if kind == "png":
         text = json.dumps(shown.describe_axes(figure), separators=(",", ":"), allow_nan=False)
         path.write_bytes(pictures.with_text(path.read_bytes(), pictures.AXES_KEY, text))
 
 
 def control_label(unit: str) -> str:
-    """What an axis says of a plant's control in this unit."""
+    """Return the axis label of a plant's control.
+
+    Args:
+        unit: Unit of the control.
+    """
     return {"N m": "brake torque [N m]", "V": "voltage [V]"}.get(unit, f"control [{unit}]")
 
 
 def signal_label(output: Any) -> str:
-    """Return what an axis says of the first signal of an output."""
+    """Return the axis label of the first signal of an output.
+
+    Args:
+        output: Output of a plant, with `units`.
+    """
     name, unit = next(iter(output.units.items()))
     return f"{spaced_name(name)} [{unit}]"
 
 
 def spaced_name(name: str) -> str:
-    """Return what an axis says of a signal or a metric."""
+    """Return the name of a signal or metric with spaces instead of underscores.
+
+    Args:
+        name: Name of the signal or metric.
+    """
     return name.replace("_", " ")

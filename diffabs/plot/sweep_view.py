@@ -1,6 +1,7 @@
-"""What the figures ask of a sweep: which metrics vary, which variables move them, and the cells of a map.
+"""Statistics of a sweep for its figures: varying metrics, influential variables, and the cells of a map.
 
-Columns are in SI; variables that are speeds are drawn in km/h."""
+Columns are in SI units. Variables that are speeds are drawn in km/h.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -10,16 +11,21 @@ import numpy as np
 from diffabs.plot.style import KMH
 from diffabs.sweep.results import Results
 
-CELL_COUNTS = (
-    4,
-    24,
-)  # of a map along one variable, fewest and most; one with fewer different values has a cell for each
-MIN_RUNS_PER_CELL = 10  # of a cell on average, if there are enough
-ROUNDING_EPS = 16  # epsilons: metrics are differences of numbers around one
+# Fewest and most cells of a map along one variable. A variable with fewer different values has one cell for each.
+CELL_COUNTS = (4, 24)
+MIN_RUNS_PER_CELL = 10  # on average over the cells, if there are enough runs
+# In machine epsilons. Metrics are differences of numbers around 1: a smaller range of values is rounding.
+ROUNDING_EPS = 16
 
 
 class AxisVariable(NamedTuple):
-    """A column for an axis: numbers, or places in a list of names."""
+    """A column for an axis.
+
+    Attributes:
+        label: Label of the axis, with unit.
+        values: Numbers, or indices into `names`.
+        names: Names of a variable that is not a number; empty for numbers.
+    """
 
     label: str
     values: np.ndarray
@@ -27,16 +33,17 @@ class AxisVariable(NamedTuple):
 
 
 class SweepView:
-    """What the figures ask of a sweep."""
+    """The rows, metrics and variables of a sweep that its figures show."""
 
     def __init__(self, found: Results, units: Mapping[str, str] = {}):
-        """`units`: by the name of a column."""
+        """Select the rows and metrics of the sweep `found`; `units` are by the name of a column."""
         self.found, self.units, self.bounds = found, units, found.study["failures"]
         self.design, self.good = found.study["space"]["design"]["type"], ~found.column("diverged")
         self.accepted = found.accepted
         self.good &= self.accepted
+        # A Saltelli design repeats blocks (A, B, AB_1, ..., AB_p). Only A is an independent sample for the statistics.
         period = len(found.study["space"]["variables"]) + 2 if self.design == "saltelli" else 1
-        self.rows = self.good & (found.column("sample") % period == 0)  # those in the statistics: A of (A, B, AB)
+        self.rows = self.good & (found.column("sample") % period == 0)
         least = ROUNDING_EPS * np.finfo(found.study["dtype"]).eps
         columns = ((name, found.column(name)[self.rows]) for name in found.metrics if self.rows.any())
         finite = ((name, x[np.isfinite(x)]) for name, x in columns)
@@ -44,23 +51,29 @@ class SweepView:
         self.leading = next((name for name in [*self.bounds, *self.varying] if name in self.varying), "")
 
     def known(self, name: str, rows: np.ndarray) -> np.ndarray:
-        """Those of the rows in which a metric is finite: a run that never settles has no place in a figure."""
+        """Return the `rows` in which the metric `name` is finite.
+
+        A run that never settles has no finite settling time and is left out.
+        """
         return rows & np.isfinite(self.found.column(name)) if name else rows
 
     def never(self, name: str) -> str:
-        """How many runs a figure of this metric leaves out; empty for none."""
+        """Return a note on the number of runs that a figure of the metric `name` leaves out, or "" for none."""
         count = np.sum(self.rows & ~self.known(name, self.rows))
         return f" ({count} never: left out)" if count else ""
 
     def named(self, name: str) -> str:
-        """A column's name with its unit."""
+        """Return the column's `name` with its unit."""
         unit = self.units.get(name, "")
-        if ", " in unit:  # of a list, one after the other
+        if ", " in unit:  # units of a list's entries: the last part of the name is the index
             unit = unit.split(", ")[int(name.rpartition(".")[2])]
         return f"{name} [{unit}]" if unit else name
 
     def title(self, what: str, rows: np.ndarray) -> str:
-        """With the scenario's name, if it has one, and how many runs are behind the figure."""
+        """Return a title with the scenario's name, the words `what`, and the number of runs in `rows`.
+
+        Diverged and refused runs are counted in addition.
+        """
         name, bad = self.found.manifest.get("source", {}).get("name"), np.sum(self.accepted & ~self.good)
         refused = np.sum(~self.accepted)
         runs = f"{np.sum(rows):,} runs" + (f" ({bad:,} diverged)" if bad else "")
@@ -68,7 +81,7 @@ class SweepView:
         return f"{name}: {what} {runs}" if name else f"{what} {runs}"
 
     def variable(self, path: str, rows: np.ndarray) -> AxisVariable:
-        """A varied parameter in these rows, for an axis."""
+        """Return the varied parameter `path` in these `rows`, for an axis."""
         values = self.found.column(path)[rows]
         if not self.found.is_number(path):
             names, places = np.unique(values.astype(str), return_inverse=True)
@@ -77,8 +90,14 @@ class SweepView:
         return AxisVariable(f"{path} [km/h]" if fast else self.named(path), values * (KMH if fast else 1.0), [])
 
     def influential(self, rows: np.ndarray, result: np.ndarray, *, numbers_first: bool = False) -> list[str]:
-        """The variable that moves a result most, and the one that moves most of what the first leaves unexplained;
-        names last because the upward axis has room for them."""
+        """Return the paths of the two most influential variables on a `result`, given in these `rows`.
+
+        The first variable explains the largest variance between cells. The second explains the largest variance of the
+        rest.
+        With `numbers_first`, numeric variables precede names. In the returned list names come last: the vertical axis
+        has room
+        for them.
+        """
         best: list[str] = []
         for _ in range(2 if len(result) else 0):
             rank = {}
@@ -86,6 +105,7 @@ class SweepView:
                 one = self.variable(path, rows)
                 if path not in best and np.ptp(one.values) > 0:
                     rank[path] = (numbers_first and bool(one.names), -np.var(cell_means(one, result)))
+            # The second variable is chosen on the residual of the first.
             if rank:
                 best.append(min(rank, key=rank.__getitem__))
                 result = result - cell_means(self.variable(best[-1], rows), result)
@@ -93,7 +113,14 @@ class SweepView:
 
 
 def assign_cells(one: AxisVariable, along: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """The place of each run among cells, and their edges: around each value if there are few, else equally wide."""
+    """Return the cell index of each run and the edges of the cells.
+
+    A variable with few different values has one cell around each value. Other cells are equally wide.
+
+    Args:
+        one: Variable to divide into cells.
+        along: Number of variables of the map, 1 or 2.
+    """
     levels, n = np.unique(one.values), len(one.values)
     if one.names or len(levels) <= min(CELL_COUNTS[1], n / 2):
         middles = (levels[1:] + levels[:-1]) / 2
@@ -106,7 +133,15 @@ def assign_cells(one: AxisVariable, along: int = 2) -> tuple[np.ndarray, np.ndar
 
 
 def cell_means(one: AxisVariable, result: np.ndarray) -> np.ndarray:
-    """For each run the mean of the result over its cell. Unlike a correlation their variance sees a result that is
-    worst in the middle, and what names do."""
+    """Return the mean of the result over the cell of each run, shape (runs,).
+
+    Unlike a correlation, the variance of these means also shows a result that is worst in the middle of a range. It
+    also
+    shows the influence of a variable with names.
+
+    Args:
+        one: Variable to divide into cells.
+        result: Result of each run, shape (runs,).
+    """
     place = assign_cells(one)[0]
     return (np.bincount(place, result) / np.maximum(np.bincount(place), 1))[place]

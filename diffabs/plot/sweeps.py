@@ -1,7 +1,8 @@
-"""Figures of a sweep: what the metrics are like, how often they exceed a value, which runs are worst, what moves them,
-and where runs fail. Columns that do not vary are left out, and so are runs that diverged, except among the failures.
+"""Figures of a sweep: distributions, exceedance, worst runs, sensitivities, and a map of failures.
 
-Units are handed in by the name of a column. Columns are in SI; variables that are speeds are drawn in km/h."""
+Columns that do not vary are left out. Diverged runs are left out except among the failures. Units are given by the name
+of a column. Columns are in SI units; variables that are speeds are drawn in km/h.
+"""
 
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -15,20 +16,24 @@ from diffabs.sweep.engines import describe_wrong_end
 from diffabs.sweep.results import Results
 from diffabs.sweep.statistics.estimates import Count, Tail
 
-MAX_BOUND_DISTANCE = (
-    2.0  # widths between the outer quantiles: what lies further outside would press a histogram together
-)
-LEVELS = 32  # of an exceedance curve along the share, as many along its logarithm, and as many runs one by one
-POINTS = 5000  # of a scatter
-FEW = 10  # failures, or runs without, that are too few to tell which variables matter
-ROW = 0.055  # of the axes' height, for a line of text beside them
+# In distances between the outer quantiles. Values further outside are left out, or they would compress the histogram.
+MAX_BOUND_DISTANCE = 2.0
+LEVELS = 32  # corners of an exceedance curve along the share, along its logarithm, and over the greatest single runs
+POINTS = 5000  # largest number of points of a scatter
+FEW = 10  # fewer failures, or runs without failure, do not show which variables matter
+ROW = 0.055  # height of a line of text beside the axes, as a share of their height
 ABOVE = dict(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False, fontsize=9, handlelength=1.5)
 
 
 def draw_sweep(found: Results, document: Any, folder: pathlib.Path, units: Mapping[str, str]) -> list[pathlib.Path]:
-    """Write every figure that has something in it as PNG.
+    """Write every figure that has content as PNG, and return the paths.
 
-    document: of `diffabs.sweep.statistics.summary.summarise_sweep`."""
+    Args:
+        found: Results of the sweep.
+        document: Summary from `diffabs.sweep.statistics.summary.summarise_sweep`.
+        folder: Folder for the figures.
+        units: Units by the name of a column.
+    """
     figures = {
         "distributions": draw_distributions(found, units),
         "exceedance": draw_exceedance(found, units, document["confidence"]),
@@ -40,7 +45,12 @@ def draw_sweep(found: Results, document: Any, folder: pathlib.Path, units: Mappi
 
 
 def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
-    """A histogram of each metric, with its median and two quantiles. None where no metric varies."""
+    """Return histograms of each metric with its median and two quantiles, or None if no metric varies.
+
+    Args:
+        found: Results of the sweep.
+        units: Units by the name of a column.
+    """
     view = SweepView(found, units)
     figure, axes = _panels(view.varying, view.title("distributions of", view.rows))
     for ax, name in zip(axes, view.varying, strict=True):
@@ -62,8 +72,15 @@ def draw_distributions(found: Results, units: Mapping[str, str] = {}) -> Figure 
 
 
 def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: float = 0.95) -> Figure | None:
-    """The share of runs beyond each value, with pointwise intervals of Clopper and Pearson unless nothing is random.
-    None where no metric varies."""
+    """Return the share of runs beyond each value for each metric, or None if no metric varies.
+
+    Pointwise intervals of Clopper and Pearson are drawn unless the design is a grid or corners, which are not random.
+
+    Args:
+        found: Results of the sweep.
+        units: Units by the name of a column.
+        confidence: Confidence level of the intervals.
+    """
     view = SweepView(found, units)
     band = f"{100 * confidence:g} % band" + ("" if view.design == "random" else " (as if independent)")
     figure, axes = _panels(view.varying, view.title("how often a value is exceeded in", view.rows))
@@ -85,9 +102,17 @@ def draw_exceedance(found: Results, units: Mapping[str, str] = {}, confidence: f
 
 
 def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -> Figure | None:
-    """The runs over the two variables, numbers first, that move a metric most; the worst with their sample numbers. The
-    metric is the first that has a bound of failure and varies, or else the first that varies. With one variable, the
-    metric over it. None where nothing varies."""
+    """Return a scatter of the runs over the two variables that move a metric most, or None if nothing varies.
+
+    The metric is the first varying one with a bound of failure, or else the first varying one. The worst runs have
+    their
+    sample numbers. Numeric variables are preferred. With one variable, the figure shows the metric over it.
+
+    Args:
+        found: Results of the sweep.
+        units: Units by the name of a column.
+        count: Number of worst runs that are marked.
+    """
     view = SweepView(found, units)
     metric = view.leading
     good = view.known(metric, view.good)
@@ -96,9 +121,10 @@ def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -
         return None
     values, samples = found.column(metric)[good], found.column("sample")[good]
     bound, tail = view.bounds.get(metric), Tail.of(values, samples, count)
-    ends = np.searchsorted(samples, tail.indices)
+    ends = np.searchsorted(samples, tail.indices)  # sample numbers ascend
     shown = np.union1d(np.random.default_rng(0).permutation(len(values))[: POINTS - count], ends)
-    shown = shown[np.argsort(values[shown], kind="stable")]  # of runs at one place the worst is seen
+    # Later points cover earlier ones: ascending values keep the worst run of a place visible.
+    shown = shown[np.argsort(values[shown], kind="stable")]
     x, y = ones[0].values, ones[1].values if ones[1:] else values
     figure, (ax,) = sheet(title=view.title(f"greatest {metric} of", good), size=(8.4, 4.8))
     dots = ax.scatter(x[shown], y[shown], 10, values[shown], cmap="viridis", linewidths=0)
@@ -114,8 +140,14 @@ def draw_worst(found: Results, units: Mapping[str, str] = {}, count: int = 10) -
 
 
 def draw_sensitivity(found: Results, document: Mapping[str, Any]) -> Figure | None:
-    """Bars with intervals for each metric: rank correlations, or Sobol' indices for a Saltelli design. None where the
-    document has none."""
+    """Return bars with intervals for each metric, or None if the document has no sensitivities.
+
+    The bars are rank correlations, or Sobol' indices for a Saltelli design.
+
+    Args:
+        found: Results of the sweep.
+        document: Summary with `sensitivity` and `confidence`.
+    """
     view = SweepView(found)
     sobol = view.design == "saltelli"
     kinds, what = (("first", "total"), "Sobol indices") if sobol else (("spearman",), "rank correlations")
@@ -138,9 +170,19 @@ def draw_sensitivity(found: Results, document: Mapping[str, Any]) -> Figure | No
 
 
 def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | None:
-    """The share of failed runs in cells of the two variables that move it most, or that move the metric of `worst` most
-    if too few failed, or did not; cells without a run are grey. Where none failed the colour is the greatest value of
-    that metric in a cell. None where no variable varies, or nothing failed and no metric varies."""
+    """Return a map of the share of failed runs over its two most influential variables.
+
+    Fewer than ten failed runs, or fewer than ten runs without failure, do not show an influence. The map then uses the
+    two
+    variables that move the metric of `draw_worst` most. If no run failed, the colour is the largest value of that
+    metric in a cell. Cells without a run are grey.
+
+    Without a varying variable the function returns None. It also returns None if no run failed and no metric varies.
+
+    Args:
+        found: Results of the sweep.
+        units: Units by the name of a column.
+    """
     view = SweepView(found, units)
     failed = found.failed()[every := view.accepted]
     if not (failed.any() or view.leading):
@@ -173,21 +215,26 @@ def draw_failure_map(found: Results, units: Mapping[str, str] = {}) -> Figure | 
 
 
 def _greatest(cell: Any, values: np.ndarray, lanes: np.ndarray) -> np.ndarray:
-    """The greatest value in each cell."""
+    """Return the largest value in each cell."""
     table = np.full(lanes.size, -np.inf)
     np.maximum.at(table, cell, values)
     return table.reshape(lanes.shape)
 
 
 def _draw_bound(view: SweepView) -> str:
-    """What the colour is where nothing failed."""
+    """Return the label of the colour bar for a map without failures."""
     bound = view.bounds.get(view.leading)
     return f"greatest {view.named(view.leading)}" + ("" if bound is None else f", fails beyond {bound:g}")
 
 
 def _exceedance_corners(ordered: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of 1 - F from low to high: values, each twice, and how many reach it and are greater. Of many, some."""
+    """Return the corners of the step function 1 - F from low to high, for `ordered` values.
+
+    The corners are the values, each twice, and the number of runs that reach and that exceed them. Of many values a
+    selection is returned.
+    """
     n = len(ordered)
+    # Corners are dense among the greatest runs, where the logarithmic axis shows each of them.
     some = [np.arange(1, min(n, LEVELS) + 1), np.geomspace(1, n, LEVELS), np.linspace(1, n, LEVELS)]
     x = np.unique(ordered[n - np.unique(np.concatenate(some).astype(int))])
     sides = [n - np.searchsorted(ordered, x, side="left"), n - np.searchsorted(ordered, x, side="right")]
@@ -195,7 +242,7 @@ def _exceedance_corners(ordered: np.ndarray, low: float, high: float) -> tuple[n
 
 
 def _bars(ax: Axes, rows: Sequence[Mapping[str, Any]], kinds: Sequence[str]) -> None:
-    """One row below the other, a bar for each kind; no interval where the document has none."""
+    """Draw one row per variable with a bar for each kind; the interval is left out if the document has none."""
     for j, kind in enumerate(kinds):
         at = np.arange(len(rows)) + (j + 0.5) * 0.8 / len(kinds) - 0.4
         ax.barh(
@@ -208,10 +255,13 @@ def _bars(ax: Axes, rows: Sequence[Mapping[str, Any]], kinds: Sequence[str]) -> 
 
 
 def _callouts(ax: Axes, x: np.ndarray, y: np.ndarray, texts: Sequence[str]) -> None:
-    """Texts in a column beside the axes with a line to each point, in the order of their heights: points that are worst
-    lie close together, and names at their places would cover each other."""
+    """Write texts in a column beside the axes, with a line to each point, in the order of the points' heights.
+
+    The worst points lie close together, and texts at their places would cover each other.
+    """
     line = {"arrowstyle": "-", "color": GREY, "linewidth": 0.7, "shrinkA": 1, "shrinkB": 4, "relpos": (0, 0.5)}
     (low, high), half = ax.get_ylim(), ROW * (len(texts) - 1) / 2
+    # Centre the column on the points, but keep it within the axes.
     middle = np.clip((np.mean(y) - low) / (high - low), half, 1 - half)
     for height, i in zip(np.linspace(middle - half, middle + half, len(texts)), np.lexsort((-x, y)), strict=True):
         place = {"xytext": (1.06, height), "textcoords": "axes fraction", "va": "center", "annotation_clip": False}
@@ -219,7 +269,10 @@ def _callouts(ax: Axes, x: np.ndarray, y: np.ndarray, texts: Sequence[str]) -> N
 
 
 def _limits(ax: Axes, low: float, high: float, bound: float | None) -> tuple[float, float]:
-    """Of the values' axis: with the bound, whose line is drawn, if that leaves half of it to the data."""
+    """Return the limits of the value axis, and draw the bound.
+
+    The bound is inside if that leaves half of the axis to the data.
+    """
     width = high - low
     if bound is not None:
         ax.axvline(bound, color=COLOURS[1], linewidth=1.6, label=f"bound {bound:g}")
@@ -229,7 +282,7 @@ def _limits(ax: Axes, low: float, high: float, bound: float | None) -> tuple[flo
 
 
 def _panels(names: Sequence[str], title: str, size: tuple[float, float] = (5.0, 3.1), **kwargs: Any) -> Any:
-    """A figure with as many axes, and these; no figure without names."""
+    """Return a figure and one axes for each name, or None and no axes without names."""
     if not names:
         return None, []
     columns = min(len(names), 2 if len(names) <= 4 else 3)

@@ -1,4 +1,4 @@
-"""Figures of a tuning: how it went, a run before and after, the price of a short stop, the worst case."""
+"""Figures of a tuning: convergence, runs before and after, the front of two objectives, and the worst case."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,12 +21,16 @@ from diffabs.simulate.solution import Trajectory
 
 MARKS = "osD^v"
 MAX_DECADES = 5.0  # an objective that falls by less is easier to read on a linear axis
-SETTLED_MULTIPLE = 1.5  # how much longer than the transient a panel is
+SETTLED_MULTIPLE = 1.5  # length of the time axis, in transients
 
 
 def draw_history(points: Sequence[Any], *, title: str = "") -> Figure:
-    """Objective and gradient over the gradients computed. `points` have `evaluations`, `objective`, `gradient` and
-    `violation`."""
+    """Return a figure of the objective and the gradient over the number of computed gradients.
+
+    Args:
+        points: Points of the iteration with `evaluations`, `objective`, `gradient` and `violation`.
+        title: Title of the figure.
+    """
     figure, axes = sheet(1, 2, title=title, size=(5.2, 3.4))
     _objective(axes[0], points)
     _gradient(axes[1], points)
@@ -36,7 +40,15 @@ def draw_history(points: Sequence[Any], *, title: str = "") -> Figure:
 def draw_tuning(
     points: Sequence[Any], runs: Mapping[str, Trajectory], *, title: str = "", lane: str = "", unit: str = "N m"
 ) -> Figure:
-    """History above, the runs of one lane below, their control in its `unit`: all that `diffabs tune` draws."""
+    """Return the figure of `diffabs tune`: convergence above, the runs before and after below.
+
+    Args:
+        points: Points of the iteration, as in `draw_history`.
+        runs: Trajectories of one run of the batch by name.
+        title: Title of the figure.
+        lane: Description of this run, the worst of the batch.
+        unit: Unit of the control.
+    """
     figure, (objective, gradient, slip, torque) = sheet(2, 2, title=title, size=(5.8, 3.1))
     _objective(objective, points)
     _gradient(gradient, points)
@@ -52,8 +64,17 @@ def draw_pareto(
     y: str = "stopping distance [m]",
     title: str = "",
 ) -> Figure:
-    """What one objective costs in the other: points (x, y) by name, joined where no other is better in both; the rest
-    of them pale. `marks` are single points with names."""
+    """Return a figure of one objective over another, with the Pareto front of each set of points.
+
+    Points on a front are joined; the others are pale.
+
+    Args:
+        fronts: Points (x, y) by name.
+        marks: Single points (x, y) by name.
+        x: Label of the horizontal axis.
+        y: Label of the vertical axis.
+        title: Title of the figure.
+    """
     figure, (ax,) = sheet(title=title, size=(6.2, 4.0))
     for i, (name, (across, up)) in enumerate(fronts.items()):
         across, up = np.asarray(across, float), np.asarray(up, float)
@@ -67,8 +88,16 @@ def draw_pareto(
 
 
 def pareto_front(x: Any, y: Any) -> np.ndarray:
-    """Indices of the points of which no other is smaller in both, along x. NaN is never among them."""
+    """Return the indices of the Pareto-optimal points, in the order of x.
+
+    A point is Pareto-optimal if no other point is smaller in both objectives. Points with NaN are left out.
+
+    Args:
+        x: First objective, shape (n,).
+        y: Second objective, shape (n,).
+    """
     x, y = np.asarray(x, float), np.asarray(y, float)
+    # In the order of x (of equal x the smallest y first), a point is on the front if its y is a new minimum.
     order = [i for i in np.lexsort((y, x)) if np.isfinite([x[i], y[i]]).all()]
     kept, least = [], np.inf
     for i in order:
@@ -81,8 +110,15 @@ def pareto_front(x: Any, y: Any) -> np.ndarray:
 def draw_worst_case(
     nominal: Trajectory, worst: Trajectory, parameters: Mapping[str, Any], *, metric: str = "", title: str = ""
 ) -> Figure:
-    """The nominal run against the worst one found, with the parameters of the latter; `metric` says of what it is the
-    worst, `overshoot = 0.31`."""
+    """Return a figure of the nominal run and the worst run, with the parameters of the worst run.
+
+    Args:
+        nominal: Trajectory of the nominal run.
+        worst: Trajectory of the worst run.
+        parameters: Parameters of the worst run by path.
+        metric: Metric with its worst value, such as `overshoot = 0.31`.
+        title: Title of the figure.
+    """
     found = ", ".join(f"{path} = {_short(value)}" for path, value in parameters.items())
     heading = "\n".join(line for line in (title, f"{metric} at {found}" if metric else found) if line)
     figure, axes = sheet(1, 3, title=heading, size=(4.6, 3.4))
@@ -97,7 +133,7 @@ def draw_worst_case(
 
 
 def _objective(ax: Axes, points: Sequence[Any]) -> None:
-    """The objective, and what violates the constraints most, on an axis of its own."""
+    """Draw the objective and, on an axis of its own, the largest violation of a constraint."""
     n, values = [p.evaluations for p in points], np.array([p.objective for p in points])
     ax.plot(n, values, "o-", markersize=3.5, color=COLOURS[0], label="objective")
     known = values[np.isfinite(values)]
@@ -120,7 +156,7 @@ def _gradient(ax: Axes, points: Sequence[Any]) -> None:
 
 
 def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str = "", unit: str = "N m") -> None:
-    """The first signal, a brake's slip, with its setpoint, and the control."""
+    """Draw the first signal (the slip of a brake) with its setpoint, and the control."""
     for i, (name, seen) in enumerate(runs.items()):
         t = np.asarray(seen.sample.t)
         slip.plot(t, seen.sample.output[0], DASHES[i], color=COLOURS[i], label=name)
@@ -135,7 +171,10 @@ def _runs(slip: Axes, torque: Axes, runs: Mapping[str, Trajectory], title: str =
 
 
 def _arrival_time(runs: Mapping[str, Trajectory]) -> float:
-    """Long enough to see every run arrive within 2 % of its end, or the whole where one does not."""
+    """Return the end of the time axis [s]: 1.5 times the longest transient, at most the longest run.
+
+    The transient of a run ends when its first signal stays within 2 % of its largest magnitude around the setpoint.
+    """
     ends = []
     for seen in runs.values():
         t, slip = np.asarray(seen.sample.t), np.asarray(seen.sample.output[0])
